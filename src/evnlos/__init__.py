@@ -1,0 +1,1 @@
+"""evnlos sees moving things around a corner with an event camera."""

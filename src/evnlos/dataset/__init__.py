@@ -1,0 +1,36 @@
+"""Samples on disk: simulate them, import them from captures, split them, load them."""
+
+from evnlos.dataset.capture import Capture, CaptureInfo, read_capture
+from evnlos.dataset.importer import capture_samples, character_of, import_captures
+from evnlos.dataset.loader import CHANNELS, PARADIGMS, NlosDataset, Paradigm, network_input
+from evnlos.dataset.sampling import Samples, Sampling, make_samples, reduce_by_area
+from evnlos.dataset.shard import read_shard, write_shard
+from evnlos.dataset.simulate import SensorSize, Simulation, simulate, simulate_object
+from evnlos.dataset.store import Dataset, create_dataset, open_dataset
+
+__all__ = [
+    "CHANNELS",
+    "PARADIGMS",
+    "Capture",
+    "CaptureInfo",
+    "Dataset",
+    "NlosDataset",
+    "Paradigm",
+    "Samples",
+    "Sampling",
+    "SensorSize",
+    "Simulation",
+    "capture_samples",
+    "character_of",
+    "create_dataset",
+    "import_captures",
+    "make_samples",
+    "network_input",
+    "open_dataset",
+    "read_capture",
+    "read_shard",
+    "reduce_by_area",
+    "simulate",
+    "simulate_object",
+    "write_shard",
+]

@@ -1,0 +1,99 @@
+"""Real recordings become the same kind of dataset as simulated ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from evnlos.config import config_hash, to_dict
+from evnlos.dataset.capture import Capture, read_capture
+from evnlos.dataset.sampling import Samples, Sampling, make_samples
+from evnlos.dataset.shard import write_shard
+from evnlos.dataset.store import Dataset, create_dataset
+from evnlos.errors import DataError
+
+
+def capture_samples(capture: Capture, sampling: Sampling) -> Samples:
+    """Return one sample for each frame but the first: the frame, and the events since the frame before.
+
+    Raises:
+        DataError: The capture has fewer than two frames.
+    """
+    if len(capture.frames) < 2:
+        raise DataError(
+            f"{capture.name} has {len(capture.frames)} frame(s); a sample needs two, with events between"
+        )
+    return make_samples(
+        capture.frames[1:], capture.peak, capture.events, capture.frame_times_us, capture.scene, sampling
+    )
+
+
+def import_captures(
+    folders: Iterable[str | Path],
+    out: str | Path,
+    sampling: Sampling = Sampling(),
+    *,
+    test: Iterable[str] = (),
+    validation: Iterable[str] = (),
+) -> Iterator[tuple[str, Samples]]:
+    """Import capture folders, yielding each capture's name and samples as its shard is in place.
+
+    Args:
+        folders: Capture folders; the folder's name becomes the object's name, the part behind the last
+            underscore its character (`near_R` -> R).
+        out: The dataset's folder; new, or begun with the same captures and settings.
+        sampling: Resolution and representation.
+        test: Names of captures, or characters, that are held out for testing.
+        validation: The same for validation.
+
+    Raises:
+        DataError: No folder, two captures of one name, or a held-out name that no capture has.
+    """
+    paths = {Path(folder).resolve().name: Path(folder).resolve() for folder in folders}
+    given = list(folders) if isinstance(folders, (list, tuple)) else list(paths)
+    if not paths:
+        raise DataError("no captures given; name at least one capture folder")
+    if len(paths) != len(given):
+        raise DataError(f"{len(given)} folders have {len(paths)} different names; rename those that share one")
+    split = _split(list(paths), list(test), list(validation))
+    # Read every description first: a wrong folder is an error before anything is written.
+    for path in paths.values():
+        if not (path / "capture.yaml").is_file():
+            raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
+    config = {"captures": sorted(paths), "sampling": to_dict(sampling)}
+    dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
+    first = next(iter(paths.values()))
+    captures: dict[str, Capture] = {first.name: read_capture(first)}
+    create_dataset(dataset)
+    for name in dataset.missing():
+        capture = captures.pop(name, None) or read_capture(paths[name])
+        samples = capture_samples(capture, sampling)
+        attributes = {"object": name, "config_hash": dataset.config_hash, "camera": capture.info.camera.name}
+        write_shard(dataset.shard(name), samples, attributes)
+        yield name, samples
+
+
+def character_of(name: str) -> str:
+    """Return what an object shows, from its name: the part behind the last underscore.
+
+    Example:
+        >>> character_of("near_R"), character_of("writer03_A")
+        ('R', 'A')
+    """
+    return name.rsplit("_", 1)[-1]
+
+
+def _split(names: list[str], test: list[str], validation: list[str]) -> dict[str, list[str]]:
+    split: dict[str, list[str]] = {"train": [], "validation": [], "test": []}
+    for wanted in (*test, *validation):
+        if not any(wanted in (name, character_of(name)) for name in names):
+            raise DataError(
+                f"no capture is named {wanted} or shows it; held-out names must be among the captures"
+            )
+    for name in names:
+        keys = {name, character_of(name)}
+        in_test, in_validation = bool(keys & set(test)), bool(keys & set(validation))
+        if in_test and in_validation:
+            raise DataError(f"{name} is held out for testing and for validation; choose one")
+        split["test" if in_test else "validation" if in_validation else "train"].append(name)
+    return split

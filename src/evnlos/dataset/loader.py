@@ -1,0 +1,80 @@
+"""Samples in memory, ready for a network: the three paradigms are one switch."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evnlos.dataset.shard import read_shard
+from evnlos.dataset.store import Dataset
+from evnlos.errors import DataError
+
+Paradigm = Literal["frame", "event", "fusion"]
+PARADIGMS: tuple[Paradigm, ...] = ("frame", "event", "fusion")
+CHANNELS: dict[Paradigm, int] = {"frame": 1, "event": 2, "fusion": 3}
+
+
+def network_input(frame: NDArray | Tensor, surface: NDArray | Tensor, paradigm: Paradigm) -> Tensor:
+    """Return what a network of a paradigm sees: frame [N, H, W] and surface [N, 2, H, W] -> [N, C, H, W].
+
+    The frame is standardised (mean 0, standard deviation 1 in each picture): gain and a constant ambient
+    light drop out. The two polarities are standardised together, by the root mean square of both, which
+    keeps 0 = "no event" at 0 and their ratio as it is. Fusion is the two, concatenated.
+
+    Raises:
+        DataError: The paradigm is unknown.
+    """
+    if paradigm not in CHANNELS:
+        raise DataError(f"paradigm is {paradigm!r}; give one of {', '.join(PARADIGMS)}")
+    parts = []
+    if paradigm in ("frame", "fusion"):
+        picture = torch.as_tensor(frame, dtype=torch.float32)[:, None]  # [N, 1, H, W]
+        picture = picture - picture.mean(dim=(-2, -1), keepdim=True)
+        parts.append(picture / picture.square().mean(dim=(-2, -1), keepdim=True).sqrt().clamp_min(1e-3))
+    if paradigm in ("event", "fusion"):
+        maps = torch.as_tensor(surface, dtype=torch.float32)  # [N, 2, H, W]
+        parts.append(maps / maps.square().mean(dim=(-3, -2, -1), keepdim=True).sqrt().clamp_min(1e-3))
+    return torch.cat(parts, dim=1)
+
+
+class NlosDataset(torch.utils.data.Dataset):
+    """The samples of a split in memory: item i is (input [C, H, W], truth [1, H, W]), float32.
+
+    Args:
+        dataset: The dataset on disk.
+        split: "train", "validation", "test" or "all".
+        paradigm: "frame", "event" or "fusion".
+
+    Attributes:
+        inputs: float16 [N, C, H, W].
+        truth: float16 [N, H, W].
+        names: The object of each sample, [N].
+
+    Raises:
+        DataError: A shard is missing or damaged, or an object has no truth to learn from.
+    """
+
+    def __init__(self, dataset: Dataset, split: str, paradigm: Paradigm) -> None:
+        inputs, truth, names = [], [], []
+        for name in dataset.objects(split):
+            samples, _ = read_shard(dataset.shard(name))
+            if samples.truth is None:
+                raise DataError(
+                    f"{dataset.shard(name)} has no truth (unknown target or motion); reconstruct it instead"
+                )
+            inputs.append(network_input(samples.frame, samples.surface, paradigm).half())
+            truth.append(torch.from_numpy(samples.truth).half())
+            names += [name] * len(samples)
+        self.inputs, self.truth = torch.cat(inputs), torch.cat(truth)
+        self.names = np.array(names)
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def __getitem__(self, index: int | Tensor | slice) -> tuple[Tensor, Tensor]:
+        """Return one sample, or a batch for a tensor of indices."""
+        return self.inputs[index].float(), self.truth[index].unsqueeze(-3).float()

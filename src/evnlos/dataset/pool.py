@@ -1,0 +1,85 @@
+"""A pool of processes that survives the death of a worker: lost tasks are run again."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import TypeVar
+
+from evnlos.errors import EvnlosError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+_TRIES = 3
+
+
+def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+    """Run `function` on each task and yield the results as they come.
+
+    Args:
+        function: A picklable function of one task; it writes its own file and returns its name.
+        tasks: The tasks, in the order in which they start.
+        workers: Processes; 1 runs everything in this process, 0 means one for each core.
+
+    Raises:
+        EvnlosError: A task broke its worker three times (killed, out of memory); other errors pass through.
+    """
+    pending = list(tasks)
+    workers = min(workers or os.cpu_count() or 1, len(pending))
+    if workers <= 1:
+        yield from map(function, pending)
+        return
+    tries = [0] * len(pending)
+    left = set(range(len(pending)))
+    while left:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _quiet_threads) as pool:
+            try:
+                yield from _drain(pool, function, pending, left, workers)
+            except BrokenProcessPool:
+                # The pool can't say which task killed the worker: all that were in flight get a try more.
+                first = sorted(left)[: 2 * workers]
+                for i in first:
+                    tries[i] += 1
+                if max(tries) >= _TRIES:
+                    raise EvnlosError(
+                        f"a worker process died {_TRIES} times (killed, or out of memory?); "
+                        "run again with fewer --workers: finished shards are kept"
+                    ) from None
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+
+def _drain(
+    pool: ProcessPoolExecutor,
+    function: Callable[[Task], Result],
+    tasks: list[Task],
+    left: set[int],
+    workers: int,
+) -> Iterator[Result]:
+    """Keep twice as many tasks in flight as there are workers, so that memory stays bounded."""
+    queue = iter(sorted(left))
+    flying: dict[Future, int] = {}
+    while True:
+        for i in queue:
+            flying[pool.submit(function, tasks[i])] = i
+            if len(flying) >= 2 * workers:
+                break
+        if not flying:
+            return
+        done, _ = wait(flying, return_when=FIRST_COMPLETED)
+        for future in done:
+            i = flying.pop(future)
+            result = future.result()
+            left.discard(i)
+            yield result
+
+
+def _quiet_threads() -> None:
+    """Give each worker one thread: the processes are the parallelism."""
+    import torch
+
+    torch.set_num_threads(1)

@@ -1,0 +1,142 @@
+"""From what the cameras recorded to the maps a network sees: one sample a position, at a working resolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.events import time_surface
+from evnlos.scene import Scene
+from evnlos.types import Events, Plane
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How recordings become samples; the defaults are the standard sample, so that figures compare."""
+
+    height: int = 64
+    """Rows of every stored map, pixels."""
+    width: int = 96
+    """Columns of every stored map, pixels."""
+    pitch_m: float = 0.0025
+    """Size of a pixel of the truth on the target's plane, metres."""
+    scored_rows: int = 48
+    """Rows in the middle of the canvas that are scored; the target never leaves them, pixels."""
+    surface: Literal["sae", "context", "hots"] = "sae"
+    """Kind of the time surface."""
+    tau_s: float = 0.2
+    """Time constant of the time surface, seconds."""
+    radius: int = 3
+    """Radius of the neighbourhood of the surfaces `context` and `hots`, pixels."""
+
+    def __post_init__(self) -> None:
+        for name in ("height", "width", "scored_rows"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"Sampling.{name} is {getattr(self, name)}; give at least 1 pixel")
+        if self.scored_rows > self.height:
+            raise ConfigError(f"Sampling.scored_rows is {self.scored_rows}; the canvas has {self.height} rows")
+        for name in ("pitch_m", "tau_s"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"Sampling.{name} is {getattr(self, name)}; give a positive number")
+
+    @property
+    def canvas(self) -> Plane:
+        """The part of the target's plane that the truth shows, centred on the middle of the travel."""
+        return Plane(self.height, self.width, self.pitch_m)
+
+    @property
+    def scored(self) -> slice:
+        """The scored rows of the canvas."""
+        first = (self.height - self.scored_rows) // 2
+        return slice(first, first + self.scored_rows)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """All positions of one object, in the order of time.
+
+    Args:
+        frame: What the frame camera saw, float32 [N, H, W], 0..1 (1 = the largest digital number).
+        surface: Time surface of the events since the position before, float32 [N, 2, H, W]: ON, OFF.
+        truth: The plate on the canvas, float32 [N, H, W], 0..1; None where the target is unknown.
+        time_s: Instant of each position, float64 [N], seconds.
+        position_m: Plate's centre (x, y), float64 [N, 2], metres; None where the motion is unknown.
+        event_count: Events behind each surface, int64 [N].
+    """
+
+    frame: NDArray[np.float32]
+    surface: NDArray[np.float32]
+    truth: NDArray[np.float32] | None
+    time_s: NDArray[np.float64]
+    position_m: NDArray[np.float64] | None
+    event_count: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+def make_samples(
+    frames: NDArray,
+    peak: float,
+    events: Events,
+    edges_us: NDArray[np.int64],
+    scene: Scene | None,
+    sampling: Sampling,
+) -> Samples:
+    """Turn one recording into samples: surfaces at sensor resolution, then all reduced by area averaging.
+
+    Args:
+        frames: One frame a position, unsigned integers [N, H, W], digital numbers.
+        peak: Largest digital number of the frames.
+        events: The events of the whole recording.
+        edges_us: N + 1 ascending instants, microseconds; position k has the events in (edge k, edge k + 1].
+        scene: The target and its motion on the events' clock; None where unknown (then there is no truth).
+        sampling: Resolution and representation.
+
+    Raises:
+        DataError: The number of frames and of edges disagree.
+    """
+    if len(edges_us) != len(frames) + 1:
+        raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
+    shape = (sampling.height, sampling.width)
+    surface = time_surface(
+        events, edges_us, sampling.tau_s * 1e6, mode=sampling.surface, radius=sampling.radius
+    )  # [N, 2, H, W]
+    time_s = np.asarray(edges_us[1:], dtype=np.float64) * 1e-6
+    position = scene.motion.position_m(time_s) if scene else None
+    return Samples(
+        frame=reduce_by_area(frames / np.float32(peak), shape),
+        surface=reduce_by_area(surface, shape),
+        truth=scene.target.rasterise(sampling.canvas, position) if scene and position is not None else None,
+        time_s=time_s,
+        position_m=position,
+        event_count=np.diff(np.searchsorted(events.t_us, edges_us, side="right")).astype(np.int64),
+    )
+
+
+def reduce_by_area(images: NDArray, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Resample images [..., H, W] to [..., *shape] by exact area averaging, also at fractional ratios.
+
+    Each output pixel is the mean of the input over its cell; the mean of the picture is kept.
+
+    Example:
+        >>> reduce_by_area(np.arange(6.0).reshape(1, 6), (1, 4))
+        array([[0.33..., 1.66..., 3.33..., 4.66...]], dtype=float32)
+    """
+    images = np.asarray(images, dtype=np.float32)
+    if images.shape[-2:] == tuple(shape):
+        return images
+    over_y, over_x = (_area_weights(a, b) for a, b in zip(images.shape[-2:], shape, strict=True))
+    return np.ascontiguousarray((over_y @ images) @ over_x.T)  # [..., *shape]
+
+
+def _area_weights(inside: int, outside: int) -> NDArray[np.float32]:
+    """Return the fraction of each of `outside` equal cells that each of `inside` equal cells covers."""
+    cell = inside / outside
+    low = np.maximum(np.arange(outside)[:, None] * cell, np.arange(inside))
+    high = np.minimum(np.arange(1, outside + 1)[:, None] * cell, np.arange(1, inside + 1))
+    return (np.maximum(high - low, 0.0) / cell).astype(np.float32)

@@ -1,0 +1,100 @@
+"""One HDF5 file an object: written whole or not at all, checksummed, read in one go or by position."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from evnlos.config import write_atomically
+from evnlos.dataset.sampling import Samples
+from evnlos.errors import DataError
+from evnlos.types import Events
+
+SUFFIX = ".h5"
+_MAPS = ("frame", "surface", "truth")
+
+
+def write_shard(path: str | Path, samples: Samples, attributes: dict, events: Events | None = None) -> None:
+    """Write the samples of one object as an HDF5 shard: temporary file, fsync, rename; fletcher32 throughout.
+
+    Maps are stored as float16 (11 bits of mantissa; frames have 8 to 12), one chunk a position, so that a
+    loader can fetch a single position. The same samples give the same bytes.
+
+    Args:
+        path: The shard's final name.
+        samples: What to store.
+        attributes: Provenance of the shard: strings, numbers.
+        events: The whole recording, stored as `events/{x, y, t, p}` where given.
+    """
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w", libver=("v110", "v110"), track_order=True) as file:
+        for key, value in attributes.items():
+            file.attrs[key] = value
+        for name in _MAPS:
+            maps = getattr(samples, name)
+            if maps is not None:
+                _put(file, name, maps.astype(np.float16), chunks=(1, *maps.shape[1:]))
+        _put(file, "time_s", samples.time_s)
+        if samples.position_m is not None:
+            _put(file, "position_m", samples.position_m)
+        _put(file, "event_count", samples.event_count)
+        if events is not None:
+            for name, column in (("x", events.x), ("y", events.y), ("t", events.t_us), ("p", events.p)):
+                _put(
+                    file, f"events/{name}", column.astype(np.uint8) if name == "p" else column, chunks=(65_536,)
+                )
+            file["events"].attrs["width"], file["events"].attrs["height"] = events.width, events.height
+    write_atomically(path, buffer.getvalue())
+
+
+def _put(file: h5py.File, name: str, values: np.ndarray, chunks: tuple[int, ...] | bool = True) -> None:
+    if not values.size:
+        file.create_dataset(name, data=values)
+        return
+    if isinstance(chunks, tuple):
+        chunks = (min(chunks[0], len(values)), *chunks[1:])
+    file.create_dataset(
+        name, data=values, chunks=chunks, fletcher32=True, compression="gzip", compression_opts=1
+    )
+
+
+def read_shard(path: str | Path) -> tuple[Samples, dict]:
+    """Read a shard's samples and its attributes; every checksum is verified on the way.
+
+    Raises:
+        DataError: The file is missing, is not a shard, or a checksum does not fit.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            columns = {
+                name: file[name][()] for name in (*_MAPS, "time_s", "position_m", "event_count") if name in file
+            }
+            attributes = {key: _plain(value) for key, value in file.attrs.items()}
+    except FileNotFoundError:
+        raise DataError(f"{path} does not exist; run the command that made the dataset again") from None
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise DataError(
+            f"{path} is damaged ({_one_line(error)}); delete it and run the command again"
+        ) from None
+    missing = {"frame", "surface", "time_s", "event_count"} - columns.keys()
+    if missing:
+        raise DataError(f"{path} is not a shard: {', '.join(sorted(missing))} missing; delete it and run again")
+    return Samples(
+        frame=columns["frame"].astype(np.float32),
+        surface=columns["surface"].astype(np.float32),
+        truth=columns["truth"].astype(np.float32) if "truth" in columns else None,
+        time_s=columns["time_s"],
+        position_m=columns.get("position_m"),
+        event_count=columns["event_count"],
+    ), attributes
+
+
+def _plain(value: object) -> object:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -1,0 +1,155 @@
+"""From settings to a dataset of shards: each object is a pure function of (settings, seed, name)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from evnlos.config import config_hash, to_dict
+from evnlos.dataset.pool import run_tasks
+from evnlos.dataset.sampling import Samples, Sampling, make_samples
+from evnlos.dataset.shard import write_shard
+from evnlos.dataset.store import Dataset, create_dataset
+from evnlos.dataset.variation import varied
+from evnlos.errors import ConfigError
+from evnlos.scene import EmnistGlyphs, FontGlyphs, HandwritingGlyphs, LineMotion, NistGlyphs, Scene
+from evnlos.seeds import derive_seed
+from evnlos.sensor import EventCamera, EventPixel, FrameCamera
+from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.types import Events
+
+
+@dataclass(frozen=True)
+class SensorSize:
+    """Pixels of the sensor that carries both the frame and the event pixels."""
+
+    height: int = 100
+    """Rows, pixels."""
+    width: int = 160
+    """Columns, pixels."""
+
+    def __post_init__(self) -> None:
+        for name in ("height", "width"):
+            if not 8 <= getattr(self, name) <= 8192:
+                raise ConfigError(f"SensorSize.{name} is {getattr(self, name)}; give 8 to 8192 pixels")
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Everything that decides a simulated dataset."""
+
+    glyphs: HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs = field(
+        default_factory=HandwritingGlyphs
+    )
+    """What is hidden."""
+    motion: LineMotion = field(default_factory=LineMotion)
+    """How it moves."""
+    duration_s: float = 8.0
+    """Length of a pass, seconds."""
+    positions: int = 40
+    """Equidistant positions of an object, one sample each."""
+    transport: PaperTransport | RadiometricTransport = field(default_factory=PaperTransport)
+    """How its light reaches the wall and the camera."""
+    sensor: SensorSize = field(default_factory=SensorSize)
+    """Size of the sensor."""
+    frame_camera: FrameCamera = field(default_factory=FrameCamera)
+    """The frame camera."""
+    pixel: EventPixel = field(default_factory=EventPixel)
+    """The event pixel."""
+    sampling: Sampling = field(default_factory=Sampling)
+    """Resolution and representation of the stored samples."""
+    vary: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Settings drawn for each object from a range: dotted name -> (low, high)."""
+    validation: float = 0.05
+    """Share of the objects that is held out for validation, 0..1."""
+    keep_events: bool = False
+    """Store the events of each object beside the maps."""
+    seed: int = 0
+    """Seed of every draw."""
+
+    def __post_init__(self) -> None:
+        if not self.duration_s > 0:
+            raise ConfigError(f"Simulation.duration_s is {self.duration_s}; give a positive number of seconds")
+        if self.positions < 1:
+            raise ConfigError(f"Simulation.positions is {self.positions}; give at least 1")
+        if not 0 <= self.validation < 1:
+            raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
+        varied(
+            self, self.vary, self.seed, ""
+        )  # a wrong name or range is an error now, not in the hundredth shard
+
+
+def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
+    """Simulate one object's pass: scene -> wall -> events and frames -> samples.
+
+    Args:
+        config: The settings.
+        name: One of `config.glyphs.objects()`.
+
+    Returns:
+        The samples of all positions, and the events of the whole pass.
+    """
+    drawn = varied(config, config.vary, config.seed, name)
+    target = config.glyphs.target(name, derive_seed(config.seed, "glyph"))
+    scene = Scene(target, drawn.motion, drawn.duration_s)
+    wall = drawn.transport.wall(scene, (config.sensor.height, config.sensor.width))
+    times_s = scene.position_times_s(config.positions)
+    events = EventCamera(drawn.pixel).record(
+        wall, 0.0, drawn.duration_s, seed=derive_seed(config.seed, name, "events")
+    )
+    frames = drawn.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
+    edges_us = np.concatenate([[0], np.round(times_s * 1e6)]).astype(np.int64)
+    peak = 2**drawn.frame_camera.bit_depth - 1
+    return make_samples(frames, peak, events, edges_us, scene, config.sampling), events
+
+
+def split_of(config: Simulation) -> dict[str, list[str]]:
+    """Return the split by object: a seeded share for validation, the others for training."""
+    names = config.glyphs.objects()
+    count = round(config.validation * len(names))
+    order = np.random.default_rng(derive_seed(config.seed, "split")).permutation(len(names))
+    held_out = {names[i] for i in order[:count]}
+    return {
+        "train": [name for name in names if name not in held_out],
+        "validation": [name for name in names if name in held_out],
+        "test": [],
+    }
+
+
+def simulate(config: Simulation, folder: str | Path, workers: int = 1) -> Iterator[str]:
+    """Simulate a dataset, yielding the name of each object as its shard is in place.
+
+    Shards that exist are not made again, so a run that was killed goes on where it was. The shards are
+    the same bytes for any number of workers.
+
+    Args:
+        config: The settings.
+        folder: Where the dataset goes; new, or begun with the same settings.
+        workers: Processes; 0 means one for each core.
+
+    Raises:
+        DataError: The folder holds something else.
+    """
+    values = to_dict(config)
+    dataset = Dataset(
+        Path(folder),
+        "simulation",
+        config.sampling,
+        split_of(config),
+        config=values,
+        config_hash=config_hash(config),
+    )
+    create_dataset(dataset)
+    tasks = [(config, name, dataset.shard(name), dataset.config_hash) for name in dataset.missing()]
+    yield from run_tasks(_simulate_shard, tasks, workers)
+
+
+def _simulate_shard(task: tuple[Simulation, str, Path, str]) -> str:
+    config, name, path, settings = task
+    samples, events = simulate_object(config, name)
+    attributes = {"object": name, "config_hash": settings, "seed": config.seed}
+    write_shard(path, samples, attributes, events if config.keep_events else None)
+    return name

@@ -1,0 +1,124 @@
+"""A dataset on disk: a folder with `dataset.yaml` and one shard an object; a shard that exists is done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from evnlos.config import differing_keys, from_dict, read_yaml, save_yaml
+from evnlos.dataset.sampling import Sampling
+from evnlos.dataset.shard import SUFFIX
+from evnlos.errors import DataError
+from evnlos.version import __version__
+
+SPLITS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """What `dataset.yaml` holds: where the samples come from, how they were made, and who is held out.
+
+    Args:
+        folder: Where the dataset lies.
+        origin: "simulation" or "captures".
+        sampling: Resolution and representation of the samples.
+        split: Split name -> names of its objects; an object is in exactly one split.
+        config: The settings that made the samples (resolved, complete).
+        config_hash: Hash of these settings.
+        version: Version of the package that made it.
+    """
+
+    folder: Path
+    origin: str
+    sampling: Sampling
+    split: dict[str, list[str]]
+    config: dict[str, Any] = field(default_factory=dict)
+    config_hash: str = ""
+    version: str = __version__
+
+    def shard(self, name: str) -> Path:
+        """Return the path of an object's shard."""
+        return self.folder / f"{name}{SUFFIX}"
+
+    def objects(self, split: str = "all") -> list[str]:
+        """Return the names of the objects of a split ("train", "validation", "test" or "all").
+
+        Raises:
+            DataError: There is no such split, or it is empty.
+        """
+        if split == "all":
+            return [name for names in self.split.values() for name in names]
+        if split not in self.split or not self.split[split]:
+            there = ", ".join(f"{key} ({len(names)})" for key, names in self.split.items() if names)
+            raise DataError(f"{self.folder} has no objects in split {split!r}; it has {there or 'none'}")
+        return self.split[split]
+
+    def missing(self) -> list[str]:
+        """Return the objects whose shard is not there yet."""
+        return [name for name in self.objects() if not self.shard(name).is_file()]
+
+
+def create_dataset(dataset: Dataset) -> Dataset:
+    """Create the folder and `dataset.yaml`, or take up a folder that was begun with the same settings.
+
+    Raises:
+        DataError: The folder holds a dataset of other settings (the differing keys are named), or other files.
+    """
+    path = dataset.folder / "dataset.yaml"
+    content = _content(dataset)
+    if path.is_file():
+        theirs = read_yaml(path)
+        differing = differing_keys(_comparable(content), _comparable(theirs))
+        if differing:
+            shown = "; ".join(differing[:6]) + (
+                f"; and {len(differing) - 6} more" if len(differing) > 6 else ""
+            )
+            raise DataError(f"{dataset.folder} holds a dataset of other settings ({shown}); give another --out")
+        return dataset
+    if dataset.folder.is_dir() and any(dataset.folder.iterdir()):
+        raise DataError(f"{dataset.folder} is not empty and holds no dataset.yaml; give a new folder")
+    dataset.folder.mkdir(parents=True, exist_ok=True)
+    save_yaml(content, path)
+    return dataset
+
+
+def open_dataset(folder: str | Path) -> Dataset:
+    """Open a dataset's folder.
+
+    Raises:
+        DataError: It is not a dataset, or its splits overlap.
+    """
+    folder = Path(folder)
+    path = folder / "dataset.yaml"
+    if not path.is_file():
+        raise DataError(
+            f"{folder} is no dataset: {path.name} is missing; make one with `evnlos simulate` or `import`"
+        )
+    values = read_yaml(path)
+    try:
+        split = {str(key): [str(name) for name in names] for key, names in values["split"].items()}
+        sampling = from_dict(Sampling, values["sampling"], source=str(path))
+        origin, version = str(values["origin"]), str(values["version"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path} lacks or garbles {error}; make the dataset again") from None
+    names = [name for group in split.values() for name in group]
+    if len(names) != len(set(names)):
+        raise DataError(f"{path}: an object stands in two splits; each belongs to exactly one")
+    if any("/" in name or "\\" in name or name.startswith(".") for name in names):
+        raise DataError(f"{path}: an object's name leads out of the folder; names are plain file names")
+    return Dataset(
+        folder, origin, sampling, split, values.get("config", {}), values.get("config_hash", ""), version
+    )
+
+
+def _content(dataset: Dataset) -> dict[str, Any]:
+    from evnlos.config import to_dict
+
+    values = to_dict(dataset)
+    del values["folder"]
+    return values
+
+
+def _comparable(content: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in content.items() if key not in ("version", "config_hash")}

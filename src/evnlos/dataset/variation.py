@@ -1,0 +1,54 @@
+"""Variation from object to object: settings drawn from ranges, so that no network learns one rig by heart."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from typing import Any, TypeVar
+
+import numpy as np
+
+from evnlos.errors import ConfigError
+from evnlos.seeds import derive_seed
+
+T = TypeVar("T")
+Ranges = dict[str, tuple[float, float]]
+
+
+def varied(config: T, ranges: Ranges, seed: int, name: str) -> T:
+    """Return `config` with the named settings drawn uniformly from their ranges, for one object.
+
+    Args:
+        config: A nested frozen dataclass.
+        ranges: Dotted name of a number (`pixel.threshold_on`; `offset_m.0` for the first entry of a
+            tuple) -> (low, high), in the setting's own unit.
+        seed: The run's seed.
+        name: The object's name; the same seed and name draw the same settings.
+
+    Raises:
+        ConfigError: A name is unknown (the nearest is named), is not a number, or a range is not ascending.
+    """
+    for path, (low, high) in ranges.items():
+        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+            raise ConfigError(f"vary.{path} is ({low}, {high}); give two ascending finite numbers")
+        draw = np.random.default_rng(derive_seed(seed, name, "vary", path)).uniform(low, high)
+        config = _replaced(config, path.split("."), float(draw), path)
+    return config
+
+
+def _replaced(node: Any, keys: list[str], value: float, path: str) -> Any:
+    if not keys:
+        if isinstance(node, bool) or not isinstance(node, (int, float)):
+            raise ConfigError(f"vary.{path} names {node!r}, which is no number; name a number")
+        return value
+    key, rest = keys[0], keys[1:]
+    if isinstance(node, tuple) and key.isdigit() and int(key) < len(node):
+        i = int(key)
+        return (*node[:i], _replaced(node[i], rest, value, path), *node[i + 1 :])
+    names = [field.name for field in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+    if key not in names:
+        near = difflib.get_close_matches(key, names, n=1)
+        cure = f"perhaps you meant {near[0]!r}" if near else f"known here: {', '.join(names) or 'nothing'}"
+        raise ConfigError(f"vary.{path}: unknown setting {key!r}; {cure}")
+    return dataclasses.replace(node, **{key: _replaced(getattr(node, key), rest, value, path)})

@@ -1,0 +1,110 @@
+"""A network on a dataset: metrics a character and overall, with the baselines beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evnlos.config import from_dict
+from evnlos.dataset import Dataset, NlosDataset, Sampling, character_of, network_input
+from evnlos.errors import DataError
+from evnlos.evaluation.score import Perceptual, Scores, score
+from evnlos.model import ResidualUNet, Weights
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Scores and pictures of one network (or baseline) on one split.
+
+    Args:
+        images: Reconstructions on the scored canvas, float32 [N, H, W], 0..1.
+        truth: True pictures, the same shape.
+        names: Object of each picture, [N].
+        scores: Scores of each picture.
+        baselines: Scores of the all-black picture ("zero") and of the mean training picture ("mean").
+    """
+
+    images: Tensor
+    truth: Tensor
+    names: np.ndarray
+    scores: Scores
+    baselines: dict[str, Scores]
+
+    def characters(self) -> list[str]:
+        """Return the objects in the order of the dataset."""
+        return list(dict.fromkeys(self.names.tolist()))
+
+    def summary(self) -> dict[str, Any]:
+        """Return metrics overall and an object, for network and baselines, as plain numbers."""
+
+        def table(scores: Scores) -> dict[str, Any]:
+            objects = {
+                name: {"character": character_of(name), **scores.mean(self.names == name)}
+                for name in self.characters()
+            }
+            return {"overall": scores.mean(), "characters": objects}
+
+        return {
+            "images": len(self.images),
+            **table(self.scores),
+            "baselines": {name: table(scores) for name, scores in self.baselines.items()},
+        }
+
+
+def evaluate(
+    weights: Weights, dataset: Dataset, split: str = "test", perceptual: Perceptual | None = None
+) -> Evaluation:
+    """Reconstruct a split of a dataset and score it.
+
+    The baseline "mean" is the mean picture of the dataset's split `train`; a dataset without one has
+    only the baseline "zero".
+
+    Args:
+        weights: The network and its paradigm.
+        dataset: Where the samples are.
+        split: "train", "validation", "test" or "all".
+        perceptual: LPIPS, where its weights are at hand.
+
+    Raises:
+        DataError: The split is empty, or its samples were made in another way than those of the training.
+    """
+    check_sampling(weights, dataset.sampling)
+    samples = NlosDataset(dataset, split, weights.paradigm)  # type: ignore[arg-type]
+    rows = dataset.sampling.scored
+    truth = samples.truth.float()[:, rows].contiguous()
+    images = infer(weights.network, samples.inputs)[:, rows].contiguous()
+    blank = {"zero": torch.zeros_like(truth)}
+    if split != "train" and dataset.split.get("train"):
+        seen = NlosDataset(dataset, "train", weights.paradigm)  # type: ignore[arg-type]
+        blank["mean"] = seen.truth.float().mean(dim=0)[rows].expand_as(truth).contiguous()
+    baselines = {name: score(image, truth, perceptual) for name, image in blank.items()}
+    return Evaluation(images, truth, samples.names, score(images, truth, perceptual), baselines)
+
+
+@torch.inference_mode()
+def infer(network: ResidualUNet, inputs: Tensor, batch_size: int = 40) -> Tensor:
+    """Run a network on inputs [N, C, H, W] in batches; return pictures, float32 [N, H, W], 0..1."""
+    network = network.eval()
+    return torch.cat([network(part.float())[:, 0] for part in inputs.split(batch_size)])
+
+
+def reconstruct(weights: Weights, frame: np.ndarray, surface: np.ndarray) -> Tensor:
+    """Reconstruct samples without a truth: frame [N, H, W], surface [N, 2, H, W] -> float32 [N, H, W], 0..1."""
+    return infer(weights.network, network_input(frame, surface, weights.paradigm))  # type: ignore[arg-type]
+
+
+def check_sampling(weights: Weights, sampling: Sampling) -> None:
+    """Refuse samples that were made in another way than those that a network was trained on.
+
+    Raises:
+        DataError: Names the settings that differ.
+    """
+    trained = from_dict(Sampling, weights.sampling, source="the weights' sampling")
+    if trained != sampling:
+        raise DataError(
+            f"the weights were trained on samples of {trained}; these are {sampling}: make them alike"
+        )

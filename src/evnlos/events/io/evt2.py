@@ -1,0 +1,114 @@
+"""EVT2: words of 32 bits, four of them the type; the time is 28 bits of a high word and 6 of the event."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from evnlos.events.io.kernel_state import (
+    BACKWARDS,
+    BASE,
+    CLOCK,
+    CLOCK_BACK,
+    JITTER_US,
+    NEWEST,
+    OUT_OF_RANGE,
+    STARTED,
+    TRIGGERS,
+    UNDATED,
+    UNKNOWN,
+    note,
+)
+
+WRAP_US = 1 << 34
+_HIGH_TURN = 1 << 28
+
+
+def bound_evt2(words: NDArray[np.uint32]) -> int:
+    """Return the largest number of events that `words` can hold."""
+    return len(words)
+
+
+@njit(cache=True)
+def decode_evt2(words, state, t_us, x, y, p, width, height):  # noqa: D103 - see decode_words
+    high, newest, base = state[CLOCK], state[NEWEST], state[BASE]
+    started = state[STARTED] != 0
+    count = 0
+    for index in range(len(words)):
+        word = np.int64(words[index])
+        kind = word >> 28
+        if kind <= 1:
+            column = (word >> 11) & 0x7FF
+            row = word & 0x7FF
+            time = base + ((word >> 22) & 0x3F)
+            if not started:
+                note(state, UNDATED, index)
+                continue
+            if column >= width or row >= height:
+                note(state, OUT_OF_RANGE, index)
+                continue
+            if time < newest:
+                if time < newest - JITTER_US:
+                    note(state, BACKWARDS, index)
+                    newest = time
+                else:
+                    time = newest
+            newest = time
+            t_us[count] = time
+            x[count] = column
+            y[count] = row
+            p[count] = kind == 1
+            count += 1
+        elif kind == 8:
+            new = word & 0xFFFFFFF
+            if started and new < high:
+                if high - new > _HIGH_TURN // 2:
+                    base += WRAP_US
+                else:
+                    note(state, CLOCK_BACK, index)
+                    newest = base + ((new - high) << 6)  # one fault, not one more for each event behind it
+            base += (new - high) << 6
+            high = new
+            started = True
+        elif kind == 10:
+            state[TRIGGERS] += 1
+        elif kind != 14 and kind != 15:
+            note(state, UNKNOWN, index)
+    state[CLOCK], state[NEWEST], state[BASE], state[STARTED] = high, newest, base, started
+    return count
+
+
+@njit(cache=True)
+def encode_evt2(t_us, x, y, p, words):
+    """Write EVT2 words for times that start below one turn of the clock; return how many."""
+    high = np.int64(-1)
+    count = 0
+    for index in range(len(t_us)):
+        new = t_us[index] >> 6
+        if new != high:
+            while high >= 0 and (new >> 28) > (high >> 28):
+                words[count] = np.uint32(0x8FFFFFFF)
+                words[count + 1] = np.uint32(0x80000000)
+                count += 2
+                high = ((high >> 28) + 1) << 28
+            high = new
+            words[count] = np.uint32(0x80000000 | (new & 0xFFFFFFF))
+            count += 1
+        low = t_us[index] & 0x3F
+        words[count] = np.uint32(
+            (np.int64(p[index]) << 28) | (low << 22) | (np.int64(x[index]) << 11) | np.int64(y[index])
+        )
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def encoded_size_evt2(t_us) -> int:
+    """Return an upper bound of the number of words that `encode_evt2` writes."""
+    count = len(t_us)
+    for index in range(len(t_us)):
+        before = t_us[index - 1] if index else np.int64(-64)
+        turns = (t_us[index] >> 34) - (before >> 34) if index else 0
+        count += 2 * turns + ((t_us[index] >> 6) != (before >> 6))
+    return count + 1

@@ -1,0 +1,210 @@
+"""HDF5 with the columns of DSEC (events/x, y, t, p) and an index of milliseconds; chunks have checksums."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.events.io.columns import ColumnCheck, Columns
+from evnlos.events.io.report import ReadReport, unreadable
+from evnlos.types import Events
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_CHUNK = 65_536
+_MAX_RATIO = 1100  # deflate and lzf shrink a chunk at most that much
+_NAMES = {"t_us": "t", "x": "x", "y": "y", "p": "p"}
+_OPTIONAL = ("adc", "polarity_known")
+_H5_ERRORS = (
+    OSError,
+    RuntimeError,
+    KeyError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+)
+_CURE = "the file is damaged or not complete: copy it again"
+_LIMITS = {"t_us": (-(2**63), 2**63 - 1), "x": (0, 65_535), "y": (0, 65_535), "adc": (0, 65_535)}
+
+
+@contextmanager
+def _h5_errors(path: Path) -> Iterator[None]:
+    """Turn whatever h5py raises on damage into one error."""
+    try:
+        yield
+    except (
+        OSError,
+        RuntimeError,
+        KeyError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        MemoryError,
+    ) as error:
+        found = " ".join(str(error).split())[:160]
+        if "filter" in found.lower() and ("plugin" in found.lower() or "not available" in found.lower()):
+            cure = "install hdf5plugin, or export it uncompressed (ECF: convert with the camera maker's tools)"
+        else:
+            cure = _CURE
+        raise unreadable(path, 0, f"HDF5 cannot read it ({found})", cure) from None
+
+
+class Hdf5Source:
+    """An open HDF5 file of events."""
+
+    def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
+        self.path, self.report = path, report
+        report.format = "HDF5"
+        with _h5_errors(path), h5py.File(path, "r") as file:
+            self._count = self._check_layout(file)
+            self._t_offset = self._offset(file)
+            self._geometry(file, width, height)
+
+    def _datasets(self, file: h5py.File) -> dict[str, h5py.Dataset]:
+        group = file.get("events")
+        if not isinstance(group, h5py.Group):
+            group = file.get("CD")
+            if isinstance(group, h5py.Group):
+                raise unreadable(
+                    self.path,
+                    0,
+                    "Prophesee's HDF5 (group CD, ECF codec)",
+                    "convert it to RAW with the camera maker's tools",
+                )
+            raise unreadable(
+                self.path, 0, "an HDF5 file without a group 'events'", "DSEC columns events/{x,y,t,p} are read"
+            )
+        datasets = {name: group.get(key) for name, key in _NAMES.items()}
+        datasets |= {name: group[name] for name in _OPTIONAL if name in group}
+        for name, dataset in datasets.items():
+            if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.kind not in "iub":
+                raise unreadable(
+                    self.path, 0, f"events/{_NAMES.get(name, name)} is not a 1-D column of integers", _CURE
+                )
+        return datasets  # type: ignore[return-value]
+
+    def _check_layout(self, file: h5py.File) -> int:
+        """Return the number of events; refuse, before any allocation, sizes that the stored bytes cannot hold."""
+        lengths = {}
+        for name, dataset in self._datasets(file).items():
+            lengths[name] = int(dataset.shape[0])
+            stored = dataset.id.get_storage_size()
+            need = lengths[name] * dataset.dtype.itemsize
+            missing = (
+                dataset.chunks is not None and dataset.id.get_num_chunks() * dataset.chunks[0] < lengths[name]
+            )
+            if missing or need > stored * _MAX_RATIO:
+                raise unreadable(
+                    self.path,
+                    0,
+                    f"events/{_NAMES.get(name, name)} announces {need} bytes, {stored} are stored",
+                    _CURE,
+                )
+        if len(set(lengths.values())) != 1:
+            raise unreadable(self.path, 0, f"columns of unequal length {lengths}", _CURE)
+        return lengths["t_us"]
+
+    def _offset(self, file: h5py.File) -> int:
+        for place in ("t_offset", "events/t_offset"):
+            if place in file:
+                return int(file[place][()])  # type: ignore[index]
+        return 0
+
+    def _geometry(self, file: h5py.File, width: int | None, height: int | None) -> None:
+        if width is not None:
+            return self.report.set_geometry(width, height, "caller")
+        for holder in (file["events"], file):
+            if "width" in holder.attrs and "height" in holder.attrs:
+                return self.report.set_geometry(holder.attrs["width"], holder.attrs["height"], "header")
+        largest = {"x": 0, "y": 0}
+        datasets = self._datasets(file)
+        for start in range(0, self._count, 1 << 20):
+            for name in largest:
+                largest[name] = max(largest[name], int(datasets[name][start : start + (1 << 20)].max()))
+        return self.report.set_geometry(largest["x"] + 1, largest["y"] + 1, "events")
+
+    def _column(self, name: str, values: NDArray) -> NDArray:
+        if name in ("p", "polarity_known"):
+            if values.dtype == np.bool_:
+                return values
+            if values.size and not np.isin(values, (-1, 0, 1)).all():
+                raise unreadable(self.path, 0, "events/p holds more than 0/1 or -1/+1", _CURE)
+            return values > 0
+        low, high = _LIMITS[name]
+        if values.size and not (low <= int(values.min()) and int(values.max()) <= high):
+            raise unreadable(self.path, 0, f"events/{_NAMES.get(name, name)} leaves {low}..{high}", _CURE)
+        if name != "t_us":
+            return values.astype(np.uint16, copy=False)
+        times = values.astype(np.int64, copy=False)
+        if self._t_offset and times.size:
+            if not -(2**63) <= int(times.min()) + self._t_offset <= int(times.max()) + self._t_offset < 2**63:
+                raise unreadable(self.path, 0, f"t_offset is {self._t_offset} us", "times have 63 bits")
+            times = times + self._t_offset
+        return times
+
+    def blocks(self, size: int = 1 << 19) -> Iterator[Columns]:
+        """Yield columns of at most `size` events."""
+        check = ColumnCheck(self.report)
+        with _h5_errors(self.path), h5py.File(self.path, "r") as file:
+            datasets = self._datasets(file)
+            for start in range(0, self._count, size):
+                block = {}
+                for name, dataset in datasets.items():
+                    block[name] = self._column(name, dataset[start : start + size])
+                yield check(block)
+
+    def read(self) -> Columns:
+        """Return all events."""
+        return next(self.blocks(max(self._count, 1)), {})
+
+
+def _ms_to_idx(t: NDArray) -> NDArray[np.uint64]:
+    """Return the index of the first event not earlier than each millisecond after t_offset."""
+    last_ms = int(t[-1]) // 1000 if len(t) else 0
+    return np.searchsorted(t, np.arange(last_ms + 2, dtype=np.int64) * 1000).astype(np.uint64)
+
+
+_MAX_INDEX_MS = 1 << 24  # 4.7 hours; a longer index would be larger than the events of a sparse recording
+
+
+def write_hdf5(path: Path, events: Events) -> None:
+    """Write the columns of DSEC; all metadata and chunks carry checksums."""
+    first = int(events.t_us[0]) if len(events) else 0
+    wide = events.duration_us >= 2**32 or not -(2**62) < first < 2**62
+    t_offset = 0 if wide else first
+    t = events.t_us if wide else (events.t_us - t_offset).astype(np.uint32)
+    columns = {"x": events.x, "y": events.y, "t": t, "p": events.p.astype(np.uint8)}
+    for name in _OPTIONAL:
+        column = getattr(events, name)
+        if column is not None:
+            columns[name] = column.astype(np.uint8 if column.dtype == np.bool_ else column.dtype)
+    with h5py.File(path, "w", libver=("v110", "v110")) as file:
+        group = file.create_group("events")
+        group.attrs["width"], group.attrs["height"] = events.width, events.height
+        for name, column in columns.items():
+            _put(group, name, column)
+        if not wide and events.duration_us // 1000 < _MAX_INDEX_MS:
+            _put(file, "ms_to_idx", _ms_to_idx(t))
+        _put_compact(file, "t_offset", t_offset)
+
+
+def _put(group: h5py.Group, name: str, column: NDArray) -> None:
+    chunk = (max(1, min(_CHUNK, len(column))),)
+    packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+    group.create_dataset(name, data=column, chunks=chunk, maxshape=(None,), **packed)
+
+
+def _put_compact(file: h5py.File, name: str, value: int) -> None:
+    """Store one number inside the object header, which has a checksum; a plain scalar has none."""
+    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    layout.set_layout(h5py.h5d.COMPACT)
+    space = h5py.h5s.create(h5py.h5s.SCALAR)
+    dataset = h5py.h5d.create(file.id, name.encode(), h5py.h5t.NATIVE_INT64, space, layout)
+    dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.array(value, np.int64))

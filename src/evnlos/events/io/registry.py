@@ -1,0 +1,113 @@
+"""The formats, found from a file's content before its name; a new format is one entry here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from evnlos.errors import EventFileError
+from evnlos.events.io import aedat4, hdf5, npz, raw
+from evnlos.events.io.columns import Columns
+from evnlos.events.io.report import ReadReport, unreadable
+from evnlos.types import Events
+
+_SNIFFED_BYTES = 65_536
+
+
+class Source(Protocol):
+    """An open event file: checked header, events as one set of columns or block by block."""
+
+    def read(self) -> Columns:
+        """Return all events."""
+        ...
+
+    def blocks(self) -> Iterator[Columns]:
+        """Yield the events in blocks of bounded size."""
+        ...
+
+
+@dataclass(frozen=True)
+class Format:
+    """One event file format.
+
+    Args:
+        name: Its name, as `write_events(format=...)` takes it.
+        suffixes: File name endings, lower case with the dot.
+        sniff: Whether the first bytes of a file (64 KiB at most) are of this format.
+        open: Opens a file: (path, report, width, height).
+        write: Writes a file: (path, events, name); None where the format is only read.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    sniff: Callable[[bytes], bool]
+    open: Callable[[Path, ReadReport, int | None, int | None], Source]
+    write: Callable[[Path, Events, str], None] | None = None
+
+
+def _raw(name: str) -> Format:
+    return Format(name, (".raw",), lambda start: raw.sniff_raw(start) == name, raw.RawSource, raw.write_raw)
+
+
+FORMATS = (
+    Format(
+        "HDF5",
+        (".h5", ".hdf5"),
+        lambda start: start.startswith(hdf5.SIGNATURE),
+        hdf5.Hdf5Source,
+        lambda path, events, _: hdf5.write_hdf5(path, events),
+    ),
+    Format(
+        "NPZ",
+        (".npz",),
+        lambda start: start.startswith(npz.SIGNATURE),
+        npz.NpzSource,
+        lambda path, events, _: npz.write_npz(path, events),
+    ),
+    _raw("EVT3"),  # the first of a suffix is the one that is written by default
+    _raw("EVT2"),
+    Format("AEDAT4", (".aedat4",), lambda start: start.startswith(aedat4.SIGNATURE), aedat4.Aedat4Source),
+)
+
+
+def find_format(path: Path) -> Format:
+    """Return the format of a file from its content.
+
+    Raises:
+        EventFileError: The file is absent, empty, or of no known format.
+    """
+    if not path.is_file():
+        raise EventFileError(f"{path}: no such file; check the path")
+    with path.open("rb") as file:
+        start = file.read(_SNIFFED_BYTES)
+    if not start:
+        raise unreadable(path, 0, "the file is empty", "record or copy it again")
+    for format in FORMATS:
+        if format.sniff(start):
+            return format
+    known = ", ".join(dict.fromkeys(format.name for format in FORMATS))
+    raise unreadable(
+        path, 0, f"no known event format starts with {start[:8].hex(' ')}", f"these are read: {known}"
+    )
+
+
+def format_to_write(path: Path, name: str | None) -> Format:
+    """Return the format to write: the named one, else the first of the file's suffix.
+
+    Raises:
+        EventFileError: The name or suffix is unknown, or the format is only read.
+    """
+    writable = [format for format in FORMATS if format.write]
+    if name is None:
+        found = [format for format in writable if path.suffix.lower() in format.suffixes]
+        what = f"suffix {path.suffix!r}"
+    else:
+        found = [format for format in writable if format.name == name.upper()]
+        what = f"format {name!r}"
+    if not found:
+        suffixes = dict.fromkeys(suffix for format in writable for suffix in format.suffixes)
+        names = ", ".join(format.name for format in writable)
+        raise EventFileError(f"{path}: cannot write {what}; suffixes {', '.join(suffixes)}, formats {names}")
+    return found[0]

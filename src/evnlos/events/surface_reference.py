@@ -1,0 +1,76 @@
+"""The time surfaces as their definitions say, event by event: slow, obvious, what the kernels must equal."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.types import Events
+
+
+def neighbours(
+    row: int, column: int, radius: int, shape: str, height: int, width: int
+) -> list[tuple[int, int]]:
+    """Return the pixels of the sensor within `radius` of a pixel, itself among them."""
+    found = []
+    for v in range(row - radius, row + radius + 1):
+        for u in range(column - radius, column + radius + 1):
+            near = shape == "box" or (v - row) ** 2 + (u - column) ** 2 <= radius**2
+            if near and 0 <= v < height and 0 <= u < width:
+                found.append((v, u))
+    return found
+
+
+def _mean_or_latest(
+    mode: str, latest: dict, sign: int, near: list[tuple[int, int]], t: int, tau_us: float, area: int
+) -> float:
+    times = [latest[sign, v, u] for v, u in near if (sign, v, u) in latest]
+    if not times:
+        return 0.0
+    if mode == "context":
+        return float(np.exp(-(t - max(times)) / tau_us))
+    return float(sum(np.exp(-(t - before) / tau_us) for before in times) / area)
+
+
+def time_surface_reference(
+    events: Events,
+    edges_us: NDArray[np.int64],
+    tau_us: float,
+    mode: str = "sae",
+    *,
+    radius: int = 1,
+    shape: str = "box",
+    border: str = "crop",
+    projection: str = "sum",
+    include_self: bool = False,
+    carry: bool = True,
+) -> NDArray[np.float64]:
+    """Return what `time_surface` returns, in double precision."""
+    grids = len(edges_us) - 1
+    out = np.zeros((grids, 2, events.height, events.width))
+    latest: dict[tuple[int, int, int], int] = {}
+    whole_area = len(neighbours(radius, radius, radius, shape, 2 * radius + 1, 2 * radius + 1))
+    for grid in range(grids):
+        start, stop = edges_us[grid], edges_us[grid + 1]
+        if not carry:
+            latest = {}
+        for t, x, y, p in zip(events.t_us, events.x, events.y, events.p, strict=True):
+            row, column, sign = int(y), int(x), 0 if p else 1
+            early = t <= start
+            if t > stop or (early and not (carry and grid == 0)):
+                continue
+            if include_self:
+                latest[sign, row, column] = int(t)
+            if not early and mode != "sae":
+                near = neighbours(row, column, radius, shape, events.height, events.width)
+                area = whole_area if border == "zero" else len(near)
+                value = _mean_or_latest(mode, latest, sign, near, int(t), tau_us, area)
+                held = out[grid, sign, row, column]
+                out[grid, sign, row, column] = {"sum": held + value, "last": value, "max": max(held, value)}[
+                    projection
+                ]
+            latest[sign, row, column] = int(t)
+        if mode == "sae":
+            for (sign, row, column), t in latest.items():
+                out[grid, sign, row, column] = np.exp(-(stop - t) / tau_us)
+    return out

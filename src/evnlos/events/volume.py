@@ -1,0 +1,180 @@
+"""Counts of events: histograms, frames, voxel grids, and the threshold-ordinal surface."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import DataError
+from evnlos.events.grids import as_edges
+from evnlos.types import Events
+
+
+def _starts(events: Events, edges_us: ArrayLike | None) -> NDArray[np.int64]:
+    """Return the index of each grid's first event; without edges all events are one grid."""
+    if edges_us is None:
+        return np.array([0, len(events)], np.int64)
+    return np.searchsorted(events.t_us, as_edges(edges_us), side="right")
+
+
+@njit(cache=True)
+def _count(x, y, p, starts, out):
+    for grid in range(len(starts) - 1):
+        counts = out[grid]
+        for index in range(starts[grid], starts[grid + 1]):
+            counts[1 - np.int64(p[index]), y[index], x[index]] += 1
+
+
+def event_histogram(events: Events, edges_us: ArrayLike | None = None) -> NDArray[np.float32]:
+    """Return the number of events a pixel and polarity.
+
+    Args:
+        events: The stream; it is not changed.
+        edges_us: Edges of the grids, [grids + 1], microseconds; one grid of all events without them.
+
+    Returns:
+        float32 [grids, 2, H, W], channel 0 brighter (ON), channel 1 darker (OFF).
+
+    Raises:
+        DataError: The edges do not ascend.
+
+    Example:
+        >>> events = Events([5, 6, 7], [0, 0, 1], [0, 0, 0], [True, True, False], width=2, height=1)
+        >>> event_histogram(events).tolist()
+        [[[[2.0, 0.0]], [[0.0, 1.0]]]]
+    """
+    starts = _starts(events, edges_us)
+    out = np.zeros((len(starts) - 1, 2, events.height, events.width), np.uint32)
+    _count(events.x, events.y, events.p, starts, out)
+    return out.astype(np.float32)
+
+
+@njit(cache=True)
+def _last(x, y, p, starts, out):
+    for grid in range(len(starts) - 1):
+        for index in range(starts[grid], starts[grid + 1]):
+            out[grid, y[index], x[index]] = 1.0 if p[index] else -1.0
+
+
+def event_frame(
+    events: Events, edges_us: ArrayLike | None = None, mode: Literal["sum", "last"] = "sum"
+) -> NDArray[np.float32]:
+    """Return signed frames: the sum of the polarities of each pixel (+1, -1), or the sign of its last event.
+
+    Args:
+        events: The stream; it is not changed.
+        edges_us: Edges of the grids, [grids + 1], microseconds; one grid of all events without them.
+        mode: "sum" or "last".
+
+    Returns:
+        float32 [grids, H, W], 0 where there was no event.
+
+    Raises:
+        DataError: The edges do not ascend or the mode is unknown.
+    """
+    if mode == "sum":
+        counts = event_histogram(events, edges_us)
+        return counts[:, 0] - counts[:, 1]
+    if mode != "last":
+        raise DataError(f"mode is {mode!r}; give sum or last")
+    starts = _starts(events, edges_us)
+    out = np.zeros((len(starts) - 1, events.height, events.width), np.float32)
+    _last(events.x, events.y, events.p, starts, out)
+    return out
+
+
+@njit(cache=True)
+def _vote(t_us, x, y, p, first, scale, bins, out):
+    for index in range(len(t_us)):
+        place = (t_us[index] - first) * scale
+        low = min(np.int64(place), bins - 1)
+        part = np.float32(place - low)
+        sign = np.float32(1.0) if p[index] else np.float32(-1.0)
+        row, column = y[index], x[index]
+        out[low, row, column] += sign * (np.float32(1.0) - part)
+        if low + 1 < bins:
+            out[low + 1, row, column] += sign * part
+
+
+def voxel_grid(
+    events: Events, bins: int, start_us: int | None = None, stop_us: int | None = None
+) -> NDArray[np.float32]:
+    """Return signed votes, shared between the two nearest bins of time (Zhu et al., CVPR 2019, eq. 1-3).
+
+    Bin b collects sign * max(0, 1 - |b - (bins - 1) (t - start) / (stop - start)|).
+
+    Args:
+        events: The stream; it is not changed.
+        bins: Bins of time, at least 1.
+        start_us: Time of the first bin, microseconds, by default the first event's; earlier ones are left out.
+        stop_us: Time of the last bin, microseconds, by default the last event's; later ones are left out.
+
+    Returns:
+        float32 [bins, H, W].
+
+    Raises:
+        DataError: Fewer than one bin, or an end before the start.
+
+    Example:
+        >>> events = Events([0, 25, 100], [0, 1, 0], [0, 0, 0], [True, False, True], width=2, height=1)
+        >>> voxel_grid(events, 2).tolist()
+        [[[1.0, -0.75]], [[1.0, -0.25]]]
+    """
+    if bins < 1:
+        raise DataError(f"bins is {bins}; give at least 1")
+    out = np.zeros((bins, events.height, events.width), np.float32)
+    if not len(events):
+        return out
+    first = int(events.t_us[0]) if start_us is None else int(start_us)
+    last = int(events.t_us[-1]) if stop_us is None else int(stop_us)
+    if last < first:
+        raise DataError(f"the voxel grid ends at {last} us before it starts at {first} us")
+    low, high = np.searchsorted(events.t_us, first, "left"), np.searchsorted(events.t_us, last, "right")
+    scale = (bins - 1) / (last - first) if last > first else 0.0
+    inside = slice(int(low), int(high))
+    _vote(events.t_us[inside], events.x[inside], events.y[inside], events.p[inside], first, scale, bins, out)
+    return out
+
+
+@njit(cache=True)
+def _ordinal(x, y, radius, threshold, out):
+    height, width = out.shape
+    for index in range(len(x)):
+        row, column = np.int64(y[index]), np.int64(x[index])
+        for v in range(max(0, row - radius), min(height, row + radius + 1)):
+            for u in range(max(0, column - radius), min(width, column + radius + 1)):
+                value = out[v, u]
+                out[v, u] = value - 1 if value > threshold else 0
+        out[row, column] = 255
+
+
+def threshold_ordinal_surface(
+    events: Events, radius: int = 3, threshold: int | None = None
+) -> NDArray[np.uint8]:
+    """Return the threshold-ordinal surface: an event is 255 and takes one from each of its neighbours.
+
+    Neighbours that would fall below the threshold become 0 (Glover, Dinale, De Souza Rosa, Bamford,
+    Bartolozzi, "luvHarris", TPAMI 2021).
+
+    Args:
+        events: The stream; it is not changed.
+        radius: Radius of the square neighbourhood, pixels, 1 to 64.
+        threshold: Smallest value kept, 1 to 254; by default 255 - 2 (2 radius + 1), not below 1.
+
+    Returns:
+        uint8 [H, W].
+
+    Raises:
+        DataError: A radius or threshold outside its range.
+    """
+    if not 1 <= radius <= 64:
+        raise DataError(f"radius is {radius}; give 1 to 64 pixels")
+    floor = max(1, 255 - 2 * (2 * radius + 1)) if threshold is None else threshold
+    if not 1 <= floor <= 254:
+        raise DataError(f"threshold is {floor}; give 1 to 254")
+    out = np.zeros((events.height, events.width), np.uint8)
+    _ordinal(events.x, events.y, radius, floor, out)
+    return out

@@ -1,0 +1,120 @@
+"""The reconstruction network on one page: a U-Net of residual blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from evnlos.errors import ConfigError, DataError
+
+
+@dataclass(frozen=True)
+class UNetConfig:
+    """Size of a `ResidualUNet`."""
+
+    width: int = 24
+    """Channels at the finest level; they double at each level down, up to 8 times."""
+    depth: int = 4
+    """Number of levels below the finest one; each halves the sides."""
+    blocks: int = 1
+    """Residual blocks at each level, on the way down and on the way up."""
+    shuffle: int = 2
+    """Side of the input cells that are folded into channels before the first level, pixels (1 = none)."""
+    groups: int = 4
+    """Groups of each group normalisation; divides `width`."""
+
+    def __post_init__(self) -> None:
+        for name in ("width", "depth", "blocks", "shuffle", "groups"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"UNetConfig.{name} is {getattr(self, name)}; give at least 1")
+        if self.width % self.groups:
+            raise ConfigError(f"UNetConfig.groups is {self.groups}; give a divisor of the width {self.width}")
+
+
+class ResidualBlock(nn.Module):
+    """Two normalised 3 x 3 convolutions beside the identity (1 x 1 where the channels change)."""
+
+    def __init__(self, inside: int, outside: int, groups: int) -> None:
+        super().__init__()
+        self.norm1 = nn.GroupNorm(groups, inside)
+        self.conv1 = nn.Conv2d(inside, outside, 3, padding=1)
+        self.norm2 = nn.GroupNorm(groups, outside)
+        self.conv2 = nn.Conv2d(outside, outside, 3, padding=1)
+        self.skip = nn.Conv2d(inside, outside, 1) if inside != outside else nn.Identity()
+        nn.init.zeros_(self.conv2.weight)  # each block starts as the identity
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, inside, H, W] to [B, outside, H, W]."""
+        y = self.conv1(F.silu(self.norm1(x)))
+        y = self.conv2(F.silu(self.norm2(y)))
+        return self.skip(x) + y
+
+
+class ResidualUNet(nn.Module):
+    """U-Net of residual blocks with skip connections: what the camera saw [B, C, H, W] -> picture [B, 1, H, W].
+
+    The output is in 0..1 (a sigmoid). Sides of any length: the network pads its input by repeating the
+    border up to a multiple of shuffle * 2^depth and crops its output. After Ronneberger, Fischer and
+    Brox, MICCAI 2015 (U-Net) and He et al., ECCV 2016 (pre-activation residual block).
+
+    Args:
+        channels: Channels of the input: frame 1, event 2, fusion 3.
+        config: Width, depth and blocks.
+
+    Example:
+        >>> net = ResidualUNet(3, UNetConfig(width=8, depth=2))
+        >>> net(torch.zeros(1, 3, 50, 75)).shape
+        torch.Size([1, 1, 50, 75])
+    """
+
+    def __init__(self, channels: int, config: UNetConfig = UNetConfig()) -> None:
+        super().__init__()
+        self.channels, self.config = channels, config
+        cell, groups, blocks = config.shuffle**2, config.groups, config.blocks
+        widths = [config.width * min(2**level, 8) for level in range(config.depth + 1)]
+
+        def stage(inside: int, outside: int) -> nn.Sequential:
+            sides = [inside] + [outside] * blocks
+            return nn.Sequential(*(ResidualBlock(a, b, groups) for a, b in pairwise(sides)))
+
+        self.stem = nn.Conv2d(channels * cell, widths[0], 3, padding=1)
+        self.encoder = nn.ModuleList(stage(w, w) for w in widths[:-1])
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, 2) for a, b in pairwise(widths))
+        self.latent = nn.Sequential(stage(widths[-1], widths[-1]), stage(widths[-1], widths[-1]))
+        self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(widths))
+        self.decoder = nn.ModuleList(stage(2 * w, w) for w in widths[:-1])
+        self.head = nn.Conv2d(widths[0], cell, 3, padding=1)
+        # A picture is dark except for a few per cent of its pixels: start there.
+        nn.init.constant_(self.head.bias, -2.0)  # type: ignore[arg-type]
+
+    @property
+    def multiple(self) -> int:
+        """The length that the padded sides are a multiple of, pixels."""
+        return self.config.shuffle * 2**self.config.depth
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to [B, 1, H, W] in 0..1.
+
+        Raises:
+            DataError: The input does not have the network's number of channels.
+        """
+        if x.ndim != 4 or x.shape[1] != self.channels:
+            raise DataError(f"input is {tuple(x.shape)}; this network takes [B, {self.channels}, H, W]")
+        height, width = x.shape[-2:]
+        x = F.pad(x, (0, -width % self.multiple, 0, -height % self.multiple), mode="replicate")
+        x = self.stem(F.pixel_unshuffle(x, self.config.shuffle))  # [B, width, H/s, W/s]
+        skips = []
+        for encode, down in zip(self.encoder, self.down, strict=True):
+            x = encode(x)
+            skips.append(x)
+            x = down(x)  # [B, 2 width, H/2, W/2]
+        x = self.latent(x)
+        for up, decode, skip in zip(self.up[::-1], self.decoder[::-1], skips[::-1], strict=True):
+            x = F.interpolate(up(x), scale_factor=2, mode="nearest")
+            x = decode(torch.cat([x, skip], dim=1))
+        x = F.pixel_shuffle(self.head(x), self.config.shuffle)  # [B, 1, H, W]
+        return torch.sigmoid(x[..., :height, :width].float())

@@ -1,0 +1,95 @@
+"""What a report shows: each run's evaluation, its training log, and what kind of training it was."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evnlos.config import read_yaml
+from evnlos.dataset import PARADIGMS, Dataset, open_dataset
+from evnlos.errors import DataError
+from evnlos.evaluation import Evaluation, available_lpips, evaluate
+from evnlos.model import load_weights
+
+METHODS = ("simulation only", "E2E", "EPNP")
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """One trained network, evaluated.
+
+    Args:
+        name: The run's folder name.
+        paradigm: "frame", "event" or "fusion".
+        method: "simulation only" (pre-trained, no capture seen), "E2E" (captures alone) or "EPNP" (both).
+        evaluation: Pictures and scores on the split.
+        log: One record an epoch.
+        history: The trainings behind the weights, oldest first.
+    """
+
+    name: str
+    paradigm: str
+    method: str
+    evaluation: Evaluation
+    log: list[dict[str, Any]]
+    history: list[dict[str, Any]]
+
+
+def gather(runs: list[str | Path], data: str | Path, split: str = "test") -> tuple[Dataset, list[RunResult]]:
+    """Evaluate runs on one split of a dataset, ordered by method and paradigm.
+
+    Raises:
+        DataError: No run is given, a run has not ended, or a run was trained on objects of the split.
+    """
+    if not runs:
+        raise DataError("no runs given; name at least one run's folder")
+    dataset = open_dataset(data)
+    results = []
+    for run in map(Path, runs):
+        weights = load_weights(run)
+        folder = run if run.is_dir() else run.parent
+        log = folder / "metrics.jsonl"
+        lines = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
+        refuse_seen(weights.history, dataset, split)
+        evaluation = evaluate(weights, dataset, split, available_lpips())
+        results.append(
+            RunResult(
+                folder.name, weights.paradigm, method_of(weights.history), evaluation, lines, weights.history
+            )
+        )
+    results.sort(key=lambda r: (METHODS.index(r.method), PARADIGMS.index(r.paradigm)))  # type: ignore[arg-type]
+    return dataset, results
+
+
+def method_of(history: list[dict[str, Any]]) -> str:
+    """Return what kind of training the weights went through, from their history."""
+    origins = [step["data"]["origin"] for step in history]
+    if "captures" not in origins:
+        return "simulation only"
+    return "EPNP" if "simulation" in origins else "E2E"
+
+
+def refuse_seen(history: list[dict[str, Any]], dataset: Dataset, split: str) -> None:
+    """Refuse to test on objects that a training saw.
+
+    Raises:
+        DataError: Names an object that was trained on.
+    """
+    if split != "test":
+        return
+    tested = set(dataset.objects(split))
+    for step in history:
+        same = step["data"]["origin"] == dataset.origin
+        seen = tested & set(step["data"]["train"]) if same else set()
+        if seen:
+            raise DataError(
+                f"{sorted(seen)[0]} of the split {split!r} was in the training data of these weights; "
+                "hold it out, or evaluate another split"
+            )
+
+
+def settings_of(dataset: Dataset) -> dict[str, Any]:
+    """Return the settings that made a dataset, as they stand in its `dataset.yaml`."""
+    return read_yaml(dataset.folder / "dataset.yaml").get("config", {})

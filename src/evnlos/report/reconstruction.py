@@ -1,0 +1,74 @@
+"""The reconstructions of one capture as files: a picture a position, a film strip, an animation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evnlos.config import from_dict, write_atomically
+from evnlos.dataset import Sampling, capture_samples, read_capture
+from evnlos.errors import DataError
+from evnlos.evaluation import reconstruct, score
+from evnlos.model import load_weights
+from evnlos.report.pictures import grey, polarity, save_animation, save_png, stretched, strip
+
+
+def reconstruct_capture(
+    capture: str | Path, weights: str | Path, out: str | Path, zoom: int = 4
+) -> dict[str, Any]:
+    """Reconstruct all positions of a capture and write them as pictures.
+
+    Writes `position_00.png` and on, `strip.png` (rows of positions), `animation.gif` (wall frame,
+    surface, reconstruction and, where known, truth, side by side) and `reconstruction.npy` (float32
+    [N, H, W], 0..1).
+
+    Args:
+        capture: A capture folder; its target may be unknown.
+        weights: A weights file or a run's folder.
+        out: The folder for the pictures; must not exist or be empty.
+        zoom: Size of a pixel in the pictures.
+
+    Returns:
+        Number of positions, the files, and, where the truth is known, the mean scores.
+
+    Raises:
+        DataError: The capture or the weights can't be used, or `out` holds other files.
+    """
+    out = Path(out)
+    loaded, shot = load_weights(weights), read_capture(capture)
+    sampling = from_dict(Sampling, loaded.sampling, source="the weights' sampling")
+    samples = capture_samples(shot, sampling)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DataError(f"{out} is not an empty folder; give a new one")
+    images = reconstruct(loaded, samples.frame, samples.surface)
+    pictures = [grey(image) for image in images]
+    out.mkdir(parents=True, exist_ok=True)
+    for k, picture in enumerate(pictures):
+        save_png(out / f"position_{k:02d}.png", picture, zoom)
+    save_png(out / "strip.png", strip(pictures), 2)
+    shown = []
+    for k, picture in enumerate(pictures):
+        row = [stretched(samples.frame[k]), polarity(samples.surface[k]), picture]
+        if samples.truth is not None:
+            row.append(grey(samples.truth[k]))
+        shown.append(strip(row, columns=4))
+    rate_hz = 1e6 / float(np.median(np.diff(shot.frame_times_us)))
+    save_animation(out / "animation.gif", shown, rate_hz, 2)
+    write_atomically(out / "reconstruction.npy", _npy(images.numpy()))
+    found: dict[str, Any] = {"capture": shot.name, "positions": len(pictures), "paradigm": loaded.paradigm}
+    if samples.truth is not None:
+        import torch
+
+        truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
+        found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
+    return found
+
+
+def _npy(array: np.ndarray) -> bytes:
+    import io
+
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()

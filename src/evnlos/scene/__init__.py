@@ -1,0 +1,52 @@
+"""What is hidden and how it moves."""
+
+from evnlos.scene.emnist import list_emnist, read_emnist
+from evnlos.scene.fonts import Font, find_font
+from evnlos.scene.glyph_sets import (
+    EmnistGlyphs,
+    FontGlyphs,
+    Glyphs,
+    GlyphSet,
+    HandwritingGlyphs,
+    NistGlyphs,
+    ObjectId,
+    Plate,
+)
+from evnlos.scene.glyphs import DIGITS, UPPER_CASE, fit_to_plate, render_glyph
+from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, hand, held_out_writers, nist_like
+from evnlos.scene.motion import LineMotion, Motion, PathMotion
+from evnlos.scene.nist_sd19 import Handwritten, list_sd19, read_sd19
+from evnlos.scene.scene import Scene
+from evnlos.scene.target import Target
+
+__all__ = [
+    "DIGITS",
+    "TRAIN_WRITERS",
+    "UPPER_CASE",
+    "EmnistGlyphs",
+    "Font",
+    "FontGlyphs",
+    "GlyphSet",
+    "Glyphs",
+    "Hand",
+    "HandwritingGlyphs",
+    "Handwritten",
+    "LineMotion",
+    "Motion",
+    "NistGlyphs",
+    "ObjectId",
+    "PathMotion",
+    "Plate",
+    "Scene",
+    "Target",
+    "find_font",
+    "fit_to_plate",
+    "hand",
+    "held_out_writers",
+    "list_emnist",
+    "list_sd19",
+    "nist_like",
+    "read_emnist",
+    "read_sd19",
+    "render_glyph",
+]

@@ -1,0 +1,265 @@
+"""Find a font: a file, an installed family, or one of the open families that come with the package."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from shutil import which
+from typing import Any
+
+from PIL import ImageFont
+
+from evnlos.errors import ConfigError, MissingDependencyError
+
+FONT_SUFFIXES = (".ttf", ".otf", ".ttc", ".otc")
+COMIC_FALLBACKS = ("Comic Neue", "Comic Sans MS", "Comic Relief", "Kalam", "Indie Flower", "Caveat")
+"""Families that stand in for a comic-style family that is not installed, nearest first."""
+
+DEBIAN_PACKAGES = {"comic neue": "fonts-comic-neue"}
+"""Debian packages of families that the standard experiments use."""
+
+_WEIGHTS = {
+    "thin": 100, "hairline": 100, "extralight": 200, "ultralight": 200, "light": 300, "regular": 400,
+    "normal": 400, "book": 400, "roman": 400, "medium": 500, "semibold": 600, "demibold": 600, "demi": 600,
+    "bold": 700, "extrabold": 800, "ultrabold": 800, "black": 900, "heavy": 900,
+}  # fmt: skip
+_SLANTS = ("italic", "oblique")
+
+
+@dataclass(frozen=True)
+class Font:
+    """A font face that was found.
+
+    Args:
+        family: Family name, as the font itself gives it.
+        path: Font file.
+        weight: Weight, 100 (thin) to 900 (black); 400 is regular, 700 bold.
+        italic: Whether the face is italic or oblique.
+        index: Number of the face in a collection file.
+        variable: Whether `weight` has to be set on the font's weight axis.
+        substituted_for: The name that was asked for where this face only stands in; None for an exact match.
+    """
+
+    family: str
+    path: Path
+    weight: int = 400
+    italic: bool = False
+    index: int = 0
+    variable: bool = False
+    substituted_for: str | None = None
+
+    @property
+    def note(self) -> str | None:
+        """One line that says what stands in for what, and the cure; None for an exact match."""
+        if self.substituted_for is None:
+            return None
+        family = _family_of(self.substituted_for)
+        package = DEBIAN_PACKAGES.get(family.casefold())
+        cure = f"install the Debian package {package}" if package else "install it or give a font file"
+        face = f"{self.family} at weight {self.weight}" + (" italic" if self.italic else "")
+        return f"font {self.substituted_for!r} is not installed: {face} stands in; {cure}"
+
+    def load(self, size_px: float) -> ImageFont.FreeTypeFont:
+        """Return the face ready to draw at `size_px` pixels an em."""
+        # The basic layout engine is in every build of Pillow: the same picture everywhere.
+        loaded = ImageFont.truetype(
+            str(self.path), size_px, index=self.index, layout_engine=ImageFont.Layout.BASIC
+        )
+        if self.variable:
+            axes = loaded.get_variation_axes()
+            wanted = [self.weight if _axis_name(axis) == "weight" else axis["default"] or 0 for axis in axes]
+            loaded.set_variation_by_axes([float(value) for value in wanted])
+        return loaded
+
+
+def find_font(name: str | os.PathLike[str], *, strict: bool = False) -> Font:
+    """Return the face that a file path or a name such as "Comic Neue Bold" means.
+
+    Names are looked up first among the families of the package index (`fontpkg-*`), then among the system's. A
+    family without the weight or slant that was asked for gives its nearest face; a comic-style family that is
+    not there gives the first of `COMIC_FALLBACKS` that is. In both cases `substituted_for` holds the name that
+    was asked for and `note` a line for the user.
+
+    Args:
+        name: Font file, or family name with optional weight and slant words; case does not matter.
+        strict: Raise instead of substituting.
+
+    Raises:
+        ConfigError: The file is not there or no font, or no family has this name.
+        MissingDependencyError: `strict` is set and only a stand-in is there.
+    """
+    text = os.fspath(name)
+    if not text.strip():
+        raise ConfigError("the font's name is empty; give a family such as 'Comic Neue Bold' or a font file")
+    if isinstance(name, os.PathLike) or text.lower().endswith(FONT_SUFFIXES):
+        return _font_of_file(Path(text).expanduser())
+    faces = installed_fonts()
+    found = _match(text, faces)
+    if found is None and "comic" in text.casefold():
+        style = text[len(_family_of(text)) :]
+        candidates = (_match(family + style, faces) for family in COMIC_FALLBACKS)
+        found = next((face for face in candidates if face is not None), None)
+        found = _substitute(found, text) if found else None
+    if found is None:
+        raise ConfigError(_unknown(text, faces))
+    if strict and found.note:
+        raise MissingDependencyError(found.note)
+    return found
+
+
+@lru_cache(maxsize=1)
+def installed_fonts() -> tuple[Font, ...]:
+    """Return all faces that can be asked for by name: the package index's families, then the system's."""
+    return (*_packaged_fonts(), *_system_fonts())
+
+
+def _match(name: str, faces: tuple[Font, ...]) -> Font | None:
+    """Return the face of an installed family that is nearest to `name`, or None."""
+    wanted_family, weight, italic = _split_name(name)
+    # A family's own name may end in a style word ("Comic Neue Light"), so the whole name is tried first.
+    for family, style in ((name.strip(), (400, False)), (wanted_family, (weight, italic))):
+        of_family = [face for face in faces if _key(face.family) == _key(family)]
+        if of_family:
+            best = min(of_family, key=lambda face: _distance(face, *style))
+            reachable = _at_weight(best, style[0])
+            exact = (reachable.weight, reachable.italic) == style
+            return reachable if exact else _substitute(reachable, name)
+    return None
+
+
+def _distance(face: Font, weight: int, italic: bool) -> tuple[bool, int]:
+    return face.italic != italic, 0 if face.variable else abs(face.weight - weight)
+
+
+def _at_weight(face: Font, weight: int) -> Font:
+    """Return a variable face set to `weight` as far as its axis reaches, any other face as it is."""
+    if not face.variable:
+        return face
+    axes = ImageFont.truetype(str(face.path), 16, index=face.index).get_variation_axes()
+    low, high = next((a["minimum"], a["maximum"]) for a in axes if _axis_name(a) == "weight")
+    return _replace(face, weight=int(min(max(weight, low or 0), high or 1000)))
+
+
+def _substitute(face: Font, name: str) -> Font:
+    return _replace(face, substituted_for=name)
+
+
+def _replace(face: Font, **changes: object) -> Font:
+    return Font(**{**face.__dict__, **changes})
+
+
+def _unknown(name: str, faces: tuple[Font, ...]) -> str:
+    families = sorted({face.family for face in faces})
+    near = difflib.get_close_matches(_family_of(name), families, n=1, cutoff=0.5)
+    hint = f"; the nearest installed family is {near[0]!r}" if near else ""
+    return f"no font family {name!r} among the {len(families)} installed ones{hint}; or give a font file"
+
+
+def _key(family: str) -> str:
+    return re.sub(r"[\s_-]+", "", family).casefold()
+
+
+def _family_of(name: str) -> str:
+    return _split_name(name)[0]
+
+
+def _split_name(name: str) -> tuple[str, int, bool]:
+    """Split "Comic Neue Bold Italic" into its family, weight and slant."""
+    words = name.split()
+    weight, italic = 400, False
+    while len(words) > 1:
+        word = words[-1].casefold().replace("-", "")
+        if word in _WEIGHTS:
+            weight = _WEIGHTS[word]
+        elif word in _SLANTS:
+            italic = True
+        else:
+            break
+        words.pop()
+    return " ".join(words), weight, italic
+
+
+def _axis_name(axis: Any) -> str:
+    name = axis["name"]
+    return (name.decode() if isinstance(name, bytes) else name or "").strip("\0").casefold()
+
+
+def _font_of_file(path: Path, index: int = 0) -> Font:
+    if not path.is_file():
+        raise ConfigError(f"no font file {path}; give an existing .ttf or .otf file, or a family name")
+    try:
+        family, style = ImageFont.truetype(str(path), 16, index=index).getname()
+    except OSError as error:
+        raise ConfigError(f"{path} is no font that can be read ({error}); give a .ttf or .otf file") from error
+    _, weight, italic = _split_name(f"x {style or ''}")
+    return Font(family or path.stem, path, weight, italic, index)
+
+
+def _packaged_fonts() -> Iterator[Font]:
+    """Yield the faces of the installed `fontpkg-*` packages."""
+    import fontpkg  # lazily: it walks the metadata of all installed packages
+
+    for family in fontpkg.families().values():
+        for file in family.files:
+            weight = file.weight if file.weight is not None else 400
+            yield Font(family.name, file.path, weight, file.style == "italic", variable=file.variable)
+
+
+def _system_fonts() -> Iterator[Font]:
+    """Yield the faces that fontconfig knows, or else those in the platform's font folders."""
+    listing = _fontconfig_listing()
+    if listing is None:
+        for folder in _font_folders():
+            for path in sorted(folder.rglob("*")) if folder.is_dir() else ():
+                if path.suffix.lower() in FONT_SUFFIXES:
+                    try:
+                        yield _font_of_file(path)
+                    except ConfigError:
+                        continue  # a damaged font on the system is not this user's mistake
+        return
+    for line in sorted(set(listing.splitlines())):
+        fields = line.split("\t")
+        if len(fields) != 4 or not fields[0].lower().endswith(FONT_SUFFIXES):
+            continue
+        file, families, styles, index = fields
+        _, weight, italic = _split_name(f"x {styles.split(',')[0]}")
+        # fontconfig packs the number of a variable font's instance above bit 16.
+        number = int(index) if index.isdigit() else 0
+        if number < 1 << 16:
+            yield Font(families.split(",")[0], Path(file), weight, italic, number)
+
+
+def _fontconfig_listing() -> str | None:
+    if which("fc-list") is None:
+        return None
+    form = "%{file}\t%{family}\t%{style}\t%{index}\n"
+    try:
+        done = subprocess.run(["fc-list", "--format", form], capture_output=True, timeout=30, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.decode("utf-8", "replace")
+
+
+def _font_folders() -> list[Path]:
+    """Return the folders where a system keeps its fonts."""
+    home = Path.home()
+    if sys.platform == "win32":
+        return [
+            Path(os.environ.get("WINDIR", "C:/Windows")) / "Fonts",
+            home / "AppData/Local/Microsoft/Windows/Fonts",
+        ]
+    if sys.platform == "darwin":
+        return [Path("/System/Library/Fonts"), Path("/Library/Fonts"), home / "Library/Fonts"]
+    return [
+        Path("/usr/share/fonts"),
+        Path("/usr/local/share/fonts"),
+        home / ".local/share/fonts",
+        home / ".fonts",
+    ]

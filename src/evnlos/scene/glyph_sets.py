@@ -1,0 +1,286 @@
+"""Which objects a data set is made of: settings that list objects by name and make the target of each."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.errors import ConfigError
+from evnlos.scene.emnist import list_emnist, read_emnist_images
+from evnlos.scene.fonts import FONT_SUFFIXES, Font, find_font
+from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, check_size, fit_to_plate, render_glyph
+from evnlos.scene.handwriting import nist_like
+from evnlos.scene.nist_sd19 import list_sd19, read_sd19_image
+from evnlos.scene.target import Target
+
+ObjectId: TypeAlias = str
+"""Name of an object, e.g. "writer03_A": unique, stable, and a file name on any file system."""
+
+
+class GlyphSet(Protocol):
+    """Anything that lists objects and makes their targets."""
+
+    def objects(self) -> list[ObjectId]:
+        """Return the names of all objects; cheap, nothing is drawn."""
+        ...
+
+    def target(self, object_id: ObjectId, seed: int = 0) -> Target:
+        """Return the target of one object; it depends on the settings, the name and the seed only."""
+        ...
+
+    def notes(self) -> list[str]:
+        """Return lines that the user should see, e.g. which font stands in for which."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plate:
+    """The square plate that carries a character.
+
+    Args:
+        size_m: Side of the plate, metres.
+        size_px: Side of the mask, pixels.
+        letter_fraction: Longer side of a letter as a part of the plate's side, 0..1.
+        digit_fraction: Longer side of a digit as a part of the plate's side, 0..1; smaller, as in the paper.
+    """
+
+    size_m: float = 0.08
+    size_px: int = 256
+    letter_fraction: float = 1.0
+    digit_fraction: float = 0.75
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.size_m) and self.size_m > 0):
+            raise ConfigError(f"size_m is {self.size_m}; give a positive number of metres")
+        for fraction in (self.letter_fraction, self.digit_fraction):
+            check_size(self.size_px, fraction)
+
+    def fraction(self, char: str) -> float:
+        """Return the part of the plate's side that this character fills."""
+        return self.digit_fraction if char in DIGITS else self.letter_fraction
+
+
+@dataclass(frozen=True)
+class HandwritingGlyphs:
+    """NIST-like handwriting: the stand-in that needs no data (see `nist_like`).
+
+    Args:
+        kind: Names this kind of set in a settings file.
+        writers: Number of writers.
+        first_writer: Number of the first writer; 39 and above are held out for testing.
+        characters: Characters that each writer writes.
+        plate: The plate that carries a character.
+    """
+
+    kind: Literal["nist-like"] = "nist-like"
+    writers: int = 39
+    first_writer: int = 0
+    characters: str = UPPER_CASE
+    plate: Plate = field(default_factory=Plate)
+
+    def __post_init__(self) -> None:
+        _check_characters(self.characters)
+        if self.writers < 1 or self.first_writer < 0:
+            raise ConfigError(f"writers {self.first_writer} + {self.writers}; give 1 writer or more, from 0 on")
+
+    def objects(self) -> list[ObjectId]:
+        """Return the names of all objects, writer by writer, e.g. "writer03_A"."""
+        return list(_handwriting_index(self))
+
+    def target(self, object_id: ObjectId, seed: int = 0) -> Target:
+        """Return one writer's character; the seed fixes the population of writers."""
+        writer, char = _look_up(_handwriting_index(self), object_id)
+        mask = nist_like(writer, char, seed, self.plate.size_px, self.plate.fraction(char))
+        return Target(object_id, mask, self.plate.size_m)
+
+    def notes(self) -> list[str]:
+        """Return a line that says what stands in for NIST's handwriting."""
+        return ["handwriting is NIST-like: drawn from open fonts, not NIST Special Database 19"]
+
+
+@dataclass(frozen=True)
+class FontGlyphs:
+    """Characters of one font.
+
+    Args:
+        kind: Names this kind of set in a settings file.
+        family: Family with optional weight and slant, or a font file.
+        characters: Characters to draw.
+        plate: The plate that carries a character.
+    """
+
+    kind: Literal["font"] = "font"
+    family: str = "Comic Neue Bold"
+    characters: str = UPPER_CASE + DIGITS
+    plate: Plate = field(default_factory=Plate)
+
+    def __post_init__(self) -> None:
+        _check_characters(self.characters)
+
+    def font(self) -> Font:
+        """Return the face that draws the characters; its `note` tells whether it stands in for another."""
+        return find_font(self.family)
+
+    def objects(self) -> list[ObjectId]:
+        """Return the names of all objects, e.g. "comic_neue_bold_A"."""
+        return list(_font_index(self))
+
+    def target(self, object_id: ObjectId, seed: int = 0) -> Target:
+        """Return one character; the seed has no part in it."""
+        char = _look_up(_font_index(self), object_id)
+        mask = render_glyph(char, self.font(), self.plate.size_px, self.plate.fraction(char))
+        return Target(object_id, mask, self.plate.size_m)
+
+    def notes(self) -> list[str]:
+        """Return a line for the user where another font stands in for this one."""
+        note = self.font().note
+        return [note] if note else []
+
+
+@dataclass(frozen=True)
+class NistGlyphs:
+    """Characters of the user's own copy of NIST Special Database 19.
+
+    Args:
+        kind: Names this kind of set in a settings file.
+        folder: The folder `by_class` of the copy, or the one that holds it.
+        characters: Characters to take.
+        partition: Group of writers: hsf_0 to hsf_8, or train; hsf_4 is NIST's own choice for testing.
+        first: Number of images of each character to pass over.
+        per_character: Number of images of each character to take.
+        plate: The plate that carries a character.
+    """
+
+    kind: Literal["nist-sd19"] = "nist-sd19"
+    folder: str = "by_class"
+    characters: str = UPPER_CASE
+    partition: str = "hsf_0"
+    first: int = 0
+    per_character: int = 39
+    plate: Plate = field(default_factory=Plate)
+
+    def __post_init__(self) -> None:
+        _check_characters(self.characters)
+        _check_count(self.first, self.per_character)
+
+    def objects(self) -> list[ObjectId]:
+        """Return the names of all objects, e.g. "nist_hsf_0_00012_A"."""
+        return list(_nist_index(self))
+
+    def target(self, object_id: ObjectId, seed: int = 0) -> Target:
+        """Return one scanned character, cut to its ink and centred; the seed has no part in it."""
+        char, path = _look_up(_nist_index(self), object_id)
+        mask = fit_to_plate(read_sd19_image(path), self.plate.size_px, self.plate.fraction(char))
+        return Target(object_id, mask, self.plate.size_m)
+
+    def notes(self) -> list[str]:
+        """Return nothing: the images are what their name says."""
+        return []
+
+
+@dataclass(frozen=True)
+class EmnistGlyphs:
+    """Characters of the user's own copy of EMNIST.
+
+    Args:
+        kind: Names this kind of set in a settings file.
+        folder: Folder with the official gzip files.
+        characters: Characters to take.
+        subset: Subset of EMNIST: byclass, bymerge, balanced, letters or digits.
+        part: Part of the subset: train or test.
+        first: Number of images of each character to pass over.
+        per_character: Number of images of each character to take.
+        plate: The plate that carries a character.
+    """
+
+    kind: Literal["emnist"] = "emnist"
+    folder: str = "emnist"
+    characters: str = UPPER_CASE
+    subset: Literal["byclass", "bymerge", "balanced", "letters", "digits"] = "byclass"
+    part: Literal["train", "test"] = "train"
+    first: int = 0
+    per_character: int = 39
+    plate: Plate = field(default_factory=Plate)
+
+    def __post_init__(self) -> None:
+        _check_characters(self.characters)
+        _check_count(self.first, self.per_character)
+
+    def objects(self) -> list[ObjectId]:
+        """Return the names of all objects, e.g. "emnist_byclass_train_000123_A"."""
+        return list(_emnist_index(self))
+
+    def target(self, object_id: ObjectId, seed: int = 0) -> Target:
+        """Return one character, cut to its ink, enlarged and centred; the seed has no part in it."""
+        char, number = _look_up(_emnist_index(self), object_id)
+        mask = fit_to_plate(_emnist_images(self)[number], self.plate.size_px, self.plate.fraction(char))
+        return Target(object_id, mask, self.plate.size_m)
+
+    def notes(self) -> list[str]:
+        """Return nothing: the images are what their name says."""
+        return []
+
+
+Glyphs: TypeAlias = HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs
+"""All kinds of sets, told apart by `kind` in a settings file."""
+
+
+@lru_cache(maxsize=16)
+def _handwriting_index(glyphs: HandwritingGlyphs) -> dict[ObjectId, tuple[int, str]]:
+    writers = range(glyphs.first_writer, glyphs.first_writer + glyphs.writers)
+    return {f"writer{w:02d}_{character_name(c)}": (w, c) for w in writers for c in glyphs.characters}
+
+
+@lru_cache(maxsize=16)
+def _font_index(glyphs: FontGlyphs) -> dict[ObjectId, str]:
+    is_file = glyphs.family.lower().endswith(FONT_SUFFIXES)
+    slug = re.sub(r"[^a-z0-9]+", "_", (Path(glyphs.family).stem if is_file else glyphs.family).lower()).strip(
+        "_"
+    )
+    return {f"{slug or 'font'}_{character_name(c)}": c for c in glyphs.characters}
+
+
+@lru_cache(maxsize=16)
+def _nist_index(glyphs: NistGlyphs) -> dict[ObjectId, tuple[str, Path]]:
+    listed = list_sd19(glyphs.folder, glyphs.characters, glyphs.partition, glyphs.first, glyphs.per_character)
+    return {f"nist_{source}_{character_name(char)}": (char, path) for char, source, path in listed}
+
+
+@lru_cache(maxsize=16)
+def _emnist_index(glyphs: EmnistGlyphs) -> dict[ObjectId, tuple[str, int]]:
+    listed = list_emnist(
+        glyphs.folder, glyphs.characters, glyphs.subset, glyphs.part, glyphs.first, glyphs.per_character
+    )
+    stem = f"emnist_{glyphs.subset}_{glyphs.part}"
+    return {f"{stem}_{number:06d}_{character_name(char)}": (char, number) for char, number in listed}
+
+
+@lru_cache(maxsize=2)
+def _emnist_images(glyphs: EmnistGlyphs) -> dict[int, NDArray[np.float32]]:
+    # A gzip file has no random access: one pass takes all images of the set, 3 kB each.
+    numbers = [number for _, number in _emnist_index(glyphs).values()]
+    return dict(read_emnist_images(glyphs.folder, numbers, glyphs.subset, glyphs.part))
+
+
+def _look_up(index: dict, object_id: ObjectId):
+    if object_id not in index:
+        raise ConfigError(
+            f"{object_id!r} is not among the {len(index)} objects of this set; take a name it lists"
+        )
+    return index[object_id]
+
+
+def _check_characters(characters: str) -> None:
+    if not characters or len(set(characters)) < len(characters) or any(c.isspace() for c in characters):
+        raise ConfigError(f"characters is {characters!r}; give each character once, and no spaces")
+
+
+def _check_count(first: int, per_character: int) -> None:
+    if first < 0 or per_character < 1:
+        raise ConfigError(f"first is {first}, per_character {per_character}; give 0 or more and 1 or more")

@@ -1,0 +1,260 @@
+"""NIST-like handwriting: many writers, each with one consistent hand.
+
+A stand-in for scanned forms, made from openly licensed handwriting fonts; none of it comes from NIST. A hand is
+a base face, a slant, proportions, a pen and an elastic deformation; each glyph adds a little variation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from evnlos.errors import DataError, MissingDependencyError
+from evnlos.scene.distance import signed_distance
+from evnlos.scene.fonts import Font, find_font
+from evnlos.scene.glyphs import check_size, render_glyph
+from evnlos.seeds import derive_seed
+
+BASE_FACES = (
+    "Caveat", "Kalam Light", "Shadows Into Light", "Indie Flower", "Kalam Bold", "Permanent Marker",
+    "Caveat Bold",
+)  # fmt: skip
+TRAIN_WRITERS = 39
+_PEN = (0.06, 0.18)  # pen width as a part of the glyph's height: from a ball-point pen to a marker
+_SLANT_DEG = (-18.0, 14.0)  # the base faces lean to the right themselves, by 0 to 10 degrees
+_ASPECT = (0.80, 1.25)
+_HEIGHT = (0.85, 1.0)
+_WAVES = 4  # cosines a direction and axis of the elastic deformation
+_HAND_BEND, _GLYPH_BEND = 0.045, 0.018  # amplitudes, as parts of the glyph's height
+_WORK_PX = 192
+_CANVAS_PX = 272  # room for strokes that are drawn before they are thinned
+
+
+def held_out_writers(count: int = 1) -> range:
+    """Return writers for testing: those after the 39 for training, which no training set may contain.
+
+    They share the base faces with the training writers, but neither slant, proportions, pen nor deformation.
+
+    Example:
+        >>> held_out_writers(3)
+        range(39, 42)
+    """
+    return range(TRAIN_WRITERS, TRAIN_WRITERS + count)
+
+
+@dataclass(frozen=True, eq=False)
+class Hand:
+    """How one writer writes.
+
+    Args:
+        font: Base face.
+        slant_deg: Slant to the right that is added to the base face's, degrees.
+        tilt_deg: Rotation of the base line, degrees, positive clockwise.
+        aspect: Widening of the base face, 1 = as drawn.
+        height: Longer side of the ink as a part of the room for it, 0..1.
+        pen: Pen width as a part of the ink's longer side, 0..1.
+        waves: Coefficients of the elastic deformation, float64 [2, K, K], as parts of the ink's height.
+    """
+
+    font: Font
+    slant_deg: float
+    tilt_deg: float
+    aspect: float
+    height: float
+    pen: float
+    waves: NDArray[np.float64]
+
+
+def hand(writer: int, seed: int) -> Hand:
+    """Return the hand of a writer; the same for every character and in any order of calls.
+
+    Slant, proportions and pen follow a low-discrepancy sequence over the writers, so that a few writers already
+    span the whole range.
+
+    Args:
+        writer: Number of the writer, 0 or more; `TRAIN_WRITERS` and above are held out for testing.
+        seed: Seed of the whole population of writers.
+
+    Raises:
+        DataError: The writer is negative.
+        MissingDependencyError: A font package of the base faces is not installed.
+    """
+    if writer < 0:
+        raise DataError(f"writer is {writer}; writers are numbered from 0")
+    # Roots of x^5 = x + 1: Roberts' generalisation of the golden ratio to four dimensions.
+    steps = 1.1673039782614187 ** -np.arange(1.0, 5.0)
+    start = _random(seed, "population").random(4)
+    slant, aspect, height, pen = (start + (writer + 1) * steps) % 1.0
+    # Faces are dealt out in shuffled rounds: a fixed cycle would tie each face to a few slants and pens.
+    deal, turn = divmod(writer, len(BASE_FACES))
+    order = np.argsort(_random(seed, "faces", deal).random(len(BASE_FACES)))
+    rng = _random(seed, "hand", writer)
+    return Hand(
+        font=_base_font(BASE_FACES[order[turn]]),
+        slant_deg=_between(_SLANT_DEG, slant),
+        tilt_deg=_between((-4.0, 4.0), rng.random()),
+        aspect=_between(_ASPECT, aspect),
+        height=_between(_HEIGHT, height),
+        pen=_between(_PEN, pen),
+        waves=_waves(rng, _HAND_BEND),
+    )
+
+
+def nist_like(
+    writer: int, char: str, seed: int, size_px: int = 256, fraction: float = 1.0
+) -> NDArray[np.float32]:
+    """Write one character in a writer's hand on a square plate: a stand-in for NIST's scanned handwriting.
+
+    Args:
+        writer: Number of the writer, 0 or more (see `held_out_writers`).
+        char: One character, A-Z, a-z or 0-9.
+        seed: Seed of the population; the picture depends on (seed, writer, char) and on nothing else.
+        size_px: Side of the mask, pixels, 8 to 2048.
+        fraction: Room for the ink as a part of the plate's side, above 0 to 1.
+
+    Returns:
+        float32 [size_px, size_px], 0..1, bright ink on dark ground, centred by its bounding box.
+
+    Raises:
+        DataError: An argument is outside its range.
+        ConfigError: The base face cannot draw the character.
+        MissingDependencyError: A font package of the base faces is not installed.
+    """
+    check_size(size_px, fraction)
+    style = hand(writer, seed)
+    rng = _random(seed, "glyph", writer, char)
+    slant = np.tan(np.radians(style.slant_deg + _between((-2.0, 2.0), rng.random())))
+    tilt = np.radians(style.tilt_deg + _between((-2.0, 2.0), rng.random()))
+    aspect = style.aspect * _between((0.95, 1.05), rng.random())
+    room = fraction * style.height * _between((0.95, 1.0), rng.random()) * _WORK_PX
+    waves = style.waves + _waves(rng, _GLYPH_BEND)
+    turn = np.array([[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]])
+    shape = (
+        turn @ np.array([[1.0, -slant], [0.0, 1.0]]) @ np.diag([aspect, 1.0])
+    )  # (x, y) of base -> of the page
+
+    base = _base_glyph(char, style.font)
+    # A smaller draft shows how large the deformed ink and its pen come out; the second drawing fits the room.
+    draft = _deform(base, 0.5 * shape, waves, (0.0, 0.0), _CANVAS_PX // 2)
+    (left, top, right, bottom), drawn_pen = _ink_box(draft), _pen_width(draft)
+    pen = style.pen * room
+    growth = (room - pen) / max(right - left - drawn_pen, bottom - top - drawn_pen, 1.0)
+    middle = growth * np.array([(left + right) / 2, (top + bottom) / 2])
+    drawn = _deform(base, 0.5 * growth * shape, waves, (-middle[0], -middle[1]), _CANVAS_PX)
+    now = _pen_width(drawn)
+    # Thinning stops early: beyond it the thin parts of a stroke would break.
+    thicken = max((pen - now) / 2, -0.22 * now)
+    distance = signed_distance(drawn, reach=int(np.ceil(abs(thicken))) + 3)
+    return _to_plate(np.clip(thicken - distance + 0.5, 0.0, 1.0), size_px, room)
+
+
+def _to_plate(ink: NDArray[np.float32], size_px: int, room: float) -> NDArray[np.float32]:
+    """Centre the ink, shrink it to `room` where it came out larger, and sample it at `size_px`."""
+    left, top, right, bottom = _ink_box(ink)
+    excess = max((right - left) / room, (bottom - top) / room, 1.0)
+    side = _WORK_PX * excess
+    margin = _WORK_PX
+    x = margin + _CANVAS_PX / 2 + (left + right - side) / 2
+    y = margin + _CANVAS_PX / 2 + (top + bottom - side) / 2
+    padded = Image.fromarray(np.pad(ink.astype(np.float32), margin))
+    plate = padded.resize((size_px, size_px), Image.Resampling.BILINEAR, box=(x, y, x + side, y + side))
+    return np.clip(np.asarray(plate, dtype=np.float32), 0.0, 1.0)
+
+
+def _deform(
+    base: NDArray[np.float32],
+    shape: NDArray[np.float64],
+    waves: NDArray[np.float64],
+    middle: tuple[float, float],
+    canvas_px: int,
+) -> NDArray[np.float32]:
+    """Return `base` mapped by `shape` about its centre, bent by `waves` and moved to `middle` (pixels)."""
+    side = len(base)
+    axis = np.arange(canvas_px) - (canvas_px - 1) / 2
+    inverse = np.linalg.inv(shape)
+    x, y = axis[None, :] - middle[0], axis[:, None] - middle[1]
+    from_x = inverse[0, 0] * x + inverse[0, 1] * y  # [C, C], C = canvas
+    from_y = inverse[1, 0] * x + inverse[1, 1] * y
+    # The bend lives on the base glyph's own square, so it is the same at every size.
+    bend_x, bend_y = _bend(waves, from_x / side + 0.5, from_y / side + 0.5)
+    return _sample(base, from_x + side * bend_x + (side - 1) / 2, from_y + side * bend_y + (side - 1) / 2)
+
+
+def _bend(waves: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]) -> tuple:
+    """Return a smooth displacement at (u, v), the cosine series sum of waves[j, i] cos(pi j v) cos(pi i u)."""
+    # A table and a look-up: the field is so smooth that 65 nodes a side leave errors below 1e-4 of the glyph.
+    nodes = np.linspace(0, 1, 65)
+    cosine = np.cos(np.pi * np.arange(waves.shape[-1])[:, None] * nodes)  # [K, 65]
+    table = np.einsum("cji,jy,ix->cyx", waves, cosine, cosine)  # [2, 65, 65]
+    column = np.clip(u * 64, 0, 64)
+    row = np.clip(v * 64, 0, 64)
+    return _sample(table[0], column, row), _sample(table[1], column, row)
+
+
+def _sample(image: NDArray, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray:
+    """Return `image` at columns `x` and rows `y`, bilinear, zero outside."""
+    padded = np.pad(image, 1)
+    height, width = padded.shape
+    x = np.clip(x + 1, 0, width - 1.001)
+    y = np.clip(y + 1, 0, height - 1.001)
+    column, row = x.astype(np.intp), y.astype(np.intp)
+    right, below = (x - column).astype(np.float32), (y - row).astype(np.float32)
+    flat, start = padded.ravel(), row * width + column
+    upper = flat[start] * (1 - right) + flat[start + 1] * right
+    lower = flat[start + width] * (1 - right) + flat[start + width + 1] * right
+    return upper * (1 - below) + lower * below
+
+
+def _pen_width(ink: NDArray[np.float32]) -> float:
+    """Return the mean width of the strokes, pixels: four times the mean distance of the ink to its edge."""
+    distance = signed_distance(ink, reach=40)
+    inside = distance < 0
+    return 4.0 * float(-distance[inside].mean()) if inside.any() else 1.0
+
+
+def _ink_box(ink: NDArray[np.float32]) -> tuple[float, float, float, float]:
+    """Return left, top, right, bottom of the ink, pixels from the centre."""
+    rows, columns = np.flatnonzero((ink > 0.5).any(1)), np.flatnonzero((ink > 0.5).any(0))
+    if not len(rows):
+        raise DataError("a deformed glyph lost all its ink; choose another base face")
+    half = len(ink) / 2
+    return columns[0] - half, rows[0] - half, columns[-1] + 1 - half, rows[-1] + 1 - half
+
+
+def _waves(rng: np.random.Generator, amplitude: float) -> NDArray[np.float64]:
+    """Draw a deformation: [2, K, K] coefficients up to `amplitude` that fall with the frequency.
+
+    Shift, slant and stretch (the lowest orders) are left out: they have parameters of their own.
+    """
+    order = np.arange(_WAVES)
+    falling = 2.0 / (order[:, None] ** 2 + order[None, :] ** 2 + 1e-9)
+    falling[order[:, None] + order[None, :] < 2] = 0.0
+    return amplitude * falling * (2.0 * rng.random((2, _WAVES, _WAVES)) - 1.0)
+
+
+def _between(limits: tuple[float, float], part: float) -> float:
+    return float(limits[0] + (limits[1] - limits[0]) * part)
+
+
+def _random(seed: int, *names: str | int) -> np.random.Generator:
+    """Return a generator for one named purpose; only its uniform draws are used, the same on every platform."""
+    return np.random.Generator(np.random.Philox(key=derive_seed(seed, "handwriting", *names)))
+
+
+@lru_cache(maxsize=64)
+def _base_font(name: str) -> Font:
+    found = find_font(name)
+    if found.substituted_for is not None:
+        raise MissingDependencyError(f"{found.note}; reinstall the package's font dependencies")
+    return found
+
+
+@lru_cache(maxsize=512)
+def _base_glyph(char: str, font: Font) -> NDArray[np.float32]:
+    glyph = render_glyph(char, font, _WORK_PX, 1.0)
+    glyph.setflags(write=False)
+    return glyph

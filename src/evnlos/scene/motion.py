@@ -1,0 +1,164 @@
+"""How a target moves: its position at any time, in continuous time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import DataError
+
+
+@runtime_checkable
+class Motion(Protocol):
+    """Anything that knows where the plate's centre is at every instant."""
+
+    def position_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
+        """Return the centre (x, y) at times `t_s` (seconds, any shape [...]), metres, float64 [..., 2]."""
+        ...
+
+    def speed_bound_m_s(self, start_s: float, stop_s: float) -> float:
+        """Return an upper bound of the speed between two times (seconds), metres a second."""
+        ...
+
+
+def _times(t_s: ArrayLike) -> NDArray[np.float64]:
+    """Return times as float64, refusing NaN and infinity."""
+    times = np.asarray(t_s, dtype=np.float64)
+    if not np.isfinite(times).all():
+        raise DataError("t_s holds NaN or infinity; give finite seconds")
+    return times
+
+
+@dataclass(frozen=True)
+class LineMotion:
+    """Constant speed along a straight line, for all times.
+
+    position(t) = start + speed * direction / |direction| * (t - start time); the defaults are the paper's:
+    2 cm/s from left to right, 8 s for 16 cm.
+
+    Args:
+        start_m: Centre (x, y) at `start_s`, metres, x to the right and y downwards.
+        speed_m_s: Speed, metres a second, 0 or more.
+        direction: Direction (x, y) of any length above 0.
+        start_s: Time at which the centre is at `start_m`, seconds.
+
+    Raises:
+        DataError: A value is not finite, the speed is negative or the direction has no length.
+
+    Example:
+        >>> LineMotion().position_m(4.0)
+        array([0., 0.])
+    """
+
+    start_m: tuple[float, float] = (-0.08, 0.0)
+    speed_m_s: float = 0.02
+    direction: tuple[float, float] = (1.0, 0.0)
+    start_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("start_m", "direction"):
+            pair = np.asarray(getattr(self, name), dtype=np.float64)
+            if pair.shape != (2,) or not np.isfinite(pair).all():
+                raise DataError(f"LineMotion.{name} is {getattr(self, name)}; give two finite numbers (x, y)")
+            object.__setattr__(self, name, (float(pair[0]), float(pair[1])))
+        if not (np.isfinite(self.speed_m_s) and self.speed_m_s >= 0):
+            raise DataError(f"LineMotion.speed_m_s is {self.speed_m_s}; give 0 or more metres a second")
+        if not np.hypot(*self.direction) > 0:
+            raise DataError("LineMotion.direction is (0, 0); give a direction with a length")
+        if not np.isfinite(self.start_s):
+            raise DataError(f"LineMotion.start_s is {self.start_s}; give finite seconds")
+
+    def position_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
+        """Return the centre (x, y) at times `t_s` (seconds, any shape [...]), metres, float64 [..., 2]."""
+        velocity = self.speed_m_s * np.asarray(self.direction) / np.hypot(*self.direction)
+        return np.asarray(self.start_m) + (_times(t_s)[..., None] - self.start_s) * velocity
+
+    def speed_bound_m_s(self, start_s: float, stop_s: float) -> float:
+        """Return the speed, metres a second; it does not depend on the times (seconds)."""
+        return float(self.speed_m_s)
+
+
+@dataclass(frozen=True)
+class PathMotion:
+    """A smooth path through given points: monotone cubic in time, at rest before the first and after the last.
+
+    Each coordinate is a cubic Hermite curve with the slopes of Fritsch and Butland (1984): it passes through
+    every point, its velocity is continuous, and it never leaves the range of two neighbouring points. The slope
+    at both ends is zero, so that the plate starts from rest and comes to rest.
+
+    Args:
+        times_s: Times of the points, seconds, strictly increasing, two or more.
+        points_m: Centres (x, y) at these times, metres, one pair a time.
+
+    Raises:
+        DataError: Fewer than two points, unequal lengths, times that do not increase, or values not finite.
+
+    Example:
+        >>> PathMotion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.0))).position_m([-1.0, 0.5, 2.0])
+        array([[0.  , 0.  ],
+               [0.05, 0.  ],
+               [0.1 , 0.  ]])
+    """
+
+    times_s: tuple[float, ...]
+    points_m: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.times_s, dtype=np.float64)
+        points = np.asarray(self.points_m, dtype=np.float64)
+        if times.ndim != 1 or len(times) < 2:
+            raise DataError(f"PathMotion.times_s has {times.size} times; give two or more")
+        if points.shape != (len(times), 2):
+            raise DataError(
+                f"PathMotion.points_m has shape {points.shape}; give ({len(times)}, 2), one (x, y) a time"
+            )
+        if not (np.isfinite(times).all() and np.isfinite(points).all()):
+            raise DataError("PathMotion holds NaN or infinity; give finite seconds and metres")
+        if not (np.diff(times) > 0).all():
+            raise DataError("PathMotion.times_s does not increase; give each time once, in order")
+        object.__setattr__(self, "times_s", tuple(times.tolist()))
+        object.__setattr__(self, "points_m", tuple((x, y) for x, y in points.tolist()))
+
+    def position_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
+        """Return the centre (x, y) at times `t_s` (seconds, any shape [...]), metres, float64 [..., 2]."""
+        knots, points, slopes = self._curve()
+        times = np.clip(_times(t_s), knots[0], knots[-1])
+        left = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
+        step = (knots[left + 1] - knots[left])[..., None]
+        u = (times - knots[left])[..., None] / step  # 0..1 within the piece
+        rise = points[left + 1] - points[left]
+        # Hermite basis written around the left point: exact there, and short.
+        bend = slopes[left] * step * u * (1 - u) ** 2 - slopes[left + 1] * step * u**2 * (1 - u)
+        return points[left] + rise * u**2 * (3 - 2 * u) + bend
+
+    def speed_bound_m_s(self, start_s: float, stop_s: float) -> float:
+        """Return an upper bound of the speed between two times (seconds), metres a second.
+
+        The velocity of a cubic piece is a parabola, bounded by its Bezier coefficients: both end slopes and
+        3 rise / step - slope - slope.
+        """
+        knots, points, slopes = self._curve()
+        step = np.diff(knots)[:, None]
+        middle = 3 * np.diff(points, axis=0) / step - slopes[:-1] - slopes[1:]
+        hull = np.stack([slopes[:-1], middle, slopes[1:]])  # [3, pieces, 2]
+        bound = np.linalg.norm(hull, axis=-1).max(axis=0)  # [pieces]
+        touched = (knots[1:] > start_s) & (knots[:-1] < stop_s)
+        return float(bound[touched].max(initial=0.0))
+
+    def _curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return knots [K], points [K, 2] and slopes [K, 2]."""
+        knots, points = np.asarray(self.times_s), np.asarray(self.points_m)
+        step = np.diff(knots)[:, None]
+        secant = np.diff(points, axis=0) / step
+        slopes = np.zeros_like(points)
+        before, after = secant[:-1], secant[1:]
+        same_way = before * after > 0
+        # Weighted harmonic mean; zero where the direction turns, which keeps the curve within its points.
+        w_before, w_after = step[:-1] + 2 * step[1:], 2 * step[:-1] + step[1:]
+        safe_before, safe_after = np.where(same_way, before, 1.0), np.where(same_way, after, 1.0)
+        mean = (w_before + w_after) / (w_before / safe_before + w_after / safe_after)
+        slopes[1:-1] = np.where(same_way, mean, 0.0)
+        return knots, points, slopes

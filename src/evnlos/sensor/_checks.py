@@ -1,0 +1,72 @@
+"""Checks of the light and the instants that come in from outside."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.sensor.pixel import MIN_THRESHOLD
+
+_LIGHT_DTYPES = (np.uint8, np.float32, np.float64)
+
+
+def check_light(frames: ArrayLike | torch.Tensor) -> NDArray:
+    """Return a video as an array [T, H, W] of uint8, float32 or float64, refusing what is not light."""
+    if isinstance(frames, torch.Tensor):
+        frames = frames.detach().cpu().numpy()
+    light = np.asarray(frames)
+    if light.ndim != 3 or 0 in light.shape[1:]:
+        raise DataError(f"frames has shape {light.shape}; give [T, H, W] with at least one pixel")
+    if light.dtype.kind not in "uif" and light.dtype != np.bool_:
+        raise DataError(f"frames has dtype {light.dtype}; give numbers, 255 = white")
+    if light.dtype not in _LIGHT_DTYPES:
+        light = light.astype(np.float32 if light.dtype == np.float16 else np.float64)
+    if light.dtype != np.uint8 and light.size:
+        lowest, highest = float(light.min()), float(light.max())
+        if not (np.isfinite(lowest) and np.isfinite(highest)):
+            raise DataError("frames holds NaN or infinity; light must be finite, 255 = white")
+        if lowest < 0:
+            raise DataError(f"frames holds {lowest:g}; light cannot be negative, black is 0")
+    return light
+
+
+def check_times(times_s: ArrayLike | torch.Tensor, count: int, after_s: float = -np.inf) -> NDArray[np.float64]:
+    """Return instants as float64 [T], refusing a wrong number, NaN, and times that do not ascend."""
+    if isinstance(times_s, torch.Tensor):
+        times_s = times_s.detach().cpu().numpy()
+    try:
+        times = np.asarray(times_s, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"times_s is not a list of numbers ({error}); give seconds") from None
+    if times.shape != (count,):
+        raise DataError(f"times_s has shape {times.shape} for {count} frames; give one time in seconds a frame")
+    if not np.isfinite(times).all():
+        raise DataError("times_s holds NaN or infinity; give finite seconds")
+    behind = np.flatnonzero(np.diff(times, prepend=after_s) <= 0)
+    if len(behind):
+        k = int(behind[0])
+        before = times[k - 1] if k else after_s
+        raise DataError(f"times_s[{k}] is {times[k]:.9g} s after {before:.9g} s; times must ascend")
+    return times
+
+
+def check_threshold_maps(thresholds: object, shape: tuple[int, int]) -> tuple[NDArray, NDArray]:
+    """Return the threshold maps (on, off) as float64 [H, W], refusing other shapes and values below 0.01."""
+    if not isinstance(thresholds, (tuple, list)) or len(thresholds) != 2:
+        raise ConfigError("thresholds must be a pair (on, off) of maps [H, W] in log units, or None")
+    maps = []
+    for name, values in zip(("on", "off"), thresholds, strict=True):
+        if isinstance(values, torch.Tensor):
+            values = values.detach().cpu().numpy()
+        field = np.asarray(values, dtype=np.float64)
+        if field.shape != shape:
+            raise ConfigError(
+                f"thresholds[{name}] has shape {field.shape}; the sensor is {shape[0]} x {shape[1]}"
+            )
+        lowest = float(field.min())
+        if not (np.isfinite(field).all() and lowest >= MIN_THRESHOLD * (1 - 1e-6)):
+            raise ConfigError(f"thresholds[{name}] holds {lowest:g}; give at least {MIN_THRESHOLD} log units")
+        maps.append(field)
+    return maps[0], maps[1]

@@ -1,0 +1,309 @@
+"""Kernels of the continuous-time pixel (`mode="exact"`).
+
+A branch-free pass over a tile advances every pixel by one step in closed form and finds those that may have
+sent something; only these are solved piece by piece for the instants of their events.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from evnlos.sensor._exact_math import (
+    KNEE,
+    LINE,
+    LOG_KNEE,
+    LOG_LINE,
+    LOW_PASS,
+    fast_exp,
+    first_crossing,
+    light_of,
+    log_light,
+    response,
+)
+from evnlos.sensor._random import (
+    STREAM_SHOT_CHOICE,
+    STREAM_SHOT_GAP,
+    STREAM_TIME_JITTER,
+    random_exponential,
+    random_normal,
+    random_uniform,
+)
+
+PIECE = 0.05
+"""Largest change of the log light in a piece on which it counts as a line: at most 3e-4 log units wrong."""
+DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
+"""The factor 1 - 0.75 (I + 20) / 275 of the shot noise at black, its largest value."""
+
+
+@njit(cache=True)
+def _grown(column):
+    """Return a copy of a column with twice its length."""
+    longer = np.empty(2 * len(column), column.dtype)
+    longer[: len(column)] = column
+    return longer
+
+
+@njit(cache=True)
+def _emit(out, count, time_s, pixel, on, jitter, window, seed, sent):
+    """Append an event, growing the columns when they are full."""
+    out_time, out_pixel, out_on = out
+    if count == len(out_time):
+        out_time, out_pixel, out_on = _grown(out_time), _grown(out_pixel), _grown(out_on)
+    if jitter > 0.0:
+        time_s += jitter * random_normal(seed, STREAM_TIME_JITTER, pixel, sent[pixel])
+        time_s = min(max(time_s, window[0]), window[1])
+    sent[pixel] += 1
+    out_time[count] = np.int64(np.rint(time_s * 1e6))
+    out_pixel[count] = pixel
+    out_on[count] = on
+    return (out_time, out_pixel, out_on), count + 1
+
+
+@njit(cache=True)
+def _shot(seed, pixel, counter, intensity, rate_on, rate_off, rate_hot):
+    """Return +1, -1 or 0: what a candidate of the dominating Poisson process becomes at this light."""
+    uniform = random_uniform(seed, STREAM_SHOT_CHOICE, pixel, counter)
+    uniform *= (rate_on + rate_off) * DIM_MAX + rate_hot
+    dim = max(1.0 - 0.75 * (intensity + 20.0) / 275.0, 0.0)
+    if uniform < rate_on * dim:
+        return 1
+    if uniform < (rate_on + rate_off) * dim:
+        return -1
+    if uniform < (rate_on + rate_off) * dim + 0.5 * rate_hot:
+        return 1
+    if uniform < (rate_on + rate_off) * dim + rate_hot:
+        return -1
+    return 0
+
+
+@njit(cache=True)
+def _piece(
+    out, count, pixel, start, length, light_a, light_b, filtered, state, constants, jitter, window, drawn, sent
+):
+    """Send the events of one pixel on one piece of its light, from `start` for `length` seconds.
+
+    `state` (reference, last event, next candidate of shot noise) is updated; returns the columns, their fill
+    and the filter's output at the end of the piece.
+    """
+    on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, seed = constants
+    gradient = (light_b - light_a) / length
+    speed, curve = rate * (light_a + 20.0), 0.5 * rate * gradient
+    if rate > 0.0:
+        kind, end = LOW_PASS, length * (speed + curve * length)
+        log_a, log_b = log_light(light_a), log_light(light_b)
+        per_tau = (log_b - log_a) / end
+        a, b, c = log_a - per_tau, per_tau + leak * length / end, filtered - log_a + per_tau
+        arrival = a + per_tau * end + c * math.exp(-end)
+    elif max(light_a, light_b) > KNEE:
+        kind, end = LOG_LINE, length
+        a, b, c = light_a, gradient, leak
+        arrival = log_light(light_b)
+    else:
+        kind, end = LINE, length
+        a, b, c = log_light(light_a), gradient * LOG_KNEE / KNEE + leak, 0.0
+        arrival = log_light(light_b)
+    now = 0.0
+    while True:
+        ready, candidate = state[1] + refractory - start, state[2] - start
+        shot_due = candidate < length
+        limit = end
+        if shot_due:
+            limit = max(now, candidate * (speed + curve * candidate) if kind == LOW_PASS else candidate)
+        if ready >= length:
+            now = end
+        elif ready > 0.0:
+            now = max(now, ready * (speed + curve * ready) if kind == LOW_PASS else ready)
+        x, sign = limit, 0
+        if now < limit:
+            change = response(kind, a, b, c, now) - state[0]
+            if change >= on:
+                x, sign = now, 1
+            elif change <= -off:
+                x, sign = now, -1
+            else:
+                x, sign = first_crossing(kind, a, b, c, now, limit, state[0] + on, state[0] - off)
+        if sign != 0:
+            moment = x
+            if kind == LOW_PASS:
+                moment = 2.0 * x / (speed + math.sqrt(max(speed * speed + 4.0 * curve * x, 0.0)))
+            moment = min(moment, length)
+            state[0] += on if sign > 0 else -off
+            state[1] = start + moment
+            out, count = _emit(out, count, start + moment, pixel, sign > 0, jitter, window, seed, sent)
+            now = x
+        elif shot_due:
+            light = light_a + gradient * candidate
+            choice = _shot(seed, pixel, drawn[pixel], light, rate_on, rate_off, rate_hot)
+            drawn[pixel] += 1
+            total = (rate_on + rate_off) * DIM_MAX + rate_hot
+            when = state[2]
+            state[2] += random_exponential(seed, STREAM_SHOT_GAP, pixel, drawn[pixel]) / total
+            if choice != 0 and when - state[1] >= refractory:
+                state[0] = response(kind, a, b, c, limit)
+                state[1] = when
+                out, count = _emit(out, count, when, pixel, choice > 0, jitter, window, seed, sent)
+            now = max(now, limit)
+        else:
+            break
+    state[0] -= leak * length
+    return out, count, arrival
+
+
+@njit(cache=True)
+def _step(
+    out, count, pixel, start, stop, light_a, light_b, filtered, state, constants, jitter, window, drawn, sent
+):
+    """Send the events of one pixel in one step, split at the knee of the log and into short log changes."""
+    length, change = stop - start, light_b - light_a
+    knee = min(light_a, light_b) < KNEE < max(light_a, light_b)
+    at, at_light = 0.0, light_a
+    for part in range(2 if knee else 1):
+        goal = KNEE if knee and part == 0 else light_b
+        log_from, log_goal = log_light(at_light), log_light(goal)
+        pieces = 1
+        if constants[6] > 0.0:
+            pieces = max(1, math.ceil(abs(log_goal - log_from) / PIECE))
+        for n in range(1, pieces + 1):
+            next_light = goal if n == pieces else light_of(log_from + (log_goal - log_from) * n / pieces)
+            following = length
+            if next_light != light_b:
+                following = min((next_light - light_a) / change, 1.0) * length
+            if following > at:
+                out, count, filtered = _piece(
+                    out, count, pixel, start + at, following - at, at_light, next_light, filtered, state,
+                    constants, jitter, window, drawn, sent,
+                )  # fmt: skip
+            at, at_light = following, next_light
+    return out, count, filtered
+
+
+@njit(cache=True)
+def _glide(
+    row, light, logs, filtered, base, on, off, leak, rate, length, light_1, logs_1, filtered_1, base_1, flags
+):
+    """Advance a tile by one step of the low-pass response, flagging the pixels that need to be solved."""
+    half = 0.5 * rate * length
+    for i in range(len(light)):
+        light_0, log_0, before = light[i], logs[i], filtered[i]
+        light_b = np.float64(row[i])
+        log_b = log_light(light_b)
+        tau = half * (light_0 + light_b + 40.0)
+        gain = 1.0 - fast_exp(-tau)
+        change = log_b - log_0
+        after = before + gain * (log_0 - before) + change * (1.0 - gain / tau)
+        drift = leak[i] * length
+        slope_0 = tau * (log_0 - before) + drift
+        slope_1 = tau * (log_b - after) + drift
+        turn = max(abs(slope_0), abs(slope_1)) if slope_0 * slope_1 < 0.0 else 0.0
+        lift_0 = before - base[i]
+        lift_1 = after - base[i] + drift
+        flags[i] = (
+            (max(lift_0, lift_1) + turn >= on[i])
+            | (min(lift_0, lift_1) - turn <= -off[i])
+            | (abs(change) > PIECE)
+            | ((light_0 < KNEE) != (light_b < KNEE))
+        )
+        light_1[i], logs_1[i], filtered_1[i], base_1[i] = light_b, log_b, after, base[i] - drift
+
+
+@njit(cache=True)
+def _jump(row, light, logs, filtered, base, on, off, leak, length, light_1, logs_1, filtered_1, base_1, flags):
+    """Advance a tile by one step without a filter, flagging the pixels that need to be solved."""
+    for i in range(len(light)):
+        light_b = np.float64(row[i])
+        log_b = log_light(light_b)
+        drift = leak[i] * length
+        low = min(logs[i], log_b) - base[i]
+        high = max(logs[i], log_b) - base[i] + drift
+        flags[i] = (high >= on[i]) | (low <= -off[i])
+        light_1[i], logs_1[i], filtered_1[i], base_1[i] = light_b, log_b, log_b, base[i] - drift
+
+
+@njit(cache=True, nogil=True)
+def run_tile(
+    frames, times, first, last, light, filtered, base, last_event, candidate, drawn, sent,
+    on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
+):  # fmt: skip
+    """Run the pixels first..last - 1 through all steps of a block and return what they sent.
+
+    `frames` [T, N] light in DN at times[1:]; `times` [T + 1] seconds; then [N] state (`light` DN,
+    `filtered`, `base`, `last_event` s, next shot-noise `candidate` s, counters `drawn`, `sent`) and constants
+    of the pixels (thresholds, `leak` in log units/s, noise rates in hertz). `rate` is 2 pi fc / 275, 0 = no
+    filter. Returns three columns: time stamp in microseconds, pixel, polarity.
+    """
+    size = last - first
+    words = (size + 7) // 8
+    flag_words = np.zeros(words, np.uint64)
+    flags = flag_words.view(np.uint8)
+    now = np.empty((4, size))
+    then = np.empty((4, size))
+    for i in range(size):
+        now[0, i] = light[first + i]
+        now[1, i] = log_light(light[first + i])
+        now[2, i] = filtered[first + i]
+        now[3, i] = base[first + i]
+    row = np.empty(size)
+    my_on, my_off, my_leak = on[first:last], off[first:last], leak[first:last]
+    state = np.empty(3)
+    has_shot = len(candidate) > 0
+    soonest = np.inf
+    if has_shot:
+        soonest = candidate[first:last].min()
+    out = (np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_))
+    count = 0
+    for k in range(len(frames)):
+        start, stop = times[k], times[k + 1]
+        for i in range(size):
+            row[i] = np.float64(frames[k, first + i])
+        if rate > 0.0:
+            _glide(
+                row, now[0], now[1], now[2], now[3], my_on, my_off, my_leak, rate, stop - start,
+                then[0], then[1], then[2], then[3], flags[:size],
+            )  # fmt: skip
+        else:
+            _jump(
+                row, now[0], now[1], now[2], now[3], my_on, my_off, my_leak, stop - start,
+                then[0], then[1], then[2], then[3], flags[:size],
+            )  # fmt: skip
+        if soonest < stop:
+            for i in range(size):
+                flags[i] |= candidate[first + i] < stop
+        for w in range(words):
+            if flag_words[w] == 0:
+                continue
+            for i in range(8 * w, min(8 * w + 8, size)):
+                if flags[i] == 0:
+                    continue
+                pixel = first + i
+                state[0], state[1] = now[3, i], last_event[pixel]
+                state[2] = candidate[pixel] if has_shot else np.inf
+                constants = (
+                    on[pixel], off[pixel], leak[pixel], rate_on[pixel], rate_off[pixel], rate_hot[pixel],
+                    rate, refractory, seed,
+                )  # fmt: skip
+                out, count, then[2, i] = _step(
+                    out, count, pixel, start, stop, now[0, i], row[i], now[2, i], state,
+                    constants, jitter, window, drawn, sent,
+                )  # fmt: skip
+                then[3, i] = state[0]
+                last_event[pixel] = state[1]
+                if has_shot:
+                    candidate[pixel] = state[2]
+        if soonest < stop:
+            soonest = candidate[first:last].min()
+        now, then = then, now
+    for i in range(size):
+        light[first + i], filtered[first + i], base[first + i] = now[0, i], now[2, i], now[3, i]
+    return out[0][:count], out[1][:count], out[2][:count]
+
+
+@njit(cache=True)
+def log_row(row):
+    """Return the log light of a row of light in DN."""
+    logs = np.empty(len(row))
+    for i in range(len(row)):
+        logs[i] = log_light(row[i])
+    return logs

@@ -1,0 +1,119 @@
+"""Put events into their one order: by time stamp, then row, then column, then OFF before ON."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+_DENSE_LIMIT = 1 << 20
+
+
+@njit(cache=True, nogil=True)
+def expand(step, pixel, crossings, shot, first_bucket, peak, out_bucket, out_pixel, out_on):
+    """Write one entry for each event of a tile's records; crossing j of step k goes to bucket first[k] + j."""
+    n = 0
+    for i in range(len(step)):
+        k = step[i]
+        bucket = first_bucket[k]
+        for j in range(abs(crossings[i])):
+            out_bucket[n] = bucket + j
+            out_pixel[n] = pixel[i]
+            out_on[n] = crossings[i] > 0
+            n += 1
+        if shot[i] != 0:
+            out_bucket[n] = bucket + max(peak[k], 1) - 1
+            out_pixel[n] = pixel[i]
+            out_on[n] = shot[i] > 0
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _counting_sort(bucket, pixel, on, time_us, out_time, out_pixel, out_on):
+    """Sort stably by bucket; bucket b has the time stamp time_us[b]."""
+    place = np.zeros(len(time_us) + 1, np.int64)
+    for i in range(len(bucket)):
+        place[bucket[i] + 1] += 1
+    for b in range(len(time_us)):
+        place[b + 1] += place[b]
+    for i in range(len(bucket)):
+        n = place[bucket[i]]
+        place[bucket[i]] = n + 1
+        out_time[n] = time_us[bucket[i]]
+        out_pixel[n] = pixel[i]
+        out_on[n] = on[i]
+
+
+@njit(cache=True, nogil=True)
+def settle_ties(time, pixel, on):
+    """Sort events of one time stamp by pixel and polarity, in place; the time stamps must ascend already."""
+    start = 0
+    while start < len(time):
+        stop = start + 1
+        tidy = True
+        while stop < len(time) and time[stop] == time[start]:
+            before = 2 * np.int64(pixel[stop - 1]) + on[stop - 1]
+            if 2 * np.int64(pixel[stop]) + on[stop] < before:
+                tidy = False
+            stop += 1
+        if not tidy:
+            key = np.empty(stop - start, np.int64)
+            for i in range(start, stop):
+                key[i - start] = 2 * np.int64(pixel[i]) + on[i]
+            key.sort()
+            for i in range(start, stop):
+                pixel[i] = key[i - start] >> 1
+                on[i] = (key[i - start] & 1) == 1
+        start = stop
+
+
+Columns = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.bool_]]
+"""Time stamps in microseconds, flat pixel indices, polarities."""
+
+
+def sort_events(bucket: NDArray, pixel: NDArray, on: NDArray, time_us: NDArray) -> Columns:
+    """Return (t_us, pixel, on) in order, given each event's bucket and each bucket's time stamp (ascending)."""
+    count = len(bucket)
+    if len(time_us) <= max(_DENSE_LIMIT, 4 * count):
+        columns = np.empty(count, np.int64), np.empty(count, np.int32), np.empty(count, np.bool_)
+        _counting_sort(bucket, pixel, on, time_us, *columns)
+    else:
+        rank = np.argsort(bucket, kind="stable")
+        columns = time_us[bucket[rank]], pixel[rank], on[rank]
+    settle_ties(*columns)
+    return columns
+
+
+def sort_times(time_us: NDArray, pixel: NDArray, on: NDArray) -> Columns:
+    """Return (t_us, pixel, on) in order, given events in any order."""
+    if not len(time_us):
+        return time_us, pixel, on
+    first = int(time_us.min())
+    span = int(time_us.max()) - first + 1
+    if span <= max(_DENSE_LIMIT, 4 * len(time_us)):
+        return sort_events(time_us - first, pixel, on, np.arange(first, first + span))
+    rank = np.argsort(time_us, kind="stable")
+    columns = time_us[rank], pixel[rank], on[rank]
+    settle_ties(*columns)
+    return columns
+
+
+def join(blocks: list[Columns]) -> Columns:
+    """Join the columns of successive blocks, settling the order where one block ends and the next begins.
+
+    The list is emptied on the way, so that no more than one column exists twice at a time.
+    """
+    if not blocks:
+        return np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0, np.bool_)
+    lengths = [len(block[0]) for block in blocks]
+    edges = np.cumsum(lengths)[:-1]
+    parts = [list(column) for column in zip(*blocks, strict=True)]
+    blocks.clear()
+    time, pixel, on = (np.concatenate(parts.pop(0)) for _ in range(3))
+    for edge in edges:
+        if 0 < edge < len(time) and time[edge - 1] >= time[edge]:
+            first = int(np.searchsorted(time, time[edge], "left"))
+            last = int(np.searchsorted(time, time[edge], "right"))
+            settle_ties(time[first:last], pixel[first:last], on[first:last])
+    return time, pixel, on

@@ -1,0 +1,62 @@
+"""What both pixel arrays share: thresholds a pixel, tiles, threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.errors import ConfigError
+from evnlos.sensor._checks import check_threshold_maps
+from evnlos.sensor._random import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_ON, normal_field
+from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
+
+_T = TypeVar("_T")
+
+
+def pixel_thresholds(
+    pixel: EventPixel, shape: tuple[int, int], seed: int, thresholds: object
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return each pixel's thresholds (on, off), float64 [H * W], log units: given, or drawn and clamped."""
+    if thresholds is not None:
+        on, off = check_threshold_maps(thresholds, shape)
+        return on.ravel(), off.ravel()
+    count = shape[0] * shape[1]
+    drawn = []
+    for nominal, stream in (
+        (pixel.threshold_on, STREAM_THRESHOLD_ON),
+        (pixel.threshold_off, STREAM_THRESHOLD_OFF),
+    ):
+        field = np.full(count, nominal)
+        if pixel.threshold_sigma > 0:
+            field += pixel.threshold_sigma * normal_field(np.uint64(seed), stream, count)
+            np.maximum(field, MIN_THRESHOLD, out=field)
+        drawn.append(field)
+    return drawn[0], drawn[1]
+
+
+def check_tiling(tile_px: int, threads: int | None) -> tuple[int, int]:
+    """Return the tile size rounded up to whole blocks of random numbers, and the number of threads."""
+    if tile_px < 1:
+        raise ConfigError(f"tile_px is {tile_px}; give at least 1 pixel")
+    if threads is None:
+        threads = min(torch.get_num_threads(), os.cpu_count() or 1)
+    if threads < 1:
+        raise ConfigError(f"threads is {threads}; give at least 1, or None for torch's number")
+    return -(-tile_px // BLOCK) * BLOCK, threads
+
+
+def map_tiles(work: Callable[[int, int], _T], count: int, tile_px: int, threads: int) -> Iterator[_T]:
+    """Yield work(first, last) for each tile in the order of the pixels."""
+    edges = range(0, count, tile_px)
+    if threads == 1 or len(edges) == 1:
+        for first in edges:
+            yield work(first, min(first + tile_px, count))
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(lambda first: work(first, min(first + tile_px, count)), edges)

@@ -1,0 +1,289 @@
+"""Kernels of the frame-stepped pixel (`mode="v2e"`): one fused pass over a tile of pixels and a block of steps.
+
+A tile keeps its state in the cache while time runs, the arithmetic of a step is branch-free over the tile, and
+only pixels that crossed a threshold are visited one by one. Nothing depends on the tiling.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from evnlos.sensor._random import (
+    BLOCK,
+    STREAM_SHOT_CHOICE,
+    STREAM_SHOT_GAP,
+    jitter_offset,
+    random_exponential,
+    random_uniform,
+)
+
+LIN_LOG_KNEE = 20.0
+_KNEE_SLOPE = math.log(LIN_LOG_KNEE) / LIN_LOG_KNEE
+
+
+@njit(cache=True, inline="always")
+def lin_log(intensity):
+    """Return the logarithm of the light in DN, linear up to 20 DN, with v2e's rounding to 1e-8 and float32."""
+    if intensity <= LIN_LOG_KNEE:
+        value = intensity * _KNEE_SLOPE
+    else:
+        value = math.log(intensity)
+    return np.float32(np.rint(value * 1e8) / 1e8)
+
+
+@njit(cache=True, inline="always")
+def brightness(intensity):
+    """Return the factor (I + 20) / 275 that scales bandwidth and shot noise with the light."""
+    return (intensity + 20.0) / 275.0
+
+
+@njit(cache=True, inline="always")
+def _weight(intensity, rate):
+    """Return the low-pass weight of a new frame; a rate of infinity means no filter."""
+    return min(brightness(intensity) * rate, 1.0)
+
+
+@njit(cache=True)
+def lookup_tables(rates):
+    """Return (1 - eps, eps * L) of the 256 gray values for each rate d * 2 pi fc, float64 [N, 256] twice."""
+    keep = np.empty((len(rates), 256))
+    add = np.empty((len(rates), 256))
+    for n in range(len(rates)):
+        for value in range(256):
+            weight = _weight(np.float64(value), rates[n])
+            keep[n, value] = 1.0 - weight
+            add[n, value] = weight * np.float64(lin_log(np.float64(value)))
+    return keep, add
+
+
+@njit(cache=True, inline="always")
+def floor_divide(value, threshold):
+    """Return floor(value / threshold) for positive numbers by way of fmod, as tensor libraries round it."""
+    rest = np.fmod(value, threshold)
+    ratio = (value - rest) / threshold
+    floor = np.floor(ratio)
+    if ratio - floor > 0.5:
+        floor += 1.0
+    return np.int64(floor)
+
+
+@njit(cache=True, inline="always")
+def shot_choice(seed, pixel, counter, chance_on, chance_off, chance_max):
+    """Return +1, -1 or 0: what a candidate that came with probability `chance_max` becomes."""
+    uniform = random_uniform(seed, STREAM_SHOT_CHOICE, pixel, counter) * chance_max
+    if uniform < chance_on:
+        return 1
+    if uniform > chance_max - chance_off:
+        return -1
+    return 0
+
+
+@njit(cache=True)
+def _crossed_u8(row, lp, base, on, off, keep, add, flags):
+    """Advance a tile by one step of 8-bit light and flag the pixels beyond a threshold."""
+    for i in range(len(lp)):
+        value = np.uint8(row[i])
+        filtered = keep[value] * lp[i] + add[value]
+        lp[i] = filtered
+        change = filtered - base[i]
+        flags[i] = (change >= on[i]) | (-change >= off[i])
+
+
+@njit(cache=True)
+def _crossed_log(log_light, weight, lp, base, on, off, flags):
+    """Advance a tile by one step of ready logarithms and weights and flag the pixels beyond a threshold."""
+    for i in range(len(lp)):
+        filtered = (1.0 - weight[i]) * lp[i] + weight[i] * log_light[i]
+        lp[i] = filtered
+        change = filtered - base[i]
+        flags[i] = (change >= on[i]) | (-change >= off[i])
+
+
+@njit(cache=True)
+def _crossed_direct(log_light, lp, base, on, off, flags):
+    """Set a tile to the light itself (no filter; single precision) and flag the pixels beyond a threshold."""
+    for i in range(len(lp)):
+        lp[i] = log_light[i]
+        change = lp[i] - base[i]
+        flags[i] = (change >= on[i]) | (-change >= off[i])
+
+
+@njit(cache=True)
+def _light(row, rate, log_light, weight):
+    """Fill the logarithms and low-pass weights of a row of light."""
+    for i in range(len(row)):
+        intensity = np.float64(row[i])
+        log_light[i] = lin_log(intensity)
+        weight[i] = _weight(intensity, rate)
+
+
+@njit(cache=True)
+def _leak(base, leak, scale, jitter, seed, first_pixel, step):
+    """Lower the reference by one step of jittered leak; tiles start at multiples of the block."""
+    for start in range(0, len(base), BLOCK):
+        offset = jitter_offset(seed, (first_pixel + start) // BLOCK, step)
+        stop = min(start + BLOCK, len(base))
+        for i in range(start, stop):
+            base[i] -= (scale * leak[i]) * jitter[offset + i - start]
+
+
+@njit(cache=True)
+def _grown(column, length):
+    """Return a longer copy of a column."""
+    longer = np.empty(length, column.dtype)
+    longer[: len(column)] = column
+    return longer
+
+
+@njit(cache=True, nogil=True)
+def run_tile(
+    frames, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn,
+    table, keep, add, rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
+    defer, peak,
+):  # fmt: skip
+    """Run the pixels first..last - 1 through all steps of a block and return what they sent.
+
+    `frames` [T, N] light in DN; `lp`, `base`, thresholds, `leak`, `hazard`, `drawn` [N] state and constants of
+    the pixels; `table` [T] index of the step's lookup table; `rate`, `leak_scale`, `hazard_sum`, `chance` [T].
+    Returns four columns: step, pixel, signed number of threshold crossings, sign of a shot-noise event. `peak`
+    [T] takes the largest number of crossings of a pixel in each step. With `defer` the reference stays where
+    it is when a threshold is crossed: the caller decides which events pass.
+    """
+    size = last - first
+    steps = len(rate)
+    my_lp, my_base = lp[first:last], base[first:last]
+    my_on, my_off, my_leak = on[first:last], off[first:last], leak[first:last]
+    words = (size + 7) // 8
+    flag_words = np.zeros(words, np.uint64)
+    flags = flag_words.view(np.uint8)
+    log_light = np.empty(size, np.float32)
+    weight = np.empty(size)
+    head = np.full(steps, -1, np.int64)
+    chain = np.empty(size, np.int64)
+    has_shot = len(hazard) > 0
+    if has_shot:
+        for i in range(size):
+            due = np.searchsorted(hazard_sum, hazard[first + i])
+            if due < steps:
+                chain[i] = head[due]
+                head[due] = i
+    capacity = 1024
+    count = 0
+    out_step = np.empty(capacity, np.int32)
+    out_pixel = np.empty(capacity, np.int32)
+    out_crossings = np.empty(capacity, np.int32)
+    out_shot = np.empty(capacity, np.int8)
+    filtered = rate[0] > 0.0
+    for k in range(steps):
+        row = frames[k, first:last]
+        if leak_scale[k] > 0.0:
+            _leak(my_base, my_leak, leak_scale[k], jitter, seed, first, first_step + k)
+        if filtered and len(keep) > 0:
+            _crossed_u8(row, my_lp, my_base, my_on, my_off, keep[table[k]], add[table[k]], flags[:size])
+        else:
+            _light(row, rate[k], log_light, weight)
+            if filtered:
+                _crossed_log(log_light, weight, my_lp, my_base, my_on, my_off, flags[:size])
+            else:
+                _crossed_direct(log_light, my_lp, my_base, my_on, my_off, flags[:size])
+        if has_shot:
+            i = head[k]
+            while i >= 0:
+                flags[i] |= 2
+                i = chain[i]
+        for w in range(words):
+            if flag_words[w] == 0:
+                continue
+            for i in range(8 * w, min(8 * w + 8, size)):
+                if flags[i] == 0:
+                    continue
+                pixel = first + i
+                crossings = 0
+                if flags[i] & 1:
+                    change = my_lp[i] - my_base[i]
+                    if change > 0:
+                        crossings = floor_divide(change, my_on[i])
+                        if not defer:
+                            my_base[i] += np.float32(crossings) * step_on[pixel]
+                    else:
+                        crossings = -floor_divide(-change, my_off[i])
+                        if not defer:
+                            my_base[i] -= np.float32(-crossings) * step_off[pixel]
+                    peak[k] = max(peak[k], abs(crossings))
+                shot = 0
+                if flags[i] & 2:
+                    dim = 1.0 - 0.75 * brightness(np.float64(row[i]))
+                    shot = shot_choice(
+                        seed, pixel, drawn[pixel], chance[k, 0] * dim * ratio_on[pixel],
+                        chance[k, 0] * dim * ratio_off[pixel], chance[k, 1],
+                    )  # fmt: skip
+                    drawn[pixel] += 1
+                    hazard[pixel] = hazard_sum[k] + random_exponential(
+                        seed, STREAM_SHOT_GAP, pixel, drawn[pixel]
+                    )
+                    due = np.searchsorted(hazard_sum, hazard[pixel])
+                    if due <= k:
+                        due = k + 1
+                    if due < steps:
+                        chain[i] = head[due]
+                        head[due] = i
+                    if shot != 0:
+                        my_base[i] = my_lp[i]
+                if crossings != 0 or shot != 0:
+                    if count == capacity:
+                        capacity *= 2
+                        out_step = _grown(out_step, capacity)
+                        out_pixel = _grown(out_pixel, capacity)
+                        out_crossings = _grown(out_crossings, capacity)
+                        out_shot = _grown(out_shot, capacity)
+                    out_step[count] = k
+                    out_pixel[count] = pixel
+                    out_crossings[count] = crossings
+                    out_shot[count] = shot
+                    count += 1
+    return out_step[:count], out_pixel[:count], out_crossings[:count], out_shot[:count]
+
+
+@njit(cache=True)
+def settle(step, pixel, crossings, shot, sub_times, period, last_event, base, step_on, step_off):
+    """Let the events of one step pass the refractory period; return (sub-time index, pixel, polarity) columns.
+
+    `sub_times` [M] float32 seconds; `last_event` [N] float32 seconds and `base` are updated. Dropped events
+    leave the reference alone: they are deferred. The period is `period` seconds, 0 = let everything pass.
+    """
+    total = 0
+    for i in range(len(step)):
+        total += abs(crossings[i]) + 1
+    out_sub = np.empty(total, np.int64)
+    out_pixel = np.empty(total, np.int32)
+    out_on = np.empty(total, np.bool_)
+    count = 0
+    for i in range(len(step)):
+        where = pixel[i]
+        kept = 0
+        for j in range(abs(crossings[i])):
+            if period > 0.0:
+                if sub_times[j] - last_event[where] <= period:
+                    continue
+                last_event[where] = sub_times[j]
+            kept += 1
+            out_sub[count], out_pixel[count], out_on[count] = j, where, crossings[i] > 0
+            count += 1
+        if shot[i] != 0:
+            out_sub[count], out_pixel[count], out_on[count] = len(sub_times) - 1, where, shot[i] > 0
+            count += 1
+        elif crossings[i] > 0:
+            base[where] += np.float32(kept) * step_on[where]
+        else:
+            base[where] -= np.float32(kept) * step_off[where]
+    return out_sub[:count], out_pixel[:count], out_on[:count]
+
+
+@njit(cache=True)
+def log_row(row, log_light):
+    """Fill the logarithms of a row of light."""
+    for i in range(len(row)):
+        log_light[i] = lin_log(np.float64(row[i]))

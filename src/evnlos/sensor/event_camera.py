@@ -1,0 +1,181 @@
+"""An event camera that looks at a wall in continuous time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.sensor._exact_math import log_light
+from evnlos.sensor.pixel import EventPixel
+from evnlos.sensor.stream import EventStream, Mode
+from evnlos.types import Events
+
+WHITE_DN = 255.0
+"""The white level of a wall (irradiance 1.0) in the pixel's digital numbers."""
+
+_CHUNK_BYTES = 32 << 20
+_CHUNK_STEPS = 32
+_LONGEST_SHIFT_PX = 1.0
+_FEWEST_STEPS = 8
+_MOST_STEPS = 10_000_000
+
+
+class Wall(Protocol):
+    """What an event camera needs to know about the light: its image at any instant, and how fast it moves."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size of the image (height, width), pixels."""
+        ...
+
+    @property
+    def speed_px_s(self) -> float:
+        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        ...
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return the image at the instants `t_s` [T] in seconds, float32 [T, H, W], 1.0 = white."""
+        ...
+
+
+@dataclass(frozen=True)
+class EventCamera:
+    """An array of event pixels that records a wall, choosing its own time steps from the motion.
+
+    The wall is rendered in chunks; between two instants its light counts as a line. The camera renders probe
+    instants in the middle of steps and shortens the steps until that line misses the true log light by no more
+    than `tolerance` thresholds. An event is then early or late by at most that fraction of the time its pixel
+    takes from one event to the next. No step moves the image by more than a pixel.
+
+    Args:
+        pixel: Parameters of the pixels.
+        tolerance: Largest error of the interpolated log light, in thresholds, more than 0.
+        time_step_s: Fixed time step, seconds; None = chosen from the motion. `mode="v2e"` needs one.
+        mode: "exact" or "v2e", as in `simulate_events`.
+
+    Raises:
+        ConfigError: A tolerance or a time step that is not positive, or `mode="v2e"` without a time step.
+    """
+
+    pixel: EventPixel = field(default_factory=EventPixel)
+    """Parameters of the pixels."""
+    tolerance: float = 0.02
+    """Largest error of the interpolated log light, in thresholds."""
+    time_step_s: float | None = None
+    """Fixed time step, seconds; None = chosen from the motion."""
+    mode: Mode = "exact"
+    """Continuous time ("exact") or frame by frame ("v2e")."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.tolerance) and self.tolerance > 0):
+            raise ConfigError(
+                f"EventCamera.tolerance is {self.tolerance}; give a positive number of thresholds"
+            )
+        step = self.time_step_s
+        if step is not None and not (math.isfinite(step) and step > 0):
+            raise ConfigError(f"EventCamera.time_step_s is {step}; give a positive number of seconds, or None")
+        if self.mode == "v2e" and step is None:
+            raise ConfigError('EventCamera.mode "v2e" depends on the time step; give time_step_s, e.g. 0.001')
+
+    def record(self, wall: Wall, t0: float, t1: float, *, seed: int = 0, threads: int | None = None) -> Events:
+        """Return the events of the time from t0 to t1; at t0 all pixels have settled to the light.
+
+        Memory is that of one chunk of frames (32 MiB), the state of the pixels and the events.
+
+        Args:
+            wall: The light: `shape`, `irradiance(t_s)` and `speed_px_s`.
+            t0: First instant, seconds.
+            t1: Last instant, seconds, after t0.
+            seed: Seed of mismatch and noise.
+            threads: Number of threads; None = as many as torch uses.
+
+        Raises:
+            ConfigError: t1 is not after t0, or the wall's speed asks for more than ten million steps.
+            DataError: The wall returned NaN, negative light, or an image of the wrong size.
+        """
+        if not (math.isfinite(t0) and math.isfinite(t1) and t1 > t0):
+            raise ConfigError(f"record from {t0} s to {t1} s; give finite times, the last after the first")
+        stream = EventStream(self.pixel, tuple(wall.shape), mode=self.mode, seed=seed, threads=threads)
+        stream.push(_render(wall, np.array([t0])), [t0])
+        for times_s, frames in self._chunks(wall, t0, t1):
+            stream.push(frames, times_s)
+        return stream.finish()
+
+    def _chunks(self, wall: Wall, t0: float, t1: float) -> Iterator[tuple[NDArray[np.float64], NDArray]]:
+        """Yield instants and frames that continue after t0 up to t1."""
+        height, width = wall.shape
+        most = max(1, min(_CHUNK_STEPS, _CHUNK_BYTES // (4 * height * width)))
+        if self.time_step_s is not None:
+            steps = max(1, math.ceil((t1 - t0) / self.time_step_s - 1e-9))
+            times = np.append(t0 + self.time_step_s * np.arange(1, steps), t1).astype(np.float64)
+            for k in range(0, steps, most):
+                yield times[k : k + most], _render(wall, times[k : k + most])
+            return
+        longest = _longest_step(wall, t0, t1)
+        limit = self.tolerance * min(self.pixel.threshold_on, self.pixel.threshold_off)
+        step, now, frame = longest, t0, _render(wall, np.array([t0]))[0]
+        while now < t1:
+            count = min(most, max(1, math.ceil((t1 - now) / step - 1e-9)))
+            times = np.asarray(now + step * np.arange(1, count + 1), np.float64)
+            if times[-1] >= t1 - 1e-9 * step:
+                times[-1] = t1
+            before = np.concatenate([[now], times[:-1]])
+            probes = sorted({0, count // 2, count - 1})
+            instants = np.concatenate([times, 0.5 * (before[probes] + times[probes])])
+            rendered = _render(wall, instants)
+            error = 0.0
+            for probe, middle in zip(probes, rendered[count:], strict=True):
+                earlier = rendered[probe - 1] if probe else frame
+                error = max(error, _worst_miss(earlier.ravel(), rendered[probe].ravel(), middle.ravel()))
+            if error > limit and step > longest * 1e-3:
+                step *= max(0.25, 0.9 * math.sqrt(limit / error))
+                continue
+            yield times, rendered[:count]
+            frame, now = rendered[count - 1], float(times[-1])
+            if error < 0.5 * limit:
+                step = min(longest, step * min(1.5, 0.9 * math.sqrt(limit / max(error, 1e-12))))
+
+
+def _longest_step(wall: Wall, t0: float, t1: float) -> float:
+    """Return the step that moves the image by one pixel, at most an eighth of the recording."""
+    speed = float(wall.speed_px_s)
+    if not (math.isfinite(speed) and speed >= 0):
+        raise ConfigError(
+            f"the wall's speed_px_s is {speed}; give a finite number of pixels a second, 0 or more"
+        )
+    step = min((t1 - t0) / _FEWEST_STEPS, _LONGEST_SHIFT_PX / max(speed, 1e-12))
+    if (t1 - t0) / step > _MOST_STEPS:
+        raise ConfigError(
+            f"{t1 - t0:g} s at {speed:g} pixels/s need {(t1 - t0) / step:.0f} steps; record in parts"
+        )
+    return step
+
+
+def _render(wall: Wall, times_s: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the wall's light at `times_s` in DN, [T, H, W]."""
+    light = wall.irradiance(times_s)
+    if tuple(light.shape) != (len(times_s), *wall.shape):
+        raise DataError(
+            f"the wall rendered {tuple(light.shape)} for {len(times_s)} instants; its shape is {wall.shape}"
+        )
+    return (light.detach().to("cpu", torch.float32) * WHITE_DN).numpy()
+
+
+@njit(cache=True)
+def _worst_miss(earlier, later, middle):
+    """Return how far the log of the mean of two frames is from the log of the frame between them, at most."""
+    worst = 0.0
+    for i in range(len(middle)):
+        line = 0.5 * (np.float64(earlier[i]) + np.float64(later[i]))
+        miss = abs(log_light(line) - log_light(np.float64(middle[i])))
+        if miss > worst:
+            worst = miss
+    return worst

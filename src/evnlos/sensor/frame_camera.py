@@ -1,0 +1,180 @@
+"""A frame camera: exposure, shot noise, read noise, fixed pattern, gain, quantisation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.sensor._random import check_seed
+from evnlos.sensor.event_camera import Wall
+
+_GAUSS = {1: [(0.0, 1.0)], 3: [(-math.sqrt(0.6), 5 / 18), (0.0, 8 / 18), (math.sqrt(0.6), 5 / 18)]}
+
+
+@dataclass(frozen=True)
+class FrameCamera:
+    """A linear frame camera in the terms of the EMVA 1288 standard.
+
+    A pixel under irradiance E (1.0 = white) collects a Poisson number of electrons with mean
+    full_well_e (1 + prnu g) E + dsnu_e h, g and h being the fixed pattern, normal; read noise is added, and
+
+        DN = black_level + (2^bit_depth - 1 - black_level) gain electrons / full_well_e,
+
+    rounded and clipped to 0..2^bit_depth - 1.
+
+    Args:
+        exposure_s: Exposure time, seconds; the light is averaged over it. 0 = an instant.
+        full_well_e: Electrons at white, more than 0.
+        read_noise_e: Standard deviation of the read noise, electrons.
+        prnu: Standard deviation of the pixels' sensitivity, fraction of the mean.
+        dsnu_e: Standard deviation of the pixels' offset, electrons.
+        gain: Amplification after the pixel, 1 = white fills the range.
+        bit_depth: Bits a pixel, 8 to 16.
+        black_level: Digital number of darkness, DN.
+        pattern_seed: Seed of the fixed pattern, so that all captures are by one camera; None = a new pattern for
+            each capture.
+
+    Raises:
+        ConfigError: A value outside its range.
+
+    Example:
+        >>> camera = FrameCamera(read_noise_e=0.0, prnu=0.0, dsnu_e=0.0, full_well_e=1e9)
+        >>> camera.expose(np.full((1, 1, 2), 0.25), seed=0)
+        array([[[64, 64]]], dtype=uint8)
+    """
+
+    exposure_s: float = 0.01
+    """Exposure time, seconds; the light is averaged over it."""
+    full_well_e: float = 15_000.0
+    """Electrons at white."""
+    read_noise_e: float = 6.0
+    """Standard deviation of the read noise, electrons."""
+    prnu: float = 0.01
+    """Standard deviation of the pixels' sensitivity, fraction."""
+    dsnu_e: float = 3.0
+    """Standard deviation of the pixels' offset, electrons."""
+    gain: float = 1.0
+    """Amplification after the pixel; 1 = white fills the range."""
+    bit_depth: int = 8
+    """Bits a pixel, 8 to 16."""
+    black_level: float = 0.0
+    """Digital number of darkness, DN."""
+    pattern_seed: int | None = 0
+    """Seed of the fixed pattern; None = a new pattern for each capture."""
+
+    def __post_init__(self) -> None:
+        for name, unit in (
+            ("exposure_s", "seconds"),
+            ("read_noise_e", "electrons"),
+            ("prnu", "a fraction"),
+            ("dsnu_e", "electrons"),
+            ("black_level", "DN"),
+        ):
+            self._require(name, 0.0, unit, strict=False)
+        self._require("full_well_e", 0.0, "electrons", strict=True)
+        self._require("gain", 0.0, "1 = white fills the range", strict=True)
+        if isinstance(self.bit_depth, bool) or self.bit_depth not in range(8, 17):
+            raise ConfigError(f"FrameCamera.bit_depth is {self.bit_depth!r}; give 8 to 16 bits")
+        if self.black_level >= self.white:
+            raise ConfigError(
+                f"FrameCamera.black_level is {self.black_level:g}; give less than white, {self.white} DN"
+            )
+        if self.pattern_seed is not None:
+            check_seed(self.pattern_seed)
+
+    def _require(self, name: str, low: float, unit: str, *, strict: bool) -> None:
+        value = getattr(self, name)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or value < low or (strict and value == low):
+            limit = f"more than {low:g}" if strict else f"at least {low:g}"
+            raise ConfigError(f"FrameCamera.{name} is {value!r}; give {limit} ({unit})")
+
+    @property
+    def white(self) -> int:
+        """Largest digital number, 2^bit_depth - 1."""
+        return 2**self.bit_depth - 1
+
+    def capture(self, wall: Wall, times_s: ArrayLike, seed: int = 0) -> NDArray[np.uint8 | np.uint16]:
+        """Return one frame for each instant: the wall, averaged over an exposure centred there.
+
+        The average is a Gauss-Legendre quadrature with 3 instants.
+
+        Args:
+            wall: The light: `shape` and `irradiance(t_s)`.
+            times_s: Middles of the exposures, [N], seconds.
+            seed: Seed of the noise, 0 to 2**64 - 1.
+
+        Returns:
+            Digital numbers [N, H, W]; uint8 for 8 bits, uint16 above.
+
+        Raises:
+            DataError: Times that are not finite, or a wall with NaN or negative light.
+        """
+        times = np.asarray(times_s, dtype=np.float64)
+        if times.ndim != 1 or not np.isfinite(times).all():
+            raise DataError(f"times_s has shape {times.shape}; give a 1-D array of finite seconds")
+        nodes = _GAUSS[3 if self.exposure_s > 0 else 1]
+        height, width = wall.shape
+        frames = np.empty((len(times), height, width), np.uint8 if self.bit_depth == 8 else np.uint16)
+        for n, time in enumerate(times):
+            instants = np.array([time + 0.5 * self.exposure_s * offset for offset, _ in nodes])
+            light = wall.irradiance(instants).detach().to("cpu", torch.float64)  # [Q, H, W]
+            weights = torch.tensor([weight for _, weight in nodes], dtype=torch.float64)
+            mean = torch.einsum("q,qhw->hw", weights, light).numpy()
+            frames[n] = self.expose(mean[None], seed=seed, first_frame=n)[0]
+        return frames
+
+    def expose(
+        self, irradiance: ArrayLike | torch.Tensor, seed: int = 0, first_frame: int = 0
+    ) -> NDArray[np.uint8 | np.uint16]:
+        """Return digital numbers of light that is already averaged over the exposure.
+
+        Args:
+            irradiance: Light [N, H, W], 1.0 = white, at least 0.
+            seed: Seed of the noise, 0 to 2**64 - 1.
+            first_frame: Number of the first frame: frame n of a capture has its own noise, however it is split.
+
+        Returns:
+            Digital numbers [N, H, W]; uint8 for 8 bits, uint16 above.
+
+        Raises:
+            DataError: A wrong shape, NaN, or negative light.
+        """
+        if isinstance(irradiance, torch.Tensor):
+            irradiance = irradiance.detach().cpu().numpy()
+        light = np.asarray(irradiance, dtype=np.float64)
+        if light.ndim != 3:
+            raise DataError(f"irradiance has shape {light.shape}; give [N, H, W]")
+        if light.size and not (np.isfinite(light).all() and light.min() >= 0):
+            raise DataError("irradiance holds NaN, infinity or negative light; give at least 0, 1.0 = white")
+        seed = check_seed(seed)
+        sensitivity, offset_e = self.fixed_pattern(light.shape[1:], seed)  # type: ignore[arg-type]
+        frames = np.empty(light.shape, np.uint8 if self.bit_depth == 8 else np.uint16)
+        for n, image in enumerate(light):
+            draw = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, 1, first_frame + n])))
+            mean_e = np.maximum(self.full_well_e * sensitivity * image, 0.0)
+            electrons = draw.poisson(mean_e) + offset_e
+            if self.read_noise_e > 0:
+                electrons += self.read_noise_e * draw.standard_normal(image.shape)
+            span = (self.white - self.black_level) * self.gain / self.full_well_e
+            frames[n] = np.clip(np.rint(self.black_level + span * electrons), 0, self.white)
+        return frames
+
+    def fixed_pattern(
+        self, shape: tuple[int, int], seed: int = 0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return this camera's fixed pattern: relative sensitivity and offset in electrons, [H, W] each.
+
+        Args:
+            shape: Sensor size (height, width), pixels.
+            seed: Seed of the capture; used when `pattern_seed` is None.
+        """
+        own = check_seed(seed) if self.pattern_seed is None else self.pattern_seed
+        draw = np.random.Generator(np.random.Philox(np.random.SeedSequence([own, 0])))
+        sensitivity = np.maximum(1.0 + self.prnu * draw.standard_normal(shape), 0.0)
+        return sensitivity, self.dsnu_e * draw.standard_normal(shape)

@@ -1,0 +1,59 @@
+"""The whole state of a training in one safetensors file, so that a killed run goes on bit for bit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from evnlos.config import write_atomically
+from evnlos.errors import DataError
+
+
+def save_checkpoint(
+    path: str | Path,
+    network: torch.nn.Module,
+    optimiser: torch.optim.Adam,
+    epoch: int,
+    log: list[dict],
+    key: str,
+) -> None:
+    """Write weights, optimiser state, number of finished epochs and the log so far, atomically."""
+    tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
+    for index, state in optimiser.state_dict()["state"].items():
+        for name, value in state.items():
+            tensors[f"optimiser.{index}.{name}"] = torch.as_tensor(value)
+    tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    about = json.dumps({"epoch": epoch, "log": log, "key": key})
+    write_atomically(path, save(tensors, metadata={"evnlos": about}))
+
+
+def load_checkpoint(
+    path: str | Path, network: torch.nn.Module, optimiser: torch.optim.Adam, key: str
+) -> tuple[int, list[dict]]:
+    """Restore a training in place; return the number of finished epochs and the log.
+
+    Raises:
+        DataError: The file is damaged, or belongs to a training with other settings.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads(file.metadata()["evnlos"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(
+            f"{path} is damaged ({' '.join(str(error).split())}); delete it to start afresh"
+        ) from None
+    if about["key"] != key:
+        raise DataError(f"{path} belongs to a training with other settings; give another --out")
+    network.load_state_dict({name[8:]: value for name, value in tensors.items() if name.startswith("network.")})
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimiser."):
+            _, index, field = name.split(".")
+            state.setdefault(int(index), {})[field] = value
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+    return about["epoch"], about["log"]

@@ -1,0 +1,26 @@
+"""The paper's training settings (Wang et al., EPNP, section on training), as functions."""
+
+from __future__ import annotations
+
+from evnlos.dataset import Paradigm
+from evnlos.training.settings import Training
+
+
+def paper_pretraining(paradigm: Paradigm = "fusion") -> Training:
+    """Return the paper's pre-training: 200 epochs of Adam, 1e-4 for 100 then 5e-5, batch 16, L1 + 2/SSIM."""
+    return Training(
+        paradigm=paradigm,
+        epochs=200,
+        batch_size=16,
+        learning_rate=1e-4,
+        schedule="step",
+        step_epoch=100,
+        loss="paper",
+    )
+
+
+def paper_finetuning(paradigm: Paradigm = "fusion") -> Training:
+    """Return the paper's fine-tuning: from the pre-trained weights, 100 epochs at 1e-5, batch 16."""
+    return Training(
+        paradigm=paradigm, epochs=100, batch_size=16, learning_rate=1e-5, schedule="constant", loss="paper"
+    )

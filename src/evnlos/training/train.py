@@ -1,0 +1,192 @@
+"""Training, flat and readable: pre-training, end-to-end training and fine-tuning are one loop."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from evnlos.config import config_hash, differing_keys, read_yaml, save_yaml, to_dict, write_atomically
+from evnlos.dataset import CHANNELS, Dataset, NlosDataset
+from evnlos.errors import DataError
+from evnlos.metrics import psnr
+from evnlos.model import ResidualUNet, Weights, load_weights, save_weights
+from evnlos.seeds import derive_seed
+from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
+from evnlos.training.loss import LOSSES
+from evnlos.training.settings import Training, step_size
+from evnlos.version import __version__
+
+_PARTS = {"encoder": ("stem", "encoder", "down"), "latent": ("latent",), "decoder": ("up", "decoder", "head")}
+
+
+def train(
+    dataset: Dataset, settings: Training, out: str | Path, weights: str | Path | None = None
+) -> Iterator[dict[str, Any]]:
+    """Train a network on a dataset's split `train`, yielding one record an epoch.
+
+    From random weights this is pre-training (on simulation) or the end-to-end baseline (on captures);
+    from `weights` it is fine-tuning. The run's folder holds `run.yaml` (settings, data, versions),
+    `metrics.jsonl`, a checkpoint after each epoch, and in the end `weights.safetensors`. A run that was
+    killed goes on when it is started again, and ends with the same bytes.
+
+    Args:
+        dataset: Where the samples are; its split `validation` is scored each epoch where there is one.
+        settings: What decides the training.
+        out: The run's folder; new, or begun with the same settings.
+        weights: Weights (or a run) to start from.
+
+    Yields:
+        Records with epoch, loss, learning_rate, seconds, and psnr_db, zero_db and collapsed of the validation.
+
+    Raises:
+        DataError: The folder holds another run, a sample is damaged, or weights and data do not fit.
+    """
+    out = Path(out)
+    start = load_weights(weights) if weights else None
+    network, settings = _network(settings, start)
+    about = _about(dataset, settings, start)
+    _claim(out, about)
+    if (out / "weights.safetensors").is_file():
+        for line in (out / "metrics.jsonl").read_text().splitlines():
+            yield json.loads(line)
+        return
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    for part in settings.freeze:
+        for name in _PARTS[part]:
+            getattr(network, name).requires_grad_(False)
+    trained = [p for p in network.parameters() if p.requires_grad]
+    if not trained:
+        raise DataError(f"freeze is {settings.freeze}; leave at least one part of the network to train")
+    optimiser = torch.optim.Adam(trained, lr=settings.learning_rate)
+    loss_of, half = LOSSES[settings.loss], _half(settings, device)
+    samples = NlosDataset(dataset, "train", settings.paradigm)
+    held_out = (
+        NlosDataset(dataset, "validation", settings.paradigm) if dataset.split.get("validation") else None
+    )
+
+    done, log = 0, []
+    checkpoint, key = out / "checkpoint.safetensors", config_hash(settings)
+    if checkpoint.is_file():
+        done, log = load_checkpoint(checkpoint, network, optimiser, key)
+        yield from log
+    for epoch in range(done, settings.epochs):
+        began, total = time.perf_counter(), torch.zeros((), device=device)
+        network.train()
+        order = torch.randperm(
+            len(samples), generator=torch.Generator().manual_seed(_order_seed(settings, epoch))
+        )
+        batches = order.split(settings.batch_size)
+        for step, batch in enumerate(batches):
+            rate = step_size(settings, epoch + step / len(batches))
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            seen, truth = (part.to(device, non_blocking=True) for part in samples[batch])
+            with torch.autocast(device.type, torch.bfloat16, enabled=half):
+                image = network(seen.contiguous(memory_format=torch.channels_last))
+            loss = loss_of(image, truth)
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(trained, 1.0)
+            optimiser.step()
+            total += loss.detach() * (len(batch) / len(samples))
+        record: dict[str, Any] = {"epoch": epoch + 1, "loss": round(float(total), 6), "learning_rate": rate}
+        if held_out is not None:
+            record |= _validate(network, held_out, dataset, device, half)
+        record["seconds"] = round(time.perf_counter() - began, 2)
+        log.append(record)
+        save_checkpoint(checkpoint, network, optimiser, epoch + 1, log, key)
+        write_atomically(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in log).encode())
+        yield record
+    history = [*(start.history if start else []), about]
+    done_weights = Weights(network.cpu().eval(), settings.paradigm, to_dict(dataset.sampling), history)
+    save_weights(out / "weights.safetensors", done_weights)
+    checkpoint.unlink(missing_ok=True)
+
+
+def _network(settings: Training, start: Weights | None) -> tuple[ResidualUNet, Training]:
+    """Return the network to train; fine-tuning takes paradigm and size from its weights."""
+    if start is None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive_seed(settings.seed, "weights"))
+            return ResidualUNet(CHANNELS[settings.paradigm], settings.network), settings
+    from dataclasses import replace
+
+    settings = replace(settings, paradigm=start.paradigm, network=start.network.config)  # type: ignore[arg-type]
+    return start.network, settings
+
+
+def _order_seed(settings: Training, epoch: int) -> int:
+    return derive_seed(settings.seed, "order", epoch)
+
+
+def _half(settings: Training, device: torch.device) -> bool:
+    if settings.precision != "auto":
+        return settings.precision == "bf16"
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    return torch.backends.cpu.get_cpu_capability() == "AVX512" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
+def _about(dataset: Dataset, settings: Training, start: Weights | None) -> dict[str, Any]:
+    return {
+        "settings": to_dict(settings),
+        "data": {
+            "origin": dataset.origin,
+            "name": dataset.folder.resolve().name,
+            "config_hash": dataset.config_hash,
+            "train": dataset.objects("train"),
+            "validation": dataset.split.get("validation", []),
+        },
+        "from": start.history[-1]["data"]["name"] if start and start.history else None,
+        "versions": {"evnlos": __version__, "torch": torch.__version__, "python": platform.python_version()},
+    }
+
+
+def _claim(out: Path, about: dict[str, Any]) -> None:
+    """Make the run's folder, or take it up where settings and data are the same."""
+    path = out / "run.yaml"
+    if path.is_file():
+        theirs = read_yaml(path)
+        differing = differing_keys(
+            {key: about[key] for key in ("settings", "data")},
+            {key: theirs.get(key) for key in ("settings", "data")},
+        )
+        if differing:
+            raise DataError(
+                f"{out} holds a run with other settings ({'; '.join(differing[:6])}); give another --out"
+            )
+        return
+    if out.is_dir() and any(out.iterdir()):
+        raise DataError(f"{out} is not empty and holds no run; give a new folder")
+    out.mkdir(parents=True, exist_ok=True)
+    save_yaml(about, path)
+
+
+@torch.inference_mode()
+def _validate(
+    network: ResidualUNet, held_out: NlosDataset, dataset: Dataset, device: torch.device, half: bool
+) -> dict[str, Any]:
+    network.eval()
+    scored = dataset.sampling.scored
+    values, blanks, spread = [], [], []
+    for first in range(0, len(held_out), 64):
+        seen, truth = held_out[slice(first, first + 64)]
+        with torch.autocast(device.type, torch.bfloat16, enabled=half):
+            image: Tensor = network(seen.to(device)).cpu()
+        image, truth = image[..., scored, :], truth[..., scored, :]
+        values.append(psnr(image, truth))
+        blanks.append(psnr(torch.zeros_like(truth), truth))
+        spread.append(image.flatten(1))
+    score, blank = torch.cat(values).mean().item(), torch.cat(blanks).mean().item()
+    # A network that has collapsed answers the same to every input.
+    collapsed = bool(torch.cat(spread).std(dim=0).mean() < 1e-3) if len(held_out) > 1 else False
+    return {"psnr_db": round(score, 3), "zero_db": round(blank, 3), "collapsed": collapsed}

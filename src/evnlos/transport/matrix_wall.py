@@ -1,0 +1,129 @@
+"""The wall under a shift-variant transport: a strip of cells on which the plate is drawn, and a matrix."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from evnlos.errors import ConfigError
+from evnlos.scene import Motion, Target
+from evnlos.transport.operator import MatrixTransport
+from evnlos.transport.spline import spline_coefficients, spline_weights
+from evnlos.transport.wall import ambient_map, check_gain, checked_times
+
+_CHUNK = 64  # positions drawn and carried over at a time
+_GUARD = 3  # keyframes beyond each end
+
+
+class MatrixWall:
+    """What a light-transport matrix makes of a moving plate, at any instant.
+
+    irradiance(t) = gain A s(t) + ambient, with s(t) the plate drawn on the strip's cells, each cell the exact
+    mean of the mask over it, at any sub-cell position. For motion along the strip's rows the wall is known from
+    keyframes: A s is computed at equally spaced positions once and a cubic spline runs between them (exact at
+        the keyframes, two
+    continuous derivatives in time); other motions multiply at every instant.
+
+    Args:
+        transport: Matrix from the strip to the camera image, in white levels a unit of the mask at gain 1.
+        target: The plate.
+        motion: Where its centre is at every instant; positions off the strip leave the light they lost.
+        magnification_px_m: Upper bound of the image motion, pixels a metre of plate motion.
+        gain: White levels, 0 or more.
+        ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
+        keyframe_step_m: Distance between keyframes, metres; None is half a cell, 0 multiplies at every instant.
+
+    Raises:
+        ConfigError: The gain, the ambient light or the step is negative or not finite.
+        DataError: The ambient array does not have the image's size.
+    """
+
+    def __init__(
+        self,
+        transport: MatrixTransport,
+        target: Target,
+        motion: Motion,
+        *,
+        magnification_px_m: float,
+        gain: float = 1.0,
+        ambient: float | ArrayLike | torch.Tensor = 0.0,
+        keyframe_step_m: float | None = None,
+    ) -> None:
+        check_gain(gain)
+        step = transport.source.pitch_m / 2 if keyframe_step_m is None else keyframe_step_m
+        if not (math.isfinite(step) and step >= 0):
+            raise ConfigError(f"keyframe_step_m is {keyframe_step_m}; give 0 or more metres")
+        self.transport = transport
+        self.target = target
+        self.motion = motion
+        self.gain = float(gain)
+        self.ambient = ambient_map(ambient, transport.shape).to(transport.matrix.device)
+        self._magnification = magnification_px_m
+        self._step = step
+        self._height: float | None = None
+        self._keys: torch.Tensor | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the camera image, pixels."""
+        return self.transport.shape
+
+    @property
+    def speed_px_s(self) -> float:
+        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        return self.motion.speed_bound_m_s(-math.inf, math.inf) * self._magnification
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return the irradiance at times `t_s`.
+
+        Args:
+            t_s: Times, seconds, shape [] or [T].
+
+        Returns:
+            White levels, float32 [H, W] or [T, H, W].
+
+        Raises:
+            DataError: The times have more than one axis.
+        """
+        times = checked_times(t_s)
+        positions = self.motion.position_m(times).reshape(-1, 2)  # [T, 2]
+        level = self._step > 0 and len(positions) > 0 and bool((positions[:, 1] == positions[0, 1]).all())
+        light = self._between_keys(positions) if level else self.light(positions)
+        image = (self.ambient + self.gain * light.clamp(min=0)).to(torch.float32)  # [T, H, W]
+        return image[0] if times.ndim == 0 else image
+
+    def light(self, positions_m: ArrayLike) -> torch.Tensor:
+        """Return A s for the plate at positions (x, y) [T, 2], metres: the direct product, real [T, H, W]."""
+        positions = np.asarray(positions_m, dtype=np.float64)
+        matrix = self.transport.matrix
+        image = matrix.new_zeros((len(positions), *self.shape))
+        for start in range(0, len(positions), _CHUNK):
+            drawn = self.target.rasterise(self.transport.source, positions[start : start + _CHUNK])
+            image[start : start + _CHUNK] = self.transport(torch.as_tensor(drawn).to(matrix))
+        return image
+
+    def _between_keys(self, positions: np.ndarray) -> torch.Tensor:
+        height = float(positions[0, 1])
+        if self._keys is None or self._height != height:
+            self._keys, self._height = self._make_keys(height), height
+        # Beyond the last keyframes the plate has left the strip, and the wall stays dark.
+        at = np.clip((positions[:, 0] - self._first_m) / self._step, 1, len(self._keys) - 3)
+        whole = np.minimum(np.floor(at), len(self._keys) - 3).astype(np.int64)
+        weight = spline_weights(torch.as_tensor(at - whole)).to(self._keys)  # [4, T]
+        light = self._keys.new_zeros((len(positions), *self.shape))
+        for k in range(4):
+            light += weight[k][:, None, None] * self._keys[torch.as_tensor(whole - 1 + k)]
+        return light
+
+    def _make_keys(self, height: float) -> torch.Tensor:
+        """Return the spline's coefficients at keyframes over all places where the plate touches the strip."""
+        strip = self.transport.source
+        reach = strip.extent_m[1] / 2 + self.target.size_m / 2
+        steps = math.ceil(reach / self._step) + _GUARD
+        self._first_m = strip.center_m[0] - steps * self._step
+        x = self._first_m + np.arange(2 * steps + 1) * self._step
+        frames = self.light(np.stack([x, np.full_like(x, height)], axis=-1))
+        return spline_coefficients(frames, axes=(0,))  # dark at both ends, so periodic will do

@@ -1,0 +1,153 @@
+"""The radiometric transport as settings: a wall, a camera, and the strip along which the target moves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import torch
+
+from evnlos.errors import ConfigError
+from evnlos.scene import Scene
+from evnlos.transport.angular_spectrum import check_lengths
+from evnlos.transport.brdf import GGX, Brdf, Lambert
+from evnlos.transport.matrix_wall import MatrixWall
+from evnlos.transport.operator import MatrixTransport
+from evnlos.transport.radiometric import light_transport_matrix
+from evnlos.transport.view import View
+from evnlos.transport.wall import ambient_plane
+from evnlos.types import Plane
+
+
+@dataclass(frozen=True)
+class RadiometricTransport:
+    """A self-luminous target, a wall with a BRDF, and a pin-hole camera that sees the wall at an angle."""
+
+    kind: Literal["radiometric"] = "radiometric"
+    """Tag of this transport."""
+    wall_material: Literal["ggx", "lambert"] = "ggx"
+    """Rough aluminium (GGX microfacets) or a matte wall (Lambert)."""
+    roughness: float = 0.05
+    """GGX roughness alpha, above 0; along x for a brushed wall."""
+    roughness_y: float | None = None
+    """GGX roughness along y; None is the same as along x."""
+    albedo: float = 0.8
+    """Reflected share of a matte wall, 0..1."""
+    distance_m: float = 0.3
+    """Distance from target to wall, metres."""
+    target_offset_m: tuple[float, float] | None = None
+    """Middle of the travel over the wall (x, y), metres; None is the mirror direction of the camera."""
+    camera_distance_m: float = 0.6
+    """Distance from camera to the wall's middle, metres."""
+    camera_angle_deg: float = 30.0
+    """Angle between the optical axis and the wall's normal, degrees."""
+    field_of_view_deg: float = 30.0
+    """Horizontal field of view, degrees."""
+    cell_m: float = 0.0025
+    """Side of a target cell, metres."""
+    strip_m: tuple[float, float] = (0.24, 0.08)
+    """Width and height of the region in which the target moves, metres."""
+    gain: float = 0.8
+    """White levels of the brightest pixel while a square of the strip's height shines in its middle."""
+    ambient: float = 0.05
+    """Ambient light in the middle of the image, white levels."""
+    ambient_gradient: tuple[float, float] = (0.0, 0.0)
+    """Relative growth of the ambient light from the middle to the right and the lower border."""
+
+    def brdf(self) -> Brdf:
+        """Return the wall's BRDF."""
+        if self.wall_material == "lambert":
+            return Lambert(self.albedo)
+        return GGX(self.roughness, self.roughness_y)
+
+    def view(self, shape: tuple[int, int]) -> View:
+        """Return the camera's view for an image of `shape` (H, W), pixels."""
+        angle, fov = math.radians(self.camera_angle_deg), math.radians(self.field_of_view_deg)
+        return View.perspective(shape, self.camera_distance_m, angle, fov)
+
+    def source(self) -> Plane:
+        """Return the strip of cells, in the coordinates of the target's motion."""
+        check_lengths(cell_m=self.cell_m, strip_width_m=self.strip_m[0], strip_height_m=self.strip_m[1])
+        width, height = (max(1, round(side / self.cell_m)) for side in self.strip_m)
+        return Plane(height, width, self.cell_m)
+
+    def offset_m(self) -> tuple[float, float]:
+        """Return where the middle of the travel lies over the wall (x, y), metres."""
+        if self.target_offset_m is not None:
+            return self.target_offset_m
+        return -self.distance_m * math.tan(math.radians(self.camera_angle_deg)), 0.0
+
+    def transport(self, shape: tuple[int, int]) -> MatrixTransport:
+        """Return the matrix from the strip to the camera, scaled so that `gain` means what it says; cached."""
+        # Light that only adds up afterwards does not belong to the matrix's key.
+        return _transport(replace(self, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0)), shape)
+
+    def wall(self, scene: Scene, shape: tuple[int, int]) -> MatrixWall:
+        """Return the wall that a camera of `shape` (H, W) sees while the scene's plate moves.
+
+        Raises:
+            ConfigError: The plate leaves the strip, or a setting is outside its range.
+        """
+        self._check_travel(scene)
+        return MatrixWall(
+            self.transport(shape),
+            scene.target,
+            scene.motion,
+            # No point of the image outruns the target: the reflection moves at most as fast as the plate.
+            magnification_px_m=self.view(shape).magnification(),
+            gain=self.gain,
+            ambient=ambient_plane(self.ambient, self.ambient_gradient, shape),
+        )
+
+    def _check_travel(self, scene: Scene) -> None:
+        positions = scene.motion.position_m(np.linspace(0.0, scene.duration_s, 65))
+        reach = np.abs(positions).max(axis=0) + scene.target.size_m / 2
+        for name, needed, side in zip(("width", "height"), reach, self.strip_m, strict=True):
+            if needed > side / 2 + self.cell_m:
+                raise ConfigError(
+                    f"the plate reaches {needed:.3f} m from the middle of a strip of {name} {side} m; "
+                    f"set strip_m to at least {2 * needed:.3f} m there"
+                )
+
+
+@lru_cache(maxsize=4)
+def _transport(rig: RadiometricTransport, shape: tuple[int, int]) -> MatrixTransport:
+    source = rig.source()
+    matrix = light_transport_matrix(
+        rig.view(shape), source, rig.distance_m, rig.brdf(), offset_m=rig.offset_m(), dtype=torch.float32
+    )
+    # A square of the strip's height is the plate of the paper; it makes gains comparable between walls.
+    lit = (torch.arange(source.width) - (source.width - 1) / 2).abs() <= source.height / 2
+    brightest = (matrix @ lit.to(matrix).repeat(source.height)).max()
+    if not float(brightest) > 0:
+        raise ConfigError("the camera receives no light from the target; move the target or the camera")
+    return MatrixTransport(matrix / brightest, source, shape)
+
+
+_ROUGHNESS = {"easy": 0.02, "main": 0.05, "hard": 0.1}
+NEAR_M, FAR_M = 0.30, 0.50
+
+
+def rig_preset(name: str, distance_m: float = NEAR_M) -> RadiometricTransport:
+    """Return one of the named rigs.
+
+    Args:
+        name: "easy", "main" or "hard" (rough aluminium of roughness 0.02, 0.05, 0.1), or "matte" (a plain white
+            wall: the control on which every method must fail).
+        distance_m: Distance from target to wall, metres; near is 0.30, far 0.50.
+
+    Raises:
+        ConfigError: The name is unknown.
+
+    Example:
+        >>> rig_preset("hard").roughness
+        0.1
+    """
+    if name == "matte":
+        return RadiometricTransport(wall_material="lambert", distance_m=distance_m)
+    if name in _ROUGHNESS:
+        return RadiometricTransport(roughness=_ROUGHNESS[name], distance_m=distance_m)
+    raise ConfigError(f"the rig {name!r} is unknown; choose easy, main, hard or matte")

@@ -1,0 +1,242 @@
+"""The wall that the camera sees, in continuous time: an image that slides under a shift-invariant transport."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch.nn.functional import pad
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import Motion
+from evnlos.transport.spline import MARGIN, box_average, spline_coefficients, spline_sample, spline_weights
+from evnlos.transport.view import View
+from evnlos.types import Plane
+
+_MAX_CANVAS = 8192  # pixels a side
+
+
+@runtime_checkable
+class Wall(Protocol):
+    """The camera's image of the wall at every instant, before the sensor: no noise, no rounding."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the camera image, pixels."""
+        ...
+
+    @property
+    def speed_px_s(self) -> float:
+        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        ...
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return the irradiance at times `t_s` (seconds, shape [] or [T]), float32 [H, W] or [T, H, W].
+
+        The unit is the camera's white level (1.0 = 255 DN); gain and ambient light are included.
+        """
+        ...
+
+
+class SlidingWall:
+    """A wall image that follows the target: what a shift-invariant transport makes of a translating plate.
+
+    irradiance(p, t) = gain W(A p - m(t)) + ambient(p), with W the wall image of the plate at the origin, A the
+    view and m the motion. W is averaged over a pixel's area (of mean size where the
+    view is oblique) and interpolated by a cubic B-spline, so each pixel's signal has two continuous
+    derivatives in time and no event is timed by the interpolation. For an affine view W is carried to the
+    camera's pixel grid once; a frame is then a sub-pixel shift. Negative light, which interpolation could make,
+    is cut at zero.
+
+    Args:
+        image: Wall image of the plate at the origin, real [h, w]; zero beyond its borders.
+        plane: Plane on which `image` is sampled.
+        view: The camera's view of the wall.
+        motion: Where the plate's centre is at every instant.
+        gain: White levels a unit of `image`, 0 or more.
+        ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
+
+    Raises:
+        ConfigError: The gain or the ambient light is negative or not finite, or the picture of the plate is too
+            large.
+        DataError: The image does not have the size of the plane, or the ambient array that of the view.
+    """
+
+    def __init__(
+        self,
+        image: torch.Tensor,
+        plane: Plane,
+        view: View,
+        motion: Motion,
+        *,
+        gain: float = 1.0,
+        ambient: float | ArrayLike | torch.Tensor = 0.0,
+    ) -> None:
+        if tuple(image.shape) != plane.shape:
+            raise DataError(f"the wall image is {tuple(image.shape)}; its plane has {plane.shape} samples")
+        check_gain(gain)
+        self.view = view
+        self.motion = motion
+        self.gain = float(gain)
+        self.ambient = ambient_map(ambient, view.shape).to(image.device)
+        self._plane = plane
+        work = image.to(torch.promote_types(image.dtype, torch.float32))
+        pixel = view.pixel_size_m().mean(dim=(0, 1)) / plane.pitch_m  # samples a pixel, across and down
+        self._margin = MARGIN + math.ceil(float(pixel.max()))
+        coefficients = spline_coefficients(pad(work, (self._margin,) * 4))
+        self._wall = box_average(coefficients, float(pixel[1]), float(pixel[0]))
+        self._band: tuple[float, torch.Tensor] | None = None
+        if view.is_affine:
+            self._carry_to_pixels()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the camera image, pixels."""
+        return self.view.shape
+
+    @property
+    def speed_px_s(self) -> float:
+        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        return self.motion.speed_bound_m_s(-math.inf, math.inf) * self.view.magnification()
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return the irradiance at times `t_s`.
+
+        Args:
+            t_s: Times, seconds, shape [] or [T].
+
+        Returns:
+            White levels, float32 [H, W] or [T, H, W].
+
+        Raises:
+            DataError: The times have more than one axis.
+        """
+        times = checked_times(t_s)
+        positions = self.motion.position_m(times)  # [..., 2]
+        frame = self._shifted if self.view.is_affine else self._projected
+        image = self.ambient.new_empty((times.size, *self.shape))
+        for k, (x, y) in enumerate(positions.reshape(-1, 2).tolist()):
+            image[k] = frame(x, y).clamp_(min=0).mul_(self.gain).add_(self.ambient)
+        return image.reshape((*times.shape, *self.shape))
+
+    def _carry_to_pixels(self) -> None:
+        """Sample the wall image on the camera's pixel grid, over all of its support."""
+        height, width = (side * self._plane.pitch_m / 2 for side in self._plane.shape)
+        cx, cy = self._plane.center_m
+        corners = torch.tensor([(cx + a * width, cy + b * height) for a in (-1, 1) for b in (-1, 1)])
+        pixels = self.view.pixels(corners.double())
+        low = pixels.amin(dim=0).floor().long() - MARGIN
+        size = pixels.amax(dim=0).ceil().long() + MARGIN + 1 - low
+        if int(size.max()) > _MAX_CANVAS:
+            raise ConfigError(
+                f"the plate's picture is {int(size[0])} x {int(size[1])} pixels, above {_MAX_CANVAS}; "
+                "lower the magnification or the length of the tPSF"
+            )
+        self._low = (int(low[0]), int(low[1]))
+        canvas_view = _shifted_view(self.view, self._low, (int(size[1]), int(size[0])))
+        self._canvas = spline_coefficients(self._sampled(canvas_view, 0.0, 0.0))
+
+    def _sampled(self, view: View, x_m: float, y_m: float) -> torch.Tensor:
+        """Return the wall image with the plate at (x, y), as the pixels of `view` see it."""
+        x, y = view.wall_points_m().to(self._wall.device).unbind(-1)
+        plane = self._plane
+        column = (x - x_m - plane.center_m[0]) / plane.pitch_m + (plane.width - 1) / 2 + self._margin
+        row = (y - y_m - plane.center_m[1]) / plane.pitch_m + (plane.height - 1) / 2 + self._margin
+        return spline_sample(self._wall, row, column)
+
+    def _projected(self, x_m: float, y_m: float) -> torch.Tensor:
+        return self._sampled(self.view, x_m, y_m)
+
+    def _shifted(self, x_m: float, y_m: float) -> torch.Tensor:
+        """Return the canvas displaced by the motion: four taps along each axis, the same for all pixels."""
+        origin, moved = self.view.pixels(torch.tensor([(0.0, 0.0), (x_m, y_m)], dtype=torch.float64))
+        across, down = (moved - origin).tolist()
+        band = self._rows(down)  # [H, canvas width]
+        whole, taps = _taps(-across)
+        start = whole - 1 - self._low[0]
+        window = _window(band, start, self.shape[1] + 3)
+        frame = taps[0] * window[:, : self.shape[1]]
+        for k in range(1, 4):
+            frame.add_(window[:, k : k + self.shape[1]], alpha=taps[k])
+        return frame
+
+    def _rows(self, down: float) -> torch.Tensor:
+        """Return the canvas at the camera's rows; motion along the rows asks for the same ones again."""
+        if self._band is not None and abs(self._band[0] - down) < 1e-9:
+            return self._band[1]
+        whole, taps = _taps(-down)
+        start = whole - 1 - self._low[1]
+        window = _window(self._canvas.mT, start, self.shape[0] + 3).mT  # [H + 3, canvas width]
+        band = sum(
+            (taps[k] * window[k : k + self.shape[0]] for k in range(1, 4)), taps[0] * window[: self.shape[0]]
+        )
+        self._band = (down, band)
+        return band
+
+
+def check_gain(gain: float) -> None:
+    """Refuse a gain that is negative or not finite."""
+    if not (math.isfinite(gain) and gain >= 0):
+        raise ConfigError(f"gain is {gain}; give 0 or more white levels")
+
+
+def checked_times(t_s: ArrayLike) -> NDArray[np.float64]:
+    """Return times as float64 of shape [] or [T], refusing more axes."""
+    times = np.asarray(t_s, dtype=np.float64)
+    if times.ndim > 1:
+        raise DataError(f"t_s has shape {times.shape}; give one time or a 1-D array of times")
+    return times
+
+
+def ambient_map(ambient: float | ArrayLike | torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
+    """Return ambient light as a map [H, W], float32, white levels, refusing negative light."""
+    level = torch.as_tensor(ambient, dtype=torch.float32)
+    if level.ndim and tuple(level.shape) != shape:
+        raise DataError(f"the ambient light is {tuple(level.shape)}; give a number or {shape}")
+    if not bool((torch.isfinite(level) & (level >= 0)).all()):
+        raise ConfigError(
+            f"the ambient light reaches {float(level.min())}; give 0 or more white levels everywhere"
+        )
+    return level.expand(shape).clone()
+
+
+def ambient_plane(level: float, gradient: tuple[float, float], shape: tuple[int, int]) -> torch.Tensor:
+    """Return ambient light that grows linearly: level (1 + gx x + gy y), x and y from -1 to 1 over the image.
+
+    Args:
+        level: Light in the middle of the image, white levels.
+        gradient: Relative growth (gx, gy) from the middle to the right and the lower border.
+        shape: Size (H, W), pixels.
+
+    Example:
+        >>> ambient_plane(0.1, (0.5, 0.0), (1, 3))
+        tensor([[0.0500, 0.1000, 0.1500]])
+    """
+    y = torch.linspace(-1, 1, shape[0]) if shape[0] > 1 else torch.zeros(1)
+    x = torch.linspace(-1, 1, shape[1]) if shape[1] > 1 else torch.zeros(1)
+    return ambient_map(level * (1 + gradient[1] * y[:, None] + gradient[0] * x), shape)
+
+
+def _taps(shift: float) -> tuple[int, list[float]]:
+    """Return the whole part of a shift and the spline's four weights at its fraction."""
+    whole = math.floor(shift)
+    return whole, spline_weights(torch.tensor(shift - whole, dtype=torch.float64)).tolist()
+
+
+def _window(image: torch.Tensor, start: int, length: int) -> torch.Tensor:
+    """Return columns start..start + length of `image`, zero outside it."""
+    width = image.shape[-1]
+    first, last = max(0, min(start, width)), max(0, min(start + length, width))
+    if last <= first:
+        return image.new_zeros((*image.shape[:-1], length))
+    return pad(image[..., first:last], (first - start, start + length - last))
+
+
+def _shifted_view(view: View, low: tuple[int, int], shape: tuple[int, int]) -> View:
+    """Return the view whose pixel (0, 0) is pixel `low` (column, row) of `view`."""
+    (a, b, c), (d, e, f), last = view.matrix
+    u, v = low
+    return View(shape, ((a, b, c + a * u + b * v), (d, e, f + d * u + e * v), last))

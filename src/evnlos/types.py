@@ -1,0 +1,223 @@
+"""The nouns that every stage shares: event streams and sampled planes. Data carry their geometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import DataError
+
+_MAX_SIDE = 65_536  # x and y are uint16
+
+
+def _column(values: ArrayLike, name: str, dtype: type, low: int, high: int) -> NDArray:
+    """Return `values` as a contiguous 1-D column of `dtype`, refusing values outside [low, high]."""
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise DataError(f"Events.{name} has {array.ndim} dimensions; give a 1-D column")
+    if array.dtype.kind not in "iub" and array.size:
+        raise DataError(f"Events.{name} has dtype {array.dtype}; give integers")
+    if array.dtype != dtype and array.size:
+        smallest, largest = int(array.min()), int(array.max())
+        if smallest < low or largest > high:
+            worst = smallest if smallest < low else largest
+            raise DataError(f"Events.{name} holds {worst}, outside {low}..{high}")
+    return np.ascontiguousarray(array, dtype=dtype)
+
+
+def _polarity(values: ArrayLike) -> NDArray[np.bool_]:
+    """Return polarities as bool; True, 1 and +1 are brighter, False, 0 and -1 darker."""
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise DataError(f"Events.p has {array.ndim} dimensions; give a 1-D column")
+    if array.dtype == np.bool_ or not array.size:
+        return np.ascontiguousarray(array, dtype=np.bool_)
+    wrong = (array != 1) & (array != 0) & (array != -1)
+    if wrong.any():
+        raise DataError(f"Events.p holds {array[wrong][0]}; a polarity is bool, 0/1 or -1/+1")
+    return np.ascontiguousarray(array > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """A stream of events in the order of time, as contiguous columns.
+
+    Args:
+        t_us: Times, int64 [N], microseconds, non-decreasing.
+        x: Columns, uint16 [N], 0 on the left, below `width`.
+        y: Rows, uint16 [N], 0 on top, below `height`.
+        p: Polarities, bool [N], True = brighter (0/1 and -1/+1 are converted).
+        width: Sensor width, pixels.
+        height: Sensor height, pixels.
+        adc: Optional intensity that came with each event, uint16 [N], digital numbers (CeleX EI mode).
+        polarity_known: Optional bool [N]; False where the camera gave no polarity (`p` is False there).
+
+    Raises:
+        DataError: Columns of unequal length, coordinates outside the sensor, or times that run backwards.
+
+    Example:
+        >>> events = Events([10, 20], [0, 3], [1, 1], [True, False], width=4, height=2)
+        >>> len(events), events.duration_us
+        (2, 10)
+    """
+
+    t_us: NDArray[np.int64]
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    p: NDArray[np.bool_]
+    width: int
+    height: int
+    adc: NDArray[np.uint16] | None = field(default=None, kw_only=True)
+    polarity_known: NDArray[np.bool_] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        for name, side in (("width", self.width), ("height", self.height)):
+            if not 1 <= int(side) <= _MAX_SIDE:
+                raise DataError(f"Events.{name} is {side}; give 1 to {_MAX_SIDE} pixels")
+            object.__setattr__(self, name, int(side))
+        put = object.__setattr__
+        put(self, "t_us", _column(self.t_us, "t_us", np.int64, -(2**63), 2**63 - 1))
+        put(self, "x", _column(self.x, "x", np.uint16, 0, _MAX_SIDE - 1))
+        put(self, "y", _column(self.y, "y", np.uint16, 0, _MAX_SIDE - 1))
+        put(self, "p", _polarity(self.p))
+        if self.adc is not None:
+            put(self, "adc", _column(self.adc, "adc", np.uint16, 0, _MAX_SIDE - 1))
+        if self.polarity_known is not None:
+            put(self, "polarity_known", _polarity(self.polarity_known))
+        self._check()
+
+    def _check(self) -> None:
+        count = len(self.t_us)
+        for name, column in self.columns().items():
+            if len(column) != count:
+                raise DataError(f"Events.{name} has {len(column)} entries, t_us has {count}; make them equal")
+        if not count:
+            return
+        if int(self.x.max()) >= self.width:
+            raise DataError(f"Events.x holds {int(self.x.max())}; the sensor is {self.width} pixels wide")
+        if int(self.y.max()) >= self.height:
+            raise DataError(f"Events.y holds {int(self.y.max())}; the sensor is {self.height} pixels high")
+        backwards = np.flatnonzero(self.t_us[1:] < self.t_us[:-1])
+        if len(backwards):
+            i = int(backwards[0])
+            raise DataError(
+                f"Events.t_us runs backwards at event {i + 1}: {int(self.t_us[i + 1])} us after "
+                f"{int(self.t_us[i])} us; sort the events by time first"
+            )
+
+    def columns(self) -> dict[str, NDArray]:
+        """Return the columns that are present, by name."""
+        named = {"t_us": self.t_us, "x": self.x, "y": self.y, "p": self.p}
+        if self.adc is not None:
+            named["adc"] = self.adc
+        if self.polarity_known is not None:
+            named["polarity_known"] = self.polarity_known
+        return named
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    def __getitem__(self, index: slice | NDArray) -> Events:
+        """Return the events that a slice, a boolean mask or ascending indices select."""
+        if isinstance(index, (int, np.integer)):
+            raise DataError(f"Events[{index}] is one event; give a slice, a mask or an array of indices")
+        chosen = {name: column[index] for name, column in self.columns().items()}
+        return Events(width=self.width, height=self.height, **chosen)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Events):
+            return NotImplemented
+        mine, theirs = self.columns(), other.columns()
+        same_shape = (self.width, self.height) == (other.width, other.height) and mine.keys() == theirs.keys()
+        return same_shape and all(np.array_equal(mine[name], theirs[name]) for name in mine)
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return f"Events(0 events, {self.width} x {self.height})"
+        on = 100.0 * float(self.p.mean())
+        return (
+            f"Events({len(self):,} events, {self.width} x {self.height}, "
+            f"{int(self.t_us[0]):,}..{int(self.t_us[-1]):,} us, {on:.0f} % ON)"
+        )
+
+    @property
+    def duration_us(self) -> int:
+        """Time from the first to the last event, microseconds; 0 without events."""
+        return int(self.t_us[-1]) - int(self.t_us[0]) if len(self) else 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Sensor size as (height, width), pixels."""
+        return self.height, self.width
+
+    def between(self, start_us: int, stop_us: int) -> Events:
+        """Return the events with start_us < t_us <= stop_us, the half-open interval of the position grids."""
+        first, last = np.searchsorted(self.t_us, [start_us, stop_us], side="right")
+        return self[int(first) : int(last)]
+
+    @classmethod
+    def _trusted(cls, columns: dict[str, NDArray], width: int, height: int) -> Events:
+        """Return events of columns that a decoder has checked already; a second check costs as much again."""
+        events = object.__new__(cls)
+        blank = {"adc": None, "polarity_known": None}
+        for name, value in {**blank, **columns, "width": width, "height": height}.items():
+            object.__setattr__(events, name, value)
+        return events
+
+    @classmethod
+    def empty(cls, width: int, height: int) -> Events:
+        """Return a stream without events for a sensor of `width` x `height` pixels."""
+        none = np.zeros(0, np.int64)
+        return cls(none, none, none, none.astype(bool), width, height)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane sampled on a square grid: row 0 on top, x to the right, y downwards.
+
+    Args:
+        height: Number of rows.
+        width: Number of columns.
+        pitch_m: Distance between sample centres, metres.
+        center_m: Coordinates (x, y) of the middle of the grid, metres.
+
+    Raises:
+        DataError: A side below 1 sample or a pitch that is not positive and finite.
+
+    Example:
+        >>> Plane(64, 96, 0.0025).extent_m
+        (0.16, 0.24)
+    """
+
+    height: int
+    width: int
+    pitch_m: float
+    center_m: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.height < 1 or self.width < 1:
+            raise DataError(f"Plane is {self.height} x {self.width} samples; each side needs at least 1")
+        if not (np.isfinite(self.pitch_m) and self.pitch_m > 0):
+            raise DataError(f"Plane.pitch_m is {self.pitch_m}; give a positive number of metres")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Grid size (rows, columns)."""
+        return self.height, self.width
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Physical size (height, width), metres, from outer edge to outer edge."""
+        return self.height * self.pitch_m, self.width * self.pitch_m
+
+    @property
+    def x_m(self) -> NDArray[np.float64]:
+        """Horizontal coordinate of each column's centre, float64 [W], metres."""
+        return self.center_m[0] + (np.arange(self.width) - (self.width - 1) / 2) * self.pitch_m
+
+    @property
+    def y_m(self) -> NDArray[np.float64]:
+        """Vertical coordinate (downwards) of each row's centre, float64 [H], metres."""
+        return self.center_m[1] + (np.arange(self.height) - (self.height - 1) / 2) * self.pitch_m

@@ -1,0 +1,191 @@
+"""Free-space propagation against analytic truth, at tolerances that float32 mistakes do not pass."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import fresnel
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.transport import (
+    angular_spectrum,
+    blur_radius_px,
+    fresnel_number,
+    rayleigh_sommerfeld_sum,
+    sampling_limit_m,
+)
+from evnlos.transport.angular_spectrum import transfer_function
+
+WAVELENGTH = 500e-9
+
+
+def axis(samples: int, pitch: float) -> torch.Tensor:
+    return (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * pitch
+
+
+def relative(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float((a - b).norm() / b.norm())
+
+
+def gaussian(samples: int, pitch: float, waist: float, distance: float) -> torch.Tensor:
+    """Paraxial Gaussian beam without its carrier; complex128."""
+    x = axis(samples, pitch)
+    q = complex(1, distance * WAVELENGTH / (math.pi * waist**2))
+    return torch.exp(-(x[:, None] ** 2 + x**2) / (waist**2 * q)) / q
+
+
+def square_aperture(samples: int, pitch: float, side: float, distance: float) -> torch.Tensor:
+    """Fresnel integral of a square opening, complex128."""
+    x = axis(samples, pitch).numpy()
+    scale = math.sqrt(2 / (WAVELENGTH * distance))
+    (s1, c1), (s0, c0) = fresnel(scale * (x + side / 2)), fresnel(scale * (x - side / 2))
+    one = torch.as_tensor(((c1 - c0) + 1j * (s1 - s0)) / np.sqrt(2j))
+    return one[:, None] * one
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.complex64, torch.complex128])
+def test_gaussian_beam(dtype):
+    start = gaussian(512, 10e-6, 0.3e-3, 0.0).real.to(dtype)
+    moved = angular_spectrum(start, 10e-6, WAVELENGTH, 0.4)
+    assert moved.dtype == (torch.complex64 if dtype in (torch.float32, torch.complex64) else torch.complex128)
+    assert relative(moved, gaussian(512, 10e-6, 0.3e-3, 0.4)) <= 1e-6
+
+
+def test_gaussian_beam_backwards():
+    waist = gaussian(256, 10e-6, 0.3e-3, 0.0)
+    there = angular_spectrum(gaussian(256, 10e-6, 0.3e-3, 0.1), 10e-6, WAVELENGTH, -0.1)
+    assert relative(there, waist) <= 1e-6
+
+
+def test_square_aperture_beyond_the_sampling_limit():
+    samples, pitch = 512, 10e-6
+    assert sampling_limit_m(samples, pitch, WAVELENGTH) < 1.0
+    x = axis(samples, pitch).abs() < 0.8e-3
+    opening = (x[:, None] & x).double()
+    truth = square_aperture(samples, pitch, 1.6e-3, 1.0)
+    limited = relative(angular_spectrum(opening, pitch, WAVELENGTH, 1.0), truth)
+    unlimited = relative(angular_spectrum(opening, pitch, WAVELENGTH, 1.0, band_limit=False), truth)
+    assert limited < 1e-2
+    assert unlimited > 10 * limited
+
+
+@pytest.mark.parametrize("distance", [2e-3, 4e-3])
+def test_direct_sum(distance):
+    pitch = 4e-6
+    x = axis(40, pitch)
+    start = torch.exp(-(x[:, None] ** 2 + (x - 1e-5) ** 2) / 2.5e-5**2) * torch.exp(1j * 2e4 * x)
+    slow = rayleigh_sommerfeld_sum(start, pitch, WAVELENGTH, distance)
+    fast = angular_spectrum(start, pitch, WAVELENGTH, distance, pad=3)
+    assert relative(fast, slow) < 1e-6
+    carried = rayleigh_sommerfeld_sum(start, pitch, WAVELENGTH, distance, carrier=True)
+    assert relative(angular_spectrum(start, pitch, WAVELENGTH, distance, pad=3, carrier=True), carried) < 1e-6
+
+
+def test_order_of_convergence():
+    """A narrow square opening sampled ever finer: the staircase of its edge converges with the first order."""
+    errors = []
+    # The edge falls a quarter of a sample inside a cell on every grid, so the error has one sign and one order.
+    for samples in (96, 192, 384):
+        pitch = 2.4e-3 / samples
+        side = 2 * (samples // 4 + 0.25) * pitch
+        inside = axis(samples, pitch).abs() < side / 2
+        opening = (inside[:, None] & inside).double()
+        moved = angular_spectrum(opening, pitch, WAVELENGTH, 0.5)
+        errors.append(relative(moved, square_aperture(samples, pitch, side, 0.5)))
+    orders = [math.log2(a / b) for a, b in pairwise(errors)]
+    assert all(0.8 < order < 1.3 for order in orders), (errors, orders)
+
+
+def test_spectral_convergence_of_a_smooth_field():
+    coarse, fine = (
+        relative(
+            angular_spectrum(gaussian(n, 4.8e-3 / n, 0.3e-3, 0.0), 4.8e-3 / n, WAVELENGTH, 0.2),
+            gaussian(n, 4.8e-3 / n, 0.3e-3, 0.2),
+        )
+        for n in (24, 48)
+    )
+    assert coarse > 1e-3
+    assert fine < 1e-6
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**31), st.floats(1e-3, 0.3), st.sampled_from([(33, 48), (64, 64), (51, 30)]))
+def test_forward_then_backward_is_the_identity_in_band(seed, distance, shape):
+    generator = torch.Generator().manual_seed(seed)
+    start = torch.randn(*shape, generator=generator, dtype=torch.complex128)
+    there = angular_spectrum(start, 10e-6, WAVELENGTH, distance, pad=1)
+    back = angular_spectrum(there, 10e-6, WAVELENGTH, -distance, pad=1)
+    transfer = transfer_function(shape, 10e-6, WAVELENGTH, distance, True, torch.complex128)
+    in_band = torch.fft.ifft2(torch.fft.fft2(start) * (transfer.abs() > 0.5))
+    assert relative(back, in_band) < 1e-12
+    assert abs(there.norm() - in_band.norm()) < 1e-12 * in_band.norm()
+
+
+def test_energy_is_kept():
+    start = gaussian(256, 10e-6, 0.3e-3, 0.0)
+    moved = angular_spectrum(start, 10e-6, WAVELENGTH, 0.4)
+    assert abs(float(moved.norm() / start.norm()) - 1) < 1e-7
+
+
+def test_zero_distance_is_the_identity():
+    start = torch.randn(17, 23, generator=torch.Generator().manual_seed(0), dtype=torch.complex128)
+    assert relative(angular_spectrum(start, 10e-6, WAVELENGTH, 0.0), start) < 1e-14
+
+
+def test_pruned_transform_equals_the_plain_one():
+    start = torch.randn(2, 3, 37, 50, generator=torch.Generator().manual_seed(0), dtype=torch.complex128)
+    transfer = transfer_function((93, 125), 10e-6, WAVELENGTH, 0.1, True, torch.complex128)
+    plain = torch.fft.ifft2(torch.fft.fft2(start, s=(93, 125)) * transfer)[..., :37, :50]
+    assert relative(angular_spectrum(start, 10e-6, WAVELENGTH, 0.1, pad=2.5), plain) < 1e-14
+
+
+def test_evanescent_waves_decay_both_ways():
+    start = torch.zeros(16, 16, dtype=torch.complex128)
+    start[8, 8] = 1
+    for distance in (1e-6, -1e-6):
+        moved = angular_spectrum(start, 100e-9, WAVELENGTH, distance, band_limit=False)
+        assert moved.abs().max() < 1
+    assert transfer_function((16, 16), 100e-9, WAVELENGTH, -1e-6, False, torch.complex128).abs().max() <= 1
+
+
+def test_transfer_function_is_cached_and_input_is_unchanged():
+    start = torch.ones(8, 8, dtype=torch.float64)
+    angular_spectrum(start, 10e-6, WAVELENGTH, 0.123)
+    hits = transfer_function.cache_info().hits
+    angular_spectrum(start, 10e-6, WAVELENGTH, 0.123)
+    assert transfer_function.cache_info().hits == hits + 1
+    assert torch.equal(start, torch.ones(8, 8, dtype=torch.float64))
+
+
+def test_gradient():
+    start = torch.randn(
+        5, 7, generator=torch.Generator().manual_seed(0), dtype=torch.complex128, requires_grad=True
+    )
+    assert torch.autograd.gradcheck(lambda u: angular_spectrum(u, 10e-6, WAVELENGTH, 0.05), start)
+
+
+def test_figures():
+    assert fresnel_number(0.04, WAVELENGTH, 0.5) == pytest.approx(6400)
+    assert sampling_limit_m(512, 10e-6, WAVELENGTH) == pytest.approx(0.2048)
+    assert blur_radius_px(10e-6, WAVELENGTH, 0.5) == pytest.approx(50.0)
+
+
+@pytest.mark.parametrize(
+    ("error", "changed"),
+    [
+        (ConfigError, {"pitch_m": 0.0}),
+        (ConfigError, {"wavelength_m": -1.0}),
+        (ConfigError, {"distance_m": math.nan}),
+        (ConfigError, {"pad": 0.5}),
+        (DataError, {"field": torch.zeros(4)}),
+        (DataError, {"field": torch.zeros(4, 4, dtype=torch.int32)}),
+    ],
+)
+def test_bad_input(error, changed):
+    good = {"field": torch.zeros(4, 4), "pitch_m": 1e-5, "wavelength_m": WAVELENGTH, "distance_m": 0.1}
+    with pytest.raises(error, match=next(iter(changed))):
+        angular_spectrum(**(good | changed))

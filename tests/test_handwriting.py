@@ -1,0 +1,133 @@
+"""NIST-like handwriting: consistent hands, the same on every run, different from writer to writer."""
+
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+from evnlos.errors import DataError
+from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, hand, held_out_writers, nist_like, render_glyph
+from evnlos.scene.distance import signed_distance
+
+STEMS = "BDEFHIKLPRT"  # letters whose upright strokes show the slant
+
+
+def slant(mask):
+    """Tangent of the slant: the shear that makes the columns of ink sharpest."""
+    y, x = np.nonzero(mask > 0.5)
+    shears = np.linspace(-0.8, 0.8, 161)
+    middle = (len(mask) - 1) / 2
+    columns = [np.histogram(x + s * (y - middle), bins=np.arange(-60, 2 * len(mask)))[0] for s in shears]
+    return shears[np.argmax([np.square(c.astype(float)).sum() for c in columns])]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_signed_distance_matches_scipy(seed):
+    rng = np.random.default_rng(seed)
+    mask = rng.random((37, 52)) > rng.choice([0.02, 0.5, 0.98])
+    reach = int(rng.integers(1, 25))
+    expected = np.where(
+        mask,
+        0.5 - np.minimum(distance_transform_edt(mask) if not mask.all() else 1e9, reach),
+        np.minimum(distance_transform_edt(~mask) if mask.any() else 1e9, reach) - 0.5,
+    )
+    np.testing.assert_allclose(signed_distance(mask.astype(np.float32), reach), expected, atol=1e-5)
+
+
+def test_signed_distance_of_nothing_and_everything():
+    assert signed_distance(np.zeros((5, 5)), 3).min() == 2.5
+    assert signed_distance(np.ones((5, 5)), 3).max() == -2.5
+
+
+def test_a_glyph_depends_on_seed_writer_and_character_only():
+    first = nist_like(3, "R", 7, 64)
+    nist_like(4, "Q", 1, 64)
+    hand(5, 7)
+    np.testing.assert_array_equal(first, nist_like(3, "R", 7, 64))
+    for other in (nist_like(4, "R", 7, 64), nist_like(3, "R", 8, 64), nist_like(3, "P", 7, 64)):
+        assert np.abs(first - other).mean() > 0.01
+
+
+def test_another_process_draws_the_same_bytes():
+    program = (
+        "import hashlib; from evnlos.scene import nist_like; "
+        "print(hashlib.sha256(nist_like(2, 'K', 5, 64).tobytes()).hexdigest())"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == hashlib.sha256(nist_like(2, "K", 5, 64).tobytes()).hexdigest()
+
+
+def test_every_training_letter_fits_the_plate_and_has_ink():
+    for writer in range(0, TRAIN_WRITERS, 3):
+        for char in "AMQWI8":
+            mask = nist_like(writer, char, 0, 64)
+            assert mask.shape == (64, 64)
+            assert mask.dtype == np.float32
+            assert 0 <= mask.min() <= mask.max() <= 1
+            rows, columns = np.flatnonzero((mask > 0.5).any(1)), np.flatnonzero((mask > 0.5).any(0))
+            longer = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
+            assert 0.72 * 64 <= longer <= 64
+            assert rows[0] + rows[-1] == pytest.approx(63, abs=2)
+            assert columns[0] + columns[-1] == pytest.approx(63, abs=2)
+            assert 0.02 < mask.mean() < 0.6
+
+
+def test_a_hand_keeps_its_slant_from_letter_to_letter():
+    writers = range(14)
+    measured = np.array(
+        [[slant(nist_like(w, char, 0, 128)) for char in STEMS] for w in writers]
+    )  # [W, letters]
+    between = measured.mean(axis=1).var()
+    within = measured.var(axis=1).mean() / len(STEMS)
+    assert between > 10 * within
+    # The hand's own slant adds to that of its base face, which its widening stretches.
+    hands = [hand(w, 0) for w in writers]
+    face = np.array([h.aspect * np.mean([slant(render_glyph(c, h.font, 128)) for c in STEMS]) for h in hands])
+    asked = np.tan(np.radians([h.slant_deg for h in hands]))
+    assert np.corrcoef(asked + face, measured.mean(axis=1))[0, 1] > 0.9
+
+
+def test_a_hand_keeps_its_pen_from_letter_to_letter():
+    def pen(mask):
+        distance = distance_transform_edt(mask > 0.5)
+        return 4 * distance[distance > 0].mean() / 128
+
+    writers = range(14)
+    measured = np.array([[pen(nist_like(w, char, 0, 128)) for char in "AEHKLOTX"] for w in writers])
+    assert measured.std(axis=1).mean() < 0.5 * measured.mean(axis=1).std()
+    asked = np.array([hand(w, 0).pen for w in writers])
+    assert np.corrcoef(asked, measured.mean(axis=1))[0, 1] > 0.85
+    assert measured.mean(axis=1).max() > 1.8 * measured.mean(axis=1).min()
+
+
+def test_a_few_writers_already_span_the_range_and_share_no_hand():
+    hands = [hand(w, 0) for w in range(TRAIN_WRITERS + 5)]
+    pens, slants = np.array([h.pen for h in hands]), np.array([h.slant_deg for h in hands])
+    assert np.ptp(pens[:8]) > 0.07
+    assert np.ptp(slants[:8]) > 18
+    assert len({h.font for h in hands[:7]}) == 7
+    distance = np.hypot(pens[:, None] - pens, (slants[:, None] - slants) / 300)
+    np.fill_diagonal(distance, 1)
+    assert distance.min() > 1e-4
+    # Faces do not follow from slant: every face meets upright and slanted writers.
+    for face in {h.font for h in hands}:
+        assert np.ptp([h.slant_deg for h in hands if h.font == face]) > 8
+
+
+def test_held_out_writers_share_no_object_with_the_training_set():
+    train = HandwritingGlyphs()
+    test = HandwritingGlyphs(writers=2, first_writer=held_out_writers().start)
+    assert len(train.objects()) == 39 * 26 == 1014
+    assert not set(train.objects()) & set(test.objects())
+    assert held_out_writers(3)[0] == TRAIN_WRITERS
+    target = test.target("writer39_B", seed=4)
+    np.testing.assert_array_equal(target.mask, nist_like(39, "B", 4))
+
+
+def test_bad_arguments_are_refused():
+    for arguments in ((-1, "A", 0), (0, "A", 0, 4), (0, "A", 0, 64, 0.0), (0, "AB", 0)):
+        with pytest.raises(DataError):
+            nist_like(*arguments)
