@@ -76,28 +76,28 @@ def test_square_aperture_beyond_the_sampling_limit():
 @pytest.mark.parametrize("distance", [2e-3, 4e-3])
 def test_direct_sum(distance):
     pitch = 4e-6
-    x = axis(40, pitch)
-    start = torch.exp(-(x[:, None] ** 2 + (x - 1e-5) ** 2) / 2.5e-5**2) * torch.exp(1j * 2e4 * x)
+    x = axis(56, pitch)
+    start = torch.exp(-(x[:, None] ** 2 + (x - 1e-5) ** 2) / 2e-5**2) * torch.exp(1j * 2e4 * x)
     slow = rayleigh_sommerfeld_sum(start, pitch, WAVELENGTH, distance)
     fast = angular_spectrum(start, pitch, WAVELENGTH, distance, pad=3)
-    assert relative(fast, slow) < 1e-6
+    assert relative(fast, slow) < 1e-10
     carried = rayleigh_sommerfeld_sum(start, pitch, WAVELENGTH, distance, carrier=True)
-    assert relative(angular_spectrum(start, pitch, WAVELENGTH, distance, pad=3, carrier=True), carried) < 1e-6
+    assert relative(angular_spectrum(start, pitch, WAVELENGTH, distance, pad=3, carrier=True), carried) < 1e-7
 
 
-def test_order_of_convergence():
-    """A narrow square opening sampled ever finer: the staircase of its edge converges with the first order."""
+@pytest.mark.parametrize(("inset", "order"), [(0.0, 2.0), (0.25, 1.0)])
+def test_order_of_convergence(inset, order):
+    """Ever finer grids: second order when the opening's edge lies between samples, first order when it cuts a cell."""
     errors = []
-    # The edge falls a quarter of a sample inside a cell on every grid, so the error has one sign and one order.
     for samples in (96, 192, 384):
         pitch = 2.4e-3 / samples
-        side = 2 * (samples // 4 + 0.25) * pitch
+        side = 2 * (samples // 4 + inset) * pitch
         inside = axis(samples, pitch).abs() < side / 2
         opening = (inside[:, None] & inside).double()
-        moved = angular_spectrum(opening, pitch, WAVELENGTH, 0.5)
-        errors.append(relative(moved, square_aperture(samples, pitch, side, 0.5)))
+        moved = angular_spectrum(opening, pitch, WAVELENGTH, 0.1, pad=4)
+        errors.append(relative(moved, square_aperture(samples, pitch, side, 0.1)))
     orders = [math.log2(a / b) for a, b in pairwise(errors)]
-    assert all(0.8 < order < 1.3 for order in orders), (errors, orders)
+    assert all(abs(found - order) < 0.25 for found in orders), (errors, orders)
 
 
 def test_spectral_convergence_of_a_smooth_field():
@@ -108,8 +108,8 @@ def test_spectral_convergence_of_a_smooth_field():
         )
         for n in (24, 48)
     )
-    assert coarse > 1e-3
-    assert fine < 1e-6
+    assert coarse > 5e-4
+    assert fine < 1e-7
 
 
 @settings(max_examples=10, deadline=None)

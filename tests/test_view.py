@@ -55,7 +55,9 @@ def test_pin_hole_geometry():
 def test_aim_moves_everything():
     moved = View.perspective((60, 96), 0.6, math.radians(30), math.radians(30), aim_m=(0.05, -0.02))
     shift = moved.wall_points_m() - OBLIQUE.wall_points_m()
-    torch.testing.assert_close(shift, torch.tensor([0.05, -0.02], dtype=torch.float64).expand_as(shift), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        shift, torch.tensor([0.05, -0.02], dtype=torch.float64).expand_as(shift), rtol=0, atol=1e-12
+    )
 
 
 def test_magnification_bounds_image_motion():

@@ -29,7 +29,7 @@ def to_dict(config: Any) -> dict[str, Any]:
         >>> to_dict(Plane(64, 96, 0.0025))
         {'height': 64, 'width': 96, 'pitch_m': 0.0025, 'center_m': [0.0, 0.0]}
     """
-    return json.loads(json.dumps(dataclasses.asdict(config)))
+    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
 def from_dict(cls: type[T], values: dict[str, Any], *, source: str = "the configuration") -> T:

@@ -13,7 +13,7 @@ from evnlos.dataset.pool import run_tasks
 from evnlos.dataset.sampling import Samples, Sampling, make_samples
 from evnlos.dataset.shard import write_shard
 from evnlos.dataset.store import Dataset, create_dataset
-from evnlos.dataset.variation import varied
+from evnlos.dataset.variation import check_ranges, varied
 from evnlos.errors import ConfigError
 from evnlos.scene import EmnistGlyphs, FontGlyphs, HandwritingGlyphs, LineMotion, NistGlyphs, Scene
 from evnlos.seeds import derive_seed
@@ -77,9 +77,7 @@ class Simulation:
             raise ConfigError(f"Simulation.positions is {self.positions}; give at least 1")
         if not 0 <= self.validation < 1:
             raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
-        varied(
-            self, self.vary, self.seed, ""
-        )  # a wrong name or range is an error now, not in the hundredth shard
+        check_ranges(self, self.vary)
 
 
 def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from evnlos.config import differing_keys, from_dict, read_yaml, save_yaml
+from evnlos.config import differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.dataset.sampling import Sampling
 from evnlos.dataset.shard import SUFFIX
 from evnlos.errors import DataError
@@ -113,8 +113,6 @@ def open_dataset(folder: str | Path) -> Dataset:
 
 
 def _content(dataset: Dataset) -> dict[str, Any]:
-    from evnlos.config import to_dict
-
     values = to_dict(dataset)
     del values["folder"]
     return values

@@ -27,14 +27,35 @@ def varied(config: T, ranges: Ranges, seed: int, name: str) -> T:
         name: The object's name; the same seed and name draw the same settings.
 
     Raises:
-        ConfigError: A name is unknown (the nearest is named), is not a number, or a range is not ascending.
+        ConfigError: A name is unknown (the nearest is named) or is not a number.
+    """
+    for path, (low, high) in ranges.items():
+        draw = np.random.default_rng(derive_seed(seed, name, "vary", path)).uniform(low, high)
+        config = _replaced(config, path.split("."), float(draw), path)
+    return config
+
+
+def check_ranges(config: object, ranges: Ranges) -> None:
+    """Try both ends of every range, so that a wrong name or value is an error at once.
+
+    Raises:
+        ConfigError: As for `varied`, or a value that the setting itself refuses.
     """
     for path, (low, high) in ranges.items():
         if not (math.isfinite(low) and math.isfinite(high) and low <= high):
             raise ConfigError(f"vary.{path} is ({low}, {high}); give two ascending finite numbers")
-        draw = np.random.default_rng(derive_seed(seed, name, "vary", path)).uniform(low, high)
-        config = _replaced(config, path.split("."), float(draw), path)
-    return config
+        first, *rest = path.split(".")
+        names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
+        if first not in names:
+            raise _unknown(path, first, names)
+        for value in (low, high):
+            _replaced(getattr(config, first), rest, value, path)
+
+
+def _unknown(path: str, key: str, names: list[str]) -> ConfigError:
+    near = difflib.get_close_matches(key, names, n=1)
+    cure = f"perhaps you meant {near[0]!r}" if near else f"known here: {', '.join(names) or 'nothing'}"
+    return ConfigError(f"vary.{path}: unknown setting {key!r}; {cure}")
 
 
 def _replaced(node: Any, keys: list[str], value: float, path: str) -> Any:
@@ -48,7 +69,5 @@ def _replaced(node: Any, keys: list[str], value: float, path: str) -> Any:
         return (*node[:i], _replaced(node[i], rest, value, path), *node[i + 1 :])
     names = [field.name for field in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
     if key not in names:
-        near = difflib.get_close_matches(key, names, n=1)
-        cure = f"perhaps you meant {near[0]!r}" if near else f"known here: {', '.join(names) or 'nothing'}"
-        raise ConfigError(f"vary.{path}: unknown setting {key!r}; {cure}")
+        raise _unknown(path, key, names)
     return dataclasses.replace(node, **{key: _replaced(getattr(node, key), rest, value, path)})

@@ -86,5 +86,4 @@ class ExactArray:
 
         tiles = list(map_tiles(work, frames.shape[1], self._tile_px, self._threads))
         self._time = float(times_s[-1])
-        time_us, where, on = (np.concatenate(column) for column in zip(*tiles, strict=True))
-        return sort_times(time_us, where, on)
+        return sort_times(*(np.concatenate([tile[n] for tile in tiles]) for n in range(3)))

@@ -103,7 +103,8 @@ class EventCamera:
         """
         if not (math.isfinite(t0) and math.isfinite(t1) and t1 > t0):
             raise ConfigError(f"record from {t0} s to {t1} s; give finite times, the last after the first")
-        stream = EventStream(self.pixel, tuple(wall.shape), mode=self.mode, seed=seed, threads=threads)
+        height, width = wall.shape
+        stream = EventStream(self.pixel, (height, width), mode=self.mode, seed=seed, threads=threads)
         stream.push(_render(wall, np.array([t0])), [t0])
         for times_s, frames in self._chunks(wall, t0, t1):
             stream.push(frames, times_s)

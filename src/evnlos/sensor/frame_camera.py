@@ -36,8 +36,7 @@ class FrameCamera:
         gain: Amplification after the pixel, 1 = white fills the range.
         bit_depth: Bits a pixel, 8 to 16.
         black_level: Digital number of darkness, DN.
-        pattern_seed: Seed of the fixed pattern, so that all captures are by one camera; None = a new pattern for
-            each capture.
+        pattern_seed: Seed of the fixed pattern: one camera for all captures; None = a new one for each capture.
 
     Raises:
         ConfigError: A value outside its range.

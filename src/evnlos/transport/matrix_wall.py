@@ -16,6 +16,7 @@ from evnlos.transport.wall import ambient_map, check_gain, checked_times
 
 _CHUNK = 64  # positions drawn and carried over at a time
 _GUARD = 3  # keyframes beyond each end
+_PROBES_S = np.linspace(-100.0, 100.0, 2001)  # does the plate ever leave its row?
 
 
 class MatrixWall:
@@ -63,8 +64,9 @@ class MatrixWall:
         self.ambient = ambient_map(ambient, transport.shape).to(transport.matrix.device)
         self._magnification = magnification_px_m
         self._step = step
-        self._height: float | None = None
         self._keys: torch.Tensor | None = None
+        probes = motion.position_m(_PROBES_S)[:, 1]
+        self._height = float(probes[0]) if step > 0 and bool((probes == probes[0]).all()) else None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -90,8 +92,8 @@ class MatrixWall:
         """
         times = checked_times(t_s)
         positions = self.motion.position_m(times).reshape(-1, 2)  # [T, 2]
-        level = self._step > 0 and len(positions) > 0 and bool((positions[:, 1] == positions[0, 1]).all())
-        light = self._between_keys(positions) if level else self.light(positions)
+        along_rows = self._height is not None and bool((positions[:, 1] == self._height).all())
+        light = self._between_keys(positions) if along_rows else self.light(positions)
         image = (self.ambient + self.gain * light.clamp(min=0)).to(torch.float32)  # [T, H, W]
         return image[0] if times.ndim == 0 else image
 
@@ -106,9 +108,8 @@ class MatrixWall:
         return image
 
     def _between_keys(self, positions: np.ndarray) -> torch.Tensor:
-        height = float(positions[0, 1])
-        if self._keys is None or self._height != height:
-            self._keys, self._height = self._make_keys(height), height
+        if self._keys is None:
+            self._keys = self._make_keys()
         # Beyond the last keyframes the plate has left the strip, and the wall stays dark.
         at = np.clip((positions[:, 0] - self._first_m) / self._step, 1, len(self._keys) - 3)
         whole = np.minimum(np.floor(at), len(self._keys) - 3).astype(np.int64)
@@ -118,12 +119,12 @@ class MatrixWall:
             light += weight[k][:, None, None] * self._keys[torch.as_tensor(whole - 1 + k)]
         return light
 
-    def _make_keys(self, height: float) -> torch.Tensor:
+    def _make_keys(self) -> torch.Tensor:
         """Return the spline's coefficients at keyframes over all places where the plate touches the strip."""
         strip = self.transport.source
         reach = strip.extent_m[1] / 2 + self.target.size_m / 2
         steps = math.ceil(reach / self._step) + _GUARD
         self._first_m = strip.center_m[0] - steps * self._step
         x = self._first_m + np.arange(2 * steps + 1) * self._step
-        frames = self.light(np.stack([x, np.full_like(x, height)], axis=-1))
+        frames = self.light(np.stack([x, np.full_like(x, self._height)], axis=-1))
         return spline_coefficients(frames, axes=(0,))  # dark at both ends, so periodic will do

@@ -44,7 +44,9 @@ def _chain(*steps: Callable[[Plane], Transport]) -> Transport:
 
 EXAMPLES: dict[str, Callable[[], Transport]] = {
     "diffraction": lambda: Diffraction(_SCENE, distance_m=0.005, wave_pitch_m=2e-5),
-    "diffraction of intensity": lambda: Diffraction(_SCENE, distance_m=0.005, wave_pitch_m=2e-5, result="intensity"),
+    "diffraction of intensity": lambda: Diffraction(
+        _SCENE, distance_m=0.005, wave_pitch_m=2e-5, result="intensity"
+    ),
     "diffuse reflection": lambda: _reflection(_SCENE),
     "lopsided kernel": lambda: DiffuseReflection(_SCENE, torch.arange(15.0, dtype=torch.float64).reshape(3, 5)),
     "affine view": lambda: Viewing(_SCENE, _AFFINE),
@@ -54,6 +56,8 @@ EXAMPLES: dict[str, Callable[[], Transport]] = {
     "brushed metal": lambda: _matrix(GGX(0.05, 0.2)),
     "reflection, then view": lambda: _chain(_reflection, lambda plane: Viewing(plane, _AFFINE)),
     "the paper's steps": lambda: _chain(
-        lambda plane: Diffraction(plane, distance_m=0.005, wave_pitch_m=2e-5), _reflection, lambda plane: Viewing(plane, _OBLIQUE)
+        lambda plane: Diffraction(plane, distance_m=0.005, wave_pitch_m=2e-5),
+        _reflection,
+        lambda plane: Viewing(plane, _OBLIQUE),
     ),
 }

@@ -42,8 +42,8 @@ class View:
             raise ConfigError("View.matrix must be 3 x 3 finite numbers")
         if abs(float(torch.linalg.det(matrix / matrix.abs().amax(dim=1, keepdim=True)))) < 1e-14:
             raise ConfigError("View.matrix is singular; the camera sees the wall edge-on")
-        corners = torch.tensor([(u, v, 1.0) for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
-        if float((corners.double() @ matrix[2]).min()) <= 0:
+        corners = [(u, v, 1.0) for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)]
+        if float((torch.tensor(corners, dtype=torch.float64) @ matrix[2]).min()) <= 0:
             raise ConfigError(
                 "part of the image does not see the wall; turn the camera towards it or narrow its view"
             )
@@ -81,7 +81,7 @@ class View:
         lean = torch.tensor([[1.0, shear], [0.0, stretch]], dtype=torch.float64)
         flip = torch.diag(torch.tensor([-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0], dtype=torch.float64))
         to_wall = torch.linalg.inv(pixels_per_m * turn @ lean @ flip)
-        middle = torch.tensor([(shape[1] - 1) / 2 + offset_px[0], (shape[0] - 1) / 2 + offset_px[1]]).double()
+        middle = to_wall.new_tensor([(shape[1] - 1) / 2 + offset_px[0], (shape[0] - 1) / 2 + offset_px[1]])
         (a, b), (d, e) = to_wall.tolist()
         tx, ty = (-to_wall @ middle).tolist()
         return cls((int(shape[0]), int(shape[1])), ((a, b, tx), (d, e, ty), (0.0, 0.0, 1.0)))

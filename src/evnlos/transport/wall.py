@@ -126,8 +126,8 @@ class SlidingWall:
         """Sample the wall image on the camera's pixel grid, over all of its support."""
         height, width = (side * self._plane.pitch_m / 2 for side in self._plane.shape)
         cx, cy = self._plane.center_m
-        corners = torch.tensor([(cx + a * width, cy + b * height) for a in (-1, 1) for b in (-1, 1)])
-        pixels = self.view.pixels(corners.double())
+        corners = [(cx + a * width, cy + b * height) for a in (-1, 1) for b in (-1, 1)]
+        pixels = self.view.pixels(torch.tensor(corners, dtype=torch.float64))
         low = pixels.amin(dim=0).floor().long() - MARGIN
         size = pixels.amax(dim=0).ceil().long() + MARGIN + 1 - low
         if int(size.max()) > _MAX_CANVAS:

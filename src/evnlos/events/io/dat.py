@@ -1,0 +1,89 @@
+"""DAT, Prophesee's decoded events: a text header, two bytes, then 8 bytes an event; only read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from evnlos.events.io.kernel_state import BACKWARDS, BASE, CLOCK, NEWEST, OUT_OF_RANGE, UNKNOWN, note
+from evnlos.events.io.raw_header import parse_raw_header, raw_format_names, raw_geometry, read_raw_header
+from evnlos.events.io.report import ReadReport, unreadable
+from evnlos.events.io.words import WordCodec, WordSource
+
+_EVENT_TYPES = (0, 12)  # a generic 2-D event, a contrast detection
+_EVENT_SIZE = 8
+_MAX_SIDE = 16_384  # 14 bits
+
+
+def sniff_dat(start: bytes) -> bool:
+    """Return whether a text header that names no RAW format is followed by type and size of an event."""
+    if not start.startswith(b"%"):
+        return False
+    header = parse_raw_header(start)
+    tail = start[header.size : header.size + 2]
+    named_raw = raw_format_names(header)
+    return not named_raw and (
+        b"Data file containing" in start[: header.size] or tail[1:] == bytes([_EVENT_SIZE])
+    )
+
+
+def _bound(words: NDArray[np.int64]) -> int:
+    return len(words)
+
+
+@njit(cache=True)
+def decode_dat(words, state, t_us, x, y, p, width, height):  # noqa: D103 - see words.Decode
+    clock, newest, base = state[CLOCK], state[NEWEST], state[BASE]
+    count = 0
+    for index in range(len(words)):
+        word = words[index]
+        stamp = word & 0xFFFFFFFF
+        column, row, sign = (word >> 32) & 0x3FFF, (word >> 46) & 0x3FFF, (word >> 60) & 0xF
+        if sign > 1:
+            note(state, UNKNOWN, index)
+            continue
+        if column >= width or row >= height:
+            note(state, OUT_OF_RANGE, index)
+            continue
+        if clock - stamp > 0x80000000:  # 32 bits of microseconds turn over after 71 minutes
+            base += 0x100000000
+        clock = stamp
+        time = base + stamp
+        if time < newest:
+            note(state, BACKWARDS, index)
+        newest = time
+        t_us[count] = time
+        x[count] = column
+        y[count] = row
+        p[count] = sign == 1
+        count += 1
+    state[CLOCK], state[NEWEST], state[BASE] = clock, newest, base
+    return count
+
+
+_CODEC = WordCodec(np.dtype("<i8"), _bound, decode_dat, kind_shift=60)
+
+
+class DatSource(WordSource):
+    """An open DAT file of version 2."""
+
+    def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
+        report.format = "DAT"
+        with path.open("rb") as file:
+            header = read_raw_header(file, report)
+            event = file.read(2)
+        if len(event) < 2:
+            raise unreadable(path, header.size, "a DAT file that ends after its header", "copy it again")
+        version = header.integer("version", report)
+        if version not in (None, 2):
+            raise unreadable(
+                path, 0, f"DAT of version {version}", "version 2 is read: convert it to RAW or HDF5"
+            )
+        if event[0] not in _EVENT_TYPES or event[1] != _EVENT_SIZE:
+            found = f"events of type {event[0]} and {event[1]} bytes"
+            raise unreadable(path, header.size, found, "types 0 and 12 of 8 bytes are read")
+        raw_geometry(header, report, width, height, _MAX_SIDE)
+        super().__init__(path, _CODEC, header.size + 2, report)

@@ -1,0 +1,152 @@
+"""EVT2.1: words of 64 bits, each up to 32 neighbouring pixels of one row, time and polarity."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from evnlos.events.io.kernel_state import (
+    BACKWARDS,
+    BASE,
+    CLOCK,
+    CLOCK_BACK,
+    JITTER_US,
+    NEWEST,
+    OUT_OF_RANGE,
+    STARTED,
+    TRIGGERS,
+    UNDATED,
+    UNKNOWN,
+    note,
+)
+
+WRAP_US = 1 << 34
+_HIGH_TURN = 1 << 28
+_KNOWN = (0, 1, 8, 10, 14, 15)
+
+
+def looks_swapped(words: NDArray[np.int64]) -> bool:
+    """Return whether the fields lie in the low half of each word, as some sensors (IMX636) send them."""
+    plain = np.isin((words >> 60) & 15, _KNOWN).sum()
+    swapped = np.isin((words >> 28) & 15, _KNOWN).sum()
+    if plain != swapped or not len(words):
+        return bool(swapped > plain)
+    return bool(((words[0] >> 28) & 15) == 8 and ((words[0] >> 60) & 15) != 8)
+
+
+def bound_evt21(words: NDArray[np.int64]) -> int:
+    """Return how many events `words` can hold at most: the bits set in the masks of both layouts."""
+    return int(np.bitwise_count(words.view(np.uint64)).sum())
+
+
+@njit(cache=True)
+def _decode(words, state, t_us, x, y, p, width, height, swapped):
+    high, newest, base = state[CLOCK], state[NEWEST], state[BASE]
+    started = state[STARTED] != 0
+    count = 0
+    for index in range(len(words)):
+        word = words[index]
+        if swapped:
+            fields, mask = word & 0xFFFFFFFF, (word >> 32) & 0xFFFFFFFF
+        else:
+            fields, mask = (word >> 32) & 0xFFFFFFFF, word & 0xFFFFFFFF
+        kind = fields >> 28
+        if kind <= 1:
+            if not started:
+                note(state, UNDATED, index)
+                continue
+            row, column = fields & 0x7FF, (fields >> 11) & 0x7FF
+            time = base + ((fields >> 22) & 0x3F)
+            if time < newest:
+                if time < newest - JITTER_US:
+                    note(state, BACKWARDS, index)
+                else:
+                    time = newest
+            newest = time
+            while mask:
+                if mask & 1:
+                    if column >= width or row >= height:
+                        note(state, OUT_OF_RANGE, index)
+                    else:
+                        t_us[count] = time
+                        x[count] = column
+                        y[count] = row
+                        p[count] = kind == 1
+                        count += 1
+                mask >>= 1
+                column += 1
+        elif kind == 8:
+            new = fields & 0xFFFFFFF
+            if started and new < high:
+                if high - new > _HIGH_TURN // 2:
+                    base += WRAP_US
+                else:
+                    note(state, CLOCK_BACK, index)
+                    newest = base + ((new - high) << 6)
+            base += (new - high) << 6
+            high = new
+            started = True
+        elif kind == 10:
+            state[TRIGGERS] += 1
+        elif kind != 14 and kind != 15:
+            note(state, UNKNOWN, index)
+    state[CLOCK], state[NEWEST], state[BASE], state[STARTED] = high, newest, base, started
+    return count
+
+
+def decode_evt21(words, state, t_us, x, y, p, width, height):
+    """Decode words whose fields lie in the high half."""
+    return _decode(words, state, t_us, x, y, p, width, height, False)
+
+
+def decode_evt21_swapped(words, state, t_us, x, y, p, width, height):
+    """Decode words whose fields lie in the low half."""
+    return _decode(words, state, t_us, x, y, p, width, height, True)
+
+
+@njit(cache=True)
+def encode_evt21(t_us, x, y, p, words):
+    """Write words for times that start below one turn of the clock; return how many."""
+    high = np.int64(-1)
+    count = 0
+    index = 0
+    while index < len(t_us):
+        new = t_us[index] >> 6
+        if new != high:
+            while high >= 0 and (new >> 28) > (high >> 28):
+                words[count] = (np.int64(0x8FFFFFFF) - (np.int64(1) << 32)) << 32
+                words[count + 1] = (np.int64(0x80000000) - (np.int64(1) << 32)) << 32
+                count += 2
+                high = ((high >> 28) + 1) << 28
+            high = new
+            words[count] = ((np.int64(0x80000000) | (new & 0xFFFFFFF)) - (np.int64(1) << 32)) << 32
+            count += 1
+        # A word starts at a multiple of 32, as the sensors send it.
+        start = np.int64(x[index]) & ~np.int64(31)
+        fields = (np.int64(p[index]) << 28) | ((t_us[index] & 0x3F) << 22) | (start << 11) | np.int64(y[index])
+        mask = np.int64(0)
+        last = np.int64(-1)
+        first = index
+        while (
+            index < len(t_us)
+            and t_us[index] == t_us[first]
+            and y[index] == y[first]
+            and p[index] == p[first]
+            and last < np.int64(x[index]) < start + 32
+        ):
+            last = np.int64(x[index])
+            mask |= np.int64(1) << (last - start)
+            index += 1
+        words[count] = (fields << 32) | mask
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def encoded_size_evt21(t_us) -> int:
+    """Return an upper bound of the number of words that `encode_evt21` writes."""
+    count = 2 * len(t_us) + 2
+    for index in range(1, len(t_us)):
+        count += 2 * ((t_us[index] >> 34) - (t_us[index - 1] >> 34))
+    return count

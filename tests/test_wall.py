@@ -1,0 +1,265 @@
+"""Walls in continuous time: the fast paths against slow, obvious ones."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import LineMotion, PathMotion, Scene, Target
+from evnlos.transport import (
+    DiffuseReflection,
+    MatrixTransport,
+    MatrixWall,
+    PaperTransport,
+    RadiometricTransport,
+    SlidingWall,
+    View,
+    Wall,
+    tpsf_kernel,
+)
+from evnlos.transport.spline import spline_coefficients, spline_sample, spline_weights
+from evnlos.transport.wall import ambient_plane
+from evnlos.types import Plane
+
+SHAPE = (40, 64)
+PLANE = Plane(80, 90, 0.001, (0.002, -0.003))
+DIAGONAL = LineMotion((-0.03, 0.01), 0.02, (1.0, -0.3))
+
+
+def spot(plane: Plane, x0: float, y0: float, sigma: float = 0.006) -> torch.Tensor:
+    x, y = torch.as_tensor(plane.x_m), torch.as_tensor(plane.y_m)[:, None]
+    return torch.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * sigma**2))
+
+
+def letter(seed: int = 0, side: int = 32) -> Target:
+    """Blocky random strokes."""
+    mask = np.random.default_rng(seed).integers(0, 2, (8, 8)).astype(np.float32)
+    return Target("noise", np.kron(mask, np.ones((side // 8, side // 8), np.float32)), 0.08)
+
+
+def pixel_mean_of_spot(view: View, position: np.ndarray, sigma: float) -> torch.Tensor:
+    """Mean of a Gaussian spot over each pixel by fine sampling: the truth of a sliding wall."""
+    total = torch.zeros(view.shape, dtype=torch.float64)
+    offsets = (np.arange(8) + 0.5) / 8 - 0.5
+    for dv in offsets:
+        for du in offsets:
+            points = view.wall_points_m(du, dv)
+            d2 = (points[..., 0] - position[0]) ** 2 + (points[..., 1] - position[1]) ** 2
+            total += torch.exp(-d2 / (2 * sigma**2))
+    return total / 64
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        View.affine(SHAPE, 400.0),
+        View.affine(SHAPE, 400.0, 0.05, offset_px=(3.3, -2.2)),
+        View.perspective(SHAPE, 0.4, math.radians(20), math.radians(20)),
+    ],
+    ids=["axis-aligned", "turned", "oblique"],
+)
+@pytest.mark.parametrize("motion", [LineMotion((-0.03, 0.004), 0.02), DIAGONAL], ids=["along x", "diagonal"])
+def test_sliding_wall_follows_a_spot(view, motion):
+    sigma = 0.006
+    wall = SlidingWall(spot(PLANE, 0.0, 0.0, sigma).float(), PLANE, view, motion, gain=0.7, ambient=0.1)
+    times = np.array([0.0, 0.731, 1.5])
+    for image, time in zip(wall.irradiance(times), times, strict=True):
+        truth = 0.1 + 0.7 * pixel_mean_of_spot(view, motion.position_m(time), sigma)
+        assert float((image - truth).abs().max()) < 2e-3 * 0.7
+
+
+def test_shift_by_whole_pixels_is_exact():
+    view = View.affine(SHAPE, 500.0)
+    wall = SlidingWall(spot(PLANE, 0.0, 0.0).float(), PLANE, view, LineMotion((0.0, 0.0), 0.02))
+    first, later = wall.irradiance([0.0, 0.5])  # 0.5 s at 0.02 m/s and 500 px/m: 5 px
+    torch.testing.assert_close(later[:, 10:], first[:, 5:-5], rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("view", [View.affine(SHAPE, 400.0, 0.1), View.perspective(SHAPE, 0.4, 0.3, 0.35)])
+def test_signal_is_smooth_in_time(view):
+    """The second derivative in time has no jumps: its steps shrink with the time step."""
+    wall = SlidingWall(spot(PLANE, 0, 0, 0.004).double(), PLANE, view, DIAGONAL)
+    jumps = []
+    for step in (8e-3, 4e-3):
+        light = wall.irradiance(0.9 + step * np.arange(60)).double()[:, 18:22, 20:40]
+        second = light.diff(n=2, dim=0) / step**2
+        jumps.append(float(second.diff(dim=0).abs().max() / second.abs().max()))
+    assert jumps[1] < 0.75 * jumps[0]
+    assert jumps[0] < 0.3
+
+
+def test_scalar_and_array_times_agree():
+    wall = SlidingWall(spot(PLANE, 0, 0).float(), PLANE, View.affine(SHAPE, 400.0), DIAGONAL, ambient=0.05)
+    assert isinstance(wall, Wall)
+    assert wall.irradiance(1.0).shape == SHAPE
+    assert wall.irradiance([]).shape == (0, *SHAPE)
+    one, many = wall.irradiance(1.0), wall.irradiance([0.2, 1.0])
+    assert one.dtype == many.dtype == torch.float32
+    assert torch.equal(one, many[1])
+    with pytest.raises(DataError, match="1-D"):
+        wall.irradiance([[0.0]])
+
+
+def test_far_away_only_ambient_light_is_left():
+    wall = SlidingWall(spot(PLANE, 0, 0).float(), PLANE, View.affine(SHAPE, 400.0), LineMotion(), ambient=0.05)
+    assert torch.equal(wall.irradiance(1e4), torch.full(SHAPE, 0.05))
+    assert torch.equal(wall.irradiance(-1e4), torch.full(SHAPE, 0.05))
+
+
+def test_light_never_falls_below_the_ambient():
+    """Interpolation of a sharp edge would ring below zero."""
+    hard = (spot(PLANE, 0, 0) > 0.5).float()
+    wall = SlidingWall(hard, PLANE, View.affine(SHAPE, 900.0), LineMotion((0.0, 0.0)), ambient=0.05)
+    assert float(wall.irradiance([0.0, 0.123]).min()) >= 0.05
+
+
+def test_speed_bounds_the_image_motion():
+    for view in (View.affine(SHAPE, 400.0, 0.3), View.perspective(SHAPE, 0.4, 0.5, 0.3)):
+        wall = SlidingWall(
+            spot(PLANE, 0, 0).float(), PLANE, view, PathMotion((0.0, 1.0), ((0.0, 0.0), (0.01, 0.02)))
+        )
+        track = view.pixels(torch.as_tensor(wall.motion.position_m(np.linspace(0, 1, 500))))
+        assert float(track.diff(dim=0).norm(dim=-1).max()) * 499 <= wall.speed_px_s * 1.001
+
+
+def test_paper_wall_equals_the_plain_chain_of_steps():
+    """Every frame rendered on its own, the slow way: draw, diffract, convolve, sample."""
+    config = PaperTransport(
+        pitch_m=0.001, tpsf_length_m=0.008, gain=0.9, ambient=0.02, ambient_gradient=(0.2, -0.1)
+    )
+    scene = Scene(letter(), LineMotion((-0.02, 0.005), 0.02))
+    wall = config.wall(scene, (60, 96))
+    view = config.view((60, 96))
+    transport = config.transport(0.08)
+    source = transport.source
+    for time in (0.0, 1.234):
+        x, y = scene.motion.position_m(time)
+        wide = Plane(source.height + 60, source.width + 80, source.pitch_m)
+        drawn = torch.from_numpy(scene.target.rasterise(wide, (x, y))).double()
+        step_a = config._diffraction(wide)(drawn)
+        step_b = DiffuseReflection(wide, tpsf_kernel(0.001, 0.008))
+        pixel = torch.zeros(60, 96, dtype=torch.float64)
+        for dv in (-0.375, -0.125, 0.125, 0.375):
+            for du in (-0.375, -0.125, 0.125, 0.375):
+                points = view.wall_points_m(du, dv)
+                rows = (points[..., 1]) / 0.001 + (step_b.shape[0] - 1) / 2
+                columns = (points[..., 0]) / 0.001 + (step_b.shape[1] - 1) / 2
+                pixel += spline_sample(spline_coefficients(step_b(step_a)), rows, columns) / 16
+        truth = ambient_plane(0.02, (0.2, -0.1), (60, 96)) + 0.9 * pixel
+        error = (wall.irradiance(time) - truth).abs().max() / (truth.max() - truth.min())
+        assert float(error) < 4e-3
+
+
+def test_paper_defaults():
+    config = PaperTransport()
+    figures = config.figures(0.08, (100, 160))
+    assert figures["fresnel_number"] == pytest.approx(6400)
+    wall = config.wall(Scene(letter()), (50, 80))
+    light = wall.irradiance(np.linspace(0, 8, 5))
+    assert light.shape == (5, 50, 80)
+    assert float(light.min()) >= 0.05
+    assert float(light.max()) < 1.05
+    # The centre of light moves to the right at the speed of the plate.
+    x = torch.arange(80.0)
+    centre = ((light - 0.05) * x).sum((1, 2)) / (light - 0.05).sum((1, 2))
+    speed = float(centre[3] - centre[1]) / 4
+    assert speed == pytest.approx(wall.speed_px_s, rel=0.01)
+
+
+def test_offset_is_the_middle_of_the_image():
+    for angle in (0.0, 25.0):
+        view = PaperTransport(offset_m=(0.03, -0.01), rotation_deg=20.0, camera_angle_deg=angle).view((41, 61))
+        assert view.wall_points_m()[20, 30].tolist() == pytest.approx([0.03, -0.01], abs=1e-12)
+
+
+def strip_wall(motion, **options) -> MatrixWall:
+    """A smooth shift-variant transport on a strip: a Gaussian that widens to the right."""
+    strip, pixels = Plane(16, 48, 0.005), Plane(9, 30, 0.008)
+    x, y = torch.as_tensor(pixels.x_m), torch.as_tensor(pixels.y_m)
+    columns = []
+    for row in strip.y_m:
+        for column in strip.x_m:
+            width = 0.02 + 0.05 * (column + 0.12)
+            columns.append(torch.exp(-((x - column) ** 2 + (y[:, None] - row) ** 2) / (2 * width**2)).flatten())
+    transport = MatrixTransport(torch.stack(columns, dim=1), strip, pixels.shape)
+    return MatrixWall(transport, letter(), motion, magnification_px_m=125.0, **options)
+
+
+def test_keyframes_agree_with_the_direct_product():
+    times = np.random.default_rng(0).uniform(0, 8, 30)
+    keyed, direct = strip_wall(LineMotion()), strip_wall(LineMotion(), keyframe_step_m=0.0)
+    error = (keyed.irradiance(times) - direct.irradiance(times)).abs().max() / direct.irradiance(times).max()
+    assert float(error) < 1e-3
+    assert float(error) > 0  # two different ways
+
+
+def test_matrix_wall_equals_the_matrix_times_the_drawing():
+    wall = strip_wall(DIAGONAL, gain=0.5, ambient=0.03)
+    drawn = wall.target.rasterise(wall.transport.source, DIAGONAL.position_m(0.77))
+    expected = 0.03 + 0.5 * wall.transport(torch.as_tensor(drawn).double())
+    torch.testing.assert_close(wall.irradiance(0.77), expected.float())
+    assert isinstance(wall, Wall)
+    assert wall.speed_px_s == pytest.approx(2.5)
+
+
+def test_matrix_wall_is_dark_when_the_plate_has_left():
+    wall = strip_wall(LineMotion(), ambient=0.03)
+    gone = wall.irradiance([-100.0, 100.0])
+    assert float((gone - 0.03).abs().max()) < 1e-4
+
+
+def test_matrix_wall_scalar_and_array_times_agree():
+    wall = strip_wall(LineMotion())
+    torch.testing.assert_close(wall.irradiance(1.0), wall.irradiance([0.2, 1.0])[1])
+    assert wall.irradiance([]).shape == (0, 9, 30)
+
+
+def test_radiometric_wall():
+    config = RadiometricTransport(roughness=0.3, cell_m=0.01, gain=0.6, ambient=0.1)
+    lit = Scene(Target("plate", np.ones((8, 8)), 0.08))
+    wall = config.wall(lit, (20, 32))
+    assert wall.transport is config.wall(lit, (20, 32)).transport  # one matrix for all targets
+    middle = wall.irradiance(4.0)
+    assert float(middle.max()) == pytest.approx(0.7, abs=1e-3)
+    x = torch.arange(32.0)
+    light = wall.irradiance([1.0, 7.0]) - 0.1
+    centre = (light * x).sum((1, 2)) / light.sum((1, 2))
+    assert float(centre[1] - centre[0]) > 3
+    with pytest.raises(ConfigError, match="strip_m"):
+        config.wall(Scene(lit.target, LineMotion((0.0, 0.0))), (20, 32))
+
+
+def test_spline_interpolates_and_its_weights_add_up():
+    samples = torch.randn(2, 9, 14, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    coefficients = spline_coefficients(samples)
+    row, column = torch.meshgrid(torch.arange(2.0, 7), torch.arange(2.0, 12), indexing="ij")
+    torch.testing.assert_close(
+        spline_sample(coefficients[1], row.double(), column.double()), samples[1, 2:7, 2:12]
+    )
+    fraction = torch.linspace(0, 1, 7, dtype=torch.float64)
+    torch.testing.assert_close(spline_weights(fraction).sum(0), torch.ones(7, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "options"),
+    [
+        (ConfigError, "gain", {"gain": -1.0}),
+        (ConfigError, "ambient light", {"ambient": -0.1}),
+        (ConfigError, "ambient light", {"ambient": float("nan")}),
+        (DataError, "ambient light", {"ambient": np.zeros((3, 3))}),
+    ],
+)
+def test_bad_input(error, match, options):
+    with pytest.raises(error, match=match):
+        SlidingWall(spot(PLANE, 0, 0), PLANE, View.affine(SHAPE, 400.0), LineMotion(), **options)
+    with pytest.raises(error, match=match):
+        strip_wall(LineMotion(), **options)
+
+
+def test_images_of_the_wrong_size_are_refused():
+    with pytest.raises(DataError, match="samples"):
+        SlidingWall(torch.zeros(3, 3), PLANE, View.affine(SHAPE, 400.0), LineMotion())
+    with pytest.raises(ConfigError, match="8192"):
+        SlidingWall(torch.zeros(PLANE.shape), PLANE, View.affine(SHAPE, 1e6), LineMotion())
