@@ -15,3 +15,49 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no shared data at {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    """Settings of a simulation that takes a second: 16 objects, 8 positions each, a small sensor."""
+    from evnlos.dataset import Sampling, SensorSize, Simulation
+    from evnlos.scene import HandwritingGlyphs
+    from evnlos.transport import PaperTransport
+
+    return Simulation(
+        glyphs=HandwritingGlyphs(characters="ABCEFHLT", writers=2),
+        transport=PaperTransport(tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, field_of_view_m=0.3),
+        sensor=SensorSize(48, 72),
+        sampling=Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24),
+        positions=8,
+        validation=0.2,
+        vary={"transport.gain": (1.5, 2.0)},
+    )
+
+
+@pytest.fixture(scope="session")
+def tiny_dataset(tiny, tmp_path_factory):
+    """A simulated dataset on disk that tests only read."""
+    from evnlos.dataset import open_dataset, simulate
+
+    folder = tmp_path_factory.mktemp("tiny") / "simulation"
+    for _ in simulate(tiny, folder):
+        pass
+    return open_dataset(folder)
+
+
+@pytest.fixture(scope="session")
+def tiny_captures(tmp_path_factory) -> list[Path]:
+    """Four rendered captures of a small sensor, without any installed font."""
+    from evnlos.dataset import SensorSize
+    from evnlos.dataset.lab import Lab, render_captures
+    from evnlos.scene import FontGlyphs
+    from evnlos.transport import RadiometricTransport
+
+    lab = Lab(
+        glyphs=FontGlyphs(family="kalam", characters="ALT4"),
+        sensor=SensorSize(48, 72),
+        transport=RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06),
+        frame_rate_hz=1.0,
+    )
+    return list(render_captures(lab, tmp_path_factory.mktemp("lab")))

@@ -87,7 +87,7 @@ def test_direct_sum(distance):
 
 @pytest.mark.parametrize(("inset", "order"), [(0.0, 2.0), (0.25, 1.0)])
 def test_order_of_convergence(inset, order):
-    """Ever finer grids: second order when the opening's edge lies between samples, first order when it cuts a cell."""
+    """Second order when the opening's edge lies between samples, first order when it cuts a cell."""
     errors = []
     for samples in (96, 192, 384):
         pitch = 2.4e-3 / samples
@@ -141,6 +141,26 @@ def test_pruned_transform_equals_the_plain_one():
     transfer = transfer_function((93, 125), 10e-6, WAVELENGTH, 0.1, True, torch.complex128)
     plain = torch.fft.ifft2(torch.fft.fft2(start, s=(93, 125)) * transfer)[..., :37, :50]
     assert relative(angular_spectrum(start, 10e-6, WAVELENGTH, 0.1, pad=2.5), plain) < 1e-14
+
+
+@pytest.mark.parametrize("shape", [(2, 150, 201), (130, 260)])
+def test_blocked_transform_equals_the_plain_one(shape):
+    start = torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.complex128)
+    padded = (2 * shape[-2], 2 * shape[-1])
+    transfer = transfer_function(padded, 10e-6, WAVELENGTH, 0.1, True, torch.complex128)
+    plain = torch.fft.ifft2(torch.fft.fft2(start, s=padded) * transfer)[..., : shape[-2], : shape[-1]]
+    before = start.clone()
+    assert relative(angular_spectrum(start, 10e-6, WAVELENGTH, 0.1), plain) < 1e-14
+    assert torch.equal(start, before)
+
+
+def test_gradient_of_the_blocked_transform():
+    """The adjoint of propagation is propagation backwards."""
+    draw = torch.Generator().manual_seed(0)
+    u, v = (torch.randn(150, 140, generator=draw, dtype=torch.complex128) for _ in range(2))
+    u.requires_grad_()
+    (gradient,) = torch.autograd.grad(angular_spectrum(u, 10e-6, WAVELENGTH, 0.05), u, v)
+    assert relative(gradient, angular_spectrum(v, 10e-6, WAVELENGTH, -0.05)) < 1e-13
 
 
 def test_evanescent_waves_decay_both_ways():

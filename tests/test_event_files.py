@@ -8,11 +8,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from evnlos.errors import DataError, EventFileError, EvnlosError
-from evnlos.events import read_events, read_events_report, write_events
+from evnlos.events import keep_known_polarity, read_events, read_events_report, write_events
 from evnlos.types import Events
 
-WRITABLE = [("HDF5", ".h5"), ("NPZ", ".npz"), ("EVT3", ".raw"), ("EVT2", ".raw")]
-RAW = ["EVT3", "EVT2"]
+WRITABLE = [
+    ("HDF5", ".h5"),
+    ("NPZ", ".npz"),
+    ("EVT3", ".raw"),
+    ("EVT2", ".raw"),
+    ("EVT21", ".raw"),
+    ("CSV", ".csv"),
+]
+RAW = ["EVT3", "EVT2", "EVT21"]
 MANY = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -20,7 +27,9 @@ MANY = settings(max_examples=60, deadline=None, suppress_health_check=[HealthChe
 def streams(draw, max_side: int = 2048) -> Events:
     """Return any small stream: empty, one pixel, largest sensor, equal times, far and long times."""
     width, height = draw(st.sampled_from([(1, 1), (3, 2), (160, 100), (1280, 720), (max_side, max_side)]))
-    steps = st.one_of(st.just(0), st.integers(0, 70), st.integers(0, 5000), st.integers(0, 2**25), st.integers(0, 2**36))
+    steps = st.one_of(
+        st.just(0), st.integers(0, 70), st.integers(0, 5000), st.integers(0, 2**25), st.integers(0, 2**36)
+    )
     gaps = draw(st.lists(steps, max_size=40))
     start = draw(st.one_of(st.just(0), st.integers(-(2**40), 2**50)))
     count = len(gaps)
@@ -74,7 +83,7 @@ def test_dense_vectors_survive_evt3(tmp_path):
 
 @pytest.mark.parametrize("name", RAW)
 def test_clock_wraps_are_unwrapped(name, tmp_path):
-    turn = {"EVT3": 1 << 24, "EVT2": 1 << 34}[name]
+    turn = 1 << 24 if name == "EVT3" else 1 << 34
     times = np.array([0, turn - 1, turn, 3 * turn + 5, 3 * turn + 5, 20 * turn, 20 * turn + turn // 2])
     zeros = np.zeros(len(times), int)
     events = Events(times, zeros, zeros, zeros.astype(bool), width=1, height=1)
@@ -88,7 +97,12 @@ def test_formats_refuse_what_they_cannot_hold(tmp_path):
     century = Events([0, 3 * 10**15], [0, 0], [0, 0], [True, True], width=1, height=1)
     with pytest.raises(DataError, match="clock"):
         write_events(tmp_path / "old.raw", century)
+    unknown = Events([1, 2], [0, 0], [0, 0], [0, 1], width=1, height=1, polarity_known=[False, True])
+    with pytest.raises(DataError, match="keep_known_polarity"):
+        write_events(tmp_path / "a.raw", unknown)
     assert not list(tmp_path.iterdir())
+    write_events(tmp_path / "a.raw", keep_known_polarity(unknown))
+    assert read_events(tmp_path / "a.raw").t_us.tolist() == [2]
 
 
 def test_writing_is_atomic_and_says_what_is_wrong(tmp_path, monkeypatch):
@@ -141,7 +155,9 @@ def write_raw(path: Path, header: str, words: list[int], dtype: str) -> Path:
 
 
 def test_header_t0_is_added(tmp_path):
-    path = write_raw(tmp_path / "a.raw", "% evt 2.0\n% geometry 8x8\n% t0 -400\n", [0x80000001, 0x1040_0801], "<u4")
+    path = write_raw(
+        tmp_path / "a.raw", "% evt 2.0\n% geometry 8x8\n% t0 -400\n", [0x80000001, 0x1040_0801], "<u4"
+    )
     events = read_events(path)
     assert events.t_us.tolist() == [64 + 1 - 400] and (events.x[0], events.y[0], events.p[0]) == (1, 1, True)
 
@@ -158,7 +174,9 @@ def test_header_t0_is_added(tmp_path):
     ],
 )
 def test_geometry_comes_from_the_header(header, shape, source, tmp_path):
-    events, report = read_events_report(write_raw(tmp_path / "a.raw", header, [0x8000, 0x6001, 3, 0x2802], "<u2"))
+    events, report = read_events_report(
+        write_raw(tmp_path / "a.raw", header, [0x8000, 0x6001, 3, 0x2802], "<u2")
+    )
     assert (events.shape, report.geometry_from) == (shape, source)
     assert (events.t_us[0], events.x[0], events.y[0], events.p[0]) == (1, 2, 3, True)
 
@@ -244,7 +262,9 @@ def test_triggers_and_vendor_words_are_no_events(tmp_path):
 def test_real_recordings(shared_data, name, count, shape, span_us):
     events, report = read_events_report(shared_data / "recordings" / name, "strict")
     assert (len(events), events.shape, report.geometry_from) == (count, shape, "camera")
-    Events(events.t_us, events.x, events.y, events.p, events.width, events.height)  # the checked constructor agrees
+    Events(
+        events.t_us, events.x, events.y, events.p, events.width, events.height
+    )  # the checked constructor agrees
     if span_us is not None:
         assert events.duration_us == span_us
 
@@ -254,7 +274,11 @@ def test_evt3_agrees_with_another_decoder(shared_data, tmp_path):
     written = tmp_path / "w.raw"
     draw = np.random.default_rng(3)
     times = np.sort(draw.integers(0, 40_000_000, 5000))
-    columns = (draw.integers(0, 1280, 5000), draw.integers(0, 720, 5000), draw.integers(0, 2, 5000).astype(bool))
+    columns = (
+        draw.integers(0, 1280, 5000),
+        draw.integers(0, 720, 5000),
+        draw.integers(0, 2, 5000).astype(bool),
+    )
     write_events(written, Events(times, *columns, width=1280, height=720))
     for path in (shared_data / "recordings" / "expelliarmus_evt3_sample.raw", written):
         ours, theirs = read_events(path), evt3.decode_file(str(path))

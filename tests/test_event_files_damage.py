@@ -10,7 +10,15 @@ from evnlos.errors import EventFileError
 from evnlos.events import read_events, read_events_report, write_events
 from evnlos.types import Events
 
-WRITABLE = [("HDF5", ".h5"), ("NPZ", ".npz"), ("EVT3", ".raw"), ("EVT2", ".raw")]
+WRITABLE = [
+    ("HDF5", ".h5"),
+    ("NPZ", ".npz"),
+    ("EVT3", ".raw"),
+    ("EVT2", ".raw"),
+    ("EVT21", ".raw"),
+    ("CSV", ".csv"),
+]
+RAW = ("EVT2", "EVT21", "EVT3")
 CHECKSUMMED = {"HDF5", "NPZ"}
 
 
@@ -80,7 +88,7 @@ def test_cut_files_are_errors(written, cut):
     name, path, data = written
     path.write_bytes(data[: int(len(data) * cut)])
     one_error(path)
-    if name in ("EVT2", "EVT3"):
+    if name in RAW:
         events, report = read_events_report(path)
         assert report.truncated
         assert events == sample()[: len(events)] and len(events) > 0.9 * cut * len(sample())
@@ -136,7 +144,7 @@ def test_random_bytes_are_an_error(seed, tmp_path):
 
 def test_valid_start_before_random_bytes_is_an_error(written):
     name, path, data = written
-    keep = data.find(b"% end\n") + 6 if name in ("EVT2", "EVT3") else 512
+    keep = data.find(b"% end\n") + 6 if name in RAW else 512
     path.write_bytes(data[:keep] + np.random.default_rng(5).bytes(1 << 20))
     one_error(path)
     tracemalloc.start()

@@ -45,7 +45,14 @@ def test_columns_have_their_types():
     ],
 )
 def test_wrong_columns_are_refused_in_one_line(change, said):
-    columns = {"t_us": [1, 2, 2, 9], "x": [0, 3, 1, 2], "y": [1, 0, 1, 1], "p": [1, 0, 1, 1], "width": 4, "height": 2}
+    columns = {
+        "t_us": [1, 2, 2, 9],
+        "x": [0, 3, 1, 2],
+        "y": [1, 0, 1, 1],
+        "p": [1, 0, 1, 1],
+        "width": 4,
+        "height": 2,
+    }
     with pytest.raises(DataError, match=said) as raised:
         Events(**(columns | change))
     assert "\n" not in str(raised.value)

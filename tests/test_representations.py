@@ -1,5 +1,7 @@
 """Every representation against its slow reference or a count by hand; inputs untouched."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -102,7 +104,9 @@ def test_paper_surface_taken_literally_is_a_count():
 def test_long_streams_do_not_overflow():
     day_us = 86_400_000_000
     events = Events([0, day_us, 2 * day_us], [0, 0, 0], [0, 0, 0], [True] * 3, width=1, height=1)
-    surface = time_surface(events, [-1, day_us, 2 * day_us + 10], tau_us=float(day_us), mode="context", radius=0)
+    surface = time_surface(
+        events, [-1, day_us, 2 * day_us + 10], tau_us=float(day_us), mode="context", radius=0
+    )
     np.testing.assert_allclose(surface[:, 0, 0, 0], [np.exp(-1), np.exp(-1)], rtol=1e-6)
 
 
@@ -225,10 +229,14 @@ def test_grid_makers():
     assert edges_from_rate(10, 1_000_010, 4).tolist() == [10, 250_010, 500_010, 750_010, 1_000_010]
     events = random_events(0, span_us=100_000)
     edges = edges_from_count(events, 50)
-    counts = [len(events.between(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    counts = [len(events.between(a, b)) for a, b in itertools.pairwise(edges)]
     assert sum(counts) == len(events)
     assert max(counts) <= 52 and min(counts[:-1]) >= 48
     assert suggest_tau_us(0.004, 0.02) == pytest.approx(200_000)
-    for wrong in (lambda: edges_from_rate(0, 10, 1), lambda: edges_from_count(events, 0), lambda: suggest_tau_us(0, 1)):
+    for wrong in (
+        lambda: edges_from_rate(0, 10, 1),
+        lambda: edges_from_count(events, 0),
+        lambda: suggest_tau_us(0, 1),
+    ):
         with pytest.raises(DataError):
             wrong()

@@ -169,8 +169,8 @@ class Events:
     @classmethod
     def empty(cls, width: int, height: int) -> Events:
         """Return a stream without events for a sensor of `width` x `height` pixels."""
-        none = np.zeros(0, np.int64)
-        return cls(none, none, none, none.astype(bool), width, height)
+        place = np.zeros(0, np.uint16)
+        return cls(np.zeros(0, np.int64), place, place, np.zeros(0, np.bool_), width, height)
 
 
 @dataclass(frozen=True)
@@ -215,9 +215,13 @@ class Plane:
     @property
     def x_m(self) -> NDArray[np.float64]:
         """Horizontal coordinate of each column's centre, float64 [W], metres."""
-        return self.center_m[0] + (np.arange(self.width) - (self.width - 1) / 2) * self.pitch_m
+        return (
+            self.center_m[0] + (np.arange(self.width, dtype=np.float64) - (self.width - 1) / 2) * self.pitch_m
+        )
 
     @property
     def y_m(self) -> NDArray[np.float64]:
         """Vertical coordinate (downwards) of each row's centre, float64 [H], metres."""
-        return self.center_m[1] + (np.arange(self.height) - (self.height - 1) / 2) * self.pitch_m
+        return (
+            self.center_m[1] + (np.arange(self.height, dtype=np.float64) - (self.height - 1) / 2) * self.pitch_m
+        )

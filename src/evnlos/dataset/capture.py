@@ -111,7 +111,7 @@ class Capture:
             return None
         direction = np.asarray(motion.direction, dtype=float)
         start = motion.start_m
-        if isinstance(start, float):
+        if not isinstance(start, tuple):
             along = start * direction / np.hypot(*direction)
             start = (float(along[0]), float(along[1]))
         line = LineMotion(start, motion.speed_m_s, motion.direction, motion.start_us * 1e-6)
@@ -187,4 +187,4 @@ def _read_target(folder: Path, info: TargetInfo | None) -> Target | None:
     if info is None or info.mask is None:
         return None
     mask = _read_image(_inside(folder, info.mask))
-    return Target(info.name, mask.astype(np.float32) / np.iinfo(mask.dtype).max, info.plate_m)
+    return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.plate_m)

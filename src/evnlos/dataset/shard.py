@@ -7,6 +7,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from evnlos.config import write_atomically
 from evnlos.dataset.sampling import Samples
@@ -69,9 +70,7 @@ def read_shard(path: str | Path) -> tuple[Samples, dict]:
     """
     try:
         with h5py.File(path, "r") as file:
-            columns = {
-                name: file[name][()] for name in (*_MAPS, "time_s", "position_m", "event_count") if name in file
-            }
+            found = {name: _array(file, name) for name in (*_MAPS, "time_s", "position_m", "event_count")}
             attributes = {key: _plain(value) for key, value in file.attrs.items()}
     except FileNotFoundError:
         raise DataError(f"{path} does not exist; run the command that made the dataset again") from None
@@ -79,17 +78,27 @@ def read_shard(path: str | Path) -> tuple[Samples, dict]:
         raise DataError(
             f"{path} is damaged ({_one_line(error)}); delete it and run the command again"
         ) from None
-    missing = {"frame", "surface", "time_s", "event_count"} - columns.keys()
-    if missing:
-        raise DataError(f"{path} is not a shard: {', '.join(sorted(missing))} missing; delete it and run again")
-    return Samples(
-        frame=columns["frame"].astype(np.float32),
-        surface=columns["surface"].astype(np.float32),
-        truth=columns["truth"].astype(np.float32) if "truth" in columns else None,
-        time_s=columns["time_s"],
-        position_m=columns.get("position_m"),
-        event_count=columns["event_count"],
-    ), attributes
+    frame, surface, time_s, count = (found[name] for name in ("frame", "surface", "time_s", "event_count"))
+    if frame is None or surface is None or time_s is None or count is None:
+        raise DataError(
+            f"{path} is not a shard: it lacks a map or its times; delete it and run the command again"
+        )
+    truth = found["truth"]
+    samples = Samples(
+        frame=frame.astype(np.float32),
+        surface=surface.astype(np.float32),
+        truth=None if truth is None else truth.astype(np.float32),
+        time_s=time_s,
+        position_m=found["position_m"],
+        event_count=count,
+    )
+    return samples, attributes
+
+
+def _array(file: h5py.File, name: str) -> NDArray | None:
+    """Return a dataset's values, or None where the file has none of that name."""
+    node = file.get(name)
+    return node[()] if isinstance(node, h5py.Dataset) else None
 
 
 def _plain(value: object) -> object:

@@ -86,6 +86,9 @@ def create_dataset(dataset: Dataset) -> Dataset:
 def open_dataset(folder: str | Path) -> Dataset:
     """Open a dataset's folder.
 
+    Args:
+        folder: The folder that holds `dataset.yaml`.
+
     Raises:
         DataError: It is not a dataset, or its splits overlap.
     """

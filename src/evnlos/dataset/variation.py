@@ -67,7 +67,9 @@ def _replaced(node: Any, keys: list[str], value: float, path: str) -> Any:
     if isinstance(node, tuple) and key.isdigit() and int(key) < len(node):
         i = int(key)
         return (*node[:i], _replaced(node[i], rest, value, path), *node[i + 1 :])
-    names = [field.name for field in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+    if not dataclasses.is_dataclass(node) or isinstance(node, type):
+        raise _unknown(path, key, [])
+    names = [field.name for field in dataclasses.fields(node)]
     if key not in names:
         raise _unknown(path, key, names)
     return dataclasses.replace(node, **{key: _replaced(getattr(node, key), rest, value, path)})

@@ -93,7 +93,16 @@ def infer(network: ResidualUNet, inputs: Tensor, batch_size: int = 40) -> Tensor
 
 
 def reconstruct(weights: Weights, frame: np.ndarray, surface: np.ndarray) -> Tensor:
-    """Reconstruct samples without a truth: frame [N, H, W], surface [N, 2, H, W] -> float32 [N, H, W], 0..1."""
+    """Reconstruct samples, also those without a truth.
+
+    Args:
+        weights: The network and its paradigm.
+        frame: Frames, float32 [N, H, W], 0..1, as in `Samples`.
+        surface: Time surfaces, float32 [N, 2, H, W].
+
+    Returns:
+        Pictures, float32 [N, H, W], 0..1.
+    """
     return infer(weights.network, network_input(frame, surface, weights.paradigm))  # type: ignore[arg-type]
 
 

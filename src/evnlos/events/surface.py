@@ -33,10 +33,10 @@ def _spans(radius: int, shape: str) -> NDArray[np.int64]:
     return np.array([int(np.sqrt(radius**2 - row**2 + 1e-9)) for row in rows], np.int64)
 
 
-def _time_map(events: Events, edges: NDArray[np.int64]) -> tuple[NDArray, int, int]:
+def _time_map(events: Events, edges: NDArray[np.int64], margin: int) -> tuple[NDArray, int, int]:
     """Return an empty map of newest times, its mark for "never" and its zero; 32 bits where they suffice."""
     origin = int(min(events.t_us[0], edges[0])) if len(events) else int(edges[0])
-    shape = (2, events.height, events.width)
+    shape = (2, events.height + 2 * margin, events.width + 2 * margin)
     latest = int(max(events.t_us[-1], edges[-1])) if len(events) else int(edges[-1])
     dtype, never = (np.int32, -1) if latest - origin < 2**31 else (np.int64, -1)
     return np.full(shape, never, dtype), never, origin
@@ -101,7 +101,7 @@ def time_surface(
     _choice("border", border, ("crop", "zero"))
     _choice("projection", projection, tuple(_PROJECTIONS))
     starts = np.searchsorted(events.t_us, edges, side="right")
-    newest, never, origin = _time_map(events, edges)
+    newest, never, origin = _time_map(events, edges, int(radius) if mode == "context" else 0)
     out = np.zeros((len(edges) - 1, 2, events.height, events.width), np.float32)
     columns = (events.t_us, events.x, events.y, events.p)
     if mode == "sae":
@@ -110,7 +110,7 @@ def time_surface(
     spans = _spans(int(radius), shape)
     chosen = (*columns, edges, starts, float(tau_us), carry, _PROJECTIONS[projection], include_self, spans)
     if mode == "context":
-        kernels.context(*chosen, newest, never, origin, out)
+        kernels.context(*chosen, shape == "box", newest, never, origin, out)
     else:
         whole_area = int((2 * spans + 1).sum()) if border == "zero" else 0
         kernels.hots(*chosen, whole_area, newest, never, origin, out)

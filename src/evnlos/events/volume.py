@@ -21,11 +21,14 @@ def _starts(events: Events, edges_us: ArrayLike | None) -> NDArray[np.int64]:
 
 
 @njit(cache=True)
-def _count(x, y, p, starts, out):
+def _count(x, y, p, starts, height, width, out):
+    off, one = np.uint32(height * width), out.dtype.type(1)
     for grid in range(len(starts) - 1):
-        counts = out[grid]
+        counts = out[grid].reshape(-1)
         for index in range(starts[grid], starts[grid + 1]):
-            counts[1 - np.int64(p[index]), y[index], x[index]] += 1
+            # Places are counted without a sign, or every access would be checked for a negative index.
+            pixel = np.uint32(y[index]) * np.uint32(width) + np.uint32(x[index])
+            counts[pixel + (np.uint32(0) if p[index] else off)] += one
 
 
 def event_histogram(events: Events, edges_us: ArrayLike | None = None) -> NDArray[np.float32]:
@@ -47,9 +50,10 @@ def event_histogram(events: Events, edges_us: ArrayLike | None = None) -> NDArra
         [[[[2.0, 0.0]], [[0.0, 1.0]]]]
     """
     starts = _starts(events, edges_us)
-    out = np.zeros((len(starts) - 1, 2, events.height, events.width), np.uint32)
-    _count(events.x, events.y, events.p, starts, out)
-    return out.astype(np.float32)
+    exact = len(events) < 2**24  # whole numbers that a float32 holds
+    out = np.zeros((len(starts) - 1, 2, events.height, events.width), np.float32 if exact else np.uint32)
+    _count(events.x, events.y, events.p, starts, events.height, events.width, out)
+    return out.astype(np.float32, copy=False)
 
 
 @njit(cache=True)
@@ -88,15 +92,33 @@ def event_frame(
 
 @njit(cache=True)
 def _vote(t_us, x, y, p, first, scale, bins, out):
+    """Add the votes; the two bins in use lie side by side in `pair`, so that an event touches one place."""
+    height, width = out.shape[1], out.shape[2]
+    pair = np.zeros((height * width, 2), np.float32)
+    bin_now = 0
     for index in range(len(t_us)):
-        place = (t_us[index] - first) * scale
+        place = np.float64(t_us[index] - first) * scale
         low = min(np.int64(place), bins - 1)
+        while bin_now < low:
+            _shift(pair, out[bin_now].reshape(-1))
+            bin_now += 1
         part = np.float32(place - low)
         sign = np.float32(1.0) if p[index] else np.float32(-1.0)
-        row, column = y[index], x[index]
-        out[low, row, column] += sign * (np.float32(1.0) - part)
-        if low + 1 < bins:
-            out[low + 1, row, column] += sign * part
+        # Places are counted without a sign, or every access would be checked for a negative index.
+        pixel = np.uint32(y[index]) * np.uint32(width) + np.uint32(x[index])
+        pair[pixel, np.uint32(0)] += sign - sign * part
+        pair[pixel, np.uint32(1)] += sign * part
+    for last in range(bin_now, bins):
+        _shift(pair, out[last].reshape(-1))
+
+
+@njit(cache=True)
+def _shift(pair, done):
+    """Hand over the finished bin and make the next one the first of the pair."""
+    for pixel in range(len(done)):
+        done[pixel] = pair[pixel, 0]
+        pair[pixel, 0] = pair[pixel, 1]
+        pair[pixel, 1] = 0.0
 
 
 def voxel_grid(

@@ -52,6 +52,9 @@ def save_weights(path: str | Path, weights: Weights) -> None:
 def load_weights(path: str | Path) -> Weights:
     """Read weights; a run's folder stands for the `weights.safetensors` in it.
 
+    Args:
+        path: A safetensors file, or the folder of a run whose training has ended.
+
     Raises:
         DataError: The file is missing, is not a weights file of this package, or does not fit its own config.
     """

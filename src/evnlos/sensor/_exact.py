@@ -32,13 +32,13 @@ from evnlos.sensor._random import (
     random_uniform,
 )
 
-PIECE = 0.05
-"""Largest change of the log light in a piece on which it counts as a line: at most 3e-4 log units wrong."""
+PIECE = 0.02
+"""Largest change of the log light in a piece on which it counts as a line: at most 5e-5 log units wrong."""
 DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
 """The factor 1 - 0.75 (I + 20) / 275 of the shot noise at black, its largest value."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _grown(column):
     """Return a copy of a column with twice its length."""
     longer = np.empty(2 * len(column), column.dtype)
@@ -46,7 +46,7 @@ def _grown(column):
     return longer
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _emit(out, count, time_s, pixel, on, jitter, window, seed, sent):
     """Append an event, growing the columns when they are full."""
     out_time, out_pixel, out_on = out
@@ -62,7 +62,7 @@ def _emit(out, count, time_s, pixel, on, jitter, window, seed, sent):
     return (out_time, out_pixel, out_on), count + 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _shot(seed, pixel, counter, intensity, rate_on, rate_off, rate_hot):
     """Return +1, -1 or 0: what a candidate of the dominating Poisson process becomes at this light."""
     uniform = random_uniform(seed, STREAM_SHOT_CHOICE, pixel, counter)
@@ -79,7 +79,7 @@ def _shot(seed, pixel, counter, intensity, rate_on, rate_off, rate_hot):
     return 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _piece(
     out, count, pixel, start, length, light_a, light_b, filtered, state, constants, jitter, window, drawn, sent
 ):
@@ -152,7 +152,7 @@ def _piece(
     return out, count, arrival
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _step(
     out, count, pixel, start, stop, light_a, light_b, filtered, state, constants, jitter, window, drawn, sent
 ):
@@ -180,7 +180,7 @@ def _step(
     return out, count, filtered
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _glide(
     row, light, logs, filtered, base, on, off, leak, rate, length, light_1, logs_1, filtered_1, base_1, flags
 ):
@@ -209,7 +209,7 @@ def _glide(
         light_1[i], logs_1[i], filtered_1[i], base_1[i] = light_b, log_b, after, base[i] - drift
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _jump(row, light, logs, filtered, base, on, off, leak, length, light_1, logs_1, filtered_1, base_1, flags):
     """Advance a tile by one step without a filter, flagging the pixels that need to be solved."""
     for i in range(len(light)):
@@ -222,7 +222,7 @@ def _jump(row, light, logs, filtered, base, on, off, leak, length, light_1, logs
         light_1[i], logs_1[i], filtered_1[i], base_1[i] = light_b, log_b, log_b, base[i] - drift
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def run_tile(
     frames, times, first, last, light, filtered, base, last_event, candidate, drawn, sent,
     on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
@@ -300,7 +300,7 @@ def run_tile(
     return out[0][:count], out[1][:count], out[2][:count]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def log_row(row):
     """Return the log light of a row of light in DN."""
     logs = np.empty(len(row))

@@ -20,7 +20,7 @@ LOW_PASS, LOG_LINE, LINE = 0, 1, 2
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def fast_log(x):
     """Return ln x for a normal positive number, within 3 ulp, in a form that compilers vectorise.
 
@@ -45,7 +45,7 @@ def fast_log(x):
     return e * _LN2_HIGH + (2.0 * s + (s * z * series + e * _LN2_LOW))
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def fast_exp(x):
     """Return exp x for x <= 0 (clamped at -700), within 2 ulp, in a form that compilers vectorise."""
     x = max(x, -700.0)
@@ -67,20 +67,20 @@ def fast_exp(x):
     return p * np.int64((np.int64(n) + 1023) << 52).view(np.float64)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def log_light(intensity):
     """Return the log of the light in DN, linear up to 20 DN and continuous there."""
     logarithm = fast_log(max(intensity, KNEE))
     return intensity * KNEE_SLOPE if intensity <= KNEE else logarithm
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def light_of(log_value):
     """Return the light in DN whose `log_light` this is."""
     return log_value / KNEE_SLOPE if log_value <= LOG_KNEE else math.exp(log_value)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def response(kind, a, b, c, x):
     """Return the response of a piece at its own time x.
 
@@ -93,7 +93,7 @@ def response(kind, a, b, c, x):
     return a + b * x
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def slope(kind, a, b, c, x):
     """Return the derivative of `response` with respect to x."""
     if kind == LOW_PASS:
@@ -103,7 +103,7 @@ def slope(kind, a, b, c, x):
     return b
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def extremum(kind, a, b, c):
     """Return where the response of a piece turns, or infinity."""
     if kind == LOW_PASS and b * c > 0.0:
@@ -113,7 +113,7 @@ def extremum(kind, a, b, c):
     return math.inf
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def solve(kind, a, b, c, level, low, high):
     """Return the x in [low, high] where a response that is monotone there meets `level`: bracketed Newton."""
     if kind == LINE:
@@ -136,7 +136,7 @@ def solve(kind, a, b, c, level, low, high):
     return x
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def first_crossing(kind, a, b, c, low, high, level_on, level_off):
     """Return (x, +1 or -1) of the first time in (low, high] that the response reaches a level, or (high, 0).
 

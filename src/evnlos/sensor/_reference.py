@@ -107,8 +107,8 @@ def reference_exact(
 ) -> list[Event]:
     """Return the events of `mode="exact"` without shot noise, hot pixels and jitter, by brute force.
 
-    Each step is cut into `fine` pieces on which the light is constant at its middle value; the filter's output is
-    the exponential response, and an event's instant is interpolated linearly inside its piece.
+    Each step is cut into `fine` pieces on which the light is constant at its middle value; the filter's output
+    is the exponential response, and an event's instant is interpolated linearly inside its piece.
     """
     steps, height, width = frames.shape
     light = frames.reshape(steps, -1).astype(np.float64)  # [T, N]

@@ -24,7 +24,7 @@ LIN_LOG_KNEE = 20.0
 _KNEE_SLOPE = math.log(LIN_LOG_KNEE) / LIN_LOG_KNEE
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def lin_log(intensity):
     """Return the logarithm of the light in DN, linear up to 20 DN, with v2e's rounding to 1e-8 and float32."""
     if intensity <= LIN_LOG_KNEE:
@@ -34,19 +34,19 @@ def lin_log(intensity):
     return np.float32(np.rint(value * 1e8) / 1e8)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def brightness(intensity):
     """Return the factor (I + 20) / 275 that scales bandwidth and shot noise with the light."""
     return (intensity + 20.0) / 275.0
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def _weight(intensity, rate):
     """Return the low-pass weight of a new frame; a rate of infinity means no filter."""
     return min(brightness(intensity) * rate, 1.0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def lookup_tables(rates):
     """Return (1 - eps, eps * L) of the 256 gray values for each rate d * 2 pi fc, float64 [N, 256] twice."""
     keep = np.empty((len(rates), 256))
@@ -59,7 +59,7 @@ def lookup_tables(rates):
     return keep, add
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def floor_divide(value, threshold):
     """Return floor(value / threshold) for positive numbers by way of fmod, as tensor libraries round it."""
     rest = np.fmod(value, threshold)
@@ -70,7 +70,7 @@ def floor_divide(value, threshold):
     return np.int64(floor)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def shot_choice(seed, pixel, counter, chance_on, chance_off, chance_max):
     """Return +1, -1 or 0: what a candidate that came with probability `chance_max` becomes."""
     uniform = random_uniform(seed, STREAM_SHOT_CHOICE, pixel, counter) * chance_max
@@ -81,7 +81,7 @@ def shot_choice(seed, pixel, counter, chance_on, chance_off, chance_max):
     return 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _crossed_u8(row, lp, base, on, off, keep, add, flags):
     """Advance a tile by one step of 8-bit light and flag the pixels beyond a threshold."""
     for i in range(len(lp)):
@@ -92,7 +92,7 @@ def _crossed_u8(row, lp, base, on, off, keep, add, flags):
         flags[i] = (change >= on[i]) | (-change >= off[i])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _crossed_log(log_light, weight, lp, base, on, off, flags):
     """Advance a tile by one step of ready logarithms and weights and flag the pixels beyond a threshold."""
     for i in range(len(lp)):
@@ -102,7 +102,7 @@ def _crossed_log(log_light, weight, lp, base, on, off, flags):
         flags[i] = (change >= on[i]) | (-change >= off[i])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _crossed_direct(log_light, lp, base, on, off, flags):
     """Set a tile to the light itself (no filter; single precision) and flag the pixels beyond a threshold."""
     for i in range(len(lp)):
@@ -111,7 +111,7 @@ def _crossed_direct(log_light, lp, base, on, off, flags):
         flags[i] = (change >= on[i]) | (-change >= off[i])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _light(row, rate, log_light, weight):
     """Fill the logarithms and low-pass weights of a row of light."""
     for i in range(len(row)):
@@ -120,7 +120,7 @@ def _light(row, rate, log_light, weight):
         weight[i] = _weight(intensity, rate)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _leak(base, leak, scale, jitter, seed, first_pixel, step):
     """Lower the reference by one step of jittered leak; tiles start at multiples of the block."""
     for start in range(0, len(base), BLOCK):
@@ -130,7 +130,7 @@ def _leak(base, leak, scale, jitter, seed, first_pixel, step):
             base[i] -= (scale * leak[i]) * jitter[offset + i - start]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _grown(column, length):
     """Return a longer copy of a column."""
     longer = np.empty(length, column.dtype)
@@ -138,7 +138,7 @@ def _grown(column, length):
     return longer
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def run_tile(
     frames, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn,
     table, keep, add, rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
@@ -247,7 +247,7 @@ def run_tile(
     return out_step[:count], out_pixel[:count], out_crossings[:count], out_shot[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def settle(step, pixel, crossings, shot, sub_times, period, last_event, base, step_on, step_off):
     """Let the events of one step pass the refractory period; return (sub-time index, pixel, polarity) columns.
 
@@ -282,7 +282,7 @@ def settle(step, pixel, crossings, shot, sub_times, period, last_event, base, st
     return out_sub[:count], out_pixel[:count], out_on[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def log_row(row, log_light):
     """Fill the logarithms of a row of light."""
     for i in range(len(row)):

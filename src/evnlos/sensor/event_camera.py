@@ -170,7 +170,7 @@ def _render(wall: Wall, times_s: NDArray[np.float64]) -> NDArray[np.float32]:
     return (light.detach().to("cpu", torch.float32) * WHITE_DN).numpy()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _worst_miss(earlier, later, middle):
     """Return how far the log of the mean of two frames is from the log of the frame between them, at most."""
     worst = 0.0

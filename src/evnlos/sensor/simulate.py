@@ -56,8 +56,8 @@ def simulate_events(
         array([30, 60, 90])
     """
     shape = np.shape(frames)
-    if len(shape) != 3:
-        raise DataError(f"frames has shape {tuple(shape)}; give [T, H, W]")
+    if len(shape) != 3 or 0 in shape[1:]:
+        raise DataError(f"frames has shape {tuple(shape)}; give [T, H, W] with at least one pixel")
     stream = EventStream(
         EventPixel() if pixel is None else pixel,
         (int(shape[1]), int(shape[2])),

@@ -64,6 +64,8 @@ class EventStream:
             raise ConfigError(f'mode is {mode!r}; give "exact" or "v2e"')
         if not isinstance(pixel, EventPixel):
             raise ConfigError(f"pixel is {type(pixel).__name__}; give an EventPixel")
+        if len(shape) != 2 or min(shape) < 1:
+            raise ConfigError(f"shape is {tuple(shape)}; give (height, width), at least 1 pixel each")
         self.shape, self._jitter = shape, pixel.jitter_s > 0
         kind = ExactArray if mode == "exact" else V2eArray
         options = {} if tile_px is None else {"tile_px": tile_px}

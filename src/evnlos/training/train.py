@@ -79,7 +79,7 @@ def train(
         done, log = load_checkpoint(checkpoint, network, optimiser, key)
         yield from log
     for epoch in range(done, settings.epochs):
-        began, total = time.perf_counter(), torch.zeros((), device=device)
+        began, rate, total = time.perf_counter(), 0.0, torch.zeros((), device=device)
         network.train()
         order = torch.randperm(
             len(samples), generator=torch.Generator().manual_seed(_order_seed(settings, epoch))
@@ -147,7 +147,7 @@ def _about(dataset: Dataset, settings: Training, start: Weights | None) -> dict[
             "validation": dataset.split.get("validation", []),
         },
         "from": start.history[-1]["data"]["name"] if start and start.history else None,
-        "versions": {"evnlos": __version__, "torch": torch.__version__, "python": platform.python_version()},
+        "versions": {"evnlos": __version__, "torch": str(torch.__version__), "python": platform.python_version()},
     }
 
 

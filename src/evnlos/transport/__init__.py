@@ -9,9 +9,13 @@ from evnlos.transport.angular_spectrum import (
 )
 from evnlos.transport.brdf import GGX, Brdf, Lambert
 from evnlos.transport.diffraction import Diffraction
+from evnlos.transport.lamp import lamp_radiance
+from evnlos.transport.light_transport import LightTransport
 from evnlos.transport.matrix_wall import MatrixWall
+from evnlos.transport.occluder import Occluder
 from evnlos.transport.operator import LinearTransport, MatrixTransport, Transport, compose
 from evnlos.transport.paper import PaperTransport
+from evnlos.transport.patches import Patches
 from evnlos.transport.radiometric import light_transport_matrix
 from evnlos.transport.reflection import DiffuseReflection
 from evnlos.transport.rig import RadiometricTransport, rig_preset
@@ -26,10 +30,13 @@ __all__ = [
     "Diffraction",
     "DiffuseReflection",
     "Lambert",
+    "LightTransport",
     "LinearTransport",
     "MatrixTransport",
     "MatrixWall",
+    "Occluder",
     "PaperTransport",
+    "Patches",
     "RadiometricTransport",
     "SlidingWall",
     "Transport",
@@ -40,6 +47,7 @@ __all__ = [
     "blur_radius_px",
     "compose",
     "fresnel_number",
+    "lamp_radiance",
     "light_transport_matrix",
     "rayleigh_sommerfeld_sum",
     "rig_preset",

@@ -36,13 +36,13 @@ class Lambert:
     """A matte wall: f = albedo / pi.
 
     Args:
-        albedo: Reflected share of the light, 0..1.
+        albedo: Reflected share of the light, 0..1; a tensor carries its gradient.
 
     Raises:
         ConfigError: The albedo is outside 0..1.
     """
 
-    albedo: float = 0.8
+    albedo: float | torch.Tensor = 0.8
 
     def __post_init__(self) -> None:
         if not 0 <= self.albedo <= 1:
@@ -70,16 +70,16 @@ class GGX:
         alpha: Roughness along x, above 0.
         alpha_y: Roughness along y; None is the same (isotropic).
         n: Real part of the metal's refractive index; the default is aluminium at 500 nm.
-        k: Its extinction coefficient.
+        k: Its extinction coefficient; any of the four may be a tensor with a gradient.
 
     Raises:
         ConfigError: A roughness or index is not positive.
     """
 
-    alpha: float = 0.05
-    alpha_y: float | None = None
-    n: float = ALUMINIUM[500e-9][0]
-    k: float = ALUMINIUM[500e-9][1]
+    alpha: float | torch.Tensor = 0.05
+    alpha_y: float | torch.Tensor | None = None
+    n: float | torch.Tensor = ALUMINIUM[500e-9][0]
+    k: float | torch.Tensor = ALUMINIUM[500e-9][1]
 
     def __post_init__(self) -> None:
         for name in ("alpha", "alpha_y", "n"):
@@ -89,10 +89,20 @@ class GGX:
         if not self.k >= 0:
             raise ConfigError(f"k is {self.k}; give 0 or more")
 
+    @classmethod
+    def aluminium(cls, alpha: float, wavelength_m: float, alpha_y: float | None = None) -> GGX:
+        """Return rough aluminium at a wavelength of `ALUMINIUM`, metres: one call a colour channel."""
+        for known, (n, k) in ALUMINIUM.items():
+            if math.isclose(known, wavelength_m, rel_tol=1e-3):
+                return cls(alpha, alpha_y, n, k)
+        names = ", ".join(f"{known * 1e9:.0f}" for known in ALUMINIUM)
+        raise ConfigError(f"no n and k of aluminium at {wavelength_m * 1e9:g} nm; choose {names} nm")
+
     @property
     def lobe(self) -> float:
         """The smaller roughness."""
-        return float(min(self.alpha, self.alpha if self.alpha_y is None else self.alpha_y))
+        widths = (self.alpha, self.alpha if self.alpha_y is None else self.alpha_y)
+        return min(float(torch.as_tensor(width).detach()) for width in widths)
 
     def __call__(self, towards_light: Direction, towards_eye: Direction) -> torch.Tensor:
         """Return the BRDF, 1/sr, for directions with components [...]."""

@@ -36,7 +36,7 @@ class Diffraction(Transport):
         ConfigError: A length is not positive, or `field` or `result` is unknown.
     """
 
-    source: Plane
+    source: Plane  # pyright: ignore[reportIncompatibleVariableOverride] - frozen, so narrowing is safe
     wavelength_m: float = 500e-9
     distance_m: float = 0.5
     wave_pitch_m: float | None = None

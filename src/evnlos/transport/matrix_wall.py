@@ -13,6 +13,7 @@ from evnlos.scene import Motion, Target
 from evnlos.transport.operator import MatrixTransport
 from evnlos.transport.spline import spline_coefficients, spline_weights
 from evnlos.transport.wall import ambient_map, check_gain, checked_times
+from evnlos.types import Plane
 
 _CHUNK = 64  # positions drawn and carried over at a time
 _GUARD = 3  # keyframes beyond each end
@@ -54,10 +55,14 @@ class MatrixWall:
         keyframe_step_m: float | None = None,
     ) -> None:
         check_gain(gain)
-        step = transport.source.pitch_m / 2 if keyframe_step_m is None else keyframe_step_m
+        strip = transport.source
+        if not isinstance(strip, Plane):
+            raise ConfigError("the matrix starts from patches; a moving plate needs a Plane of square cells")
+        step = strip.pitch_m / 2 if keyframe_step_m is None else keyframe_step_m
         if not (math.isfinite(step) and step >= 0):
             raise ConfigError(f"keyframe_step_m is {keyframe_step_m}; give 0 or more metres")
         self.transport = transport
+        self._strip = strip
         self.target = target
         self.motion = motion
         self.gain = float(gain)
@@ -103,7 +108,7 @@ class MatrixWall:
         matrix = self.transport.matrix
         image = matrix.new_zeros((len(positions), *self.shape))
         for start in range(0, len(positions), _CHUNK):
-            drawn = self.target.rasterise(self.transport.source, positions[start : start + _CHUNK])
+            drawn = self.target.rasterise(self._strip, positions[start : start + _CHUNK])
             image[start : start + _CHUNK] = self.transport(torch.as_tensor(drawn).to(matrix))
         return image
 
@@ -121,7 +126,7 @@ class MatrixWall:
 
     def _make_keys(self) -> torch.Tensor:
         """Return the spline's coefficients at keyframes over all places where the plate touches the strip."""
-        strip = self.transport.source
+        strip = self._strip
         reach = strip.extent_m[1] / 2 + self.target.size_m / 2
         steps = math.ceil(reach / self._step) + _GUARD
         self._first_m = strip.center_m[0] - steps * self._step

@@ -9,6 +9,7 @@ from itertools import pairwise
 import torch
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.transport.patches import Patches
 from evnlos.types import Plane
 
 
@@ -17,10 +18,10 @@ class Transport(ABC):
     `LinearTransport`.
 
     Attributes:
-        source: Plane on which the input image is sampled.
+        source: Plane, or grid of patches, on which the input image is sampled.
     """
 
-    source: Plane
+    source: Plane | Patches
 
     @property
     @abstractmethod
@@ -142,14 +143,14 @@ class MatrixTransport(LinearTransport):
 
     Args:
         matrix: Real tensor [H W, h w], rows and columns in row-major order.
-        source: Plane of the scene image, h x w.
+        source: Plane or patches of the scene image, h x w.
         shape: Size (H, W) of the images that it makes.
 
     Raises:
         ConfigError: The matrix does not have H W rows and h w columns.
     """
 
-    def __init__(self, matrix: torch.Tensor, source: Plane, shape: tuple[int, int]) -> None:
+    def __init__(self, matrix: torch.Tensor, source: Plane | Patches, shape: tuple[int, int]) -> None:
         expected = (shape[0] * shape[1], source.height * source.width)
         if tuple(matrix.shape) != expected:
             raise ConfigError(f"the matrix is {tuple(matrix.shape)}; these planes need {expected}")

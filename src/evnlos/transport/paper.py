@@ -111,7 +111,7 @@ class PaperTransport:
             ConfigError: A setting is outside its range; the text names it.
         """
         transport = self.transport(scene.target.size_m)
-        mask = torch.from_numpy(scene.target.rasterise(transport.source))
+        mask = torch.from_numpy(scene.target.rasterise(self.source(scene.target.size_m)))
         plane = transport.output
         assert plane is not None  # both steps end on planes
         ambient = ambient_plane(self.ambient, self.ambient_gradient, shape)

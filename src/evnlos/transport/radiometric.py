@@ -1,117 +1,276 @@
-"""The light-transport matrix from a self-luminous plane over a wall to a camera (paper Eq. 2-3)."""
+"""The light-transport matrix from a luminous plane over a wall to a camera (paper Eq. 2-3)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 
 from evnlos.errors import ConfigError
 from evnlos.transport.angular_spectrum import check_lengths
-from evnlos.transport.brdf import Brdf, Direction
+from evnlos.transport.brdf import GGX, Brdf, Direction, Lambert
+from evnlos.transport.occluder import Occluder, check_between, visibility
+from evnlos.transport.patches import Patches, as_patches
 from evnlos.transport.quadrature import gauss_points, points_for
 from evnlos.transport.view import View
 from evnlos.types import Plane
 
 _CHUNK = 2**19  # pairs of wall point and target point evaluated at a time
+_POINTS_AT_A_SHADOW = 4  # a side of a cell when a shadow's edge may cut it
+
+Scalar = float | torch.Tensor
 
 
 def light_transport_matrix(
-    view: View,
-    source: Plane,
-    distance_m: float,
+    seen: View | Plane | Patches,
+    source: Plane | Patches,
+    distance_m: Scalar,
     brdf: Brdf,
     *,
-    offset_m: tuple[float, float] = (0.0, 0.0),
+    offset_m: tuple[Scalar, Scalar] = (0.0, 0.0),
+    occluders: Sequence[Occluder] = (),
+    emission: torch.Tensor | None = None,
+    emission_exponent: tuple[float, float] = (0.0, 0.0),
     points: tuple[int, int] | None = None,
+    rows: slice = slice(None),
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
+    compiled: bool | None = None,
 ) -> torch.Tensor:
-    """Return the matrix from the radiance of target cells to the radiance of camera pixels.
+    """Return the matrix from the brightness of target cells to the radiance of camera pixels.
 
-    A[p, c] = mean over pixel p of integral over cell c of f(i, o) cos_w cos_t / r^2 dA, with f the wall's BRDF,
-    r the distance, cos_w and cos_t the cosines at the wall and at the target, which is parallel to the wall,
-    faces it and is a Lambertian emitter. Gauss-Legendre quadrature over cells and pixels, adapted to the width
-    of the reflected lobe; nothing is random.
+    A[p, c] = mean over pixel p of integral over cell c of V f(i, o) cos_w cos_t / r^2 L dA, with f the wall's
+    BRDF, r the distance, V the visibility, cos_w and cos_t the cosines at the wall and at the target, which is
+    parallel to the wall and faces it, and L the radiance of a cell of brightness 1. Gauss-Legendre quadrature
+    over cells and pixels, adapted to the width of the reflected lobe; nothing is random.
 
     Args:
-        view: The camera's view with a known pin-hole (`View.perspective`).
-        source: The target's plane; its coordinates are relative to `offset_m`.
-        distance_m: Distance from wall to target, metres.
-        brdf: How the wall reflects.
-        offset_m: Where the target plane's origin lies over the wall (x, y), metres.
+        seen: The camera's view with a known pin-hole (`View.perspective`), or wall patches seen from
+            anywhere (matte walls only).
+        source: The target's plane or cells; its coordinates are relative to `offset_m`.
+        distance_m: Distance from wall to target, metres; may be a tensor with a gradient.
+        brdf: How the wall reflects; its parameters may be tensors with gradients.
+        offset_m: Where the target plane's origin lies over the wall (x, y), metres; may be tensors with
+            gradients.
+        occluders: Opaque polygons between wall and target.
+        emission: Radiance of each cell at brightness 1, [h, w]; None is 1 (see `lamp_radiance` for a lit
+            target).
+        emission_exponent: Extra fall of the emission, cos_x^a cos_y^b of its angles in the two axes; (0, 0) is
+            Lambertian, screens have more.
         points: Quadrature points a side of a (pixel, cell); None adapts them to the lobe.
-        dtype: Floating-point type of the work and of the result.
-        device: Device of the work and of the result.
+        rows: The pixels, counted row by row, whose rows of the matrix are made.
+        dtype: Floating-point type of the result; the compiled loop works in float64.
+        device: Device of the result.
+        compiled: Whether to use the compiled loop; None does so on the CPU when no gradient is asked for.
 
     Returns:
         Matrix [H W, h w], without unit (radiance a radiance).
 
     Raises:
-        ConfigError: The distance is not positive, or the view has no pin-hole.
+        ConfigError: The distance is not positive, the view has no pin-hole, or an occluder reaches the target.
     """
-    check_lengths(distance_m=distance_m)
-    if view.eye_m is None:
-        raise ConfigError("the view has no pin-hole; build it with View.perspective")
-    over_pixel, over_cell = points or quadrature_points(view, source, distance_m, brdf)
-    targets = _cell_points(source, offset_m, over_cell, dtype, device)
-    sub, area = gauss_points(over_pixel)
-    cells = source.height * source.width
-    matrix = torch.zeros(view.shape[0] * view.shape[1], cells, dtype=dtype, device=device)
-    rows = max(1, _CHUNK // cells)
-    for dv, wv in zip(sub, area, strict=True):
-        for du, wu in zip(sub, area, strict=True):
-            wall = view.wall_points_m(du, dv).reshape(-1, 2).to(dtype=dtype, device=device)  # [P, 2]
-            for start in range(0, len(wall), rows):
-                block = wall[start : start + rows]
-                for (x, y), share in targets:
-                    pair = _pair_throughput(block, x, y, distance_m, view.eye_m, brdf)
-                    matrix[start : start + rows] += (wu * wv * share) * pair
-    return matrix.mul_(source.pitch_m**2)
+    distance = _number(distance_m)
+    check_lengths(distance_m=distance)
+    check_between(occluders, distance)
+    eye = _eye(seen, brdf)
+    over_pixel, over_cell = points or quadrature_points(seen, source, distance, brdf, occluders)
+    if emission is not None and tuple(emission.shape) != source.shape:
+        raise ConfigError(f"emission is {tuple(emission.shape)}; the target plane has {source.shape} cells")
+    wall, wall_weight = _wall_points(seen, over_pixel)  # [S, P, 2], [S]
+    wall = wall[:, rows]
+    differentiable = any(
+        isinstance(value, torch.Tensor) and value.requires_grad
+        for value in (distance_m, *offset_m, emission, *vars(brdf).values())
+    )
+    if compiled is None:
+        compiled = torch.device(device).type == "cpu" and not differentiable and isinstance(brdf, Lambert | GGX)
+    if compiled:
+        cell_brightness = torch.ones(source.shape) if emission is None else emission
+        matrix = torch.empty(wall.shape[1], source.height * source.width, dtype=dtype)
+        _fill(
+            matrix,
+            wall,
+            wall_weight,
+            source,
+            over_cell,
+            cell_brightness,
+            distance,
+            offset_m,
+            eye,
+            brdf,
+            emission_exponent,
+            occluders,
+        )
+        return matrix.to(device)
+    target, target_weight = _target_points(source, over_cell)  # [Q, 2, C], [Q]
+    wall, target = wall.to(dtype=dtype, device=device), target.to(dtype=dtype, device=device)
+    matrix = torch.zeros(wall.shape[1], target.shape[-1], dtype=dtype, device=device)
+    block_rows = max(1, _CHUNK // target.shape[-1])
+    blocks = []
+    for start in range(0, wall.shape[1], block_rows):
+        block = matrix[start : start + block_rows]
+        for patch, share in zip(wall[:, start : start + block_rows], wall_weight.tolist(), strict=True):
+            for (x, y), part in zip(target, target_weight.tolist(), strict=True):
+                pair = pair_throughput(
+                    patch, x + offset_m[0], y + offset_m[1], distance_m, eye, brdf, emission_exponent
+                )
+                if occluders:
+                    # Visibility is a step: it carries no gradient.
+                    with torch.no_grad():
+                        way = visibility(patch, x + offset_m[0], y + offset_m[1], distance, occluders)
+                    pair = pair * way
+                block = block + (share * part) * pair
+        blocks.append(block)
+    matrix = torch.cat(blocks)
+    return matrix if emission is None else matrix * emission.flatten().to(matrix)
 
 
-def quadrature_points(view: View, source: Plane, distance_m: float, brdf: Brdf) -> tuple[int, int]:
+def pair_throughput(
+    wall_m: torch.Tensor,
+    x_m: torch.Tensor,
+    y_m: torch.Tensor,
+    distance_m: Scalar,
+    eye_m: tuple[Scalar, Scalar, Scalar],
+    brdf: Brdf,
+    emission_exponent: tuple[float, float] = (0.0, 0.0),
+) -> torch.Tensor:
+    """Return f cos cos / r^2 from target points over wall points to the eye: differentiable in everything.
+
+    Args:
+        wall_m: Wall points (x, y), [P, 2], metres.
+        x_m: x of the target points, [C], metres.
+        y_m: y of the target points, [C], metres.
+        distance_m: Distance from wall to target, metres.
+        eye_m: Pin-hole (x, y, z), metres.
+        brdf: How the wall reflects.
+        emission_exponent: Extra fall of the emission with its angle in both axes.
+
+    Returns:
+        Throughput [P, C], 1/m^2.
+    """
+    dx, dy = x_m - wall_m[:, :1], y_m - wall_m[:, 1:]  # [P, C]
+    lateral = dx * dx + dy * dy
+    r2 = lateral + distance_m * distance_m
+    inverse = r2.rsqrt()
+    light: Direction = (dx * inverse, dy * inverse, distance_m * inverse)
+    ex, ey = eye_m[0] - wall_m[:, 0], eye_m[1] - wall_m[:, 1]
+    ez = torch.zeros_like(ex) + eye_m[2]
+    scale = (ex * ex + ey * ey + ez * ez).rsqrt()
+    eye: Direction = ((ex * scale)[:, None], (ey * scale)[:, None], (ez * scale)[:, None])
+    # Parallel planes: both cosines are distance / r.
+    pair = brdf(light, eye) * light[2] * light[2] / r2
+    for side, exponent in zip((dx, dy), emission_exponent, strict=True):
+        if exponent:
+            pair = pair * (1 + (side / distance_m) ** 2) ** (-exponent / 2)
+    return pair
+
+
+def quadrature_points(
+    seen: View | Plane | Patches,
+    source: Plane | Patches,
+    distance_m: float,
+    brdf: Brdf,
+    occluders: Sequence[Occluder] = (),
+) -> tuple[int, int]:
     """Return the Gauss points a side of a pixel and of a cell that resolve the reflected lobe and the falloff.
 
     A microfacet slope of alpha turns the ray by 2 alpha: 2 alpha r on the target, and on the wall the share of
     it that a move of the point makes, 2 alpha / (1/r + 1/R) with R the distance to the eye.
     """
-    if view.eye_m is None:
-        raise ConfigError("the view has no pin-hole; build it with View.perspective")
-    eye = torch.tensor(view.eye_m).norm().item()
-    pixel = float(view.pixel_size_m().max())
+    reach = torch.tensor(_eye(seen, brdf)).norm().item()
+    pixel = float(seen.pixel_size_m().max()) if isinstance(seen, View) else max(as_patches(seen).size_m)
+    cell = max(as_patches(source).size_m)
     # Without a lobe the falloff with r sets the scale: half the distance, as a standard deviation.
     on_target = min(2 * brdf.lobe * distance_m, distance_m / 2)
-    on_wall = min(2 * brdf.lobe / (1 / distance_m + 1 / eye), distance_m / 2)
-    return points_for(pixel, on_wall), points_for(source.pitch_m, on_target)
+    on_wall = min(2 * brdf.lobe / (1 / distance_m + 1 / reach), distance_m / 2)
+    over_pixel, over_cell = points_for(pixel, on_wall), points_for(cell, on_target)
+    if occluders:
+        # A cell's width already blurs a shadow's edge on the wall; coarse pixels need points of their own.
+        over_pixel, over_cell = (
+            max(over_pixel, 1 if pixel < cell / 2 else 2),
+            max(over_cell, _POINTS_AT_A_SHADOW),
+        )
+    return over_pixel, over_cell
 
 
-def _cell_points(
-    source: Plane, offset_m: tuple[float, float], count: int, dtype: torch.dtype, device: torch.device | str
-) -> list[tuple[tuple[torch.Tensor, torch.Tensor], float]]:
-    """Return, for each quadrature point of a cell, its (x, y) in all cells [h w] and its weight."""
+def _eye(seen: View | Plane | Patches, brdf: Brdf) -> tuple[float, float, float]:
+    if isinstance(seen, View):
+        if seen.eye_m is None:
+            raise ConfigError("the view has no pin-hole; build it with View.perspective")
+        return seen.eye_m
+    if not isinstance(brdf, Lambert):
+        raise ConfigError(
+            f"a wall of {type(brdf).__name__} looks different from everywhere; give a View, not a Plane"
+        )
+    return (0.0, 0.0, 1.0)
+
+
+def _number(value: Scalar) -> float:
+    return float(value.detach()) if isinstance(value, torch.Tensor) else float(value)
+
+
+def _wall_points(seen: View | Plane | Patches, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return wall points [S, P, 2], S = count^2 for each pixel, and their weights [S]."""
     sub, weight = gauss_points(count)
-    found = []
-    for dy, wy in zip(sub, weight, strict=True):
-        for dx, wx in zip(sub, weight, strict=True):
-            x = torch.as_tensor(source.x_m + offset_m[0] + dx * source.pitch_m).to(dtype=dtype, device=device)
-            y = torch.as_tensor(source.y_m + offset_m[1] + dy * source.pitch_m).to(dtype=dtype, device=device)
-            found.append(((x.repeat(source.height), y.repeat_interleave(source.width)), wx * wy))
-    return found
+    if isinstance(seen, View):
+        points = [seen.wall_points_m(du, dv).flatten(0, 1) for dv in sub for du in sub]
+    else:
+        patches = as_patches(seen)
+        y, x = torch.tensor(patches.y_m)[:, None], torch.tensor(patches.x_m)
+        flat = torch.stack(torch.broadcast_tensors(x, y), dim=-1).flatten(0, 1)
+        size = flat.new_tensor(patches.size_m)
+        points = [flat + flat.new_tensor([du, dv]) * size for dv in sub for du in sub]
+    share = torch.tensor(weight, dtype=torch.float64)
+    return torch.stack(points), torch.outer(share, share).flatten()
 
 
-def _pair_throughput(
+def _target_points(source: Plane | Patches, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return points [Q, 2, C], Q = count^2 a cell, and their weights [Q], which add up to its area."""
+    points, weight = _wall_points(source, count)
+    width, height = as_patches(source).size_m
+    return points.mT.contiguous(), weight * (width * height)
+
+
+def _fill(
+    matrix: torch.Tensor,
     wall: torch.Tensor,
-    x: torch.Tensor,
-    y: torch.Tensor,
+    wall_weight: torch.Tensor,
+    source: Plane | Patches,
+    over_cell: int,
+    emission: torch.Tensor,
     distance_m: float,
+    offset_m: tuple[Scalar, Scalar],
     eye_m: tuple[float, float, float],
     brdf: Brdf,
-) -> torch.Tensor:
-    """Return f cos cos / r^2 [P, C] from target points (x, y) [C] over wall points [P, 2] to the eye."""
-    dx, dy = x - wall[:, :1], y - wall[:, 1:]  # [P, C]
-    r2 = dx * dx + dy * dy + distance_m**2
-    inverse = r2.rsqrt()
-    light: Direction = (dx * inverse, dy * inverse, distance_m * inverse)
-    to_eye = torch.stack([eye_m[0] - wall[:, 0], eye_m[1] - wall[:, 1], torch.full_like(wall[:, 0], eye_m[2])])
-    ex, ey, ez = (to_eye / to_eye.norm(dim=0))[:, :, None]  # three [P, 1]
-    # Parallel planes: both cosines are distance / r.
-    return brdf(light, (ex, ey, ez)) * light[2] * light[2] / r2
+    exponent: tuple[float, float],
+    occluders: Sequence[Occluder],
+) -> None:
+    """Fill `matrix` by the compiled loop."""
+    from evnlos.transport.radiometric_kernel import fill_matrix  # numba loads slowly
+
+    metal, albedo = np.zeros(4), 0.0
+    if isinstance(brdf, GGX):
+        alpha_y = brdf.alpha if brdf.alpha_y is None else brdf.alpha_y
+        metal = np.array([_number(value) for value in (brdf.alpha, alpha_y, brdf.n, brdf.k)])
+    elif isinstance(brdf, Lambert):
+        albedo = _number(brdf.albedo)
+    patches = as_patches(source)
+    sub, weight = (np.array(values) for values in gauss_points(over_cell))
+    width, height = patches.size_m
+    fill_matrix(
+        matrix.numpy(),
+        wall.contiguous().numpy(),
+        wall_weight.numpy(),
+        patches.x_m + _number(offset_m[0]) + sub[:, None] * width,
+        patches.y_m + _number(offset_m[1]) + sub[:, None] * height,
+        weight,
+        emission.detach().flatten().double().numpy() * (width * height),
+        distance_m,
+        np.array(eye_m),
+        metal,
+        albedo,
+        np.array(exponent, dtype=np.float64),
+        np.array([corner for one in occluders for corner in one.vertices_m], np.float64).reshape(-1, 3),
+        np.cumsum([len(one.vertices_m) for one in occluders], dtype=np.int64),
+    )

@@ -26,7 +26,7 @@ class DiffuseReflection(LinearTransport):
     def __init__(self, source: Plane, kernel: torch.Tensor) -> None:
         if kernel.ndim != 2 or kernel.shape[0] % 2 == 0 or kernel.shape[1] % 2 == 0:
             raise ConfigError(f"the kernel is {tuple(kernel.shape)}; give [k, l] with odd sides")
-        self.source = source
+        self.source = self._plane = source
         self.kernel = kernel
 
     @property
@@ -37,7 +37,7 @@ class DiffuseReflection(LinearTransport):
     @property
     def output(self) -> Plane:
         """Plane of the full convolution."""
-        return Plane(*self.shape, self.source.pitch_m, self.source.center_m)
+        return Plane(*self.shape, self._plane.pitch_m, self._plane.center_m)
 
     def _forward(self, scene: torch.Tensor) -> torch.Tensor:
         height, width = self.shape

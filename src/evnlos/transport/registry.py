@@ -12,6 +12,9 @@ import torch
 
 from evnlos.transport.brdf import GGX, Brdf, Lambert
 from evnlos.transport.diffraction import Diffraction
+from evnlos.transport.lamp import lamp_radiance
+from evnlos.transport.light_transport import LightTransport
+from evnlos.transport.occluder import Occluder
 from evnlos.transport.operator import MatrixTransport, Transport, compose
 from evnlos.transport.radiometric import light_transport_matrix
 from evnlos.transport.reflection import DiffuseReflection
@@ -54,6 +57,12 @@ EXAMPLES: dict[str, Callable[[], Transport]] = {
     "matte wall": lambda: _matrix(Lambert()),
     "rough metal": lambda: _matrix(GGX(0.1)),
     "brushed metal": lambda: _matrix(GGX(0.05, 0.2)),
+    "matte wall behind a post": lambda: LightTransport(
+        Plane(5, 8, 0.02), _SCENE, 0.3, Lambert(), occluders=(Occluder.post(0.01, 0.1, 0.02),), block=200
+    ),
+    "brushed metal, torch-lit, in blocks": lambda: LightTransport(
+        _OBLIQUE, _SCENE, 0.3, GGX(0.1, 0.3), emission=lamp_radiance(_SCENE, 0.3, (0.1, 0.0, 0.1)), block=500
+    ),
     "reflection, then view": lambda: _chain(_reflection, lambda plane: Viewing(plane, _AFFINE)),
     "the paper's steps": lambda: _chain(
         lambda plane: Diffraction(plane, distance_m=0.005, wave_pitch_m=2e-5),

@@ -14,7 +14,9 @@ from evnlos.errors import ConfigError
 from evnlos.scene import Scene
 from evnlos.transport.angular_spectrum import check_lengths
 from evnlos.transport.brdf import GGX, Brdf, Lambert
+from evnlos.transport.lamp import lamp_radiance
 from evnlos.transport.matrix_wall import MatrixWall
+from evnlos.transport.occluder import Occluder
 from evnlos.transport.operator import MatrixTransport
 from evnlos.transport.radiometric import light_transport_matrix
 from evnlos.transport.view import View
@@ -50,6 +52,14 @@ class RadiometricTransport:
     """Side of a target cell, metres."""
     strip_m: tuple[float, float] = (0.24, 0.08)
     """Width and height of the region in which the target moves, metres."""
+    post_width_m: float = 0.0
+    """Width of an upright post halfway between the wall's middle and the travel's, metres; 0 is none."""
+    lamp_m: tuple[float, float, float] | None = None
+    """A torch (x, y, z) that lights the target, metres, z from the wall; None: it shines itself."""
+    lamp_half_angle_deg: float = 20.0
+    """Angle from the torch's axis at which it is half as bright, degrees."""
+    wavelength_m: float = 500e-9
+    """Wavelength at which the metal's n and k are taken, metres: 450e-9, 500e-9, 550e-9 or 650e-9."""
     gain: float = 0.8
     """White levels of the brightest pixel while a square of the strip's height shines in its middle."""
     ambient: float = 0.05
@@ -61,7 +71,7 @@ class RadiometricTransport:
         """Return the wall's BRDF."""
         if self.wall_material == "lambert":
             return Lambert(self.albedo)
-        return GGX(self.roughness, self.roughness_y)
+        return GGX.aluminium(self.roughness, self.wavelength_m, self.roughness_y)
 
     def view(self, shape: tuple[int, int]) -> View:
         """Return the camera's view for an image of `shape` (H, W), pixels."""
@@ -79,6 +89,12 @@ class RadiometricTransport:
         if self.target_offset_m is not None:
             return self.target_offset_m
         return -self.distance_m * math.tan(math.radians(self.camera_angle_deg)), 0.0
+
+    def occluders(self) -> tuple[Occluder, ...]:
+        """Return what stands between wall and target."""
+        if self.post_width_m == 0:
+            return ()
+        return (Occluder.post(self.offset_m()[0] / 2, self.distance_m / 2, self.post_width_m),)
 
     def transport(self, shape: tuple[int, int]) -> MatrixTransport:
         """Return the matrix from the strip to the camera, scaled so that `gain` means what it says; cached."""
@@ -116,8 +132,20 @@ class RadiometricTransport:
 @lru_cache(maxsize=4)
 def _transport(rig: RadiometricTransport, shape: tuple[int, int]) -> MatrixTransport:
     source = rig.source()
+    offset = rig.offset_m()
+    emission = None
+    if rig.lamp_m is not None:
+        beam = rig.lamp_half_angle_deg
+        emission = lamp_radiance(source, rig.distance_m, rig.lamp_m, offset_m=offset, half_angle_deg=beam)
     matrix = light_transport_matrix(
-        rig.view(shape), source, rig.distance_m, rig.brdf(), offset_m=rig.offset_m(), dtype=torch.float32
+        rig.view(shape),
+        source,
+        rig.distance_m,
+        rig.brdf(),
+        offset_m=offset,
+        occluders=rig.occluders(),
+        emission=emission,
+        dtype=torch.float32,
     )
     # A square of the strip's height is the plate of the paper; it makes gains comparable between walls.
     lit = (torch.arange(source.width) - (source.width - 1) / 2).abs() <= source.height / 2
@@ -127,16 +155,25 @@ def _transport(rig: RadiometricTransport, shape: tuple[int, int]) -> MatrixTrans
     return MatrixTransport(matrix / brightest, source, shape)
 
 
-_ROUGHNESS = {"easy": 0.02, "main": 0.05, "hard": 0.1}
 NEAR_M, FAR_M = 0.30, 0.50
+
+_PRESETS = {
+    "mirror": RadiometricTransport(roughness=0.005),
+    "easy": RadiometricTransport(roughness=0.02),
+    "main": RadiometricTransport(roughness=0.05),
+    "hard": RadiometricTransport(roughness=0.1),
+    "matte": RadiometricTransport(wall_material="lambert"),
+    "aperture": RadiometricTransport(wall_material="lambert", post_width_m=0.016),
+}
 
 
 def rig_preset(name: str, distance_m: float = NEAR_M) -> RadiometricTransport:
     """Return one of the named rigs.
 
     Args:
-        name: "easy", "main" or "hard" (rough aluminium of roughness 0.02, 0.05, 0.1), or "matte" (a plain white
-            wall: the control on which every method must fail).
+        name: "mirror" (polished, for alignment; sharp to about a cell), "easy", "main" or "hard" (rough
+            aluminium of roughness 0.02, 0.05, 0.1), "matte" (a plain white wall, the control on which every
+            method must fail), or "aperture" (a white wall and a 16 mm post halfway).
         distance_m: Distance from target to wall, metres; near is 0.30, far 0.50.
 
     Raises:
@@ -146,8 +183,6 @@ def rig_preset(name: str, distance_m: float = NEAR_M) -> RadiometricTransport:
         >>> rig_preset("hard").roughness
         0.1
     """
-    if name == "matte":
-        return RadiometricTransport(wall_material="lambert", distance_m=distance_m)
-    if name in _ROUGHNESS:
-        return RadiometricTransport(roughness=_ROUGHNESS[name], distance_m=distance_m)
-    raise ConfigError(f"the rig {name!r} is unknown; choose easy, main, hard or matte")
+    if name not in _PRESETS:
+        raise ConfigError(f"the rig {name!r} is unknown; choose one of {', '.join(_PRESETS)}")
+    return replace(_PRESETS[name], distance_m=distance_m)

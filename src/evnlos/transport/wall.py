@@ -118,8 +118,12 @@ class SlidingWall:
         positions = self.motion.position_m(times)  # [..., 2]
         frame = self._shifted if self.view.is_affine else self._projected
         image = self.ambient.new_empty((times.size, *self.shape))
+        compiled = self.view.is_affine and self._canvas.device.type == "cpu" and not self._canvas.requires_grad
         for k, (x, y) in enumerate(positions.reshape(-1, 2).tolist()):
-            image[k] = frame(x, y).clamp_(min=0).mul_(self.gain).add_(self.ambient)
+            if compiled:
+                self._expose(image[k], x, y)
+            else:
+                image[k] = frame(x, y).clamp(min=0) * self.gain + self.ambient
         return image.reshape((*times.shape, *self.shape))
 
     def _carry_to_pixels(self) -> None:
@@ -137,7 +141,7 @@ class SlidingWall:
             )
         self._low = (int(low[0]), int(low[1]))
         canvas_view = _shifted_view(self.view, self._low, (int(size[1]), int(size[0])))
-        self._canvas = spline_coefficients(self._sampled(canvas_view, 0.0, 0.0))
+        self._canvas = spline_coefficients(self._sampled(canvas_view, 0.0, 0.0)).contiguous()
 
     def _sampled(self, view: View, x_m: float, y_m: float) -> torch.Tensor:
         """Return the wall image with the plate at (x, y), as the pixels of `view` see it."""
@@ -152,16 +156,28 @@ class SlidingWall:
 
     def _shifted(self, x_m: float, y_m: float) -> torch.Tensor:
         """Return the canvas displaced by the motion: four taps along each axis, the same for all pixels."""
-        origin, moved = self.view.pixels(torch.tensor([(0.0, 0.0), (x_m, y_m)], dtype=torch.float64))
-        across, down = (moved - origin).tolist()
-        band = self._rows(down)  # [H, canvas width]
-        whole, taps = _taps(-across)
-        start = whole - 1 - self._low[0]
+        band, start, taps = self._shift(x_m, y_m)
         window = _window(band, start, self.shape[1] + 3)
         frame = taps[0] * window[:, : self.shape[1]]
         for k in range(1, 4):
-            frame.add_(window[:, k : k + self.shape[1]], alpha=taps[k])
+            frame = frame + taps[k] * window[:, k : k + self.shape[1]]
         return frame
+
+    def _expose(self, out: torch.Tensor, x_m: float, y_m: float) -> None:
+        """Write the exposed frame to `out` in one pass; `_shifted` is the slow reference."""
+        from evnlos.transport.shift_kernel import expose_shifted  # numba loads slowly
+
+        band, start, taps = self._shift(x_m, y_m)
+        expose_shifted(
+            out.numpy(), band.numpy(), start, np.array(taps, np.float32), self.gain, self.ambient.numpy()
+        )
+
+    def _shift(self, x_m: float, y_m: float) -> tuple[torch.Tensor, int, list[float]]:
+        """Return the canvas at the camera's rows [H, canvas width], its column under pixel 0, and four weights."""
+        origin, moved = self.view.pixels(torch.tensor([(0.0, 0.0), (x_m, y_m)], dtype=torch.float64))
+        across, down = (moved - origin).tolist()
+        whole, taps = _taps(-across)
+        return self._rows(down), whole - 1 - self._low[0], taps
 
     def _rows(self, down: float) -> torch.Tensor:
         """Return the canvas at the camera's rows; motion along the rows asks for the same ones again."""
@@ -173,6 +189,7 @@ class SlidingWall:
         band = sum(
             (taps[k] * window[k : k + self.shape[0]] for k in range(1, 4)), taps[0] * window[: self.shape[0]]
         )
+        band = band.contiguous()
         self._band = (down, band)
         return band
 

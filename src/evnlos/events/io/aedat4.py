@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
 import struct
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,33 +18,65 @@ from evnlos.events.io.columns import ColumnCheck, Columns, join
 from evnlos.events.io.report import ReadReport, unreadable
 
 SIGNATURE = b"#!AER-DAT4.0\r\n"
+_CHILD_BYTES = 2 << 30  # address space of an interpreter with numpy
+_MAX_RATIO = 300  # LZ4 expands at most 255 times
 _CURE = "the file is damaged or not complete: copy it again"
 
 
-def _decoder_class() -> Any:
+def _require_package() -> None:
     try:
-        import aedat
+        import aedat  # noqa: F401
     except ImportError:
         raise MissingDependencyError(
             "reading AEDAT4 needs the package aedat: pip install evnlos[aedat], "
             "or convert the file elsewhere to HDF5 (DSEC columns), NPZ or RAW"
         ) from None
-    return aedat.Decoder
 
 
-@contextmanager
-def _aedat_errors(path: Path) -> Iterator[None]:
-    """Turn what the decoder raises, its panics among them, into one error."""
-    try:
-        yield
-    except (EventFileError, MissingDependencyError):
-        raise
-    except BaseException as error:
-        panic = type(error).__name__ == "PanicException"  # derives from BaseException on purpose
-        if not panic and not isinstance(error, Exception):
-            raise
-        found = " ".join(str(error).split())[:160]
-        raise unreadable(path, 0, f"AEDAT4 cannot be decoded ({found})", _CURE) from None
+class _Decoder:
+    """The package at work in a process of its own, whose memory and time grow with the file only."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        size = path.stat().st_size
+        child = Path(__file__).with_name("_aedat4_child.py")
+        limits = [str(_CHILD_BYTES + _MAX_RATIO * size), str(30 + size // 500_000)]
+        known = os.pathsep.join(place for place in sys.path if place)
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed in __exit__
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(child), str(path.absolute()), *limits],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env=os.environ | {"PYTHONPATH": known, "OPENBLAS_NUM_THREADS": "1", "RUST_BACKTRACE": "0"},
+        )
+        assert self._process.stdout is not None
+        self.stream = self._process.stdout
+
+    def __enter__(self) -> _Decoder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()  # a reader may stop early
+        self.stream.close()
+        self._process.wait()
+        self._errors.close()
+
+    def take(self, size: int) -> bytearray:
+        """Return the next `size` bytes of its output."""
+        data = bytearray(self.stream.read(size))
+        if len(data) < size:
+            raise self.failure()
+        return data
+
+    def failure(self) -> EventFileError:
+        """Return the error of a decoder that stopped before the end of the file."""
+        code = self._process.wait()
+        self._errors.seek(0)
+        lines = self._errors.read(1 << 16).decode("utf-8", "replace").strip().splitlines()
+        said = [line for line in lines if "Error" in line or "panicked" in line or "Exception" in line]
+        found = " ".join((said or lines or [f"it ended with code {code}"])[-1].split())[:160]
+        return unreadable(self._path, 0, f"AEDAT4 cannot be decoded ({found})", _CURE)
 
 
 def check_packets(path: Path, report: ReadReport) -> None:
@@ -89,34 +124,38 @@ class Aedat4Source:
     def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
         self.path, self.report = path, report
         report.format = "AEDAT4"
-        self._class = _decoder_class()
+        _require_package()
         check_packets(path, report)
-        with _aedat_errors(path):
-            streams = self._class(str(path)).id_to_stream()
-        chosen = [(number, stream) for number, stream in streams.items() if stream.get("type") == "events"]
-        if not chosen:
-            raise unreadable(path, 0, "an AEDAT4 file without an event stream", "record events as well")
-        self._stream, stream = chosen[0]
         if width is not None:
             report.set_geometry(width, height, "caller")
-        else:
-            report.set_geometry(stream["width"], stream["height"], "header")
+
+    def _read_size(self, decoder: _Decoder) -> None:
+        line = decoder.stream.readline()
+        if not line.endswith(b"\n"):
+            raise decoder.failure()
+        size = json.loads(line)
+        if size is None:
+            raise unreadable(self.path, 0, "an AEDAT4 file without an event stream", "record events as well")
+        if not self.report.geometry_from:
+            self.report.set_geometry(size[0], size[1], "header")
 
     def blocks(self) -> Iterator[Columns]:
         """Yield the columns packet by packet."""
         check = ColumnCheck(self.report)
-        with _aedat_errors(self.path):
-            for packet in self._class(str(self.path)):
-                if packet["stream_id"] != self._stream or "events" not in packet:
-                    continue
-                events = packet["events"]
+        with _Decoder(self.path) as decoder:
+            self._read_size(decoder)
+            while True:
+                count = struct.unpack("<q", decoder.take(8))[0]
+                if count < 0:
+                    return
+                data = decoder.take(13 * count)
+                times = np.frombuffer(data, "<i8", count)
+                x, y = (
+                    np.frombuffer(data, "<u2", count, 8 * count),
+                    np.frombuffer(data, "<u2", count, 10 * count),
+                )
                 yield check(
-                    {
-                        "t_us": events["t"].astype(np.int64),
-                        "x": np.ascontiguousarray(events["x"]),
-                        "y": np.ascontiguousarray(events["y"]),
-                        "p": np.ascontiguousarray(events["on"]),
-                    }
+                    {"t_us": times, "x": x, "y": y, "p": np.frombuffer(data, np.bool_, count, 12 * count)}
                 )
 
     def read(self) -> Columns:

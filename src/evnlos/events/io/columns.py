@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from numba import njit
@@ -30,6 +30,20 @@ def allocate(count: int, names: Iterable[str] = ("t_us", "x", "y", "p")) -> Colu
 def cut(columns: Columns, start: int, stop: int) -> Columns:
     """Return a view of the events start..stop."""
     return {name: column[start:stop] for name, column in columns.items()}
+
+
+def enlarge(columns: Columns, count: int, room: int) -> None:
+    """Put columns of `room` places in place of these, with their first `count` events."""
+    for name, column in columns.items():
+        larger = np.empty(room, column.dtype)
+        larger[:count] = column[:count]
+        columns[name] = larger
+
+
+def shorten(columns: Columns, count: int) -> None:
+    """Give the memory behind the first `count` events back; nothing is copied."""
+    for column in columns.values():
+        column.resize(count, refcheck=False)
 
 
 def join(blocks: list[Columns]) -> Columns:
@@ -67,19 +81,24 @@ def _check_columns(t_us, x, y, width, height, newest):
 class ColumnCheck:
     """Checks blocks of a file that stores columns (HDF5, NPZ, CSV, AEDAT4): coordinates and order of time."""
 
-    def __init__(self, report: ReadReport) -> None:
-        self._report = report
+    def __init__(self, report: ReadReport, locate: Callable[[int], int] | None = None) -> None:
+        """`locate` gives the byte of the file where an event, by its number, stands."""
+        self._report, self._locate = report, locate
         self._newest = np.iinfo(np.int64).min
         self._events = 0
 
-    def __call__(self, columns: Columns, offset: int | None = None) -> Columns:
-        """Return the block without events outside the sensor; report them, and times that run backwards."""
+    def __call__(self, columns: Columns, offsets: NDArray[np.int64] | None = None) -> Columns:
+        """Return the block without events outside the sensor; report them, and times that run backwards.
+
+        `offsets` are the bytes of the file where the events stand, where that is known.
+        """
         report = self._report
         first, kind, outside, backwards, self._newest = _check_columns(
             columns["t_us"], columns["x"], columns["y"], report.width, report.height, self._newest
         )
         if kind:
             number = self._events + first
+            offset = int(offsets[first]) if offsets is not None else self._locate(number) if self._locate else 0
             order = ((1, outside), (2, backwards)) if kind == 1 else ((2, backwards), (1, outside))
             for which, count in order:
                 if count and which == 1:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from evnlos.events.io.kernel_state import (
     BACKWARDS,
     BASE,
+    CHUNK,
     CLOCK,
     CLOCK_BACK,
     JITTER_US,
@@ -31,7 +32,8 @@ def bound_evt2(words: NDArray[np.uint32]) -> int:
 
 
 @njit(cache=True)
-def decode_evt2(words, state, t_us, x, y, p, width, height):  # noqa: D103 - see decode_words
+def _decode_carefully(words, first, state, t_us, x, y, p, width, height):
+    """Decode word by word and note every fault; `first` is the number of the first word in its block."""
     high, newest, base = state[CLOCK], state[NEWEST], state[BASE]
     started = state[STARTED] != 0
     count = 0
@@ -43,14 +45,14 @@ def decode_evt2(words, state, t_us, x, y, p, width, height):  # noqa: D103 - see
             row = word & 0x7FF
             time = base + ((word >> 22) & 0x3F)
             if not started:
-                note(state, UNDATED, index)
+                note(state, UNDATED, first + index)
                 continue
             if column >= width or row >= height:
-                note(state, OUT_OF_RANGE, index)
+                note(state, OUT_OF_RANGE, first + index)
                 continue
             if time < newest:
                 if time < newest - JITTER_US:
-                    note(state, BACKWARDS, index)
+                    note(state, BACKWARDS, first + index)
                     newest = time
                 else:
                     time = newest
@@ -66,7 +68,7 @@ def decode_evt2(words, state, t_us, x, y, p, width, height):  # noqa: D103 - see
                 if high - new > _HIGH_TURN // 2:
                     base += WRAP_US
                 else:
-                    note(state, CLOCK_BACK, index)
+                    note(state, CLOCK_BACK, first + index)
                     newest = base + ((new - high) << 6)  # one fault, not one more for each event behind it
             base += (new - high) << 6
             high = new
@@ -74,8 +76,70 @@ def decode_evt2(words, state, t_us, x, y, p, width, height):  # noqa: D103 - see
         elif kind == 10:
             state[TRIGGERS] += 1
         elif kind != 14 and kind != 15:
-            note(state, UNKNOWN, index)
+            note(state, UNKNOWN, first + index)
     state[CLOCK], state[NEWEST], state[BASE], state[STARTED] = high, newest, base, started
+    return count
+
+
+@njit(cache=True)
+def _unpack(words, x, y, p):
+    """Split events into columns, one loop each for vector code; return the largest x and y."""
+    largest_x, largest_y = np.uint16(0), np.uint16(0)
+    for index in range(len(words)):
+        column = np.uint16((words[index] >> np.uint32(11)) & np.uint32(0x7FF))
+        x[index] = column
+        largest_x = max(largest_x, column)
+    for index in range(len(words)):
+        row = np.uint16(words[index] & np.uint32(0x7FF))
+        y[index] = row
+        largest_y = max(largest_y, row)
+    for index in range(len(words)):
+        p[index] = (words[index] >> np.uint32(28)) != 0
+    return largest_x, largest_y
+
+
+@njit(cache=True)
+def _decode_chunk(words, state, events, t_us, x, y, p, width, height):
+    """Decode words among which nothing is unusual; return the number of events, or -1 where something is."""
+    high, newest, base = state[CLOCK], state[NEWEST], state[BASE]
+    unusual = state[STARTED] == 0
+    count = np.uint64(0)  # without a sign no access is checked for a negative index
+    for index in range(len(words)):
+        word = words[index]
+        if word < 0x20000000:
+            time = base + np.int64((word >> 22) & 0x3F)
+            unusual |= time < newest
+            newest = time
+            t_us[count] = time
+            events[count] = word
+            count += np.uint64(1)
+        else:
+            new = np.int64(word & 0xFFFFFFF)
+            unusual |= (word >> 28) != 8 or new < high
+            base += (new - high) << 6
+            high = new
+    if unusual:
+        return np.int64(-1)
+    found = np.int64(count)
+    largest_x, largest_y = _unpack(events[:found], x[:found], y[:found], p[:found])
+    if largest_x >= width or largest_y >= height:
+        return np.int64(-1)
+    state[CLOCK], state[NEWEST], state[BASE] = high, newest, base
+    return found
+
+
+@njit(cache=True)
+def decode_evt2(words, state, t_us, x, y, p, width, height):
+    """Decode a block: quickly, and once more with care where a chunk holds anything unusual."""
+    events = np.empty(CHUNK, np.uint32)
+    count = 0
+    for first in range(0, len(words), CHUNK):
+        chunk = words[first : first + CHUNK]
+        out = t_us[count:], x[count:], y[count:], p[count:]
+        found = _decode_chunk(chunk, state, events, *out, width, height)
+        if found < 0:
+            found = _decode_carefully(chunk, first, state, *out, width, height)
+        count += found
     return count
 
 

@@ -36,8 +36,13 @@ def looks_swapped(words: NDArray[np.int64]) -> bool:
 
 
 def bound_evt21(words: NDArray[np.int64]) -> int:
-    """Return how many events `words` can hold at most: the bits set in the masks of both layouts."""
-    return int(np.bitwise_count(words.view(np.uint64)).sum())
+    """Return how many events `words` can hold at most."""
+    return int(np.bitwise_count(words & 0xFFFFFFFF).sum())
+
+
+def bound_evt21_swapped(words: NDArray[np.int64]) -> int:
+    """Return how many events `words` can hold at most when the fields lie in their low halves."""
+    return int(np.bitwise_count((words >> 32) & 0xFFFFFFFF).sum())
 
 
 @njit(cache=True)

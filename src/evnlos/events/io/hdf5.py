@@ -30,7 +30,6 @@ _H5_ERRORS = (
     MemoryError,
 )
 _CURE = "the file is damaged or not complete: copy it again"
-_LIMITS = {"t_us": (-(2**63), 2**63 - 1), "x": (0, 65_535), "y": (0, 65_535), "adc": (0, 65_535)}
 
 
 @contextmanager
@@ -91,7 +90,7 @@ class Hdf5Source:
         return datasets  # type: ignore[return-value]
 
     def _check_layout(self, file: h5py.File) -> int:
-        """Return the number of events; refuse, before any allocation, sizes that the stored bytes cannot hold."""
+        """Return the number of events; refuse sizes that the stored bytes cannot hold before allocating."""
         lengths = {}
         for name, dataset in self._datasets(file).items():
             lengths[name] = int(dataset.shape[0])
@@ -134,26 +133,31 @@ class Hdf5Source:
         if name in ("p", "polarity_known"):
             if values.dtype == np.bool_:
                 return values
-            if values.size and not np.isin(values, (-1, 0, 1)).all():
+            if values.size and not (int(values.max()) <= 1 and int(values.min()) >= -1):
                 raise unreadable(self.path, 0, "events/p holds more than 0/1 or -1/+1", _CURE)
-            return values > 0
-        low, high = _LIMITS[name]
-        if values.size and not (low <= int(values.min()) and int(values.max()) <= high):
-            raise unreadable(self.path, 0, f"events/{_NAMES.get(name, name)} leaves {low}..{high}", _CURE)
+            return values.view(np.bool_) if values.dtype == np.uint8 else values > 0
         if name != "t_us":
+            if values.dtype != np.uint16 and values.size:
+                self._refuse_outside(name, values, 0, 65_535)
             return values.astype(np.uint16, copy=False)
-        times = values.astype(np.int64, copy=False)
-        if self._t_offset and times.size:
-            if not -(2**63) <= int(times.min()) + self._t_offset <= int(times.max()) + self._t_offset < 2**63:
-                raise unreadable(self.path, 0, f"t_offset is {self._t_offset} us", "times have 63 bits")
-            times = times + self._t_offset
-        return times
+        if not self._t_offset or not values.size:
+            self._refuse_outside(name, values, -(2**63), 2**63 - 1)
+            return values.astype(np.int64, copy=False)
+        self._refuse_outside(name, values, -(2**63) - self._t_offset, 2**63 - 1 - self._t_offset)
+        return np.add(values, self._t_offset, dtype=np.int64)
 
-    def blocks(self, size: int = 1 << 19) -> Iterator[Columns]:
+    def _refuse_outside(self, name: str, values: NDArray, low: int, high: int) -> None:
+        info = np.iinfo(values.dtype) if values.dtype != np.bool_ else None
+        if info is None or not values.size or (low <= info.min and info.max <= high):
+            return  # whatever the column holds, it is inside
+        if not (low <= int(values.min()) and int(values.max()) <= high):
+            raise unreadable(self.path, 0, f"events/{_NAMES.get(name, name)} leaves {low}..{high}", _CURE)
+
+    def blocks(self, size: int = 1 << 17) -> Iterator[Columns]:
         """Yield columns of at most `size` events."""
-        check = ColumnCheck(self.report)
         with _h5_errors(self.path), h5py.File(self.path, "r") as file:
             datasets = self._datasets(file)
+            check = ColumnCheck(self.report, lambda number: _stored_at(datasets["t_us"], number))
             for start in range(0, self._count, size):
                 block = {}
                 for name, dataset in datasets.items():
@@ -163,6 +167,14 @@ class Hdf5Source:
     def read(self) -> Columns:
         """Return all events."""
         return next(self.blocks(max(self._count, 1)), {})
+
+
+def _stored_at(dataset: h5py.Dataset, number: int) -> int:
+    """Return the byte of the file where the chunk with entry `number` starts."""
+    if dataset.chunks is None:
+        return (dataset.id.get_offset() or 0) + number * dataset.dtype.itemsize
+    start = number // dataset.chunks[0] * dataset.chunks[0]
+    return dataset.id.get_chunk_info_by_coord((start,)).byte_offset or 0
 
 
 def _ms_to_idx(t: NDArray) -> NDArray[np.uint64]:

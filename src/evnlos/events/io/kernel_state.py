@@ -12,6 +12,9 @@ UNKNOWN, UNDATED, OUT_OF_RANGE, BACKWARDS, CLOCK_BACK = range(5)
 KINDS = ("unknown", "undated", "out_of_range", "backwards", "backwards")
 STATE_SIZE = 32
 
+# Words that are decoded at once, on the assumption that nothing is wrong with them; they stay in the cache.
+CHUNK = 4096
+
 # Real cameras send a time a few microseconds (11 at most) below the one before it: that is no fault.
 JITTER_US = 64
 

@@ -108,7 +108,7 @@ class NpzSource:
                     )
                 sides.append(int(member.take(1)[0]))
                 member.close()
-            return self.report.set_geometry(*sides, "header")
+            return self.report.set_geometry(sides[0], sides[1], "header")
         sides = []
         for name in ("x", "y"):
             member, largest, left = _Member(self.path, archive, self._infos[name]), 0, self._count
@@ -116,7 +116,7 @@ class NpzSource:
                 largest = max(largest, int(member.take(min(left, 1 << 20)).max()))
                 left -= min(left, 1 << 20)
             sides.append(largest + 1)
-        return self.report.set_geometry(*sides, "events")
+        return self.report.set_geometry(sides[0], sides[1], "events")
 
     def _convert(self, name: str, values: np.ndarray) -> np.ndarray:
         dtype = DTYPES[name]
@@ -128,9 +128,9 @@ class NpzSource:
                 raise unreadable(self.path, 0, f"array {name} leaves {low}..{high}", _CURE)
         return values > 0 if dtype == np.bool_ else values.astype(dtype)
 
-    def blocks(self, size: int = 1 << 19) -> Iterator[Columns]:
+    def blocks(self, size: int = 1 << 17) -> Iterator[Columns]:
         """Yield columns of at most `size` events."""
-        check = ColumnCheck(self.report)
+        check = ColumnCheck(self.report, lambda _: self._infos["t_us"].header_offset)
         with _zip_errors(self.path), ExitStack() as stack:
             archive = stack.enter_context(zipfile.ZipFile(self.path))
             members = {name: _Member(self.path, archive, self._infos[name]) for name in self._names}

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from evnlos.errors import DataError
-from evnlos.events.io import evt2, evt3
+from evnlos.events.io import evt2, evt3, evt3_encode, evt21
 from evnlos.events.io.raw_header import (
     RawHeader,
     parse_raw_header,
@@ -21,12 +22,17 @@ from evnlos.events.io.words import WordCodec, WordSource
 from evnlos.types import Events
 
 CODECS = {
-    "EVT2": WordCodec(np.dtype("<u4"), evt2.bound_evt2, evt2.decode_evt2),
-    "EVT3": WordCodec(np.dtype("<u2"), evt3.bound_evt3, evt3.decode_evt3, one_event_a_word=False),
+    "EVT2": WordCodec(np.dtype("<u4"), evt2.bound_evt2, evt2.decode_evt2, 28),
+    "EVT21": WordCodec(np.dtype("<i8"), evt21.bound_evt21, evt21.decode_evt21, 60, most_events=32),
+    "EVT3": WordCodec(np.dtype("<u2"), evt3.bound_evt3, evt3.decode_evt3, 12, most_events=12),
 }
+_SWAPPED_EVT21 = WordCodec(
+    np.dtype("<i8"), evt21.bound_evt21_swapped, evt21.decode_evt21_swapped, 28, most_events=32
+)
 _ENCODERS = {
     "EVT2": ("2.0", np.dtype("<u4"), evt2.WRAP_US, evt2.encoded_size_evt2, evt2.encode_evt2),
-    "EVT3": ("3.0", np.dtype("<u2"), evt3.WRAP_US, evt3.encoded_size_evt3, evt3.encode_evt3),
+    "EVT21": ("2.1", np.dtype("<i8"), evt21.WRAP_US, evt21.encoded_size_evt21, evt21.encode_evt21),
+    "EVT3": ("3.0", np.dtype("<u2"), evt3.WRAP_US, evt3_encode.encoded_size_evt3, evt3_encode.encode_evt3),
 }
 _MAX_SIDE = 2048
 _MAX_TURNS = 1 << 16
@@ -57,7 +63,10 @@ class RawSource(WordSource):
         name = next(name for name in names if name in CODECS)
         report.format = name
         raw_geometry(header, report, width, height, _MAX_SIDE)
-        super().__init__(path, CODECS[name], header.size, report, header.integer("t0", report) or 0)
+        codec = CODECS[name]
+        if name == "EVT21" and _is_swapped(path, header):
+            codec = _SWAPPED_EVT21
+        super().__init__(path, codec, header.size, report, header.integer("t0", report) or 0)
         self._announced = _announced_events(header, report)
         self._decoded = 0
 
@@ -75,17 +84,33 @@ class RawSource(WordSource):
             self.report.fault(kind, size, found, 'copy the file again or read it with on_error="salvage"')
 
 
+def _is_swapped(path: Path, header: RawHeader) -> bool:
+    """Return whether the halves of EVT2.1 words are exchanged: as the header says, else as they look."""
+    found = header.find("format")
+    stated = re.search(r"endianness=(\w+)", found[0]) if found else None
+    if stated:
+        return stated[1] == "legacy"
+    with path.open("rb") as file:
+        file.seek(header.size)
+        start = file.read(8 * 4096)
+    return evt21.looks_swapped(np.frombuffer(start[: len(start) // 8 * 8], "<i8"))
+
+
 def _announced_events(header: RawHeader, report: ReadReport) -> int | None:
     return header.integer("events", report)
 
 
 def write_raw(path: Path, events: Events, format: str) -> None:
-    """Write a RAW file of `format` "EVT2" or "EVT3"; `path` is overwritten."""
+    """Write a RAW file of `format` "EVT2", "EVT21" or "EVT3"; intensities are left out."""
     version, dtype, wrap_us, encoded_size, encode = _ENCODERS[format]
     if max(events.width, events.height) > _MAX_SIDE:
         raise DataError(
             f"{format} holds sensors up to {_MAX_SIDE} x {_MAX_SIDE}, not {events.width} x {events.height}; "
             "write .h5 or .npz"
+        )
+    if events.polarity_known is not None and not events.polarity_known.all():
+        raise DataError(
+            f"{format} has no mark for an unknown polarity; use keep_known_polarity(events) first, or write .h5"
         )
     first = int(events.t_us[0]) if len(events) else 0
     t0_us = first - first % wrap_us

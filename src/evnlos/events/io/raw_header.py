@@ -169,9 +169,10 @@ def _guess_geometry(header: RawHeader, report: ReadReport) -> None:
 
 def write_raw_header(format_name: str, version: str, width: int, height: int, t0_us: int, events: int) -> bytes:
     """Return the header of a RAW file; the number of events lets a reader see that a file was cut."""
+    layout = "endianness=little;" if format_name == "EVT21" else ""
     lines = [
         f"evt {version}",
-        f"format {format_name};width={width};height={height}",
+        f"format {format_name};{layout}width={width};height={height}",
         f"geometry {width}x{height}",
         f"t0 {t0_us}",
         f"events {events}",

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Protocol
 
 from evnlos.errors import EventFileError
-from evnlos.events.io import aedat4, hdf5, npz, raw
+from evnlos.events.io import aedat4, celex, celex_write, csv, dat, hdf5, npz, raw
+from evnlos.events.io.celex_options import CelexOptions
 from evnlos.events.io.columns import Columns
 from evnlos.events.io.report import ReadReport, unreadable
 from evnlos.types import Events
@@ -36,19 +37,30 @@ class Format:
         name: Its name, as `write_events(format=...)` takes it.
         suffixes: File name endings, lower case with the dot.
         sniff: Whether the first bytes of a file (64 KiB at most) are of this format.
-        open: Opens a file: (path, report, width, height).
-        write: Writes a file: (path, events, name); None where the format is only read.
+        open: Opens a file: (path, report, width, height, celex options).
+        write: Writes a file: (path, events, the name that it will get); None where the format is only read.
     """
 
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[bytes], bool]
-    open: Callable[[Path, ReadReport, int | None, int | None], Source]
-    write: Callable[[Path, Events, str], None] | None = None
+    open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None], Source]
+    write: Callable[[Path, Events, Path], None] | None = None
+
+
+def _plain(source: Callable[[Path, ReadReport, int | None, int | None], Source]) -> Callable[..., Source]:
+    """Return an opener that has no use for the options of CeleX-V."""
+    return lambda path, report, width, height, _: source(path, report, width, height)
 
 
 def _raw(name: str) -> Format:
-    return Format(name, (".raw",), lambda start: raw.sniff_raw(start) == name, raw.RawSource, raw.write_raw)
+    return Format(
+        name,
+        (".raw",),
+        lambda start: raw.sniff_raw(start) == name,
+        _plain(raw.RawSource),
+        lambda path, events, _: raw.write_raw(path, events, name),
+    )
 
 
 FORMATS = (
@@ -56,24 +68,36 @@ FORMATS = (
         "HDF5",
         (".h5", ".hdf5"),
         lambda start: start.startswith(hdf5.SIGNATURE),
-        hdf5.Hdf5Source,
+        _plain(hdf5.Hdf5Source),
         lambda path, events, _: hdf5.write_hdf5(path, events),
     ),
     Format(
         "NPZ",
         (".npz",),
         lambda start: start.startswith(npz.SIGNATURE),
-        npz.NpzSource,
+        _plain(npz.NpzSource),
         lambda path, events, _: npz.write_npz(path, events),
     ),
     _raw("EVT3"),  # the first of a suffix is the one that is written by default
     _raw("EVT2"),
-    Format("AEDAT4", (".aedat4",), lambda start: start.startswith(aedat4.SIGNATURE), aedat4.Aedat4Source),
+    _raw("EVT21"),
+    Format("DAT", (".dat",), dat.sniff_dat, _plain(dat.DatSource)),
+    Format(
+        "AEDAT4", (".aedat4",), lambda start: start.startswith(aedat4.SIGNATURE), _plain(aedat4.Aedat4Source)
+    ),
+    Format("CELEX", (".bin",), celex.sniff_celex, celex.CelexSource, celex_write.write_celex),
+    Format(
+        "CSV",
+        (".csv", ".txt"),
+        lambda start: csv.find_layout(start) is not None,
+        csv.CsvSource,
+        lambda path, events, _: csv.write_csv(path, events),
+    ),
 )
 
 
-def find_format(path: Path) -> Format:
-    """Return the format of a file from its content.
+def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format:
+    """Return the format of a file from its content; a stated CeleX event format overrides a damaged header.
 
     Raises:
         EventFileError: The file is absent, empty, or of no known format.
@@ -84,6 +108,8 @@ def find_format(path: Path) -> Format:
         start = file.read(_SNIFFED_BYTES)
     if not start:
         raise unreadable(path, 0, "the file is empty", "record or copy it again")
+    if celex_options is not None and celex_options.event_format is not None:
+        return next(format for format in FORMATS if format.name == "CELEX")
     for format in FORMATS:
         if format.sniff(start):
             return format

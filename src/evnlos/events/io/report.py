@@ -32,6 +32,7 @@ class ReadReport:
             "assumed" (the format's usual sensor).
         events: Events returned.
         triggers: External trigger edges seen.
+        skipped: Events before the first row or time of a recording that starts in the middle; no fault.
         faults: How many faults of each kind: "truncated", "left_over", "out_of_range", "backwards",
             "undated", "unknown", "header", "checksum", "count".
         first: One line on the first fault of each kind, with its byte offset.
@@ -47,6 +48,7 @@ class ReadReport:
     geometry_from: str = ""
     events: int = 0
     triggers: int = 0
+    skipped: int = 0
     faults: dict[str, int] = field(default_factory=dict)
     first: dict[str, str] = field(default_factory=dict)
     bytes_left_over: int = 0
@@ -73,11 +75,10 @@ class ReadReport:
         return not self.faults
 
     def fault(
-        self, kind: str, offset: int | None, found: str, cure: str, *, count: int = 1, lost_bytes: int = 0
+        self, kind: str, offset: int, found: str, cure: str, *, count: int = 1, lost_bytes: int = 0
     ) -> None:
         """Note a fault at byte `offset`; in strict mode raise it as one line."""
-        where = "" if offset is None else f" byte {offset}:"
-        line = f"{self.path}:{where} {found}; {cure}"
+        line = f"{self.path}: byte {offset}: {found}; {cure}"
         if self.strict:
             raise EventFileError(line)
         self.faults[kind] = self.faults.get(kind, 0) + count

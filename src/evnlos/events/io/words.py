@@ -6,18 +6,20 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.events.io.columns import Columns, allocate, cut
+from evnlos.events.io.columns import Columns, allocate, cut, enlarge, shorten
 from evnlos.events.io.kernel_state import FAULTS, KINDS, STATE_SIZE, TRIGGERS, new_state
 from evnlos.events.io.report import ReadReport, unreadable
 
+_ROOM = 16  # a decoder may write that many places behind its last event
 _BLOCK_BYTES = 1 << 20  # stays in the second-level cache between reading and decoding
 
 # (words, state, t_us, x, y, p, width, height) -> number of events written
-Decode = Callable[..., int]
+Decode = Callable[..., Any]
 
 _FOUND = (
     "an unknown word type {kind:#x} ({word:#x})",
@@ -37,13 +39,15 @@ class WordCodec:
         dtype: One word, little endian.
         bound: Largest number of events that words can hold.
         decode: The kernel: fills the columns, carries the state on, returns how many events it wrote.
-        one_event_a_word: Whether no word holds more than one event, so that words need not be counted first.
+        kind_shift: Place of the lowest bit of a word's type.
+        most_events: Most events that one word can hold.
     """
 
     dtype: np.dtype
     bound: Callable[[NDArray], int]
     decode: Decode
-    one_event_a_word: bool = True
+    kind_shift: int
+    most_events: int = 1
 
 
 class WordSource:
@@ -64,7 +68,7 @@ class WordSource:
         done = 0
         while done < self.words:
             want = min(len(buffer), self.words - done)
-            got = file.readinto(buffer[:want].view(np.uint8)) // itemsize
+            got = file.readinto(memoryview(buffer[:want].view(np.uint8))) // itemsize  # type: ignore[arg-type]
             if not got:
                 raise unreadable(
                     self.path, self.start + done * itemsize, "the file became shorter", "read it again"
@@ -88,9 +92,9 @@ class WordSource:
         counts = state[FAULTS : FAULTS + 2 * len(KINDS) : 2]
         indices = state[FAULTS + 1 : FAULTS + 2 * len(KINDS) : 2]
         for kind in sorted(np.flatnonzero(counts), key=lambda kind: indices[kind]):
-            word = int(words[indices[kind]])
+            word = int(words[indices[kind]]) & ((1 << 8 * itemsize) - 1)
             offset = self.start + (first + int(indices[kind])) * itemsize
-            found = _FOUND[kind].format(word=word, kind=word >> (itemsize * 8 - 4))
+            found = _FOUND[kind].format(word=word, kind=(word >> self.codec.kind_shift) & 15)
             cure = _SALVAGE
             if KINDS[kind] == "out_of_range":
                 cure = f"the sensor is {self.report.width} x {self.report.height}; give width= and height="
@@ -127,17 +131,23 @@ class WordSource:
 
     def read(self) -> Columns:
         """Return all events, decoded straight into columns of the whole size."""
+        columns = allocate(self.words + _ROOM)  # pages that no event reaches are never used
+        count = 0
         with self.path.open("rb", buffering=0) as file:
-            if self.codec.one_event_a_word:
-                bound = self.words
-            else:
-                bound = sum(self.codec.bound(words) for _, words in self._word_blocks(file))
-            columns = allocate(bound)
-            count = 0
             for first, words in self._word_blocks(file):
+                self._make_room(columns, count, words, first)
                 count += self._decode(words, first, columns, count)
         self._finish()
-        columns = cut(columns, 0, count)
-        if count < bound // 2:  # do not keep memory that no event uses
-            columns = {name: column.copy() for name, column in columns.items()}
+        shorten(columns, count)
         return self._dated(columns)
+
+    def _make_room(self, columns: Columns, count: int, words: NDArray, first: int) -> None:
+        """Enlarge the columns where a block may hold more events than they have room for."""
+        room = len(columns["t_us"]) - count
+        if room >= self.codec.most_events * len(words) + _ROOM:
+            return
+        need = self.codec.bound(words)
+        if room < need:
+            done = first + len(words)
+            expected = (count + need) * self.words // done  # if the rest of the file is like its beginning
+            enlarge(columns, count, max(count + need, expected + expected // 16))

@@ -18,7 +18,7 @@ def write_events(path: str | PathLike[str], events: Events, *, format: str | Non
         path: The file to write; an existing one is replaced.
         events: The events.
         format: Name of the format, such as "EVT2"; by default the suffix decides: .h5 and .hdf5 HDF5 with
-            DSEC columns, .npz NPZ, .raw EVT3.
+            DSEC columns, .npz NPZ, .raw EVT3, .csv CSV, .bin CeleX-V (name it ..._100M.bin).
 
     Raises:
         EventFileError: No writable format has that suffix or name, or the folder cannot be written.
@@ -31,7 +31,7 @@ def write_events(path: str | PathLike[str], events: Events, *, format: str | Non
     assert chosen.write is not None
     temporary = path.with_name(f".{path.name[:80]}.{secrets.token_hex(4)}.part")
     try:
-        chosen.write(temporary, events, chosen.name)
+        chosen.write(temporary, events, path)
         temporary.replace(path)
     except OSError as error:
         raise EventFileError(

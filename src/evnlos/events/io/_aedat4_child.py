@@ -1,0 +1,50 @@
+"""Decodes an AEDAT4 file in a process of its own: on damage the package may abort, hang or ask for all memory.
+
+Run as a program: path, limit of memory in bytes, limit of processor time in seconds. Writes one line of JSON
+(width and height of the event stream, or null), then for every packet a 64-bit count and the columns t, x, y,
+on; a count of -1 ends a complete file.
+"""
+
+import json
+import struct
+import sys
+
+
+def main(path: str, memory_bytes: int, seconds: int) -> None:
+    """Write the first event stream of `path` to the standard output."""
+    try:
+        import resource
+    except ImportError:  # a system without limits
+        pass
+    else:
+        resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    import aedat
+
+    decoder = aedat.Decoder(path)
+    streams = [
+        (number, stream) for number, stream in decoder.id_to_stream().items() if stream["type"] == "events"
+    ]
+    out = sys.stdout.buffer
+    if not streams:
+        out.write(b"null\n")
+        return
+    number, stream = streams[0]
+    out.write(json.dumps([stream["width"], stream["height"]]).encode() + b"\n")
+    for packet in decoder:
+        if packet["stream_id"] != number or "events" not in packet:
+            continue
+        events = packet["events"]
+        columns = (
+            events["t"].astype("<i8"),
+            events["x"].astype("<u2"),
+            events["y"].astype("<u2"),
+            events["on"],
+        )
+        out.write(struct.pack("<q", len(events)) + b"".join(column.tobytes() for column in columns))
+    out.write(struct.pack("<q", -1))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

@@ -1,0 +1,229 @@
+"""CeleX-V recordings (`.bin`): a header of 12 bytes, then packages of events or full pictures."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+
+import numpy as np
+
+from evnlos.events.io import celex_kernels as kernels
+from evnlos.events.io.celex_options import CelexOptions, clock_from_name, tick_divisor
+from evnlos.events.io.columns import Columns, allocate, cut, shorten
+from evnlos.events.io.report import ReadReport, unreadable
+
+HEADER_BYTES = 12
+PICTURE_BYTES = kernels.WIDTH * kernels.HEIGHT * 3 // 2
+_MAX_PAYLOAD = PICTURE_BYTES + 1  # the longest that the camera sends; the last byte is the kind
+_FULL_PICTURE = 3  # a mode
+_SALVAGE = 'read it with on_error="salvage"'
+_IMU_BYTES = 32
+
+
+@dataclass(frozen=True)
+class CelexHeader:
+    """The 12 bytes at the start of a recording.
+
+    Args:
+        loop: Whether modes alternate.
+        has_imu: Whether a time stamp and IMU samples follow each package.
+        modes: The modes of loop A, B, C; a fixed mode is the first, 255 is none.
+        event_format: 0, 1 or 2.
+        packages: Number of packages that the camera counted; 0 where it was not written.
+    """
+
+    loop: bool
+    has_imu: bool
+    modes: tuple[int, int, int]
+    event_format: int
+    packages: int
+
+
+@dataclass(frozen=True)
+class Package:
+    """One package: byte offset and length of its data (without the kind), and what it holds."""
+
+    offset: int
+    length: int
+    is_picture: bool
+    host_time: int | None
+
+
+def sniff_celex(start: bytes) -> bool:
+    """Return whether the fields of the header and the length of the first package are possible."""
+    if len(start) < HEADER_BYTES + 4:
+        return False
+    kind, mode, _, _, event_format, hour, minute, second = start[:8]
+    length = struct.unpack_from("<I", start, HEADER_BYTES)[0]
+    clock = hour < 24 and minute < 60 and second < 60
+    return kind <= 3 and mode <= 6 and event_format <= 2 and clock and 1 < length <= _MAX_PAYLOAD
+
+
+def parse_header(path: Path, options: CelexOptions) -> CelexHeader:
+    """Return the header, with the caller's overrides in place of what a crash left."""
+    with path.open("rb") as file:
+        data = file.read(HEADER_BYTES)
+    if len(data) < HEADER_BYTES:
+        raise unreadable(path, 0, f"a CeleX header of {len(data)} bytes", "12 are needed: copy the file again")
+    event_format = data[4] if options.event_format is None else options.event_format
+    if event_format > 2:
+        cure = "0, 1 and 2 exist: give celex=CelexOptions(event_format=...)"
+        raise unreadable(path, 4, f"event format {event_format}", cure)
+    crashed = options.event_format is not None
+    has_imu = bool(data[0] & 2) if options.has_imu is None else options.has_imu
+    packages = 0 if crashed else struct.unpack_from("<I", data, 8)[0]
+    return CelexHeader(bool(data[0] & 1), has_imu, (data[1], data[2], data[3]), event_format, packages)
+
+
+def walk_packages(file: FileIO, header: CelexHeader, report: ReadReport) -> Iterator[Package]:
+    """Yield the packages up to the end of the file; a length is believed only as far as the file reaches."""
+    size = file.seek(0, 2)
+    at, count = HEADER_BYTES, 0
+    while at < size:
+        file.seek(at)
+        head = file.read(4)
+        length = struct.unpack("<I", head)[0] if len(head) == 4 else 0
+        if not 1 < length <= _MAX_PAYLOAD and len(head) == 4:
+            found = f"a package of {length} bytes"
+            report.fault(
+                "unknown", at, found, f"2 to {_MAX_PAYLOAD} are possible: {_SALVAGE}", lost_bytes=size - at
+            )
+            return
+        after = at + 4 + length
+        if after > size or len(head) < 4:
+            found = f"a package of {length} bytes, {size - at - len(head)} are left"
+            report.fault("truncated", at, found, f"copy the file again or {_SALVAGE}", lost_bytes=size - at)
+            return
+        file.seek(after - 1)
+        is_picture = file.read(1) == b"\0"
+        host_time = None
+        if header.has_imu:
+            tail = file.read(12)
+            host_time, samples = struct.unpack("<qI", tail) if len(tail) == 12 else (None, 0)
+            after += 12 + _IMU_BYTES * samples
+            if after > size or host_time is None:
+                found = f"{samples} IMU samples behind a package"
+                report.fault("truncated", at, found, f"copy the file again or {_SALVAGE}", lost_bytes=size - at)
+                return
+        if is_picture and length != _MAX_PAYLOAD:
+            found = f"a full picture of {length - 1} bytes"
+            report.fault("unknown", at, found, f"{PICTURE_BYTES} are one: {_SALVAGE}", lost_bytes=length)
+        else:
+            yield Package(at + 4, length - 1, is_picture, host_time)
+        at, count = after, count + 1
+    if header.packages and count != header.packages:
+        kind = "truncated" if count < header.packages else "count"
+        found = f"{count} packages where the header announces {header.packages}"
+        cure = f"after a crash give celex=CelexOptions(event_format={header.event_format}), or {_SALVAGE}"
+        report.fault(kind, size, found, cure)
+
+
+class CelexSource:
+    """The events of an open CeleX-V recording."""
+
+    def __init__(
+        self,
+        path: Path,
+        report: ReadReport,
+        width: int | None,
+        height: int | None,
+        options: CelexOptions | None,
+    ) -> None:
+        self.path, self.report = path, report
+        options = options or CelexOptions()
+        self._header = parse_header(path, options)
+        report.format = "CELEX"
+        if not self._header.loop and self._header.modes[0] == _FULL_PICTURE and options.event_format is None:
+            raise unreadable(path, 1, "a recording of full pictures", "read it with evnlos.read_frames(path)")
+        if width is not None and (width, height) != (kernels.WIDTH, kernels.HEIGHT):
+            raise unreadable(
+                path, 0, f"a sensor of {width} x {height}", "CeleX-V has 1280 x 800: leave the size out"
+            )
+        report.set_geometry(kernels.WIDTH, kernels.HEIGHT, "format")
+        clock = options.clock_mhz or clock_from_name(path)
+        if clock is None:
+            found = "a file name without the sensor's clock"
+            report.fault("header", 0, found, "name it ..._100M.bin or give celex=CelexOptions(clock_mhz=...)")
+            clock = 100
+        self._divisor = tick_divisor(clock)
+        self._buffer = np.empty(_MAX_PAYLOAD, np.uint8)
+
+    def _names(self) -> tuple[str, ...]:
+        names = ("t_us", "x", "y", "p", "polarity_known")
+        return names if self._header.event_format == 2 else (*names, "adc")
+
+    def _bound(self, package: Package) -> int:
+        format = self._header.event_format
+        return package.length // kernels.GROUP_BYTES[format] * kernels.EVENTS_A_GROUP[format]
+
+    def _new_state(self) -> tuple[np.ndarray, np.ndarray]:
+        state = np.zeros(kernels.STATE_SIZE, np.int64)
+        state[kernels.DIVISOR] = self._divisor
+        return state, np.full((kernels.HEIGHT, kernels.WIDTH), -1, np.int16)
+
+    def _decode(self, file: FileIO, package: Package, state: np.ndarray, last: np.ndarray, out: Columns) -> int:
+        file.seek(package.offset)
+        data = self._buffer[: package.length]
+        data = data[: file.readinto(memoryview(data))]  # type: ignore[arg-type]
+        format = self._header.event_format
+        left = package.length % kernels.GROUP_BYTES[format]
+        if left:
+            found = f"a package that ends {left} bytes into a group of {kernels.GROUP_BYTES[format]}"
+            self.report.fault(
+                "left_over", package.offset + package.length - left, found, _SALVAGE, lost_bytes=left
+            )
+        adc = out.get("adc", out["x"])  # format 2 has none and writes none
+        count = kernels.DECODERS[format](
+            data, state, out["t_us"], out["x"], out["y"], out["p"], adc, out["polarity_known"], last
+        )
+        for kind, slot, first, found in (
+            ("unknown", kernels.UNKNOWN, kernels.FIRST_UNKNOWN, "a word of an unknown kind"),
+            ("out_of_range", kernels.OUTSIDE, kernels.FIRST_OUTSIDE, "an event outside 1280 x 800"),
+        ):
+            if state[slot]:
+                offset = package.offset + int(state[first])
+                self.report.fault(
+                    kind, offset, found, f"the file is damaged there: {_SALVAGE}", count=int(state[slot])
+                )
+                state[slot] = 0
+        return int(count)
+
+    def _finish(self, state: np.ndarray, events: int, pictures: int) -> None:
+        self.report.skipped = int(state[kernels.SKIPPED])
+        if not events and pictures:
+            raise unreadable(
+                self.path, 0, "a recording of full pictures", "read it with evnlos.read_frames(path)"
+            )
+
+    def blocks(self) -> Iterator[Columns]:
+        """Yield the events package by package."""
+        state, last = self._new_state()
+        events = pictures = 0
+        with self.path.open("rb", buffering=0) as file:
+            for package in walk_packages(file, self._header, self.report):
+                if package.is_picture:
+                    pictures += 1
+                    continue
+                out = allocate(self._bound(package), self._names())
+                count = self._decode(file, package, state, last, out)
+                events += count
+                yield cut(out, 0, count)
+        self._finish(state, events, pictures)
+
+    def read(self) -> Columns:
+        """Return all events, decoded straight into columns of the whole size."""
+        state, last = self._new_state()
+        with self.path.open("rb", buffering=0) as file:
+            packages = list(walk_packages(file, self._header, self.report))
+            held = [package for package in packages if not package.is_picture]
+            columns = allocate(sum(map(self._bound, held)), self._names())
+            count = 0
+            for package in held:
+                out = cut(columns, count, len(columns["t_us"]))
+                count += self._decode(file, package, state, last, out)
+        self._finish(state, count, len(packages) - len(held))
+        shorten(columns, count)
+        return columns

@@ -1,0 +1,297 @@
+"""CSV: rows of numbers under a line of names, and the layouts of other programs, of CeleX-V among them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.events.io.celex_options import CelexOptions, clock_from_name, tick_divisor
+from evnlos.events.io.columns import ColumnCheck, Columns, join
+from evnlos.events.io.csv_kernels import FAULTS, FIRST_FAULT, parse_rows, print_rows
+from evnlos.events.io.report import ReadReport, unreadable
+from evnlos.types import Events
+
+_BLOCK_BYTES = 1 << 20
+_MAX_LINE = 4096
+_SALVAGE = 'repair the line or read with on_error="salvage"'
+_ALIASES = {
+    "t": "t_us", "time": "t_us", "timestamp": "t_us", "ts": "t_us", "t_us": "t_us", "time_us": "t_us",
+    "x": "x", "col": "x", "column": "x", "y": "y", "row": "y",
+    "p": "p", "pol": "p", "polarity": "p", "on": "p",
+    "adc": "adc", "intensity": "adc", "polarity_known": "polarity_known", "t_in_pixel": "t_in_pixel",
+}  # fmt: skip
+_CELEX = {
+    3: ("y", "x", "t_us"),
+    4: ("y", "x", "t_in_pixel", "t_us"),
+    5: ("y", "x", "adc", "p", "t_us"),
+}
+_LIMITS = {"x": (0, 65_535), "y": (0, 65_535), "adc": (0, 65_535), "p": (-1, 1), "polarity_known": (0, 1)}
+_SDK_WRAP_TICKS = 1 << 22  # the camera's program prints times modulo this
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the columns of a file are.
+
+    Args:
+        names: Column names, left to right.
+        start: Byte offset of the first row.
+        in_seconds: Whether times have decimals and are seconds.
+        is_celex: Whether the file was exported by the CeleX-V program.
+        size: Sensor size (width, height) that comments state.
+        announced: Number of events that comments state.
+    """
+
+    names: tuple[str, ...]
+    start: int
+    in_seconds: bool = False
+    is_celex: bool = False
+    size: tuple[int, int] | None = None
+    announced: int | None = None
+
+
+def _comment(lines: list[bytes]) -> tuple[tuple[int, int] | None, int | None]:
+    """Return sensor size and number of events that comment lines state."""
+    text = b"\n".join(lines).decode("latin-1").lower()
+    pair = re.search(r"geometry\W+(\d{1,5})\s*[x,]\s*(\d{1,5})", text)
+    width, height = re.search(r"width\W+(\d{1,5})", text), re.search(r"height\W+(\d{1,5})", text)
+    size = (int(pair[1]), int(pair[2])) if pair else None
+    if size is None and width and height:
+        size = int(width[1]), int(height[1])
+    count = re.search(r"events=(\d{1,18})", text)
+    return size, int(count[1]) if count else None
+
+
+def _split(line: bytes) -> list[bytes]:
+    return [field for field in re.split(rb"[\s,;]+", line.strip()) if field]
+
+
+def _is_number(field: bytes) -> bool:
+    return re.fullmatch(rb"[+-]?\d{1,18}(\.\d*)?", field) is not None
+
+
+def _is_sign(field: bytes) -> bool:
+    return field in (b"0", b"1", b"-1", b"+1")
+
+
+def find_layout(start: bytes) -> Layout | None:
+    """Return the layout of a text file from its first bytes, None where they are no rows of numbers."""
+    if any(byte < 9 or 13 < byte < 32 or byte > 126 for byte in start[:_MAX_LINE]):
+        return None
+    offset, comments, names = 0, [], ()
+    for line in start.splitlines(keepends=True):
+        fields = _split(line)
+        if line[:1] in (b"#", b"%"):
+            comments.append(line)
+        elif fields and not names and not any(map(_is_number, fields)):
+            names = tuple(_ALIASES.get(field.decode("latin-1").lower(), "") for field in fields)
+            if not {"t_us", "x", "y"} <= set(names):
+                return None
+        elif fields:
+            break
+        offset += len(line)
+    else:
+        fields = []
+    size, announced = _comment(comments)
+    if names:
+        in_seconds = bool(fields) and len(fields) == len(names) and b"." in fields[names.index("t_us")]
+        return Layout(names, offset, in_seconds, "t_in_pixel" in names, size, announced)
+    if not fields or not all(map(_is_number, fields)):
+        return None
+    return _headless(start, offset, fields, size, announced)
+
+
+def _headless(
+    start: bytes, offset: int, fields: list[bytes], size: tuple[int, int] | None, announced: int | None
+) -> Layout | None:
+    """Return the layout of rows without names: seconds first, the CeleX-V program's, or x, y, p, t."""
+    rows = [_split(line) for line in start[offset:].splitlines()[:1000]]
+    rows = [row for row in rows if len(row) == len(fields)]
+    if len(fields) == 4 and b"." in fields[0]:
+        return Layout(("t_us", "x", "y", "p"), offset, True, False, size, announced)
+    if len(fields) == 4 and all(_is_sign(row[2]) for row in rows):
+        return Layout(("x", "y", "p", "t_us"), offset, False, False, size, announced)
+    if len(fields) == 4 and all(_is_sign(row[3]) for row in rows):
+        return Layout(("t_us", "x", "y", "p"), offset, False, False, size, announced)
+    if len(fields) in _CELEX:
+        return Layout(_CELEX[len(fields)], offset, False, True, size, announced)
+    return None
+
+
+class CsvSource:
+    """An open text file of events."""
+
+    def __init__(
+        self,
+        path: Path,
+        report: ReadReport,
+        width: int | None,
+        height: int | None,
+        options: CelexOptions | None,
+    ) -> None:
+        self.path, self.report = path, report
+        self._options = options or CelexOptions()
+        with path.open("rb") as file:
+            layout = find_layout(file.read(1 << 16))
+        if layout is None:
+            raise unreadable(path, 0, "text that is no table of events", "columns t_us, x, y, p are read")
+        self._layout = layout
+        report.format = "CSV"
+        if width is not None:
+            report.set_geometry(width, height, "caller")
+        elif layout.size is not None:
+            report.set_geometry(*layout.size, "header")
+        elif layout.is_celex:
+            report.set_geometry(1280, 800, "format")
+        else:
+            largest = [0, 0]
+            quiet = ReadReport(path, strict=False)
+            for values, _ in self._rows(quiet):
+                for index, name in enumerate(("x", "y")):
+                    column = values[:, layout.names.index(name)]
+                    if len(column):
+                        largest[index] = max(largest[index], min(int(column.max()), 65_535))
+            report.set_geometry(largest[0] + 1, largest[1] + 1, "events")
+
+    def _rows(self, report: ReadReport) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Yield blocks of rows [rows, columns] and the byte offset of each row."""
+        layout = self._layout
+        columns = len(layout.names)
+        seconds = layout.names.index("t_us") if layout.in_seconds else -1
+        state = np.zeros(3, np.int64)
+        offset, tail, count = layout.start, b"", 0
+        with self.path.open("rb") as file:
+            file.seek(offset)
+            while True:
+                data = file.read(_BLOCK_BYTES)
+                last = len(data) < _BLOCK_BYTES
+                text = tail + data
+                if last and text and not text.endswith(b"\n"):
+                    if layout.announced is not None:  # a file of ours ends its last line
+                        found = "the last line has no end"
+                        report.fault("truncated", offset + len(text), found, f"copy the file again: {_SALVAGE}")
+                    text += b"\n"
+                block = np.frombuffer(text, np.uint8)
+                most = len(text) // (2 * columns) + 1  # a digit and a separator a column
+                values, starts = np.empty((most, columns), np.int64), np.empty(most, np.int64)
+                rows, used = parse_rows(block, columns, seconds, values, starts, state)
+                if state[FAULTS]:
+                    at = int(state[FIRST_FAULT])
+                    found = f"the line {text[at : at + 40].splitlines()[0]!r}"
+                    cure = f"{columns} numbers belong there: {_SALVAGE}"
+                    report.fault("unknown", offset + at, found, cure, count=int(state[FAULTS]))
+                    state[:] = 0
+                if len(text) - used > _MAX_LINE and not last:
+                    found = f"a line of more than {_MAX_LINE} bytes"
+                    lost = self.path.stat().st_size - offset - used
+                    report.fault("unknown", offset + used, found, "the file is no CSV", lost_bytes=lost)
+                    return
+                count += rows
+                yield values[:rows], offset + starts[:rows]
+                offset += used
+                tail = text[used:]
+                if last:
+                    break
+        if layout.announced is not None and layout.announced != count and report.clean:
+            kind = "truncated" if count < layout.announced else "count"
+            found = f"{count} events where the header announces {layout.announced}"
+            report.fault(kind, self.path.stat().st_size, found, f"copy the file again: {_SALVAGE}")
+
+    def blocks(self) -> Iterator[Columns]:
+        """Yield the events of about a megabyte of text at a time."""
+        check = ColumnCheck(self.report)
+        unwrap = _Unwrap(self.path, self.report, self._options) if self._layout.is_celex else None
+        for values, offsets in self._rows(self.report):
+            values, offsets = self._in_range(values, offsets)
+            columns = {name: values[:, index] for index, name in enumerate(self._layout.names)}
+            if unwrap is not None:
+                columns["t_us"] = unwrap(columns["t_us"])
+            yield check(_typed(columns, self._layout.is_celex), offsets)
+
+    def _in_range(self, values: NDArray, offsets: NDArray) -> tuple[NDArray, NDArray]:
+        """Leave out, and report, rows with a number that its column cannot hold."""
+        for index, name in enumerate(self._layout.names):
+            low, high = _LIMITS.get(name, (-(2**63), 2**63 - 1))
+            wrong = (values[:, index] < low) | (values[:, index] > high)
+            if wrong.any():
+                first = int(np.argmax(wrong))
+                found = f"{name} = {values[first, index]}"
+                cure = f"it runs from {low} to {high}: {_SALVAGE}"
+                self.report.fault("out_of_range", int(offsets[first]), found, cure, count=int(wrong.sum()))
+                values, offsets = values[~wrong], offsets[~wrong]
+        return values, offsets
+
+    def read(self) -> Columns:
+        """Return all events."""
+        return join(list(self.blocks()))
+
+
+def _typed(columns: dict[str, NDArray], is_celex: bool) -> Columns:
+    """Return columns in their types; polarities that the file does not have are unknown."""
+    out: Columns = {
+        "t_us": np.ascontiguousarray(columns["t_us"]),
+        "x": columns["x"].astype(np.uint16),
+        "y": columns["y"].astype(np.uint16),
+    }
+    if "p" in columns:
+        out["p"] = columns["p"] > 0
+        if is_celex:
+            out["polarity_known"] = columns["p"] != 0  # the camera's program prints 0 for no change
+    else:
+        out["p"] = np.zeros(len(out["t_us"]), np.bool_)
+        out["polarity_known"] = np.zeros(len(out["t_us"]), np.bool_)
+    if "polarity_known" in columns:
+        out["polarity_known"] = columns["polarity_known"] > 0
+    if "adc" in columns:
+        out["adc"] = columns["adc"].astype(np.uint16)
+    return out
+
+
+class _Unwrap:
+    """Undoes the turns of the times that the CeleX-V program prints, and converts ticks to microseconds."""
+
+    def __init__(self, path: Path, report: ReadReport, options: CelexOptions) -> None:
+        self._path, self._report, self._ticks = path, report, options.csv_in_ticks
+        self._clock = options.clock_mhz or clock_from_name(path)
+        self._turns, self._last = 0, 0
+
+    def _divisor(self) -> int:
+        if self._clock is None:
+            found = "times that turn over or count ticks, and no clock"
+            self._report.fault("header", 0, found, "give celex=CelexOptions(clock_mhz=...)")
+            self._clock = 100
+        return tick_divisor(self._clock)
+
+    def __call__(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        if not len(times):
+            return times
+        steps = np.diff(times, prepend=self._last)
+        self._last = int(times[-1])
+        shortest = _SDK_WRAP_TICKS if self._ticks else _SDK_WRAP_TICKS * 1024 // 140
+        turned = steps < -shortest // 2  # a smaller step back is a fault, which the check of order reports
+        turns = self._turns + np.cumsum(turned)
+        self._turns = int(turns[-1])
+        if not self._ticks and not self._turns:
+            return times
+        divisor = self._divisor()
+        if self._ticks:
+            return ((times + turns * _SDK_WRAP_TICKS) * 2048 + divisor) // (2 * divisor)
+        return times + (turns * _SDK_WRAP_TICKS * 2048 + divisor) // (2 * divisor)
+
+
+def write_csv(path: Path, events: Events) -> None:
+    """Write a comment with sensor size and count, a line of names, and one row an event."""
+    columns = events.columns()
+    with path.open("wb") as file:
+        file.write(f"# width={events.width} height={events.height} events={len(events)}\n".encode("ascii"))
+        file.write((",".join(columns) + "\n").encode("ascii"))
+        for start in range(0, len(events), 1 << 16):
+            part = [column[start : start + (1 << 16)].astype(np.int64) for column in columns.values()]
+            values = np.stack(part, axis=1)  # [rows, columns]
+            text = np.empty(21 * values.size, np.uint8)
+            text[: print_rows(values, text)].tofile(file)

@@ -1,0 +1,95 @@
+"""The rules of the house: which stage may import which, what the core may not need, what every public name says."""
+
+import ast
+import importlib
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import evnlos
+
+SOURCE = Path(evnlos.__file__).parent
+FORBIDDEN = {"torchvision", "matplotlib", "gradio", "dask", "distributed", "scipy", "pandas", "cv2", "mitsuba"}
+STAGES = ["scene", "transport", "sensor", "events", "dataset", "model", "training", "evaluation", "report"]
+LEAVES = {"types", "errors", "config", "metrics", "seeds", "version"}
+FILES = sorted(SOURCE.rglob("*.py"))
+
+
+def imported(path: Path, *, lazy: bool) -> set[str]:
+    """Return the modules that a file imports; with `lazy`, also those inside functions."""
+    tree = ast.parse(path.read_text())
+    nodes = ast.walk(tree) if lazy else iter(tree.body)
+    names = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import; name the package"
+            names.add(node.module or "")
+    return names
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
+def test_a_stage_imports_only_stages_to_its_left(path: Path) -> None:
+    parts = path.relative_to(SOURCE).parts
+    stage = parts[0].removesuffix(".py")
+    for name in imported(path, lazy=True):
+        if not name.startswith("evnlos."):
+            continue
+        other = name.split(".")[1]
+        if stage in STAGES:
+            assert other in LEAVES or STAGES.index(other) <= STAGES.index(stage), f"{path} imports {name}"
+        elif stage in LEAVES:
+            assert other in LEAVES, f"the leaf {path} imports {name}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
+def test_the_core_imports_nothing_heavy(path: Path) -> None:
+    assert not {name.split(".")[0] for name in imported(path, lazy=False)} & FORBIDDEN
+
+
+def test_no_file_is_long() -> None:
+    lengths = {str(path.relative_to(SOURCE)): len(path.read_text().splitlines()) for path in FILES}
+    assert {name: n for name, n in lengths.items() if n > 400} == {}
+
+
+def test_import_costs_torch_and_half_a_second() -> None:
+    code = (
+        "import json, sys, time\n"
+        "a = time.perf_counter()\nimport torch\nb = time.perf_counter()\nimport evnlos\nc = time.perf_counter()\n"
+        "print(json.dumps([c - b, sorted(sys.modules)]))"
+    )
+    runs = [json.loads(subprocess.check_output([sys.executable, "-c", code])) for _ in range(3)]
+    # numba looks for scipy by itself and takes it where it is installed.
+    assert not {name.split(".")[0] for name in runs[0][1]} & (FORBIDDEN - {"scipy"})
+    assert min(seconds for seconds, _ in runs) < 0.5
+
+
+@pytest.mark.parametrize("name", evnlos.__all__)
+def test_public_names_are_documented(name: str) -> None:
+    thing = getattr(evnlos, name)
+    if name.startswith("__"):
+        return
+    text = inspect.getdoc(thing) or ""
+    assert text.split("\n\n")[0].rstrip().endswith("."), f"{name} needs a docstring of one sentence first"
+    if inspect.isfunction(thing) and inspect.signature(thing).parameters:
+        assert "Args:" in text, f"{name} needs its arguments with shapes and units"
+
+
+def test_the_project_names_no_machine() -> None:
+    root = SOURCE.parent.parent
+    words = ("/" + "work/", "/" + "root/", "/home/", "/" + "tmp/")
+    for path in [*FILES, *root.glob("docs/*.md"), *root.glob("*.md")]:
+        text = path.read_text()
+        assert not [word for word in words if word in text], path
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_every_stage_lists_what_it_offers(stage: str) -> None:
+    module = importlib.import_module(f"evnlos.{stage}")
+    assert module.__all__ == sorted(module.__all__, key=lambda n: (not n.isupper(), n[0].islower(), n))
+    assert module.__doc__

@@ -1,0 +1,141 @@
+"""Captures: the shared ones under the standard sample, rendered ones, and everything that can be wrong with a folder."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from evnlos import EvnlosError, import_captures, open_dataset, read_capture
+from evnlos.dataset import capture_samples, character_of, read_shard, reduce_by_area
+from evnlos.dataset.sampling import Sampling
+
+
+@pytest.fixture
+def capture(tiny_captures, tmp_path) -> Path:
+    return Path(shutil.copytree(tiny_captures[0], tmp_path / "near_A"))
+
+
+def test_a_rendered_capture_reads_back(tiny_captures) -> None:
+    shot = read_capture(tiny_captures[0])
+    assert (shot.name, shot.target.name) == ("lab_A", "A")
+    assert shot.frames.shape == (9, 48, 72)
+    np.testing.assert_array_equal(shot.frame_times_us, np.arange(9) * 1_000_000)
+    assert shot.events.shape == (48, 72)
+    assert len(shot.events) > 1000
+    np.testing.assert_allclose(shot.scene.motion.position_m(4.0), (0.0, 0.0), atol=1e-12)
+
+
+def test_the_standard_sample_of_a_shared_capture(shared_data) -> None:
+    folder = shared_data / "captures" / "near_F"
+    shot = read_capture(folder)
+    samples = capture_samples(shot, Sampling())
+    assert samples.frame.shape == (40, 64, 96)
+    np.testing.assert_allclose(samples.time_s, np.arange(1, 41) * 0.2)
+    np.testing.assert_allclose(samples.position_m[:, 0], -0.08 + 0.004 * np.arange(1, 41), atol=1e-9)
+    picture = np.asarray(Image.open(folder / "frames" / "0007.png"), dtype=np.float64) / 255
+    np.testing.assert_allclose(samples.frame[6], reduce_by_area(picture, (64, 96)), atol=1e-6)
+    # The definition of the surface, pixel by pixel: last event of each polarity up to the frame's time.
+    t, x, y, p = shot.events.t_us, shot.events.x, shot.events.y, shot.events.p
+    expected = np.zeros((2, 100, 160))
+    for i in range(int(np.searchsorted(t, 1_400_000, side="right"))):
+        expected[0 if p[i] else 1, y[i], x[i]] = np.exp(-(1.4e6 - t[i]) / 0.2e6)
+    np.testing.assert_allclose(samples.surface[6], reduce_by_area(expected, (64, 96)), atol=2e-6)
+    # The truth is the plate: 8 cm of a canvas of 24 cm, in the middle at 4 s.
+    plate = np.asarray(Image.open(folder / "target.png"), dtype=np.float64) / 255
+    np.testing.assert_allclose(
+        samples.truth[19, 16:48, 32:64], plate.reshape(32, 8, 32, 8).mean(axis=(1, 3)), atol=1e-6
+    )
+    assert samples.truth[19].sum() == pytest.approx(plate.mean() * 32 * 32, rel=1e-5)
+
+
+def test_every_shared_capture_imports(shared_data, tmp_path) -> None:
+    pytest.importorskip("aedat", reason="the far captures need the extra [aedat]")
+    folders = [shared_data / "captures" / name for name in ("near_G", "near_S", "far_G", "far_S")]
+    list(import_captures(folders, tmp_path / "d", test=["G"]))
+    dataset = open_dataset(tmp_path / "d")
+    assert dataset.split == {"train": ["near_S", "far_S"], "validation": [], "test": ["near_G", "far_G"]}
+    for name in dataset.objects():
+        samples, _ = read_shard(dataset.shard(name))
+        assert len(samples) == 40
+        assert samples.event_count.min() > 100
+
+
+def test_import_is_resumable_and_refuses_other_captures(tiny_captures, tmp_path) -> None:
+    steps = import_captures(tiny_captures, tmp_path / "d", test=["4"])
+    next(steps)
+    steps.close()
+    assert len(open_dataset(tmp_path / "d").missing()) == 3
+    assert len(list(import_captures(tiny_captures, tmp_path / "d", test=["4"]))) == 3
+    with pytest.raises(EvnlosError, match="other settings"):
+        list(import_captures(tiny_captures[:3], tmp_path / "d"))
+
+
+def test_held_out_names_must_exist_and_not_overlap(tiny_captures, tmp_path) -> None:
+    with pytest.raises(EvnlosError, match="no capture is named Z"):
+        list(import_captures(tiny_captures, tmp_path / "d", test=["Z"]))
+    with pytest.raises(EvnlosError, match="choose one"):
+        list(import_captures(tiny_captures, tmp_path / "d", test=["A"], validation=["lab_A"]))
+    assert not (tmp_path / "d").exists()
+
+
+def test_an_unknown_target_gives_samples_without_truth(capture) -> None:
+    text = (capture / "capture.yaml").read_text()
+    (capture / "capture.yaml").write_text(text.replace("  mask: target.png\n", ""))
+    samples = capture_samples(read_capture(capture), Sampling())
+    assert samples.truth is None and samples.position_m is None
+    assert samples.frame.shape == (8, 64, 96)
+
+
+def _edit(name: str, old: str, new: str):
+    def edit(folder: Path) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new))
+
+    return edit
+
+
+DAMAGE = {
+    "no capture.yaml": (lambda f: (f / "capture.yaml").unlink(), "capture.yaml"),
+    "unknown key": (_edit("capture.yaml", "plate_m", "plate"), "plate_m"),
+    "wrong type": (_edit("capture.yaml", "width: 72", "width: wide"), "camera.width"),
+    "missing events": (lambda f: (f / "events.raw").unlink(), "events.raw"),
+    "empty events": (lambda f: (f / "events.raw").write_bytes(b""), "events.raw"),
+    "cut events": (
+        lambda f: (f / "events.raw").write_bytes((f / "events.raw").read_bytes()[:-1]),
+        "events.raw",
+    ),
+    "outside": (_edit("capture.yaml", "mask: target.png", "mask: ../../secret.png"), "outside"),
+    "missing frame": (lambda f: (f / "frames/0003.png").unlink(), "0003.png"),
+    "no picture": (lambda f: (f / "frames/0003.png").write_text("hello"), "picture"),
+    "small frame": (lambda f: Image.new("L", (70, 48)).save(f / "frames/0003.png"), "70 x 48"),
+    "times": (_edit("frames.csv", "3000000", "2000000"), "ascend"),
+    "time text": (_edit("frames.csv", "3000000", "three"), "whole number"),
+    "no frames": (lambda f: (f / "frames.csv").write_text("t_us,file\n"), "no frames"),
+    "too wide": (_edit("capture.yaml", "width: 72", "width: 71"), "71"),
+    "nan": (_edit("capture.yaml", "speed_m_s: 0.02", "speed_m_s: .nan"), "speed_m_s"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_capture_is_a_one_line_error_and_writes_nothing(damage: str, capture, tmp_path) -> None:
+    break_it, says = DAMAGE[damage]
+    break_it(capture)
+    with pytest.raises(EvnlosError, match=says) as caught:
+        list(import_captures([capture], tmp_path / "d"))
+    assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "d").glob("*.h5"))
+
+
+def test_a_capture_without_events_is_refused(capture, tmp_path) -> None:
+    from evnlos import Events, write_events
+
+    write_events(capture / "events.raw", Events.empty(72, 48))
+    with pytest.raises(EvnlosError, match="no event"):
+        read_capture(capture)
+
+
+def test_characters_of_names() -> None:
+    assert [character_of(n) for n in ("near_R", "writer03_A", "plain")] == ["R", "A", "plain"]

@@ -1,0 +1,205 @@
+"""Every command, as a user types it: right input does the job, wrong input is one line and exit code 2."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from evnlos import open_dataset
+from evnlos.cli import COMMANDS, main
+from evnlos.config import save_yaml
+
+NETWORK = ["--network.width", "8", "--network.depth", "2"]
+
+
+def call(*arguments: object) -> None:
+    main([str(argument) for argument in arguments])
+
+
+def fails(capsys, *arguments: object) -> str:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        call(*arguments)
+    error = capsys.readouterr().err
+    assert stop.value.code == 2, error
+    lines = [line for line in error.splitlines() if line.startswith("evnlos")]
+    assert len(lines) == 1, error
+    assert "Traceback" not in error
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def shots(tiny_captures, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("shots") / "d"
+    sampling = ["--sampling.height", 32, "--sampling.width", 48, "--sampling.scored-rows", 24]
+    call("import", *tiny_captures, "--out", out, "--test", "4", *sampling, "--sampling.pitch-m", 0.005)
+    return out
+
+
+@pytest.fixture(scope="module")
+def runs(shots, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
+    """Pre-trained, fine-tuned and end-to-end runs, made by the commands."""
+    out = tmp_path_factory.mktemp("runs")
+    found = {}
+    for paradigm in ("frame", "fusion"):
+        pre, epnp, e2e = (out / f"{kind}-{paradigm}" for kind in ("pre", "epnp", "e2e"))
+        call(
+            "train",
+            "--data",
+            tiny_dataset.folder,
+            "--paradigm",
+            paradigm,
+            "--out",
+            pre,
+            "--epochs",
+            2,
+            *NETWORK,
+        )
+        call("finetune", "--weights", pre, "--data", shots, "--out", epnp, "--epochs", 2)
+        call("train", "--data", shots, "--paradigm", paradigm, "--out", e2e, "--epochs", 2, *NETWORK)
+        found |= {p.name: p for p in (pre, epnp, e2e)}
+    return found
+
+
+@pytest.mark.parametrize("verb", COMMANDS)
+def test_help_shows_every_command_with_its_defaults(verb: str, capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        call(verb, "--help")
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert "--out" in text or verb == "evaluate"
+    assert "default" in text
+    call("--help")
+    assert verb in capsys.readouterr().out
+
+
+def test_version(capsys) -> None:
+    call("--version")
+    assert re.match(r"\d+\.\d+", capsys.readouterr().out)
+
+
+def test_simulate_prints_what_diffraction_does(tiny, tmp_path, capsys) -> None:
+    save_yaml(tiny, tmp_path / "tiny.yaml")
+    call(
+        "simulate",
+        "--config",
+        tmp_path / "tiny.yaml",
+        "--glyphs.characters",
+        "AB",
+        "--out",
+        tmp_path / "d",
+        "--workers",
+        1,
+    )
+    shown = capsys.readouterr()
+    assert "fresnel_number" in shown.err
+    assert "4 objects, 32 samples, 0 missing" in shown.out
+    assert len(open_dataset(tmp_path / "d").objects()) == 4
+    with pytest.raises(SystemExit):
+        call(
+            "simulate", "--config", tmp_path / "tiny.yaml", "--glyphs.kharacters", "AB", "--out", tmp_path / "e"
+        )
+
+
+def test_import_splits(shots) -> None:
+    assert open_dataset(shots).split == {
+        "train": ["lab_A", "lab_L", "lab_T"],
+        "validation": [],
+        "test": ["lab_4"],
+    }
+
+
+def test_lab_renders_a_capture(tmp_path, capsys) -> None:
+    small = ["--sensor.height", 24, "--sensor.width", 36, "--transport.cell-m", 0.02, "--frame-rate-hz", 1]
+    call("lab", "--out", tmp_path / "lab", "--glyphs.family", "kalam", "--glyphs.characters", "K", *small)
+    assert (tmp_path / "lab" / "lab_K" / "capture.yaml").is_file()
+    assert len(list((tmp_path / "lab" / "lab_K" / "frames").glob("*.png"))) == 9
+
+
+def test_evaluate_prints_one_json_object(runs, shots, capsys) -> None:
+    capsys.readouterr()
+    call("evaluate", "--weights", runs["epnp-fusion"], "--data", shots, "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["paradigm"] == "fusion"
+    assert found["images"] == 8
+    assert set(found["characters"]) == {"lab_4"}
+    assert found["characters"]["lab_4"]["character"] == "4"
+    for scores in (
+        found["overall"],
+        found["baselines"]["zero"]["overall"],
+        found["baselines"]["mean"]["overall"],
+    ):
+        assert 0 < scores["psnr_db"] < 60
+        assert -1 <= scores["ssim"] <= 1
+        assert scores["lpips"] is None
+    call("evaluate", "--weights", runs["epnp-fusion"], "--data", shots)
+    assert "not available" in capsys.readouterr().out
+
+
+def test_evaluate_refuses_objects_that_training_saw(runs, tmp_path, tiny_captures, capsys) -> None:
+    sampling = ["--sampling.height", 32, "--sampling.width", 48, "--sampling.scored-rows", 24]
+    call(
+        "import", *tiny_captures, "--out", tmp_path / "d", "--test", "A", *sampling, "--sampling.pitch-m", 0.005
+    )
+    assert "lab_A" in fails(capsys, "evaluate", "--weights", runs["e2e-frame"], "--data", tmp_path / "d")
+
+
+def test_reconstruct_writes_pictures_strip_and_animation(runs, tiny_captures, tmp_path, capsys) -> None:
+    capsys.readouterr()
+    call("reconstruct", tiny_captures[3], "--weights", runs["epnp-frame"], "--out", tmp_path / "r", "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["positions"] == 8 and found["scores"]["psnr_db"] > 0
+    assert len(list((tmp_path / "r").glob("position_*.png"))) == 8
+    images = np.load(tmp_path / "r" / "reconstruction.npy")
+    assert images.shape == (8, 32, 48)
+    with Image.open(tmp_path / "r" / "animation.gif") as animation:
+        assert animation.n_frames == 8
+    with Image.open(tmp_path / "r" / "position_03.png") as picture:
+        np.testing.assert_array_equal(np.asarray(picture)[::4, ::4], np.round(255 * images[3]).astype(np.uint8))
+    assert "not an empty folder" in fails(
+        capsys, "reconstruct", tiny_captures[3], "--weights", runs["epnp-frame"], "--out", tmp_path / "r"
+    )
+
+
+def test_report_is_one_page_without_requests(runs, shots, tmp_path, capsys) -> None:
+    call("report", *runs.values(), "--data", shots, "--out", tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert not re.findall(r"(?:src|href)=['\"](?!data:)", page)
+    assert "https:" not in page and "http:" not in page
+    assert page.count("<img") == 3 + len(runs)
+    rows = (tmp_path / "report.csv").read_text().splitlines()
+    assert rows[0].split(",")[3:5] == ["all-zero", "mean image"]
+    assert {"simulation only frame", "E2E fusion", "EPNP frame"} <= set(rows[0].split(","))
+    shown = capsys.readouterr().out
+    assert "report:" in shown and "lab 4" in shown
+    # The page, the CSV and `evaluate` say the same.
+    call("evaluate", "--weights", runs["e2e-fusion"], "--data", shots, "--json")
+    number = json.loads(capsys.readouterr().out)["overall"]["psnr_db"]
+    row = dict(zip(rows[0].split(","), rows[1].split(","), strict=True))
+    assert float(row["E2E fusion"]) == pytest.approx(number)
+    assert f">{number:.2f}<" in page
+
+
+def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    assert "unknown command" in fails(capsys, "reconstrukt")
+    assert "no dataset" in fails(capsys, "train", "--data", tmp_path, "--out", out)
+    assert "does not exist" in fails(
+        capsys, "finetune", "--weights", tmp_path / "w", "--data", shots, "--out", out
+    )
+    assert "not a folder" in fails(
+        capsys, "reconstruct", tmp_path / "c", "--weights", runs["e2e-frame"], "--out", out
+    )
+    assert "capture.yaml" in fails(capsys, "import", tmp_path, "--out", out)
+    assert "does not exist" in fails(capsys, "simulate", "--config", tmp_path / "c.yaml", "--out", out)
+    assert "--preset" in fails(capsys, "simulate", "--preset", "papper", "--out", out)
+    (tmp_path / "c.yaml").write_text("epoch: 3\n")
+    assert "epochs" in fails(capsys, "train", "--config", tmp_path / "c.yaml", "--data", shots, "--out", out)
+    assert "vgg" in fails(
+        capsys, "evaluate", "--weights", runs["e2e-frame"], "--data", shots, "--vgg", tmp_path / "vgg.pth"
+    )
+    assert "pitch_m" in fails(capsys, "import", *tiny_captures, "--out", out, "--sampling.pitch-m", "nan")
+    assert not out.exists()

@@ -1,0 +1,196 @@
+"""Samples on disk: area averaging, shards, simulation for any number of workers, resume, splits."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evnlos.config import save_yaml
+from evnlos.dataset import (
+    NlosDataset,
+    network_input,
+    open_dataset,
+    read_shard,
+    reduce_by_area,
+    simulate,
+    write_shard,
+)
+from evnlos.dataset.pool import run_tasks
+from evnlos.errors import DataError, EvnlosError
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.h5"))}
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 40), st.integers(1, 40), st.integers(0, 99))
+@settings(max_examples=60, deadline=None)
+def test_area_averaging_is_the_mean_over_each_cell(h: int, w: int, hh: int, ww: int, seed: int) -> None:
+    image = np.random.default_rng(seed).random((h, w)).astype(np.float32)
+    before = image.copy()
+    # A grid that both divide: repeat, then average whole blocks.
+    fine = np.repeat(np.repeat(image.astype(np.float64), hh, axis=0), ww, axis=1)
+    expected = fine.reshape(hh, h, ww, w).mean(axis=(1, 3))
+    np.testing.assert_allclose(reduce_by_area(image, (hh, ww)), expected, atol=2e-6)
+    np.testing.assert_array_equal(image, before)
+
+
+def test_a_sample_shows_the_plate_where_it_is(tiny_dataset) -> None:
+    samples, attributes = read_shard(tiny_dataset.shard("writer00_T"))
+    sampling = tiny_dataset.sampling
+    assert samples.frame.shape == (8, 32, 48)
+    assert samples.surface.shape == (8, 2, 32, 48)
+    assert attributes["object"] == "writer00_T"
+    np.testing.assert_allclose(samples.time_s, np.arange(1, 9))
+    np.testing.assert_allclose(samples.position_m[:, 0], -0.08 + 0.02 * np.arange(1, 9), atol=1e-12)
+    assert 0 < samples.frame.max() <= 1
+    assert samples.surface.min() >= 0
+    assert samples.event_count.sum() > 100
+    # The truth's centre of light moves as the plate does, 2 cm a position.
+    x = (np.arange(48) - 23.5) * sampling.pitch_m
+    centre = (samples.truth * x).sum(axis=(1, 2)) / samples.truth.sum(axis=(1, 2))
+    np.testing.assert_allclose(np.diff(centre), 0.02, atol=2e-4)
+    # And so does the spot in the frame, in the same direction.
+    spot = samples.frame - np.median(samples.frame, axis=(1, 2), keepdims=True)
+    spot = np.where(spot > 0.3 * spot.max(), spot, 0)
+    assert (np.diff((spot * np.arange(48)).sum(axis=(1, 2)) / spot.sum(axis=(1, 2))) > 1).all()
+
+
+def test_shards_are_the_same_bytes_for_any_number_of_workers(tiny, tiny_dataset, tmp_path) -> None:
+    names = list(simulate(tiny, tmp_path / "two", workers=2))
+    assert sorted(names) == sorted(tiny_dataset.objects())
+    assert contents(tmp_path / "two") == contents(tiny_dataset.folder)
+
+
+def test_a_run_goes_on_where_it_was(tiny, tiny_dataset, tmp_path) -> None:
+    folder = tmp_path / "again"
+    steps = simulate(tiny, folder)
+    first = [next(steps), next(steps)]
+    steps.close()
+    assert len(open_dataset(folder).missing()) == 14
+    rest = list(simulate(tiny, folder))
+    assert not set(first) & set(rest)
+    assert contents(folder) == contents(tiny_dataset.folder)
+
+
+def test_a_killed_run_leaves_no_half_shard(tiny, tiny_dataset, tmp_path) -> None:
+    save_yaml(tiny, tmp_path / "tiny.yaml")
+    command = [
+        sys.executable,
+        "-m",
+        "evnlos",
+        "simulate",
+        "--config",
+        "tiny.yaml",
+        "--out",
+        "d",
+        "--workers",
+        "1",
+    ]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while (
+        len(list((tmp_path / "d").glob("*.h5"))) < 3 and process.poll() is None and time.monotonic() < deadline
+    ):
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    found = contents(tmp_path / "d")
+    assert 3 <= len(found) <= 16
+    assert found.items() <= contents(tiny_dataset.folder).items()
+    list(simulate(tiny, tmp_path / "d"))
+    assert contents(tmp_path / "d") == contents(tiny_dataset.folder)
+
+
+def test_a_folder_of_other_settings_is_refused(tiny, tiny_dataset) -> None:
+    with pytest.raises(DataError, match=r"positions: 8 -> 9"):
+        next(simulate(replace(tiny, positions=9), tiny_dataset.folder))
+
+
+def test_splits_are_by_object(tiny_dataset) -> None:
+    train, held_out = set(tiny_dataset.objects("train")), set(tiny_dataset.objects("validation"))
+    assert (len(train), len(held_out)) == (13, 3)
+    assert not train & held_out
+    with pytest.raises(DataError, match="no objects in split 'test'"):
+        tiny_dataset.objects("test")
+
+
+def test_a_flipped_bit_in_a_shard_is_found(tiny_dataset, tmp_path) -> None:
+    samples, attributes = read_shard(tiny_dataset.shard("writer00_A"))
+    write_shard(tmp_path / "s.h5", samples, attributes)
+    clean = (tmp_path / "s.h5").read_bytes()
+    start = clean.find(b"\x78\x01") + 40  # inside the first gzip chunk
+    rng = np.random.default_rng(0)
+    for place in rng.integers(start, len(clean) // 2, 8):
+        broken = bytearray(clean)
+        broken[place] ^= 1 << int(rng.integers(8))
+        (tmp_path / "b.h5").write_bytes(broken)
+        try:
+            again, _ = read_shard(tmp_path / "b.h5")
+        except DataError as error:
+            assert "damaged" in str(error) or "not a shard" in str(error)
+        else:  # the bit lay in space that holds nothing
+            np.testing.assert_array_equal(again.frame, samples.frame)
+            np.testing.assert_array_equal(again.surface, samples.surface)
+    with pytest.raises(DataError, match="damaged"):
+        (tmp_path / "b.h5").write_bytes(clean[: len(clean) // 2])
+        read_shard(tmp_path / "b.h5")
+
+
+def test_paradigms_are_one_switch(tiny_dataset) -> None:
+    sets = {
+        paradigm: NlosDataset(tiny_dataset, "validation", paradigm) for paradigm in ("frame", "event", "fusion")
+    }
+    assert [d.inputs.shape[1] for d in sets.values()] == [1, 2, 3]
+    np.testing.assert_array_equal(sets["fusion"].inputs[:, :1], sets["frame"].inputs)
+    np.testing.assert_array_equal(sets["fusion"].inputs[:, 1:], sets["event"].inputs)
+    seen, truth = sets["fusion"][5]
+    assert (seen.shape, truth.shape) == ((3, 32, 48), (1, 32, 48))
+    with pytest.raises(DataError, match="paradigm"):
+        network_input(np.zeros((1, 4, 4)), np.zeros((1, 2, 4, 4)), "sound")
+
+
+def test_gain_and_ambient_light_drop_out_of_the_frame() -> None:
+    frame = np.random.default_rng(0).random((2, 8, 8))
+    same = network_input(frame * 0.5 + 0.2, np.zeros((2, 2, 8, 8)), "frame")
+    np.testing.assert_allclose(same, network_input(frame, np.zeros((2, 2, 8, 8)), "frame"), atol=1e-5)
+
+
+def _die_once(task: tuple[Path, int]) -> int:
+    flag, number = task
+    if number == 2 and not flag.exists():
+        flag.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def _always_die(number: int) -> int:
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_the_pool_survives_the_death_of_a_worker(tmp_path) -> None:
+    assert sorted(run_tasks(_die_once, [(tmp_path / "died", i) for i in range(6)], 2)) == list(range(6))
+    with pytest.raises(EvnlosError, match="died 3 times"):
+        list(run_tasks(_always_die, range(4), 2))
+
+
+def test_no_dataset_and_overlapping_splits(tmp_path) -> None:
+    with pytest.raises(DataError, match="no dataset"):
+        open_dataset(tmp_path)
+    about = {"origin": "simulation", "sampling": {}, "version": "0"}
+    save_yaml({**about, "split": {"train": ["a"], "test": ["a"]}}, tmp_path / "dataset.yaml")
+    with pytest.raises(DataError, match="two splits"):
+        open_dataset(tmp_path)
+    save_yaml({**about, "split": {"train": ["../a"]}}, tmp_path / "dataset.yaml")
+    with pytest.raises(DataError, match="out of the folder"):
+        open_dataset(tmp_path)

@@ -1,0 +1,192 @@
+"""Learning: a tiny run must see, a killed run must go on bit for bit, the paper's loss must be caught collapsing."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos import EvnlosError, ResidualUNet, Training, UNetConfig, evaluate, load_weights, train
+from evnlos.dataset import NlosDataset
+from evnlos.errors import DataError
+from evnlos.model import save_weights
+from evnlos.training import LOSSES, balanced_loss, paper_loss, step_size
+
+SMALL = UNetConfig(width=8, depth=2, shuffle=1)
+QUICK = Training(epochs=2, network=SMALL, precision="float32")
+
+
+def run(dataset, settings, out, weights=None) -> list[dict]:
+    return list(train(dataset, settings, out, weights))
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_dataset, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "frame"
+    log = run(tiny_dataset, replace(QUICK, epochs=14, learning_rate=3e-3), out)
+    return out, log
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 96), (37, 51), (16, 16), (1, 3)])
+def test_the_network_takes_any_size(height: int, width: int) -> None:
+    net = ResidualUNet(3, UNetConfig(width=8, depth=3))
+    out = net(torch.zeros(2, 3, height, width))
+    assert out.shape == (2, 1, height, width)
+    assert 0 <= out.min() and out.max() <= 1
+
+
+def test_the_network_refuses_the_wrong_number_of_channels() -> None:
+    with pytest.raises(EvnlosError, match=r"\[B, 3, H, W\]"):
+        ResidualUNet(3, SMALL)(torch.zeros(1, 1, 16, 16))
+
+
+def test_every_parameter_is_trained() -> None:
+    net = ResidualUNet(1, SMALL)
+    for _ in range(2):  # the second convolution of each block starts at zero and hides the first one's gradient
+        net.zero_grad()
+        net(torch.randn(2, 1, 16, 16)).square().mean().backward()
+        with torch.no_grad():
+            for p in net.parameters():
+                p.add_(p.grad if p.grad is not None else 0)
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in net.parameters())
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_losses_are_least_at_the_truth_and_finite(name: str) -> None:
+    truth = torch.zeros(3, 1, 32, 32)
+    truth[:, :, 8:20, 10:14] = 1
+    at_truth = LOSSES[name](truth, truth)
+    for other in (torch.zeros_like(truth), torch.rand(truth.shape), 1 - truth):
+        image = other.clone().requires_grad_()
+        loss = LOSSES[name](image, truth)
+        loss.backward()
+        assert loss > at_truth + 0.1
+        assert torch.isfinite(image.grad).all()
+
+
+def test_black_costs_almost_nothing_under_the_papers_loss_only() -> None:
+    truth = torch.zeros(4, 1, 48, 96)
+    truth[:, :, 20:30, 40:42] = 1
+    black = torch.zeros_like(truth)
+    worst = {"paper": paper_loss(1 - truth, truth), "balanced": balanced_loss(1 - truth, truth)}
+    assert (paper_loss(black, truth) - 2) / (worst["paper"] - 2) < 0.02
+    assert balanced_loss(black, truth) > 1.2  # energy 1, overlap 1/4: far from the 0 of the truth
+
+
+def test_a_tiny_run_beats_the_mean_image(trained, tiny_dataset) -> None:
+    out, log = trained
+    found = evaluate(load_weights(out), tiny_dataset, "validation").summary()
+    assert found["overall"]["psnr_db"] > found["baselines"]["mean"]["overall"]["psnr_db"] + 1.0
+    assert found["overall"]["psnr_db"] > found["baselines"]["zero"]["overall"]["psnr_db"] + 1.0
+    assert log[-1]["psnr_db"] == pytest.approx(found["overall"]["psnr_db"], abs=0.1)
+    assert log[-1]["loss"] < 0.7 * log[0]["loss"]
+    assert not log[-1]["collapsed"]
+    assert set(found["characters"]) == set(tiny_dataset.objects("validation"))
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tiny_dataset, tmp_path) -> None:
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        run(tiny_dataset, replace(QUICK, seed=seed), tmp_path / name)
+    a, b, c = ((tmp_path / n / "weights.safetensors").read_bytes() for n in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_a_killed_training_ends_with_the_same_bytes(tiny_dataset, tmp_path) -> None:
+    settings = replace(QUICK, epochs=6)
+    run(tiny_dataset, settings, tmp_path / "whole")
+    command = [sys.executable, "-m", "evnlos", "train", "--data", str(tiny_dataset.folder), "--out", "killed"]
+    command += ["--epochs", "6", "--precision", "float32"]
+    command += ["--network.width", "8", "--network.depth", "2", "--network.shuffle", "1"]
+    threads = {"OMP_NUM_THREADS": str(torch.get_num_threads())}
+    quiet = {
+        "cwd": tmp_path,
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+        "env": os.environ | threads,
+    }
+    process = subprocess.Popen(command, **quiet)
+    checkpoint = tmp_path / "killed" / "checkpoint.safetensors"
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert checkpoint.exists() and not (tmp_path / "killed" / "weights.safetensors").exists()
+    subprocess.run(command, check=True, **quiet)
+    whole, killed = (load_weights(tmp_path / name).network.state_dict() for name in ("whole", "killed"))
+    for name, value in whole.items():
+        assert torch.equal(value, killed[name]), name
+    lines = (tmp_path / "killed" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["epoch"] for line in lines] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_run_that_has_ended_is_not_trained_again(trained, tiny_dataset) -> None:
+    out, log = trained
+    before = (out / "weights.safetensors").stat().st_mtime_ns
+    assert run(tiny_dataset, replace(QUICK, epochs=14, learning_rate=3e-3), out) == log
+    assert (out / "weights.safetensors").stat().st_mtime_ns == before
+    with pytest.raises(DataError, match=r"settings\.epochs: 14 -> 2"):
+        run(tiny_dataset, replace(QUICK, learning_rate=3e-3), out)
+
+
+def test_fine_tuning_starts_from_the_weights_and_keeps_frozen_parts(trained, tiny_dataset, tmp_path) -> None:
+    out, _ = trained
+    settings = replace(QUICK, freeze=("encoder", "latent"), learning_rate=1e-3, paradigm="event")
+    run(tiny_dataset, settings, tmp_path / "fine", out)
+    old, new = load_weights(out), load_weights(tmp_path / "fine")
+    assert new.paradigm == "frame"  # that of the weights
+    assert [step["data"]["origin"] for step in new.history] == ["simulation", "simulation"]
+    for name, value in old.network.state_dict().items():
+        frozen = name.split(".")[0] in ("stem", "encoder", "down", "latent")
+        assert torch.equal(value, new.network.state_dict()[name]) == frozen, name
+
+
+def test_step_sizes() -> None:
+    step = Training(epochs=200, learning_rate=1e-4, schedule="step", step_epoch=100)
+    assert [step_size(step, e) for e in (0, 99.9, 100, 199)] == [1e-4, 1e-4, 5e-5, 5e-5]
+    cosine = Training(epochs=10, learning_rate=1.0)
+    np.testing.assert_allclose([step_size(cosine, e) for e in (0, 5, 10)], [1, 0.5, 0], atol=1e-12)
+
+
+def test_a_collapsed_network_is_recognised(tiny_dataset, tmp_path) -> None:
+    log = run(tiny_dataset, replace(QUICK, epochs=1, loss="paper", learning_rate=1e-9), tmp_path / "stuck")
+    assert log[-1]["collapsed"] is False or log[-1]["psnr_db"] < log[-1]["zero_db"] + 0.1
+    net = ResidualUNet(1, SMALL)
+    for p in net.parameters():
+        torch.nn.init.zeros_(p)
+    from evnlos.training.train import _validate
+
+    held_out = NlosDataset(tiny_dataset, "validation", "frame")
+    assert _validate(net, held_out, tiny_dataset, torch.device("cpu"), False)["collapsed"]
+
+
+@pytest.mark.parametrize("damage", ["cut", "text", "other", "missing", "huge"])
+def test_strange_weights_are_refused(damage: str, trained, tmp_path) -> None:
+    path = tmp_path / "w.safetensors"
+    good = (trained[0] / "weights.safetensors").read_bytes()
+    if damage == "cut":
+        path.write_bytes(good[: len(good) // 2])
+    elif damage == "text":
+        path.write_text("no weights")
+    elif damage == "other":
+        from safetensors.torch import save_file
+
+        save_file({"a": torch.zeros(2)}, path)
+    elif damage == "huge":
+        path.write_bytes(good.replace(b'\\"width\\": 8', b'\\"width\\": 80000', 1))
+    with pytest.raises(EvnlosError) as caught:
+        load_weights(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_round_trip(trained, tmp_path) -> None:
+    weights = load_weights(trained[0])
+    save_weights(tmp_path / "w.safetensors", weights)
+    assert (tmp_path / "w.safetensors").read_bytes() == (trained[0] / "weights.safetensors").read_bytes()
