@@ -1,8 +1,8 @@
 """How much faster, and how much more accurate, is our angular spectrum than torchoptics' on one grid?
 
 Both propagate the Gaussian beam of the tests (w0 0.3 mm, 10 um, 0.4 m, 500 nm) on the same zero-padded grid.
-torchoptics makes its transfer function at every call, and in float64 even for float32 data (version 1.0.2), which
-explains its float32 errors and times. Install it beside this package; without it only our columns are measured.
+torchoptics makes its transfer function at every call, and in float64 even for float32 data (1.0.2): hence its
+float32 errors and times. Install it beside this package; without it only our columns are measured.
 
     python benchmarks/angular_spectrum.py --sizes 512 1024 --threads 1
 """

@@ -3,6 +3,11 @@
 import os
 from pathlib import Path
 
+# One thread a process, here and in the programs that tests start: several processes test at once, and
+# threads that wait for each other at every operation would make them many times slower. The line stands
+# before the first import of torch and numba.
+os.environ["OMP_NUM_THREADS"] = "1"
+
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -1,4 +1,4 @@
-"""Captures: the shared ones under the standard sample, rendered ones, and everything that can be wrong with a folder."""
+"""Captures: the shared ones under the standard sample, rendered ones, all that can be wrong with a folder."""
 
 import shutil
 from pathlib import Path

@@ -1,7 +1,6 @@
-"""Learning: a tiny run must see, a killed run must go on bit for bit, the paper's loss must be caught collapsing."""
+"""Learning: a tiny run must see, a killed run must go on bit for bit, a collapse must be noticed."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -38,7 +37,7 @@ def test_the_network_takes_any_size(height: int, width: int) -> None:
     net = ResidualUNet(3, UNetConfig(width=8, depth=3))
     out = net(torch.zeros(2, 3, height, width))
     assert out.shape == (2, 1, height, width)
-    assert 0 <= out.min() and out.max() <= 1
+    assert out.min() >= 0 and out.max() <= 1
 
 
 def test_the_network_refuses_the_wrong_number_of_channels() -> None:
@@ -76,7 +75,7 @@ def test_black_costs_almost_nothing_under_the_papers_loss_only() -> None:
     black = torch.zeros_like(truth)
     worst = {"paper": paper_loss(1 - truth, truth), "balanced": balanced_loss(1 - truth, truth)}
     assert (paper_loss(black, truth) - 2) / (worst["paper"] - 2) < 0.02
-    assert balanced_loss(black, truth) > 1.2  # energy 1, overlap 1/4: far from the 0 of the truth
+    assert balanced_loss(black, truth) > 5 * balanced_loss(torch.full_like(truth, float(truth.mean())), truth)
 
 
 def test_a_tiny_run_beats_the_mean_image(trained, tiny_dataset) -> None:
@@ -104,13 +103,7 @@ def test_a_killed_training_ends_with_the_same_bytes(tiny_dataset, tmp_path) -> N
     command = [sys.executable, "-m", "evnlos", "train", "--data", str(tiny_dataset.folder), "--out", "killed"]
     command += ["--epochs", "6", "--precision", "float32"]
     command += ["--network.width", "8", "--network.depth", "2", "--network.shuffle", "1"]
-    threads = {"OMP_NUM_THREADS": str(torch.get_num_threads())}
-    quiet = {
-        "cwd": tmp_path,
-        "stdout": subprocess.DEVNULL,
-        "stderr": subprocess.DEVNULL,
-        "env": os.environ | threads,
-    }
+    quiet = {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     process = subprocess.Popen(command, **quiet)
     checkpoint = tmp_path / "killed" / "checkpoint.safetensors"
     deadline = time.monotonic() + 120

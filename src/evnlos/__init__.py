@@ -11,7 +11,17 @@ from evnlos.dataset import (
 )
 from evnlos.errors import EvnlosError
 from evnlos.evaluation import evaluate, reconstruct
-from evnlos.events import read_events, time_surface, voxel_grid, write_events
+from evnlos.events import (
+    CelexOptions,
+    iter_events,
+    keep_known_polarity,
+    read_events,
+    read_events_report,
+    read_frames,
+    time_surface,
+    voxel_grid,
+    write_events,
+)
 from evnlos.metrics import psnr, ssim
 from evnlos.model import ResidualUNet, UNetConfig, load_weights
 from evnlos.scene import LineMotion, PathMotion, Scene, Target, find_font
@@ -31,6 +41,7 @@ from evnlos.version import __version__
 
 __all__ = [
     "GGX",
+    "CelexOptions",
     "EventCamera",
     "EventPixel",
     "Events",
@@ -56,11 +67,15 @@ __all__ = [
     "evaluate",
     "find_font",
     "import_captures",
+    "iter_events",
+    "keep_known_polarity",
     "load_weights",
     "open_dataset",
     "psnr",
     "read_capture",
     "read_events",
+    "read_events_report",
+    "read_frames",
     "reconstruct",
     "simulate",
     "simulate_events",

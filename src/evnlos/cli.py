@@ -270,7 +270,9 @@ def main(argv: list[str] | None = None) -> None:
         if verb not in COMMANDS:
             raise ConfigError(f"unknown command {verb!r}; give one of {', '.join(COMMANDS)}")
         default = _defaults(verb, rest)
-        command = tyro.cli(COMMANDS[verb], args=rest, prog=f"evnlos {verb}", default=default)
+        # The kinds of glyphs and transport come from preset or file; flags change the numbers of that kind.
+        quiet = (tyro.conf.AvoidSubcommands,)
+        command = tyro.cli(COMMANDS[verb], args=rest, prog=f"evnlos {verb}", default=default, config=quiet)
         command.run()
     except EvnlosError as error:
         print(f"evnlos {verb}: error: {error}", file=sys.stderr)
@@ -329,17 +331,17 @@ def _flag(arguments: list[str], name: str) -> str | None:
 
 
 def _train(data: Path, settings: Training, out: Path, weights: Path | None) -> None:
-    bar = tqdm(total=settings.epochs, desc=out.name, unit="epoch")
+    dataset = open_dataset(data)
     record: dict[str, Any] = {}
-    for record in train(open_dataset(data), settings, out, weights):
-        bar.update()
-        shown = {key: record[key] for key in ("loss", "psnr_db") if key in record}
-        bar.set_postfix(shown)
-    bar.close()
+    with tqdm(
+        train(dataset, settings, out, weights), total=settings.epochs, desc=out.name, unit="epoch"
+    ) as bar:
+        for record in bar:
+            bar.set_postfix({key: record[key] for key in ("loss", "psnr_db") if key in record})
     if record.get("collapsed"):
         _say(
             f"warning: the network answers the same to every input ({record['psnr_db']} dB; all-black has "
-            f"{record['zero_db']} dB): it has collapsed; use --loss balanced, more epochs, or a smaller step size"
+            f"{record['zero_db']} dB): it has collapsed; use --loss balanced, or train for more epochs"
         )
     print(f"{out}: {record['epoch']} epochs, loss {record['loss']}, weights in {out / 'weights.safetensors'}")
 
@@ -348,7 +350,8 @@ def _progress(steps: Iterable[T], total: int, unit: str, out: Path) -> Iterator[
     done = 0
     if (out / "dataset.yaml").is_file():
         done = total - len(open_dataset(out).missing())
-    yield from tqdm(steps, total=total, initial=done, unit=f" {unit}", desc=out.name)
+    with tqdm(steps, total=total, initial=done, unit=f" {unit}", desc=out.name) as bar:
+        yield from bar
 
 
 def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:

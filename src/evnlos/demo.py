@@ -66,8 +66,8 @@ def run_demo(settings: Demo) -> Path:
     if not folders:
         lab = Lab(glyphs=FontGlyphs(characters="ABCDEFGHIJKLMNOPQRSTUVWXYZ"[::2] + "KD49"), seed=settings.seed)
         notes.append(
-            "The captures of this page are not recordings: they were rendered with a wall of rough aluminium, which "
-            "the training simulator does not know, and other cameras. Give --captures for recordings."
+            "The captures of this page are not recordings: they were rendered with a wall of rough aluminium, "
+            "which the training simulator does not know, and other cameras. Give --captures for recordings."
         )
         notes += lab.glyphs.notes()
         names = lab.glyphs.objects()
@@ -119,4 +119,5 @@ def _fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None) 
 
 
 def _drain(steps: Iterator[Any], total: int, title: str) -> list[Any]:
-    return list(tqdm(steps, total=total, desc=title.ljust(24)))
+    with tqdm(steps, total=total, desc=title.ljust(24)) as bar:
+        return list(bar)

@@ -10,7 +10,7 @@ _WIDTH, _HEIGHT, _LEFT, _TOP, _RIGHT, _BOTTOM = 980, 300, 60, 16, 190, 40
 
 
 def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_label: str) -> str:
-    """Return named curves of (x, y) points as one SVG drawing with axes and a legend; empty curves are left out."""
+    """Return named curves of (x, y) points as one SVG drawing with axes and legend; empty ones are left out."""
     series = {name: points for name, points in series.items() if points}
     if not series:
         return ""
@@ -42,13 +42,10 @@ def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_lab
     for i, (name, points) in enumerate(series.items()):
         colour, dash = _COLOURS[i % len(_COLOURS)], ("", "6 3", "2 3")[i // 3 % 3]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*p) for p in points))
-        parts.append(
-            f"<polyline points='{path}' fill=none stroke='{colour}' stroke-width=1.8 stroke-dasharray='{dash}'/>"
-        )
+        pen = f"stroke='{colour}' stroke-width=1.8 stroke-dasharray='{dash}'"
+        parts.append(f"<polyline points='{path}' fill=none {pen}/>")
         y = _TOP + 14 + 17 * i
-        parts.append(
-            f"<path d='M{_LEFT + wide + 12} {y - 4}h22' stroke='{colour}' stroke-width=2 stroke-dasharray='{dash}'/>"
-        )
+        parts.append(f"<path d='M{_LEFT + wide + 12} {y - 4}h22' {pen}/>")
         parts.append(f"<text x={_LEFT + wide + 40} y={y} fill=currentColor>{html.escape(name)}</text>")
     return "".join(parts) + "</svg>"
 

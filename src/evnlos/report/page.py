@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from evnlos.config import write_atomically
 from evnlos.dataset import Dataset, character_of, read_shard
@@ -16,19 +17,7 @@ from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
 from evnlos.report.tables import available_metrics, best_two, columns_of, label, rows_of, to_csv
 from evnlos.version import __version__
 
-_STYLE = """
-:root{color-scheme:light dark;--ink:#1d2126;--dim:#667080;--line:#d5dae1;--paper:#fff;--best:#0b5fa5}
-@media(prefers-color-scheme:dark){:root{--ink:#e6e9ee;--dim:#9aa5b4;--line:#39414d;--paper:#14171b;--best:#7cc0ff}}
-body{font:15px/1.5 system-ui,sans-serif;color:var(--ink);background:var(--paper);max-width:1080px;margin:2rem auto;
-padding:0 1rem}h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.15rem;margin-top:2.2rem}
-.dim{color:var(--dim)}table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.86rem}
-th,td{padding:.25rem .6rem;text-align:right;border-bottom:1px solid var(--line)}th:first-child,td:first-child{text-align:left}
-tr.mean td{font-weight:600;border-top:2px solid var(--line)}.best{color:var(--best);font-weight:700}
-.second{text-decoration:underline}.wide{overflow-x:auto}img{image-rendering:pixelated;display:block}
-.shots{display:grid;gap:6px;align-items:center;font-size:.78rem;overflow-x:auto}.shots img{width:120px}
-pre{font-size:.78rem;overflow-x:auto;border:1px solid var(--line);padding:.6rem}svg{max-width:100%;height:auto}
-@media print{body{max-width:none}h2{break-after:avoid}table,.shots,svg{break-inside:avoid}}
-"""
+_STYLE = Path(__file__).parent / "style.css"
 
 
 def write_report(
@@ -52,7 +41,7 @@ def write_report(
         [
             "<!doctype html><html lang=en><meta charset=utf-8>",
             "<meta name=viewport content='width=device-width,initial-scale=1'>",
-            f"<title>evnlos report</title><style>{_STYLE}</style>",
+            f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
             _head(dataset, results, notes, split),
             *(_table(results, metric, *about) for metric, about in available_metrics(results).items()),
             _pictures(dataset, results),
@@ -79,16 +68,17 @@ def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: s
         if results[0].evaluation.scores.lpips is not None
         else " LPIPS: not available (no VGG trunk was given)."
     )
+    seen = f"{len(first.images)} pictures of {len(first.characters())} objects ({html.escape(objects)})"
     return (
         "<h1>Around the corner: reconstructions of hidden moving objects</h1>"
-        f"<p class=dim>evnlos {__version__} · {len(first.images)} pictures of {len(first.characters())} objects "
-        f"({html.escape(objects)}), split “{html.escape(split)}”, none of them seen in training</p>{lines}"
-        f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm a pixel; PSNR is the mean over the "
-        "pictures of each picture's PSNR with peak 1. The first columns are what one scores without looking: an "
-        "all-black picture, and the mean of the training pictures. A method below them has learned nothing."
-        f"{no_lpips}</p>"
-        "<p><b>E2E</b>: trained on the captures alone. <b>EPNP</b>: pre-trained on simulation, then fine-tuned on "
-        "the captures. <span class=best>Best</span> and <span class=second>second best</span> of a row are marked.</p>"
+        f"<p class=dim>evnlos {__version__} · {seen}, split “{html.escape(split)}”</p>{lines}"
+        f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm a pixel; PSNR is the mean over "
+        "the pictures of each picture's PSNR with peak 1. The first columns are what one scores without "
+        "looking: an all-black picture, and the mean of the training pictures. A method that does not exceed "
+        f"them has learned nothing.{no_lpips}</p>"
+        "<p><b>E2E</b>: trained on the captures alone. <b>EPNP</b>: pre-trained on simulation, then fine-tuned "
+        "on the captures. <span class=best>Best</span> and <span class=second>second best</span> of a row are "
+        "marked.</p>"
     )
 
 
@@ -112,7 +102,7 @@ def _table(results: list[RunResult], metric: str, title: str, unit: str, decimal
 
 def _pictures(dataset: Dataset, results: list[RunResult]) -> str:
     """Show one position of each object: wall frame, surface, truth and each reconstruction."""
-    first, rows = results[0].evaluation, dataset.sampling.scored
+    first = results[0].evaluation
     heads = ["", "wall frame", "events", "truth", *(label(r) for r in results)]
     cells = [f"<b>{html.escape(h)}</b>" for h in heads]
     for name in first.characters():
@@ -127,10 +117,10 @@ def _pictures(dataset: Dataset, results: list[RunResult]) -> str:
             f"<img alt='{html.escape(text)} of {html.escape(name)}' src='{data_uri(png(picture))}'>"
             for text, picture in zip(texts, shown, strict=True)
         ]
-    grid = f"grid-template-columns:4.5rem repeat({len(heads) - 1},120px)"
+    grid = f"grid-template-columns:4.5rem repeat({len(heads) - 1},100px)"
     return (
-        "<h2>Pictures</h2><p class=dim>The middle position of each object. Wall frame stretched in contrast; events "
-        "as time surface (red brighter, blue darker); reconstructions and truth on the same scale from 0 to 1.</p>"
+        "<h2>Pictures</h2><p class=dim>The middle position of each object. Wall frame stretched in contrast; "
+        "events as time surface (red brighter, blue darker); reconstructions and truth from 0 to 1.</p>"
         f"<div class=shots style='{grid}'>{''.join(f'<div>{c}</div>' for c in cells)}</div>"
     )
 
@@ -148,11 +138,10 @@ def _curves(results: list[RunResult]) -> str:
 
 
 def _provenance(dataset: Dataset, results: list[RunResult]) -> str:
-    import yaml
-
     about: dict[str, Any] = {
         "dataset": {"name": dataset.folder.resolve().name, "settings": settings_of(dataset)}
     }
     about["runs"] = {label(r): r.history for r in results}
     text = yaml.safe_dump(about, sort_keys=False, allow_unicode=True)
-    return f"<h2>How it was made</h2><details><summary>Settings and versions</summary><pre>{html.escape(text)}</pre></details>"
+    summary = "<details><summary>Settings and versions</summary>"
+    return f"<h2>How it was made</h2>{summary}<pre>{html.escape(text)}</pre></details>"

@@ -6,6 +6,8 @@ import csv
 import io
 from typing import Any
 
+import numpy as np
+
 from evnlos.dataset import character_of
 from evnlos.report.gather import RunResult
 
@@ -29,16 +31,15 @@ def rows_of(results: list[RunResult], metric: str) -> list[tuple[str, str, list[
     The group is the object's name before its last underscore, e.g. `near` of `near_G`.
     """
     first = results[0].evaluation
-    tables = [scores for scores in first.baselines.values()] + [r.evaluation.scores for r in results]
+    tables = [*first.baselines.values(), *(r.evaluation.scores for r in results)]
     rows = []
     groups: dict[str, list[str]] = {}
     for name in first.characters():
         groups.setdefault(_group(name), []).append(name)
-    import numpy as np
-
     for group, names in groups.items():
-        for name in names:
-            rows.append((group, character_of(name), [t.mean(first.names == name)[metric] for t in tables]))
+        rows += [
+            (group, character_of(name), [t.mean(first.names == name)[metric] for t in tables]) for name in names
+        ]
         chosen = np.isin(first.names, names)
         rows.append((group, "mean", [t.mean(chosen)[metric] for t in tables]))
     if len(groups) > 1:

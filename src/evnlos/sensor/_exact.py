@@ -17,12 +17,12 @@ from evnlos.sensor._exact_math import (
     LOG_KNEE,
     LOG_LINE,
     LOW_PASS,
-    fast_exp,
     first_crossing,
     light_of,
     log_light,
     response,
 )
+from evnlos.sensor._fast_math import fast_exp
 from evnlos.sensor._random import (
     STREAM_SHOT_CHOICE,
     STREAM_SHOT_GAP,
@@ -180,46 +180,76 @@ def _step(
     return out, count, filtered
 
 
+# Each of the following loops writes one array: with more, a compiler gives up proving that they do not overlap.
+
+
 @njit(cache=True, error_model="numpy")
-def _glide(
-    row, light, logs, filtered, base, on, off, leak, rate, length, light_1, logs_1, filtered_1, base_1, flags
-):
-    """Advance a tile by one step of the low-pass response, flagging the pixels that need to be solved."""
-    half = 0.5 * rate * length
-    for i in range(len(light)):
-        light_0, log_0, before = light[i], logs[i], filtered[i]
-        light_b = np.float64(row[i])
-        log_b = log_light(light_b)
-        tau = half * (light_0 + light_b + 40.0)
-        gain = 1.0 - fast_exp(-tau)
-        change = log_b - log_0
-        after = before + gain * (log_0 - before) + change * (1.0 - gain / tau)
+def log_row(row, logs):
+    """Fill the log light of a row of light in DN."""
+    for i in range(len(row)):
+        logs[i] = log_light(row[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _copy(row, light):
+    """Take over a row of light in double precision."""
+    for i in range(len(row)):
+        light[i] = np.float64(row[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _fall(base, leak, length, base_1):
+    """Lower the references by the leak of one step."""
+    for i in range(len(base)):
+        base_1[i] = base[i] - leak[i] * length
+
+
+@njit(cache=True, error_model="numpy")
+def _gain(light_0, light_1, half, gain):
+    """Fill 1 - exp(-tau), tau being the step in the filter's own time."""
+    for i in range(len(gain)):
+        gain[i] = 1.0 - fast_exp(-half * (light_0[i] + light_1[i] + 40.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, filtered_1):
+    """Fill the filter's output after one step on which the log light is a line in the filter's own time."""
+    for i in range(len(gain)):
+        tau = half * (light_0[i] + light_1[i] + 40.0)
+        before = filtered_0[i]
+        change = logs_1[i] - logs_0[i]
+        filtered_1[i] = before + gain[i] * (logs_0[i] - before) + change * (1.0 - gain[i] / tau)
+
+
+@njit(cache=True, error_model="numpy")
+def _flag_filtered(now, then, leak, half, length, on, off, flags):
+    """Flag the pixels that may have met a threshold, or whose light bent too much for one line."""
+    light_0, logs_0, filtered_0, base = now[0], now[1], now[2], now[3]
+    light_1, logs_1, filtered_1 = then[0], then[1], then[2]
+    for i in range(len(leak)):
+        tau = half * (light_0[i] + light_1[i] + 40.0)
         drift = leak[i] * length
-        slope_0 = tau * (log_0 - before) + drift
-        slope_1 = tau * (log_b - after) + drift
+        slope_0 = tau * (logs_0[i] - filtered_0[i]) + drift
+        slope_1 = tau * (logs_1[i] - filtered_1[i]) + drift
         turn = max(abs(slope_0), abs(slope_1)) if slope_0 * slope_1 < 0.0 else 0.0
-        lift_0 = before - base[i]
-        lift_1 = after - base[i] + drift
+        lift_0 = filtered_0[i] - base[i]
+        lift_1 = filtered_1[i] - base[i] + drift
         flags[i] = (
             (max(lift_0, lift_1) + turn >= on[i])
             | (min(lift_0, lift_1) - turn <= -off[i])
-            | (abs(change) > PIECE)
-            | ((light_0 < KNEE) != (light_b < KNEE))
+            | (abs(logs_1[i] - logs_0[i]) > PIECE)
+            | ((light_0[i] < KNEE) != (light_1[i] < KNEE))
         )
-        light_1[i], logs_1[i], filtered_1[i], base_1[i] = light_b, log_b, after, base[i] - drift
 
 
 @njit(cache=True, error_model="numpy")
-def _jump(row, light, logs, filtered, base, on, off, leak, length, light_1, logs_1, filtered_1, base_1, flags):
-    """Advance a tile by one step without a filter, flagging the pixels that need to be solved."""
-    for i in range(len(light)):
-        light_b = np.float64(row[i])
-        log_b = log_light(light_b)
-        drift = leak[i] * length
-        low = min(logs[i], log_b) - base[i]
-        high = max(logs[i], log_b) - base[i] + drift
+def _flag_direct(now, then, leak, length, on, off, flags):
+    """Flag the pixels that may have met a threshold on the light itself."""
+    logs_0, base, logs_1 = now[1], now[3], then[1]
+    for i in range(len(leak)):
+        low = min(logs_0[i], logs_1[i]) - base[i]
+        high = max(logs_0[i], logs_1[i]) - base[i] + leak[i] * length
         flags[i] = (high >= on[i]) | (low <= -off[i])
-        light_1[i], logs_1[i], filtered_1[i], base_1[i] = light_b, log_b, log_b, base[i] - drift
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -240,12 +270,9 @@ def run_tile(
     flags = flag_words.view(np.uint8)
     now = np.empty((4, size))
     then = np.empty((4, size))
-    for i in range(size):
-        now[0, i] = light[first + i]
-        now[1, i] = log_light(light[first + i])
-        now[2, i] = filtered[first + i]
-        now[3, i] = base[first + i]
-    row = np.empty(size)
+    now[0], now[2], now[3] = light[first:last], filtered[first:last], base[first:last]
+    log_row(now[0], now[1])
+    gain = np.empty(size)
     my_on, my_off, my_leak = on[first:last], off[first:last], leak[first:last]
     state = np.empty(3)
     has_shot = len(candidate) > 0
@@ -256,18 +283,17 @@ def run_tile(
     count = 0
     for k in range(len(frames)):
         start, stop = times[k], times[k + 1]
-        for i in range(size):
-            row[i] = np.float64(frames[k, first + i])
+        _copy(frames[k, first:last], then[0])
+        log_row(then[0], then[1])
+        _fall(now[3], my_leak, stop - start, then[3])
         if rate > 0.0:
-            _glide(
-                row, now[0], now[1], now[2], now[3], my_on, my_off, my_leak, rate, stop - start,
-                then[0], then[1], then[2], then[3], flags[:size],
-            )  # fmt: skip
+            half = 0.5 * rate * (stop - start)
+            _gain(now[0], then[0], half, gain)
+            _respond(now[0], then[0], now[1], then[1], gain, now[2], half, then[2])
+            _flag_filtered(now, then, my_leak, half, stop - start, my_on, my_off, flags[:size])
         else:
-            _jump(
-                row, now[0], now[1], now[2], now[3], my_on, my_off, my_leak, stop - start,
-                then[0], then[1], then[2], then[3], flags[:size],
-            )  # fmt: skip
+            then[2] = then[1]
+            _flag_direct(now, then, my_leak, stop - start, my_on, my_off, flags[:size])
         if soonest < stop:
             for i in range(size):
                 flags[i] |= candidate[first + i] < stop
@@ -285,7 +311,7 @@ def run_tile(
                     rate, refractory, seed,
                 )  # fmt: skip
                 out, count, then[2, i] = _step(
-                    out, count, pixel, start, stop, now[0, i], row[i], now[2, i], state,
+                    out, count, pixel, start, stop, now[0, i], then[0, i], now[2, i], state,
                     constants, jitter, window, drawn, sent,
                 )  # fmt: skip
                 then[3, i] = state[0]
@@ -295,15 +321,5 @@ def run_tile(
         if soonest < stop:
             soonest = candidate[first:last].min()
         now, then = then, now
-    for i in range(size):
-        light[first + i], filtered[first + i], base[first + i] = now[0, i], now[2, i], now[3, i]
+    light[first:last], filtered[first:last], base[first:last] = now[0], now[2], now[3]
     return out[0][:count], out[1][:count], out[2][:count]
-
-
-@njit(cache=True, error_model="numpy")
-def log_row(row):
-    """Return the log light of a row of light in DN."""
-    logs = np.empty(len(row))
-    for i in range(len(row)):
-        logs[i] = log_light(row[i])
-    return logs

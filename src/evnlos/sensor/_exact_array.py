@@ -58,7 +58,8 @@ class ExactArray:
         """Set all pixels to rest at the first frame, [N] light."""
         count = len(frame)
         self._light = frame.astype(np.float64)
-        self._filtered = _exact.log_row(self._light)
+        self._filtered = np.empty(count)
+        _exact.log_row(self._light, self._filtered)
         self._base = self._filtered.copy()
         if self.pixel.leak_rate_hz > 0:
             # a pixel at rest has been leaking since its last event, at a time of its own

@@ -9,62 +9,15 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
+
+from evnlos.sensor._fast_math import fast_log
 
 KNEE = 20.0
 LOG_KNEE = math.log(KNEE)
 KNEE_SLOPE = LOG_KNEE / KNEE
 
 LOW_PASS, LOG_LINE, LINE = 0, 1, 2
-_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def fast_log(x):
-    """Return ln x for a normal positive number, within 3 ulp, in a form that compilers vectorise.
-
-    x = 2^e m with sqrt(1/2) <= m < sqrt(2), s = (m - 1) / (m + 1): ln m = 2 (s + s^3 / 3 + s^5 / 5 + ...).
-    """
-    bits = np.float64(x).view(np.int64)
-    exponent = (bits - np.int64(0x3FE6A09E667F3BCD)) >> 52
-    f = np.int64(bits - (exponent << 52)).view(np.float64) - 1.0
-    s = f / (2.0 + f)
-    z = s * s
-    series = 2.0 / 21.0
-    series = series * z + 2.0 / 19.0
-    series = series * z + 2.0 / 17.0
-    series = series * z + 2.0 / 15.0
-    series = series * z + 2.0 / 13.0
-    series = series * z + 2.0 / 11.0
-    series = series * z + 2.0 / 9.0
-    series = series * z + 2.0 / 7.0
-    series = series * z + 2.0 / 5.0
-    series = series * z + 2.0 / 3.0
-    e = np.float64(exponent)
-    return e * _LN2_HIGH + (2.0 * s + (s * z * series + e * _LN2_LOW))
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def fast_exp(x):
-    """Return exp x for x <= 0 (clamped at -700), within 2 ulp, in a form that compilers vectorise."""
-    x = max(x, -700.0)
-    n = np.rint(x * 1.4426950408889634)
-    r = (x - n * _LN2_HIGH) - n * _LN2_LOW
-    p = 1.0 / 479001600.0
-    p = p * r + 1.0 / 39916800.0
-    p = p * r + 1.0 / 3628800.0
-    p = p * r + 1.0 / 362880.0
-    p = p * r + 1.0 / 40320.0
-    p = p * r + 1.0 / 5040.0
-    p = p * r + 1.0 / 720.0
-    p = p * r + 1.0 / 120.0
-    p = p * r + 1.0 / 24.0
-    p = p * r + 1.0 / 6.0
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
-    return p * np.int64((np.int64(n) + 1023) << 52).view(np.float64)
 
 
 @njit(cache=True, error_model="numpy", inline="always")

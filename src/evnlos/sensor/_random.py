@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
+from evnlos.sensor._fast_math import cos_turns, fast_log
 
 STREAM_THRESHOLD_ON, STREAM_THRESHOLD_OFF, STREAM_LEAK_RATE, STREAM_LEAK_PHASE = 1, 2, 3, 4
 STREAM_LEAK_JITTER, STREAM_SHOT_GAP, STREAM_SHOT_CHOICE = 5, 6, 7
@@ -48,21 +49,21 @@ def random_uniform(seed, stream, pixel, counter):
     return (np.float64(word >> np.uint64(12)) + 0.5) * 2.0**-52
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", inline="always")
 def random_exponential(seed, stream, pixel, counter):
     """Return an exponential number of mean 1."""
-    return -math.log(random_uniform(seed, stream, pixel, counter))
+    return -fast_log(random_uniform(seed, stream, pixel, counter))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", inline="always")
 def random_normal(seed, stream, pixel, counter):
     """Return a normal number of mean 0 and variance 1 (Box and Muller)."""
     first = random_uniform(seed, stream, pixel, 2 * counter)
     second = random_uniform(seed, stream, pixel, 2 * counter + 1)
-    return math.sqrt(-2.0 * math.log(first)) * math.cos(2.0 * math.pi * second)
+    return math.sqrt(-2.0 * fast_log(first)) * cos_turns(second)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def normal_field(seed, stream, count):
     """Return one normal number a pixel, float64 [count]."""
     field = np.empty(count)
@@ -71,7 +72,7 @@ def normal_field(seed, stream, count):
     return field
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def uniform_field(seed, stream, count):
     """Return one uniform number in (0, 1) a pixel, float64 [count]."""
     field = np.empty(count)
@@ -80,7 +81,7 @@ def uniform_field(seed, stream, count):
     return field
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def exponential_field(seed, stream, count):
     """Return one exponential number of mean 1 a pixel, float64 [count]."""
     field = np.empty(count)

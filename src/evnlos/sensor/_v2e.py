@@ -6,11 +6,10 @@ only pixels that crossed a threshold are visited one by one. Nothing depends on 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
+from evnlos.sensor._exact_math import log_light
 from evnlos.sensor._random import (
     BLOCK,
     STREAM_SHOT_CHOICE,
@@ -20,43 +19,17 @@ from evnlos.sensor._random import (
     random_uniform,
 )
 
-LIN_LOG_KNEE = 20.0
-_KNEE_SLOPE = math.log(LIN_LOG_KNEE) / LIN_LOG_KNEE
-
 
 @njit(cache=True, error_model="numpy", inline="always")
 def lin_log(intensity):
     """Return the logarithm of the light in DN, linear up to 20 DN, with v2e's rounding to 1e-8 and float32."""
-    if intensity <= LIN_LOG_KNEE:
-        value = intensity * _KNEE_SLOPE
-    else:
-        value = math.log(intensity)
-    return np.float32(np.rint(value * 1e8) / 1e8)
+    return np.float32(np.rint(log_light(intensity) * 1e8) / 1e8)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def brightness(intensity):
     """Return the factor (I + 20) / 275 that scales bandwidth and shot noise with the light."""
     return (intensity + 20.0) / 275.0
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _weight(intensity, rate):
-    """Return the low-pass weight of a new frame; a rate of infinity means no filter."""
-    return min(brightness(intensity) * rate, 1.0)
-
-
-@njit(cache=True, error_model="numpy")
-def lookup_tables(rates):
-    """Return (1 - eps, eps * L) of the 256 gray values for each rate d * 2 pi fc, float64 [N, 256] twice."""
-    keep = np.empty((len(rates), 256))
-    add = np.empty((len(rates), 256))
-    for n in range(len(rates)):
-        for value in range(256):
-            weight = _weight(np.float64(value), rates[n])
-            keep[n, value] = 1.0 - weight
-            add[n, value] = weight * np.float64(lin_log(np.float64(value)))
-    return keep, add
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -81,53 +54,44 @@ def shot_choice(seed, pixel, counter, chance_on, chance_off, chance_max):
     return 0
 
 
-@njit(cache=True, error_model="numpy")
-def _crossed_u8(row, lp, base, on, off, keep, add, flags):
-    """Advance a tile by one step of 8-bit light and flag the pixels beyond a threshold."""
-    for i in range(len(lp)):
-        value = np.uint8(row[i])
-        filtered = keep[value] * lp[i] + add[value]
-        lp[i] = filtered
-        change = filtered - base[i]
-        flags[i] = (change >= on[i]) | (-change >= off[i])
+# Each of the following loops writes one array: with more, a compiler gives up proving that they do not overlap.
 
 
 @njit(cache=True, error_model="numpy")
-def _crossed_log(log_light, weight, lp, base, on, off, flags):
-    """Advance a tile by one step of ready logarithms and weights and flag the pixels beyond a threshold."""
-    for i in range(len(lp)):
-        filtered = (1.0 - weight[i]) * lp[i] + weight[i] * log_light[i]
-        lp[i] = filtered
-        change = filtered - base[i]
-        flags[i] = (change >= on[i]) | (-change >= off[i])
+def log_row(row, log_out):
+    """Fill the logarithms of a row of light."""
+    for i in range(len(row)):
+        log_out[i] = lin_log(np.float64(row[i]))
 
 
 @njit(cache=True, error_model="numpy")
-def _crossed_direct(log_light, lp, base, on, off, flags):
-    """Set a tile to the light itself (no filter; single precision) and flag the pixels beyond a threshold."""
+def _look_up(row, table, log_out):
+    """Fill the logarithms of a row of 8-bit light from the table of its 256 values."""
+    for i in range(len(row)):
+        log_out[i] = table[np.uint8(row[i])]
+
+
+@njit(cache=True, error_model="numpy")
+def _filter(row, log_in, rate, lp):
+    """Move the filter towards the new logarithms, by a weight of (I + 20) / 275 d 2 pi fc, at most 1."""
     for i in range(len(lp)):
-        lp[i] = log_light[i]
+        weight = min(brightness(np.float64(row[i])) * rate, 1.0)
+        lp[i] = (1.0 - weight) * lp[i] + weight * np.float64(log_in[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _flag(lp, base, on, off, flags):
+    """Flag the pixels beyond a threshold."""
+    for i in range(len(lp)):
         change = lp[i] - base[i]
         flags[i] = (change >= on[i]) | (-change >= off[i])
 
 
 @njit(cache=True, error_model="numpy")
-def _light(row, rate, log_light, weight):
-    """Fill the logarithms and low-pass weights of a row of light."""
-    for i in range(len(row)):
-        intensity = np.float64(row[i])
-        log_light[i] = lin_log(intensity)
-        weight[i] = _weight(intensity, rate)
-
-
-@njit(cache=True, error_model="numpy")
-def _leak(base, leak, scale, jitter, seed, first_pixel, step):
-    """Lower the reference by one step of jittered leak; tiles start at multiples of the block."""
-    for start in range(0, len(base), BLOCK):
-        offset = jitter_offset(seed, (first_pixel + start) // BLOCK, step)
-        stop = min(start + BLOCK, len(base))
-        for i in range(start, stop):
-            base[i] -= (scale * leak[i]) * jitter[offset + i - start]
+def _leak(base, leak, scale, jitter):
+    """Lower the reference of a block of pixels by one step of jittered leak."""
+    for i in range(len(base)):
+        base[i] -= (scale * leak[i]) * jitter[i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -140,14 +104,15 @@ def _grown(column, length):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def run_tile(
-    frames, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn,
-    table, keep, add, rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
+    frames, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
+    rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
     defer, peak,
 ):  # fmt: skip
     """Run the pixels first..last - 1 through all steps of a block and return what they sent.
 
     `frames` [T, N] light in DN; `lp`, `base`, thresholds, `leak`, `hazard`, `drawn` [N] state and constants of
-    the pixels; `table` [T] index of the step's lookup table; `rate`, `leak_scale`, `hazard_sum`, `chance` [T].
+    the pixels; `table` [256] logarithms of 8-bit light, empty for other light; `rate`, `leak_scale`,
+    `hazard_sum`, `chance` [T].
     Returns four columns: step, pixel, signed number of threshold crossings, sign of a shot-noise event. `peak`
     [T] takes the largest number of crossings of a pixel in each step. With `defer` the reference stays where
     it is when a threshold is crossed: the caller decides which events pass.
@@ -159,15 +124,14 @@ def run_tile(
     words = (size + 7) // 8
     flag_words = np.zeros(words, np.uint64)
     flags = flag_words.view(np.uint8)
-    log_light = np.empty(size, np.float32)
-    weight = np.empty(size)
+    logs = np.empty(size, np.float32)
     head = np.full(steps, -1, np.int64)
     chain = np.empty(size, np.int64)
     has_shot = len(hazard) > 0
     if has_shot:
         for i in range(size):
-            due = np.searchsorted(hazard_sum, hazard[first + i])
-            if due < steps:
+            if hazard[first + i] <= hazard_sum[-1]:
+                due = np.searchsorted(hazard_sum, hazard[first + i])
                 chain[i] = head[due]
                 head[due] = i
     capacity = 1024
@@ -180,15 +144,20 @@ def run_tile(
     for k in range(steps):
         row = frames[k, first:last]
         if leak_scale[k] > 0.0:
-            _leak(my_base, my_leak, leak_scale[k], jitter, seed, first, first_step + k)
-        if filtered and len(keep) > 0:
-            _crossed_u8(row, my_lp, my_base, my_on, my_off, keep[table[k]], add[table[k]], flags[:size])
+            scale = np.float32(leak_scale[k])
+            for start in range(0, size, BLOCK):
+                stop = min(start + BLOCK, size)
+                offset = jitter_offset(seed, (first + start) // BLOCK, first_step + k)
+                _leak(my_base[start:stop], my_leak[start:stop], scale, jitter[offset : offset + stop - start])
+        if len(table) > 0:
+            _look_up(row, table, logs)
         else:
-            _light(row, rate[k], log_light, weight)
-            if filtered:
-                _crossed_log(log_light, weight, my_lp, my_base, my_on, my_off, flags[:size])
-            else:
-                _crossed_direct(log_light, my_lp, my_base, my_on, my_off, flags[:size])
+            log_row(row, logs)
+        if filtered:
+            _filter(row, logs, rate[k], my_lp)
+        else:
+            my_lp[:] = logs
+        _flag(my_lp, my_base, my_on, my_off, flags[:size])
         if has_shot:
             i = head[k]
             while i >= 0:
@@ -280,10 +249,3 @@ def settle(step, pixel, crossings, shot, sub_times, period, last_event, base, st
         else:
             base[where] -= np.float32(kept) * step_off[where]
     return out_sub[:count], out_pixel[:count], out_on[:count]
-
-
-@njit(cache=True, error_model="numpy")
-def log_row(row, log_light):
-    """Fill the logarithms of a row of light."""
-    for i in range(len(row)):
-        log_light[i] = lin_log(np.float64(row[i]))

@@ -64,9 +64,9 @@ class V2eArray:
 
     def start(self, frame: NDArray, time_s: float) -> None:
         """Set all pixels to rest at the first frame, [N] DN."""
-        log_light = np.empty(len(frame), np.float32)
-        _v2e.log_row(frame, log_light)
-        self._lp, self._base = log_light.astype(self._state_type), log_light.astype(self._state_type)
+        logs = np.empty(len(frame), np.float32)
+        _v2e.log_row(frame, logs)
+        self._lp, self._base = logs.astype(self._state_type), logs.astype(self._state_type)
         self._time = time_s
 
     def advance(self, frames: NDArray, times_s: NDArray[np.float64]) -> Columns:
@@ -84,10 +84,8 @@ class V2eArray:
             rate = delta / (1.0 / (math.pi * 2.0 * pixel.cutoff_hz))
         else:
             rate = np.zeros(steps)
-        table, tables = np.zeros(steps, np.int64), np.zeros(0)
-        if pixel.cutoff_hz > 0 and frames.dtype == np.uint8:
-            tables, table = np.unique(rate, return_inverse=True)
-        keep, add = _v2e.lookup_tables(tables)
+        table = np.empty(256 if frames.dtype == np.uint8 else 0, np.float32)
+        _v2e.log_row(np.arange(len(table), dtype=np.float64), table)
         chance = np.zeros((steps, 2))
         chance[:, 0] = 0.5 * pixel.shot_noise_rate_hz * delta
         chance[:, 1] = np.minimum(chance[:, 0] * self._most * _DIM_MAX, 1.0 - 1e-9)
@@ -98,7 +96,7 @@ class V2eArray:
             peak = np.zeros(steps, np.int32)
             records = _v2e.run_tile(
                 frames, first, last, self._lp, self._base, self._on, self._off, self._step_on, self._step_off,
-                self._leak, self._hazard, self._drawn, table, keep, add, rate, pixel.leak_rate_hz * delta,
+                self._leak, self._hazard, self._drawn, table, rate, pixel.leak_rate_hz * delta,
                 hazard_sum[1:], chance, self._ratio_on, self._ratio_off, jitter_table(), self.seed, self._steps,
                 defer, peak,
             )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
+import torch.nn.functional as F
 from torch import Tensor
 
 from evnlos.metrics import ssim
@@ -27,22 +28,22 @@ def paper_loss(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def balanced_loss(image: Tensor, truth: Tensor) -> Tensor:
-    """Return MSE relative to the truth's own energy + (1 - SSIM) / 4 + (1 - Dice) / 4.
+    """Return cross-entropy / entropy of the mean + squared error / energy of the truth + (1 - SSIM) / 4.
 
-    Each term is bounded. Dividing the squared error of a batch by its mean square makes the all-black
-    picture cost 1 whatever share of the canvas a character covers, and the soft Dice overlap,
-    2 sum(xy) / (sum(x^2) + sum(y^2)) (Milletari, Navab and Ahmadi, 3DV 2016), has its worst value there.
+    The first two terms are those of the best constant picture = 1, whatever share of the canvas a
+    character covers. Both are least at the posterior mean, which is also what PSNR asks for. The
+    cross-entropy of an all-black picture is unbounded, and its gradient does not vanish behind a
+    saturated sigmoid, so training can't rest there: squared error, SSIM and overlap alone can.
 
     Args:
         image: Pictures of the network, [B, 1, H, W], 0..1.
         truth: True pictures, [B, 1, H, W], 0..1.
     """
-    energy = truth.square().mean()
-    error = (image - truth).square().mean() / (energy + 1e-4)
-    together = (image * truth).sum(dim=(-3, -2, -1))
-    apart = image.square().sum(dim=(-3, -2, -1)) + truth.square().sum(dim=(-3, -2, -1))
-    dice = (2 * together + 1e-3) / (apart + 1e-3)
-    return error + (1 - ssim(image, truth).mean()) / 4 + (1 - dice.mean()) / 4
+    share = truth.mean().clamp(1e-4, 1 - 1e-4)
+    entropy = -(share * share.log() + (1 - share) * (1 - share).log())
+    cross = F.binary_cross_entropy(image, truth) / entropy
+    error = (image - truth).square().mean() / (truth.square().mean() + 1e-4)
+    return cross + error + (1 - ssim(image, truth).mean()) / 4
 
 
 LOSSES: dict[LossName, Callable[[Tensor, Tensor], Tensor]] = {"balanced": balanced_loss, "paper": paper_loss}

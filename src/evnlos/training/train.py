@@ -147,7 +147,11 @@ def _about(dataset: Dataset, settings: Training, start: Weights | None) -> dict[
             "validation": dataset.split.get("validation", []),
         },
         "from": start.history[-1]["data"]["name"] if start and start.history else None,
-        "versions": {"evnlos": __version__, "torch": str(torch.__version__), "python": platform.python_version()},
+        "versions": {
+            "evnlos": __version__,
+            "torch": str(torch.__version__),
+            "python": platform.python_version(),
+        },
     }
 
 

@@ -1,4 +1,4 @@
-"""Free-space propagation between parallel planes by the angular spectrum of plane waves (paper Eq. 8)."""
+"""Free-space propagation between parallel planes by the angular spectrum of plane waves (paper Eq. 17)."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def _filter_in_blocks(field: torch.Tensor, transposed: torch.Tensor) -> torch.Te
 def rayleigh_sommerfeld_sum(
     field: torch.Tensor, pitch_m: float, wavelength_m: float, distance_m: float, *, carrier: bool = False
 ) -> torch.Tensor:
-    """Propagate by the first Rayleigh-Sommerfeld integral, summed directly: the slow reference (paper Eq. 7).
+    """Propagate by the first Rayleigh-Sommerfeld integral, summed directly: the slow reference (paper Eq. 16).
 
     E(p) = sum over q of U(q) z / (2 pi r^2) (1/r - j k) exp(j k r) dx^2, with r the distance from q to p; the
     term 1/r, which the paper drops, is kept.

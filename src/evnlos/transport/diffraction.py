@@ -14,8 +14,7 @@ from evnlos.types import Plane
 
 @dataclass(frozen=True)
 class Diffraction(Transport):
-    """Angular spectrum over a distance, then the modulus: |E| or |E|^2 on a plane of the same size (paper Eq.
-    8).
+    """Propagation over a distance, then |E| or |E|^2, on a plane of the same size (paper Eq. 17).
 
     The modulus makes this step non-linear, so it has no adjoint: the images of two objects do not add up to the
     image of both.

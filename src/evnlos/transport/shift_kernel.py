@@ -1,4 +1,4 @@
-"""The compiled loop that shifts, scales and adds ambient light to a wall image; `wall` holds the slow reference."""
+"""The compiled loop that shifts and scales a wall image; `wall` holds the slow reference."""
 
 from __future__ import annotations
 
@@ -38,12 +38,11 @@ def expose_shifted(
             c = u + start
             light = taps[0] * row[c] + taps[1] * row[c + 1] + taps[2] * row[c + 2] + taps[3] * row[c + 3]
             out[v, u] = scale * max(light, np.float32(0)) + ambient[v, u]
-        for u in range(width):
-            if first <= u < last:
-                continue
-            light = np.float32(0)
-            for k in range(4):
-                c = u + start + k
-                if 0 <= c < columns:
-                    light += taps[k] * np.float32(row[c])
-            out[v, u] = scale * max(light, np.float32(0)) + ambient[v, u]
+        for low, high in ((0, first), (last, width)):
+            for u in range(low, high):
+                light = np.float32(0)
+                for k in range(4):
+                    c = u + start + k
+                    if 0 <= c < columns:
+                        light += taps[k] * np.float32(row[c])
+                out[v, u] = scale * max(light, np.float32(0)) + ambient[v, u]

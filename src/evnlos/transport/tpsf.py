@@ -1,4 +1,4 @@
-"""The transmission point-spread function (tPSF) that stands for diffuse reflection (paper Eq. 9)."""
+"""The transmission point-spread function (tPSF) that stands for diffuse reflection (paper Eq. 18)."""
 
 from __future__ import annotations
 

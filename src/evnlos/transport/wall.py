@@ -173,7 +173,7 @@ class SlidingWall:
         )
 
     def _shift(self, x_m: float, y_m: float) -> tuple[torch.Tensor, int, list[float]]:
-        """Return the canvas at the camera's rows [H, canvas width], its column under pixel 0, and four weights."""
+        """Return the canvas at the camera's rows [H, C], its column under pixel 0, and the four weights."""
         origin, moved = self.view.pixels(torch.tensor([(0.0, 0.0), (x_m, y_m)], dtype=torch.float64))
         across, down = (moved - origin).tolist()
         whole, taps = _taps(-across)
