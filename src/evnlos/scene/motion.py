@@ -158,7 +158,8 @@ class PathMotion:
         same_way = before * after > 0
         # Weighted harmonic mean; zero where the direction turns, which keeps the curve within its points.
         w_before, w_after = step[:-1] + 2 * step[1:], 2 * step[:-1] + step[1:]
-        safe_before, safe_after = np.where(same_way, before, 1.0), np.where(same_way, after, 1.0)
-        mean = (w_before + w_after) / (w_before / safe_before + w_after / safe_after)
+        # Written as a fraction of products: a slope of almost nothing must not overflow when divided by.
+        below = np.where(same_way, w_before * after + w_after * before, 1.0)
+        mean = (w_before + w_after) * (before * after) / below
         slopes[1:-1] = np.where(same_way, mean, 0.0)
         return knots, points, slopes

@@ -22,7 +22,16 @@ from evnlos.sensor._exact_math import (
     log_light,
     response,
 )
-from evnlos.sensor._fast_math import fast_exp
+from evnlos.sensor._exact_pass import (
+    PIECE,
+    copy_light,
+    fall,
+    flag_direct,
+    flag_filtered,
+    gain_of,
+    log_row,
+    respond,
+)
 from evnlos.sensor._random import (
     STREAM_SHOT_CHOICE,
     STREAM_SHOT_GAP,
@@ -32,8 +41,6 @@ from evnlos.sensor._random import (
     random_uniform,
 )
 
-PIECE = 0.02
-"""Largest change of the log light in a piece on which it counts as a line: at most 5e-5 log units wrong."""
 DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
 """The factor 1 - 0.75 (I + 20) / 275 of the shot noise at black, its largest value."""
 
@@ -180,90 +187,12 @@ def _step(
     return out, count, filtered
 
 
-# Each of the following loops writes one array: with more, a compiler gives up proving that they do not overlap.
-
-
 @njit(cache=True, error_model="numpy")
-def log_row(row, logs):
-    """Fill the log light of a row of light in DN."""
-    for i in range(len(row)):
-        logs[i] = log_light(row[i])
-
-
-@njit(cache=True, error_model="numpy")
-def _copy(row, light):
-    """Take over a row of light in double precision."""
-    for i in range(len(row)):
-        light[i] = np.float64(row[i])
-
-
-@njit(cache=True, error_model="numpy")
-def _fall(base, leak, length, base_1):
-    """Lower the references by the leak of one step."""
-    for i in range(len(base)):
-        base_1[i] = base[i] - leak[i] * length
-
-
-@njit(cache=True, error_model="numpy")
-def _gain(light_0, light_1, half, gain):
-    """Fill 1 - exp(-tau), tau being the step in the filter's own time."""
-    for i in range(len(gain)):
-        gain[i] = 1.0 - fast_exp(-half * (light_0[i] + light_1[i] + 40.0))
-
-
-@njit(cache=True, error_model="numpy")
-def _respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, filtered_1):
-    """Fill the filter's output after one step on which the log light is a line in the filter's own time."""
-    for i in range(len(gain)):
-        tau = half * (light_0[i] + light_1[i] + 40.0)
-        before = filtered_0[i]
-        change = logs_1[i] - logs_0[i]
-        filtered_1[i] = before + gain[i] * (logs_0[i] - before) + change * (1.0 - gain[i] / tau)
-
-
-@njit(cache=True, error_model="numpy")
-def _flag_filtered(now, then, leak, half, length, on, off, flags):
-    """Flag the pixels that may have met a threshold, or whose light bent too much for one line."""
-    light_0, logs_0, filtered_0, base = now[0], now[1], now[2], now[3]
-    light_1, logs_1, filtered_1 = then[0], then[1], then[2]
-    for i in range(len(leak)):
-        tau = half * (light_0[i] + light_1[i] + 40.0)
-        drift = leak[i] * length
-        slope_0 = tau * (logs_0[i] - filtered_0[i]) + drift
-        slope_1 = tau * (logs_1[i] - filtered_1[i]) + drift
-        turn = max(abs(slope_0), abs(slope_1)) if slope_0 * slope_1 < 0.0 else 0.0
-        lift_0 = filtered_0[i] - base[i]
-        lift_1 = filtered_1[i] - base[i] + drift
-        flags[i] = (
-            (max(lift_0, lift_1) + turn >= on[i])
-            | (min(lift_0, lift_1) - turn <= -off[i])
-            | (abs(logs_1[i] - logs_0[i]) > PIECE)
-            | ((light_0[i] < KNEE) != (light_1[i] < KNEE))
-        )
-
-
-@njit(cache=True, error_model="numpy")
-def _flag_direct(now, then, leak, length, on, off, flags):
-    """Flag the pixels that may have met a threshold on the light itself."""
-    logs_0, base, logs_1 = now[1], now[3], then[1]
-    for i in range(len(leak)):
-        low = min(logs_0[i], logs_1[i]) - base[i]
-        high = max(logs_0[i], logs_1[i]) - base[i] + leak[i] * length
-        flags[i] = (high >= on[i]) | (low <= -off[i])
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def run_tile(
-    frames, times, first, last, light, filtered, base, last_event, candidate, drawn, sent,
+def _run_tile(
+    out, count, frames, times, first, last, light, filtered, base, last_event, candidate, drawn, sent,
     on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
 ):  # fmt: skip
-    """Run the pixels first..last - 1 through all steps of a block and return what they sent.
-
-    `frames` [T, N] light in DN at times[1:]; `times` [T + 1] seconds; then [N] state (`light` DN,
-    `filtered`, `base`, `last_event` s, next shot-noise `candidate` s, counters `drawn`, `sent`) and constants
-    of the pixels (thresholds, `leak` in log units/s, noise rates in hertz). `rate` is 2 pi fc / 275, 0 = no
-    filter. Returns three columns: time stamp in microseconds, pixel, polarity.
-    """
+    """Run the pixels first..last - 1 through all steps of a block; see `run_tiles`."""
     size = last - first
     words = (size + 7) // 8
     flag_words = np.zeros(words, np.uint64)
@@ -279,21 +208,19 @@ def run_tile(
     soonest = np.inf
     if has_shot:
         soonest = candidate[first:last].min()
-    out = (np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_))
-    count = 0
     for k in range(len(frames)):
         start, stop = times[k], times[k + 1]
-        _copy(frames[k, first:last], then[0])
+        copy_light(frames[k, first:last], then[0])
         log_row(then[0], then[1])
-        _fall(now[3], my_leak, stop - start, then[3])
+        fall(now[3], my_leak, stop - start, then[3])
         if rate > 0.0:
             half = 0.5 * rate * (stop - start)
-            _gain(now[0], then[0], half, gain)
-            _respond(now[0], then[0], now[1], then[1], gain, now[2], half, then[2])
-            _flag_filtered(now, then, my_leak, half, stop - start, my_on, my_off, flags[:size])
+            gain_of(now[0], then[0], half, gain)
+            respond(now[0], then[0], now[1], then[1], gain, now[2], half, then[2])
+            flag_filtered(now, then, my_leak, half, stop - start, my_on, my_off, flags[:size])
         else:
             then[2] = then[1]
-            _flag_direct(now, then, my_leak, stop - start, my_on, my_off, flags[:size])
+            flag_direct(now, then, my_leak, stop - start, my_on, my_off, flags[:size])
         if soonest < stop:
             for i in range(size):
                 flags[i] |= candidate[first + i] < stop
@@ -322,4 +249,27 @@ def run_tile(
             soonest = candidate[first:last].min()
         now, then = then, now
     light[first:last], filtered[first:last], base[first:last] = now[0], now[2], now[3]
+    return out, count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def run_tiles(
+    frames, times, first, last, tile_px, light, filtered, base, last_event, candidate, drawn, sent,
+    on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
+):  # fmt: skip
+    """Run the pixels first..last - 1 through all steps of a block, tile by tile, and return what they sent.
+
+    `frames` [T, N] light in DN at times[1:]; `times` [T + 1] seconds; then [N] state (`light` DN,
+    `filtered`, `base`, `last_event` s, next shot-noise `candidate` s, counters `drawn`, `sent`) and constants
+    of the pixels (thresholds, `leak` in log units/s, noise rates in hertz). `rate` is 2 pi fc / 275, 0 = no
+    filter. Returns three columns: time stamp in microseconds, pixel, polarity.
+    """
+    out = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_)
+    count = 0
+    for start in range(first, last, tile_px):
+        out, count = _run_tile(
+            out, count, frames, times, start, min(start + tile_px, last), light, filtered, base, last_event,
+            candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter,
+            window, seed,
+        )  # fmt: skip
     return out[0][:count], out[1][:count], out[2][:count]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.sensor import _exact
+from evnlos.sensor._exact_pass import log_row
 from evnlos.sensor._order import Columns, sort_times
 from evnlos.sensor._random import (
     STREAM_HOT,
@@ -18,7 +19,7 @@ from evnlos.sensor._random import (
     normal_field,
     uniform_field,
 )
-from evnlos.sensor._tiles import check_tiling, map_tiles, pixel_thresholds
+from evnlos.sensor._tiles import check_tiling, map_shares, pixel_thresholds
 from evnlos.sensor.pixel import EventPixel
 
 
@@ -59,7 +60,7 @@ class ExactArray:
         count = len(frame)
         self._light = frame.astype(np.float64)
         self._filtered = np.empty(count)
-        _exact.log_row(self._light, self._filtered)
+        log_row(self._light, self._filtered)
         self._base = self._filtered.copy()
         if self.pixel.leak_rate_hz > 0:
             # a pixel at rest has been leaking since its last event, at a time of its own
@@ -77,14 +78,18 @@ class ExactArray:
         times = np.concatenate([[self._time], times_s])
         rate = 2.0 * math.pi * self.pixel.cutoff_hz / 275.0
 
-        def work(first: int, last: int) -> Columns:
-            return _exact.run_tile(
-                frames, times, first, last, self._light, self._filtered, self._base,
+        def work(first: int, last: int) -> tuple[NDArray, ...]:
+            return _exact.run_tiles(
+                frames, times, first, last, self._tile_px, self._light, self._filtered, self._base,
                 self._last_event, self._candidate, self._drawn, self._sent, self._on, self._off, self._leak,
                 self._rate_on, self._rate_off, self._rate_hot, rate, self.pixel.refractory_s,
                 self.pixel.jitter_s, self._window, self.seed,
             )  # fmt: skip
 
-        tiles = list(map_tiles(work, frames.shape[1], self._tile_px, self._threads))
+        tiles = list(map_shares(work, frames.shape[1], self._tile_px, self._threads))
         self._time = float(times_s[-1])
-        return sort_times(*(np.concatenate([tile[n] for tile in tiles]) for n in range(3)))
+        return sort_times(
+            np.concatenate([tile[0] for tile in tiles]),
+            np.concatenate([tile[1] for tile in tiles]),
+            np.concatenate([tile[2] for tile in tiles]),
+        )

@@ -45,14 +45,14 @@ def reference_v2e(
         on, off = on32.astype(np.float64), off32.astype(np.float64)
     key = np.uint64(seed)
     filtered = [float(np.float32(np.rint(_log(v) * 1e8) / 1e8)) for v in light[0]]
-    base = list(filtered)
+    base: list[float] = [*filtered]
     factor = [
         np.float32(10 ** (0.1 * random_normal(key, STREAM_LEAK_RATE, n, 0)) * on[n]) for n in range(count)
     ]
     most = float((pixel.threshold_on / on + pixel.threshold_off / off).max())
-    hazard = [random_exponential(key, STREAM_SHOT_GAP, n, 0) for n in range(count)]
+    hazard: list[float] = [random_exponential(key, STREAM_SHOT_GAP, n, 0) for n in range(count)]
     drawn, spent = [0] * count, 0.0
-    last = np.full(count, -pixel.refractory_s, np.float32)
+    last = [float(np.float32(-pixel.refractory_s))] * count
     events: list[Event] = []
     for k in range(1, steps):
         delta = times_s[k] - times_s[k - 1]
@@ -75,12 +75,13 @@ def reference_v2e(
             kept = 0
             for j in range(abs(crossings[n])):
                 if pixel.refractory_s > delta / peak:
-                    if subs[j] - last[n] <= np.float32(pixel.refractory_s):
+                    if np.float32(subs[j] - np.float32(last[n])) <= np.float32(pixel.refractory_s):
                         continue
-                    last[n] = subs[j]
+                    last[n] = float(subs[j])
                 kept += 1
                 events.append((float(subs[j]), n, 1 if crossings[n] > 0 else -1))
-            base[n] += float(np.float32(kept) * (on32[n] if crossings[n] > 0 else -off32[n]))
+            size = on32[n] if crossings[n] > 0 else -off32[n]
+            base[n] = base[n] + float(np.float32(kept) * size)
             if top > 0 and hazard[n] <= spent:
                 dim = 1.0 - 0.75 * (light[k, n] + 20.0) / 275.0
                 uniform = random_uniform(key, STREAM_SHOT_CHOICE, n, drawn[n]) * top

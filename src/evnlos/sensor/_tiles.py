@@ -17,6 +17,7 @@ from evnlos.sensor._random import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_
 from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
 
 _T = TypeVar("_T")
+_SHARES = 4
 
 
 def pixel_thresholds(
@@ -51,12 +52,12 @@ def check_tiling(tile_px: int, threads: int | None) -> tuple[int, int]:
     return -(-tile_px // BLOCK) * BLOCK, threads
 
 
-def map_tiles(work: Callable[[int, int], _T], count: int, tile_px: int, threads: int) -> Iterator[_T]:
-    """Yield work(first, last) for each tile in the order of the pixels."""
-    edges = range(0, count, tile_px)
-    if threads == 1 or len(edges) == 1:
-        for first in edges:
-            yield work(first, min(first + tile_px, count))
+def map_shares(work: Callable[[int, int], _T], count: int, tile_px: int, threads: int) -> Iterator[_T]:
+    """Yield work(first, last) for each share of whole tiles, in the order of the pixels."""
+    if threads == 1 or count <= tile_px:
+        yield work(0, count)
         return
+    # a few shares a thread, so that a busy part of the image does not keep the others waiting
+    share = -(-count // (_SHARES * threads * tile_px)) * tile_px
     with ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(lambda first: work(first, min(first + tile_px, count)), edges)
+        yield from pool.map(lambda first: work(first, min(first + share, count)), range(0, count, share))

@@ -95,28 +95,20 @@ def _leak(base, leak, scale, jitter):
 
 
 @njit(cache=True, error_model="numpy")
-def _grown(column, length):
-    """Return a longer copy of a column."""
-    longer = np.empty(length, column.dtype)
+def _grown(column):
+    """Return a copy of a column with twice its length."""
+    longer = np.empty(2 * len(column), column.dtype)
     longer[: len(column)] = column
     return longer
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def run_tile(
-    frames, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
+@njit(cache=True, error_model="numpy")
+def _run_tile(
+    out, count, frames, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
     rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
     defer, peak,
 ):  # fmt: skip
-    """Run the pixels first..last - 1 through all steps of a block and return what they sent.
-
-    `frames` [T, N] light in DN; `lp`, `base`, thresholds, `leak`, `hazard`, `drawn` [N] state and constants of
-    the pixels; `table` [256] logarithms of 8-bit light, empty for other light; `rate`, `leak_scale`,
-    `hazard_sum`, `chance` [T].
-    Returns four columns: step, pixel, signed number of threshold crossings, sign of a shot-noise event. `peak`
-    [T] takes the largest number of crossings of a pixel in each step. With `defer` the reference stays where
-    it is when a threshold is crossed: the caller decides which events pass.
-    """
+    """Run the pixels first..last - 1 through all steps of a block; see `run_tiles`."""
     size = last - first
     steps = len(rate)
     my_lp, my_base = lp[first:last], base[first:last]
@@ -134,12 +126,7 @@ def run_tile(
                 due = np.searchsorted(hazard_sum, hazard[first + i])
                 chain[i] = head[due]
                 head[due] = i
-    capacity = 1024
-    count = 0
-    out_step = np.empty(capacity, np.int32)
-    out_pixel = np.empty(capacity, np.int32)
-    out_crossings = np.empty(capacity, np.int32)
-    out_shot = np.empty(capacity, np.int8)
+    out_step, out_pixel, out_crossings, out_shot = out
     filtered = rate[0] > 0.0
     for k in range(steps):
         row = frames[k, first:last]
@@ -202,18 +189,41 @@ def run_tile(
                     if shot != 0:
                         my_base[i] = my_lp[i]
                 if crossings != 0 or shot != 0:
-                    if count == capacity:
-                        capacity *= 2
-                        out_step = _grown(out_step, capacity)
-                        out_pixel = _grown(out_pixel, capacity)
-                        out_crossings = _grown(out_crossings, capacity)
-                        out_shot = _grown(out_shot, capacity)
+                    if count == len(out_step):
+                        out_step, out_pixel = _grown(out_step), _grown(out_pixel)
+                        out_crossings, out_shot = _grown(out_crossings), _grown(out_shot)
                     out_step[count] = k
                     out_pixel[count] = pixel
                     out_crossings[count] = crossings
                     out_shot[count] = shot
                     count += 1
-    return out_step[:count], out_pixel[:count], out_crossings[:count], out_shot[:count]
+    return (out_step, out_pixel, out_crossings, out_shot), count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def run_tiles(
+    frames, first, last, tile_px, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
+    rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
+    defer, peak,
+):  # fmt: skip
+    """Run the pixels first..last - 1 through all steps of a block, tile by tile, and return what they sent.
+
+    `frames` [T, N] light in DN; `lp`, `base`, thresholds, `leak`, `hazard`, `drawn` [N] state and constants of
+    the pixels; `table` [256] logarithms of 8-bit light, empty for other light; `rate`, `leak_scale`,
+    `hazard_sum`, `chance` [T].
+    Returns four columns: step, pixel, signed number of threshold crossings, sign of a shot-noise event. `peak`
+    [T] takes the largest number of crossings of a pixel in each step. With `defer` the reference stays where
+    it is when a threshold is crossed: the caller decides which events pass.
+    """
+    out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024, np.int8)
+    count = 0
+    for start in range(first, last, tile_px):
+        out, count = _run_tile(
+            out, count, frames, start, min(start + tile_px, last), lp, base, on, off, step_on, step_off,
+            leak, hazard, drawn, table, rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter,
+            seed, first_step, defer, peak,
+        )  # fmt: skip
+    return out[0][:count], out[1][:count], out[2][:count], out[3][:count]
 
 
 @njit(cache=True, error_model="numpy")

@@ -18,7 +18,7 @@ from evnlos.sensor._random import (
     jitter_table,
     normal_field,
 )
-from evnlos.sensor._tiles import check_tiling, map_tiles, pixel_thresholds
+from evnlos.sensor._tiles import check_tiling, map_shares, pixel_thresholds
 from evnlos.sensor.pixel import EventPixel
 
 _DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
@@ -85,7 +85,7 @@ class V2eArray:
         else:
             rate = np.zeros(steps)
         table = np.empty(256 if frames.dtype == np.uint8 else 0, np.float32)
-        _v2e.log_row(np.arange(len(table), dtype=np.float64), table)
+        _v2e.log_row(np.arange(len(table)), table)
         chance = np.zeros((steps, 2))
         chance[:, 0] = 0.5 * pixel.shot_noise_rate_hz * delta
         chance[:, 1] = np.minimum(chance[:, 0] * self._most * _DIM_MAX, 1.0 - 1e-9)
@@ -94,15 +94,16 @@ class V2eArray:
 
         def work(first: int, last: int) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
             peak = np.zeros(steps, np.int32)
-            records = _v2e.run_tile(
-                frames, first, last, self._lp, self._base, self._on, self._off, self._step_on, self._step_off,
+            records = _v2e.run_tiles(
+                frames, first, last, self._tile_px, self._lp, self._base, self._on, self._off,
+                self._step_on, self._step_off,
                 self._leak, self._hazard, self._drawn, table, rate, pixel.leak_rate_hz * delta,
                 hazard_sum[1:], chance, self._ratio_on, self._ratio_off, jitter_table(), self.seed, self._steps,
                 defer, peak,
             )  # fmt: skip
             return (*records, peak)
 
-        tiles = list(map_tiles(work, count, self._tile_px, self._threads))
+        tiles = list(map_shares(work, count, self._tile_px, self._threads))
         peak = np.max([tile[4] for tile in tiles], axis=0)
         sub_times = [_sub_times(starts[k], delta[k], times_s[k], int(peak[k])) for k in range(steps)]
         self._time, self._steps = float(times_s[-1]), self._steps + steps

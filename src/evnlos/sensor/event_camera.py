@@ -67,7 +67,7 @@ class EventCamera:
 
     pixel: EventPixel = field(default_factory=EventPixel)
     """Parameters of the pixels."""
-    tolerance: float = 0.02
+    tolerance: float = 0.005
     """Largest error of the interpolated log light, in thresholds."""
     time_step_s: float | None = None
     """Fixed time step, seconds; None = chosen from the motion."""
@@ -104,14 +104,17 @@ class EventCamera:
         if not (math.isfinite(t0) and math.isfinite(t1) and t1 > t0):
             raise ConfigError(f"record from {t0} s to {t1} s; give finite times, the last after the first")
         height, width = wall.shape
+        longest = _longest_step(wall, t0, t1) if self.time_step_s is None else self.time_step_s
         stream = EventStream(self.pixel, (height, width), mode=self.mode, seed=seed, threads=threads)
         stream.push(_render(wall, np.array([t0])), [t0])
-        for times_s, frames in self._chunks(wall, t0, t1):
+        for times_s, frames in self._chunks(wall, t0, t1, longest):
             stream.push(frames, times_s)
         return stream.finish()
 
-    def _chunks(self, wall: Wall, t0: float, t1: float) -> Iterator[tuple[NDArray[np.float64], NDArray]]:
-        """Yield instants and frames that continue after t0 up to t1."""
+    def _chunks(
+        self, wall: Wall, t0: float, t1: float, longest: float
+    ) -> Iterator[tuple[NDArray[np.float64], NDArray]]:
+        """Yield instants and frames that continue after t0 up to t1, at most `longest` seconds apart."""
         height, width = wall.shape
         most = max(1, min(_CHUNK_STEPS, _CHUNK_BYTES // (4 * height * width)))
         if self.time_step_s is not None:
@@ -120,7 +123,6 @@ class EventCamera:
             for k in range(0, steps, most):
                 yield times[k : k + most], _render(wall, times[k : k + most])
             return
-        longest = _longest_step(wall, t0, t1)
         limit = self.tolerance * min(self.pixel.threshold_on, self.pixel.threshold_off)
         step, now, frame = longest, t0, _render(wall, np.array([t0]))[0]
         while now < t1:

@@ -89,7 +89,8 @@ class EventStream:
         times = check_times(times_s, len(light), self._last_s)
         if not len(times):
             return
-        rows = np.ascontiguousarray(light).reshape(len(light), -1)  # [T, H * W]
+        rows = np.ascontiguousarray(light).reshape(len(light), -1).view()  # [T, H * W]
+        rows.flags.writeable = False  # one type of input: the kernels compile once, not twice
         first = 0
         if np.isneginf(self._last_s):
             self._array.start(rows[0], float(times[0]))

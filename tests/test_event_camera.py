@@ -1,0 +1,111 @@
+"""The event camera on a wall in continuous time: its own steps against fine ones, memory, laws, bad input."""
+
+import tracemalloc
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos import EventCamera, EventPixel, EvnlosError, simulate_events
+
+CLEAN = EventPixel(0.15, 0.15, 0.0, 15.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A Gaussian spot that crosses the image at a constant speed."""
+
+    shape: tuple[int, int] = (12, 40)
+    speed_px_s: float = 10.0
+    scale: float = 0.6
+    broken: float = 0.0
+
+    def irradiance(self, t_s) -> torch.Tensor:
+        t = torch.as_tensor(np.asarray(t_s), dtype=torch.float64)
+        y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in self.shape), indexing="ij")
+        centre = 5.0 + self.speed_px_s * t.reshape(-1, 1, 1)
+        light = 0.1 + self.scale * torch.exp(-((x - centre) ** 2 + (y - 5.5) ** 2) / (2 * 3.0**2))
+        return (light + self.broken).float().reshape(*t.shape, *self.shape)
+
+
+def by_pixel(events) -> dict:
+    found: dict = {}
+    for t, x, y, p in zip(
+        events.t_us.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True
+    ):
+        found.setdefault((x, y, p), []).append(t)
+    return found
+
+
+def test_its_own_steps_agree_with_steps_of_a_tenth_of_a_millisecond() -> None:
+    own = EventCamera(CLEAN).record(Spot(), 0.0, 3.0)
+    fine = EventCamera(CLEAN, time_step_s=1e-4).record(Spot(), 0.0, 3.0)
+    assert len(own) > 2000
+    assert abs(len(own) - len(fine)) <= 0.002 * len(fine)
+    mine, theirs = by_pixel(own), by_pixel(fine)
+    errors = [
+        a - b
+        for key in mine.keys() & theirs.keys()
+        if len(mine[key]) == len(theirs[key])
+        for a, b in zip(mine[key], theirs[key], strict=True)
+    ]
+    assert len(errors) > 0.98 * len(fine)
+    assert np.sqrt(np.mean(np.square(errors))) < 1000  # microseconds
+
+
+def test_a_recording_is_the_simulation_of_its_frames() -> None:
+    times = np.arange(0, 301) * 0.01
+    frames = Spot().irradiance(times).numpy() * 255
+    recorded = EventCamera(CLEAN, time_step_s=0.01, mode="v2e").record(Spot(), 0.0, 3.0, seed=4)
+    assert recorded == simulate_events(frames, times, CLEAN, mode="v2e", seed=4)
+    assert EventCamera(CLEAN, time_step_s=0.01).record(Spot(), 0.0, 3.0) == simulate_events(
+        frames, times, CLEAN
+    )
+
+
+def test_a_wall_at_rest_gives_no_signal() -> None:
+    assert len(EventCamera(CLEAN).record(Spot(speed_px_s=0.0), 0.0, 5.0)) == 0
+    noisy = EventPixel(0.15, 0.15, 0.03, 15.0, 0.1, 1.0, 0.0)
+    assert len(EventCamera(noisy).record(Spot(speed_px_s=0.0), 0.0, 5.0)) > 100
+
+
+def test_the_seed_decides_the_noise_and_threads_do_not() -> None:
+    camera = EventCamera(EventPixel(shot_noise_rate_hz=2.0, leak_rate_hz=0.5))
+    first = camera.record(Spot(), 0.0, 1.0, seed=1, threads=1)
+    assert first == camera.record(Spot(), 0.0, 1.0, seed=1, threads=2)
+    assert first != camera.record(Spot(), 0.0, 1.0, seed=2, threads=1)
+
+
+def test_memory_is_that_of_a_chunk_and_the_events() -> None:
+    wall = Spot(shape=(200, 320), speed_px_s=100.0)
+    EventCamera(CLEAN, time_step_s=0.05).record(wall, 0.0, 0.1)
+    tracemalloc.start()
+    EventCamera(CLEAN, time_step_s=0.005).record(
+        wall, 0.0, 2.0
+    )  # 400 steps: 102 MB of frames, 205 MB of doubles
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6
+
+
+@pytest.mark.parametrize(
+    ("wall", "times", "says"),
+    [
+        (Spot(), (1.0, 1.0), "last after the first"),
+        (Spot(), (0.0, float("nan")), "finite"),
+        (Spot(broken=float("nan")), (0.0, 1.0), "NaN"),
+        (Spot(broken=-1.0), (0.0, 1.0), "negative"),
+        (Spot(speed_px_s=float("inf")), (0.0, 1.0), "speed"),
+        (Spot(speed_px_s=1e9), (0.0, 1.0), "steps"),
+    ],
+)
+def test_bad_input(wall, times, says: str) -> None:
+    with pytest.raises(EvnlosError, match=says):
+        EventCamera(CLEAN).record(wall, *times)
+
+
+@pytest.mark.parametrize("settings", [{"tolerance": 0.0}, {"time_step_s": -1.0}, {"mode": "v2e"}])
+def test_bad_settings(settings: dict) -> None:
+    with pytest.raises(EvnlosError):
+        EventCamera(CLEAN, **settings)

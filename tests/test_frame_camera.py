@@ -1,0 +1,88 @@
+"""The frame camera against the closed forms of its noise model."""
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos import EvnlosError, FrameCamera
+
+QUIET = {"read_noise_e": 0.0, "prnu": 0.0, "dsnu_e": 0.0, "full_well_e": 1e10, "bit_depth": 16}
+
+
+class Ramp:
+    """A wall whose light grows with the square of time."""
+
+    shape = (3, 5)
+    speed_px_s = 0.0
+
+    def irradiance(self, t_s) -> torch.Tensor:
+        t = torch.as_tensor(np.asarray(t_s), dtype=torch.float64)
+        return (t**2).reshape(-1, 1, 1).expand(-1, *self.shape).float()
+
+
+def noise_dn(level: float, **settings: float) -> np.ndarray:
+    camera = FrameCamera(**({"bit_depth": 16, "prnu": 0.0, "dsnu_e": 0.0, "read_noise_e": 0.0} | settings))
+    return camera.expose(np.full((40, 50, 50), level), seed=3).astype(float) / camera.white
+
+
+def test_an_exposure_is_the_mean_over_its_time() -> None:
+    frames = FrameCamera(exposure_s=0.4, **QUIET).capture(Ramp(), [0.5, 0.7])
+    expected = np.array([0.5, 0.7]) ** 2 + 0.4**2 / 12
+    np.testing.assert_allclose(frames[:, 0, 0] / 65535, expected, atol=2e-5)
+    at_once = FrameCamera(exposure_s=0.0, **QUIET).capture(Ramp(), [0.5])
+    np.testing.assert_allclose(at_once / 65535, 0.25, atol=2e-5)
+
+
+@pytest.mark.parametrize("level", [0.05, 0.4])
+def test_shot_noise_is_the_root_of_the_electrons(level: float) -> None:
+    seen = noise_dn(level, full_well_e=5000.0)
+    assert seen.mean() == pytest.approx(level, rel=2e-3)
+    assert seen.std() == pytest.approx(np.sqrt(level * 5000) / 5000, rel=0.02)
+
+
+def test_read_noise_adds_in_squares() -> None:
+    seen = noise_dn(0.3, full_well_e=5000.0, read_noise_e=30.0)
+    assert seen.std() == pytest.approx(np.sqrt(0.3 * 5000 + 30**2) / 5000, rel=0.02)
+
+
+def test_the_fixed_pattern_stays_and_the_noise_does_not() -> None:
+    camera = FrameCamera(prnu=0.05, dsnu_e=0.0, read_noise_e=0.0, full_well_e=1e9, bit_depth=16)
+    a, b = (camera.expose(np.full((2, 40, 40), 0.5), seed=s).astype(float) for s in (1, 2))
+    assert a[0].std() / a[0].mean() == pytest.approx(0.05, rel=0.1)
+    np.testing.assert_allclose(a[0], b[1], rtol=1e-3)
+    other = FrameCamera(prnu=0.05, dsnu_e=0.0, read_noise_e=0.0, full_well_e=1e9, bit_depth=16, pattern_seed=9)
+    assert (
+        abs(np.corrcoef(a[0].ravel(), other.expose(np.full((1, 40, 40), 0.5), seed=1)[0].ravel())[0, 1]) < 0.1
+    )
+
+
+@pytest.mark.parametrize(("bits", "dtype"), [(8, np.uint8), (12, np.uint16), (16, np.uint16)])
+def test_quantisation_and_saturation(bits: int, dtype: type) -> None:
+    camera = FrameCamera(**(QUIET | {"bit_depth": bits}), black_level=10.0)
+    seen = camera.expose(np.array([[[0.0, 0.5, 1.0, 7.0]]]), seed=0)
+    white = 2**bits - 1
+    assert seen.dtype == dtype
+    np.testing.assert_allclose(seen[0, 0], [10, 10 + (white - 10) / 2, white, white], atol=1.0)
+
+
+def test_the_same_seed_gives_the_same_frames_and_inputs_stay() -> None:
+    light = np.random.default_rng(0).random((2, 6, 7))
+    before = light.copy()
+    camera = FrameCamera()
+    np.testing.assert_array_equal(camera.expose(light, seed=5), camera.expose(light, seed=5))
+    assert (camera.expose(light, seed=5) != camera.expose(light, seed=6)).any()
+    np.testing.assert_array_equal(light, before)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"full_well_e": 0.0}, {"bit_depth": 7}, {"exposure_s": -1.0}, {"gain": float("nan")}]
+)
+def test_bad_settings(settings: dict) -> None:
+    with pytest.raises(EvnlosError, match=next(iter(settings))):
+        FrameCamera(**settings)
+
+
+@pytest.mark.parametrize("light", [np.full((1, 2, 2), np.nan), np.full((1, 2, 2), -0.1)])
+def test_bad_light(light: np.ndarray) -> None:
+    with pytest.raises(EvnlosError):
+        FrameCamera().expose(light, seed=0)

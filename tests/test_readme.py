@@ -1,0 +1,55 @@
+"""The README works as written: its Python prints what it says, its YAML loads, its commands and files exist."""
+
+import contextlib
+import io
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from evnlos.cli import COMMANDS
+from evnlos.config import from_dict
+from evnlos.dataset import CaptureInfo, Simulation
+
+ROOT = Path(__file__).resolve().parent.parent
+TEXT = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"```(\w*)\n(.*?)```", TEXT, flags=re.DOTALL)
+
+
+def test_python_snippets_print_what_they_say() -> None:
+    names: dict = {}
+    compared = 0
+    for (kind, code), (_, printed) in zip(BLOCKS, [*BLOCKS[1:], ("", "")], strict=True):
+        if kind == "python":
+            out = io.StringIO()
+            with contextlib.redirect_stdout(out):
+                exec(code, names)
+            assert out.getvalue() == printed
+            compared += 1
+    assert compared == 2
+
+
+def test_yaml_snippets_load() -> None:
+    settings, capture = (yaml.safe_load(code) for kind, code in BLOCKS if kind == "yaml")
+    assert from_dict(Simulation, settings).pixel.refractory_s == 0.001
+    assert from_dict(CaptureInfo, capture).target.name == "R"
+
+
+def test_every_command_is_listed() -> None:
+    assert set(re.findall(r"`evnlos (\w+)", TEXT)) == set(COMMANDS)
+
+
+@pytest.mark.parametrize(
+    "name", ["README.md", "CONTRIBUTING.md", *(f"docs/{p.name}" for p in ROOT.glob("docs/*.md"))]
+)
+def test_links_lead_somewhere(name: str) -> None:
+    page = ROOT / name
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
+        assert (page.parent / target).exists(), f"{name} links to {target}"
+
+
+def test_make_targets_named_in_the_readme_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    for target in set(re.findall(r"(?:^ +|`)make (\w+)", TEXT, flags=re.MULTILINE)):
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
