@@ -132,24 +132,27 @@ def interleaved(
     return {name: (statistics.median(c), statistics.median(w), events[name]) for name, (c, w) in spent.items()}
 
 
-def memory_above_input_mb(height: int, width: int, steps: int) -> float:
-    """Return the peak memory above the input of a run in a process of its own, MB."""
+def memory_above_input_mb(height: int, width: int, steps: int) -> tuple[float, int]:
+    """Return the peak memory above the input of a run in a process of its own in MB, and its events."""
     code = f"""
-import numpy as np
-from evnlos.sensor import EventPixel, simulate_events
-draw = np.random.default_rng(0)
-simulate_events(np.full((3, 8, 8), 9, np.uint8), [0, 1, 2], EventPixel(), mode="v2e", threads=1)
-row = (60 + 40 * np.sin(np.arange({width}) / 30)).astype(np.uint8)
-frames = np.stack([np.broadcast_to(np.roll(row, k // 4), ({height}, {width})) for k in range({steps + 1})])
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from event_pixel import PAPER, STEP_S, Wall, np, simulate_events
+wall = Wall({height}, {width}, 60.0)
+simulate_events(np.full((3, 8, 8), 9, np.uint8), [0, 1, 2], PAPER, mode="v2e", threads=1)
+frames = np.empty(({steps + 1}, {height}, {width}), np.uint8)
+for k in range(len(frames)):
+    frames[k] = 255 * wall.irradiance([k * STEP_S])[0].numpy()
 def status(key):
     return int(next(line for line in open("/proc/self/status") if line.startswith(key)).split()[1])
 open("/proc/self/clear_refs", "w").write("5")
 before = status("VmRSS")
-events = simulate_events(frames, np.arange({steps + 1}) * 1e-3, EventPixel(), mode="v2e", threads=1)
+events = simulate_events(frames, np.arange(len(frames)) * STEP_S, PAPER, mode="v2e", threads=1)
 print((status("VmHWM") - before) / 1024, len(events))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return float(done.stdout.split()[0])
+    megabytes, events = done.stdout.split()
+    return float(megabytes), int(events)
 
 
 def machine() -> str:
@@ -167,6 +170,27 @@ def machine() -> str:
     return f"{name}, {os.cpu_count()} cores; Python {platform.python_version()}, numba {numba.__version__}"
 
 
+def picture(path: str) -> None:
+    """Draw the time stamps of one row of pixels in both modes, as a vector graphic."""
+    wall = Wall(200, 300, 4000.0)
+    times = np.arange(31) * STEP_S
+    light = (255 * wall.irradiance(times)).numpy()
+    pixel = EventPixel(threshold_sigma=0, cutoff_hz=200, leak_rate_hz=0, shot_noise_rate_hz=0)
+    marks = ['<text x="10" y="14">mode="v2e"</text><text x="10" y="254">mode="exact"</text>']
+    for top, mode in ((20, "v2e"), (260, "exact")):
+        events = simulate_events(light, times, pixel, mode=mode)
+        kept = (events.y == 100) & (events.t_us > 8_000) & (events.t_us <= 18_000)
+        marks.append(f'<rect x="10" y="{top}" width="620" height="200" fill="none" stroke="#888"/>')
+        for time_us, x, on in zip(events.t_us[kept], events.x[kept], events.p[kept], strict=True):
+            across, down = 10 + 2.06 * x, top + 200 - (time_us - 8_000) / 50
+            marks.append(f'<circle cx="{across:.1f}" cy="{down:.1f}" r="1" fill="{"#c22" if on else "#22c"}"/>')
+    marks.append('<text x="10" y="480">column 0 to 299 across, 10 ms upwards; red ON, blue OFF</text>')
+    head = '<svg xmlns="http://www.w3.org/2000/svg" width="640" height="490" font-family="sans-serif" '
+    Path(path).write_text(
+        head + 'font-size="12">' + '<rect width="640" height="490" fill="#fff"/>' + "".join(marks) + "</svg>\n"
+    )
+
+
 def main() -> None:
     """Run the contest and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -175,7 +199,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--write", help="write the table to this file as well")
+    parser.add_argument("--picture", help="only draw the time stamps of both modes into this SVG file")
     args = parser.parse_args()
+    if args.picture:
+        picture(args.picture)
+        return
     torch.set_num_threads(1)
     height, width = args.size
     light, times = video(height, width, args.steps)
@@ -221,7 +249,9 @@ def main() -> None:
     lines += [
         f"Rendering and events of {seconds:g} s of a sliding wall, steps chosen by the camera: {cpu:.2f} s CPU "
         f"for {len(events):,} events: {1e9 * cpu / (height * width * frames):.3f} ns a pixel and millisecond.",
-        f"Memory above the input, 500 steps: {memory_above_input_mb(height, width, 500):.0f} MB.",
+        "Memory above the input, 500 steps, the events included: {:.0f} MB for {:,} events.".format(
+            *memory_above_input_mb(height, width, 500)
+        ),
     ]
     text = "\n".join(lines) + "\n"
     print(text)

@@ -135,7 +135,7 @@ class FinetuneCommand:
     """`default`, or `paper` for the paper's 100 epochs at 1e-5 with its loss."""
     config: Path | None = None
     """YAML file with settings."""
-    settings: Flat[Training] = field(default_factory=lambda: Training(learning_rate=3e-4))
+    settings: Flat[Training] = field(default_factory=Training)
 
     def run(self) -> None:
         """Train, with a progress bar over the epochs."""
@@ -150,8 +150,8 @@ class EvaluateCommand:
     """Weights file, or a run's folder."""
     data: Path
     """Folder of the dataset."""
-    split: str = "test"
-    """Split to score: test, validation, train or all."""
+    split: str | None = None
+    """Split to score: test, validation, train or all; by default `test` where there is one, else `all`."""
     vgg: Path | None = None
     """torchvision's vgg16-397923af.pth for LPIPS; by default it is looked for in the torch hub cache."""
     lpips_heads: Path | None = None
@@ -163,24 +163,26 @@ class EvaluateCommand:
         """Evaluate and print."""
         from evnlos.evaluation import available_lpips, evaluate, load_lpips
         from evnlos.model import load_weights
-        from evnlos.report import refuse_seen
+        from evnlos.report import refuse_seen, seen_in_training
 
         dataset, weights = open_dataset(self.data), load_weights(self.weights)
-        if self.split == "test" and not dataset.split.get("test"):
-            raise EvnlosError(f"{self.data} has no split 'test'; give --split all, or import with --test")
-        refuse_seen(weights.history, dataset, self.split)
+        split = self.split or ("test" if dataset.split.get("test") else "all")
+        refuse_seen(weights.history, dataset, split)
         metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
-        found = evaluate(weights, dataset, self.split, metric).summary()
+        found = evaluate(weights, dataset, split, metric).summary()
         about = {
             "weights": str(self.weights),
             "paradigm": weights.paradigm,
             "data": str(self.data),
-            "split": self.split,
+            "split": split,
         }
+        seen = seen_in_training(weights.history, dataset, split)
         if self.json:
-            print(json.dumps(about | found))
+            print(json.dumps(about | {"seen_in_training": seen} | found))
         else:
             _print_summary(about, found)
+            if seen:
+                _say(f"note: training saw {', '.join(seen)}; scores on them say nothing about unseen objects")
 
 
 @dataclass(frozen=True)
@@ -305,7 +307,7 @@ def _defaults(verb: str, rest: list[str]) -> Any:
         "simulate": PRESETS,
         "lab": {"default": Lab},
         "train": {"default": Training, "paper": paper_pretraining},
-        "finetune": {"default": lambda: Training(learning_rate=3e-4), "paper": paper_finetuning},
+        "finetune": {"default": Training, "paper": paper_finetuning},
     }[verb]
     if preset is not None and preset not in presets:
         raise ConfigError(f"--preset is {preset!r}; give one of {', '.join(presets)}")

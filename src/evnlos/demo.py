@@ -85,7 +85,7 @@ def run_demo(settings: Demo) -> Path:
         e2e = out / "runs" / f"e2e-{paradigm}"
         _fit(shots, dataclasses.replace(plan, epochs=settings.e2e_epochs), e2e, None)
         epnp = out / "runs" / f"epnp-{paradigm}"
-        _fit(shots, dataclasses.replace(plan, epochs=settings.finetune_epochs, learning_rate=5e-4), epnp, pre)
+        _fit(shots, dataclasses.replace(plan, epochs=settings.finetune_epochs), epnp, pre)
         runs += [pre, e2e, epnp]
 
     dataset, results = gather(runs, out / "shots")

@@ -60,8 +60,7 @@ def evaluate(
 ) -> Evaluation:
     """Reconstruct a split of a dataset and score it.
 
-    The baseline "mean" is the mean picture of the dataset's split `train`; a dataset without one has
-    only the baseline "zero".
+    The baseline "mean" is the mean of the true pictures that the network was trained on last.
 
     Args:
         weights: The network and its paradigm.
@@ -78,9 +77,8 @@ def evaluate(
     truth = samples.truth.float()[:, rows].contiguous()
     images = infer(weights.network, samples.inputs)[:, rows].contiguous()
     blank = {"zero": torch.zeros_like(truth)}
-    if split != "train" and dataset.split.get("train"):
-        seen = NlosDataset(dataset, "train", weights.paradigm)  # type: ignore[arg-type]
-        blank["mean"] = seen.truth.float().mean(dim=0)[rows].expand_as(truth).contiguous()
+    if weights.mean_image is not None:
+        blank["mean"] = weights.mean_image.float()[rows].expand_as(truth).contiguous()
     baselines = {name: score(image, truth, perceptual) for name, image in blank.items()}
     return Evaluation(images, truth, samples.names, score(images, truth, perceptual), baselines)
 

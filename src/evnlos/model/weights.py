@@ -17,6 +17,7 @@ from evnlos.errors import DataError
 from evnlos.model.unet import ResidualUNet, UNetConfig
 
 _FORMAT = "evnlos-weights-1"
+_MEAN = "baseline.mean_image"
 
 
 @dataclass(frozen=True)
@@ -28,17 +29,21 @@ class Weights:
         paradigm: What it sees: "frame", "event" or "fusion".
         sampling: Resolution and representation of the samples that it was trained on.
         history: The trainings behind it, oldest first: settings, data, version.
+        mean_image: Mean of the true pictures of the last training, float32 [H, W]: the baseline to beat.
     """
 
     network: ResidualUNet
     paradigm: str
     sampling: dict[str, Any]
     history: list[dict[str, Any]]
+    mean_image: torch.Tensor | None = None
 
 
 def save_weights(path: str | Path, weights: Weights) -> None:
     """Write weights as one safetensors file, atomically."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in weights.network.state_dict().items()}
+    if weights.mean_image is not None:
+        tensors[_MEAN] = weights.mean_image.contiguous()
     about = {
         "format": _FORMAT,
         "paradigm": weights.paradigm,
@@ -77,12 +82,15 @@ def load_weights(path: str | Path) -> Weights:
         )
     config = from_dict(UNetConfig, about["network"], source=str(path))
     _refuse_oversized(config, tensors, path)
+    mean_image = tensors.pop(_MEAN, None)
     network = ResidualUNet(CHANNELS[about["paradigm"]], config)
     try:
         network.load_state_dict({name: value.float() for name, value in tensors.items()})
     except RuntimeError as error:
         raise DataError(f"{path} does not fit its own config: {' '.join(str(error).split())[:160]}") from None
-    return Weights(network.eval(), about["paradigm"], about.get("sampling", {}), about.get("history", []))
+    return Weights(
+        network.eval(), about["paradigm"], about.get("sampling", {}), about.get("history", []), mean_image
+    )
 
 
 def _refuse_oversized(config: UNetConfig, tensors: dict[str, torch.Tensor], path: Path) -> None:

@@ -1,8 +1,17 @@
 """Results for people: one HTML page with its numbers as CSV, and reconstructions as pictures."""
 
-from evnlos.report.gather import RunResult, gather, refuse_seen
+from evnlos.report.gather import RunResult, gather, refuse_seen, seen_in_training
 from evnlos.report.page import write_report
 from evnlos.report.reconstruction import reconstruct_capture
 from evnlos.report.tables import to_csv, to_text
 
-__all__ = ["RunResult", "gather", "reconstruct_capture", "refuse_seen", "to_csv", "to_text", "write_report"]
+__all__ = [
+    "RunResult",
+    "gather",
+    "reconstruct_capture",
+    "refuse_seen",
+    "seen_in_training",
+    "to_csv",
+    "to_text",
+    "write_report",
+]

@@ -77,17 +77,19 @@ def refuse_seen(history: list[dict[str, Any]], dataset: Dataset, split: str) -> 
     Raises:
         DataError: Names an object that was trained on.
     """
-    if split != "test":
-        return
+    seen = seen_in_training(history, dataset, split)
+    if split == "test" and seen:
+        raise DataError(
+            f"{seen[0]} of the split {split!r} was in the training data of these weights; "
+            "hold it out, or evaluate another split"
+        )
+
+
+def seen_in_training(history: list[dict[str, Any]], dataset: Dataset, split: str) -> list[str]:
+    """Return the objects of a split that a training behind the weights saw, by origin and name."""
     tested = set(dataset.objects(split))
-    for step in history:
-        same = step["data"]["origin"] == dataset.origin
-        seen = tested & set(step["data"]["train"]) if same else set()
-        if seen:
-            raise DataError(
-                f"{sorted(seen)[0]} of the split {split!r} was in the training data of these weights; "
-                "hold it out, or evaluate another split"
-            )
+    trained = [set(step["data"]["train"]) for step in history if step["data"]["origin"] == dataset.origin]
+    return sorted(tested & set().union(*trained))
 
 
 def settings_of(dataset: Dataset) -> dict[str, Any]:

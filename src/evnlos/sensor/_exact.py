@@ -17,9 +17,9 @@ from evnlos.sensor._exact_math import (
     LOG_KNEE,
     LOG_LINE,
     LOW_PASS,
+    bend_response,
     first_crossing,
     light_of,
-    log_light,
     response,
 )
 from evnlos.sensor._exact_pass import (
@@ -32,6 +32,7 @@ from evnlos.sensor._exact_pass import (
     log_row,
     respond,
 )
+from evnlos.sensor._fast_math import fast_exp
 from evnlos.sensor._random import (
     STREAM_SHOT_CHOICE,
     STREAM_SHOT_GAP,
@@ -88,8 +89,9 @@ def _shot(seed, pixel, counter, intensity, rate_on, rate_off, rate_hot):
 
 @njit(cache=True, error_model="numpy")
 def _piece(
-    out, count, pixel, start, length, light_a, light_b, filtered, state, constants, jitter, window, drawn, sent
-):
+    out, count, pixel, start, length, light_a, light_b, log_a, log_b, filtered, state, constants, jitter,
+    window, drawn, sent,
+):  # fmt: skip
     """Send the events of one pixel on one piece of its light, from `start` for `length` seconds.
 
     `state` (reference, last event, next candidate of shot noise) is updated; returns the columns, their fill
@@ -98,20 +100,21 @@ def _piece(
     on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, seed = constants
     gradient = (light_b - light_a) / length
     speed, curve = rate * (light_a + 20.0), 0.5 * rate * gradient
+    arrival = log_b
     if rate > 0.0:
         kind, end = LOW_PASS, length * (speed + curve * length)
-        log_a, log_b = log_light(light_a), log_light(light_b)
         per_tau = (log_b - log_a) / end
         a, b, c = log_a - per_tau, per_tau + leak * length / end, filtered - log_a + per_tau
-        arrival = a + per_tau * end + c * math.exp(-end)
+        decay = fast_exp(-end)
+        arrival = a + per_tau * end + c * decay
+        arrival += bend_response(light_a, light_b, log_b - log_a, end, 1.0 / end, 1.0 - decay, rate * length)
     elif max(light_a, light_b) > KNEE:
         kind, end = LOG_LINE, length
         a, b, c = light_a, gradient, leak
-        arrival = log_light(light_b)
     else:
         kind, end = LINE, length
-        a, b, c = log_light(light_a), gradient * LOG_KNEE / KNEE + leak, 0.0
-        arrival = log_light(light_b)
+        a, b, c = log_a, gradient * LOG_KNEE / KNEE + leak, 0.0
+    arrived = arrival + leak * length
     now = 0.0
     while True:
         ready, candidate = state[1] + refractory - start, state[2] - start
@@ -125,13 +128,14 @@ def _piece(
             now = max(now, ready * (speed + curve * ready) if kind == LOW_PASS else ready)
         x, sign = limit, 0
         if now < limit:
-            change = response(kind, a, b, c, now) - state[0]
-            if change >= on:
+            value = response(kind, a, b, c, now)[0] if now > 0.0 else filtered
+            if value - state[0] >= on:
                 x, sign = now, 1
-            elif change <= -off:
+            elif value - state[0] <= -off:
                 x, sign = now, -1
             else:
-                x, sign = first_crossing(kind, a, b, c, now, limit, state[0] + on, state[0] - off)
+                final = arrived if limit == end else response(kind, a, b, c, limit)[0]
+                x, sign = first_crossing(kind, a, b, c, now, limit, value, final, state[0] + on, state[0] - off)
         if sign != 0:
             moment = x
             if kind == LOW_PASS:
@@ -149,7 +153,7 @@ def _piece(
             when = state[2]
             state[2] += random_exponential(seed, STREAM_SHOT_GAP, pixel, drawn[pixel]) / total
             if choice != 0 and when - state[1] >= refractory:
-                state[0] = response(kind, a, b, c, limit)
+                state[0] = response(kind, a, b, c, limit)[0]
                 state[1] = when
                 out, count = _emit(out, count, when, pixel, choice > 0, jitter, window, seed, sent)
             now = max(now, limit)
@@ -161,29 +165,31 @@ def _piece(
 
 @njit(cache=True, error_model="numpy")
 def _step(
-    out, count, pixel, start, stop, light_a, light_b, filtered, state, constants, jitter, window, drawn, sent
-):
+    out, count, pixel, start, stop, light_a, light_b, log_a, log_b, filtered, state, constants, jitter,
+    window, drawn, sent,
+):  # fmt: skip
     """Send the events of one pixel in one step, split at the knee of the log and into short log changes."""
     length, change = stop - start, light_b - light_a
     knee = min(light_a, light_b) < KNEE < max(light_a, light_b)
-    at, at_light = 0.0, light_a
+    at, at_light, at_log = 0.0, light_a, log_a
     for part in range(2 if knee else 1):
-        goal = KNEE if knee and part == 0 else light_b
-        log_from, log_goal = log_light(at_light), log_light(goal)
-        pieces = 1
+        goal, log_goal = (KNEE, LOG_KNEE) if knee and part == 0 else (light_b, log_b)
+        log_from, pieces = at_log, 1
         if constants[6] > 0.0:
             pieces = max(1, math.ceil(abs(log_goal - log_from) / PIECE))
         for n in range(1, pieces + 1):
-            next_light = goal if n == pieces else light_of(log_from + (log_goal - log_from) * n / pieces)
-            following = length
+            next_light, next_log, following = goal, log_goal, length
+            if n < pieces:
+                next_log = log_from + (log_goal - log_from) * n / pieces
+                next_light = light_of(next_log)
             if next_light != light_b:
                 following = min((next_light - light_a) / change, 1.0) * length
             if following > at:
                 out, count, filtered = _piece(
-                    out, count, pixel, start + at, following - at, at_light, next_light, filtered, state,
-                    constants, jitter, window, drawn, sent,
+                    out, count, pixel, start + at, following - at, at_light, next_light, at_log, next_log,
+                    filtered, state, constants, jitter, window, drawn, sent,
                 )  # fmt: skip
-            at, at_light = following, next_light
+            at, at_light, at_log = following, next_light, next_log
     return out, count, filtered
 
 
@@ -238,7 +244,8 @@ def _run_tile(
                     rate, refractory, seed,
                 )  # fmt: skip
                 out, count, then[2, i] = _step(
-                    out, count, pixel, start, stop, now[0, i], then[0, i], now[2, i], state,
+                    out, count, pixel, start, stop, now[0, i], then[0, i], now[1, i],
+                    then[1, i], now[2, i], state,
                     constants, jitter, window, drawn, sent,
                 )  # fmt: skip
                 then[3, i] = state[0]

@@ -2,7 +2,8 @@
 
 Between two frames the light I(t) is a line. In the filter's own time tau, d tau = w(I(t)) dt with
 w = 2 pi fc (I + 20) / 275, the response P obeys dP/d tau = L(tau) - P whatever the light does. On a short piece
-L is a line in tau, so P(tau) = a + b tau + c exp(-tau), which has at most one extremum.
+L is nearly a line in tau, so P(tau) = a + b tau + c exp(-tau), which has at most one extremum; at the end of a
+piece the bend of L is added to second order.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import math
 
 from numba import njit
 
-from evnlos.sensor._fast_math import fast_log
+from evnlos.sensor._fast_math import fast_exp, fast_log
 
 KNEE = 20.0
 LOG_KNEE = math.log(KNEE)
@@ -34,26 +35,36 @@ def light_of(log_value):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
+def bend_response(light_a, light_b, change, tau, inverse, gain, span):
+    """Return what the filter's output at the end of a piece gains from the bend of the log light.
+
+    The log light lies above its chord by 4 e s (1 - s), s = time / tau. With d its change over the piece and I
+    the light in the middle, e = d^2 / 8 (1 + I / (I + 20)) above the knee and d dI / (8 (I + 20)) below. The
+    filter takes 4 e J of that, J being the integral of exp(-(tau - x)) s (1 - s), at most tau / 6. `inverse` is
+    1 / tau, `span` is tau / (I + 20).
+    """
+    middle = 0.5 * (light_a + light_b)
+    lifted = span * inverse
+    above = change * change * (1.0 + middle * lifted)
+    below = change * (light_b - light_a) * lifted
+    rest = (tau - gain) * inverse
+    share = rest - 1.0 + 2.0 * rest * inverse
+    return 0.5 * (above if middle > KNEE else below) * min(max(share, 0.0), tau / 6.0)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def response(kind, a, b, c, x):
-    """Return the response of a piece at its own time x.
+    """Return the response of a piece at its own time x, and its derivative there.
 
     LOW_PASS: a + b x + c exp(-x). LOG_LINE: ln(a + b x) + c x. LINE: a + b x.
     """
     if kind == LOW_PASS:
-        return a + b * x + c * math.exp(-x)
+        decay = c * fast_exp(-x)
+        return a + b * x + decay, b - decay
     if kind == LOG_LINE:
-        return math.log(a + b * x) + c * x
-    return a + b * x
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def slope(kind, a, b, c, x):
-    """Return the derivative of `response` with respect to x."""
-    if kind == LOW_PASS:
-        return b - c * math.exp(-x)
-    if kind == LOG_LINE:
-        return b / (a + b * x) + c
-    return b
+        light = a + b * x
+        return fast_log(light) + c * x, b / light + c
+    return a + b * x, b
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -67,44 +78,45 @@ def extremum(kind, a, b, c):
 
 
 @njit(cache=True, error_model="numpy")
-def solve(kind, a, b, c, level, low, high):
-    """Return the x in [low, high] where a response that is monotone there meets `level`: bracketed Newton."""
-    if kind == LINE:
-        return min(max((level - a) / b, low), high)
-    rising = response(kind, a, b, c, high) >= response(kind, a, b, c, low)
-    x = low + 0.5 * (high - low)
+def _solve(kind, a, b, c, level, low, high, value_low, value_high):
+    """Return the x in [low, high] where a response that is monotone there meets `level`: bracketed Newton.
+
+    The first guess lies on the chord; 1e-11 of the bracket is far below a microsecond.
+    """
+    rising = value_high > value_low
+    tolerance = 1e-11 * (high - low)
+    x = low + (high - low) * (level - value_low) / (value_high - value_low)
     for _ in range(60):
-        error = response(kind, a, b, c, x) - level
-        if (error > 0.0) == rising:
+        value, gradient = response(kind, a, b, c, x)
+        if (value > level) == rising:
             high = x
         else:
             low = x
-        gradient = slope(kind, a, b, c, x)
-        following = x - error / gradient if gradient != 0.0 else low
-        if not low < following < high:
+        following = x - (value - level) / gradient if gradient != 0.0 else low - 1.0
+        if not low <= following <= high:
             following = low + 0.5 * (high - low)
-        if abs(following - x) <= 1e-13 * (abs(x) + high - low) or error == 0.0:
-            return following if error != 0.0 else x
+        if abs(following - x) <= tolerance:
+            return following
         x = following
     return x
 
 
 @njit(cache=True, error_model="numpy")
-def first_crossing(kind, a, b, c, low, high, level_on, level_off):
+def first_crossing(kind, a, b, c, low, high, value_low, value_high, level_on, level_off):
     """Return (x, +1 or -1) of the first time in (low, high] that the response reaches a level, or (high, 0).
 
-    The response at `low` must lie between the levels.
+    The response is `value_low` at `low`, between the levels, and `value_high` at `high`.
     """
     turn = extremum(kind, a, b, c)
-    left = low
-    for _ in range(2):
-        right = min(high, turn) if left < turn else high
-        value = response(kind, a, b, c, right)
+    if low < turn < high:
+        value = response(kind, a, b, c, turn)[0]
         if value >= level_on:
-            return solve(kind, a, b, c, level_on, left, right), 1
+            return _solve(kind, a, b, c, level_on, low, turn, value_low, value), 1
         if value <= level_off:
-            return solve(kind, a, b, c, level_off, left, right), -1
-        if right >= high:
-            break
-        left = right
+            return _solve(kind, a, b, c, level_off, low, turn, value_low, value), -1
+        low, value_low = turn, value
+    if value_high >= level_on:
+        return _solve(kind, a, b, c, level_on, low, high, value_low, value_high), 1
+    if value_high <= level_off:
+        return _solve(kind, a, b, c, level_off, low, high, value_low, value_high), -1
     return high, 0

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from evnlos.sensor._exact_math import KNEE, log_light
+from evnlos.sensor._exact_math import KNEE, bend_response, log_light
 from evnlos.sensor._fast_math import fast_exp
 
-PIECE = 0.02
-"""Largest change of the log light in a piece on which it counts as a line: at most 5e-5 log units wrong."""
+STRIDE = 0.1
+"""Largest change of the log light in a step that is taken in one piece."""
+PIECE = 0.04
+"""Largest change of the log light in a piece on which crossings are solved: 4e-4 log units off a line."""
 
 # Each of the following loops writes one array: with more, a compiler gives up proving that they do not overlap.
 
@@ -49,7 +51,9 @@ def respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, filtered_1
         tau = half * (light_0[i] + light_1[i] + 40.0)
         before = filtered_0[i]
         change = logs_1[i] - logs_0[i]
-        filtered_1[i] = before + gain[i] * (logs_0[i] - before) + change * (1.0 - gain[i] / tau)
+        inverse = 1.0 / tau
+        bend = bend_response(light_0[i], light_1[i], change, tau, inverse, gain[i], 2.0 * half)
+        filtered_1[i] = before + gain[i] * (logs_0[i] - before) + change * (1.0 - gain[i] * inverse) + bend
 
 
 @njit(cache=True, error_model="numpy")
@@ -68,7 +72,7 @@ def flag_filtered(now, then, leak, half, length, on, off, flags):
         flags[i] = (
             (max(lift_0, lift_1) + turn >= on[i])
             | (min(lift_0, lift_1) - turn <= -off[i])
-            | (abs(logs_1[i] - logs_0[i]) > PIECE)
+            | (abs(logs_1[i] - logs_0[i]) > STRIDE)
             | ((light_0[i] < KNEE) != (light_1[i] < KNEE))
         )
 

@@ -107,7 +107,10 @@ def train(
         write_atomically(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in log).encode())
         yield record
     history = [*(start.history if start else []), about]
-    done_weights = Weights(network.cpu().eval(), settings.paradigm, to_dict(dataset.sampling), history)
+    mean_image = samples.truth.float().mean(dim=0)  # [H, W]
+    done_weights = Weights(
+        network.cpu().eval(), settings.paradigm, to_dict(dataset.sampling), history, mean_image
+    )
     save_weights(out / "weights.safetensors", done_weights)
     checkpoint.unlink(missing_ok=True)
 

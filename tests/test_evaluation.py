@@ -1,0 +1,116 @@
+"""Scores: boxes, baselines, LPIPS from files, tables and curves."""
+
+import hashlib
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from evnlos import EvnlosError
+from evnlos.evaluation import load_lpips, score
+from evnlos.evaluation import lpips as module
+from evnlos.report.curves import curves_svg
+from evnlos.report.gather import method_of
+from evnlos.report.tables import best_two
+
+CONVOLUTIONS = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]  # places in torchvision's vgg16.features
+SIDES = [(3, 64), (64, 64), (64, 128), (128, 128), (128, 256), (256, 256), (256, 256)]
+SIDES += [(256, 512), (512, 512), (512, 512), (512, 512), (512, 512), (512, 512)]
+
+
+def test_the_box_holds_the_target_and_two_pixels_more() -> None:
+    truth = torch.zeros(1, 20, 30)
+    truth[0, 8:10, 12:15] = 1
+    image = truth.clone()
+    image[0, 6, 10] = 0.5  # inside the box by its margin
+    image[0, 5, 10] = 0.5  # outside
+    found = score(image, truth)
+    assert found.psnr_box_db[0] == pytest.approx(10 * np.log10(6 * 7 / 0.25), abs=1e-4)
+    assert found.psnr_db[0] == pytest.approx(10 * np.log10(600 / 0.5), abs=1e-4)
+    empty = score(torch.full((1, 20, 30), 0.1), torch.zeros(1, 20, 30))
+    assert empty.psnr_box_db[0] == pytest.approx(20.0, abs=1e-4)
+
+
+def test_means_are_over_pictures_not_over_errors() -> None:
+    truth = torch.zeros(2, 16, 16)
+    image = torch.stack([torch.full((16, 16), 0.1), torch.full((16, 16), 0.01)])
+    found = score(image, truth)
+    assert found.mean()["psnr_db"] == pytest.approx(30.0, abs=1e-3)
+    assert found.mean(np.array([True, False]))["psnr_db"] == pytest.approx(20.0, abs=1e-3)
+    assert found.mean()["lpips"] is None
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A seeded random trunk and heads, in the layout of the published files."""
+    generator = torch.Generator().manual_seed(0)
+    trunk = {}
+    for place, (inside, outside) in zip(CONVOLUTIONS, SIDES, strict=True):
+        weight = torch.randn(outside, inside, 3, 3, generator=generator) * (2 / (9 * inside)) ** 0.5
+        trunk[f"features.{place}.weight"] = weight
+        trunk[f"features.{place}.bias"] = torch.randn(outside, generator=generator) * 0.01
+    trunk["classifier.0.weight"] = torch.zeros(2, 2)
+    widths = (64, 128, 256, 512, 512)
+    heads = {
+        f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1, generator=generator) for i, c in enumerate(widths)
+    }
+    torch.save(trunk, tmp_path / "vgg16.pth")
+    torch.save(heads, tmp_path / "vgg.pth")
+    return tmp_path / "vgg16.pth", tmp_path / "vgg.pth", trunk, heads
+
+
+def slow_lpips(a: torch.Tensor, b: torch.Tensor, trunk: dict, heads: dict) -> float:
+    """LPIPS of one grey pair, spelled out layer by layer as in torchvision's list of features."""
+    total = 0.0
+    xs = []
+    for image in (a, b):
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        xs.append(((2 * image - 1).expand(3, -1, -1) - shift[:, None, None]) / scale[:, None, None])
+    layer = 0
+    for place in range(30):
+        if place in (4, 9, 16, 23):
+            xs = [F.max_pool2d(x[None], 2)[0] for x in xs]
+        elif place in CONVOLUTIONS:
+            weight, bias = trunk[f"features.{place}.weight"], trunk[f"features.{place}.bias"]
+            xs = [F.conv2d(x[None], weight, bias, padding=1)[0].clamp_min(0) for x in xs]
+            if place in (2, 7, 14, 21, 28):
+                u, v = (x / (x.square().sum(0, keepdim=True).sqrt() + 1e-10) for x in xs)
+                total += float(((u - v).square() * heads[f"lin{layer}.model.1.weight"][0]).sum(0).mean())
+                layer += 1
+    return total
+
+
+def test_lpips_has_the_published_arithmetic(files, monkeypatch) -> None:
+    trunk_path, heads_path, trunk, heads = files
+    monkeypatch.setattr(module, "_TRUNK_HASH", hashlib.sha256(trunk_path.read_bytes()).hexdigest()[:8])
+    metric = load_lpips(trunk_path, heads_path)
+    a, b = torch.rand(2, 3, 1, 48, 96, generator=torch.Generator().manual_seed(1))
+    expected = [slow_lpips(a[i], b[i], trunk, heads) for i in range(3)]
+    np.testing.assert_allclose(metric(a, b).numpy(), expected, rtol=1e-4)
+    np.testing.assert_allclose(metric(a, a).numpy(), 0.0, atol=1e-7)
+    assert score(a[:, 0], b[:, 0], metric).mean()["lpips"] == pytest.approx(np.mean(expected), rel=1e-3)
+
+
+def test_an_untrained_trunk_is_refused(files) -> None:
+    with pytest.raises(EvnlosError, match="SHA-256"):
+        load_lpips(*files[:2])
+    with pytest.raises(EvnlosError, match="not available"):
+        load_lpips(files[0].with_name("missing.pth"), files[1])
+
+
+def test_methods_follow_from_the_history() -> None:
+    sim, shot = {"data": {"origin": "simulation"}}, {"data": {"origin": "captures"}}
+    assert [method_of(h) for h in ([sim], [shot], [sim, shot])] == ["simulation only", "E2E", "EPNP"]
+
+
+def test_best_two_skips_the_baselines() -> None:
+    assert best_two([30.0, 1.0, 3.0, None, 2.0], 1) == (2, 4)
+    assert best_two([1.0], 1) == (None, None)
+
+
+def test_curves_hold_every_point_and_name() -> None:
+    svg = curves_svg({"a<b": [(1, 2.0), (2, 1.0)], "none": []}, "epoch", "loss")
+    assert svg.count("<polyline") == 1
+    assert "a&lt;b" in svg
+    assert curves_svg({}, "x", "y") == ""

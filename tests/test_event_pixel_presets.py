@@ -1,0 +1,28 @@
+"""The presets: every one works, and the paper's is the default."""
+
+import numpy as np
+import pytest
+
+from evnlos.errors import ConfigError
+from evnlos.sensor import EventPixel, pixel_preset, simulate_events
+from evnlos.sensor.presets import PRESETS
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_see_a_flash_in_both_modes(name):
+    frames = np.full((20, 8, 9), 60, np.uint8)
+    frames[5:] = 180
+    for mode in ("exact", "v2e"):
+        events = simulate_events(frames, np.arange(20) * 0.01, pixel_preset(name), mode=mode)
+        assert events.p.sum() > 72
+
+
+def test_the_papers_settings_are_the_default():
+    assert pixel_preset("paper") == EventPixel()
+
+
+def test_a_wrong_name_names_the_nearest():
+    with pytest.raises(ConfigError, match="davis346"):
+        pixel_preset("davis364")
+    with pytest.raises(ConfigError, match="celex_v"):
+        pixel_preset("retina")
