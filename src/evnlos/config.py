@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from evnlos.errors import ConfigError
 
@@ -43,6 +42,8 @@ def from_dict(cls: type[T], values: dict[str, Any], *, source: str = "the config
     Raises:
         ConfigError: An unknown key (the nearest field is named), a wrong type, or a value outside its range.
     """
+    from pydantic import TypeAdapter, ValidationError  # here: `import evnlos` stays quick
+
     if not isinstance(values, dict):
         raise ConfigError(
             f"{source} holds a {type(values).__name__}; give a mapping of setting names to values"
@@ -150,7 +151,6 @@ def _dataclasses_in(cls: Any) -> list[type]:
     if typing.get_origin(cls) in (typing.Union, types.UnionType):
         return [found for part in typing.get_args(cls) for found in _dataclasses_in(part)]
     if isinstance(cls, type) and dataclasses.is_dataclass(cls):
-        cls.__pydantic_config__ = ConfigDict(extra="forbid")  # type: ignore[attr-defined]
         return [cls]
     return []
 
