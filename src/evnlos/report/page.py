@@ -14,7 +14,7 @@ from evnlos.dataset import Dataset, character_of, read_shard
 from evnlos.report.curves import curves_svg
 from evnlos.report.gather import RunResult, settings_of
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
-from evnlos.report.tables import available_metrics, best_two, columns_of, label, rows_of, to_csv
+from evnlos.report.tables import available_metrics, baselines_of, best_two, columns_of, label, rows_of, to_csv
 from evnlos.version import __version__
 
 _STYLE = Path(__file__).parent / "style.css"
@@ -83,7 +83,7 @@ def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: s
 
 
 def _table(results: list[RunResult], metric: str, title: str, unit: str, decimals: int) -> str:
-    skip = len(results[0].evaluation.baselines)
+    skip = len(baselines_of(results))
     heads = "".join(f"<th>{html.escape(c)}</th>" for c in columns_of(results))
     lines = []
     for group, character, values in rows_of(results, metric):

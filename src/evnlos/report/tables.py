@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from evnlos.dataset import character_of
+from evnlos.evaluation import Scores
 from evnlos.report.gather import RunResult
 
 METRICS = {"psnr_db": ("PSNR", "dB", 2), "ssim": ("SSIM", "", 3), "psnr_box_db": ("PSNR in the box", "dB", 2)}
@@ -16,8 +17,13 @@ METRICS = {"psnr_db": ("PSNR", "dB", 2), "ssim": ("SSIM", "", 3), "psnr_box_db":
 
 def columns_of(results: list[RunResult]) -> list[str]:
     """Return the headings of the table: baselines, then a column for each run."""
-    baselines = list(results[0].evaluation.baselines)
+    baselines = list(baselines_of(results))
     return [*(f"all-{b}" if b == "zero" else f"{b} image" for b in baselines), *(label(r) for r in results)]
+
+
+def baselines_of(results: list[RunResult]) -> dict[str, Scores]:
+    """Return the baselines of the last run: its mean picture is that of captures, where any run saw some."""
+    return results[-1].evaluation.baselines
 
 
 def label(result: RunResult) -> str:
@@ -31,7 +37,7 @@ def rows_of(results: list[RunResult], metric: str) -> list[tuple[str, str, list[
     The group is the object's name before its last underscore, e.g. `near` of `near_G`.
     """
     first = results[0].evaluation
-    tables = [*first.baselines.values(), *(r.evaluation.scores for r in results)]
+    tables = [*baselines_of(results).values(), *(r.evaluation.scores for r in results)]
     rows = []
     groups: dict[str, list[str]] = {}
     for name in first.characters():
