@@ -20,6 +20,9 @@ from evnlos.report import gather, to_text, write_report
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.training import Training, train
 
+LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
+"""What the rendered captures show."""
+
 _TEST = ("G", "K", "4", "9")
 
 
@@ -64,7 +67,7 @@ def run_demo(settings: Demo) -> Path:
 
     folders = list(settings.captures)
     if not folders:
-        lab = Lab(glyphs=FontGlyphs(characters="ABCDEFGHIJKLMNOPQRSTUVWXYZ"[::2] + "KD49"), seed=settings.seed)
+        lab = Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=settings.seed)
         notes.append(
             "The captures of this page are not recordings: they were rendered with a wall of rough aluminium, "
             "which the training simulator does not know, and other cameras. Give --captures for recordings."
