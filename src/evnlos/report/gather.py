@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evnlos.config import read_yaml
 from evnlos.dataset import PARADIGMS, Dataset, open_dataset
 from evnlos.errors import DataError
 from evnlos.evaluation import Evaluation, available_lpips, evaluate
@@ -90,8 +89,3 @@ def seen_in_training(history: list[dict[str, Any]], dataset: Dataset, split: str
     tested = set(dataset.objects(split))
     trained = [set(step["data"]["train"]) for step in history if step["data"]["origin"] == dataset.origin]
     return sorted(tested & set().union(*trained))
-
-
-def settings_of(dataset: Dataset) -> dict[str, Any]:
-    """Return the settings that made a dataset, as they stand in its `dataset.yaml`."""
-    return read_yaml(dataset.folder / "dataset.yaml").get("config", {})

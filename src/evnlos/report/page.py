@@ -12,7 +12,7 @@ import yaml
 from evnlos.config import write_atomically
 from evnlos.dataset import Dataset, character_of, read_shard
 from evnlos.report.curves import curves_svg
-from evnlos.report.gather import RunResult, settings_of
+from evnlos.report.gather import RunResult
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
 from evnlos.report.tables import available_metrics, baselines_of, best_two, columns_of, label, rows_of, to_csv
 from evnlos.version import __version__
@@ -138,9 +138,7 @@ def _curves(results: list[RunResult]) -> str:
 
 
 def _provenance(dataset: Dataset, results: list[RunResult]) -> str:
-    about: dict[str, Any] = {
-        "dataset": {"name": dataset.folder.resolve().name, "settings": settings_of(dataset)}
-    }
+    about: dict[str, Any] = {"dataset": {"name": dataset.folder.resolve().name, "settings": dataset.config}}
     about["runs"] = {label(r): r.history for r in results}
     text = yaml.safe_dump(about, sort_keys=False, allow_unicode=True)
     summary = "<details><summary>Settings and versions</summary>"

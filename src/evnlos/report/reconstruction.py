@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from evnlos.config import from_dict, write_atomically
 from evnlos.dataset import Sampling, capture_samples, read_capture
@@ -59,16 +61,12 @@ def reconstruct_capture(
     write_atomically(out / "reconstruction.npy", _npy(images.numpy()))
     found: dict[str, Any] = {"capture": shot.name, "positions": len(pictures), "paradigm": loaded.paradigm}
     if samples.truth is not None:
-        import torch
-
         truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
         found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
     return found
 
 
 def _npy(array: np.ndarray) -> bytes:
-    import io
-
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from typing import Any
 
 import numpy as np
 
@@ -82,14 +81,9 @@ def to_text(results: list[RunResult], metric: str = "psnr_db") -> str:
 
 def best_two(values: list[float | None], skip: int) -> tuple[int | None, int | None]:
     """Return the positions of the largest and second largest value behind the first `skip` ones."""
-    order = sorted(
-        (i for i, v in enumerate(values) if v is not None and i >= skip), key=lambda i: -_number(values[i])
-    )
+    ranked = [(v, i) for i, v in enumerate(values) if v is not None and i >= skip]
+    order = [i for _, i in sorted(ranked, key=lambda pair: -pair[0])]
     return (order[0] if order else None), (order[1] if len(order) > 1 else None)
-
-
-def _number(value: Any) -> float:
-    return float(value)
 
 
 def _group(name: str) -> str:

@@ -6,6 +6,7 @@ import json
 import platform
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -121,8 +122,6 @@ def _network(settings: Training, start: Weights | None) -> tuple[ResidualUNet, T
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(settings.seed, "weights"))
             return ResidualUNet(CHANNELS[settings.paradigm], settings.network), settings
-    from dataclasses import replace
-
     settings = replace(settings, paradigm=start.paradigm, network=start.network.config)  # type: ignore[arg-type]
     return start.network, settings
 
