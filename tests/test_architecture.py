@@ -14,7 +14,19 @@ import evnlos
 
 SOURCE = Path(evnlos.__file__).parent
 FORBIDDEN = {"torchvision", "matplotlib", "gradio", "dask", "distributed", "scipy", "pandas", "cv2", "mitsuba"}
-STAGES = ["scene", "transport", "sensor", "events", "dataset", "model", "training", "evaluation", "report"]
+STAGES = [
+    "scene",
+    "transport",
+    "sensor",
+    "events",
+    "dataset",
+    "model",
+    "solver",
+    "calibration",
+    "training",
+    "evaluation",
+    "report",
+]
 LEAVES = {"types", "errors", "config", "metrics", "seeds", "version"}
 FILES = sorted(SOURCE.rglob("*.py"))
 

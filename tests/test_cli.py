@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from evnlos import open_dataset
-from evnlos.cli import COMMANDS, main
+from evnlos.cli import VERBS, main
 from evnlos.config import save_yaml
 
 NETWORK = ["--network.width", "8", "--network.depth", "2"]
@@ -64,7 +64,7 @@ def runs(shots, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
     return found
 
 
-@pytest.mark.parametrize("verb", COMMANDS)
+@pytest.mark.parametrize("verb", VERBS)
 def test_help_shows_every_command_with_its_defaults(verb: str, capsys) -> None:
     with pytest.raises(SystemExit) as stop:
         call(verb, "--help")

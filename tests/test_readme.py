@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from evnlos.cli import COMMANDS
+from evnlos.cli import VERBS
 from evnlos.config import from_dict
 from evnlos.dataset import CaptureInfo, Simulation
 
@@ -37,7 +37,7 @@ def test_yaml_snippets_load() -> None:
 
 
 def test_every_command_is_listed() -> None:
-    assert set(re.findall(r"`evnlos (\w+)", TEXT)) == set(COMMANDS)
+    assert set(re.findall(r"`evnlos (\w+)", TEXT)) == set(VERBS)
 
 
 @pytest.mark.parametrize(

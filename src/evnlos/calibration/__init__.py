@@ -1,0 +1,3 @@
+"""Fitting the simulator to captures of a rig."""
+
+__all__: list[str] = []

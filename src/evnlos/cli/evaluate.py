@@ -1,0 +1,74 @@
+"""`evnlos evaluate`: weights and dataset in, scores beside their baselines out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evnlos.cli.console import say
+from evnlos.dataset import open_dataset
+
+
+@dataclass(frozen=True)
+class Command:
+    """Score a network on a split of a dataset, with the baselines beside it."""
+
+    weights: Path
+    """Weights file, or a run's folder."""
+    data: Path
+    """Folder of the dataset."""
+    split: str | None = None
+    """Split to score: test, validation, train or all; by default `test` where there is one, else `all`."""
+    vgg: Path | None = None
+    """torchvision's vgg16-397923af.pth for LPIPS; by default it is looked for in the torch hub cache."""
+    lpips_heads: Path | None = None
+    """The linear heads vgg.pth of LPIPS v0.1; by default those of an installed `lpips`."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> None:
+        """Evaluate and print."""
+        from evnlos.evaluation import available_lpips, evaluate, load_lpips
+        from evnlos.model import load_weights
+        from evnlos.report import refuse_seen, seen_in_training
+
+        dataset, weights = open_dataset(self.data), load_weights(self.weights)
+        split = self.split or ("test" if dataset.split.get("test") else "all")
+        refuse_seen(weights.history, dataset, split)
+        metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
+        found = evaluate(weights, dataset, split, metric).summary()
+        about = {
+            "weights": str(self.weights),
+            "paradigm": weights.paradigm,
+            "data": str(self.data),
+            "split": split,
+        }
+        seen = seen_in_training(weights.history, dataset, split)
+        if self.json:
+            print(json.dumps(about | {"seen_in_training": seen} | found))
+        else:
+            _print_summary(about, found)
+            if seen:
+                say(f"note: training saw {', '.join(seen)}; scores on them say nothing about unseen objects")
+
+
+def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
+    print(
+        f"{about['weights']} ({about['paradigm']}) on {about['data']}, split {about['split']}: "
+        f"{found['images']} pictures"
+    )
+    names = list(found["overall"])
+    rows = [["", *names]]
+    rows += [[name, *(_cell(v[key]) for key in names)] for name, v in found["characters"].items()]
+    rows.append(["all", *(_cell(found["overall"][key]) for key in names)])
+    rows += [
+        [f"{n} image", *(_cell(v["overall"][key]) for key in names)] for n, v in found["baselines"].items()
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    print("\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows))
+
+
+def _cell(value: float | None) -> str:
+    return "not available" if value is None else f"{value:.3f}"

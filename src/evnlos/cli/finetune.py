@@ -1,0 +1,32 @@
+"""`evnlos finetune`: run and dataset in, run out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from evnlos.cli.console import Flat, train_with_bar
+from evnlos.training import Training, paper_finetuning
+
+PRESETS = {"default": Training, "paper": paper_finetuning}
+
+
+@dataclass(frozen=True)
+class Command:
+    """Fine-tune weights on few captures (EPNP): paradigm and network are those of the weights."""
+
+    weights: Path
+    """Weights file, or the run to start from."""
+    data: Path
+    """Folder of the dataset of captures."""
+    out: Path
+    """Folder of the run; new, or begun with the same settings."""
+    preset: str = "default"
+    """`default`, or `paper` for the paper's 100 epochs at 1e-5 with its loss."""
+    config: Path | None = None
+    """YAML file with settings."""
+    settings: Flat[Training] = field(default_factory=Training)
+
+    def run(self) -> None:
+        """Train, with a progress bar over the epochs."""
+        train_with_bar(self.data, self.settings, self.out, self.weights)

@@ -1,0 +1,24 @@
+"""The list of verbs, in the order of the work."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+VERBS: dict[str, str] = {
+    "demo": "demo",
+    "simulate": "simulate",
+    "import": "importing",
+    "lab": "lab",
+    "train": "train",
+    "finetune": "finetune",
+    "evaluate": "evaluate",
+    "reconstruct": "reconstruct",
+    "report": "report",
+}
+"""The module of each verb in `evnlos.cli`; it holds `Command`, and `PRESETS` where settings have presets."""
+
+
+def module_of(verb: str) -> ModuleType:
+    """Return the module of a verb."""
+    return importlib.import_module(f"evnlos.cli.{VERBS[verb]}")

@@ -1,0 +1,3 @@
+"""Inversion without learning, on the operator protocol."""
+
+__all__: list[str] = []
