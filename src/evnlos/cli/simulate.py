@@ -9,7 +9,7 @@ from evnlos.cli.console import Flat, progress, say
 from evnlos.dataset import Simulation, open_dataset, simulate
 from evnlos.dataset.presets import PRESETS
 
-__all__ = ["PRESETS", "Command", "describe_optics"]
+__all__ = ["PRESETS", "Command"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class Command:
         config = self.settings
         for note in config.glyphs.notes():
             say(note)
-        say(describe_optics(config))
+        for name, value in config.optics().items():
+            say(f"{name} {value:.3g}")
         total = len(config.glyphs.objects())
         for _ in progress(simulate(config, self.out, self.workers), total, "objects", self.out):
             pass
@@ -39,12 +40,3 @@ class Command:
         print(
             f"{self.out}: {total} objects, {total * config.positions} samples, {len(dataset.missing())} missing"
         )
-
-
-def describe_optics(config: Simulation) -> str:
-    """Return one line about what diffraction and the wall do to the picture."""
-    figures = getattr(config.transport, "figures", None)
-    if figures is None:
-        return f"radiometric wall, {config.transport.kind}"
-    found = figures(config.glyphs.plate.size_m, (config.sensor.height, config.sensor.width))
-    return ", ".join(f"{name} {value:.3g}" for name, value in found.items())

@@ -79,6 +79,19 @@ class Simulation:
             raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
         check_ranges(self, self.vary)
 
+    def optics(self) -> dict[str, float]:
+        """Return what diffraction and the wall do to the picture: Fresnel number, blurs, sampling limit.
+
+        Empty for a radiometric wall, whose blur `evnlos identify` measures.
+
+        Example:
+            >>> round(Simulation().optics()["fresnel_number"])
+            6400
+        """
+        if not isinstance(self.transport, PaperTransport):
+            return {}
+        return self.transport.figures(self.glyphs.plate.size_m, (self.sensor.height, self.sensor.width))
+
 
 def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     """Simulate one object's pass: scene -> wall -> events and frames -> samples.
@@ -139,6 +152,7 @@ def simulate(config: Simulation, folder: str | Path, workers: int = 1) -> Iterat
         split_of(config),
         config=values,
         config_hash=config_hash(config),
+        optics=config.optics(),
     )
     create_dataset(dataset)
     tasks = [(config, name, dataset.shard(name), dataset.config_hash) for name in dataset.missing()]

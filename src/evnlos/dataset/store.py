@@ -26,6 +26,7 @@ class Dataset:
         split: Split name -> names of its objects; an object is in exactly one split.
         config: The settings that made the samples (resolved, complete).
         config_hash: Hash of these settings.
+        optics: What diffraction and the wall do to the picture, by name; empty where nobody knows.
         version: Version of the package that made it.
     """
 
@@ -35,6 +36,7 @@ class Dataset:
     split: dict[str, list[str]]
     config: dict[str, Any] = field(default_factory=dict)
     config_hash: str = ""
+    optics: dict[str, float] = field(default_factory=dict)
     version: str = __version__
 
     def shard(self, name: str) -> Path:
@@ -110,9 +112,8 @@ def open_dataset(folder: str | Path) -> Dataset:
         raise DataError(f"{path}: an object stands in two splits; each belongs to exactly one")
     if any("/" in name or "\\" in name or name.startswith(".") for name in names):
         raise DataError(f"{path}: an object's name leads out of the folder; names are plain file names")
-    return Dataset(
-        folder, origin, sampling, split, values.get("config", {}), values.get("config_hash", ""), version
-    )
+    settings, key, optics = values.get("config", {}), values.get("config_hash", ""), values.get("optics", {})
+    return Dataset(folder, origin, sampling, split, settings, key, optics, version)
 
 
 def _content(dataset: Dataset) -> dict[str, Any]:
@@ -122,4 +123,4 @@ def _content(dataset: Dataset) -> dict[str, Any]:
 
 
 def _comparable(content: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in content.items() if key not in ("version", "config_hash")}
+    return {key: value for key, value in content.items() if key not in ("version", "config_hash", "optics")}

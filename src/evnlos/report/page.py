@@ -46,6 +46,7 @@ def write_report(
             *(_table(results, metric, *about) for metric, about in available_metrics(results).items()),
             _pictures(dataset, results),
             _curves(results),
+            _optics(dataset, results),
             _provenance(dataset, results),
             "</html>",
         ]
@@ -135,6 +136,25 @@ def _curves(results: list[RunResult]) -> str:
     if any(scores.values()):
         parts.append(curves_svg(scores, "epoch", "PSNR on the validation objects, dB"))
     return "<h2>Training</h2>" + "".join(parts)
+
+
+def _optics(dataset: Dataset, results: list[RunResult]) -> str:
+    """Show what the optics of each simulated dataset does to the picture."""
+    found = {dataset.folder.resolve().name: dataset.optics}
+    for step in (step for r in results for step in r.history):
+        found[step["data"]["name"]] = step["data"].get("optics", {})
+    lines = [
+        f"<tr><td>{html.escape(name)}</td><td>{html.escape(key)}</td><td>{value:.3g}</td></tr>"
+        for name, figures in found.items()
+        for key, value in figures.items()
+    ]
+    if not lines:
+        return ""
+    return (
+        "<h2>Optics of the simulation</h2><p class=dim>Fresnel number of half a plate; blur by diffraction and "
+        "radius of the tPSF in camera pixels; distance up to which the sampled wave is true, in metres.</p>"
+        f"<table><tr><th>dataset</th><th></th><th></th></tr>{''.join(lines)}</table>"
+    )
 
 
 def _provenance(dataset: Dataset, results: list[RunResult]) -> str:

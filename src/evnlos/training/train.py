@@ -145,6 +145,7 @@ def _about(dataset: Dataset, settings: Training, start: Weights | None) -> dict[
             "origin": dataset.origin,
             "name": dataset.folder.resolve().name,
             "config_hash": dataset.config_hash,
+            "optics": dataset.optics,
             "train": dataset.objects("train"),
             "validation": dataset.split.get("validation", []),
         },
