@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from evnlos.metrics import psnr, ssim
+from evnlos.metrics import gmsd, haarpsi, ms_ssim, psnr, ssim
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 _MARGIN = 2  # pixels around the target's bounding box: the blur of its edge belongs to it
@@ -23,22 +23,23 @@ class Scores:
         psnr_db: On the scored canvas, peak 1.
         ssim: On the scored canvas.
         psnr_box_db: On the smallest box that holds the target, grown by 2 pixels.
+        ms_ssim: On the scored canvas, as many scales as it holds.
+        haarpsi: On the scored canvas.
+        gmsd: On the scored canvas; smaller is better.
         lpips: With the VGG trunk; None where it is not at hand.
     """
 
     psnr_db: np.ndarray
     ssim: np.ndarray
     psnr_box_db: np.ndarray
+    ms_ssim: np.ndarray
+    haarpsi: np.ndarray
+    gmsd: np.ndarray
     lpips: np.ndarray | None = None
 
     def mean(self, chosen: np.ndarray | slice = slice(None)) -> dict[str, float | None]:
         """Return the mean over the chosen images, by name of the metric."""
-        values = {
-            "psnr_db": self.psnr_db,
-            "ssim": self.ssim,
-            "psnr_box_db": self.psnr_box_db,
-            "lpips": self.lpips,
-        }
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
         return {name: None if v is None else round(float(v[chosen].mean()), 4) for name, v in values.items()}
 
 
@@ -56,6 +57,9 @@ def score(images: Tensor, truth: Tensor, perceptual: Perceptual | None = None) -
         psnr_db=psnr(images, truth).double().numpy(),
         ssim=ssim(images, truth).double().numpy(),
         psnr_box_db=torch.stack(in_box).double().numpy(),
+        ms_ssim=ms_ssim(images, truth).double().numpy(),
+        haarpsi=haarpsi(images, truth).double().numpy(),
+        gmsd=gmsd(images, truth).double().numpy(),
         lpips=perceptual(images[:, None], truth[:, None]).double().numpy() if perceptual else None,
     )
 

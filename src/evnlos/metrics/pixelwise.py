@@ -1,4 +1,4 @@
-"""Image metrics that need no weights: PSNR and SSIM, for single images and batches."""
+"""PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def psnr(image: torch.Tensor, truth: torch.Tensor, peak: float = 1.0) -> torch.T
         >>> psnr(torch.zeros(8, 8), torch.full((8, 8), 0.1)).item()
         20.0
     """
-    image, truth = _checked(image, truth)
+    image, truth = checked(image, truth)
     mse = (image - truth).square().mean(dim=(-2, -1))
     return 10 * torch.log10(peak**2 / mse)
 
@@ -59,7 +59,7 @@ def ssim(
         >>> round(ssim(picture, picture).item(), 6)
         1.0
     """
-    image, truth = _checked(image, truth)
+    image, truth = checked(image, truth)
     height, width = image.shape[-2:]
     if min(height, width) < window:
         raise DataError(
@@ -72,6 +72,14 @@ def ssim(
 
 def ssim_map(x: torch.Tensor, y: torch.Tensor, window: int = 11, sigma: float = 1.5) -> torch.Tensor:
     """Return the SSIM at each position of the window: x, y [N, 1, H, W] in 0..1 -> [N, 1, H-w+1, W-w+1]."""
+    luminance, structure = ssim_terms(x, y, window, sigma)
+    return luminance * structure
+
+
+def ssim_terms(
+    x: torch.Tensor, y: torch.Tensor, window: int = 11, sigma: float = 1.5
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the two factors of the SSIM at each position: luminance, and contrast times structure."""
     taps = torch.arange(window, device=x.device, dtype=x.dtype) - (window - 1) / 2
     taps = torch.exp(-taps.square() / (2 * sigma**2))
     taps = taps / taps.sum()
@@ -81,10 +89,15 @@ def ssim_map(x: torch.Tensor, y: torch.Tensor, window: int = 11, sigma: float = 
     blurred = F.conv2d(F.conv2d(moments, rows, groups=5), columns, groups=5)
     mx, my, xx, yy, xy = blurred.split(1, dim=1)
     vx, vy, cov = xx - mx * mx, yy - my * my, xy - mx * my
-    return ((2 * mx * my + _C1) * (2 * cov + _C2)) / ((mx * mx + my * my + _C1) * (vx + vy + _C2))
+    return (2 * mx * my + _C1) / (mx * mx + my * my + _C1), (2 * cov + _C2) / (vx + vy + _C2)
 
 
-def _checked(image: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def checked(image: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return two finite float images [..., H, W] of the same shape and type.
+
+    Raises:
+        DataError: The shapes differ, a value is not finite, or the images are integers.
+    """
     image, truth = torch.as_tensor(image), torch.as_tensor(truth)
     if image.shape != truth.shape or image.ndim < 2:
         raise DataError(
