@@ -171,7 +171,7 @@ def test_report_is_one_page_without_requests(runs, shots, tmp_path, capsys) -> N
     assert "https:" not in page and "http:" not in page
     assert page.count("<img") == 3 + len(runs)
     rows = (tmp_path / "report.csv").read_text().splitlines()
-    assert rows[0].split(",")[3:5] == ["all-zero", "mean image"]
+    assert rows[0].split(",")[3:6] == ["all-black", "mean image", "nearest shot"]
     assert {"simulation only frame", "E2E fusion", "EPNP frame"} <= set(rows[0].split(","))
     shown = capsys.readouterr().out
     assert "report:" in shown and "lab 4" in shown

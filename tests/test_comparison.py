@@ -54,6 +54,7 @@ def tiny_shots(tiny_captures, tmp_path_factory):
 
 def test_memory_lies_at_the_place_of_the_test_picture(tiny_shots) -> None:
     memory = recall(tiny_shots, "test", "fusion")
+    assert memory is not None
     samples = NlosDataset(tiny_shots, "test", "fusion")
     trained = NlosDataset(tiny_shots, "train", "fusion")
     assert memory.truth.shape == (len(memory.names), *samples.truth.shape)

@@ -9,6 +9,7 @@ from typing import Any
 
 from evnlos.cli.console import say
 from evnlos.dataset import open_dataset
+from evnlos.evaluation import BASELINES, CHECKS
 
 
 @dataclass(frozen=True)
@@ -64,10 +65,12 @@ def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
     rows += [[name, *(_cell(v[key]) for key in names)] for name, v in found["characters"].items()]
     rows.append(["all", *(_cell(found["overall"][key]) for key in names)])
     rows += [
-        [f"{n} image", *(_cell(v["overall"][key]) for key in names)] for n, v in found["baselines"].items()
+        [BASELINES[n], *(_cell(v["overall"][key]) for key in names)] for n, v in found["baselines"].items()
     ]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     print("\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows))
+    for name, share in found["checks"].items():
+        print(f"{CHECKS[name]}: {share:.0%}")
 
 
 def _cell(value: float | None) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,23 @@ import torch
 from torch import Tensor
 
 from evnlos.config import from_dict
-from evnlos.dataset import Dataset, NlosDataset, Sampling, character_of, network_input
+from evnlos.dataset import Dataset, NlosDataset, Sampling, character_of, network_input, read_shard
 from evnlos.errors import DataError
+from evnlos.evaluation.classifier import CHARACTERS, plates, read_characters
+from evnlos.evaluation.memory import nearer_to_truth, nearest_answer, recall
 from evnlos.evaluation.score import Perceptual, Scores, score
 from evnlos.model import ResidualUNet, Weights
+from evnlos.types import Plane
+
+BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest shot"}
+"""Heading of each baseline."""
+
+CHECKS = {
+    "read": "characters that an independent reader names rightly",
+    "read_truth": "the same on the true pictures",
+    "nearer_to_truth": "pictures nearer to the truth than to any training picture",
+}
+"""Meaning of each check."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +38,11 @@ class Evaluation:
         truth: True pictures, the same shape.
         names: Object of each picture, [N].
         scores: Scores of each picture.
-        baselines: Scores of the all-black picture ("zero") and of the mean training picture ("mean").
+        baselines: Scores of the all-black picture ("zero"), of the mean training picture ("mean"), and of the
+            true picture of the training object whose measurement is most like this one ("nearest").
+        checks: Shares of the pictures: "read", whose character the independent reader names rightly;
+            "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
+            the truth than to any training picture. Only what could be found out.
     """
 
     images: Tensor
@@ -33,6 +50,7 @@ class Evaluation:
     names: np.ndarray
     scores: Scores
     baselines: dict[str, Scores]
+    checks: dict[str, float] = field(default_factory=dict)
 
     def characters(self) -> list[str]:
         """Return the objects in the order of the dataset."""
@@ -52,6 +70,7 @@ class Evaluation:
             "images": len(self.images),
             **table(self.scores),
             "baselines": {name: table(scores) for name, scores in self.baselines.items()},
+            "checks": self.checks,
         }
 
 
@@ -79,8 +98,31 @@ def evaluate(
     blank = {"zero": torch.zeros_like(truth)}
     if weights.mean_image is not None:
         blank["mean"] = weights.mean_image.float()[rows].expand_as(truth).contiguous()
+    checks = _reading(dataset, split, images, truth, samples.names)
+    learned = dataset.split.get("train") and split in ("test", "validation")
+    if learned and (memory := recall(dataset, split, weights.paradigm)) is not None:
+        blank["nearest"] = nearest_answer(memory, samples.inputs)[:, rows].contiguous()
+        away = nearer_to_truth(images, truth, memory.truth[:, :, rows])
+        checks["nearer_to_truth"] = round(float(away.mean()), 4)
     baselines = {name: score(image, truth, perceptual) for name, image in blank.items()}
-    return Evaluation(images, truth, samples.names, score(images, truth, perceptual), baselines)
+    return Evaluation(images, truth, samples.names, score(images, truth, perceptual), baselines, checks)
+
+
+def _reading(
+    dataset: Dataset, split: str, images: Tensor, truth: Tensor, names: np.ndarray
+) -> dict[str, float]:
+    """Return how often the independent reader names the character, on reconstructions and on the truth."""
+    answers = [character_of(name) for name in names]
+    places = [read_shard(dataset.shard(name))[0].position_m for name in dataset.objects(split)]
+    if not set(answers) <= set(CHARACTERS) or any(place is None for place in places):
+        return {}
+    scored = Plane(dataset.sampling.scored_rows, dataset.sampling.width, dataset.sampling.pitch_m)
+    position = np.concatenate([place for place in places if place is not None])
+    found = {}
+    for key, pictures in (("read", images), ("read_truth", truth)):
+        read = read_characters(plates(pictures, scored, position))
+        found[key] = round(float(np.mean([a == b for a, b in zip(read, answers, strict=True)])), 4)
+    return found
 
 
 @torch.inference_mode()

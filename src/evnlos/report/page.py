@@ -11,10 +11,20 @@ import yaml
 
 from evnlos.config import write_atomically
 from evnlos.dataset import Dataset, character_of, read_shard
+from evnlos.evaluation import CHECKS
 from evnlos.report.curves import curves_svg
 from evnlos.report.gather import RunResult
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
-from evnlos.report.tables import available_metrics, baselines_of, best_two, columns_of, label, rows_of, to_csv
+from evnlos.report.tables import (
+    available_metrics,
+    baselines_of,
+    best_two,
+    columns_of,
+    label,
+    larger_is_better,
+    rows_of,
+    to_csv,
+)
 from evnlos.version import __version__
 
 _STYLE = Path(__file__).parent / "style.css"
@@ -44,6 +54,7 @@ def write_report(
             f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
             _head(dataset, results, notes, split),
             *(_table(results, metric, *about) for metric, about in available_metrics(results).items()),
+            _checks(results),
             _pictures(dataset, results),
             _curves(results),
             _optics(dataset, results),
@@ -75,8 +86,8 @@ def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: s
         f"<p class=dim>evnlos {__version__} · {seen}, split “{html.escape(split)}”</p>{lines}"
         f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm a pixel; PSNR is the mean over "
         "the pictures of each picture's PSNR with peak 1. The first columns are what one scores without "
-        "looking: an all-black picture, and the mean of the training pictures. A method that does not exceed "
-        f"them has learned nothing.{no_lpips}</p>"
+        "looking: an all-black picture, and the mean of the training pictures, then what pure memory scores. A "
+        f"method that does not exceed them has learned nothing.{no_lpips}</p>"
         "<p><b>E2E</b>: trained on the captures alone. <b>EPNP</b>: pre-trained on simulation, then fine-tuned "
         "on the captures. <span class=best>Best</span> and <span class=second>second best</span> of a row are "
         "marked.</p>"
@@ -88,7 +99,7 @@ def _table(results: list[RunResult], metric: str, title: str, unit: str, decimal
     heads = "".join(f"<th>{html.escape(c)}</th>" for c in columns_of(results))
     lines = []
     for group, character, values in rows_of(results, metric):
-        ranked = [None if v is None else -v for v in values] if metric == "lpips" else values
+        ranked = values if larger_is_better(metric) else [None if v is None else -v for v in values]
         best, second = best_two(ranked, skip)
         cells = "".join(
             f"<td class='{'best' if i == best else 'second' if i == second else ''}'>"
@@ -99,6 +110,24 @@ def _table(results: list[RunResult], metric: str, title: str, unit: str, decimal
         lines.append(f"<tr{kind}><td>{html.escape(group)} {html.escape(character)}</td>{cells}</tr>")
     heading = f"{title}, {unit}" if unit else title
     return f"<h2>{heading}</h2><div class=wide><table><tr><th></th>{heads}</tr>{''.join(lines)}</table></div>"
+
+
+def _checks(results: list[RunResult]) -> str:
+    """Show what stands beside the metrics: can the pictures be read, and are they more than memory?"""
+    rows = []
+    for name, meaning in CHECKS.items():
+        values = [r.evaluation.checks.get(name) for r in results]
+        if any(value is not None for value in values):
+            cells = "".join(f"<td>{'-' if v is None else f'{v:.0%}'}</td>" for v in values)
+            rows.append(f"<tr><td>{meaning}</td>{cells}</tr>")
+    if not rows:
+        return ""
+    heads = "".join(f"<th>{html.escape(label(r))}</th>" for r in results)
+    return (
+        "<h2>Read, or remembered?</h2><p class=dim>The reader is a small network trained on clean glyphs of "
+        "other hands. “nearest shot” answers with the training object whose measurement is most alike.</p>"
+        f"<div class=wide><table><tr><th></th>{heads}</tr>{''.join(rows)}</table></div>"
+    )
 
 
 def _pictures(dataset: Dataset, results: list[RunResult]) -> str:

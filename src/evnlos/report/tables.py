@@ -8,16 +8,24 @@ import io
 import numpy as np
 
 from evnlos.dataset import character_of
-from evnlos.evaluation import Scores
+from evnlos.evaluation import BASELINES, Scores
 from evnlos.report.gather import RunResult
 
-METRICS = {"psnr_db": ("PSNR", "dB", 2), "ssim": ("SSIM", "", 3), "psnr_box_db": ("PSNR in the box", "dB", 2)}
+METRICS = {
+    "psnr_db": ("PSNR", "dB", 2),
+    "psnr_box_db": ("PSNR in the box", "dB", 2),
+    "ssim": ("SSIM", "", 3),
+    "ms_ssim": ("MS-SSIM", "", 3),
+    "haarpsi": ("HaarPSI", "", 3),
+    "gmsd": ("GMSD", "", 3),
+}
+_SMALLER_IS_BETTER = ("gmsd", "lpips")
 
 
 def columns_of(results: list[RunResult]) -> list[str]:
     """Return the headings of the table: baselines, then a column for each run."""
     baselines = list(baselines_of(results))
-    return [*(f"all-{b}" if b == "zero" else f"{b} image" for b in baselines), *(label(r) for r in results)]
+    return [*(BASELINES[name] for name in baselines), *(label(r) for r in results)]
 
 
 def baselines_of(results: list[RunResult]) -> dict[str, Scores]:
@@ -77,6 +85,11 @@ def to_text(results: list[RunResult], metric: str = "psnr_db") -> str:
         body.append([f"{group} {character}", *("-" if v is None else f"{v:.{decimals}f}" for v in values)])
     widths = [max(len(row[i]) for row in body) for i in range(len(body[0]))]
     return "\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in body)
+
+
+def larger_is_better(metric: str) -> bool:
+    """Return whether a larger value of the metric is the better one."""
+    return metric not in _SMALLER_IS_BETTER
 
 
 def best_two(values: list[float | None], skip: int) -> tuple[int | None, int | None]:
