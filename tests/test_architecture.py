@@ -27,7 +27,7 @@ STAGES = [
     "evaluation",
     "report",
 ]
-LEAVES = {"types", "errors", "config", "metrics", "seeds", "version"}
+LEAVES = {"claim", "types", "errors", "config", "metrics", "seeds", "version"}
 FILES = sorted(SOURCE.rglob("*.py"))
 
 

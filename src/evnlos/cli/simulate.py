@@ -7,7 +7,9 @@ from pathlib import Path
 
 from evnlos.cli.console import Flat, progress, say
 from evnlos.dataset import Simulation, open_dataset, simulate
+from evnlos.dataset.estimate import estimate
 from evnlos.dataset.presets import PRESETS
+from evnlos.errors import ConfigError
 
 __all__ = ["PRESETS", "Command"]
 
@@ -24,6 +26,10 @@ class Command:
     """YAML file with settings that replace the preset's."""
     workers: int = 0
     """Processes; 0 = one for each core."""
+    shard: str = "1/1"
+    """Share of the objects to make here, i/n: run the shares 1/n to n/n anywhere, on one shared folder."""
+    dry_run: bool = False
+    """Only simulate one object and print what the whole would take: time, disk, memory."""
     settings: Flat[Simulation] = field(default_factory=Simulation)
 
     def run(self) -> None:
@@ -33,10 +39,24 @@ class Command:
             say(note)
         for name, value in config.optics().items():
             say(f"{name} {value:.3g}")
+        share = _share(self.shard)
         total = len(config.glyphs.objects())
-        for _ in progress(simulate(config, self.out, self.workers), total, "objects", self.out):
+        if self.dry_run:
+            for line in estimate(config, self.workers, share).lines(self.out):
+                print(line)
+            return
+        made = simulate(config, self.out, self.workers, share)
+        for _ in progress(made, len(range(share[0] - 1, total, share[1])), "objects", self.out):
             pass
         dataset = open_dataset(self.out)
         print(
             f"{self.out}: {total} objects, {total * config.positions} samples, {len(dataset.missing())} missing"
         )
+
+
+def _share(text: str) -> tuple[int, int]:
+    """Return (i, n) of "i/n"."""
+    first, _, stride = text.partition("/")
+    if not (first.isdigit() and stride.isdigit() and 1 <= int(first) <= int(stride)):
+        raise ConfigError(f"--shard is {text!r}; give i/n with i from 1 to n, e.g. 3/16")
+    return int(first), int(stride)

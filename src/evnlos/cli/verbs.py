@@ -9,6 +9,7 @@ VERBS: dict[str, str] = {
     "demo": "demo",
     "simulate": "simulate",
     "import": "importing",
+    "verify": "verify",
     "lab": "lab",
     "train": "train",
     "finetune": "finetune",

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evnlos.claim import claim
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.pool import run_tasks
 from evnlos.dataset.sampling import Samples, Sampling, make_samples
@@ -130,7 +131,9 @@ def split_of(config: Simulation) -> dict[str, list[str]]:
     }
 
 
-def simulate(config: Simulation, folder: str | Path, workers: int = 1) -> Iterator[str]:
+def simulate(
+    config: Simulation, folder: str | Path, workers: int = 1, share: tuple[int, int] = (1, 1)
+) -> Iterator[str]:
     """Simulate a dataset, yielding the name of each object as its shard is in place.
 
     Shards that exist are not made again, so a run that was killed goes on where it was. The shards are
@@ -140,10 +143,16 @@ def simulate(config: Simulation, folder: str | Path, workers: int = 1) -> Iterat
         config: The settings.
         folder: Where the dataset goes; new, or begun with the same settings.
         workers: Processes; 0 means one for each core.
+        share: (i, n): only every n-th object, beginning with the i-th; i from 1 to n. The n shares together,
+            made anywhere and in any order, are the dataset.
 
     Raises:
-        DataError: The folder holds something else.
+        ConfigError: The share is none.
+        DataError: The folder holds something else, or another process is at work in it.
     """
+    first, stride = share
+    if not 1 <= first <= stride:
+        raise ConfigError(f"share {first} of {stride} is none; give i/n with i from 1 to n")
     values = to_dict(config)
     dataset = Dataset(
         Path(folder),
@@ -154,9 +163,12 @@ def simulate(config: Simulation, folder: str | Path, workers: int = 1) -> Iterat
         config_hash=config_hash(config),
         optics=config.optics(),
     )
-    create_dataset(dataset)
-    tasks = [(config, name, dataset.shard(name), dataset.config_hash) for name in dataset.missing()]
-    yield from run_tasks(_simulate_shard, tasks, workers)
+    with claim(folder, f"{first}-of-{stride}" if stride > 1 else ""):
+        create_dataset(dataset)
+        ours = set(config.glyphs.objects()[first - 1 :: stride])
+        missing = [name for name in dataset.missing() if name in ours]
+        tasks = [(config, name, dataset.shard(name), dataset.config_hash) for name in missing]
+        yield from run_tasks(_simulate_shard, tasks, workers)
 
 
 def _simulate_shard(task: tuple[Simulation, str, Path, str]) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from evnlos.claim import is_empty
 from evnlos.config import differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.dataset.sampling import Sampling
 from evnlos.dataset.shard import SUFFIX
@@ -78,7 +79,7 @@ def create_dataset(dataset: Dataset) -> Dataset:
             )
             raise DataError(f"{dataset.folder} holds a dataset of other settings ({shown}); give another --out")
         return dataset
-    if dataset.folder.is_dir() and any(dataset.folder.iterdir()):
+    if not is_empty(dataset.folder):
         raise DataError(f"{dataset.folder} is not empty and holds no dataset.yaml; give a new folder")
     dataset.folder.mkdir(parents=True, exist_ok=True)
     save_yaml(content, path)

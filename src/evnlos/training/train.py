@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from evnlos.claim import claim, is_empty
 from evnlos.config import config_hash, differing_keys, read_yaml, save_yaml, to_dict, write_atomically
 from evnlos.dataset import CHANNELS, Dataset, NlosDataset
 from evnlos.errors import DataError
@@ -47,13 +48,22 @@ def train(
         Records with epoch, loss, learning_rate, seconds, and psnr_db, zero_db and collapsed of the validation.
 
     Raises:
-        DataError: The folder holds another run, a sample is damaged, or weights and data do not fit.
+        DataError: The folder holds another run, another process is at work in it, a sample is damaged, or
+            weights and data do not fit.
     """
     out = Path(out)
     start = load_weights(weights) if weights else None
     network, settings = _network(settings, start)
     about = _about(dataset, settings, start)
-    _claim(out, about)
+    with claim(out):
+        _take_up(out, about)
+        yield from _epochs(network, dataset, settings, out, [*(start.history if start else []), about])
+
+
+def _epochs(
+    network: ResidualUNet, dataset: Dataset, settings: Training, out: Path, history: list[dict[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """Run the epochs that are left, and write the weights after the last."""
     if (out / "weights.safetensors").is_file():
         for line in (out / "metrics.jsonl").read_text().splitlines():
             yield json.loads(line)
@@ -107,7 +117,6 @@ def train(
         save_checkpoint(checkpoint, network, optimiser, epoch + 1, log, key)
         write_atomically(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in log).encode())
         yield record
-    history = [*(start.history if start else []), about]
     mean_image = samples.truth.float().mean(dim=0)  # [H, W]
     done_weights = Weights(
         network.cpu().eval(), settings.paradigm, to_dict(dataset.sampling), history, mean_image
@@ -158,7 +167,7 @@ def _about(dataset: Dataset, settings: Training, start: Weights | None) -> dict[
     }
 
 
-def _claim(out: Path, about: dict[str, Any]) -> None:
+def _take_up(out: Path, about: dict[str, Any]) -> None:
     """Make the run's folder, or take it up where settings and data are the same."""
     path = out / "run.yaml"
     if path.is_file():
@@ -172,9 +181,8 @@ def _claim(out: Path, about: dict[str, Any]) -> None:
                 f"{out} holds a run with other settings ({'; '.join(differing[:6])}); give another --out"
             )
         return
-    if out.is_dir() and any(out.iterdir()):
+    if not is_empty(out):
         raise DataError(f"{out} is not empty and holds no run; give a new folder")
-    out.mkdir(parents=True, exist_ok=True)
     save_yaml(about, path)
 
 

@@ -1,0 +1,191 @@
+"""What can go wrong on a long run: damaged shards, full disks, two runs in one folder, ctrl-C."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from evnlos import EvnlosError, open_dataset
+from evnlos.claim import claim, is_empty
+from evnlos.cli import main
+from evnlos.config import save_yaml
+from evnlos.dataset import simulate
+from evnlos.dataset.verify import find_faults
+
+COMMAND = [sys.executable, "-m", "evnlos"]
+
+
+@pytest.fixture
+def copy(tiny_dataset, tmp_path):
+    """A dataset that a test may damage."""
+    shutil.copytree(tiny_dataset.folder, tmp_path / "copy")
+    return open_dataset(tmp_path / "copy")
+
+
+@pytest.fixture(scope="module")
+def settings(tiny, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("settings") / "tiny.yaml"
+    save_yaml(tiny, path)
+    return path
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if not path.name.startswith(".")}
+
+
+def alive(group: int) -> list[int]:
+    """Return the processes of a group that still run; those that only wait to be reaped do not."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, their_group = path.read_text().rsplit(")", 1)[1].split()[:3]
+        except OSError:
+            continue
+        if int(their_group) == group and state != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_damage_is_found_named_and_repaired(copy, tiny_dataset, capsys) -> None:
+    names = copy.objects()
+    changed, cut, swapped, gone = (copy.shard(name) for name in names[:4])
+    content = bytearray(changed.read_bytes())
+    content[len(content) // 2] ^= 4
+    changed.write_bytes(content)
+    cut.write_bytes(cut.read_bytes()[:2000])
+    shutil.copy(copy.shard(names[5]), swapped)
+    gone.unlink()
+    with pytest.raises(SystemExit):
+        main(["verify", str(copy.folder)])
+    out, err = capsys.readouterr()
+    for path, reason in (
+        (changed, ""),
+        (cut, "truncated"),
+        (swapped, f"object {names[5]!r}"),
+        (gone, "missing"),
+    ):
+        assert any(str(path) in line and reason in line for line in out.splitlines()), out
+    assert f"4 of {len(names)} shards are faulty" in err
+    main(["verify", str(copy.folder), "--repair", "--workers", "1"])
+    assert "4 of 4" in capsys.readouterr().out
+    assert bytes_of(copy.folder) == bytes_of(tiny_dataset.folder)
+    main(["verify", str(copy.folder)])
+    assert "all whole" in capsys.readouterr().out
+
+
+def test_a_shard_of_other_settings_is_found(copy, tiny, tmp_path) -> None:
+    from dataclasses import replace
+
+    other = replace(tiny, seed=7)
+    name = next(iter(simulate(other, tmp_path / "other")))
+    shutil.copy(tmp_path / "other" / f"{name}.h5", copy.shard(name))
+    faults = [fault for fault in find_faults(copy) if fault]
+    assert [(fault.name, fault.reason) for fault in faults] == [(name, "it was made with other settings")]
+
+
+def test_settings_changed_by_hand_are_not_repaired_with(copy, capsys) -> None:
+    page = copy.folder / "dataset.yaml"
+    page.write_text(page.read_text().replace("duration_s: 8.0", "duration_s: 7.0"))
+    copy.shard(copy.objects()[0]).unlink()
+    with pytest.raises(SystemExit):
+        main(["verify", str(copy.folder), "--repair"])
+    assert "was changed" in capsys.readouterr().err
+
+
+def test_shares_made_apart_are_the_dataset(tiny, tiny_dataset, tmp_path) -> None:
+    made = [list(simulate(tiny, tmp_path / "d", 1, (i, 3))) for i in (2, 3, 1)]
+    assert sorted(name for share in made for name in share) == sorted(tiny_dataset.objects())
+    assert bytes_of(tmp_path / "d") == bytes_of(tiny_dataset.folder)
+    with pytest.raises(EvnlosError, match="share 4 of 3"):
+        next(simulate(tiny, tmp_path / "d", 1, (4, 3)))
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "x", "1"])
+def test_a_share_that_is_none_is_one_line(text: str, settings, tmp_path, capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["simulate", "--config", str(settings), "--out", str(tmp_path / "d"), "--shard", text])
+    assert stop.value.code == 2
+    assert "--shard" in capsys.readouterr().err
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_dry_run_says_what_it_would_take_and_writes_nothing(settings, tiny_dataset, tmp_path, capsys) -> None:
+    main(["simulate", "--config", str(settings), "--out", str(tmp_path / "d"), "--dry-run"])
+    out = capsys.readouterr().out
+    assert f"objects: {len(tiny_dataset.objects())}" in out
+    assert {line.split(":")[0] for line in out.splitlines()} == {"objects", "time", "disk", "memory"}
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_folder_has_one_run_at_a_time(tiny, tmp_path) -> None:
+    folder = tmp_path / "d"
+    running = simulate(tiny, folder)
+    next(running)
+    second = subprocess.run(
+        [*COMMAND, "simulate", "--out", str(folder)], capture_output=True, text=True, timeout=120
+    )
+    assert second.returncode == 2
+    assert "another process is at work" in second.stderr
+    running.close()
+    with claim(folder):
+        pass
+    with claim(tmp_path / "new"):
+        assert is_empty(tmp_path / "new")
+
+
+def test_what_a_killed_process_left_half_written_is_swept(tiny, tiny_dataset, tmp_path) -> None:
+    folder = tmp_path / "d"
+    next(simulate(tiny, folder))
+    (folder / ".x.h5.abc.tmp").write_bytes(b"half")
+    list(simulate(tiny, folder))
+    assert not list(folder.glob(".*.tmp"))
+    assert bytes_of(folder) == bytes_of(tiny_dataset.folder)
+
+
+def test_a_full_disk_is_one_line_and_nothing_is_lost(settings, tiny_dataset, tmp_path) -> None:
+    place = tmp_path / "small"
+    place.mkdir()
+    size = sum(len(content) for content in bytes_of(tiny_dataset.folder).values())
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size // 2}", "tmpfs", str(place)]
+    if not shutil.which("mount") or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting a small tmpfs needs root")
+    try:
+        command = [*COMMAND, "simulate", "--config", str(settings), "--workers", "1", "--out", str(place / "d")]
+        full = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert full.returncode == 2
+        says = [line for line in full.stderr.splitlines() if line.startswith("evnlos simulate: error")]
+        assert len(says) == 1 and "No space left" in says[0]
+        whole = bytes_of(tiny_dataset.folder)
+        kept = bytes_of(place / "d")
+        assert 1 < len(kept) < len(whole)
+        assert all(whole[name] == content for name, content in kept.items())
+        assert not list((place / "d").glob(".*.tmp"))
+        subprocess.run(["mount", "-o", f"remount,size={4 * size}", str(place)], check=True)
+        subprocess.run(command, check=True, capture_output=True, timeout=120)
+        assert bytes_of(place / "d") == whole
+    finally:
+        subprocess.run(["umount", str(place)], check=True)
+
+
+def test_ctrl_c_ends_all_processes_within_seconds(settings, tmp_path) -> None:
+    folder = tmp_path / "d"
+    command = [*COMMAND, "simulate", "--config", str(settings), "--workers", "2", "--out", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 90
+    while not list(folder.glob("*.h5")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it: to the whole group
+    began = time.monotonic()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "run the same command again" in err
+    assert "Traceback" not in err
+    assert time.monotonic() - began < 20
+    while alive(process.pid) and time.monotonic() - began < 20:
+        time.sleep(0.1)
+    assert not alive(process.pid)
