@@ -194,3 +194,17 @@ def test_no_dataset_and_overlapping_splits(tmp_path) -> None:
     save_yaml({**about, "split": {"train": ["../a"]}}, tmp_path / "dataset.yaml")
     with pytest.raises(DataError, match="out of the folder"):
         open_dataset(tmp_path)
+
+
+def test_bytes_do_not_depend_on_who_holds_the_objects_of_the_file(tiny_dataset, tmp_path, monkeypatch) -> None:
+    import h5py
+
+    name = tiny_dataset.objects()[0]
+    samples, attributes = read_shard(tiny_dataset.shard(name))
+    held, create = [], h5py.File.create_dataset
+    monkeypatch.setattr(
+        h5py.File, "create_dataset", lambda *a, **k: (held.append(create(*a, **k)), held[-1])[1]
+    )
+    write_shard(tmp_path / "held.h5", samples, attributes)
+    assert len(held) == 6
+    assert (tmp_path / "held.h5").read_bytes() == tiny_dataset.shard(name).read_bytes()

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 from evnlos.cli.console import Flat, progress, say
 from evnlos.dataset import Simulation, open_dataset, simulate
+from evnlos.dataset.cluster import run_on_dask
 from evnlos.dataset.estimate import estimate
+from evnlos.dataset.pool import run_tasks
 from evnlos.dataset.presets import PRESETS
 from evnlos.errors import ConfigError
 
@@ -28,6 +32,10 @@ class Command:
     """Processes; 0 = one for each core."""
     shard: str = "1/1"
     """Share of the objects to make here, i/n: run the shares 1/n to n/n anywhere, on one shared folder."""
+    engine: Literal["local", "dask"] = "local"
+    """Processes on this machine, or a Dask cluster (extra `cluster`) on a shared file system."""
+    scheduler: str | None = None
+    """Address of a running Dask scheduler, e.g. tcp://node1:8786; by default a cluster on this machine."""
     dry_run: bool = False
     """Only simulate one object and print what the whole would take: time, disk, memory."""
     settings: Flat[Simulation] = field(default_factory=Simulation)
@@ -40,12 +48,15 @@ class Command:
         for name, value in config.optics().items():
             say(f"{name} {value:.3g}")
         share = _share(self.shard)
+        if self.scheduler and self.engine != "dask":
+            raise ConfigError(f"--scheduler {self.scheduler} needs --engine dask")
         total = len(config.glyphs.objects())
         if self.dry_run:
             for line in estimate(config, self.workers, share).lines(self.out):
                 print(line)
             return
-        made = simulate(config, self.out, self.workers, share)
+        engine = run_tasks if self.engine == "local" else partial(run_on_dask, scheduler=self.scheduler)
+        made = simulate(config, self.out, self.workers, share, engine)
         for _ in progress(made, len(range(share[0] - 1, total, share[1])), "objects", self.out):
             pass
         dataset = open_dataset(self.out)

@@ -7,12 +7,15 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from evnlos.errors import EvnlosError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+Engine = Callable[[Callable[[Any], str], Iterable[Any], int], Iterator[str]]
+"""Runs a function on each task with so many processes, and yields the results as they come."""
+
 _TRIES = 3
 
 

@@ -57,9 +57,12 @@ def _put(file: h5py.File, name: str, values: np.ndarray, chunks: tuple[int, ...]
         return
     if isinstance(chunks, tuple):
         chunks = (min(chunks[0], len(values)), *chunks[1:])
-    file.create_dataset(
+    dataset = file.create_dataset(
         name, data=values, chunks=chunks, fletcher32=True, compression="gzip", compression_opts=1
     )
+    # Else chunks go to the file when the object is collected, and a debugger or a profiler that holds the frame
+    # would change their order, and so the bytes of the file.
+    dataset.flush()
 
 
 def read_shard(path: str | Path) -> tuple[Samples, dict]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from evnlos.claim import claim
 from evnlos.config import config_hash, to_dict
-from evnlos.dataset.pool import run_tasks
+from evnlos.dataset.pool import Engine, run_tasks
 from evnlos.dataset.sampling import Samples, Sampling, make_samples
 from evnlos.dataset.shard import write_shard
 from evnlos.dataset.store import Dataset, create_dataset
@@ -132,7 +132,11 @@ def split_of(config: Simulation) -> dict[str, list[str]]:
 
 
 def simulate(
-    config: Simulation, folder: str | Path, workers: int = 1, share: tuple[int, int] = (1, 1)
+    config: Simulation,
+    folder: str | Path,
+    workers: int = 1,
+    share: tuple[int, int] = (1, 1),
+    engine: Engine = run_tasks,
 ) -> Iterator[str]:
     """Simulate a dataset, yielding the name of each object as its shard is in place.
 
@@ -145,6 +149,7 @@ def simulate(
         workers: Processes; 0 means one for each core.
         share: (i, n): only every n-th object, beginning with the i-th; i from 1 to n. The n shares together,
             made anywhere and in any order, are the dataset.
+        engine: What runs the tasks: processes here, or `run_on_dask`.
 
     Raises:
         ConfigError: The share is none.
@@ -168,7 +173,7 @@ def simulate(
         ours = set(config.glyphs.objects()[first - 1 :: stride])
         missing = [name for name in dataset.missing() if name in ours]
         tasks = [(config, name, dataset.shard(name), dataset.config_hash) for name in missing]
-        yield from run_tasks(_simulate_shard, tasks, workers)
+        yield from engine(_simulate_shard, tasks, workers)
 
 
 def _simulate_shard(task: tuple[Simulation, str, Path, str]) -> str:
