@@ -4,7 +4,15 @@ from evnlos.sensor.event_camera import EventCamera
 from evnlos.sensor.frame_camera import FrameCamera
 from evnlos.sensor.pixel import EventPixel
 from evnlos.sensor.presets import pixel_preset
-from evnlos.sensor.simulate import simulate_events
+from evnlos.sensor.simulate import simulate_batch, simulate_events
 from evnlos.sensor.stream import EventStream
 
-__all__ = ["EventCamera", "EventPixel", "EventStream", "FrameCamera", "pixel_preset", "simulate_events"]
+__all__ = [
+    "EventCamera",
+    "EventPixel",
+    "EventStream",
+    "FrameCamera",
+    "pixel_preset",
+    "simulate_batch",
+    "simulate_events",
+]

@@ -105,7 +105,7 @@ class V2eArray:
 
         tiles = list(map_shares(work, count, self._tile_px, self._threads))
         peak = np.max([tile[4] for tile in tiles], axis=0)
-        sub_times = [_sub_times(starts[k], delta[k], times_s[k], int(peak[k])) for k in range(steps)]
+        sub_times = [instants_within(starts[k], delta[k], times_s[k], int(peak[k])) for k in range(steps)]
         self._time, self._steps = float(times_s[-1]), self._steps + steps
         self._hazard_sum = float(hazard_sum[-1])
         stamps = np.rint(np.concatenate(sub_times).astype(np.float64) * 1e6).astype(np.int64)
@@ -135,7 +135,7 @@ class V2eArray:
         return sort_events(bucket, where, on, stamps)
 
 
-def _sub_times(start_s: float, delta_s: float, stop_s: float, peak: int) -> NDArray[np.float32]:
+def instants_within(start_s: float, delta_s: float, stop_s: float, peak: int) -> NDArray[np.float32]:
     """Return the time stamps of a step whose busiest pixel crossed `peak` thresholds, float32 [>= 1]."""
     if peak <= 1:
         return np.array([start_s + delta_s], np.float32)

@@ -1,0 +1,107 @@
+"""From light to the filter's output, one frame at a time, on flat tensors and without a copy of the video.
+
+Light of 8 bits goes through tables of 256 entries, other light through the logarithm. What is computed, in
+which order and in which precision is that of the numba kernels, so that a state of float64 has the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+_KNEE = 20.0
+_SLOPE = math.log(_KNEE) / _KNEE
+
+
+def lin_log(light: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Return the logarithm of the light in DN, linear up to 20 DN, in float32, by way of `dtype`.
+
+    By way of float64 with v2e's rounding to 1e-8, which float32 does not resolve.
+    """
+    light = light.to(dtype)
+    logs = torch.where(light <= _KNEE, light * _SLOPE, light.clamp(min=_KNEE).log_())
+    if dtype == torch.float32:
+        return logs
+    return logs.mul_(1e8).round_().div_(1e8).to(torch.float32)
+
+
+def filter_weight(light: Tensor, rate: float, dtype: torch.dtype) -> Tensor:
+    """Return the weight min((I + 20) / 275 d 2 pi fc, 1) of new light; `rate` is d 2 pi fc."""
+    return (light.to(dtype) + 20.0).div_(275.0).mul_(rate).clamp_(max=1.0)
+
+
+class Filter:
+    """The low-pass filter over blocks of frames, for up to `capacity` pixels at a time.
+
+    State of float64 follows P <- (1 - w) P + w L. State of float32 follows P <- P + w (L - L0 - P), relative to
+    the log light L0 of the first frame, so that its rounding is that of changes. Without a filter P = L.
+
+    Args:
+        rates: d 2 pi fc of each step, empty without a filter.
+        is_bytes: Whether the light has 8 bits.
+        dtype: float64 or float32; float32 without a filter.
+        capacity: Most pixels that `advance` ever takes.
+        device: Where all tensors live.
+    """
+
+    def __init__(
+        self, rates: Sequence[float], is_bytes: bool, dtype: torch.dtype, capacity: int, device: torch.device
+    ) -> None:
+        self._rates, self._is_bytes, self._device = rates, is_bytes, device
+        self.has_filter = len(rates) > 0
+        self.relative = self.has_filter and dtype == torch.float32
+        self._index = torch.empty(capacity if is_bytes else 0, dtype=torch.int64, device=device)
+        self._log = torch.empty(capacity if is_bytes else 0, dtype=dtype, device=device)
+        self._weight = torch.empty_like(self._log)
+        self._bytes = torch.arange(256 if is_bytes else 0, device=device)
+        self._logs = lin_log(self._bytes)
+        self._keep: list[Tensor] = []
+        self._gain: list[Tensor] = []
+
+    def start_block(self, first: int, last: int) -> None:
+        """Prepare the steps first..last - 1, of which `advance` then takes each as 0, 1, ..."""
+        self._first = first
+        if not (self._is_bytes and self.has_filter):
+            return
+        rates = torch.tensor(self._rates[first:last], dtype=torch.float64, device=self._device)[:, None]
+        weights = ((self._bytes + 20.0).to(torch.float64).div_(275.0) * rates).clamp_(max=1.0)  # [steps, 256]
+        if self.relative:
+            self._gain = list(weights.to(torch.float32).unbind())
+        else:
+            self._keep = list((1.0 - weights).unbind())
+            self._gain = list(weights.mul_(self._logs.to(torch.float64)).unbind())
+
+    def advance(self, lp: Tensor, light: Tensor, origin: Tensor, step: int) -> None:
+        """Move the output `lp` [n] by one step, in place, given the new light (n values) and L0 [n]."""
+        if self._is_bytes:
+            self._advance_bytes(lp, light, origin, step)
+            return
+        light = light.reshape(-1)
+        if not self.has_filter:
+            lp.copy_(lin_log(light))
+            return
+        weight = filter_weight(light, self._rates[self._first + step], lp.dtype)
+        logs = lin_log(light, lp.dtype)
+        if self.relative:
+            lp.lerp_(logs.sub_(origin), weight)
+        else:
+            lp.mul_(1.0 - weight).add_(weight.mul_(logs))
+
+    def _advance_bytes(self, lp: Tensor, light: Tensor, origin: Tensor, step: int) -> None:
+        index, log, weight = self._index, self._log, self._weight
+        if lp.numel() != index.numel():
+            index, log, weight = (buffer[: lp.numel()] for buffer in (index, log, weight))
+        index.view(light.shape).copy_(light)
+        if not self.has_filter:
+            torch.index_select(self._logs, 0, index, out=lp)
+        elif self.relative:
+            torch.index_select(self._logs, 0, index, out=log)
+            torch.index_select(self._gain[step], 0, index, out=weight)
+            lp.lerp_(log.sub_(origin), weight)
+        else:
+            torch.index_select(self._keep[step], 0, index, out=weight)
+            torch.index_select(self._gain[step], 0, index, out=log)
+            lp.mul_(weight).add_(log)
