@@ -1,8 +1,11 @@
 """Event pixels of known settings and sensors, with the source of every number that has one.
 
-A data sheet quotes a contrast c as a fraction of the light; here an ON threshold is ln(1 + c) and an OFF
-threshold -ln(1 - c). Where no source is named, the number is an assumption for indoor light: bandwidth and
-noise of real sensors depend on their biases and on the light, so fit them to a recording when they matter.
+A data sheet quotes a contrast c as a fraction of the light. An ON threshold is ln(1 + c). An OFF threshold is
+-ln(1 - c) where c is a fraction of the light before, and ln(1 + c) where it is one of the darker light, as the
+maker of the Prophesee sensors defines it: 100 % (L_max - L_min) / L_min ("Event-based vision sensor
+characteristics", Prophesee support pages). Where no source is named, the number is an assumption for indoor
+light: bandwidth and noise of real sensors depend on their biases and on the light, so fit them to a recording
+when they matter.
 """
 
 from __future__ import annotations
@@ -26,43 +29,43 @@ def paper() -> EventPixel:
 
 
 def v2e_clean() -> EventPixel:
-    """Return v2e's parameter set "clean": no noise, no filter, slight mismatch (v2e, command line help)."""
+    """Return v2e's parameter set "clean": no noise, no filter, slight mismatch (v2e, `set_dvs_params`)."""
     return EventPixel(0.2, 0.2, 0.02, 0.0, 0.0, 0.0, 0.0)
 
 
 def v2e_noisy() -> EventPixel:
-    """Return v2e's parameter set "noisy": a dim scene (v2e, command line help)."""
+    """Return v2e's parameter set "noisy": a dim scene (v2e, `set_dvs_params`)."""
     return EventPixel(0.2, 0.2, 0.05, 30.0, 0.1, 5.0, 0.0)
 
 
 def davis346() -> EventPixel:
-    """Return a DAVIS346: contrast 14.3 % ON and 22.5 % OFF (Gallego et al., TPAMI 2020, Table 1).
+    """Return a DAVIS346: contrast 14.3 to 22.5 % (Gallego et al., TPAMI 2020, Table 1), taken as ON and OFF.
 
     Mismatch 3.5 % of contrast (Brandli et al., JSSC 2014, for the DAVIS240); bandwidth, noise and refractory
-    period are assumed.
+    period are assumed, and so is that the OFF contrast is a fraction of the light before.
     """
-    return EventPixel(*_contrast(0.143, 0.225), 0.035, 200.0, 0.1, 1.0, 5e-4)
+    return EventPixel(_brighter(0.143), _darker(0.225), 0.035, 200.0, 0.1, 1.0, 5e-4)
 
 
 def prophesee_gen3() -> EventPixel:
-    """Return a Prophesee Gen3 VGA CD: contrast 12 % (Gallego et al., TPAMI 2020, Table 1).
+    """Return a Prophesee Gen3 VGA CD: contrast 12 % of the darker light (Gallego et al., TPAMI 2020, Table 1).
 
     The bandwidth is that of the slowest quoted latency, 200 us; the rest is assumed.
     """
-    return EventPixel(*_contrast(0.12, 0.12), 0.03, _cutoff(200e-6), 0.1, 0.5, 3e-4)
+    return EventPixel(_brighter(0.12), _brighter(0.12), 0.03, _cutoff(200e-6), 0.1, 0.5, 3e-4)
 
 
 def prophesee_gen4() -> EventPixel:
-    """Return a Prophesee Gen4 HD CD: contrast 11 % (Gallego et al., TPAMI 2020, Table 1).
+    """Return a Prophesee Gen4 HD CD: contrast 11 % of the darker light (Gallego et al., TPAMI 2020, Table 1).
 
     The bandwidth is that of the slowest quoted latency, 150 us; the rest is assumed.
     """
-    return EventPixel(*_contrast(0.11, 0.11), 0.03, _cutoff(150e-6), 0.1, 0.5, 2e-4)
+    return EventPixel(_brighter(0.11), _brighter(0.11), 0.03, _cutoff(150e-6), 0.1, 0.5, 2e-4)
 
 
 def celex_v() -> EventPixel:
     """Return a CeleX-V: contrast 10 % (Gallego et al., TPAMI 2020, Table 1); all else is assumed."""
-    return EventPixel(*_contrast(0.10, 0.10), 0.03, 200.0, 0.2, 1.0, 5e-4)
+    return EventPixel(_brighter(0.10), _darker(0.10), 0.03, 200.0, 0.2, 1.0, 5e-4)
 
 
 PRESETS: dict[str, Callable[[], EventPixel]] = {
@@ -89,9 +92,14 @@ def pixel_preset(name: str) -> EventPixel:
     return PRESETS[name]()
 
 
-def _contrast(on: float, off: float) -> tuple[float, float]:
-    """Return thresholds in log units of contrasts in fractions of the light."""
-    return round(math.log1p(on), 4), round(-math.log1p(-off), 4)
+def _brighter(contrast: float) -> float:
+    """Return the threshold, log units, of a contrast in fractions of the darker light."""
+    return round(math.log1p(contrast), 4)
+
+
+def _darker(contrast: float) -> float:
+    """Return the threshold, log units, of a fall by a fraction of the light before."""
+    return round(-math.log1p(-contrast), 4)
 
 
 def _cutoff(latency_s: float) -> float:

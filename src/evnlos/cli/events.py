@@ -1,0 +1,178 @@
+"""`evnlos events`: a video in, the events of an event camera that watches it out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from evnlos.cli.console import say
+from evnlos.cli.event_files import amount, refuse_existing
+from evnlos.cli.preview import look_of, write_preview
+from evnlos.config import load_yaml
+from evnlos.events import EventWriter
+from evnlos.events.recording import Cut, Recording
+from evnlos.sensor.pixel import EventPixel
+from evnlos.sensor.presets import pixel_preset
+from evnlos.sensor.stream import Mode
+from evnlos.sensor.video import Tone, Video, open_video, video_events
+from evnlos.types import Events
+
+
+@dataclass(frozen=True)
+class PixelChanges:
+    """Parameters in place of the preset's, which stands where none is given."""
+
+    threshold_on: float | None = None
+    """Mean contrast threshold of ON events, log units (e-fold)."""
+    threshold_off: float | None = None
+    """Mean contrast threshold of OFF events, log units (e-fold)."""
+    threshold_sigma: float | None = None
+    """Standard deviation of both thresholds over the pixels, log units; 0 = none."""
+    cutoff_hz: float | None = None
+    """Corner frequency of the low-pass filter at white, hertz; 0 = no filter."""
+    leak_rate_hz: float | None = None
+    """Rate of ON events from the leaking reference, hertz a pixel."""
+    shot_noise_rate_hz: float | None = None
+    """Rate of noise events in the dark limit, ON and OFF together, hertz a pixel."""
+    refractory_s: float | None = None
+    """Dead time of a pixel after each of its events, seconds."""
+    hot_pixel_fraction: float | None = None
+    """Fraction of pixels that fire without cause, 0 to 1 (mode exact only)."""
+    hot_pixel_rate_hz: float | None = None
+    """Rate of events of a hot pixel, hertz (mode exact only)."""
+    jitter_s: float | None = None
+    """Standard deviation of the time stamps, seconds (mode exact only)."""
+
+    def applied(self, pixel: EventPixel) -> EventPixel:
+        """Return the pixel with these changes."""
+        return replace(pixel, **{name: value for name, value in asdict(self).items() if value is not None})
+
+
+@dataclass(frozen=True)
+class Command:
+    """Turn any video into the events that an event camera would send: files, animations, pictures, arrays."""
+
+    video: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
+    """Video file (mp4, avi, mkv, ...), GIF, APNG, WebP, pictures or a folder of them, .npy [T, H, W(, 3)]."""
+    out: Path
+    """The event file; its ending says the format: .h5, .npz, .raw (EVT3), .aedat4, .csv."""
+    pixel: str = "davis346"
+    """paper, v2e_clean, v2e_noisy, davis346, prophesee_gen3, prophesee_gen4, celex_v, or a YAML file."""
+    changes: Annotated[PixelChanges, tyro.conf.arg(name="pixel")] = field(default_factory=PixelChanges)
+    """Parameters in place of the preset's, which stand where none is given."""
+    mode: Mode = "exact"
+    """exact: in continuous time; v2e: stepped from frame to frame, as v2e does."""
+    seed: int = 0
+    """Seed of mismatch and noise: same seed, same bytes."""
+    fps: float | None = None
+    """Frames a second; needed for pictures and arrays, otherwise in place of the times in the file."""
+    slow_motion: float = 1.0
+    """How many times slower than life the video plays, e.g. 8 for 240 Hz shown at 30 Hz."""
+    tone: Tone = "as-is"
+    """as-is: numbers are light, as in v2e; srgb, rec709: undo that curve first (2.2 times the contrast)."""
+    white: float | None = None
+    """Value of white in the video; by default 255, or 65535 for 16 bits."""
+    scale: str | None = None
+    """Size of the sensor, WIDTHxHEIGHT, or a factor such as 0.5; by default that of the video."""
+    format: str | None = None
+    """Format to write where the ending does not say, e.g. EVT2 for .raw."""
+    preview: Path | None = None
+    """Also show the events: an animation (.gif) or a sheet of pictures (.png)."""
+    force: bool = False
+    """Replace the file where it exists."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Simulate, with a progress bar over the frames, and print what came out."""
+        refuse_existing(self.out, self.force)
+        if self.preview is not None:
+            refuse_existing(self.preview, self.force)
+        look = look_of(self.preview) if self.preview else None
+        pixel = self.changes.applied(_pixel(self.pixel))
+        writer = EventWriter(self.out, format=self.format)
+        video = open_video(
+            self.video,
+            fps=self.fps,
+            slow_motion=self.slow_motion,
+            tone=self.tone,
+            white=self.white,
+            scale=self.scale,
+        )
+        on = 0
+        clock = _Clock()
+        with writer:
+            writer.write(Events.empty(video.width, video.height))
+            for piece in video_events(clock.watched(video, self.out.name), pixel, self.mode, self.seed):
+                writer.write(piece)
+                on += int(piece.p.sum())
+        found = _found(self, video, pixel, clock, writer.events, on)
+        if self.preview and look:
+            if writer.events:
+                write_preview(Recording(self.out), Cut(), self.preview, look)
+            else:
+                say(f"note: no events, so no {self.preview}")
+        print(json.dumps(found) if self.json else _text(found))
+
+
+class _Clock:
+    """Counts frames and keeps the time of the last one while they pass by under a progress bar."""
+
+    frames, last_s = 0, 0.0
+
+    def watched(self, video: Video, name: str) -> Iterator[tuple[float, NDArray]]:
+        for time_s, light in tqdm(video, total=video.frames, desc=name, unit=" frames", leave=False):
+            self.frames, self.last_s = self.frames + 1, time_s
+            yield time_s, light
+
+
+def _pixel(name: str) -> EventPixel:
+    if Path(name).suffix in (".yaml", ".yml"):
+        return load_yaml(EventPixel, name)
+    return pixel_preset(name)
+
+
+def _found(
+    command: Command, video: Video, pixel: EventPixel, clock: _Clock, events: int, on: int
+) -> dict[str, Any]:
+    pixels = video.width * video.height
+    return {
+        "out": str(command.out),
+        "width": video.width,
+        "height": video.height,
+        "frames": clock.frames,
+        "duration_s": clock.last_s,
+        "times_from": "fps" if video.fps else "file",
+        "events": events,
+        "on": on,
+        "off": events - on,
+        "on_off_ratio": on / (events - on) if events > on else None,
+        "rate_hz": events / clock.last_s,
+        "rate_per_pixel_hz": events / clock.last_s / pixels,
+        "pixel": asdict(pixel),
+        "pixel_name": command.pixel,
+        "mode": command.mode,
+        "seed": command.seed,
+        "tone": command.tone,
+        "bytes": command.out.stat().st_size,
+    }
+
+
+def _text(found: dict[str, Any]) -> str:
+    ratio = f"{found['on_off_ratio']:.2f}" if found["on_off_ratio"] is not None else "no OFF events"
+    rate = f"{amount(found['rate_hz'], 'ev/s')}, {found['rate_per_pixel_hz']:.3g} Hz a pixel"
+    times = "from --fps" if found["times_from"] == "fps" else "from the file"
+    return (
+        f"{found['out']}: {found['events']:,} events ({rate}), ON/OFF {ratio}, {amount(found['bytes'], 'B')}\n"
+        f"  {found['frames']} frames of {found['width']} x {found['height']} in {found['duration_s']:.6g} s, "
+        f"times {times}, tone {found['tone']}\n"
+        f"  pixel {found['pixel_name']}, mode {found['mode']}, seed {found['seed']}; "
+        f"to look at it: evnlos preview {found['out']}"
+    )

@@ -1,0 +1,248 @@
+"""Pictures of an event stream, window by window, in memory that does not grow with it; Pillow alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from evnlos.errors import ConfigError
+from evnlos.events.summary import Summary
+from evnlos.types import Events
+
+Style = Literal["polarity", "surface"]
+"""Events of each window by sign, or the newest event of each pixel, fading."""
+Background = Literal["dark", "light"]
+
+# Orange and blue: told apart with every common kind of colour blindness. Background, ON, OFF, text and events
+# without a polarity, bar.
+_COLOURS = {
+    "dark": ((14, 16, 20), (255, 176, 66), (74, 152, 255), (205, 208, 214), (52, 56, 64)),
+    "light": ((255, 255, 255), (200, 74, 0), (24, 94, 190), (60, 64, 72), (224, 226, 230)),
+}
+_FAINTEST = 0.3  # how strongly a single event is drawn where many are usual
+_CAPTION_PX = 26
+_FILL = 0.05  # of the pixels that an automatic window shows as having sent an event
+_MAX_FRAMES = 500
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a preview looks.
+
+    Args:
+        style: "polarity" counts the events of each window by sign, "surface" shows each pixel's newest event,
+            fading with the length of a window.
+        background: "dark" or "light".
+        frames: Number of windows, spread evenly over the recording, 1 to 500.
+        window_ms: Length of a window, milliseconds; None = as long as it takes to show something, at most up to
+            the next window.
+        side_px: About the longest side of a picture, pixels: larger sensors are added up, smaller magnified.
+
+    Raises:
+        ConfigError: A value outside its range.
+    """
+
+    style: Style = "polarity"
+    background: Background = "dark"
+    frames: int = 40
+    window_ms: float | None = None
+    side_px: int = 480
+
+    def __post_init__(self) -> None:
+        for name, kinds in (("style", get_args(Style)), ("background", get_args(Background))):
+            if getattr(self, name) not in kinds:
+                raise ConfigError(f"{name} is {getattr(self, name)!r}; give one of {', '.join(kinds)}")
+        if not 1 <= self.frames <= _MAX_FRAMES:
+            raise ConfigError(f"frames is {self.frames}; give 1 to {_MAX_FRAMES}")
+        if self.window_ms is not None and not 1e-3 <= self.window_ms < np.inf:
+            raise ConfigError(f"window_ms is {self.window_ms}; give at least 0.001 ms")
+        if not 64 <= self.side_px <= 2048:
+            raise ConfigError(f"side_px is {self.side_px}; give 64 to 2048 pixels")
+
+
+def preview_pictures(
+    pieces: Iterable[Events], summary: Summary, look: Look | None = None
+) -> list[NDArray[np.uint8]]:
+    """Return pictures [H, W, 3] of a recording with a line of text below: time, events, length of the window.
+
+    Args:
+        pieces: The events in the order of time, as `iter_events` yields them.
+        summary: What they hold (`summarise`).
+        look: How it looks; None = the defaults.
+
+    Example:
+        >>> from evnlos.events.summary import summarise
+        >>> events = Events([0, 900], [0, 3], [1, 1], [1, 0], width=4, height=2)
+        >>> pictures = preview_pictures([events], summarise([events]), Look(frames=2))
+        >>> len(pictures), pictures[0].shape, pictures[0][-30, 0].tolist()
+        (2, (266, 480, 3), [255, 176, 66])
+    """
+    look = look or Look()
+    windows = _windows(summary, look)
+    factor = max(1, round(max(summary.width, summary.height) / look.side_px))
+    shape = -(-summary.height // factor), -(-summary.width // factor)
+    draw = _polarity_maps if look.style == "polarity" else _surface_maps
+    shown = list(draw(pieces, windows, shape, factor))
+    strength = np.arange(256) / 255.0  # of what a map holds
+    if look.style == "polarity":  # few events at a place stay visible beside many
+        part = np.log1p(np.arange(256)) / np.log1p(_full_scale(maps for maps, _ in shown))
+        strength = np.where(part > 0, _FAINTEST + (1 - _FAINTEST) * np.minimum(part, 1.0), 0.0)
+    zoom = max(1, look.side_px // max(shape))
+    pictures = []
+    for (maps, count), (_, start, stop) in zip(shown, windows, strict=True):
+        pixels = np.kron(_coloured(strength[maps], look.background), np.ones((zoom, zoom, 1), np.uint8))
+        text = f"{(stop - summary.first_us) / 1e6:.{_decimals(summary)}f} s"
+        detail = f"{count:,} events in {(stop - start) / 1e3:.3g} ms"
+        done = (stop - summary.first_us) / max(summary.duration_us, 1)
+        pictures.append(
+            np.concatenate([pixels, _caption(pixels.shape[1], text, detail, done, look.background)])
+        )
+    return pictures
+
+
+def _windows(summary: Summary, look: Look) -> list[tuple[int, int, int]]:
+    """Return (end of the window before, begin, end) of each window, microseconds; begin < t <= end."""
+    span = max(summary.duration_us, look.frames)
+    ends = summary.first_us + np.linspace(0, span, look.frames + 1).round().astype(np.int64)
+    if look.window_ms is not None:
+        length = round(1e3 * look.window_ms)
+    else:
+        step = span / look.frames
+        wanted = _FILL * summary.width * summary.height / max(summary.rate_hz, 1e-9) * 1e6
+        length = round(max(min(step, max(wanted, 1000.0)), 1.0))
+    starts = ends[1:] - max(length, 1)
+    starts = np.where(starts <= summary.first_us, summary.first_us - 1, starts)  # the first event is inside
+    befores = np.concatenate([[summary.first_us - 1], ends[1:-1]])
+    return [(int(b), int(s), int(e)) for b, s, e in zip(befores, starts, ends[1:], strict=True)]
+
+
+def _slices(pieces: Iterable[Events], ends: list[int]) -> Iterator[tuple[int, Events]]:
+    """Yield (number of a window, events up to its end that are later than the end before)."""
+    number = 0
+    for events in pieces:
+        done = 0
+        while number < len(ends):
+            stop = int(np.searchsorted(events.t_us, ends[number], "right"))
+            if stop > done:
+                yield number, events[done:stop]
+            done = stop
+            if stop == len(events):
+                break
+            number += 1
+
+
+def _places(events: Events, factor: int, width: int) -> NDArray[np.int64]:
+    return (events.y // factor).astype(np.int64) * width + events.x // factor
+
+
+Shown = tuple[NDArray[np.uint8], int]
+"""A map for each sign [3, H, W] (ON, OFF, unknown), and the number of events."""
+
+
+def _signs(events: Events) -> NDArray[np.uint8]:
+    """Return 0 for ON, 1 for OFF, 2 where the camera gave no polarity."""
+    signs = (~events.p).astype(np.uint8)
+    if events.polarity_known is not None:
+        signs[~events.polarity_known] = 2
+    return signs
+
+
+def _polarity_maps(
+    pieces: Iterable[Events], windows: list[tuple[int, int, int]], shape: tuple[int, int], factor: int
+) -> Iterator[Shown]:
+    """Yield the number of events of each sign at each place, up to 255, for each window."""
+    # Windows longer than their distance overlap: an event then counts in every window that holds it.
+    held: list[Events] = []
+    for number, events in _with_gaps(_slices(pieces, [end for _, _, end in windows]), len(windows)):
+        _, start, end = windows[number]
+        held = [one for one in (*held, *events) if len(one) and int(one.t_us[-1]) > start]
+        area = shape[0] * shape[1]
+        counts = np.zeros(3 * area, np.int64)
+        for one in held:
+            inside = one.between(start, end)
+            counts += np.bincount(
+                _places(inside, factor, shape[1]) + _signs(inside).astype(np.int64) * area, minlength=3 * area
+            )
+        yield np.minimum(counts, 255).astype(np.uint8).reshape(3, *shape), int(counts.sum())
+
+
+def _surface_maps(
+    pieces: Iterable[Events], windows: list[tuple[int, int, int]], shape: tuple[int, int], factor: int
+) -> Iterator[Shown]:
+    """Yield 255 exp(-age / length of the window) of the newest event at each place, on the map of its sign."""
+    newest = np.full(shape[0] * shape[1], -np.inf)
+    signs = np.zeros(shape[0] * shape[1], np.uint8)
+    for number, slices in _with_gaps(_slices(pieces, [end for _, _, end in windows]), len(windows)):
+        _, start, end = windows[number]
+        total = 0
+        for events in slices:
+            where = _places(events, factor, shape[1])
+            newest[where], signs[where] = (
+                events.t_us,
+                _signs(events),
+            )  # of several at a place the last one stays
+            total += len(events.between(start, end))
+        fresh = np.floor(255 * np.exp((newest - end) / (end - start)))
+        maps = np.where(signs == np.arange(3)[:, None], fresh, 0)
+        yield maps.astype(np.uint8).reshape(3, *shape), total
+
+
+def _with_gaps(slices: Iterator[tuple[int, Events]], count: int) -> Iterator[tuple[int, list[Events]]]:
+    """Yield every window's number with its events, those without events too."""
+    here = next(slices, None)
+    for number in range(count):
+        found = []
+        while here is not None and here[0] == number:
+            found.append(here[1])
+            here = next(slices, None)
+        yield number, found
+
+
+def _full_scale(maps: Iterable[NDArray[np.uint8]]) -> float:
+    """Return the number of events that is drawn in full colour, the same for all windows: no flicker."""
+    tally = np.zeros(256, np.int64)
+    for one in maps:
+        tally += np.bincount(one.ravel(), minlength=256)
+    tally[0] = 0
+    if not tally.any():
+        return 1.0
+    return max(float(np.searchsorted(np.cumsum(tally), 0.95 * tally.sum())), 1.0)
+
+
+def _coloured(strength: NDArray[np.float64], background: Background) -> NDArray[np.uint8]:
+    """Return strengths from 0 to 1 [3, H, W] as a picture [H, W, 3]."""
+    ground, *inks = (np.array(colour, np.float64) for colour in _COLOURS[background][:4])
+    share = strength / np.maximum(strength.sum(axis=0), 1e-9)
+    colour = np.tensordot(share, np.stack(inks), axes=(0, 0))  # [H, W, 3]
+    opacity = strength.max(axis=0)[..., None]
+    return np.round(ground + opacity * (colour - ground)).astype(np.uint8)
+
+
+def _decimals(summary: Summary) -> int:
+    return 3 if summary.duration_us >= 200_000 else 4 if summary.duration_us >= 20_000 else 6
+
+
+def _caption(width: int, time: str, detail: str, done: float, background: Background) -> NDArray[np.uint8]:
+    """Return a line of text on the recording's position: its time, what is shown, which colour is which."""
+    ground, on, off, ink, bar = _COLOURS[background]
+    image = Image.new("RGB", (width, _CAPTION_PX), ground)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle((0, 0, width - 1, 1), fill=bar)
+    draw.rectangle((0, 0, round(done * (width - 1)), 1), fill=ink)
+    font = ImageFont.load_default(13)
+    measure: Callable[[str], float] = lambda text: draw.textlength(text, font=font)  # noqa: E731
+    draw.text((6, 6), time, fill=ink, font=font)
+    right = width - 6.0
+    for text, colour in (("OFF", off), ("ON", on)):
+        right -= measure(text)
+        draw.text((right, 6), text, fill=colour, font=font)
+        right -= 10
+    left = 18 + measure(time)
+    if left + measure(detail) < right:
+        draw.text((left, 6), detail, fill=ink, font=font)
+    return np.asarray(image)

@@ -1,0 +1,214 @@
+"""The four kinds of moving pictures that are read: containers, animations, single pictures, arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from evnlos.errors import DataError, MissingDependencyError
+from evnlos.sensor._tone import Picture
+
+
+class Source(Protocol):
+    """Moving pictures on disk."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        ...
+
+    @property
+    def frames(self) -> int | None:
+        """Number of pictures, None where the file does not say."""
+        ...
+
+    @property
+    def white(self) -> float | None:
+        """Value of white where the type of the pictures says it; None for floating point."""
+        ...
+
+    @property
+    def timed(self) -> bool:
+        """Whether the file states the times of its pictures."""
+        ...
+
+    def pictures(self) -> Iterator[tuple[float | None, Picture]]:
+        """Yield the time in seconds, None where it is not stated, and the picture."""
+        ...
+
+
+class ContainerSource:
+    """A video file, through PyAV (FFmpeg); pictures are turned as the file's rotation says."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.timed = path, True
+        with self._opened() as container:
+            self.frames = container.streams.video[0].frames or None
+        pictures = self.pictures()
+        try:
+            time_s, first = next(pictures)
+        except StopIteration:
+            raise DataError(f"{path}: a video without frames; give another file") from None
+        finally:
+            pictures.close()
+        self.timed = time_s is not None
+        self.size = first.shape[1], first.shape[0]
+        self.white = float(np.iinfo(first.dtype).max)
+
+    def _opened(self) -> Any:
+        av = _pyav()
+        try:
+            container = av.open(str(self.path))
+        except (av.error.FFmpegError, ValueError) as error:
+            raise DataError(f"{self.path}: not a video that FFmpeg reads ({_reason(error)})") from None
+        if not container.streams.video:
+            container.close()
+            raise DataError(f"{self.path}: a media file without a video stream; give another file")
+        return container
+
+    def pictures(self) -> Generator[tuple[float | None, Picture], None, None]:
+        """Yield the presentation time and the picture, 16 bits deep where the video has more than 8."""
+        av = _pyav()
+        count = 0
+        with self._opened() as container:
+            container.streams.video[0].thread_type = "AUTO"
+            try:
+                for frame in container.decode(video=0):
+                    deep = max(part.bits for part in frame.format.components) > 8
+                    picture = frame.to_ndarray(format="rgb48le" if deep else "rgb24")  # [H, W, 3]
+                    yield frame.time, np.rot90(picture, round(frame.rotation / 90))
+                    count += 1
+            except av.error.FFmpegError as error:
+                raise DataError(
+                    f"{self.path}: decoding failed after frame {count} ({_reason(error)}); "
+                    "the file is damaged: copy or encode it again"
+                ) from None
+
+
+def _pyav() -> Any:
+    try:
+        import av
+    except ImportError:
+        raise MissingDependencyError(
+            'reading video files needs PyAV: pip install "evnlos[video]" (GIF, pictures and .npy go without)'
+        ) from None
+    av.logging.set_level(None)  # pyright: ignore[reportPrivateImportUsage]  # FFmpeg's own remarks are no use to a reader of one line
+    return av
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)
+
+
+class AnimationSource:
+    """An animated GIF, PNG or WebP, through Pillow."""
+
+    white, timed = 255.0, True
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _image(path) as image:
+            self.frames = int(getattr(image, "n_frames", 1))
+            self.size = image.size
+
+    def pictures(self) -> Iterator[tuple[float | None, Picture]]:
+        """Yield the sum of the durations before a picture, and the picture."""
+        shown_ms = 0.0
+        with _image(self.path) as image:
+            for number in range(self.frames):
+                picture = _seek(image, number, self.path)
+                yield shown_ms / 1000, picture
+                shown_ms += float(image.info.get("duration", 0))
+
+
+class PicturesSource:
+    """Single pictures in the order of their names; they carry no times."""
+
+    timed = False
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = paths
+        self.frames = len(paths)
+        with _image(paths[0]) as image:
+            self.size = image.size
+            first = _array(image, paths[0])
+        self._dtype, self.white = first.dtype, _white(first)
+
+    def pictures(self) -> Iterator[tuple[float | None, Picture]]:
+        """Yield the pictures without times."""
+        for path in self.paths:
+            with _image(path) as image:
+                if image.size != self.size:
+                    found, first = "{} x {}".format(*image.size), "{} x {}".format(*self.size)
+                    raise DataError(f"{path} is {found}, {self.paths[0]} is {first}; give pictures of one size")
+                picture = _array(image, path)
+            if picture.dtype != self._dtype:
+                kinds = f"{path} holds {picture.dtype}, {self.paths[0]} {self._dtype}"
+                raise DataError(f"{kinds}; give pictures of one depth")
+            yield None, picture
+
+
+class ArraySource:
+    """A NumPy file [T, H, W] or [T, H, W, 3], read through a memory map; it carries no times."""
+
+    timed = False
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._array = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError, OSError) as error:
+            reason = " ".join(str(error).split())[:120]
+            raise DataError(f"{path}: not a NumPy array ({reason}); save one with numpy.save") from None
+        shape, dtype = self._array.shape, self._array.dtype
+        if len(shape) not in (3, 4) or (len(shape) == 4 and shape[3] != 3) or 0 in shape[1:]:
+            raise DataError(f"{path}: an array of shape {shape}; give [T, H, W] or [T, H, W, 3]")
+        if dtype not in (np.uint8, np.uint16) and dtype.kind != "f":
+            raise DataError(f"{path}: an array of {dtype}; give uint8, uint16 or floating point")
+        self.frames, self.size = shape[0], (shape[2], shape[1])
+        self.white = _white(self._array)
+
+    def pictures(self) -> Iterator[tuple[float | None, Picture]]:
+        """Yield the pictures without times."""
+        for picture in self._array:
+            yield None, np.asarray(picture)
+
+
+def _white(pictures: NDArray) -> float | None:
+    return float(np.iinfo(pictures.dtype).max) if pictures.dtype.kind == "u" else None
+
+
+def _image(path: Path) -> Image.Image:
+    try:
+        return Image.open(path)
+    except UnidentifiedImageError:
+        raise DataError(f"{path}: not a picture that Pillow reads; give PNG, TIFF, JPEG, GIF or WebP") from None
+    except (OSError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: cannot be read ({error})") from None
+
+
+def _seek(image: Image.Image, number: int, path: Path) -> Picture:
+    try:
+        image.seek(number)
+    except (OSError, EOFError, SyntaxError) as error:
+        raise DataError(f"{path}: picture {number} cannot be read ({error}); copy the file again") from None
+    return _array(image, path)
+
+
+def _array(image: Image.Image, path: Path) -> Picture:
+    """Return the current picture: uint8, uint16 for 16-bit files, float32 for floating-point files."""
+    try:
+        if image.mode.startswith("I"):
+            numbers = np.asarray(image)
+            if numbers.min() < 0 or numbers.max() > 65_535:
+                raise DataError(f"{path}: a picture of more than 16 bits; save it as 16 bits or floating point")
+            return numbers.astype(np.uint16)
+        if image.mode in ("L", "RGB"):
+            return np.asarray(image)
+        return np.asarray(image if image.mode == "F" else image.convert("RGB"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: the picture cannot be decoded ({error}); copy the file again") from None
