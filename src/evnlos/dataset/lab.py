@@ -1,30 +1,43 @@
-"""Pseudo-real captures: shots that the paper's simulator did not make, for people without a camera."""
+"""Pseudo-real captures: shots that the training simulator did not make, for people without a camera."""
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from evnlos.config import save_yaml
+from evnlos.config import differing_keys, read_yaml, save_yaml, to_dict
+from evnlos.dataset.lab_sensor import SENSOR_SPREAD
+from evnlos.dataset.pool import run_tasks
 from evnlos.dataset.simulate import SensorSize
-from evnlos.errors import DataError
+from evnlos.dataset.variation import check_ranges, varied
+from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
-from evnlos.scene import FontGlyphs, LineMotion, Scene
+from evnlos.scene import EmnistGlyphs, FontGlyphs, HandwritingGlyphs, LineMotion, NistGlyphs, Scene
 from evnlos.seeds import derive_seed
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
-from evnlos.transport import RadiometricTransport
+from evnlos.transport import RadiometricTransport, rig_preset
+from evnlos.version import __version__
+
+LIGHT = {"gain": 0.7, "ambient": 0.06, "ambient_gradient": (0.3, -0.2)}
+"""Light of the lab: dimmer and less even than in the training simulator."""
+
+_SKETCH = (6, 10)  # pixels
 
 
 @dataclass(frozen=True)
 class Lab:
-    """A rendered laboratory: rough aluminium instead of a tPSF, and another camera than the simulator's."""
+    """A rendered laboratory: a wall of metal or paint instead of a tPSF, and other cameras."""
 
-    glyphs: FontGlyphs = field(default_factory=FontGlyphs)
+    name: str = "lab"
+    """Name of the rig; captures are called NAME_A, NAME_B, ..."""
+    glyphs: FontGlyphs | HandwritingGlyphs | NistGlyphs | EmnistGlyphs = field(default_factory=FontGlyphs)
     """What is hidden."""
     motion: LineMotion = field(default_factory=LineMotion)
     """How it moves."""
@@ -32,10 +45,8 @@ class Lab:
     """Length of a pass, seconds."""
     frame_rate_hz: float = 5.0
     """Frames a second, hertz; a pass of 8 s has the 40 positions of the paper."""
-    transport: RadiometricTransport = field(
-        default_factory=lambda: RadiometricTransport(gain=0.7, ambient=0.06, ambient_gradient=(0.3, -0.2))
-    )
-    """The rig."""
+    transport: RadiometricTransport = field(default_factory=lambda: RadiometricTransport(**LIGHT))
+    """The rig: wall, camera, occluders, torch, ambient light."""
     sensor: SensorSize = field(default_factory=SensorSize)
     """Size of the sensor."""
     frame_camera: FrameCamera = field(
@@ -54,40 +65,129 @@ class Lab:
         )
     )
     """The event pixel: on purpose not that of the training simulator."""
+    spread: dict[str, tuple[float, float]] = field(default_factory=lambda: dict(SENSOR_SPREAD))
+    """Settings drawn once for the rig, uniformly: dotted name -> (low, high); {} takes them as they stand."""
     seed: int = 0
-    """Seed of every draw."""
+    """Seed of every draw, the sensor's own settings among them."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", self.name):
+            raise ConfigError(f"Lab.name is {self.name!r}; give letters, digits, '.', '_' or '-'")
+        for name, unit in (("duration_s", "seconds"), ("frame_rate_hz", "hertz")):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"Lab.{name} is {getattr(self, name)}; give a positive number of {unit}")
+        if self.duration_s * self.frame_rate_hz < 1:
+            raise ConfigError(
+                f"Lab.duration_s is {self.duration_s} s at {self.frame_rate_hz} Hz; a sample needs two frames"
+            )
+        if self.frame_camera.bit_depth != 8:
+            raise ConfigError(
+                f"Lab.frame_camera.bit_depth is {self.frame_camera.bit_depth}; captures hold 8 bits"
+            )
+        check_ranges(self, self.spread)
+
+    def drawn(self) -> Lab:
+        """Return the lab with its sensor's settings drawn from `spread`: a function of the seed and the name.
+
+        Example:
+            >>> one, other = Lab(seed=1).drawn(), Lab(seed=2).drawn()
+            >>> one.pixel == other.pixel, 0.18 <= one.pixel.threshold_on <= 0.28, one.spread
+            (False, True, {})
+        """
+        if not self.spread:
+            return self
+        pattern = derive_seed(self.seed, self.name, "fixed pattern")
+        own = replace(self, frame_camera=replace(self.frame_camera, pattern_seed=pattern))
+        return replace(varied(own, self.spread, self.seed, self.name), spread={})
 
 
-def render_captures(lab: Lab, out: str | Path, names: list[str] | None = None) -> Iterator[Path]:
-    """Render one capture folder an object, yielding each as it is done.
+def lab_preset(name: str) -> Lab:
+    """Return the lab of a named rig, e.g. "main-near" (see `rig_preset`), in the lab's light.
 
-    A folder that exists is done and is kept, so that a run can be taken up again.
+    Raises:
+        ConfigError: The name is unknown.
+
+    Example:
+        >>> lab_preset("aperture-far").transport.distance_m
+        0.5
+    """
+    return Lab(name=name, transport=replace(rig_preset(name), **LIGHT))
+
+
+def render_captures(
+    lab: Lab, out: str | Path, names: list[str] | None = None, workers: int = 1
+) -> Iterator[Path]:
+    """Render one capture folder an object, yielding each as it is done, and `lab.yaml` beside them.
+
+    A capture that exists is done and is kept, so that a run can be taken up again; the captures are the same
+    for any number of workers.
 
     Args:
         lab: Rig, cameras and objects.
-        out: The folder for the captures.
+        out: The folder for the captures; new, or begun with the same settings (other characters may be added).
         names: Objects of `lab.glyphs`; all by default.
+        workers: Processes; 0 means one for each core.
 
     Raises:
-        DataError: `out` is a file.
+        DataError: `out` is a file, or was begun with other settings, or holds a folder in a capture's place.
+        ConfigError: The rig can't be.
     """
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise DataError(f"{out} is a file; give a folder for the captures")
+    drawn = lab.drawn()
+    names = lab.glyphs.objects() if names is None else names
+    folders = {name: out / _folder_name(lab, name) for name in names}
+    for folder in folders.values():
+        if folder.exists() and not (folder / "capture.yaml").is_file():
+            raise DataError(f"{folder} is there without a capture.yaml; move it away, it is no capture")
+    # A wrong rig is an error before anything is written; a few pixels are enough to find it.
+    if names:
+        drawn.transport.wall(_scene(drawn, names[0]), _SKETCH)
     out.mkdir(parents=True, exist_ok=True)
-    for name in names if names is not None else lab.glyphs.objects():
-        folder = out / f"lab_{name.rsplit('_', 1)[-1]}"
-        if not folder.is_dir():
-            _render(lab, name, folder)
-        yield folder
+    _record(lab, drawn, out)
+    missing = []
+    for name, folder in folders.items():
+        if folder.is_dir():
+            yield folder
+        else:
+            missing.append((drawn, name, folder))
+    yield from run_tasks(_render, missing, workers)
 
 
-def _render(lab: Lab, name: str, folder: Path) -> None:
+def _record(lab: Lab, drawn: Lab, out: Path) -> None:
+    """Write `lab.yaml`, or refuse a folder that was begun with other settings."""
+    path, asked = out / "lab.yaml", to_dict(lab)
+    if path.is_file():
+        before = read_yaml(path).get("lab")
+        differing = differing_keys(asked, before) if isinstance(before, dict) else ["lab: missing"]
+        differing = [line for line in differing if not line.startswith("glyphs.characters:")]
+        if differing:
+            raise DataError(
+                f"{out} was begun with other settings ({'; '.join(differing[:3])}); give another folder"
+            )
+    sensor = {"pixel": to_dict(drawn.pixel), "frame_camera": to_dict(drawn.frame_camera)}
+    save_yaml({"evnlos": __version__, "lab": asked, "drawn": sensor}, path)
+
+
+def _folder_name(lab: Lab, name: str) -> str:
+    """Return NAME_A for a font, which shows each character once, and NAME_object for other glyphs."""
+    return f"{lab.name}_{name.rsplit('_', 1)[-1] if isinstance(lab.glyphs, FontGlyphs) else name}"
+
+
+def _scene(lab: Lab, name: str) -> Scene:
+    return Scene(lab.glyphs.target(name, lab.seed), lab.motion, lab.duration_s)
+
+
+def _shape(lab: Lab) -> tuple[int, int]:
+    return lab.sensor.height, lab.sensor.width
+
+
+def _render(task: tuple[Lab, str, Path]) -> Path:
     """Render into a temporary folder, then rename: a capture is there whole or not at all."""
-    target = lab.glyphs.target(name, lab.seed)
-    scene = Scene(target, lab.motion, lab.duration_s)
-    shape = (lab.sensor.height, lab.sensor.width)
-    wall = lab.transport.wall(scene, shape)
+    lab, name, folder = task
+    scene = _scene(lab, name)
+    wall = lab.transport.wall(scene, _shape(lab))
     times_s = np.arange(round(lab.duration_s * lab.frame_rate_hz) + 1) / lab.frame_rate_hz
     seed = derive_seed(lab.seed, name)
     events = EventCamera(lab.pixel).record(wall, 0.0, lab.duration_s, seed=derive_seed(seed, "events"))
@@ -102,13 +202,17 @@ def _render(lab: Lab, name: str, folder: Path) -> None:
         Image.fromarray(frame).save(draft / f"frames/{k:04d}.png")
         rows.append(f"{round(time_s * 1e6)},frames/{k:04d}.png")
     (draft / "frames.csv").write_text("\n".join(rows) + "\n")
-    Image.fromarray(np.round(target.mask * 255).astype(np.uint8)).save(draft / "target.png")
-    save_yaml(_description(lab, folder.name, target.size_m), draft / "capture.yaml")
+    Image.fromarray(np.round(scene.target.mask * 255).astype(np.uint8)).save(draft / "target.png")
+    save_yaml(_description(lab, folder.name, scene.target.size_m), draft / "capture.yaml")
     draft.rename(folder)
+    return folder
 
 
-def _description(lab: Lab, name: str, plate_m: float) -> dict:
+def _description(lab: Lab, name: str, plate_m: float) -> dict[str, Any]:
     rig = lab.transport
+    parts = ["matte" if rig.wall_material == "lambert" else f"aluminium, GGX roughness {rig.roughness:g}"]
+    parts += [f"{len(rig.occluders())} occluder(s)"] if rig.occluders() else []
+    parts += ["torch-lit target"] if rig.lamp_m is not None else []
     return {
         "camera": {
             "name": "rendered laboratory",
@@ -128,7 +232,14 @@ def _description(lab: Lab, name: str, plate_m: float) -> dict:
         },
         "rig": {
             "distance_m": rig.distance_m,
-            "wall": f"rendered, {rig.wall_material}, roughness {rig.roughness}",
-            "ambient": f"{rig.ambient} of the white level",
+            "wall": "rendered: " + ", ".join(parts),
+            "ambient": f"{rig.ambient:g} of the white level in the middle",
+            "rendered": {
+                "by": f"evnlos {__version__}",
+                "seed": lab.seed,
+                "transport": to_dict(rig),
+                "pixel": to_dict(lab.pixel),
+                "frame_camera": to_dict(lab.frame_camera),
+            },
         },
     }

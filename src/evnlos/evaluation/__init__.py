@@ -1,4 +1,4 @@
-"""How good a reconstruction is: metrics with their baselines, a character and overall."""
+"""How good a reconstruction is, with its baselines, and how good it could be at all."""
 
 from evnlos.evaluation.evaluate import (
     BASELINES,
@@ -9,17 +9,22 @@ from evnlos.evaluation.evaluate import (
     infer,
     reconstruct,
 )
+from evnlos.evaluation.identify import Identification, identify
+from evnlos.evaluation.identify_rig import Bench
 from evnlos.evaluation.lpips import available_lpips, load_lpips
 from evnlos.evaluation.score import Scores, score
 
 __all__ = [
     "BASELINES",
     "CHECKS",
+    "Bench",
     "Evaluation",
+    "Identification",
     "Scores",
     "available_lpips",
     "check_sampling",
     "evaluate",
+    "identify",
     "infer",
     "load_lpips",
     "reconstruct",

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import torch
 
 from evnlos.errors import ConfigError
-from evnlos.transport.angular_spectrum import angular_spectrum, check_lengths
+from evnlos.transport.angular_spectrum import angular_spectrum, check_lengths, sampling_limit_m
 from evnlos.transport.operator import Transport
 from evnlos.types import Plane
+
+_LEAST_BAND = 16  # beyond so many sampling limits less than a sixteenth of the frequencies would be left
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,16 @@ class Diffraction(Transport):
         ):
             if value not in known:
                 raise ConfigError(f"{name} is {value!r}; choose {known[0]!r} or {known[1]!r}")
+        self._check_sampling()
+
+    def _check_sampling(self) -> None:
+        """Refuse a pitch so fine that the band limit would leave almost nothing of the scene."""
+        limit = sampling_limit_m(min(self.source.shape), self.pitch_m, self.wavelength_m, pad=self.pad)
+        if self.distance_m > _LEAST_BAND * limit:
+            raise ConfigError(
+                f"distance_m is {self.distance_m:g} m; samples of {self.pitch_m:g} m carry a field no farther "
+                f"than {_LEAST_BAND * limit:g} m: raise the pitch or the number of samples"
+            )
 
     @property
     def pitch_m(self) -> float:

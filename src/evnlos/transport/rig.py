@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
@@ -16,12 +18,14 @@ from evnlos.transport.angular_spectrum import check_lengths
 from evnlos.transport.brdf import GGX, Brdf, Lambert
 from evnlos.transport.lamp import lamp_radiance
 from evnlos.transport.matrix_wall import MatrixWall
-from evnlos.transport.occluder import Occluder
+from evnlos.transport.occluder import Occluder, check_between, visibility
 from evnlos.transport.operator import MatrixTransport
 from evnlos.transport.radiometric import light_transport_matrix
 from evnlos.transport.view import View
 from evnlos.transport.wall import ambient_plane
 from evnlos.types import Plane
+
+_LEAST_CELLS = 4  # a side of the plate: fewer show no shape at all
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ class RadiometricTransport:
     """Width and height of the region in which the target moves, metres."""
     post_width_m: float = 0.0
     """Width of an upright post halfway between the wall's middle and the travel's, metres; 0 is none."""
+    occluders_m: tuple[tuple[tuple[float, float, float], ...], ...] = ()
+    """Opaque flat polygons between target and wall: corners (x, y, z) of each, metres, z from the wall."""
     lamp_m: tuple[float, float, float] | None = None
     """A torch (x, y, z) that lights the target, metres, z from the wall; None: it shines itself."""
     lamp_half_angle_deg: float = 20.0
@@ -92,22 +98,59 @@ class RadiometricTransport:
 
     def occluders(self) -> tuple[Occluder, ...]:
         """Return what stands between wall and target."""
+        polygons = tuple(Occluder(corners) for corners in self.occluders_m)
         if self.post_width_m == 0:
-            return ()
-        return (Occluder.post(self.offset_m()[0] / 2, self.distance_m / 2, self.post_width_m),)
+            return polygons
+        return (*polygons, Occluder.post(self.offset_m()[0] / 2, self.distance_m / 2, self.post_width_m))
 
     def transport(self, shape: tuple[int, int]) -> MatrixTransport:
         """Return the matrix from the strip to the camera, scaled so that `gain` means what it says; cached."""
         # Light that only adds up afterwards does not belong to the matrix's key.
         return _transport(replace(self, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0)), shape)
 
+    def matrix(self, shape: tuple[int, int], source: Plane, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+        """Return the matrix from any cells of the target's plane to the camera, without `gain`, [H W, h w].
+
+        Args:
+            shape: Size (H, W) of the camera image, pixels.
+            source: Cells, in the coordinates of the target's motion.
+            dtype: Floating-point type of the result.
+
+        Raises:
+            ConfigError: An occluder reaches the wall or the target's plane, or hides the wall from the camera.
+        """
+        view, occluders, emission = self.view(shape), self.occluders(), None
+        check_lengths(distance_m=self.distance_m)
+        check_between(occluders, self.distance_m)
+        _check_sight(view, occluders)
+        if self.lamp_m is not None:
+            emission = lamp_radiance(
+                source,
+                self.distance_m,
+                self.lamp_m,
+                offset_m=self.offset_m(),
+                half_angle_deg=self.lamp_half_angle_deg,
+            )
+        return light_transport_matrix(
+            view,
+            source,
+            self.distance_m,
+            self.brdf(),
+            offset_m=self.offset_m(),
+            occluders=occluders,
+            emission=emission,
+            dtype=dtype,
+        )
+
     def wall(self, scene: Scene, shape: tuple[int, int]) -> MatrixWall:
         """Return the wall that a camera of `shape` (H, W) sees while the scene's plate moves.
 
         Raises:
-            ConfigError: The plate leaves the strip, or a setting is outside its range.
+            ConfigError: The plate leaves the strip, or needs finer cells, or a setting is out of range.
         """
+        self.source()  # refuses cells or a strip without size
         self._check_travel(scene)
+        self._check_cells(scene.target.size_m)
         return MatrixWall(
             self.transport(shape),
             scene.target,
@@ -128,31 +171,38 @@ class RadiometricTransport:
                     f"set strip_m to at least {2 * needed:.3f} m there"
                 )
 
+    def _check_cells(self, plate_m: float) -> None:
+        if self.cell_m > plate_m / _LEAST_CELLS * (1 + 1e-9):
+            raise ConfigError(
+                f"cell_m is {self.cell_m:g} m; a plate of {plate_m:g} m needs {_LEAST_CELLS} "
+                f"cells a side to show any shape: give at most {plate_m / _LEAST_CELLS:g} m"
+            )
+
 
 @lru_cache(maxsize=4)
 def _transport(rig: RadiometricTransport, shape: tuple[int, int]) -> MatrixTransport:
     source = rig.source()
-    offset = rig.offset_m()
-    emission = None
-    if rig.lamp_m is not None:
-        beam = rig.lamp_half_angle_deg
-        emission = lamp_radiance(source, rig.distance_m, rig.lamp_m, offset_m=offset, half_angle_deg=beam)
-    matrix = light_transport_matrix(
-        rig.view(shape),
-        source,
-        rig.distance_m,
-        rig.brdf(),
-        offset_m=offset,
-        occluders=rig.occluders(),
-        emission=emission,
-        dtype=torch.float32,
-    )
+    matrix = rig.matrix(shape, source, torch.float32)
     # A square of the strip's height is the plate of the paper; it makes gains comparable between walls.
     lit = (torch.arange(source.width) - (source.width - 1) / 2).abs() <= source.height / 2
     brightest = (matrix @ lit.to(matrix).repeat(source.height)).max()
     if not float(brightest) > 0:
         raise ConfigError("the camera receives no light from the target; move the target or the camera")
     return MatrixTransport(matrix / brightest, source, shape)
+
+
+def _check_sight(view: View, occluders: Sequence[Occluder]) -> None:
+    """Refuse occluders in the camera's line of sight: the matrix shades the way from target to wall only."""
+    assert view.eye_m is not None  # a rig's view is a pin-hole
+    x, y, z = (torch.tensor([value], dtype=torch.float64) for value in view.eye_m)
+    before = [one for one in occluders if max(corner[2] for corner in one.vertices_m) < float(z)]
+    hidden = ~visibility(view.wall_points_m().flatten(0, 1), x, y, float(z), before)
+    if bool(hidden.any()):
+        share = float(hidden.double().mean())
+        raise ConfigError(
+            f"an occluder hides the wall from {100 * share:.0f} % of the camera's pixels, which this model "
+            "leaves out; move it towards the target or turn the camera"
+        )
 
 
 NEAR_M, FAR_M = 0.30, 0.50
@@ -167,22 +217,36 @@ _PRESETS = {
 }
 
 
-def rig_preset(name: str, distance_m: float = NEAR_M) -> RadiometricTransport:
+_DISTANCES = {"near": NEAR_M, "far": FAR_M}
+
+
+def rig_names() -> list[str]:
+    """Return the names of all rigs with their distances, e.g. "main-near"."""
+    return [f"{name}-{place}" for name in _PRESETS for place in _DISTANCES]
+
+
+def rig_preset(name: str, distance_m: float | None = None) -> RadiometricTransport:
     """Return one of the named rigs.
 
     Args:
         name: "mirror" (polished, for alignment; sharp to about a cell), "easy", "main" or "hard" (rough
             aluminium of roughness 0.02, 0.05, 0.1), "matte" (a plain white wall, the control on which every
-            method must fail), or "aperture" (a white wall and a 16 mm post halfway).
-        distance_m: Distance from target to wall, metres; near is 0.30, far 0.50.
+            method must fail), or "aperture" (a white wall and a 16 mm post halfway); with "-near" (0.30 m) or
+            "-far" (0.50 m) behind it, or near.
+        distance_m: Distance from target to wall, metres, instead of the one that the name says.
 
     Raises:
         ConfigError: The name is unknown.
 
     Example:
-        >>> rig_preset("hard").roughness
-        0.1
+        >>> rig_preset("hard").roughness, rig_preset("hard-far").distance_m
+        (0.1, 0.5)
     """
-    if name not in _PRESETS:
-        raise ConfigError(f"the rig {name!r} is unknown; choose one of {', '.join(_PRESETS)}")
-    return replace(_PRESETS[name], distance_m=distance_m)
+    wall, _, place = name.partition("-")
+    if wall not in _PRESETS or (place or "near") not in _DISTANCES:
+        near = difflib.get_close_matches(name, rig_names(), n=1)
+        hint = f"; perhaps you meant {near[0]!r}" if near else ""
+        raise ConfigError(
+            f"the rig {name!r} is unknown; choose one of {', '.join(_PRESETS)} with -near or -far{hint}"
+        )
+    return replace(_PRESETS[wall], distance_m=_DISTANCES[place or "near"] if distance_m is None else distance_m)

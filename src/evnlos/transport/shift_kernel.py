@@ -8,6 +8,41 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, fastmath=True)
+def _inside(
+    out: NDArray[np.float32],
+    row: NDArray,
+    tap_0: float,
+    tap_1: float,
+    tap_2: float,
+    tap_3: float,
+    scale: float,
+    ambient: NDArray[np.float32],
+) -> None:
+    """Write the part of a row whose taps all lie inside; the taps are numbers, so that the loop is vectors."""
+    for u in range(len(out)):
+        light = tap_0 * row[u] + tap_1 * row[u + 1] + tap_2 * row[u + 2] + tap_3 * row[u + 3]
+        out[u] = scale * max(light, np.float32(0)) + ambient[u]
+
+
+@njit(cache=True, fastmath=True)
+def _outside(
+    out: NDArray[np.float32],
+    row: NDArray,
+    start: int,
+    taps: NDArray[np.float32],
+    scale: float,
+    ambient: NDArray[np.float32],
+) -> None:
+    """Write the part of a row that has taps outside, where the band is zero."""
+    columns = len(row)
+    for u in range(len(out)):
+        light = np.float32(0)
+        for c in range(max(0, u + start), min(columns, u + start + 4)):
+            light += taps[c - u - start] * np.float32(row[c])
+        out[u] = scale * max(light, np.float32(0)) + ambient[u]
+
+
+@njit(cache=True, fastmath=True)
 def expose_shifted(
     out: NDArray[np.float32],
     band: NDArray,
@@ -33,16 +68,8 @@ def expose_shifted(
     last = max(first, min(width, columns - 3 - start))
     scale = np.float32(gain)
     for v in range(height):
-        row = band[v]
-        for u in range(first, last):
-            c = u + start
-            light = taps[0] * row[c] + taps[1] * row[c + 1] + taps[2] * row[c + 2] + taps[3] * row[c + 3]
-            out[v, u] = scale * max(light, np.float32(0)) + ambient[v, u]
-        for low, high in ((0, first), (last, width)):
-            for u in range(low, high):
-                light = np.float32(0)
-                for k in range(4):
-                    c = u + start + k
-                    if 0 <= c < columns:
-                        light += taps[k] * np.float32(row[c])
-                out[v, u] = scale * max(light, np.float32(0)) + ambient[v, u]
+        if last > first:
+            row = band[v, first + start : last + start + 3]
+            _inside(out[v, first:last], row, taps[0], taps[1], taps[2], taps[3], scale, ambient[v, first:last])
+        _outside(out[v, :first], band[v], start, taps, scale, ambient[v, :first])
+        _outside(out[v, last:], band[v], start + last, taps, scale, ambient[v, last:])

@@ -140,6 +140,8 @@ class SlidingWall:
                 "lower the magnification or the length of the tPSF"
             )
         self._low = (int(low[0]), int(low[1]))
+        units = self.view.pixels(torch.tensor([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)], dtype=torch.float64))
+        self._pixels_per_m = (units[1:] - units[0]).tolist()  # how far a metre along x, along y moves the image
         canvas_view = _shifted_view(self.view, self._low, (int(size[1]), int(size[0])))
         self._canvas = spline_coefficients(self._sampled(canvas_view, 0.0, 0.0)).contiguous()
 
@@ -174,8 +176,8 @@ class SlidingWall:
 
     def _shift(self, x_m: float, y_m: float) -> tuple[torch.Tensor, int, list[float]]:
         """Return the canvas at the camera's rows [H, C], its column under pixel 0, and the four weights."""
-        origin, moved = self.view.pixels(torch.tensor([(0.0, 0.0), (x_m, y_m)], dtype=torch.float64))
-        across, down = (moved - origin).tolist()
+        (right_x, right_y), (down_x, down_y) = self._pixels_per_m
+        across, down = right_x * x_m + down_x * y_m, right_y * x_m + down_y * y_m
         whole, taps = _taps(-across)
         return self._rows(down), whole - 1 - self._low[0], taps
 

@@ -1,0 +1,247 @@
+"""What a rig can show at all: singular values, patterns above the noise, finest stroke, best linear picture."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from evnlos.evaluation.identify_glyphs import Plates, handwritten_plates
+from evnlos.evaluation.identify_linear import LinearEstimator, finest_bars
+from evnlos.evaluation.identify_rig import (
+    AnyTransport,
+    Bench,
+    SeenRig,
+    camera_variance,
+    carried_on,
+    seen_rig,
+)
+from evnlos.evaluation.identify_words import truncation_note, verdict
+from evnlos.seeds import derive_seed
+from evnlos.sensor import FrameCamera
+from evnlos.transport import PaperTransport
+
+MODE_LEVEL = 1e-2
+"""Singular values above this share of the largest count as usable modes."""
+KINK_LEVEL = 1e-4
+"""Level at which the kink of a cut tPSF is told apart from what the wall shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class AtNoise:
+    """What is left of a rig at one noise; figures are expectations over the noise of one picture of the wall.
+
+    Args:
+        noise: Root mean square noise of a pixel, white levels.
+        patterns: Patterns in which handwritten plates differ by more than the noise.
+        psnr_db: Mean over unseen plates of the PSNR of the best linear picture, on the plate.
+        stroke_m: Width of the finest bars that are resolved, upright and lying, metres; None where none are.
+        spectrum: Singular values of the matrix in units of the noise, float64 [n], descending.
+        picard: Coefficient of the typical plate's picture on each mode, in units of the noise, float64 [n].
+        modes: The first modes as plates, float64 [8, h, w], unit norm.
+        picture: The best linear picture of the typical plate with one draw of the noise, float64 [h, w].
+    """
+
+    noise: float
+    patterns: int
+    psnr_db: float
+    stroke_m: tuple[float | None, float | None]
+    spectrum: torch.Tensor
+    picard: torch.Tensor
+    modes: torch.Tensor
+    picture: torch.Tensor
+
+    @property
+    def finest_m(self) -> float | None:
+        """Width of the finest bars that are resolved in both directions, metres."""
+        upright, lying = self.stroke_m
+        return None if upright is None or lying is None else max(upright, lying)
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What a rig can show at all.
+
+    Args:
+        name: Name of the rig.
+        transport: Its settings.
+        camera: Its frame camera.
+        bench: How the question was put.
+        singular: Singular values over the largest, float64 [n], descending.
+        modes: How many of them lie above 1e-2.
+        zero_db: Mean PSNR of the all-black picture, on the plate.
+        mean_db: Mean PSNR of the mean training plate, on the plate.
+        stroke_m: Typical stroke of the plates, metres.
+        truth: The typical plate, float64 [h, w].
+        at_camera: At the frame camera's own noise.
+        at_fixed: At the fixed noise of the bench.
+        verdict: The same in words.
+        warnings: What makes the figures look better than they are.
+    """
+
+    name: str
+    transport: AnyTransport
+    camera: FrameCamera
+    bench: Bench
+    singular: torch.Tensor
+    modes: int
+    zero_db: float
+    mean_db: float
+    stroke_m: float
+    truth: torch.Tensor
+    at_camera: AtNoise
+    at_fixed: AtNoise
+    verdict: str
+    warnings: tuple[str, ...] = ()
+
+    def summary(self, arrays: bool = False) -> dict[str, Any]:
+        """Return plain numbers and words; with `arrays` also singular values and Picard coefficients."""
+        found: dict[str, Any] = {
+            "rig": self.name,
+            "verdict": self.verdict,
+            "warnings": list(self.warnings),
+            "modes_above_1e-2": self.modes,
+            "psnr_zero_db": round(self.zero_db, 2),
+            "psnr_mean_db": round(self.mean_db, 2),
+            "typical_stroke_m": round(self.stroke_m, 5),
+            "bench": asdict(self.bench),
+            "frame_camera": asdict(self.camera),
+            "transport": asdict(self.transport),
+        }
+        for name, one in (("camera_noise", self.at_camera), ("fixed_noise", self.at_fixed)):
+            found[name] = {
+                "rms_noise": round(one.noise, 6),
+                "patterns_above_noise": one.patterns,
+                "psnr_linear_db": round(one.psnr_db, 2),
+                "finest_upright_stroke_m": _rounded(one.stroke_m[0]),
+                "finest_lying_stroke_m": _rounded(one.stroke_m[1]),
+            }
+            if arrays:
+                found[name]["singular_values_over_noise"] = one.spectrum.tolist()
+                found[name]["picard_coefficients_over_noise"] = one.picard.tolist()
+        if arrays:
+            found["singular_values"] = self.singular.tolist()
+        return found
+
+
+def identify(
+    transport: AnyTransport,
+    camera: FrameCamera | None = None,
+    bench: Bench | None = None,
+    name: str = "rig",
+    seed: int = 0,
+) -> Identification:
+    """Say what one picture of the wall can show of a plate at a known place, whatever the method.
+
+    The linear map from the plate's cells to the camera's pixels is taken apart by its singular values; the
+    noise is the frame camera's at the light of the mean plate, and a fixed share of the brightest pixel. The
+    best linear picture uses mean and covariance of handwriting and is tested on characters and writers that it
+    never saw.
+
+    Args:
+        transport: The rig.
+        camera: Its frame camera; None is the default one.
+        bench: Cells, pixels and noise; None is the default, that of the table in docs/identifiability.md.
+        name: What to call the rig.
+        seed: Seed of the one picture that is drawn with noise.
+
+    Raises:
+        ConfigError: The rig can't be, or the camera gets no light from the plate.
+
+    Example:
+        >>> from evnlos.transport import rig_preset
+        >>> found = identify(rig_preset("matte"), bench=Bench(cells=8, height=12, width=20, writers=1))
+        >>> found.modes
+        3
+    """
+    bench, camera = bench or Bench(), camera or FrameCamera()
+    rig = seen_rig(transport, bench)
+    plates = handwritten_plates(bench.plate, bench.writers)
+    singular = singular_values(rig.matrix)
+    light = rig.ambient + rig.matrix @ plates.mean
+    own = camera_variance(light, camera, bench.frames, bench.known_pattern)
+    fixed = torch.full_like(own, (bench.fixed_noise * rig.white) ** 2 / bench.frames)
+    at_camera, at_fixed = (at_noise(rig, variance, plates, seed) for variance in (own, fixed))
+    warnings = []
+    if isinstance(transport, PaperTransport) and transport.taper < 1:
+        wide = singular_values(seen_rig(carried_on(transport), bench).matrix)
+        note = truncation_note(transport, counted(singular, KINK_LEVEL), counted(wide, KINK_LEVEL), KINK_LEVEL)
+        warnings += [note] if note else []
+    zero_db, mean_db = (
+        _psnr((plates.test - blank).square().mean(dim=-1))
+        for blank in (torch.zeros_like(plates.mean), plates.mean)
+    )
+    return Identification(
+        name,
+        transport,
+        camera,
+        bench,
+        singular,
+        counted(singular, MODE_LEVEL),
+        zero_db,
+        mean_db,
+        plates.stroke_m,
+        plates.test[plates.typical].reshape(bench.plate.shape),
+        at_camera,
+        at_fixed,
+        verdict(at_camera.patterns, at_camera.stroke_m, plates.stroke_m, bench.plate_m),
+        tuple(warnings),
+    )
+
+
+def at_noise(rig: SeenRig, variance: torch.Tensor, plates: Plates, seed: int = 0) -> AtNoise:
+    """Return what is left of a rig at independent noise of a given variance.
+
+    Args:
+        rig: The linear map.
+        variance: Variance of each pixel's noise, white levels squared, [H W], above 0.
+        plates: Prior and test.
+        seed: Seed of the one picture that is drawn with noise.
+    """
+    cells, shape = rig.plate.width, rig.plate.shape
+    whitened = rig.matrix / variance.sqrt()[:, None]
+    gram = whitened.mT @ whitened
+    power, axes = torch.linalg.eigh(gram)
+    power, axes = power.flip(0).clamp(min=0), axes.flip(1)
+    # The sign of a mode is free: the larger half is shown bright.
+    axes = axes * torch.where(axes.sum(dim=0) < 0, -1.0, 1.0)
+    typical = plates.test[plates.typical]
+    estimator = LinearEstimator.known(gram, plates.mean, plates.root)
+    shapeless = LinearEstimator.white(gram, power, axes)
+    generator = torch.Generator().manual_seed(derive_seed(seed, "identify"))
+    noise = torch.randn(len(variance), generator=generator, dtype=torch.float64)
+    seen = gram @ (typical - plates.mean) + whitened.mT @ noise
+    strokes = [finest_bars(shapeless, cells, upright) for upright in (True, False)]
+    upright, lying = (None if one is None else one * rig.plate.pitch_m for one in strokes)
+    return AtNoise(
+        float(variance.mean().sqrt()),
+        estimator.patterns_seen,
+        _psnr(estimator.expected_error(plates.test)),
+        (upright, lying),
+        power.sqrt(),
+        power.sqrt() * (axes.mT @ typical).abs(),
+        axes[:, :8].mT.reshape(8, *shape),
+        estimator.estimate(seen).reshape(shape),
+    )
+
+
+def singular_values(matrix: torch.Tensor) -> torch.Tensor:
+    """Return the singular values of a tall matrix over the largest one, float64 [n], descending."""
+    # The triangle of a QR decomposition has the same ones; a product A^T A would lose those below 1e-8.
+    values = torch.linalg.svdvals(torch.linalg.qr(matrix.double(), mode="r").R)
+    return values / values[0]
+
+
+def counted(singular: torch.Tensor, level: float) -> int:
+    """Return how many singular values lie above a share of the largest."""
+    return int((singular > level * singular[0]).sum())
+
+
+def _psnr(error: torch.Tensor) -> float:
+    """Return the mean PSNR of pictures with these mean squared errors, dB, peak 1."""
+    return float((-10 * torch.log10(error)).mean())
+
+
+def _rounded(length_m: float | None) -> float | None:
+    return None if length_m is None else round(length_m, 5)

@@ -1,0 +1,80 @@
+"""From the name of a rig, or a file that describes one, to what `identify` needs."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from evnlos.config import from_dict, read_yaml
+from evnlos.dataset import Simulation
+from evnlos.dataset.lab import Lab
+from evnlos.dataset.presets import PRESETS
+from evnlos.errors import ConfigError
+from evnlos.evaluation.identify_rig import AnyTransport
+from evnlos.sensor import FrameCamera
+from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
+from evnlos.transport.rig import rig_names
+
+
+@dataclass(frozen=True)
+class Described:
+    """A rig and its frame camera.
+
+    Args:
+        name: Name of the rig, or of its file.
+        transport: Its transport.
+        camera: Its frame camera.
+    """
+
+    name: str
+    transport: AnyTransport
+    camera: FrameCamera
+
+
+def described_rig(text: str | Path) -> Described:
+    """Return the rig of a name ("main-near"; "simulate-paper" for a preset of `simulate`) or of a YAML file.
+
+    A file holds the settings of `evnlos simulate` or `evnlos lab` (of which `transport` and `frame_camera` are
+    taken; what `vary` would draw stays as written), a dataset's `dataset.yaml`, a lab's `lab.yaml`, or the
+    settings of a transport alone.
+
+    Raises:
+        ConfigError: There is no such name and no such file, or the file holds something else.
+
+    Example:
+        >>> described_rig("hard-far").transport.roughness
+        0.1
+    """
+    path = Path(text)
+    if not path.is_file():
+        if path.suffix in (".yaml", ".yml"):
+            raise ConfigError(f"{path} does not exist; give a rig file or one of {', '.join(rig_names())}")
+        preset = str(text).removeprefix("simulate-")
+        if preset != str(text):
+            if preset not in PRESETS:
+                raise ConfigError(f"simulate has no preset {preset!r}; give one of {', '.join(PRESETS)}")
+            simulation = PRESETS[preset]()
+            return Described(str(text), simulation.transport, simulation.frame_camera)
+        return Described(str(text), rig_preset(str(text)), FrameCamera())
+    values = read_yaml(path)
+    if isinstance(values.get("lab"), dict):
+        values = values["lab"]
+    elif isinstance(values.get("config"), dict):
+        values = values["config"]
+    if "kind" in values:
+        either: Any = PaperTransport | RadiometricTransport
+        return Described(path.stem, from_dict(either, values, source=str(path)), FrameCamera())
+    if "transport" not in values:
+        near = difflib.get_close_matches("transport", [str(key) for key in values], n=1)
+        hint = f"; perhaps {near[0]!r} is meant to be it" if near else ""
+        raise ConfigError(
+            f"{path} has no `transport`; give settings of `evnlos simulate` or `evnlos lab`{hint}"
+        )
+    lab_only = {item.name for item in fields(Lab)} - {item.name for item in fields(Simulation)}
+    if lab_only & values.keys():
+        lab = from_dict(Lab, values, source=str(path)).drawn()
+        return Described(path.stem, lab.transport, lab.frame_camera)
+    simulation = from_dict(Simulation, values, source=str(path))
+    return Described(path.stem, simulation.transport, simulation.frame_camera)

@@ -1,0 +1,322 @@
+"""What a rig can show: the linear algebra against slow truths, the mode counts, the words, the command."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evnlos.cli import main
+from evnlos.config import save_yaml
+from evnlos.dataset import Simulation
+from evnlos.dataset.lab import Lab
+from evnlos.errors import ConfigError, DataError
+from evnlos.evaluation.identify import counted, identify, singular_values
+from evnlos.evaluation.identify_glyphs import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_plates
+from evnlos.evaluation.identify_linear import LinearEstimator, bars, finest_bars
+from evnlos.evaluation.identify_rig import Bench, camera_variance, carried_on, seen_rig
+from evnlos.evaluation.identify_source import described_rig
+from evnlos.evaluation.identify_table import rig_table
+from evnlos.evaluation.identify_words import verdict
+from evnlos.scene import LineMotion, Scene, Target
+from evnlos.sensor import FrameCamera
+from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
+from evnlos.transport.rig import rig_names
+
+SMALL = Bench(cells=8, height=12, width=20, writers=1)
+
+
+def random_problem(count: int = 12, pixels: int = 30):
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    root = draw(count, count) / 4
+    return draw(pixels, count), 0.3 + 0.1 * draw(count), root, 0.1 + draw(pixels).square()
+
+
+def test_the_estimator_is_the_textbook_one():
+    """x^ = m + C A^T (A C A^T + D)^-1 (y - A m), written out in the pixels' space."""
+    matrix, mean, root, variance = random_problem()
+    whitened = matrix / variance.sqrt()[:, None]
+    gram = whitened.mT @ whitened
+    estimator = LinearEstimator.known(gram, mean, root)
+    covariance = root @ root.mT
+    gain = covariance @ matrix.mT @ torch.linalg.inv(matrix @ covariance @ matrix.mT + torch.diag(variance))
+    y = torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    expected = mean + gain @ (y - matrix @ mean)
+    backprojected = matrix.mT @ ((y - matrix @ mean) / variance)
+    torch.testing.assert_close(estimator.estimate(backprojected), expected, rtol=1e-9, atol=1e-12)
+    assert estimator.noise_error == pytest.approx(float((gain @ torch.diag(variance) @ gain.mT).trace()) / 12)
+    # The posterior variance, averaged over the prior, is the expected error: trace(C - K A C).
+    posterior = float((covariance - gain @ matrix @ covariance).trace()) / 12
+    plates = mean + torch.randn(20_000, 12, generator=torch.Generator().manual_seed(2)).double() @ root.mT
+    assert float(estimator.expected_error(plates).mean()) == pytest.approx(posterior, rel=0.03)
+
+
+def test_expected_error_against_drawn_noise():
+    matrix, mean, root, variance = random_problem()
+    estimator = LinearEstimator.known(matrix.mT @ (matrix / variance[:, None]), mean, root)
+    plate = torch.linspace(0, 1, 12, dtype=torch.float64)
+    noise = torch.randn(20_000, 30, generator=torch.Generator().manual_seed(3)).double() * variance.sqrt()
+    seen = (matrix @ (plate - mean) + noise) / variance
+    error = (estimator.estimate(seen @ matrix) - plate).square().mean()
+    assert float(estimator.expected_error(plate)) == pytest.approx(float(error), rel=0.03)
+
+
+def test_white_prior_is_the_general_one_with_independent_cells():
+    matrix, _, _, variance = random_problem()
+    gram = matrix.mT @ (matrix / variance[:, None])
+    power, axes = torch.linalg.eigh(gram)
+    white = LinearEstimator.white(gram, power.flip(0), axes.flip(1))
+    half = torch.full((12,), 0.5, dtype=torch.float64)
+    known = LinearEstimator.known(gram, half, torch.eye(12, dtype=torch.float64) / 2)
+    plates = torch.rand(5, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.testing.assert_close(white.expected(plates), known.expected(plates))
+    assert white.noise_error == pytest.approx(known.noise_error)
+    assert white.patterns_seen == known.patterns_seen
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(0.3, 8.0), st.floats(-10.0, 10.0))
+def test_bars_are_means_over_cells(width, phase):
+    """A hundred points a cell of the square wave itself."""
+    drawn = bars(16, width, phase)
+    points = (np.arange(1600) + 0.5) / 100
+    wave = ((points - phase) % (2 * width) < width).reshape(16, 100).mean(axis=1)
+    np.testing.assert_allclose(drawn[3].numpy(), wave, atol=0.1)
+    torch.testing.assert_close(bars(16, width, phase, upright=False), drawn.mT)
+
+
+def test_finest_bars_of_known_cameras():
+    """A camera of all cells resolves single cells, a blind one nothing, block means of 4 cells bars near 4."""
+
+    def finest(matrix: torch.Tensor) -> float | None:
+        power, axes = torch.linalg.eigh(matrix.mT @ matrix)
+        estimator = LinearEstimator.white(matrix.mT @ matrix, power.flip(0).clamp(min=0), axes.flip(1))
+        return finest_bars(estimator, 16)
+
+    sharp = 1e3 * torch.eye(256, dtype=torch.float64)
+    assert finest(sharp) == pytest.approx(1.0)
+    assert finest(1e-6 * sharp) is None
+    block = torch.kron(torch.eye(4), torch.ones(1, 4) / 4).double()
+    found = finest(1e3 * torch.kron(block, block))
+    assert found is not None and 3.0 < found < 6.0
+
+
+@pytest.mark.parametrize("level", [0.05, 0.5])
+@pytest.mark.parametrize("known", [True, False])
+def test_noise_is_that_of_the_camera(level, known):
+    camera = FrameCamera(full_well_e=4000.0, read_noise_e=15.0, prnu=0.03, dsnu_e=20.0, bit_depth=10)
+    if known:
+        camera = dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0)
+    frame = camera.expose(np.full((1, 200, 200), level), seed=1)[0] / camera.white
+    variance = camera_variance(torch.tensor(level, dtype=torch.float64), camera, known_pattern=known)
+    assert float(frame.var()) == pytest.approx(float(variance), rel=0.03)
+    quarter = camera_variance(torch.tensor(level), dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0), frames=4)
+    whole = camera_variance(torch.tensor(level), dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0))
+    assert float(quarter) == pytest.approx(float(whole) / 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        ("matte-near", 3),
+        ("matte-far", 3),
+        ("hard-near", 12),
+        ("hard-far", 7),
+        ("main-near", 28),
+        ("main-far", 14),
+        ("easy-far", 47),
+        ("aperture-near", 16),
+        ("aperture-far", 17),
+    ],
+)
+def test_mode_counts_of_the_presets(name, count):
+    found = counted(singular_values(seen_rig(rig_preset(name)).matrix), 1e-2)
+    assert abs(found - count) <= max(1, 0.03 * count)
+
+
+def plate_in_the_middle() -> Scene:
+    mask = np.zeros((32, 32))
+    mask[4:20, 6:10], mask[16:20, 6:28] = 1.0, 0.5
+    return Scene(Target("corner", mask), LineMotion(), 8.0)
+
+
+def test_the_matrix_is_the_rig_that_the_lab_renders():
+    for rig in (
+        RadiometricTransport(roughness=0.3, gain=0.6, ambient=0.1, ambient_gradient=(0.2, -0.1)),
+        RadiometricTransport(roughness=0.3, strip_m=(0.24, 0.12), gain=0.6),
+        RadiometricTransport(wall_material="lambert", lamp_m=(-0.4, 0.0, 0.05)),
+    ):
+        scene, bench = plate_in_the_middle(), Bench(height=12, width=20)
+        seen = seen_rig(rig, bench)
+        mask = torch.from_numpy(scene.target.rasterise(bench.plate)).double().flatten()
+        rendered = rig.wall(scene, bench.shape).irradiance(4.0)
+        expected = (seen.ambient + seen.matrix @ mask).reshape(bench.shape).float()
+        torch.testing.assert_close(rendered, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_papers_matrix_is_its_wall_but_for_diffraction():
+    scene, bench = plate_in_the_middle(), Bench(height=25, width=40)
+    for length_m in (0.004, 0.02):
+        rig = PaperTransport(tpsf_length_m=length_m, gain=0.9, field_of_view_m=0.3)
+        seen = seen_rig(rig, bench)
+        mask = torch.from_numpy(scene.target.rasterise(bench.plate)).double().flatten()
+        rendered = rig.wall(scene, bench.shape).irradiance(4.0).double().flatten()
+        expected = seen.ambient + seen.matrix @ mask
+        assert float((rendered - expected).abs().max()) < 0.03 * float(expected.max())
+
+
+def test_a_cut_tpsf_is_told_apart():
+    cut = identify(PaperTransport(tpsf_length_m=0.02), bench=Bench(cells=16, height=20, width=32, writers=1))
+    assert "kink" in cut.warnings[0]
+    assert "rho = 2 with taper 0" in cut.warnings[0]
+    faded = identify(
+        PaperTransport(tpsf_length_m=0.02, taper=1.0), bench=Bench(cells=16, height=20, width=32, writers=1)
+    )
+    assert not faded.warnings
+    assert carried_on(PaperTransport()).rho_max == 8.0
+
+
+def test_prior_and_test_share_no_character():
+    assert not set(TEST_CHARACTERS) & set(TRAIN_CHARACTERS)
+    assert len(TEST_CHARACTERS) + len(TRAIN_CHARACTERS) == 36
+    plates = handwritten_plates(SMALL.plate, 1)
+    assert len(plates.names) == len(plates.test) == 2 * len(TEST_CHARACTERS)
+    assert 0.004 < plates.stroke_m < 0.012
+
+
+def test_a_sharp_rig_shows_more_than_a_matte_wall():
+    bench = Bench(cells=16, height=30, width=48, writers=1)
+    easy, matte = (identify(rig_preset(name), bench=bench, name=name) for name in ("easy", "matte"))
+    assert easy.modes > 5 * matte.modes
+    assert easy.at_camera.patterns > 2 * matte.at_camera.patterns
+    assert easy.at_camera.psnr_db > matte.at_camera.psnr_db + 1 > matte.mean_db + 1
+    assert easy.at_camera.patterns > easy.at_fixed.patterns
+    assert matte.at_camera.finest_m is None
+    assert "memory" in matte.verdict and "memory, not a measurement" not in easy.verdict
+    averaged = identify(rig_preset("easy"), bench=dataclasses.replace(bench, frames=100))
+    assert averaged.at_camera.noise == pytest.approx(easy.at_camera.noise / 10)
+    assert averaged.at_camera.patterns > easy.at_camera.patterns
+    assert averaged.at_camera.finest_m < easy.at_camera.finest_m
+    json.dumps(easy.summary(arrays=True))
+    assert rig_table([easy, matte]).count("\n| ") == 2
+
+
+def test_a_post_resolves_across_itself_only():
+    found = identify(rig_preset("aperture"), bench=Bench(cells=16, height=30, width=48, writers=1))
+    upright, lying = found.at_camera.stroke_m
+    assert upright is not None and upright < 0.012
+    assert lying is None
+    assert "upright bars" in found.verdict
+
+
+def test_picard_and_picture():
+    """The coefficients of a noiseless picture, from the definition; the same seed draws the same picture."""
+    one, same, other = (identify(rig_preset("hard"), bench=SMALL, seed=seed) for seed in (0, 0, 1))
+    rig = seen_rig(rig_preset("hard"), SMALL)
+    plates = handwritten_plates(SMALL.plate, 1)
+    light = rig.ambient + rig.matrix @ plates.mean
+    whitened = rig.matrix / camera_variance(light, FrameCamera()).sqrt()[:, None]
+    left, values, _ = torch.linalg.svd(whitened, full_matrices=False)
+    torch.testing.assert_close(one.at_camera.spectrum[:20], values[:20], rtol=1e-6, atol=1e-9)
+    seen = (left.mT @ (whitened @ plates.test[plates.typical])).abs()
+    torch.testing.assert_close(one.at_camera.picard[:20], seen[:20], rtol=1e-5, atol=1e-6)
+    assert torch.equal(one.at_camera.picture, same.at_camera.picture)
+    assert not torch.equal(one.at_camera.picture, other.at_camera.picture)
+
+
+@pytest.mark.parametrize(
+    ("widths", "words"),
+    [
+        ((0.005, 0.006), "strokes of 8.0 mm are measured"),
+        ((0.012, 0.019), "rough shape"),
+        ((0.012, 0.021), "memory, not a measurement"),
+        ((None, 0.004), "lying bars down to 4.0 mm, upright ones not at all"),
+        ((None, None), "no bars at all"),
+    ],
+)
+def test_verdict(widths, words):
+    assert words in verdict(5, widths, 0.008, 0.08)
+
+
+def test_command(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    small = ["--cells", "8", "--height", "12", "--width", "20", "--writers", "1"]
+    main(["identify", "matte-near", "--json", *small])
+    found = json.loads(capsys.readouterr().out)
+    assert (found["rig"], found["modes_above_1e-2"]) == ("matte-near", 3)
+    assert "memory" in found["verdict"]
+    main(["identify", "matte-near", "hard-far", "--out", str(tmp_path / "o"), *small])
+    shown = capsys.readouterr().out
+    assert "| matte-near | 3 |" in shown and "hard-far: With this wall" in shown
+    names = {path.name for path in (tmp_path / "o").iterdir()}
+    assert names == {"identify_matte-near.png", "identify_hard-far.png", "identify_rigs.png", "identify.json"}
+    assert len(json.loads((tmp_path / "o" / "identify.json").read_text())) == 2
+
+
+def test_rig_files(tmp_path):
+    assert described_rig("simulate-paper").transport == PaperTransport()
+    path = tmp_path / "rig.yaml"
+    save_yaml(rig_preset("hard"), path)
+    assert described_rig(path).transport == rig_preset("hard")
+    save_yaml(Simulation(transport=PaperTransport(taper=0.3)), path)
+    assert described_rig(path).transport == PaperTransport(taper=0.3)
+    lab = Lab(name="bench", transport=rig_preset("aperture"))
+    save_yaml(lab, path)
+    assert described_rig(path).transport == rig_preset("aperture")
+    assert described_rig(path).camera == lab.drawn().frame_camera
+    path.write_text("transport: {kind: radiometric, roughness: 0.2}\nframe_camera: {read_noise_e: 3.0}\n")
+    assert described_rig(path).camera.read_noise_e == 3.0
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("kind: radiometric\nroughnes: 0.1\n", "roughness"),
+        ("transprt: {}\n", "has no `transport`.*transprt"),
+        ("transport: {kind: mirror}\n", "kind is 'mirror'"),
+        ("- 1\n", "mapping"),
+    ],
+)
+def test_bad_rig_files(tmp_path, text, match):
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=match):
+        described_rig(path)
+
+
+@pytest.mark.parametrize(
+    ("match", "make"),
+    [
+        ("perhaps you meant 'main-near'", lambda: described_rig("main-nera")),
+        ("does not exist", lambda: described_rig("nothing.yaml")),
+        ("no preset 'papr'", lambda: described_rig("simulate-papr")),
+        ("cells is 4", lambda: Bench(cells=4)),
+        ("cells is 100", lambda: Bench(cells=100)),
+        ("plate_m is 0", lambda: Bench(plate_m=0.0)),
+        ("fixed_noise", lambda: Bench(fixed_noise=float("nan"))),
+        ("does not see the wall", lambda: seen_rig(RadiometricTransport(camera_angle_deg=80.0), SMALL)),
+        ("no light", lambda: seen_rig(PaperTransport(offset_m=(5.0, 0.0)), SMALL)),
+    ],
+)
+def test_bad_input(match, make):
+    with pytest.raises(ConfigError, match=match):
+        make()
+
+
+def test_bad_sizes():
+    with pytest.raises(DataError, match="root"):
+        LinearEstimator.known(torch.eye(3), torch.zeros(3), torch.eye(4))
+
+
+def test_no_rig(capsys):
+    with pytest.raises(SystemExit):
+        main(["identify"])
+    assert "no rig given" in capsys.readouterr().err
+    assert len(rig_names()) == 12

@@ -1,0 +1,309 @@
+"""The virtual laboratory: captures in the format of real ones, from a rig file, with a sensor of their own."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from evnlos.config import from_dict, load_yaml, read_yaml, save_yaml
+from evnlos.dataset import SensorSize, read_capture
+from evnlos.dataset.lab import Lab, lab_preset, render_captures
+from evnlos.dataset.lab_sensor import SENSOR_SPREAD
+from evnlos.dataset.presets import default
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, Scene
+from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
+from evnlos.transport.diffraction import Diffraction
+from evnlos.transport.rig import rig_names
+from evnlos.types import Plane
+
+
+def small(**changes) -> Lab:
+    """Return a lab that renders a capture in a second or so."""
+    rig = RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06, **changes.pop("rig", {}))
+    settings = {
+        "glyphs": FontGlyphs(family="kalam", characters="AL"),
+        "sensor": SensorSize(24, 36),
+        "frame_rate_hz": 1.0,
+        "transport": rig,
+    }
+    return Lab(**settings | changes)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("lab") / "near"
+    assert [path.name for path in render_captures(small(name="near"), out)] == ["near_A", "near_L"]
+    return out
+
+
+def test_sensor_is_drawn_from_the_stated_ranges():
+    seen = {path: [] for path in SENSOR_SPREAD}
+    for seed in range(40):
+        lab = Lab(seed=seed).drawn()
+        for path, (low, high) in SENSOR_SPREAD.items():
+            part, name = path.split(".")
+            value = getattr(getattr(lab, part), name)
+            assert low <= value <= high
+            seen[path].append(value)
+    for path, (low, high) in SENSOR_SPREAD.items():
+        assert np.ptp(seen[path]) > 0.8 * (high - low), f"{path} does not fill its range"
+
+
+def test_a_rig_keeps_its_sensor_and_another_rig_has_its_own():
+    assert Lab(seed=3).drawn() == Lab(seed=3).drawn() == Lab(seed=3).drawn().drawn()
+    assert Lab(seed=3).drawn().pixel != Lab(seed=4).drawn().pixel
+    assert Lab(name="other", seed=3).drawn().pixel != Lab(seed=3).drawn().pixel
+    assert Lab(seed=3).drawn().frame_camera.pattern_seed != Lab(seed=4).drawn().frame_camera.pattern_seed
+    fixed = Lab(spread={})
+    assert fixed.drawn() == fixed
+
+
+def test_the_sensor_is_not_the_training_simulators():
+    training = default()
+    for path, (low, high) in SENSOR_SPREAD.items():
+        part, name = path.split(".")
+        if path not in training.vary and path != "pixel.hot_pixel_fraction":
+            used = getattr(getattr(training, part), name)
+            assert not low < used < high, path
+
+
+def test_a_capture_reads_like_a_recording(rendered):
+    capture = read_capture(rendered / "near_A")
+    assert (capture.name, capture.target.name, capture.info.target.plate_m) == ("near_A", "A", 0.08)
+    assert capture.frames.shape == (9, 24, 36)
+    assert capture.frame_times_us.tolist() == [1_000_000 * k for k in range(9)]
+    assert len(capture.events) > 100
+    assert capture.scene.motion == LineMotion()
+
+
+def test_what_was_drawn_is_written_down(rendered):
+    lab, notes = small(name="near"), read_yaml(rendered / "lab.yaml")
+    drawn = lab.drawn()
+    assert from_dict(Lab, notes["lab"]) == lab
+    assert from_dict(type(drawn.pixel), notes["drawn"]["pixel"]) == drawn.pixel
+    about = read_capture(rendered / "near_L").info.rig["rendered"]
+    assert from_dict(type(drawn.pixel), about["pixel"]) == drawn.pixel
+    assert from_dict(type(drawn.frame_camera), about["frame_camera"]) == drawn.frame_camera
+    assert from_dict(RadiometricTransport, about["transport"]) == lab.transport
+
+
+def test_a_run_is_taken_up_again(rendered, tmp_path):
+    """A killed run leaves a draft; what is done is kept, what is missing comes out the same."""
+    out = tmp_path / "near"
+    lab = small(name="near")
+    first = next(iter(render_captures(lab, out)))
+    (out / ".near_L.tmp" / "frames").mkdir(parents=True)
+    (out / ".near_L.tmp" / "events.raw").write_bytes(b"half")
+    stamp = (first / "capture.yaml").stat().st_mtime_ns
+    assert [path.name for path in render_captures(lab, out)] == ["near_A", "near_L"]
+    assert (first / "capture.yaml").stat().st_mtime_ns == stamp
+    assert content(out) == content(rendered)
+
+
+def test_more_characters_may_be_added_but_no_other_rig(rendered):
+    more = small(name="near", glyphs=FontGlyphs(family="kalam", characters="ALI"))
+    with pytest.raises(DataError, match=r"begun with other settings.*seed: 0 -> 1"):
+        list(render_captures(dataclasses.replace(more, seed=1), rendered))
+    before = content(rendered / "near_A")
+    assert len(list(render_captures(more, rendered))) == 3
+    assert content(rendered / "near_A") == before
+
+
+def test_other_glyphs_keep_their_whole_name(tmp_path):
+    lab = small(glyphs=HandwritingGlyphs(characters="A", writers=1))
+    assert [path.name for path in render_captures(lab, tmp_path / "o")] == ["lab_writer00_A"]
+
+
+RIG_FILE = """
+name: bench
+seed: 5
+glyphs: {kind: font, family: kalam, characters: L}
+sensor: {height: 24, width: 36}
+frame_rate_hz: 1.0
+transport:
+  wall_material: lambert
+  distance_m: 0.4
+  cell_m: 0.01
+  ambient: 0.2
+  ambient_gradient: [0.5, 0.0]
+  lamp_m: [-0.5, 0.1, 0.05]
+  occluders_m:
+    - [[-0.14, -0.05, 0.25], [-0.11, -0.05, 0.25], [-0.11, 0.05, 0.25], [-0.14, 0.05, 0.25]]
+spread:
+  pixel.threshold_on: [0.3, 0.4]
+"""
+
+
+def test_a_rig_file_reaches_every_option(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(RIG_FILE)
+    lab = load_yaml(Lab, path)
+    assert len(lab.transport.occluders()) == 1
+    assert 0.3 <= lab.drawn().pixel.threshold_on <= 0.4
+    (folder,) = render_captures(lab, tmp_path / "o")
+    capture = read_capture(folder)
+    assert "1 occluder(s), torch-lit target" in capture.info.rig["wall"]
+    # Each option changes what the camera sees.
+    scene = Scene(lab.glyphs.target("kalam_L"), lab.motion, lab.duration_s)
+    seen = lab.transport.wall(scene, (24, 36)).irradiance(4.0)
+    for change in (
+        {"lamp_m": None},
+        {"occluders_m": ()},
+        {"ambient": 0.1},
+        {"ambient_gradient": (0.0, 0.0)},
+        {"wall_material": "ggx"},
+    ):
+        other = dataclasses.replace(lab.transport, **change).wall(scene, (24, 36)).irradiance(4.0)
+        assert float((other - seen).abs().max()) > 1e-3, change
+
+
+def test_the_documents_rig_file():
+    text = (Path(__file__).parent.parent / "docs" / "lab.md").read_text()
+    lab = from_dict(Lab, yaml.safe_load(text.split("```yaml")[1].split("```")[0]))
+    assert (lab.name, lab.transport.lamp_m, lab.spread) == (
+        "bench",
+        (-0.5, 0.1, 0.05),
+        {"pixel.threshold_on": (0.18, 0.28)},
+    )
+    coarse = dataclasses.replace(lab.transport, cell_m=0.01)
+    assert coarse.wall(scene(), (6, 9)).irradiance(4.0).shape == (6, 9)
+
+
+@pytest.mark.parametrize("name", ["matte-near", "aperture-far"])
+def test_named_rigs_render(name, tmp_path):
+    lab = lab_preset(name)
+    lab = dataclasses.replace(
+        lab,
+        transport=dataclasses.replace(lab.transport, cell_m=0.01),
+        glyphs=FontGlyphs(family="kalam", characters="T"),
+        sensor=SensorSize(24, 36),
+        frame_rate_hz=0.5,
+    )
+    (folder,) = render_captures(lab, tmp_path / "o")
+    capture = read_capture(folder)
+    assert folder.name == f"{name}_T"
+    assert capture.frames.mean() > 1.3 * 255 * lab.transport.ambient
+    assert capture.info.rig["distance_m"] == (0.5 if name.endswith("far") else 0.3)
+
+
+def test_all_names():
+    assert rig_names()[:3] == ["mirror-near", "mirror-far", "easy-near"]
+    for name in rig_names():
+        assert lab_preset(name).transport.gain == 0.7
+    assert rig_preset("main-far").distance_m == 0.5
+    assert rig_preset("main-far", 0.4).distance_m == 0.4
+
+
+def test_occluders_of_a_rig_are_those_of_its_matrix():
+    """A plate-sized screen right before the target leaves only what passes beside it."""
+    wide = ((-0.4, -0.3, 0.29), (0.0, -0.3, 0.29), (0.0, 0.3, 0.29), (-0.4, 0.3, 0.29))
+    rig = RadiometricTransport(wall_material="lambert", cell_m=0.01, occluders_m=(wide,))
+    with pytest.raises(ConfigError, match="no light"):
+        rig.transport((6, 9))
+    half = tuple((min(x, -0.173), y, z) for x, y, z in wide)
+    left = RadiometricTransport(wall_material="lambert", cell_m=0.01, occluders_m=(half,))
+    matrix = left.matrix((6, 9), Plane(2, 2, 0.04))
+    assert float(matrix[:, 0].sum()) < 0.2 * float(matrix[:, 1].sum())
+    assert torch.isfinite(matrix).all()
+
+
+def scene() -> Scene:
+    return Scene(FontGlyphs(family="kalam", characters="A").target("kalam_A"), LineMotion(), 8.0)
+
+
+BAD = [
+    ("does not see the wall", lambda: RadiometricTransport(camera_angle_deg=80.0).wall(scene(), (6, 9))),
+    ("must stand before the wall", lambda: RadiometricTransport(camera_angle_deg=95.0).wall(scene(), (6, 9))),
+    ("distance_m is -0.3", lambda: RadiometricTransport(distance_m=-0.3).wall(scene(), (6, 9))),
+    ("distance_m is nan", lambda: RadiometricTransport(distance_m=float("nan")).wall(scene(), (6, 9))),
+    (
+        "crosses the wall",
+        lambda: RadiometricTransport(occluders_m=(((0, 0, -0.1), (0, 0.1, 0.1), (0.1, 0, 0.1)),)).occluders(),
+    ),
+    (
+        "reaches z = 0.35 m and the target's plane at 0.3 m",
+        lambda: RadiometricTransport(occluders_m=(((-0.2, 0, 0.35), (-0.2, 0.1, 0.2), (-0.1, 0, 0.2)),)).wall(
+            scene(), (6, 9)
+        ),
+    ),
+    (
+        r"hides the wall from \d+ % of the camera's pixels",
+        lambda: RadiometricTransport(
+            occluders_m=(((0.1, -0.1, 0.2), (0.2, -0.1, 0.2), (0.2, 0.1, 0.2), (0.1, 0.1, 0.2)),)
+        ).wall(scene(), (6, 9)),
+    ),
+    (
+        "needs 4 cells a side to show any shape: give at most 0.005 m",
+        lambda: small(rig={}).transport.wall(tiny_plate(), (6, 9)),
+    ),
+    ("cell_m is 0", lambda: RadiometricTransport(cell_m=0.0).wall(scene(), (6, 9))),
+    ("strip_height_m is 0", lambda: RadiometricTransport(strip_m=(0.24, 0.0)).wall(scene(), (6, 9))),
+    ("set strip_m to at least", lambda: RadiometricTransport(strip_m=(0.1, 0.08)).wall(scene(), (6, 9))),
+    (
+        "samples of 1e-06 m carry a field no farther than",
+        lambda: PaperTransport(wave_pitch_m=1e-6).wall(scene(), (6, 9)),
+    ),
+    ("pitch_m is 0", lambda: PaperTransport(pitch_m=0.0).wall(scene(), (6, 9))),
+    ("perhaps you meant 'matte-near'", lambda: rig_preset("mate-near")),
+    ("rig 'main-close' is unknown", lambda: rig_preset("main-close")),
+    ("Lab.name", lambda: Lab(name="a/b")),
+    ("duration_s is 0", lambda: Lab(duration_s=0.0)),
+    ("needs two frames", lambda: Lab(duration_s=1.0, frame_rate_hz=0.5)),
+    ("captures hold 8 bits", lambda: Lab(frame_camera=dataclasses.replace(Lab().frame_camera, bit_depth=12))),
+    ("threshold_on", lambda: Lab(spread={"pixel.threshold_on": (0.0, 0.2)})),
+    ("treshold", lambda: Lab(spread={"pixel.treshold_on": (0.1, 0.2)})),
+    ("size_m", lambda: FontGlyphs(plate=dataclasses.replace(FontGlyphs().plate, size_m=0.0))),
+]
+
+
+def tiny_plate() -> Scene:
+    plate = dataclasses.replace(FontGlyphs().plate, size_m=0.02)
+    return Scene(FontGlyphs(family="kalam", characters="A", plate=plate).target("kalam_A"), LineMotion(), 8.0)
+
+
+@pytest.mark.parametrize(("match", "make"), BAD, ids=[match for match, _ in BAD])
+def test_bad_rigs(match, make):
+    with pytest.raises(ConfigError, match=match):
+        make()
+
+
+def test_a_wrong_rig_writes_nothing(tmp_path):
+    lab = small(rig={"camera_angle_deg": 80.0})
+    with pytest.raises(ConfigError, match="does not see the wall"):
+        list(render_captures(lab, tmp_path / "o"))
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_foreign_folder_is_left_alone(tmp_path):
+    (tmp_path / "o" / "lab_A").mkdir(parents=True)
+    with pytest.raises(DataError, match=r"without a capture.yaml"):
+        list(render_captures(small(), tmp_path / "o"))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="is a file"):
+        list(render_captures(small(), tmp_path / "file"))
+
+
+def test_a_pitch_at_the_limit_still_propagates():
+    """Sixteen sampling limits: the band limit leaves a sixteenth of the frequencies, and energy is kept."""
+    plane = Plane(64, 64, 1e-5)
+    limit = 128 * 1e-10 / 500e-9
+    scene_image = torch.zeros(64, 64, dtype=torch.float64)
+    scene_image[16:48, 16:48] = 1.0
+    assert float(Diffraction(plane, distance_m=15.9 * limit)(scene_image).max()) > 0
+    with pytest.raises(ConfigError, match="raise the pitch"):
+        Diffraction(plane, distance_m=16.1 * limit)
+
+
+def test_settings_survive_a_file(tmp_path):
+    lab = small(rig={"occluders_m": (((-0.14, 0.0, 0.2), (-0.1, 0.0, 0.2), (-0.1, 0.05, 0.2)),)})
+    save_yaml(lab, tmp_path / "lab.yaml")
+    assert load_yaml(Lab, tmp_path / "lab.yaml") == lab
