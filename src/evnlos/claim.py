@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from evnlos.errors import DataError
 
 LOCK = ".lock"
@@ -25,6 +23,8 @@ def claim(folder: str | Path, part: str = "") -> Iterator[Path]:
     Raises:
         DataError: Another process holds it.
     """
+    from filelock import FileLock, Timeout
+
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{LOCK}-{part}" if part else LOCK

@@ -55,19 +55,17 @@ def _grown(column):
 
 
 @njit(cache=True, error_model="numpy")
-def _emit(out, count, time_s, pixel, on, jitter, window, seed, sent):
-    """Append an event, growing the columns when they are full."""
-    out_time, out_pixel, out_on = out
-    if count == len(out_time):
-        out_time, out_pixel, out_on = _grown(out_time), _grown(out_pixel), _grown(out_on)
+def _emit(out_time, out_pixel, out_on, count, time_s, pixel, on, jitter, window, seed, sent):
+    """Append an event to the columns and return their fill; where they are full it is only counted."""
     if jitter > 0.0:
         time_s += jitter * random_normal(seed, STREAM_TIME_JITTER, pixel, sent[pixel])
         time_s = min(max(time_s, window[0]), window[1])
     sent[pixel] += 1
-    out_time[count] = np.int64(np.rint(time_s * 1e6))
-    out_pixel[count] = pixel
-    out_on[count] = on
-    return (out_time, out_pixel, out_on), count + 1
+    if count < len(out_time):
+        out_time[count] = np.int64(np.rint(time_s * 1e6))
+        out_pixel[count] = pixel
+        out_on[count] = on
+    return count + 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -89,12 +87,12 @@ def _shot(seed, pixel, counter, intensity, rate_on, rate_off, rate_hot):
 
 @njit(cache=True, error_model="numpy")
 def _piece(
-    out, count, pixel, start, length, light_a, light_b, log_a, log_b, filtered, state, constants, jitter,
-    window, drawn, sent,
+    out_time, out_pixel, out_on, count, pixel, start, length, light_a, light_b, log_a, log_b, filtered,
+    state, constants, jitter, window, drawn, sent,
 ):  # fmt: skip
     """Send the events of one pixel on one piece of its light, from `start` for `length` seconds.
 
-    `state` (reference, last event, next candidate of shot noise) is updated; returns the columns, their fill
+    `state` (reference, last event, next candidate of shot noise) is updated; returns the fill of the columns
     and the filter's output at the end of the piece.
     """
     on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, seed = constants
@@ -143,7 +141,9 @@ def _piece(
             moment = min(moment, length)
             state[0] += on if sign > 0 else -off
             state[1] = start + moment
-            out, count = _emit(out, count, start + moment, pixel, sign > 0, jitter, window, seed, sent)
+            count = _emit(
+                out_time, out_pixel, out_on, count, start + moment, pixel, sign > 0, jitter, window, seed, sent
+            )
             now = x
         elif shot_due:
             light = light_a + gradient * candidate
@@ -155,18 +155,20 @@ def _piece(
             if choice != 0 and when - state[1] >= refractory:
                 state[0] = response(kind, a, b, c, limit)[0]
                 state[1] = when
-                out, count = _emit(out, count, when, pixel, choice > 0, jitter, window, seed, sent)
+                count = _emit(
+                    out_time, out_pixel, out_on, count, when, pixel, choice > 0, jitter, window, seed, sent
+                )
             now = max(now, limit)
         else:
             break
     state[0] -= leak * length
-    return out, count, arrival
+    return count, arrival
 
 
 @njit(cache=True, error_model="numpy")
 def _step(
-    out, count, pixel, start, stop, light_a, light_b, log_a, log_b, filtered, state, constants, jitter,
-    window, drawn, sent,
+    out_time, out_pixel, out_on, count, pixel, start, stop, light_a, light_b, log_a, log_b, filtered,
+    state, constants, jitter, window, drawn, sent,
 ):  # fmt: skip
     """Send the events of one pixel in one step, split at the knee of the log and into short log changes."""
     length, change = stop - start, light_b - light_a
@@ -185,12 +187,12 @@ def _step(
             if next_light != light_b:
                 following = min((next_light - light_a) / change, 1.0) * length
             if following > at:
-                out, count, filtered = _piece(
-                    out, count, pixel, start + at, following - at, at_light, next_light, at_log, next_log,
-                    filtered, state, constants, jitter, window, drawn, sent,
+                count, filtered = _piece(
+                    out_time, out_pixel, out_on, count, pixel, start + at, following - at, at_light,
+                    next_light, at_log, next_log, filtered, state, constants, jitter, window, drawn, sent,
                 )  # fmt: skip
             at, at_light, at_log = following, next_light, next_log
-    return out, count, filtered
+    return count, filtered
 
 
 @njit(cache=True, error_model="numpy")
@@ -199,6 +201,7 @@ def _run_tile(
     on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
 ):  # fmt: skip
     """Run the pixels first..last - 1 through all steps of a block; see `run_tiles`."""
+    out_time, out_pixel, out_on = out
     size = last - first
     words = (size + 7) // 8
     flag_words = np.zeros(words, np.uint64)
@@ -237,17 +240,25 @@ def _run_tile(
                 if flags[i] == 0:
                     continue
                 pixel = first + i
-                state[0], state[1] = now[3, i], last_event[pixel]
-                state[2] = candidate[pixel] if has_shot else np.inf
                 constants = (
                     on[pixel], off[pixel], leak[pixel], rate_on[pixel], rate_off[pixel], rate_hot[pixel],
                     rate, refractory, seed,
                 )  # fmt: skip
-                out, count, then[2, i] = _step(
-                    out, count, pixel, start, stop, now[0, i], then[0, i], now[1, i],
-                    then[1, i], now[2, i], state,
-                    constants, jitter, window, drawn, sent,
-                )  # fmt: skip
+                drawn_0, sent_0 = drawn[pixel], sent[pixel]
+                while True:
+                    state[0], state[1] = now[3, i], last_event[pixel]
+                    state[2] = candidate[pixel] if has_shot else np.inf
+                    filled, arrival = _step(
+                        out_time, out_pixel, out_on, count, pixel, start, stop, now[0, i], then[0, i],
+                        now[1, i], then[1, i], now[2, i], state, constants, jitter, window, drawn, sent,
+                    )  # fmt: skip
+                    if filled <= len(out_time):
+                        break
+                    # Columns that grew deep inside would be handed up through every call, which costs more
+                    # than the events: the step is done again instead.
+                    out_time, out_pixel, out_on = _grown(out_time), _grown(out_pixel), _grown(out_on)
+                    drawn[pixel], sent[pixel] = drawn_0, sent_0
+                count, then[2, i] = filled, arrival
                 then[3, i] = state[0]
                 last_event[pixel] = state[1]
                 if has_shot:
@@ -256,7 +267,7 @@ def _run_tile(
             soonest = candidate[first:last].min()
         now, then = then, now
     light[first:last], filtered[first:last], base[first:last] = now[0], now[2], now[3]
-    return out, count
+    return (out_time, out_pixel, out_on), count
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -21,10 +21,13 @@ from evnlos.types import Events
 WHITE_DN = 255.0
 """The white level of a wall (irradiance 1.0) in the pixel's digital numbers."""
 
-_CHUNK_BYTES = 32 << 20
+_CHUNK_BYTES = 64 << 20
 _CHUNK_STEPS = 32
+_RENDER_BYTES = 2 << 20  # of light at once: it is scaled while the cache still holds it
 _LONGEST_SHIFT_PX = 1.0
 _FEWEST_STEPS = 8
+_PROBES = 3
+_BLOCK = 512
 _MOST_STEPS = 10_000_000
 
 
@@ -88,7 +91,7 @@ class EventCamera:
     def record(self, wall: Wall, t0: float, t1: float, *, seed: int = 0, threads: int | None = None) -> Events:
         """Return the events of the time from t0 to t1; at t0 all pixels have settled to the light.
 
-        Memory is that of one chunk of frames (32 MiB), the state of the pixels and the events.
+        Memory is that of one chunk of frames (64 MiB), the state of the pixels and the events.
 
         Args:
             wall: The light: `shape`, `irradiance(t_s)` and `speed_px_s`.
@@ -106,7 +109,7 @@ class EventCamera:
         height, width = wall.shape
         longest = _longest_step(wall, t0, t1) if self.time_step_s is None else self.time_step_s
         stream = EventStream(self.pixel, (height, width), mode=self.mode, seed=seed, threads=threads)
-        stream.push(_render(wall, np.array([t0])), [t0])
+        stream.push(_render(wall, np.array([t0]), np.empty((1, height, width), np.float32)), [t0])
         for times_s, frames in self._chunks(wall, t0, t1, longest):
             stream.push(frames, times_s)
         return stream.finish()
@@ -114,17 +117,25 @@ class EventCamera:
     def _chunks(
         self, wall: Wall, t0: float, t1: float, longest: float
     ) -> Iterator[tuple[NDArray[np.float64], NDArray]]:
-        """Yield instants and frames that continue after t0 up to t1, at most `longest` seconds apart."""
+        """Yield instants and frames that continue after t0 up to t1, at most `longest` seconds apart.
+
+        All chunks are written to the same memory: each is gone when the next one is asked for.
+        """
         height, width = wall.shape
         most = max(1, min(_CHUNK_STEPS, _CHUNK_BYTES // (4 * height * width)))
         if self.time_step_s is not None:
             steps = max(1, math.ceil((t1 - t0) / self.time_step_s - 1e-9))
             times = np.append(t0 + self.time_step_s * np.arange(1, steps), t1).astype(np.float64)
+            frames = np.empty((min(most, steps), height, width), np.float32)
             for k in range(0, steps, most):
-                yield times[k : k + most], _render(wall, times[k : k + most])
+                part = times[k : k + most]
+                yield part, _render(wall, part, frames[: len(part)])
             return
         limit = self.tolerance * min(self.pixel.threshold_on, self.pixel.threshold_off)
-        step, now, frame = longest, t0, _render(wall, np.array([t0]))[0]
+        step, now = longest, t0
+        # the last frame of the chunk before, the chunk, and the probes
+        frames = np.empty((1 + most + _PROBES, height, width), np.float32)
+        _render(wall, np.array([t0]), frames[:1])
         while now < t1:
             count = min(most, max(1, math.ceil((t1 - now) / step - 1e-9)))
             times = np.asarray(now + step * np.arange(1, count + 1), np.float64)
@@ -133,16 +144,16 @@ class EventCamera:
             before = np.concatenate([[now], times[:-1]])
             probes = sorted({0, count // 2, count - 1})
             instants = np.concatenate([times, 0.5 * (before[probes] + times[probes])])
-            rendered = _render(wall, instants)
+            _render(wall, instants, frames[1 : 1 + len(instants)])
             error = 0.0
-            for probe, middle in zip(probes, rendered[count:], strict=True):
-                earlier = rendered[probe - 1] if probe else frame
-                error = max(error, _worst_miss(earlier.ravel(), rendered[probe].ravel(), middle.ravel()))
+            rows = frames.reshape(len(frames), -1)
+            for probe, middle in zip(probes, rows[1 + count : 1 + len(instants)], strict=True):
+                error = max(error, _worst_miss(rows[probe], rows[probe + 1], middle))
             if error > limit and step > longest * 1e-3:
                 step *= max(0.25, 0.9 * math.sqrt(limit / error))
                 continue
-            yield times, rendered[:count]
-            frame, now = rendered[count - 1], float(times[-1])
+            yield times, frames[1 : 1 + count]
+            frames[0], now = frames[count], float(times[-1])
             if error < 0.5 * limit:
                 step = min(longest, step * min(1.5, 0.9 * math.sqrt(limit / max(error, 1e-12))))
 
@@ -162,23 +173,40 @@ def _longest_step(wall: Wall, t0: float, t1: float) -> float:
     return step
 
 
-def _render(wall: Wall, times_s: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the wall's light at `times_s` in DN, [T, H, W]."""
-    light = wall.irradiance(times_s)
-    if tuple(light.shape) != (len(times_s), *wall.shape):
-        raise DataError(
-            f"the wall rendered {tuple(light.shape)} for {len(times_s)} instants; its shape is {wall.shape}"
-        )
-    return (light.detach().to("cpu", torch.float32) * WHITE_DN).numpy()
+def _render(wall: Wall, times_s: NDArray[np.float64], out: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Write the wall's light at `times_s` in DN to `out` [T, H, W] and return it."""
+    height, width = wall.shape
+    most = max(1, _RENDER_BYTES // (4 * height * width))
+    for k in range(0, len(times_s), most):
+        part = times_s[k : k + most]
+        light = wall.irradiance(part)
+        if tuple(light.shape) != (len(part), height, width):
+            raise DataError(
+                f"the wall rendered {tuple(light.shape)} for {len(part)} instants; its shape is {wall.shape}"
+            )
+        levels = light.detach().to("cpu", torch.float32).numpy()
+        np.multiply(levels, np.float32(WHITE_DN), out=out[k : k + most])
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _misses(earlier, later, middle, out):
+    """Fill how far the log of the mean of two frames is from the log of the frame between them."""
+    for i in range(len(out)):
+        line = 0.5 * (np.float64(earlier[i]) + np.float64(later[i]))
+        out[i] = abs(log_light(line) - log_light(np.float64(middle[i])))
 
 
 @njit(cache=True, error_model="numpy")
 def _worst_miss(earlier, later, middle):
-    """Return how far the log of the mean of two frames is from the log of the frame between them, at most."""
+    """Return the largest of the misses; block by block, so that a compiler takes the logarithms in vectors."""
     worst = 0.0
-    for i in range(len(middle)):
-        line = 0.5 * (np.float64(earlier[i]) + np.float64(later[i]))
-        miss = abs(log_light(line) - log_light(np.float64(middle[i])))
-        if miss > worst:
-            worst = miss
+    block = np.empty(_BLOCK)
+    for start in range(0, len(middle), _BLOCK):
+        stop = min(start + _BLOCK, len(middle))
+        out = block[: stop - start]
+        _misses(earlier[start:stop], later[start:stop], middle[start:stop], out)
+        for miss in out:
+            if miss > worst:
+                worst = miss
     return worst
