@@ -1,0 +1,117 @@
+"""`evnlos invert`: a photograph of a wall and its geometry in, a picture of what is hidden out."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+import tyro
+
+from evnlos.cli.console import say
+from evnlos.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Command:
+    """Invert a photograph of a matte wall, with what stands in between as the aperture; nothing is learned."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """NPZ file with the wall's picture and the geometry; docs/inversion.md lists its keys."""
+    solver: Literal["all", "tikhonov", "tv"] = "all"
+    """Smooth (`tikhonov`), sharp and not below 0 (`tv`), or both and, as a control, without the occluders."""
+    lam: str = "cv"
+    """Weight of the prior: `cv`, `gcv` (tikhonov only), `discrepancy`, or a number (operator's norm = 1)."""
+    noise_sigma: float | None = None
+    """Noise of a wall sample over the largest, for `discrepancy`; by default it is estimated."""
+    background_degree: int | None = None
+    """Degree of the smooth background to ignore; by default the one that predicts left-out blocks best."""
+    no_occluder: bool = False
+    """Leave the occluders out of the model."""
+    bin: int | None = None
+    """Wall pixels a side to average; by default at most 48 a side are left."""
+    emission_exponent: tuple[float, float] | None = None
+    """Exponents of the screen's falloff, horizontal and vertical; by default the file's."""
+    out: Path = Path("inversion.png")
+    """The picture; the numbers go to the same name with .npz."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Invert, print the figures, write the picture."""
+        from evnlos.plot.inversion import draw_inversion
+        from evnlos.solver import prepare_inversion, read_photograph
+
+        lam, rule = _weight(self.lam)
+        if self.solver == "all" and rule == "gcv" and lam is None:
+            raise ConfigError("--lam gcv serves --solver tikhonov only; use cv, discrepancy or a number")
+        # Matrices of a thousand rows: threads that wait for each other cost more than they save.
+        torch.set_num_threads(1)
+        clock = time.perf_counter()
+        photograph = read_photograph(self.file, self.emission_exponent)
+        occluded = bool(photograph.occluders) and not self.no_occluder
+        options = {"occluded": occluded, "bin": self.bin}
+        inversion = prepare_inversion(photograph, degree=self.background_degree, **options)
+        names: list[Literal["tikhonov", "tv"]]
+        names = ["tikhonov", "tv"] if self.solver == "all" else [self.solver]
+        solved = {name: inversion.solve(name, lam, rule, self.noise_sigma) for name in names}
+        if self.solver == "all" and occluded:
+            options["occluded"] = False
+            control = prepare_inversion(photograph, degree=inversion.degree, **options)
+            solved["without occluder"] = control.solve("tikhonov", lam, rule, self.noise_sigma)
+        found: dict[str, Any] = {
+            "file": str(self.file),
+            "wall": list(inversion.operator.shape),
+            "background_degree": inversion.degree,
+            "solutions": {},
+        }
+        for name, solution in solved.items():
+            if not solution.converged:
+                say(f"warning: {name} stopped after {solution.iterations} iterations before it had converged")
+            row = {"lam": solution.lam, "misfit": solution.noise_sigma, "iterations": solution.iterations}
+            if photograph.truth is not None:
+                row["r"] = correlation(solution.image, photograph.truth)
+            found["solutions"][name] = row
+        panels = [] if photograph.truth is None else [("truth", photograph.truth)]
+        panels += [
+            (name + (f", r = {row['r']:.3f}" if "r" in row else ""), solved[name].image)
+            for name, row in found["solutions"].items()
+        ]
+        found["picture"] = str(draw_inversion(self.out, panels))
+        arrays: dict[str, Any] = {name.replace(" ", "_"): s.image.numpy() for name, s in solved.items()}
+        np.savez(self.out.with_suffix(".npz"), **arrays)
+        found["seconds"] = round(time.perf_counter() - clock, 1)
+        print(json.dumps(found) if self.json else to_text(found))
+
+
+def correlation(image: torch.Tensor, truth: torch.Tensor) -> float:
+    """Return Pearson's correlation over all cells and channels: no gain, no offset is fitted."""
+    pair = torch.stack([image.flatten(), truth.to(image).flatten()])
+    return round(float(torch.corrcoef(pair)[0, 1]), 4)
+
+
+def to_text(found: dict[str, Any]) -> str:
+    """Return the figures as lines for people."""
+    height, width = found["wall"]
+    lines = [
+        f"{found['file']}: {width} x {height} wall patches, background of degree {found['background_degree']}"
+    ]
+    lines.append(f"{'':18}{'lam':>10}{'misfit':>10}{'iterations':>12}{'r':>8}")
+    for name, row in found["solutions"].items():
+        r = f"{row['r']:8.3f}" if "r" in row else f"{'-':>8}"
+        lines.append(f"{name:18}{row['lam']:10.2e}{row['misfit']:10.5f}{row['iterations']:12d}{r}")
+    lines.append(f"{found['picture']}; {found['seconds']} s")
+    return "\n".join(lines)
+
+
+def _weight(text: str) -> tuple[float | None, Literal["cv", "gcv", "discrepancy"]]:
+    if text in ("cv", "gcv", "discrepancy"):
+        return None, text
+    try:
+        return float(text), "cv"
+    except ValueError:
+        raise ConfigError(f"--lam is {text!r}; give cv, gcv, discrepancy or a number") from None
