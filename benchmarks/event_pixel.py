@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike
 from evnlos.dataset.presets import paper
 from evnlos.scene import Scene
 from evnlos.seeds import derive_seed
-from evnlos.sensor import EventCamera, EventPixel, simulate_events
+from evnlos.sensor import EventCamera, EventPixel, simulate_batch, simulate_events
 from evnlos.sensor.stream import Mode
 from evnlos.transport import Wall as CameraWall
 from evnlos.types import Events
@@ -192,6 +192,16 @@ def table(results: Results, unit: str, scale: Callable[[str], float]) -> list[st
     return lines
 
 
+def torch_run(gray: np.ndarray, times: np.ndarray, dtype: torch.dtype) -> Callable[[int], int]:
+    """Return a run of the batched path on PyTorch, on the CPU."""
+
+    def run(count: int) -> int:
+        clips = torch.from_numpy(gray[:count])[None]
+        return len(simulate_batch(clips, times[:count], PAPER, [0], dtype=dtype)[0])
+
+    return run
+
+
 def rival_runs(v2e: str | None, gray: np.ndarray, times: np.ndarray) -> dict[str, Callable[[int], int]]:
     """Return the runs of the other simulators that are present, on 8-bit frames."""
     runs = {}
@@ -303,28 +313,6 @@ def machine() -> str:
     return f"{name}, {os.cpu_count()} cores; Python {platform.python_version()}, numba {numba.__version__}"
 
 
-def picture(path: str) -> None:
-    """Draw the time stamps of one row of pixels in both modes, as a vector graphic."""
-    wall = Wall(200, 300, 4000.0)
-    times = np.arange(31) * STEP_S
-    light = (255 * wall.irradiance(times)).numpy()
-    pixel = EventPixel(threshold_sigma=0, cutoff_hz=200, leak_rate_hz=0, shot_noise_rate_hz=0)
-    marks = ['<text x="10" y="14">mode="v2e"</text><text x="10" y="254">mode="exact"</text>']
-    rows: tuple[tuple[int, Mode], ...] = (20, "v2e"), (260, "exact")
-    for top, mode in rows:
-        events = simulate_events(light, times, pixel, mode=mode)
-        kept = (events.y == 100) & (events.t_us > 8_000) & (events.t_us <= 18_000)
-        marks.append(f'<rect x="10" y="{top}" width="620" height="200" fill="none" stroke="#888"/>')
-        for time_us, x, on in zip(events.t_us[kept], events.x[kept], events.p[kept], strict=True):
-            across, down = 10 + 2.06 * x, top + 200 - (time_us - 8_000) / 50
-            marks.append(f'<circle cx="{across:.1f}" cy="{down:.1f}" r="1" fill="{"#c22" if on else "#22c"}"/>')
-    marks.append('<text x="10" y="480">column 0 to 299 across, 10 ms upwards; red ON, blue OFF</text>')
-    head = '<svg xmlns="http://www.w3.org/2000/svg" width="640" height="490" font-family="sans-serif" '
-    Path(path).write_text(
-        head + 'font-size="12">' + '<rect width="640" height="490" fill="#fff"/>' + "".join(marks) + "</svg>\n"
-    )
-
-
 def main() -> None:
     """Run the contest and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -333,11 +321,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--write", help="write the table to this file as well")
-    parser.add_argument("--picture", help="only draw the time stamps of both modes into this SVG file")
     args = parser.parse_args()
-    if args.picture:
-        picture(args.picture)
-        return
     torch.set_num_threads(1)
     height, width = args.size
     light, times = video(height, width, args.steps)
@@ -350,6 +334,8 @@ def main() -> None:
         'evnlos, mode="v2e", 8-bit': ours(gray, "v2e"),
         'evnlos, mode="v2e", float': ours(light, "v2e"),
         'evnlos, mode="exact", float': ours(light, "exact"),
+        "evnlos, torch alone, 8-bit": torch_run(gray, times, torch.float64),
+        "evnlos, torch alone, float32, 8-bit": torch_run(gray, times, torch.float32),
     }
     results = interleaved({**runs, **rival_runs(args.v2e, gray, times)}, args.steps, args.rounds)
     pixel_steps = height * width * args.steps
