@@ -1,20 +1,25 @@
 """How fast do event files become arrays, next to other Python packages, on one thread?
 
-Writes the files that it reads, interleaves the packages, prints millions of events a second (best of the
-rounds) and the ratio to each rival. Rivals are optional: those that cannot be imported are left out.
+Writes the files that it reads, interleaves the packages, prints millions of events a second of processor time
+(median of the rounds) and the ratio to each rival (median of the ratios within a round). Rivals are optional:
+those that cannot be imported (pip install evutils faery) are left out.
 
-    python benchmarks/event_files.py --events 10000000 --rounds 7 [--rivals FOLDER_OF_SITE_PACKAGES]
+    python benchmarks/event_files.py
+    python benchmarks/event_files.py --events 3000000 --rounds 5 --only CeleX
+    python benchmarks/event_files.py --write benchmarks/results/event_files.md
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
+import importlib.util
 import os
 import platform
-import sys
+import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"):
@@ -94,73 +99,104 @@ def count_of(result: object) -> int:
 
 def measure(
     path: Path, readers: dict[str, Callable[[Path], object]], rounds: int, count: int
-) -> dict[str, float]:
-    """Return the best time of each reader, in seconds; a reader that fails or miscounts is left out."""
-    best: dict[str, float] = {}
-    broken: set[str] = set()
-    for _ in range(rounds + 1):  # the first round compiles and warms the page cache
-        for name, read in readers.items():
-            if name in broken:
-                continue
-            start = time.perf_counter()
+) -> dict[str, list[float]]:
+    """Return the processor times of each reader, in seconds; a reader that fails or miscounts is left out."""
+    times: dict[str, list[float]] = {name: [] for name in readers}
+    for turn in range(rounds + 1):  # the first round compiles and warms the page cache
+        for name in list(times):
+            start = time.process_time()
             try:
-                result = read(path)
+                result = readers[name](path)
             except Exception as error:
                 print(f"    {name}: {type(error).__name__}: {str(error)[:80]}")
-                broken.add(name)
+                del times[name]
                 continue
-            took = time.perf_counter() - start
+            took = time.process_time() - start
             if count_of(result) != count:
                 print(f"    {name}: {count_of(result)} events instead of {count}")
-                broken.add(name)
-            else:
-                best[name] = min(best.get(name, took), took)
+                del times[name]
+            elif turn:
+                times[name].append(took)
             del result
-    return {name: best[name] for name in best if name not in broken}
+    return times
+
+
+def ratio(ours: list[float], theirs: list[float]) -> float:
+    """Return how many times faster ours is: the median over the rounds."""
+    return statistics.median(b / a for a, b in zip(ours, theirs, strict=True))
+
+
+def files(folder: Path, count: int) -> Iterator[tuple[str, Path, int]]:
+    """Write the files of the table one after the other."""
+    for stream, make in (("uniform", uniform), ("rows", rows)):
+        events = make(count)
+        for name in ("EVT2", "EVT21", "EVT3", "HDF5"):
+            path = folder / f"{stream}_{name}{'.h5' if name == 'HDF5' else '.raw'}"
+            write_events(path, events, format=name)
+            yield f"{name} {stream}", path, len(events)
+        if stream == "uniform":
+            write_dat(folder / "uniform.dat", events)
+            yield "DAT uniform", folder / "uniform.dat", len(events)
+    celex = celex_events(count)
+    write_events(folder / "rows_EI_100M.bin", celex)
+    yield "CeleX 1 rows", folder / "rows_EI_100M.bin", len(celex)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--events", type=int, default=10_000_000)
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--rivals", help="site-packages folder to look for rivals in")
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--only", default="", help="rows whose name holds this, and EVT2 rows for CeleX-V")
+    parser.add_argument("--write", help="file for the table")
     arguments = parser.parse_args()
-    if arguments.rivals:
-        sys.path.append(arguments.rivals)
     readers = {"evnlos": read_events} | rival_readers()
-    machine = platform.processor() or platform.machine()
-    print(f"{machine}, {os.cpu_count()} cores, Python {platform.python_version()}")
-    print(f"{arguments.events:,} events, one thread, best of {arguments.rounds}, millions of events a second")
-    streams = {"uniform": uniform(arguments.events), "rows": rows(arguments.events)}
-    reference = 0.0
+    lines = [
+        "# Event files",
+        "",
+        f"{arguments.events:,} events, one thread, processor time, medians of {arguments.rounds} interleaved "
+        "rounds; millions of events a second.",
+        "",
+        f"{machine()}",
+        "",
+        f"| file | bytes an event | {' | '.join(readers)} | ratios |\n|---|---|{'---|' * len(readers)}---|",
+    ]
+    print("\n".join(lines))
     with tempfile.TemporaryDirectory() as folder:
-        cases: list[tuple[str, Path, int]] = []
-        for stream, events in streams.items():
-            for name in ("EVT2", "EVT21", "EVT3", "HDF5"):
-                path = Path(folder) / f"{stream}_{name}{'.h5' if name == 'HDF5' else '.raw'}"
-                write_events(path, events, format=name)
-                cases.append((f"{name} {stream}", path, len(events)))
-        write_dat(Path(folder) / "uniform.dat", streams["uniform"])
-        cases.append(("DAT uniform", Path(folder) / "uniform.dat", len(streams["uniform"])))
-        celex = celex_events(arguments.events)
-        write_events(Path(folder) / "rows_EI_100M.bin", celex)
-        cases.append(("CeleX 1 rows", Path(folder) / "rows_EI_100M.bin", len(celex)))
-        print(
-            f"| file | bytes an event | {' | '.join(readers)} | ratios |\n|---|---|{'---|' * len(readers)}---|"
-        )
-        for title, path, count in cases:
-            chosen = {"evnlos": read_events} if title.startswith("CeleX") else readers
-            best = measure(path, chosen, arguments.rounds, count)
-            speeds = {name: count / took / 1e6 for name, took in best.items()}
-            if title == "EVT2 rows":
-                reference = speeds["evnlos"]
+        evt2 = Path(folder) / "rows_EVT2.raw"
+        for title, path, count in files(Path(folder), arguments.events):
+            if arguments.only.lower() not in title.lower():
+                continue
+            chosen = readers
+            if title.startswith("CeleX"):  # no rival reads it: beside our own EVT2 in the same rounds
+                chosen = {"evnlos": read_events, "evnlos EVT2": lambda _: read_events(evt2)}
+            times = measure(path, chosen, arguments.rounds, count)
+            speeds = {name: count / statistics.median(taken) / 1e6 for name, taken in times.items()}
             cells = " | ".join(f"{speeds[name]:.0f}" if name in speeds else "-" for name in readers)
-            ratios = [f"{speeds['evnlos'] / speeds[name]:.2f} x {name}" for name in speeds if name != "evnlos"]
-            if title.startswith("CeleX"):
-                ratios = [f"{speeds['evnlos'] / reference:.2f} x EVT2 rows of evnlos"]
-            print(
-                f"| {title} | {path.stat().st_size / count:.2f} | {cells} | {', '.join(ratios)} |", flush=True
-            )
+            ratios = [
+                f"{ratio(times['evnlos'], times[name]):.2f} x {name}" for name in times if name != "evnlos"
+            ]
+            lines.append(f"| {title} | {path.stat().st_size / count:.2f} | {cells} | {', '.join(ratios)} |")
+            print(lines[-1], flush=True)
+    if arguments.write:
+        Path(arguments.write).write_text("\n".join(lines) + "\n")
+
+
+def machine() -> str:
+    """Return processor and versions."""
+    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
+    names = [line.split(":")[1].strip() for line in info.splitlines() if line.startswith("model name")]
+    versions = {
+        name: importlib.metadata.version(name)
+        for name in ("numpy", "numba", "evutils", "faery")
+        if installed(name)
+    }
+    packages = ", ".join(f"{name} {version}" for name, version in versions.items())
+    processor = names[0] if names else platform.machine()
+    return f"{processor}, {os.cpu_count()} cores; Python {platform.python_version()}, {packages}"
+
+
+def installed(name: str) -> bool:
+    return importlib.util.find_spec(name) is not None
 
 
 if __name__ == "__main__":

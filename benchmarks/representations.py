@@ -1,22 +1,27 @@
 """How fast do events become maps, next to other Python packages, on one thread?
 
-Times each representation of one stream on 1280 x 720, interleaved with the rivals that can be imported, and
-prints millions of events a second (best of the rounds) and ratios. Rivals get their own kind of array, made
-beforehand, and return float32 as we do; the voxel grid of evutils counts into the nearest bin, ours shares each
-vote between two.
+Times each representation of one stream on 1280 x 720, interleaved with the rivals that can be imported (pip
+install evutils tonic), and prints millions of events a second of processor time (median of the rounds) and
+ratios (median within a round). Rivals get their own kind of array, made beforehand, and return float32 as we
+do; the voxel grid of evutils counts into the nearest bin, ours shares each vote between two.
 
-    python benchmarks/representations.py --events 10000000 --rounds 5 [--rivals FOLDER_OF_SITE_PACKAGES]
+    python benchmarks/representations.py
+    python benchmarks/representations.py --events 3000000 --stream blob
+    python benchmarks/representations.py --write benchmarks/results/representations.md
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
+import importlib.util
 import os
 import platform
-import sys
+import statistics
 import time
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(name, "1")
@@ -90,65 +95,84 @@ def rivals(events: Events) -> dict[str, dict[str, Run]]:
     return runs
 
 
-def best_of(runs: dict[str, Run], rounds: int) -> dict[str, float]:
-    """Return the best time of each, in seconds, after one round that compiles; failures are left out."""
-    best: dict[str, float] = {}
-    for _ in range(rounds + 1):
-        for name, run in list(runs.items()):
-            start = time.perf_counter()
+def measure(runs: dict[str, Run], rounds: int) -> dict[str, list[float]]:
+    """Return the processor times of each, in seconds, after one round that compiles; failures are left out."""
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for turn in range(rounds + 1):
+        for name in list(times):
+            start = time.process_time()
             try:
-                run()
+                runs[name]()
             except Exception as error:
                 print(f"    {name}: {type(error).__name__}: {str(error)[:100]}")
-                del runs[name]
-                best.pop(name, None)
+                del times[name]
                 continue
-            took = time.perf_counter() - start
-            best[name] = min(best.get(name, took), took)
-    return best
+            if turn:
+                times[name].append(time.process_time() - start)
+    return times
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--events", type=int, default=10_000_000)
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--stream", choices=("uniform", "blob"), default="uniform")
-    parser.add_argument("--rivals", help="site-packages folder to look for rivals in")
+    parser.add_argument("--write", help="file for the table")
     arguments = parser.parse_args()
-    if arguments.rivals:
-        sys.path.append(arguments.rivals)
     warnings.simplefilter("ignore")
     events = {"uniform": uniform, "blob": blob}[arguments.stream](arguments.events)
     edges = np.array([events.t_us[0] - 1, events.t_us[-1]])
     theirs = rivals(events)
+    sae: Run = lambda: time_surface(events, edges, TAU_US)  # noqa: E731
     ours: dict[str, Run] = {
         "histogram": lambda: event_histogram(events),
-        "sae": lambda: time_surface(events, edges, TAU_US),
+        "sae": sae,
         "voxel": lambda: voxel_grid(events, 10),
     }
     for radius in (1, 2, 3, 5):
-        ours[f"context, radius {radius}"] = lambda radius=radius: time_surface(
-            events, edges, TAU_US, "context", radius=radius
-        )
-    machine = platform.processor() or platform.machine()
-    print(f"{machine}, {os.cpu_count()} cores, Python {platform.python_version()}")
-    kind = f"{len(events):,} {arguments.stream} events on {WIDTH} x {HEIGHT}"
-    print(f"{kind}, one thread, best of {arguments.rounds}")
-    print("| map | evnlos M/s | evutils M/s | tonic M/s | ratios |\n|---|---|---|---|---|")
-    sae = 0.0
+        title = f"context, radius {radius}"
+        ours[title] = lambda radius=radius: time_surface(events, edges, TAU_US, "context", radius=radius)
+        theirs[title] = {"our sae": sae}
+    names = ["evnlos", *dict.fromkeys(name for runs in theirs.values() for name in runs if name != "our sae")]
+    lines = [
+        "# Representations",
+        "",
+        f"{len(events):,} {arguments.stream} events on {WIDTH} x {HEIGHT}, one thread, processor time, medians "
+        f"of {arguments.rounds} interleaved rounds; millions of events a second.",
+        "",
+        machine(),
+        "",
+        f"| map | {' | '.join(names)} | ratios |\n|---|{'---|' * len(names)}---|",
+    ]
+    print("\n".join(lines))
     for title, run in ours.items():
-        best = best_of({"evnlos": run, **theirs.get(title, {})}, arguments.rounds)
-        speeds = {name: len(events) / took / 1e6 for name, took in best.items()}
-        sae = speeds["evnlos"] if title == "sae" else sae
-        ratios = [
-            f"{speeds['evnlos'] / speed:.2f} x {name}" for name, speed in speeds.items() if name != "evnlos"
-        ]
-        if title.startswith("context"):
-            ratios = [f"{speeds['evnlos'] / sae:.3f} x sae of evnlos"]
-        cells = " | ".join(
-            f"{speeds[name]:.1f}" if name in speeds else "-" for name in ("evnlos", "evutils", "tonic")
-        )
-        print(f"| {title} | {cells} | {', '.join(ratios)} |", flush=True)
+        times = measure({"evnlos": run, **theirs.get(title, {})}, arguments.rounds)
+        speeds = {name: len(events) / statistics.median(taken) / 1e6 for name, taken in times.items()}
+        ratios = [f"{ratio(times['evnlos'], times[name]):.3g} x {name}" for name in times if name != "evnlos"]
+        cells = " | ".join(f"{speeds[name]:.1f}" if name in speeds else "-" for name in names)
+        lines.append(f"| {title} | {cells} | {', '.join(ratios)} |")
+        print(lines[-1], flush=True)
+    if arguments.write:
+        Path(arguments.write).write_text("\n".join(lines) + "\n")
+
+
+def ratio(ours: list[float], theirs: list[float]) -> float:
+    """Return how many times faster ours is: the median over the rounds."""
+    return statistics.median(b / a for a, b in zip(ours, theirs, strict=True))
+
+
+def machine() -> str:
+    """Return processor and versions."""
+    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
+    names = [line.split(":")[1].strip() for line in info.splitlines() if line.startswith("model name")]
+    found = {
+        name: importlib.metadata.version(name)
+        for name in ("numpy", "numba", "evutils", "tonic")
+        if importlib.util.find_spec(name) is not None
+    }
+    packages = ", ".join(f"{name} {version}" for name, version in found.items())
+    processor = names[0] if names else platform.machine()
+    return f"{processor}, {os.cpu_count()} cores; Python {platform.python_version()}, {packages}"
 
 
 if __name__ == "__main__":

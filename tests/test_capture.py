@@ -72,6 +72,14 @@ def test_import_is_resumable_and_refuses_other_captures(tiny_captures, tmp_path)
         list(import_captures(tiny_captures[:3], tmp_path / "d"))
 
 
+def test_a_changed_description_is_another_dataset(capture, tmp_path) -> None:
+    list(import_captures([capture], tmp_path / "d"))
+    list(import_captures([capture], tmp_path / "d"))
+    _edit("capture.yaml", "events: events.raw", "events: events.raw\nfilters: {background_us: 5000}")(capture)
+    with pytest.raises(EvnlosError, match="other settings"):
+        list(import_captures([capture], tmp_path / "d"))
+
+
 def test_held_out_names_must_exist_and_not_overlap(tiny_captures, tmp_path) -> None:
     with pytest.raises(EvnlosError, match="no capture is named Z"):
         list(import_captures(tiny_captures, tmp_path / "d", test=["Z"]))

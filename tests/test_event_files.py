@@ -114,7 +114,7 @@ def test_writing_is_atomic_and_says_what_is_wrong(tmp_path, monkeypatch):
     def full_disk(*_args, **_kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez_compressed", full_disk)
+    monkeypatch.setattr(np.lib.format, "write_array", full_disk)
     with pytest.raises(EventFileError, match="No space"):
         write_events(path, events)
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["e.npz"]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tqdm import tqdm
+
 from evnlos.cli.console import Folders, progress
-from evnlos.dataset import Sampling, import_captures, open_dataset
+from evnlos.dataset import Capture, Sampling, check_picture, import_captures, open_dataset
 
 
 @dataclass(frozen=True)
@@ -21,16 +24,29 @@ class Command:
     """Captures or characters that are held out for testing, e.g. G K 4 9."""
     validation: tuple[str, ...] = ()
     """Captures or characters that are held out for validation."""
+    check_pictures: bool = True
+    """Draw one picture a capture (frame, events, both, curves over time) into the folder checks of the
+    dataset."""
     sampling: Sampling = field(default_factory=Sampling)
     """Resolution and representation."""
 
     def run(self) -> None:
         """Import, with a progress bar over the captures."""
         imported = import_captures(
-            self.captures, self.out, self.sampling, test=self.test, validation=self.validation
+            self.captures, self.out, self.sampling, test=self.test, validation=self.validation, look=self._look
         )
         for _ in progress(imported, len(self.captures), "captures", self.out):
             pass
         dataset = open_dataset(self.out)
         counts = ", ".join(f"{len(names)} {split}" for split, names in dataset.split.items())
         print(f"{self.out}: {len(dataset.objects())} captures ({counts})")
+        if self.check_pictures:
+            print(f"check pictures: {self.out / 'checks'}")
+
+    def _look(self, capture: Capture) -> None:
+        """Tell what was done to a capture, and draw it."""
+        tqdm.write(f"{capture.name}: {'; '.join(capture.notes)}", file=sys.stderr)
+        if self.check_pictures:
+            folder = self.out / "checks"
+            folder.mkdir(exist_ok=True)
+            check_picture(capture).save(folder / f"{capture.name}.png")

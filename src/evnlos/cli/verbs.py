@@ -11,11 +11,18 @@ VERBS: dict[str, str] = {
     "import": "importing",
     "verify": "verify",
     "lab": "lab",
+    "calibrate": "calibrate",
     "train": "train",
     "finetune": "finetune",
     "evaluate": "evaluate",
+    "identify": "identify",
     "reconstruct": "reconstruct",
+    "invert": "invert",
     "report": "report",
+    "events": "events",
+    "info": "info",
+    "convert": "convert",
+    "preview": "preview",
 }
 """The module of each verb in `evnlos.cli`; it holds `Command`, and `PRESETS` where settings have presets."""
 

@@ -1,6 +1,8 @@
 """Samples on disk: simulate them, import them from captures, split them, load them."""
 
-from evnlos.dataset.capture import Capture, CaptureInfo, read_capture
+from evnlos.dataset.capture import Capture, read_capture
+from evnlos.dataset.capture_info import CaptureInfo
+from evnlos.dataset.check_picture import check_picture
 from evnlos.dataset.importer import capture_samples, character_of, import_captures
 from evnlos.dataset.loader import CHANNELS, PARADIGMS, NlosDataset, Paradigm, network_input
 from evnlos.dataset.sampling import Samples, Sampling, make_samples, reduce_by_area
@@ -22,6 +24,7 @@ __all__ = [
     "Simulation",
     "capture_samples",
     "character_of",
+    "check_picture",
     "create_dataset",
     "import_captures",
     "make_samples",

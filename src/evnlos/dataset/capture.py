@@ -2,85 +2,34 @@
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
-from evnlos.config import from_dict, read_yaml
+from evnlos.dataset.alignment import find_offset
+from evnlos.dataset.capture_info import CaptureInfo, RegistrationInfo, TargetInfo, read_capture_info
+from evnlos.dataset.cleaning import (
+    check_rectangle,
+    correct_frames,
+    crop_events,
+    find_hot_pixels,
+    keep_supported,
+    without_pixels,
+)
+from evnlos.dataset.dot_grid import find_dots
+from evnlos.dataset.frame_sources import FrameSeries, inside, read_frame_series, read_image
+from evnlos.dataset.registration import homography_from_points, registration_error, warp_frames
 from evnlos.errors import DataError
-from evnlos.events import read_events
+from evnlos.events import CelexOptions, event_histogram, keep_known_polarity, read_events, read_triggers
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.types import Events
 
 
-@dataclass(frozen=True)
-class CameraInfo:
-    """The camera that watched the wall."""
-
-    width: int
-    """Sensor width, pixels."""
-    height: int
-    """Sensor height, pixels."""
-    name: str = "unknown"
-    """Maker and model."""
-    frame_rate_hz: float | None = None
-    """Frames a second, hertz."""
-    exposure_s: float | None = None
-    """Exposure of a frame, seconds."""
-
-
-@dataclass(frozen=True)
-class TargetInfo:
-    """The hidden plate, where it is known."""
-
-    name: str
-    """What it shows, e.g. a letter."""
-    mask: str | None = None
-    """Picture of the plate, a file in the folder; white shines."""
-    plate_m: float = 0.08
-    """Side of the plate, metres."""
-
-
-@dataclass(frozen=True)
-class MotionInfo:
-    """A straight, steady motion: the plate's centre is at start_m + speed (t - start_us) along `direction`."""
-
-    start_m: float | tuple[float, float]
-    """Centre at `start_us` relative to the middle of the travel: along the direction, or (x, y), metres."""
-    speed_m_s: float
-    """Speed, metres a second."""
-    direction: tuple[float, float] = (1.0, 0.0)
-    """Direction (x to the right, y downwards)."""
-    start_us: int = 0
-    """Instant of the start on the events' clock, microseconds."""
-
-
-@dataclass(frozen=True)
-class CaptureInfo:
-    """What `capture.yaml` holds."""
-
-    camera: CameraInfo
-    """The camera."""
-    events: str = "events.raw"
-    """The event file, as the camera wrote it."""
-    frames: str = "frames.csv"
-    """Table of the frames: t_us,file."""
-    target: TargetInfo | None = None
-    """The target, where it is known."""
-    motion: MotionInfo | None = None
-    """Its motion, where it is known."""
-    rig: dict[str, Any] = field(default_factory=dict)
-    """Notes about the rig: distance_m, wall, ambient."""
-
-
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One shot, read and checked.
+    """One shot, read and checked: frames and events on the same pixels and the same clock.
 
     Args:
         name: Name of the capture, that of its folder.
@@ -89,6 +38,7 @@ class Capture:
         frames: Frames, uint8 or uint16 [N, H, W], digital numbers.
         frame_times_us: Time of each frame, int64 [N], microseconds, on the events' clock.
         target: The hidden plate, or None where it is unknown.
+        notes: What reading did to the recordings, a line each.
     """
 
     name: str
@@ -97,6 +47,7 @@ class Capture:
     frames: NDArray[np.uint8] | NDArray[np.uint16]
     frame_times_us: NDArray[np.int64]
     target: Target | None
+    notes: tuple[str, ...] = field(default=())
 
     @property
     def peak(self) -> int:
@@ -121,70 +72,155 @@ class Capture:
 def read_capture(folder: str | Path) -> Capture:
     """Read a capture folder: `capture.yaml`, the event file, the frames and the target's mask.
 
+    The order is: dark frame and flat field, registration, filters of the events, clock, region of interest.
+
     Args:
         folder: The folder of one shot.
 
     Raises:
-        DataError: A file is missing, or a frame has another size than the camera.
+        DataError: A file is missing, a frame has another size than the camera, or clock or pixels do not fit.
         ConfigError: `capture.yaml` has an unknown key or a wrong type.
         EventFileError: The event file is damaged.
+        MissingDependencyError: A file needs an optional package.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise DataError(f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)")
-    described = folder / "capture.yaml"
-    info = from_dict(CaptureInfo, read_yaml(described), source=str(described))
-    size = (info.camera.height, info.camera.width)
-    frames, times = _read_frames(folder, info.frames, size)
-    events = read_events(_inside(folder, info.events), width=size[1], height=size[0])
+    info = read_capture_info(folder)
+    series = read_frame_series(folder, info)
+    notes = [f"{len(series.images)} frames from {series.what}"]
+    events, told = _read_events(folder, info)
+    notes += told
+    frames, told = _prepare_frames(folder, info, series)
+    notes += told
+    times_us, told = _place_in_time(folder, info, events, frames, series.times_us)
+    notes += told
+    roi = info.roi
+    if roi is not None:
+        check_rectangle(events.shape, roi.x, roi.y, roi.width, roi.height)
+        events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
+        frames = frames[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width]
+        notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
     if not len(events):
-        raise DataError(
-            f"{folder / info.events} holds no event; check the camera's thresholds and the recording"
+        raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
+    target = _read_target(folder, info.target)
+    return Capture(folder.name, info, events, np.ascontiguousarray(frames), times_us, target, tuple(notes))
+
+
+def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
+    path, camera = inside(folder, info.events), info.camera
+    options = CelexOptions(clock_mhz=camera.clock_mhz) if camera.clock_mhz is not None else None
+    events = read_events(path, width=camera.width, height=camera.height, celex=options)
+    if not len(events):
+        raise DataError(f"{path} holds no event; check the camera's thresholds and the recording")
+    notes = [f"{len(events):,} events from {path.name}"]
+    if events.polarity_known is not None and not events.polarity_known.any():
+        notes.append("the camera gave no polarity: all events count as darker")
+        events = replace(events, polarity_known=None)
+    elif events.polarity_known is not None:
+        count = len(events)
+        events = keep_known_polarity(events)
+        notes.append(f"{count - len(events):,} events without polarity left out")
+    filters = info.filters
+    if filters.hot_pixel_factor is not None:
+        hot, count = find_hot_pixels(events, filters.hot_pixel_factor), len(events)
+        events = without_pixels(events, hot)
+        notes.append(f"{int(hot.sum())} hot pixels with {count - len(events):,} events left out")
+    if filters.background_us is not None:
+        count = len(events)
+        events = keep_supported(events, filters.background_us)
+        notes.append(
+            f"{count - len(events):,} events without a neighbour in {filters.background_us} us left out"
         )
-    return Capture(folder.name, info, events, frames, times, _read_target(folder, info.target))
+    if not len(events):
+        raise DataError(f"{path}: no event is left; check the filters in capture.yaml")
+    return events, notes
 
 
-def _inside(folder: Path, name: str) -> Path:
-    """Return the path of a file of the capture; a name never leads out of the folder."""
-    path = (folder / name).resolve()
-    if not path.is_relative_to(folder.resolve()):
-        raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
-    if not path.is_file():
-        raise DataError(f"{path} does not exist; {folder / 'capture.yaml'} names it")
-    return path
+def _prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[NDArray, list[str]]:
+    """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
+    frames, notes = series.images, []
+    size = frames.shape[1:]
+    peak = float(np.iinfo(frames.dtype).max)
+    changed = None
+    if info.dark is not None or info.flat is not None:
+        dark, flat = (
+            read_image(inside(folder, name), size) if name else None for name in (info.dark, info.flat)
+        )
+        changed = correct_frames(frames, peak, dark, flat)
+        notes.append(f"frames corrected by {' and '.join(name for name in (info.dark, info.flat) if name)}")
+    if info.frames_turned:
+        frames = frames[:, ::-1, ::-1]
+        changed = None if changed is None else changed[:, ::-1, ::-1]
+        notes.append("frames turned by 180 degrees")
+    if info.registration is not None:
+        matrix, how = _homography(folder, info.registration, info)
+        shape = (info.camera.height, info.camera.width)
+        changed, covered = warp_frames(frames / np.float32(peak) if changed is None else changed, matrix, shape)
+        notes.append(
+            f"frames registered by {how}; they cover {100 * float(covered.mean()):.0f} % of the events' view"
+        )
+    if changed is None:
+        return frames, notes
+    return np.round(changed * 65_535).astype(np.uint16), notes
 
 
-def _read_frames(folder: Path, table: str, size: tuple[int, int]) -> tuple[NDArray, NDArray[np.int64]]:
-    path = _inside(folder, table)
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows or not {"t_us", "file"} <= rows[0].keys():
-        raise DataError(f"{path} holds no frames; give a header 't_us,file' and one line a frame")
+def _homography(folder: Path, info: RegistrationInfo, capture: CaptureInfo) -> tuple[NDArray[np.float64], str]:
+    """Return the matrix from frame to event pixels, and how it was found."""
+    if info.homography is not None:
+        return np.array(info.homography), "the homography stated"
+    if info.points is not None:
+        pairs = np.array(info.points, float).reshape(-1, 4)
+        frame, event, how = pairs[:, :2], pairs[:, 2:], f"{len(pairs)} points"
+    else:
+        dots = info.dots
+        assert dots is not None
+        picture = read_image(inside(folder, dots.frame))
+        if capture.frames_turned:
+            picture = picture[::-1, ::-1]
+        seen = read_events(
+            inside(folder, dots.events), width=capture.camera.width, height=capture.camera.height
+        )
+        frame = find_dots(picture, dots.rows, dots.columns)
+        event = find_dots(event_histogram(seen)[0].sum(axis=0), dots.rows, dots.columns)
+        how = f"{dots.rows} x {dots.columns} dots"
+    matrix = homography_from_points(frame, event)
+    return matrix, f"{how} (rms error {registration_error(matrix, frame, event):.2f} pixels)"
+
+
+def _place_in_time(
+    folder: Path, info: CaptureInfo, events: Events, frames: NDArray, times_us: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], list[str]]:
+    """Return the frames' times on the events' clock."""
+    alignment = info.alignment
+    if alignment.trigger_channel is not None:
+        triggers = read_triggers(inside(folder, info.events))
+        chosen = triggers.t_us[triggers.rising & (triggers.channel == alignment.trigger_channel)]
+        if len(chosen) != len(frames):
+            raise DataError(
+                f"{folder / info.events}: {len(chosen)} rising edges on channel {alignment.trigger_channel} "
+                f"for {len(frames)} frames; check the channel, or leave out frames without an edge"
+            )
+        return chosen + int(alignment.offset_us), [
+            f"frame times from trigger channel {alignment.trigger_channel}"
+        ]
+    if alignment.offset_us != "auto":
+        offset = int(alignment.offset_us)
+        return times_us + offset, [f"frames' clock shifted by {offset} us"] if offset else []
     try:
-        times = np.array([int(row["t_us"]) for row in rows], dtype=np.int64)
-    except (TypeError, ValueError):
-        raise DataError(f"{path} holds a time that is not a whole number of microseconds") from None
-    if (np.diff(times) <= 0).any():
-        i = int(np.argmax(np.diff(times) <= 0))
-        raise DataError(f"{path}: frame {i + 1} at {times[i + 1]} us follows {times[i]} us; times must ascend")
-    return np.stack([_read_image(_inside(folder, row["file"]), size) for row in rows]), times
-
-
-def _read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
-    """Read a grey picture as uint8 or uint16 [H, W]."""
-    try:
-        with Image.open(path) as image:
-            if size is not None and image.size != (size[1], size[0]):
-                wide, high = image.size
-                raise DataError(f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}")
-            array = np.asarray(image if image.mode.startswith("I;16") else image.convert("L"))
-    except (UnidentifiedImageError, OSError) as error:
-        raise DataError(f"{path} can't be read as a picture: {error}") from None
-    return array
+        found = find_offset(
+            events, frames, times_us, search_us=round(alignment.search_s * 1e6), blocks=alignment.blocks
+        )
+    except DataError as error:
+        raise DataError(f"{folder}: {error}") from None
+    return times_us + found.offset_us, [
+        f"frames' clock shifted by {found.offset_us} us, found: correlation {found.correlation:.2f}, "
+        f"{found.ratio:.1f} times the next best, lobe {found.lobe_us / 1000:.0f} ms wide"
+    ]
 
 
 def _read_target(folder: Path, info: TargetInfo | None) -> Target | None:
     if info is None or info.mask is None:
         return None
-    mask = _read_image(_inside(folder, info.mask))
+    mask = read_image(inside(folder, info.mask))
     return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.plate_m)

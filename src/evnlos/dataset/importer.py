@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.capture import Capture, read_capture
+from evnlos.dataset.capture_info import read_capture_info
 from evnlos.dataset.sampling import Samples, Sampling, make_samples
 from evnlos.dataset.shard import write_shard
 from evnlos.dataset.store import Dataset, create_dataset
@@ -35,6 +36,7 @@ def import_captures(
     *,
     test: Iterable[str] = (),
     validation: Iterable[str] = (),
+    look: Callable[[Capture], None] | None = None,
 ) -> Iterator[tuple[str, Samples]]:
     """Import capture folders, yielding each capture's name and samples as its shard is in place.
 
@@ -45,6 +47,7 @@ def import_captures(
         sampling: Resolution and representation.
         test: Names of captures, or characters, that are held out for testing.
         validation: The same for validation.
+        look: Called with each capture that was read, before its samples are made: to tell of it, or to draw it.
 
     Raises:
         DataError: No folder, two captures of one name, or a held-out name that no capture has.
@@ -60,13 +63,16 @@ def import_captures(
     for path in paths.values():
         if not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
-    config = {"captures": sorted(paths), "sampling": to_dict(sampling)}
+    described = {name: config_hash(read_capture_info(path)) for name, path in sorted(paths.items())}
+    config = {"captures": described, "sampling": to_dict(sampling)}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
     captures: dict[str, Capture] = {first.name: read_capture(first)}
     create_dataset(dataset)
     for name in dataset.missing():
         capture = captures.pop(name, None) or read_capture(paths[name])
+        if look is not None:
+            look(capture)
         samples = capture_samples(capture, sampling)
         attributes = {"object": name, "config_hash": dataset.config_hash, "camera": capture.info.camera.name}
         write_shard(dataset.shard(name), samples, attributes)

@@ -1,8 +1,9 @@
 """Decodes an AEDAT4 file in a process of its own: on damage the package may abort, hang or ask for all memory.
 
-Run as a program: path, limit of memory in bytes, limit of processor time in seconds. Writes one line of JSON
-(width and height of the event stream, or null), then for every packet a 64-bit count and the columns t, x, y,
-on; a count of -1 ends a complete file.
+Run as a program: path, limit of memory in bytes, limit of processor time in seconds, "events" or "frame".
+Writes one line of JSON (width and height of the first stream of that kind, or null), then for every packet of
+events a 64-bit count and the columns t, x, y, on, for every frame its time, height, width and channels (64 bits
+each) and its pixels; -1 ends a complete file.
 """
 
 import json
@@ -10,8 +11,8 @@ import struct
 import sys
 
 
-def main(path: str, memory_bytes: int, seconds: int) -> None:
-    """Write the first event stream of `path` to the standard output."""
+def main(path: str, memory_bytes: int, seconds: int, kind: str) -> None:
+    """Write the first stream of a kind in `path` to the standard output."""
     try:
         import resource
     except ImportError:  # a system without limits
@@ -23,9 +24,7 @@ def main(path: str, memory_bytes: int, seconds: int) -> None:
     import aedat
 
     decoder = aedat.Decoder(path)
-    streams = [
-        (number, stream) for number, stream in decoder.id_to_stream().items() if stream["type"] == "events"
-    ]
+    streams = [(number, stream) for number, stream in decoder.id_to_stream().items() if stream["type"] == kind]
     out = sys.stdout.buffer
     if not streams:
         out.write(b"null\n")
@@ -33,7 +32,13 @@ def main(path: str, memory_bytes: int, seconds: int) -> None:
     number, stream = streams[0]
     out.write(json.dumps([stream["width"], stream["height"]]).encode() + b"\n")
     for packet in decoder:
-        if packet["stream_id"] != number or "events" not in packet:
+        if packet["stream_id"] != number or kind not in packet:
+            continue
+        if kind == "frame":
+            frame = packet["frame"]
+            pixels = frame["pixels"]
+            channels = pixels.shape[2] if pixels.ndim == 3 else 1
+            out.write(struct.pack("<4q", frame["t"], *pixels.shape[:2], channels) + pixels.tobytes())
             continue
         events = packet["events"]
         columns = (
@@ -47,4 +52,4 @@ def main(path: str, memory_bytes: int, seconds: int) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])

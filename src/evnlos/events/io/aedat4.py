@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evnlos.errors import EventFileError, MissingDependencyError
 from evnlos.events.io.columns import ColumnCheck, Columns, join
@@ -36,7 +37,7 @@ def _require_package() -> None:
 class _Decoder:
     """The package at work in a process of its own, whose memory and time grow with the file only."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, kind: str) -> None:
         self._path = path
         size = path.stat().st_size
         child = Path(__file__).with_name("_aedat4_child.py")
@@ -44,7 +45,7 @@ class _Decoder:
         known = os.pathsep.join(place for place in sys.path if place)
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed in __exit__
         self._process = subprocess.Popen(
-            [sys.executable, "-P", str(child), str(path.absolute()), *limits],
+            [sys.executable, "-P", str(child), str(path.absolute()), *limits, kind],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=self._errors,
@@ -68,6 +69,14 @@ class _Decoder:
         if len(data) < size:
             raise self.failure()
         return data
+
+    def stream_size(self) -> tuple[int, int] | None:
+        """Return width and height of the stream, None where there is none; the first thing to take."""
+        line = self.stream.readline()
+        if not line.endswith(b"\n"):
+            raise self.failure()
+        size = json.loads(line)
+        return None if size is None else (size[0], size[1])
 
     def failure(self) -> EventFileError:
         """Return the error of a decoder that stopped before the end of the file."""
@@ -130,10 +139,7 @@ class Aedat4Source:
             report.set_geometry(width, height, "caller")
 
     def _read_size(self, decoder: _Decoder) -> None:
-        line = decoder.stream.readline()
-        if not line.endswith(b"\n"):
-            raise decoder.failure()
-        size = json.loads(line)
+        size = decoder.stream_size()
         if size is None:
             raise unreadable(self.path, 0, "an AEDAT4 file without an event stream", "record events as well")
         if not self.report.geometry_from:
@@ -142,7 +148,7 @@ class Aedat4Source:
     def blocks(self) -> Iterator[Columns]:
         """Yield the columns packet by packet."""
         check = ColumnCheck(self.report)
-        with _Decoder(self.path) as decoder:
+        with _Decoder(self.path, "events") as decoder:
             self._read_size(decoder)
             while True:
                 count = struct.unpack("<q", decoder.take(8))[0]
@@ -161,3 +167,43 @@ class Aedat4Source:
     def read(self) -> Columns:
         """Return all events of the stream."""
         return join(list(self.blocks()))
+
+
+def read_aedat4_frames(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Return the pictures of the first frame stream as grey [T, H, W], and their times [T], microseconds.
+
+    Raises:
+        EventFileError: The file is damaged, has no frames, or frames of several sizes.
+        MissingDependencyError: The package `aedat` is not installed.
+    """
+    _require_package()
+    check_packets(path, ReadReport(path))
+    frames: list[NDArray[np.uint8]] = []
+    times: list[int] = []
+    with _Decoder(path, "frame") as decoder:
+        if decoder.stream_size() is None:
+            raise unreadable(path, 0, "an AEDAT4 file without frames", "record frames as well")
+        while True:
+            t_us = struct.unpack("<q", decoder.take(8))[0]
+            if t_us == -1:
+                break
+            height, width, channels = struct.unpack("<3q", decoder.take(24))
+            pixels = np.frombuffer(decoder.take(height * width * channels), np.uint8)
+            frames.append(_grey(pixels.reshape(height, width, channels)))  # [H, W]
+            times.append(t_us)
+            if frames[-1].shape != frames[0].shape:
+                found = (
+                    f"a frame of {width} x {height} pixels after {frames[0].shape[1]} x {frames[0].shape[0]}"
+                )
+                raise unreadable(path, 0, found, "record frames of one size")
+    if not frames:
+        raise unreadable(path, 0, "an AEDAT4 file whose frame stream is empty", "record frames as well")
+    return np.stack(frames), np.array(times, np.int64)
+
+
+def _grey(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return [H, W] of [H, W, channels]: grey as it is, colours by ITU-R BT.601, transparency left out."""
+    if pixels.shape[2] < 3:
+        return pixels[:, :, 0]
+    weights = np.array([0.299, 0.587, 0.114])
+    return np.round(pixels[:, :, :3] @ weights).astype(np.uint8)

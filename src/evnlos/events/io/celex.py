@@ -150,6 +150,7 @@ class CelexSource:
             clock = 100
         self._divisor = tick_divisor(clock)
         self._buffer = np.empty(_MAX_PAYLOAD, np.uint8)
+        self._scratch = np.empty(kernels.SCRATCH, np.uint64)
 
     def _names(self) -> tuple[str, ...]:
         names = ("t_us", "x", "y", "p", "polarity_known")
@@ -162,7 +163,8 @@ class CelexSource:
     def _new_state(self) -> tuple[np.ndarray, np.ndarray]:
         state = np.zeros(kernels.STATE_SIZE, np.int64)
         state[kernels.DIVISOR] = self._divisor
-        return state, np.full((kernels.HEIGHT, kernels.WIDTH), -1, np.int16)
+        # Twice the room: an array of 4 MB and more lies in large pages, and events fall anywhere in it.
+        return state, np.full((2, kernels.HEIGHT, kernels.WIDTH), -1, np.int16)[0]
 
     def _decode(self, file: FileIO, package: Package, state: np.ndarray, last: np.ndarray, out: Columns) -> int:
         file.seek(package.offset)
@@ -177,7 +179,16 @@ class CelexSource:
             )
         adc = out.get("adc", out["x"])  # format 2 has none and writes none
         count = kernels.DECODERS[format](
-            data, state, out["t_us"], out["x"], out["y"], out["p"], adc, out["polarity_known"], last
+            data,
+            state,
+            out["t_us"],
+            out["x"],
+            out["y"],
+            out["p"],
+            adc,
+            out["polarity_known"],
+            last,
+            self._scratch,
         )
         for kind, slot, first, found in (
             ("unknown", kernels.UNKNOWN, kernels.FIRST_UNKNOWN, "a word of an unknown kind"),

@@ -1,4 +1,4 @@
-"""Full pictures of CeleX-V recordings (mode F), and writing them."""
+"""Full pictures of CeleX-V recordings (mode F)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import DataError, EventFileError
-from evnlos.events.io.celex import parse_header, sniff_celex, walk_packages
+from evnlos.events.io.celex import parse_header, walk_packages
 from evnlos.events.io.celex_kernels import HEIGHT, WIDTH
 from evnlos.events.io.celex_options import CelexOptions
-from evnlos.events.io.report import OnError, ReadReport, check_on_error, unreadable
+from evnlos.events.io.report import OnError, ReadReport, unreadable
 
 
 def _fixed_pattern(fpn: NDArray | str | PathLike[str] | None) -> NDArray | None:
@@ -46,46 +46,18 @@ def _decode_picture(data: NDArray[np.uint8], bits: int) -> NDArray:
     return pixels.reshape(HEIGHT, WIDTH)  # [H, W]
 
 
-def read_frames(
-    path: str | PathLike[str],
-    *,
-    bits: int = 8,
-    fpn: NDArray | str | PathLike[str] | None = None,
-    on_error: OnError = "strict",
-    celex: CelexOptions | None = None,
+def read_celex_frames(
+    path: Path,
+    bits: int,
+    pattern: NDArray | str | PathLike[str] | None,
+    on_error: OnError,
+    options: CelexOptions,
 ) -> NDArray:
-    """Return the full pictures of a CeleX-V recording.
-
-    Pixels are in the order of the file, which is that of the events: row and column of a picture are y and x of
-    an event. The camera's own viewer turns pictures, not events, by 180 degrees; turn pictures that it exported
-    back before laying them over events.
-
-    Args:
-        path: The recording, mode F or a loop with pictures in it.
-        bits: 8 or 12 bits a pixel.
-        fpn: Fixed pattern to subtract: [800, 1280] or the text file of the camera's program; the result is
-            clipped to the range of `bits`.
-        on_error: "strict" raises at the first fault, "salvage" returns the whole pictures.
-        celex: What the recording does not say about itself.
-
-    Returns:
-        [T, 800, 1280], uint8 or, for 12 bits, uint16; brighter is larger.
-
-    Raises:
-        EventFileError: The file is damaged or holds no pictures.
-        DataError: `bits` or the size of `fpn` is wrong.
-    """
-    path = Path(path)
-    check_on_error(on_error)
+    """Return the full pictures [T, 800, 1280] of a CeleX-V recording; arguments as those of `read_frames`."""
     if bits not in (8, 12):
         raise DataError(f"bits is {bits}; give 8 or 12")
-    if not path.is_file():
-        raise EventFileError(f"{path}: no such file; check the path")
-    pattern = _fixed_pattern(fpn)
-    options = celex or CelexOptions()
+    fixed = _fixed_pattern(pattern)
     with path.open("rb", buffering=0) as file:
-        if options.event_format is None and not sniff_celex(file.read(64)):
-            raise unreadable(path, 0, "not a CeleX-V recording", "pictures are read from .bin files of mode F")
         report = ReadReport(path, strict=on_error == "strict")
         packages = walk_packages(file, parse_header(path, options), report)
         pictures = [package for package in packages if package.is_picture]
@@ -95,7 +67,7 @@ def read_frames(
         for frame, package in zip(frames, pictures, strict=True):
             file.seek(package.offset)
             picture = _decode_picture(np.frombuffer(file.read(package.length), np.uint8), bits)
-            if pattern is not None:
-                picture = np.clip(picture.astype(np.int64) - pattern, 0, 2**bits - 1)
+            if fixed is not None:
+                picture = np.clip(picture.astype(np.int64) - fixed, 0, 2**bits - 1)
             frame[:] = picture
     return frames

@@ -12,8 +12,11 @@ DIVISOR, TIME_US = 10, 11
 STATE_SIZE = 12
 TURNS = (1 << 12, 1 << 16, 1 << 12)  # of the row time, for event formats 0, 1, 2
 GROUP_BYTES = (3, 7, 7)
-CHUNK = 1024  # groups that are decoded at once, on the assumption that nothing is wrong with them
+CHUNK = 4096  # groups that are decoded at once, on the assumption that nothing is wrong with them
 EVENTS_A_GROUP = (1, 2, 4)
+SCRATCH = 9 * CHUNK + 16  # 64-bit integers
+_MAX_TICK = 1 << 39  # three weeks and more
+U64 = tuple(np.uint64(value) for value in range(256))  # a signed constant would make signed arithmetic
 
 
 @njit(cache=True, inline="always")
@@ -38,7 +41,7 @@ def _advance(state, stamp, turn):
 
 
 @njit(cache=True)
-def decode_format_0(data, state, t_us, x, y, p, adc, known, last):
+def decode_format_0(data, state, t_us, x, y, p, adc, known, last, scratch):
     """Decode groups of 3 bytes (intensity, 8 bits); return the number of events.
 
     `last` [H, W] holds each pixel's last intensity, -1 before its first event: the sensor sends no
@@ -121,57 +124,92 @@ def _carefully_1(data, first, state, t_us, x, y, p, adc, known, last):
 
 
 @njit(cache=True)
-def _unpack_words(data, words):
-    """Put the two words of 28 bits of each group of 7 bytes into `words`."""
-    for group in range(len(data) // 7):
-        at = 7 * group
-        b5, b6, b7 = np.uint32(data[at + 4]), np.uint32(data[at + 5]), np.uint32(data[at + 6])
-        s0 = (np.uint32(data[at]) << np.uint32(6)) | (b5 & np.uint32(0x3F))
-        s1 = (
-            (np.uint32(data[at + 1]) << np.uint32(6))
-            | (b5 >> np.uint32(6))
-            | ((b6 & np.uint32(0xF)) << np.uint32(2))
-        )
-        s2 = (
-            (np.uint32(data[at + 2]) << np.uint32(6))
-            | (b6 >> np.uint32(4))
-            | ((b7 & np.uint32(3)) << np.uint32(4))
-        )
-        s3 = (np.uint32(data[at + 3]) << np.uint32(6)) | (b7 >> np.uint32(2))
-        words[2 * group] = (s1 << np.uint32(14)) | s0
-        words[2 * group + 1] = (s3 << np.uint32(14)) | s2
+def _unpack_words(data, words, groups):
+    """Put the two words of 28 bits of each group of 7 bytes into `words`.
+
+    The first four bytes of a group are the high 8 bits of its lanes, the other three their low 6 bits. Eight
+    groups are seven integers of 64 bits: taking them apart by shifts is what becomes vector code. `groups` is
+    scratch.
+    """
+    count = len(data) // 7
+    whole = count // 8 * 8
+    eight = data[: 7 * whole].view(np.uint64)
+    for block in range(whole // 8):
+        first, place = np.uint64(7 * block), np.uint64(8 * block)
+        w0, w1, w2, w3 = eight[first], eight[first + U64[1]], eight[first + U64[2]], eight[first + U64[3]]
+        w4, w5, w6 = eight[first + U64[4]], eight[first + U64[5]], eight[first + U64[6]]
+        groups[place] = w0
+        groups[place + U64[1]] = (w0 >> U64[56]) | (w1 << U64[8])
+        groups[place + U64[2]] = (w1 >> U64[48]) | (w2 << U64[16])
+        groups[place + U64[3]] = (w2 >> U64[40]) | (w3 << U64[24])
+        groups[place + U64[4]] = (w3 >> U64[32]) | (w4 << U64[32])
+        groups[place + U64[5]] = (w4 >> U64[24]) | (w5 << U64[40])
+        groups[place + U64[6]] = (w5 >> U64[16]) | (w6 << U64[48])
+        groups[place + U64[7]] = w6 >> U64[8]
+    for group in range(whole, count):
+        value = U64[0]
+        for step in range(7):
+            value |= np.uint64(data[7 * group + step]) << np.uint64(8 * step)
+        groups[group] = value
+    pairs = words.view(np.uint64)
+    low, high = U64[0x3F], U64[0xFF]
+    for group in range(count):
+        v = groups[group]
+        first = ((v >> U64[32]) & low) | ((v & high) << U64[6])
+        first |= (((v >> U64[38]) & low) << U64[14]) | (((v >> U64[8]) & high) << U64[20])
+        second = ((v >> U64[44]) & low) | (((v >> U64[16]) & high) << U64[6])
+        second |= (((v >> U64[50]) & low) << U64[14]) | (((v >> U64[24]) & high) << U64[20])
+        pairs[group] = first | (second << U64[32])
 
 
 @njit(cache=True)
-def _place_words(words, state, events, t_us, y):
+def _place_words(words, state, events, t_us, y, segments, row_words, row_times, row_starts):
     """Give the events among `words` their row and time; return how many, or -1 where anything is unusual.
 
-    Places are counted without a sign, or every access would be checked for a negative index.
+    Nobody can predict where the next row starts, so the first loop has no branch: it counts events and rows,
+    and keeps which row each event is in. Places are counted without a sign, or every access would be checked
+    for a negative index. `row_starts` receives the first event of each row.
+    It, `segments`, `row_words` and `row_times` are scratch, two longer than `words`.
     """
-    row, time, tick, stamp = np.uint16(state[ROW]), state[TIME_US], state[TICK], state[STAMP]
-    divisor = state[DIVISOR]
-    unusual = (state[ROW_SEEN] == 0) | (state[TIME_SEEN] == 0) | (state[ROW] >= HEIGHT)
-    count = np.uint64(0)
+    one = np.uint32(1)
+    count, rows = np.uint64(0), np.uint64(1)  # row 0 is the one that goes on from before
+    strange = np.uint32(0)
     for word in words:
-        kind = word & 3
-        if kind == 1:
-            events[count] = word
-            t_us[count] = time
-            y[count] = row
-            count += np.uint64(1)
-        elif kind == 2:
-            row = np.uint16(word >> 18)
-            unusual |= row >= HEIGHT
-            new = np.int64((word >> 2) & 0xFFFF)
-            if new != stamp:
-                tick += (new - stamp) & 0xFFFF
-                stamp = new
-                time = (tick * 2048 + divisor) // (2 * divisor)
-        else:
-            unusual |= kind == 3
-    if not unusual:
-        state[ROW], state[TIME_US], state[TICK], state[STAMP] = row, time, tick, stamp
-    return np.int64(-1) if unusual else np.int64(count)
+        events[count] = word
+        segments[count] = np.uint16(rows - U64[1])
+        row_words[rows] = word
+        row_starts[rows] = count
+        is_event, is_row = word & one, (word >> one) & one
+        strange |= is_event & is_row
+        count += np.uint64(is_event)
+        rows += np.uint64(is_row)
+    row_starts[0], row_starts[rows] = U64[0], count
+    row_words[0] = np.uint32(state[ROW]) << np.uint32(18)
+    row_times[0] = state[TIME_US]
+    tick, stamp = state[TICK], state[STAMP]
+    for row in range(U64[1], rows):
+        new = np.int64((row_words[row] >> np.uint32(2)) & np.uint32(0xFFFF))
+        tick += (new - stamp) & 0xFFFF
+        stamp = new
+        row_times[row] = tick
+    divisor = np.float64(state[DIVISOR])
+    for row in range(U64[1], rows):  # exact below _MAX_TICK: x + 1/2 is at least 1 / 280 from a whole number
+        row_times[row] = np.int64(np.float64(row_times[row]) * 1024.0 / divisor + 0.5)
+    lowest = np.uint32(0)
+    for row in range(rows):
+        row_words[row] = row_words[row] >> np.uint32(18)
+        lowest = max(lowest, row_words[row])
+    for event in range(count):
+        t_us[event] = row_times[segments[event]]
+    for event in range(count):
+        y[event] = np.uint16(row_words[segments[event]])
+    last = rows - U64[1]
+    unusual = (strange != 0) | (lowest >= HEIGHT) | (tick >= _MAX_TICK)
+    if unusual or state[ROW_SEEN] == 0 or state[TIME_SEEN] == 0:
+        return np.int64(-1)
+    state[ROW], state[TIME_US] = np.int64(row_words[last]), row_times[last]
+    state[TICK], state[STAMP] = tick, stamp
+    return np.int64(count)
 
 
 @njit(cache=True)
@@ -188,32 +226,55 @@ def _unpack_events(events, x, adc):
 
 
 @njit(cache=True)
-def _sign_of_change(x, y, adc, last, p, known):
-    """Set p and known from the change since each pixel's last intensity, and keep the new one."""
+def _sign_of_change(x, y, adc, last, p, known, scratch, row_starts, before_all):
+    """Set p and known from the change since each pixel's last intensity, and keep the new one.
+
+    The map is larger than the nearest caches, and nothing is known about where the next row of events lies: its
+    first place is fetched beforehand for many rows, all under way at once. Comparing in the next loop would
+    be a branch that nobody can predict.
+    """
     flat = last.ravel()
     for index in range(len(x)):
-        pixel = np.uint32(y[index]) * np.uint32(WIDTH) + np.uint32(x[index])
-        before, now = flat[pixel], np.int16(adc[index])
-        flat[pixel] = now
+        scratch[index] = np.uint32(y[index]) * np.uint32(WIDTH) + np.uint32(x[index])
+    fetched, row = np.int64(0), np.uint64(0)
+    while row_starts[row] < np.uint64(len(x)):
+        fetched += flat[scratch[row_starts[row]]]
+        row += U64[1]
+    row_starts[0] = np.uint64(fetched)  # or the loop would be left out as useless
+    for index in range(len(x)):
+        pixel = scratch[index]
+        before_all[index] = flat[pixel]
+        flat[pixel] = np.int16(adc[index])
+    for index in range(len(x)):
+        before, now = before_all[index], np.int16(adc[index])
         known[index] = (before >= 0) & (before != now)
         p[index] = (before >= 0) & (before < now)
 
 
 @njit(cache=True)
-def decode_format_1(data, state, t_us, x, y, p, adc, known, last):
-    """Decode groups of 7 bytes (intensity, 12 bits): quickly, and with care where a chunk is unusual."""
-    step = 7 * CHUNK
-    words, events = np.empty(2 * CHUNK, np.uint32), np.empty(2 * CHUNK, np.uint32)
+def decode_format_1(data, state, t_us, x, y, p, adc, known, last, scratch):
+    """Decode groups of 7 bytes (intensity, 12 bits): quickly, and with care where a chunk is unusual.
+
+    `scratch`, uint64 [SCRATCH], is the caller's: memory that is taken anew for each package is mapped anew.
+    """
+    step, room = 7 * CHUNK, 2 * CHUNK + 4
+    words, events = scratch[:CHUNK].view(np.uint32), scratch[CHUNK : 2 * CHUNK].view(np.uint32)
+    groups = scratch[2 * CHUNK : 3 * CHUNK]
+    row_times, row_starts = scratch[3 * CHUNK :][:room].view(np.int64), scratch[3 * CHUNK + room :][:room]
+    row_words = scratch[3 * CHUNK + 2 * room :][: room // 2].view(np.uint32)
+    segments = scratch[3 * CHUNK + 2 * room + room // 2 :][: room // 4].view(np.uint16)
     count = 0
     for first in range(0, len(data) // 7 * 7, step):
         chunk = data[first : first + step]
         size = len(chunk) // 7 * 2
-        _unpack_words(chunk, words)
+        _unpack_words(chunk, words, groups)
         before = state[ROW], state[TIME_US], state[TICK], state[STAMP]
-        found = _place_words(words[:size], state, events, t_us[count:], y[count:])
+        out = t_us[count:], y[count:], segments, row_words, row_times, row_starts
+        found = _place_words(words[:size], state, events, *out)
         end = count + found
         if found >= 0 and _unpack_events(events[:found], x[count:end], adc[count:end]) < WIDTH:
-            _sign_of_change(x[count:end], y[count:end], adc[count:end], last, p[count:end], known[count:end])
+            out = x[count:end], y[count:end], adc[count:end], last, p[count:end], known[count:end]
+            _sign_of_change(*out, events, row_starts, segments.view(np.int16))
             count = end
         else:
             state[ROW], state[TIME_US], state[TICK], state[STAMP] = before
@@ -223,7 +284,7 @@ def decode_format_1(data, state, t_us, x, y, p, adc, known, last):
 
 
 @njit(cache=True)
-def decode_format_2(data, state, t_us, x, y, p, adc, known, last):
+def decode_format_2(data, state, t_us, x, y, p, adc, known, last, scratch):
     """Decode groups of 7 bytes into four lanes of 14 bits; return the number of events."""
     lanes = np.empty(4, np.int64)
     count = 0

@@ -14,6 +14,7 @@ from evnlos.events.io.celex_options import CelexOptions, clock_from_name, tick_d
 from evnlos.events.io.columns import ColumnCheck, Columns, join
 from evnlos.events.io.csv_kernels import FAULTS, FIRST_FAULT, parse_rows, print_rows
 from evnlos.events.io.report import ReadReport, unreadable
+from evnlos.events.io.sink import FileSink
 from evnlos.types import Events
 
 _BLOCK_BYTES = 1 << 20
@@ -284,14 +285,29 @@ class _Unwrap:
         return times + (turns * _SDK_WRAP_TICKS * 2048 + divisor) // (2 * divisor)
 
 
-def write_csv(path: Path, events: Events) -> None:
-    """Write a comment with sensor size and count, a line of names, and one row an event."""
-    columns = events.columns()
-    with path.open("wb") as file:
-        file.write(f"# width={events.width} height={events.height} events={len(events)}\n".encode("ascii"))
-        file.write((",".join(columns) + "\n").encode("ascii"))
+class CsvSink(FileSink):
+    """A comment with sensor size and count, a line of names, and one row an event."""
+
+    def __init__(self, path: Path, first: Events) -> None:
+        super().__init__(path)
+        self._size, self._events = (first.width, first.height), 0
+        self._comment()
+        self.file.write((",".join(first.columns()) + "\n").encode("ascii"))
+
+    def _comment(self) -> None:
+        width, height = self._size
+        self.file.write(f"# width={width} height={height} events={self._events:<18}\n".encode("ascii"))
+
+    def append(self, events: Events) -> None:
+        """Write the rows of a piece."""
         for start in range(0, len(events), 1 << 16):
-            part = [column[start : start + (1 << 16)].astype(np.int64) for column in columns.values()]
-            values = np.stack(part, axis=1)  # [rows, columns]
+            part = events[start : start + (1 << 16)].columns().values()
+            values = np.stack([column.astype(np.int64) for column in part], axis=1)  # [rows, columns]
             text = np.empty(21 * values.size, np.uint8)
-            text[: print_rows(values, text)].tofile(file)
+            text[: print_rows(values, text)].tofile(self.file)
+        self._events += len(events)
+
+    def finish(self) -> None:
+        """Announce the number of events in the comment."""
+        self.file.seek(0)
+        self._comment()

@@ -144,9 +144,8 @@ def decode_evt2(words, state, t_us, x, y, p, width, height):
 
 
 @njit(cache=True)
-def encode_evt2(t_us, x, y, p, words):
-    """Write EVT2 words for times that start below one turn of the clock; return how many."""
-    high = np.int64(-1)
+def encode_evt2(t_us, x, y, p, high, words):
+    """Write EVT2 words; `high` is the high part of the time before them, -1 at the start; return how many."""
     count = 0
     for index in range(len(t_us)):
         new = t_us[index] >> 6
@@ -168,11 +167,10 @@ def encode_evt2(t_us, x, y, p, words):
 
 
 @njit(cache=True)
-def encoded_size_evt2(t_us) -> int:
-    """Return an upper bound of the number of words that `encode_evt2` writes."""
+def encoded_size_evt2(t_us, before) -> int:
+    """Return an upper bound of the words that `encode_evt2` writes after an event at `before`."""
     count = len(t_us)
     for index in range(len(t_us)):
-        before = t_us[index - 1] if index else np.int64(-64)
-        turns = (t_us[index] >> 34) - (before >> 34) if index else 0
-        count += 2 * turns + ((t_us[index] >> 6) != (before >> 6))
+        count += 2 * ((t_us[index] >> 34) - (before >> 34)) + ((t_us[index] >> 6) != (before >> 6))
+        before = t_us[index]
     return count + 1

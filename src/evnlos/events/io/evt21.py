@@ -111,9 +111,8 @@ def decode_evt21_swapped(words, state, t_us, x, y, p, width, height):
 
 
 @njit(cache=True)
-def encode_evt21(t_us, x, y, p, words):
-    """Write words for times that start below one turn of the clock; return how many."""
-    high = np.int64(-1)
+def encode_evt21(t_us, x, y, p, high, words):
+    """Write words; `high` is the high part of the time before them, -1 at the start; return how many."""
     count = 0
     index = 0
     while index < len(t_us):
@@ -149,9 +148,10 @@ def encode_evt21(t_us, x, y, p, words):
 
 
 @njit(cache=True)
-def encoded_size_evt21(t_us) -> int:
-    """Return an upper bound of the number of words that `encode_evt21` writes."""
+def encoded_size_evt21(t_us, before) -> int:
+    """Return an upper bound of the words that `encode_evt21` writes after an event at `before`."""
     count = 2 * len(t_us) + 2
-    for index in range(1, len(t_us)):
-        count += 2 * ((t_us[index] >> 34) - (t_us[index - 1] >> 34))
+    for index in range(len(t_us)):
+        count += 2 * ((t_us[index] >> 34) - (before >> 34))
+        before = t_us[index]
     return count

@@ -23,9 +23,9 @@ def _run_length(t_us, x, y, p, start):
 
 
 @njit(cache=True)
-def encode_evt3(t_us, x, y, p, words):
-    """Write EVT3 words for times that start below one turn of the clock; return how many."""
-    high, low, row = np.int64(-1), np.int64(-1), np.int64(-1)
+def encode_evt3(t_us, x, y, p, high, words):
+    """Write EVT3 words; `high` is the high part of the time before them, -1 at the start; return how many."""
+    low, row = np.int64(-1), np.int64(-1)
     count = 0
     index = 0
     while index < len(t_us):
@@ -66,9 +66,10 @@ def encode_evt3(t_us, x, y, p, words):
 
 
 @njit(cache=True)
-def encoded_size_evt3(t_us) -> int:
-    """Return an upper bound of the number of words that `encode_evt3` writes."""
+def encoded_size_evt3(t_us, before) -> int:
+    """Return an upper bound of the words that `encode_evt3` writes after an event at `before`."""
     count = 4 * len(t_us) + 4
-    for index in range(1, len(t_us)):
-        count += 2 * ((t_us[index] >> 24) - (t_us[index - 1] >> 24))
+    for index in range(len(t_us)):
+        count += 2 * ((t_us[index] >> 24) - (before >> 24))
+        before = t_us[index]
     return count

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from evnlos.events.io.columns import ColumnCheck, Columns
 from evnlos.events.io.report import ReadReport, unreadable
-from evnlos.types import Events
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_CHUNK = 65_536
 _MAX_RATIO = 1100  # deflate and lzf shrink a chunk at most that much
 _NAMES = {"t_us": "t", "x": "x", "y": "y", "p": "p"}
 _OPTIONAL = ("adc", "polarity_known")
@@ -175,48 +173,3 @@ def _stored_at(dataset: h5py.Dataset, number: int) -> int:
         return (dataset.id.get_offset() or 0) + number * dataset.dtype.itemsize
     start = number // dataset.chunks[0] * dataset.chunks[0]
     return dataset.id.get_chunk_info_by_coord((start,)).byte_offset or 0
-
-
-def _ms_to_idx(t: NDArray) -> NDArray[np.uint64]:
-    """Return the index of the first event not earlier than each millisecond after t_offset."""
-    last_ms = int(t[-1]) // 1000 if len(t) else 0
-    return np.searchsorted(t, np.arange(last_ms + 2, dtype=np.int64) * 1000).astype(np.uint64)
-
-
-_MAX_INDEX_MS = 1 << 24  # 4.7 hours; a longer index would be larger than the events of a sparse recording
-
-
-def write_hdf5(path: Path, events: Events) -> None:
-    """Write the columns of DSEC; all metadata and chunks carry checksums."""
-    first = int(events.t_us[0]) if len(events) else 0
-    wide = events.duration_us >= 2**32 or not -(2**62) < first < 2**62
-    t_offset = 0 if wide else first
-    t = events.t_us if wide else (events.t_us - t_offset).astype(np.uint32)
-    columns = {"x": events.x, "y": events.y, "t": t, "p": events.p.astype(np.uint8)}
-    for name in _OPTIONAL:
-        column = getattr(events, name)
-        if column is not None:
-            columns[name] = column.astype(np.uint8 if column.dtype == np.bool_ else column.dtype)
-    with h5py.File(path, "w", libver=("v110", "v110")) as file:
-        group = file.create_group("events")
-        group.attrs["width"], group.attrs["height"] = events.width, events.height
-        for name, column in columns.items():
-            _put(group, name, column)
-        if not wide and events.duration_us // 1000 < _MAX_INDEX_MS:
-            _put(file, "ms_to_idx", _ms_to_idx(t))
-        _put_compact(file, "t_offset", t_offset)
-
-
-def _put(group: h5py.Group, name: str, column: NDArray) -> None:
-    chunk = (max(1, min(_CHUNK, len(column))),)
-    packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
-    group.create_dataset(name, data=column, chunks=chunk, maxshape=(None,), **packed)
-
-
-def _put_compact(file: h5py.File, name: str, value: int) -> None:
-    """Store one number inside the object header, which has a checksum; a plain scalar has none."""
-    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    layout.set_layout(h5py.h5d.COMPACT)
-    space = h5py.h5s.create(h5py.h5s.SCALAR)
-    dataset = h5py.h5d.create(file.id, name.encode(), h5py.h5t.NATIVE_INT64, space, layout)
-    dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.array(value, np.int64))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -39,9 +41,9 @@ def _zip_errors(path: Path) -> Iterator[None]:
 class _Member:
     """One array of the archive, read from its start to its end."""
 
-    def __init__(self, path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
+    def __init__(self, path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stack: ExitStack) -> None:
         self.path, self.name = path, info.filename.removesuffix(".npy")
-        self._file: IO[bytes] = archive.open(info)
+        self._file: IO[bytes] = stack.enter_context(archive.open(info))
         version = np.lib.format.read_magic(self._file)
         if version == (1, 0):
             header = np.lib.format.read_array_header_1_0(self._file)
@@ -79,7 +81,8 @@ class NpzSource:
     def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
         self.path, self.report = path, report
         report.format = "NPZ"
-        with _zip_errors(path), zipfile.ZipFile(path) as archive:
+        with _zip_errors(path), ExitStack() as stack:
+            archive = stack.enter_context(zipfile.ZipFile(path))
             infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             self._infos = {_ALIASES.get(name, name): info for name, info in infos.items()}
             missing = [name for name in _REQUIRED if name not in self._infos]
@@ -88,20 +91,22 @@ class NpzSource:
                     path, 0, f"an NPZ file without {', '.join(missing)}", "arrays t_us, x, y, p are read"
                 )
             self._names = [name for name in (*_REQUIRED, *_OPTIONAL) if name in self._infos]
-            members = {name: _Member(path, archive, self._infos[name]) for name in self._names}
+            members = {name: _Member(path, archive, self._infos[name], stack) for name in self._names}
             shapes = {name: member.shape for name, member in members.items()}
             if len(set(shapes.values())) != 1 or len(shapes["t_us"]) != 1:
                 raise unreadable(path, 0, f"columns of shapes {shapes}", _CURE)
             self._count = int(shapes["t_us"][0])
-            self._geometry(archive, width, height)
+            self._geometry(archive, stack, width, height)
 
-    def _geometry(self, archive: zipfile.ZipFile, width: int | None, height: int | None) -> None:
+    def _geometry(
+        self, archive: zipfile.ZipFile, stack: ExitStack, width: int | None, height: int | None
+    ) -> None:
         if width is not None:
             return self.report.set_geometry(width, height, "caller")
         if "width" in self._infos and "height" in self._infos:
             sides = []
             for name in ("width", "height"):
-                member = _Member(self.path, archive, self._infos[name])
+                member = _Member(self.path, archive, self._infos[name], stack)
                 if int(np.prod(member.shape, dtype=object)) != 1:
                     raise unreadable(
                         self.path, 0, f"{name} of shape {member.shape}", "one number belongs there"
@@ -111,7 +116,7 @@ class NpzSource:
             return self.report.set_geometry(sides[0], sides[1], "header")
         sides = []
         for name in ("x", "y"):
-            member, largest, left = _Member(self.path, archive, self._infos[name]), 0, self._count
+            member, largest, left = _Member(self.path, archive, self._infos[name], stack), 0, self._count
             while left:
                 largest = max(largest, int(member.take(min(left, 1 << 20)).max()))
                 left -= min(left, 1 << 20)
@@ -133,7 +138,7 @@ class NpzSource:
         check = ColumnCheck(self.report, lambda _: self._infos["t_us"].header_offset)
         with _zip_errors(self.path), ExitStack() as stack:
             archive = stack.enter_context(zipfile.ZipFile(self.path))
-            members = {name: _Member(self.path, archive, self._infos[name]) for name in self._names}
+            members = {name: _Member(self.path, archive, self._infos[name], stack) for name in self._names}
             for start in range(0, self._count, size):
                 count = min(size, self._count - start)
                 block = {name: self._convert(name, member.take(count)) for name, member in members.items()}
@@ -147,8 +152,38 @@ class NpzSource:
         return next(self.blocks(max(self._count, 1)), {})
 
 
-def write_npz(path: Path, events: Events) -> None:
-    """Write the columns and the sensor size."""
-    arrays: dict[str, Any] = {**events.columns(), "width": events.width, "height": events.height}
-    with path.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+class NpzSink:
+    """Columns that wait in files without a name until the archive, one array after the other, is written."""
+
+    def __init__(self, path: Path, first: Events) -> None:
+        self._path, self._size = path, (first.width, first.height)
+        self._events = 0
+        self._held = {
+            name: tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115 - closed in close
+            for name in first.columns()
+        }
+        self._dtypes = {name: column.dtype for name, column in first.columns().items()}
+
+    def append(self, events: Events) -> None:
+        """Keep a piece."""
+        for name, column in events.columns().items():
+            self._held[name].write(column.tobytes())
+        self._events += len(events)
+
+    def finish(self) -> None:
+        """Write the archive."""
+        with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, file in self._held.items():
+                header = {"descr": self._dtypes[name].str, "fortran_order": False, "shape": (self._events,)}
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array_header_1_0(member, header)
+                    file.seek(0)
+                    shutil.copyfileobj(file, member, 1 << 20)
+            for name, side in zip(("width", "height"), self._size, strict=True):
+                with archive.open(f"{name}.npy", "w") as member:
+                    np.lib.format.write_array(member, np.array(side))
+
+    def close(self) -> None:
+        """Give the files without a name back."""
+        for file in self._held.values():
+            file.close()

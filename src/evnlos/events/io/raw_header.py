@@ -168,14 +168,17 @@ def _guess_geometry(header: RawHeader, report: ReadReport) -> None:
 
 
 def write_raw_header(format_name: str, version: str, width: int, height: int, t0_us: int, events: int) -> bytes:
-    """Return the header of a RAW file; the number of events lets a reader see that a file was cut."""
+    """Return the header of a RAW file; the number of events lets a reader see that a file was cut.
+
+    Its length does not depend on that number, so that it can be written again when all events are.
+    """
     layout = "endianness=little;" if format_name == "EVT21" else ""
     lines = [
         f"evt {version}",
         f"format {format_name};{layout}width={width};height={height}",
         f"geometry {width}x{height}",
         f"t0 {t0_us}",
-        f"events {events}",
+        f"events {events:<19}",
         "end",
     ]
     return "".join(f"% {line}\n" for line in lines).encode("ascii")

@@ -8,10 +8,24 @@ from pathlib import Path
 from typing import Protocol
 
 from evnlos.errors import EventFileError
-from evnlos.events.io import aedat4, celex, celex_write, csv, dat, hdf5, npz, raw
+from evnlos.events.io import (
+    aedat4,
+    aedat4_write,
+    celex,
+    celex_write,
+    csv,
+    dat,
+    es,
+    hdf5,
+    hdf5_write,
+    npz,
+    raw,
+    raw_write,
+)
 from evnlos.events.io.celex_options import CelexOptions
 from evnlos.events.io.columns import Columns
 from evnlos.events.io.report import ReadReport, unreadable
+from evnlos.events.io.sink import Sink
 from evnlos.types import Events
 
 _SNIFFED_BYTES = 65_536
@@ -38,14 +52,15 @@ class Format:
         suffixes: File name endings, lower case with the dot.
         sniff: Whether the first bytes of a file (64 KiB at most) are of this format.
         open: Opens a file: (path, report, width, height, celex options).
-        write: Writes a file: (path, events, the name that it will get); None where the format is only read.
+        create: Begins a file: (path, first piece of the events, the name that it will get); None where the
+            format is only read.
     """
 
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[bytes], bool]
     open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None], Source]
-    write: Callable[[Path, Events, Path], None] | None = None
+    create: Callable[[Path, Events, Path], Sink] | None = None
 
 
 def _plain(source: Callable[[Path, ReadReport, int | None, int | None], Source]) -> Callable[..., Source]:
@@ -59,7 +74,7 @@ def _raw(name: str) -> Format:
         (".raw",),
         lambda start: raw.sniff_raw(start) == name,
         _plain(raw.RawSource),
-        lambda path, events, _: raw.write_raw(path, events, name),
+        lambda path, first, _: raw_write.RawSink(path, first, name),
     )
 
 
@@ -69,29 +84,41 @@ FORMATS = (
         (".h5", ".hdf5"),
         lambda start: start.startswith(hdf5.SIGNATURE),
         _plain(hdf5.Hdf5Source),
-        lambda path, events, _: hdf5.write_hdf5(path, events),
+        lambda path, first, _: hdf5_write.Hdf5Sink(path, first),
     ),
     Format(
         "NPZ",
         (".npz",),
         lambda start: start.startswith(npz.SIGNATURE),
         _plain(npz.NpzSource),
-        lambda path, events, _: npz.write_npz(path, events),
+        lambda path, first, _: npz.NpzSink(path, first),
     ),
     _raw("EVT3"),  # the first of a suffix is the one that is written by default
     _raw("EVT2"),
     _raw("EVT21"),
     Format("DAT", (".dat",), dat.sniff_dat, _plain(dat.DatSource)),
+    Format("ES", (".es",), lambda start: start.startswith(es.SIGNATURE), _plain(es.EsSource)),
     Format(
-        "AEDAT4", (".aedat4",), lambda start: start.startswith(aedat4.SIGNATURE), _plain(aedat4.Aedat4Source)
+        "AEDAT4",
+        (".aedat4",),
+        lambda start: start.startswith(aedat4.SIGNATURE),
+        _plain(aedat4.Aedat4Source),
+        lambda path, first, _: aedat4_write.Aedat4Sink(path, first),
     ),
-    Format("CELEX", (".bin",), celex.sniff_celex, celex.CelexSource, celex_write.write_celex),
+    Format("CELEX", (".bin",), celex.sniff_celex, celex.CelexSource, celex_write.CelexSink),
+    Format(  # read as CELEX: the header tells the event formats apart
+        "CELEX0",
+        (),
+        lambda _: False,
+        celex.CelexSource,
+        lambda path, first, target: celex_write.CelexSink(path, first, target, event_format=0),
+    ),
     Format(
         "CSV",
         (".csv", ".txt"),
         lambda start: csv.find_layout(start) is not None,
         csv.CsvSource,
-        lambda path, events, _: csv.write_csv(path, events),
+        lambda path, first, _: csv.CsvSink(path, first),
     ),
 )
 
@@ -113,7 +140,7 @@ def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format
     for format in FORMATS:
         if format.sniff(start):
             return format
-    known = ", ".join(dict.fromkeys(format.name for format in FORMATS))
+    known = ", ".join(format.name for format in FORMATS if format.suffixes)
     raise unreadable(
         path, 0, f"no known event format starts with {start[:8].hex(' ')}", f"these are read: {known}"
     )
@@ -125,7 +152,7 @@ def format_to_write(path: Path, name: str | None) -> Format:
     Raises:
         EventFileError: The name or suffix is unknown, or the format is only read.
     """
-    writable = [format for format in FORMATS if format.write]
+    writable = [format for format in FORMATS if format.create]
     if name is None:
         found = [format for format in writable if path.suffix.lower() in format.suffixes]
         what = f"suffix {path.suffix!r}"

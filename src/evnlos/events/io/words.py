@@ -76,6 +76,13 @@ class WordSource:
             yield done, buffer[:got]
             done += got
 
+    def words_of_file(self) -> Iterator[NDArray]:
+        """Yield blocks of words, as they stand in the file; a block is valid until the next."""
+        with self.path.open("rb", buffering=0) as file:
+            for _, words in self._word_blocks(file):
+                yield words
+        self._finish_words()
+
     def _decode(self, words: NDArray, first: int, columns: Columns, at: int) -> int:
         out = cut(columns, at, len(columns["t_us"]))
         report, state = self.report, self._state
@@ -104,6 +111,9 @@ class WordSource:
 
     def _finish(self) -> None:
         self.report.triggers = int(self._state[TRIGGERS])
+        self._finish_words()
+
+    def _finish_words(self) -> None:
         if self._left:
             offset = self.start + self.words * self.codec.dtype.itemsize
             cure = 'the file was cut: copy it again or read it with on_error="salvage"'

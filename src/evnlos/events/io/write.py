@@ -3,39 +3,155 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 
-from evnlos.errors import EventFileError
+import numpy as np
+
+from evnlos.errors import DataError, EventFileError
 from evnlos.events.io.registry import format_to_write
+from evnlos.events.io.sink import Sink
 from evnlos.types import Events
 
+_PIECE = 1 << 16  # smaller pieces are put together: they would cost a call and a chunk each
 
-def write_events(path: str | PathLike[str], events: Events, *, format: str | None = None) -> None:
+
+class EventWriter:
+    """An event file that grows piece by piece; it appears under its name when all went well.
+
+    Memory is bounded by the largest piece. Leaving the block by an error leaves no file.
+
+    Args:
+        path: The file to write; an existing one is replaced.
+        format: Name of the format, by default that of the suffix (`write_events` lists them).
+
+    Raises:
+        EventFileError: No writable format has that suffix or name, or the folder cannot be written.
+        DataError: A piece of another sensor or with other columns than the first, or earlier than the one
+            before; no piece at all; or the format cannot hold the sensor size or the times.
+
+    Example:
+        >>> import tempfile, pathlib
+        >>> from evnlos.events import read_events
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "three.raw"
+        >>> with EventWriter(path) as writer:
+        ...     writer.write(Events([5], [0], [1], [True], width=4, height=2))
+        ...     writer.write(Events([5, 9], [3, 3], [1, 0], [True, False], width=4, height=2))
+        >>> read_events(path)
+        Events(3 events, 4 x 2, 5..9 us, 67 % ON)
+    """
+
+    def __init__(self, path: str | PathLike[str], *, format: str | None = None) -> None:
+        self.path = Path(path)
+        self._format = format_to_write(self.path, format)
+        if not self.path.parent.is_dir():
+            raise EventFileError(f"{self.path}: no such folder {self.path.parent}; create it first")
+        self._temporary = self.path.with_name(f".{self.path.name[:80]}.{secrets.token_hex(4)}.part")
+        self._sink: Sink | None = None
+        self._blank: Events | None = None  # states the sensor
+        self._names: tuple[str, ...] = ()
+        self._held: list[Events] = []
+        self._newest: int | None = None
+        self.events = 0
+
+    def __enter__(self) -> EventWriter:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            if kind is None:
+                self._finish()
+        except OSError as error:
+            raise self._failure(error) from None
+        finally:
+            if self._sink is not None:
+                self._sink.close()
+            self._temporary.unlink(missing_ok=True)
+
+    def write(self, events: Events) -> None:
+        """Add a piece; one without events states the sensor size, for a stream that may have none."""
+        self._check(events)
+        if len(events):
+            self._held.append(events)
+            self.events += len(events)
+        if sum(map(len, self._held)) >= _PIECE:
+            try:
+                self._flush()
+            except OSError as error:
+                raise self._failure(error) from None
+
+    def _check(self, events: Events) -> None:
+        if self._blank is None:
+            self._blank = events[:0]
+        if events.shape != self._blank.shape:
+            raise DataError(
+                f"{self.path}: a piece of {events.width} x {events.height} pixels after one of "
+                f"{self._blank.width} x {self._blank.height}; write one sensor a file"
+            )
+        if not len(events):
+            return
+        names = tuple(events.columns())
+        if self._names and names != self._names:
+            raise DataError(
+                f"{self.path}: a piece with columns {names} after {self._names}; make them the same"
+            )
+        self._names = names
+        if self._newest is not None and int(events.t_us[0]) < self._newest:
+            raise DataError(
+                f"{self.path}: a piece from {int(events.t_us[0])} us after an event at {self._newest} us; "
+                "write pieces in the order of time"
+            )
+        self._newest = int(events.t_us[-1])
+
+    def _flush(self) -> None:
+        piece = _joined(self._held) if self._held else self._blank
+        assert piece is not None
+        self._held = []
+        if self._sink is None:
+            assert self._format.create is not None
+            self._sink = self._format.create(self._temporary, piece, self.path)
+        self._sink.append(piece)
+
+    def _finish(self) -> None:
+        if self._blank is None:
+            raise DataError(f"{self.path}: nothing to write; give at least one piece, which may be empty")
+        if self._held or self._sink is None:
+            self._flush()
+        assert self._sink is not None
+        self._sink.finish()
+        self._sink.close()
+        self._temporary.replace(self.path)
+
+    def _failure(self, error: OSError) -> EventFileError:
+        return EventFileError(f"{self.path}: writing failed ({error}); check the folder and the space on it")
+
+
+def _joined(pieces: list[Events]) -> Events:
+    if len(pieces) == 1:
+        return pieces[0]
+    columns = {
+        name: np.concatenate([piece.columns()[name] for piece in pieces]) for name in pieces[0].columns()
+    }
+    return Events._trusted(columns, pieces[0].width, pieces[0].height)
+
+
+def write_events(
+    path: str | PathLike[str], events: Events | Iterable[Events], *, format: str | None = None
+) -> None:
     """Write events to a file; it appears under its name only when it is complete.
 
     Args:
         path: The file to write; an existing one is replaced.
-        events: The events.
+        events: The events, or pieces of one stream in the order of time, such as `iter_events` yields: memory
+            is then bounded by the largest piece.
         format: Name of the format, such as "EVT2"; by default the suffix decides: .h5 and .hdf5 HDF5 with
             DSEC columns, .npz NPZ, .raw EVT3, .csv CSV, .bin CeleX-V (name it ..._100M.bin).
 
     Raises:
         EventFileError: No writable format has that suffix or name, or the folder cannot be written.
-        DataError: The format cannot hold the sensor size or the times.
+        DataError: The format cannot hold the sensor size or the times, or the pieces do not fit together.
     """
-    path = Path(path)
-    chosen = format_to_write(path, format)
-    if not path.parent.is_dir():
-        raise EventFileError(f"{path}: no such folder {path.parent}; create it first")
-    assert chosen.write is not None
-    temporary = path.with_name(f".{path.name[:80]}.{secrets.token_hex(4)}.part")
-    try:
-        chosen.write(temporary, events, path)
-        temporary.replace(path)
-    except OSError as error:
-        raise EventFileError(
-            f"{path}: writing failed ({error}); check the folder and the space on it"
-        ) from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    with EventWriter(path, format=format) as writer:
+        for piece in [events] if isinstance(events, Events) else events:
+            writer.write(piece)

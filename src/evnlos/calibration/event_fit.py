@@ -1,0 +1,211 @@
+"""Fitting the event pixel: simulate under the fitted light until the figures of the recordings agree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.calibration.event_statistics import (
+    Recording,
+    Regions,
+    moments,
+    regions_of,
+    simulated,
+)
+from evnlos.calibration.least_squares import forward_jacobian, levenberg_marquardt
+from evnlos.sensor import EventPixel
+from evnlos.types import Events
+
+_LOG_NAMES = ("threshold_on", "threshold_off", "threshold_sigma", "shot_noise_rate_hz")
+_NAMES = (*_LOG_NAMES, "leak_rate_hz")
+_STEPS = (0.05, 0.05, 0.2, 0.1, 0.03)
+_LOWEST = (math.log(0.02), math.log(0.02), math.log(0.002), math.log(1e-4), 0.0)
+_HIGHEST = (0.0, 0.0, math.log(0.3), math.log(1e3), 10.0)
+_CUTOFFS_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
+_GRID = (20, 32)  # blocks of the map of counts, rows and columns
+_BIN_S = 0.1
+
+
+@dataclass(frozen=True)
+class PixelFit:
+    """A fitted event pixel.
+
+    Args:
+        pixel: The pixel.
+        error: Standard error by name, from the scatter between the recordings; infinite where one recording is
+            all there is.
+        cutoff_range_hz: Corner frequencies that agree with the recordings within two standard errors.
+        dead_time_s: No pixel can be blind for longer: its shortest time between two events, seconds.
+    """
+
+    pixel: EventPixel
+    error: dict[str, float]
+    cutoff_range_hz: tuple[float, float]
+    dead_time_s: float
+
+
+def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int = 0) -> PixelFit:
+    """Fit thresholds, mismatch, leak and shot noise by the method of simulated moments, and scan the cutoff.
+
+    Six figures of the recordings (`MOMENTS`) must agree with those of simulated events under the fitted light.
+    The same random draws are used for every trial, so the figures change smoothly with the settings. The cutoff
+    shows only in when events come, so it is chosen by a map of counts in tenths of a second. The refractory
+    period is left as it is: only a bound can be told.
+
+    Args:
+        recordings: Light and events.
+        start: Pixel whose other settings are kept.
+        seed: Seed of the simulations.
+
+    Raises:
+        DataError: The light moves so little that no pixel tells a threshold.
+    """
+    regions = [regions_of(recording) for recording in recordings]
+    observed = moments(recordings, regions, [r.events for r in recordings])
+    first = replace(_first_guess(recordings, regions, observed, start), cutoff_hz=_CUTOFFS_HZ[5])
+    pixel, _ = _match(recordings, regions, observed, first, seed, 6)
+    cutoff, allowed = _scan_cutoff(recordings, pixel, seed)
+    pixel, values = _match(recordings, regions, observed, replace(pixel, cutoff_hz=cutoff), seed, 2)
+    error = _errors(recordings, regions, pixel, values, seed)
+    return PixelFit(pixel, error, allowed, shortest_interval_s([r.events for r in recordings]))
+
+
+def _first_guess(
+    recordings: Sequence[Recording], regions: Sequence[Regions], observed: NDArray, start: EventPixel
+) -> EventPixel:
+    """Shot noise from the OFF events where nothing moves; thresholds by counts, which fall as 1 / threshold."""
+    level = np.mean([r.light[:, q.quiet].mean() for r, q in zip(recordings, regions, strict=True)])
+    dark = 1 - 0.75 * min(1.0, (float(level) + 20) / 275)
+    shot = min(max(2 * observed[5] / dark, 1e-3), 100.0)
+    return replace(
+        start,
+        threshold_on=0.2,
+        threshold_off=0.2,
+        threshold_sigma=0.03,
+        shot_noise_rate_hz=shot,
+        leak_rate_hz=0.02,
+    )
+
+
+def _with(pixel: EventPixel, values: NDArray[np.float64]) -> EventPixel:
+    chosen = {
+        name: float(v) if name not in _LOG_NAMES else math.exp(v)
+        for name, v in zip(_NAMES, values, strict=True)
+    }
+    return replace(pixel, **chosen)
+
+
+def _values(pixel: EventPixel) -> list[float]:
+    return [math.log(getattr(pixel, n)) if n in _LOG_NAMES else getattr(pixel, n) for n in _NAMES]
+
+
+def _match(
+    recordings: Sequence[Recording],
+    regions: Sequence[Regions],
+    observed: NDArray,
+    pixel: EventPixel,
+    seed: int,
+    iterations: int,
+) -> tuple[EventPixel, NDArray[np.float64]]:
+    """Return the pixel whose simulated figures agree with those observed, and the search's values."""
+
+    def residual(values: NDArray[np.float64]) -> torch.Tensor:
+        return _discrepancy(recordings, regions, observed, _with(pixel, values), seed)
+
+    bounds = list(zip(_LOWEST, _HIGHEST, strict=True))
+    found = levenberg_marquardt(residual, _values(pixel), _STEPS, bounds, iterations=iterations, tolerance=0.02)
+    return _with(pixel, found.values), found.values
+
+
+def _discrepancy(
+    recordings: Sequence[Recording], regions: Sequence[Regions], observed: NDArray, pixel: EventPixel, seed: int
+) -> torch.Tensor:
+    """Return the logarithms of simulated over observed figures, float64 [6]."""
+    made = moments(recordings, regions, simulated(recordings, pixel, seed))
+    return torch.from_numpy(np.log((made + 1e-4) / (observed + 1e-4)))
+
+
+def _errors(
+    recordings: Sequence[Recording],
+    regions: Sequence[Regions],
+    pixel: EventPixel,
+    values: NDArray[np.float64],
+    seed: int,
+) -> dict[str, float]:
+    """Return standard errors from how much the discrepancy scatters between recordings."""
+    if len(recordings) < 2:
+        return dict.fromkeys(_NAMES, math.inf)
+    each = []
+    for k, (recording, region) in enumerate(zip(recordings, regions, strict=True)):
+        observed = moments([recording], [region], [recording.events])
+        each.append(_discrepancy([recording], [region], observed, pixel, seed + k).numpy())
+    spread = np.cov(np.stack(each).T) / len(recordings)
+
+    def figures(trial: NDArray[np.float64]) -> torch.Tensor:
+        made = moments(recordings, regions, simulated(recordings, _with(pixel, trial), seed))
+        return torch.from_numpy(np.log(made + 1e-4))
+
+    slope = forward_jacobian(figures, values, figures(values), np.array(_STEPS), np.array(_HIGHEST)).numpy()
+    back = np.linalg.pinv(slope)
+    error = np.sqrt(np.diag(back @ spread @ back.T))
+    scale = [getattr(pixel, name) if name in _LOG_NAMES else 1.0 for name in _NAMES]
+    return dict(zip(_NAMES, (float(v) for v in error * scale), strict=True))
+
+
+def _scan_cutoff(
+    recordings: Sequence[Recording], pixel: EventPixel, seed: int
+) -> tuple[float, tuple[float, float]]:
+    """Return the best corner frequency of a list, and the lowest and highest that the recordings allow.
+
+    A frequency is allowed where its misfit exceeds the best one's by no more than twice the standard error of
+    that difference, from its scatter over the tenths of seconds.
+    """
+    misfit = []
+    for cutoff in _CUTOFFS_HZ:
+        made = simulated(recordings, replace(pixel, cutoff_hz=cutoff), seed)
+        parts = []
+        for recording, events in zip(recordings, made, strict=True):
+            seen, volume = (_count_volume(recording, found) for found in (recording.events, events))
+            parts.append(((seen - volume) ** 2 / (seen + volume + 1)).sum(axis=1))
+        misfit.append(np.concatenate(parts))
+    score = np.stack(misfit)  # [cutoffs, tenths of seconds of all recordings]
+    best = int(score.sum(axis=1).argmin())
+    excess = score - score[best]
+    error = excess.std(axis=1) * math.sqrt(excess.shape[1])
+    allowed = np.array(_CUTOFFS_HZ)[excess.sum(axis=1) <= 2 * error]
+    return _CUTOFFS_HZ[best], (float(allowed.min()), float(allowed.max()))
+
+
+def _count_volume(recording: Recording, events: Events) -> NDArray[np.float64]:
+    """Return the counts in tenths of a second, of both polarities in blocks of the sensor, [T, blocks]."""
+    rows, columns = (min(a, b) for a, b in zip(_GRID, (events.height, events.width), strict=True))
+    chosen = events.t_us > recording.settled_us
+    bins = max(1, math.ceil(recording.seconds / _BIN_S))
+    when = np.minimum(((events.t_us[chosen] - recording.settled_us) * 1e-6 / _BIN_S).astype(np.int64), bins - 1)
+    row = events.y[chosen].astype(np.int64) * rows // events.height
+    column = events.x[chosen].astype(np.int64) * columns // events.width
+    flat = ((when * 2 + events.p[chosen]) * rows + row) * columns + column
+    counts = np.bincount(flat, minlength=bins * 2 * rows * columns)
+    return counts.reshape(bins, -1).astype(np.float64)
+
+
+def shortest_interval_s(events: Sequence[Events], share: float = 1e-3) -> float:
+    """Return the time between two events of a pixel that only a share of the pairs fall below, seconds.
+
+    Args:
+        events: Recordings.
+        share: Share of the pairs that noise may put closer together.
+    """
+    gaps = []
+    for found in events:
+        pixel = found.y.astype(np.int64) * found.width + found.x
+        order = np.lexsort((found.t_us, pixel))
+        step = np.diff(found.t_us[order])
+        gaps.append(step[np.diff(pixel[order]) == 0])
+    every = np.concatenate(gaps)
+    return float(np.quantile(every, share)) * 1e-6 if len(every) else math.inf

@@ -1,0 +1,156 @@
+"""Figures of event recordings that a pixel's settings decide, and the light that made the recordings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.calibration.captures import Shots
+from evnlos.calibration.frame_model import AnyTransport
+from evnlos.calibration.frame_noise import local_square
+from evnlos.errors import DataError
+from evnlos.seeds import derive_seed
+from evnlos.sensor import EventPixel, simulate_events
+from evnlos.sensor.event_camera import WHITE_DN
+from evnlos.types import Events
+
+_STEP_PX = 0.2  # the light is linear in time between two rendered instants
+_MOST_BYTES = 1 << 30
+_SETTLE = 0.05  # share of the recording in which the pixels' references forget their start
+_QUIET, _ACTIVE = 0.06, 0.5  # range of the log light of a pixel that sees nothing, and of one that sees much
+
+MOMENTS = ("ON, active", "OFF, active", "scatter ON", "scatter OFF", "ON, quiet", "OFF, quiet")
+"""Figures of `moments`, a pixel and second: events, and the variance of the counts' roots among neighbours."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One event recording and the light that made it.
+
+    Args:
+        light: Light on the sensor in the pixel's digital numbers, float32 [T, H, W].
+        times_s: Instants of the light, float64 [T], seconds.
+        events: What the camera recorded.
+        index: Number of the capture among those it came from.
+    """
+
+    light: NDArray[np.float32]
+    times_s: NDArray[np.float64]
+    events: Events
+    index: int = 0
+
+    @property
+    def settled_us(self) -> int:
+        """Instant from which events count, microseconds."""
+        start, stop = self.times_s[0], self.times_s[-1]
+        return round((start + _SETTLE * (stop - start)) * 1e6)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the part that counts, seconds."""
+        return float(self.times_s[-1]) - self.settled_us * 1e-6
+
+    def simulate(self, pixel: EventPixel, seed: int) -> Events:
+        """Return the events of a pixel under the same light."""
+        return simulate_events(self.light, self.times_s, pixel, seed=seed)
+
+
+def read_recordings(shots: Shots, transport: AnyTransport, count: int) -> list[Recording]:
+    """Render the light of `count` captures, evenly chosen, from a fitted transport.
+
+    Raises:
+        DataError: The sensor is so large that not even one capture's light fits in 1 GiB.
+    """
+    height, width = shots.shape
+    chosen = np.unique(np.linspace(0, len(shots.captures) - 1, count).round().astype(int))
+    recordings, used = [], 0
+    for k in chosen:
+        capture, scene = shots.captures[k], shots.scenes[k]
+        wall = transport.wall(scene, shots.shape)
+        first, last = (float(t) * 1e-6 for t in capture.frame_times_us[[0, -1]])
+        steps = max(8, math.ceil((last - first) * wall.speed_px_s / _STEP_PX))
+        used += 4 * (steps + 1) * height * width
+        if used > _MOST_BYTES:
+            break
+        times = np.linspace(first, last, steps + 1)
+        light = wall.irradiance(times).numpy() * np.float32(WHITE_DN)
+        recordings.append(Recording(light, times, within(capture.events, first, last), int(k)))
+    if not recordings:
+        raise DataError(
+            f"the light of one capture needs {used >> 20} MiB, above {_MOST_BYTES >> 20}; fit frames alone "
+            "(--no-events) or record at a smaller size"
+        )
+    return recordings
+
+
+def within(events: Events, first_s: float, last_s: float) -> Events:
+    """Return the events after `first_s` and up to `last_s`, seconds."""
+    low, high = np.searchsorted(events.t_us, [first_s * 1e6, last_s * 1e6], side="right")
+    part = slice(int(low), int(high))
+    return Events(
+        events.t_us[part], events.x[part], events.y[part], events.p[part], events.width, events.height
+    )
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Pixels whose light moves much, and pixels whose light hardly moves.
+
+    Args:
+        active: bool [H, W].
+        quiet: bool [H, W].
+    """
+
+    active: NDArray[np.bool_]
+    quiet: NDArray[np.bool_]
+
+
+def regions_of(recording: Recording) -> Regions:
+    """Return the active and the quiet pixels of a recording, from its light.
+
+    Raises:
+        DataError: The light moves so little that no pixel tells a threshold.
+    """
+    light = np.log(np.maximum(recording.light, 1e-3))
+    swing = np.ptp(light, axis=0)
+    active = swing > _ACTIVE
+    if active.mean() < 1e-3:
+        raise DataError(
+            f"the log light moves by at most {swing.max():.2f} in a recording; an event pixel needs {_ACTIVE} "
+            "or more to show its thresholds: lower the ambient light, or fit frames alone (--no-events)"
+        )
+    quiet = swing < _QUIET
+    if quiet.mean() < 0.01:
+        quiet = swing <= np.quantile(swing, 0.05)
+    return Regions(active, quiet)
+
+
+def moments(recordings: Sequence[Recording], regions: Sequence[Regions], events: Sequence[Events]) -> NDArray:
+    """Return the six figures of `MOMENTS`, float64 [6]."""
+    total, pixels = np.zeros(6), np.zeros(2)
+    for recording, region, found in zip(recordings, regions, events, strict=True):
+        counts = [count_map(found, polarity, recording.settled_us) for polarity in (True, False)]
+        # The root of a count scatters alike for many events and for few.
+        scatter = [local_square(np.sqrt(count)) for count in counts]
+        for place, chosen in enumerate((region.active, region.quiet)):
+            pixels[place] += chosen.sum() * recording.seconds
+            for k in range(2):
+                total[4 * place + k] += counts[k][chosen].sum()
+                total[2 + k] += scatter[k][chosen].sum() if place == 0 else 0.0
+    return total / np.repeat(pixels, [4, 2])
+
+
+def count_map(events: Events, polarity: bool, after_us: int) -> NDArray[np.int64]:
+    """Return the events of a polarity at each pixel after an instant, int64 [H, W]."""
+    chosen = (events.p == polarity) & (events.t_us > after_us)
+    flat = events.y[chosen].astype(np.int64) * events.width + events.x[chosen]
+    return np.bincount(flat, minlength=events.width * events.height).reshape(events.height, events.width)
+
+
+def simulated(recordings: Sequence[Recording], pixel: EventPixel, seed: int) -> list[Events]:
+    """Return simulated events of all recordings; the same seed draws the same mismatch and noise."""
+    return [r.simulate(pixel, derive_seed(seed, "calibration", k)) for k, r in enumerate(recordings)]

@@ -1,0 +1,189 @@
+"""From captures of a rig to a simulation of it, with the proof on captures that the fit has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.calibration.captures import Shots, read_shots
+from evnlos.calibration.event_check import event_residuals
+from evnlos.calibration.event_fit import PixelFit, fit_pixel
+from evnlos.calibration.event_statistics import read_recordings
+from evnlos.calibration.frame_model import AnyTransport, FrameModel
+from evnlos.calibration.frame_noise import FrameNoise, fit_frame_noise
+from evnlos.calibration.residual import Residual
+from evnlos.calibration.settings import Calibration
+from evnlos.calibration.transport_fit import TransportFit, fit_transport
+from evnlos.dataset.simulate import SensorSize, Simulation
+from evnlos.errors import DataError
+from evnlos.scene import LineMotion
+from evnlos.sensor import EventPixel
+
+_EXAMPLES = 3
+
+Surfaces = dict[str, tuple[NDArray, NDArray]]
+"""Time surfaces [N, 2, h, w] of camera and model by capture."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """What a held-out capture looks like beside the fit: white levels, and time surfaces.
+
+    Args:
+        name: Name of the capture.
+        frame: A frame [H, W].
+        model: The fit's frame [H, W].
+        surface: Time surface at that frame [2, h, w]; None without events.
+        model_surface: The fit's.
+    """
+
+    name: str
+    frame: NDArray
+    model: NDArray
+    surface: NDArray | None = None
+    model_surface: NDArray | None = None
+
+
+@dataclass(frozen=True)
+class RigFit:
+    """A calibrated simulation and what it is worth.
+
+    Args:
+        simulation: The settings that make the simulator match the rig.
+        fitted: Names of the captures that were fitted.
+        held_out: Names of the captures that it was checked on.
+        optics: The fitted transport, its start and its errors.
+        noise: The frame camera's noise.
+        pixel: The fitted event pixel; None where only frames were fitted.
+        residuals: By "frames fit" and "frames held out"; with events also of "counts" and "surfaces".
+        example: Held-out captures beside the fit.
+    """
+
+    simulation: Simulation
+    fitted: tuple[str, ...]
+    held_out: tuple[str, ...]
+    optics: TransportFit
+    noise: FrameNoise
+    pixel: PixelFit | None
+    residuals: dict[str, Residual]
+    example: tuple[Example, ...]
+
+    @property
+    def worse(self) -> tuple[str, ...]:
+        """Names of the residuals on held-out captures that the fit did not lower."""
+        return tuple(
+            name for name, r in self.residuals.items() if name.endswith("held out") and not r.after < r.before
+        )
+
+
+def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) -> RigFit:
+    """Fit the simulator to captures of a rig with known targets.
+
+    Args:
+        folders: Capture folders of one rig and one camera.
+        settings: What to hold out, what to fit and where to start; None is a wall of rough metal.
+
+    Returns:
+        The calibrated simulation, its parameters' errors, and the residuals before and after on the captures
+        that were fitted and on those held out.
+
+    Raises:
+        DataError: Too few captures, unknown targets or motions, different rigs or cameras, or frames that do
+            not follow the targets.
+    """
+    settings = Calibration() if settings is None else settings
+    fit, held = read_shots(
+        folders,
+        exclude=settings.exclude,
+        holdout=settings.holdout,
+        share=settings.holdout_share,
+        seed=settings.seed,
+    )
+    start, fixed = _at_known_distance(settings, fit)
+    optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
+    residuals: dict[str, Residual] = {}
+    models = {"fit": FrameModel(fit, fit.shape), "held out": FrameModel(held, held.shape)}
+    predicted = {name: model.predict(optics.transport) for name, model in models.items()}
+    noise = fit_frame_noise(fit, predicted["fit"].numpy(), settings.start.frame_camera)
+    for name, model in models.items():
+        before = model.relative((model.frames - model.predict(optics.before)) * model.weight)
+        after = model.relative((model.frames - predicted[name]) * model.weight)
+        spread = float(model.frames.std(correction=0))
+        residuals[f"frames {name}"] = Residual(before, after, noise.temporal / spread)
+    simulation = _simulation(settings, fit, optics.transport, noise, settings.start.pixel)
+    pixel: PixelFit | None = None
+    surfaces: Surfaces = {}
+    if settings.events:
+        recordings = read_recordings(fit, optics.transport, settings.event_captures)
+        pixel = fit_pixel(recordings, settings.start.pixel, seed=settings.seed)
+        simulation = replace(simulation, pixel=pixel.pixel)
+        checks = {"fit": (fit, recordings), "held out": (held, None)}
+        for name, (shots, known) in checks.items():
+            found = known or read_recordings(shots, optics.transport, settings.event_captures)
+            events, surfaces = event_residuals(
+                shots, found, settings.start.pixel, pixel.pixel, simulation.sampling, settings.seed
+            )
+            residuals |= {f"{kind} {name}": r for kind, r in events.items()}
+    examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
+    return RigFit(simulation, fit.names, held.names, optics, noise, pixel, residuals, examples)
+
+
+def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[AnyTransport, tuple[str, ...]]:
+    """Return the start at the measured distance of target and wall, and the names of what is known."""
+    noted = shots.captures[0].info.rig.get("distance_m")
+    transport = settings.start.transport
+    if noted is not None:
+        if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not noted > 0:
+            raise DataError(
+                f"{shots.names[0]}: rig.distance_m is {noted!r}; give the metres from target to wall, above 0"
+            )
+        transport = replace(transport, distance_m=float(noted))
+    return transport, () if settings.fit_distance else ("distance_m",)
+
+
+def _simulation(
+    settings: Calibration, shots: Shots, transport: AnyTransport, noise: FrameNoise, pixel: EventPixel
+) -> Simulation:
+    """Return the start with everything that the captures tell: plate, motion, length, positions, sensor."""
+    scene, start = shots.scenes[0], settings.start
+    times = shots.times_s(0)
+    motion = scene.motion
+    assert isinstance(motion, LineMotion)  # the only motion that a capture describes
+    x, y = motion.position_m(times[0])
+    plate = replace(start.glyphs.plate, size_m=scene.target.size_m)
+    return replace(
+        start,
+        glyphs=replace(start.glyphs, plate=plate),
+        motion=replace(motion, start_m=(float(x), float(y)), start_s=0.0),
+        duration_s=float(times[-1] - times[0]),
+        positions=len(times) - 1,
+        transport=transport,
+        sensor=SensorSize(*shots.shape),
+        frame_camera=noise.camera,
+        pixel=pixel,
+    )
+
+
+def _examples(held: Shots, model: FrameModel, predicted: NDArray, surfaces: Surfaces) -> tuple[Example, ...]:
+    """Return the middle frame of some held-out captures beside the model's, and the surfaces at that frame."""
+    of = held.frame_of()
+    chosen = []
+    for name in [n for n in held.names if n in surfaces or not surfaces][:_EXAMPLES]:
+        rows = np.flatnonzero(of == held.names.index(name))
+        middle = len(rows) // 2
+        seen, made = surfaces.get(name, (None, None))
+        k = max(0, middle - 1)  # the first frame has no surface
+        chosen.append(
+            Example(
+                name,
+                model.frames[rows[middle]].numpy(),
+                predicted[rows[middle]],
+                None if seen is None else seen[k],
+                None if made is None else made[k],
+            )
+        )
+    return tuple(chosen)

@@ -1,0 +1,190 @@
+"""What a transport predicts for the frames of captures, and the light that fits them best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.calibration.captures import Shots
+from evnlos.dataset.sampling import reduce_by_area
+from evnlos.errors import ConfigError, DataError
+from evnlos.transport import PaperTransport, RadiometricTransport
+
+AnyTransport = PaperTransport | RadiometricTransport
+
+
+@dataclass(frozen=True)
+class Light:
+    """The linear part of a frame: frame = gain light + ambient (1 + gx x + gy y), x and y from -1 to 1.
+
+    Args:
+        gain: White levels a unit of light.
+        ambient: Ambient light in the middle of the image, white levels.
+        gradient: Relative growth of the ambient light to the right and the lower border.
+    """
+
+    gain: float
+    ambient: float
+    gradient: tuple[float, float]
+
+    def into(self, transport: AnyTransport) -> AnyTransport:
+        """Return the transport with this gain and ambient light.
+
+        Raises:
+            DataError: No camera shows such light: the gain is not positive, or the ambient light is negative.
+        """
+        if not self.gain > 0:
+            raise DataError(
+                f"the fitted gain is {self.gain:.3g}; the frames do not follow the targets: check the motion's "
+                "direction and start, and whether the frames are mirrored"
+            )
+        gx, gy = self.gradient
+        # A dark corner may come out a hair below zero; a wall that is dark everywhere has no gradient.
+        level = max(self.ambient, 0.0)
+        steep = abs(gx) + abs(gy)
+        shrink = min(1.0, 1.0 / steep) if steep > 0 else 1.0
+        gradient = (gx * shrink, gy * shrink) if level > 0 else (0.0, 0.0)
+        return replace(transport, gain=self.gain, ambient=level, ambient_gradient=gradient)
+
+
+class FrameModel:
+    """The frames of captures at a working size, beside what a transport makes of the same targets.
+
+    Pixels that a frame shows at its largest number are saturated and take no part.
+
+    Args:
+        shots: The captures.
+        shape: Working size (h, w), pixels; frames are reduced to it by area averaging.
+        every: Only every n-th frame of a capture takes part.
+
+    Attributes:
+        frames: The frames, white levels, float32 [N, h, w].
+        weight: 1 where a pixel takes part, 0 where it is saturated, float32 [N, h, w].
+
+    Raises:
+        ConfigError: `every` is below 1.
+    """
+
+    def __init__(self, shots: Shots, shape: tuple[int, int], every: int = 1) -> None:
+        if every < 1:
+            raise ConfigError(f"every is {every}; take every frame (1) or every n-th")
+        self.shape = shape
+        self._scenes = shots.scenes
+        self._times = [shots.times_s(k)[::every] for k in range(len(shots.captures))]
+        raw = np.concatenate([capture.frames[::every] for capture in shots.captures])
+        reduced = reduce_by_area(raw / np.float32(shots.peak), shape)
+        self.frames = torch.from_numpy(reduced)
+        open_share = reduce_by_area((raw < shots.peak).astype(np.float32), shape)
+        self.weight = torch.from_numpy((open_share > 0.999).astype(np.float32))
+        y, x = torch.linspace(-1, 1, shape[0]), torch.linspace(-1, 1, shape[1])
+        self._ramp = torch.stack([torch.ones(shape), x.expand(shape), y[:, None].expand(shape)])  # [3, h, w]
+        self._drawn: dict[object, torch.Tensor] = {}
+
+    def light(self, transport: AnyTransport) -> torch.Tensor:
+        """Return the light of every frame at gain 1 without ambient light, float32 [N, h, w]."""
+        plain = replace(transport, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0))
+        if isinstance(plain, RadiometricTransport):
+            # One matrix carries the frames of all captures at once.
+            matrix = plain.transport(self.shape).matrix
+            strips = self._strips(plain)
+            return (strips @ matrix.T.to(strips)).reshape(-1, *self.shape)
+        walls = [plain.wall(scene, self.shape) for scene in self._scenes]
+        return torch.cat([wall.irradiance(times) for wall, times in zip(walls, self._times, strict=True)])
+
+    def fit(self, light: torch.Tensor) -> tuple[Light, torch.Tensor]:
+        """Return gain and ambient light that fit best, and the residual frame - model, float32 [N, h, w]."""
+        ramp = self._ramp.double()
+        lit = light * self.weight
+        # Normal equations: the ambient light is the same three pictures in every frame.
+        columns = torch.zeros(4, 4, dtype=torch.float64)
+        columns[0, 0] = _inner(lit, light)
+        columns[0, 1:] = columns[1:, 0] = (ramp * lit.sum(0)).sum((1, 2))
+        columns[1:, 1:] = torch.einsum("ahw,bhw,hw->ab", ramp, ramp, self.weight.sum(0).double())
+        seen = (self.frames * self.weight).sum(0)
+        right = torch.cat([_inner(lit, self.frames)[None], (ramp * seen).sum((1, 2))])
+        if columns[0, 0] == 0:
+            columns[0, 0] = 1.0  # no light at all: its gain is 0, and the others stand alone
+        gain, level, gx, gy = torch.linalg.solve(columns, right).tolist()
+        ambient = (torch.tensor([level, gx, gy]) @ self._ramp.flatten(1)).reshape(self.shape)
+        residual = ((self.frames - ambient) - gain * light) * self.weight
+        floor = level if abs(level) > 1e-9 else 1e-9
+        return Light(gain, level, (gx / floor, gy / floor)), residual
+
+    def predict(self, transport: AnyTransport) -> torch.Tensor:
+        """Return the frames that the transport, with its own gain and ambient light, predicts, [N, h, w]."""
+        gx, gy = transport.ambient_gradient
+        ambient = transport.ambient * (torch.tensor([1.0, gx, gy]) @ self._ramp.flatten(1))
+        return transport.gain * self.light(transport) + ambient.reshape(self.shape)
+
+    def relative(self, residual: torch.Tensor) -> float:
+        """Return the root mean square of a residual over the frames' standard deviation, over all pixels."""
+        return relative_residual(residual, self.frames, self.weight)
+
+    def _strips(self, transport: RadiometricTransport) -> torch.Tensor:
+        """Return every frame's target on the strip of cells, float32 [N, cells]; drawn once for each strip."""
+        plane = transport.source()
+        if plane not in self._drawn:
+            drawn = [
+                scene.target.rasterise(plane, scene.motion.position_m(times))
+                for scene, times in zip(self._scenes, self._times, strict=True)
+            ]
+            self._drawn[plane] = torch.from_numpy(np.concatenate(drawn)).flatten(1)
+        return self._drawn[plane]
+
+
+def relative_residual(residual: torch.Tensor, frames: torch.Tensor, weight: torch.Tensor) -> float:
+    """Return sqrt(mean residual^2) over the standard deviation of the frames, over the pixels that take part.
+
+    Args:
+        residual: Frames minus model, [...].
+        frames: The frames, [...].
+        weight: 1 where a pixel takes part, 0 elsewhere, [...].
+
+    Example:
+        >>> frames = torch.tensor([0.0, 2.0])
+        >>> relative_residual(frames - 1.0, frames, torch.ones(2))
+        1.0
+    """
+    taken = weight > 0
+    spread = frames[taken].double().std(correction=0)
+    return float(residual[taken].double().square().mean().sqrt() / spread)
+
+
+def _inner(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return the sum of a b over [N, h, w], gathered in float64."""
+    return torch.einsum("nhw,nhw->n", a, b).double().sum()
+
+
+def working_shape(shape: tuple[int, int], columns: int) -> tuple[int, int]:
+    """Return the size (h, w), w about `columns` and at most the sensor's, that keeps the sensor's shape best.
+
+    Args:
+        shape: Sensor size (H, W), pixels.
+        columns: Wanted number of columns.
+
+    Example:
+        >>> working_shape((100, 160), 60)
+        (40, 64)
+    """
+    height, width = shape
+    if columns >= width:
+        return shape
+    candidates = [
+        (max(1, round(w * height / width)), w) for w in range(columns, min(width, columns * 4 // 3) + 1)
+    ]
+    return min(candidates, key=lambda s: (round(abs(s[0] * width / (s[1] * height) - 1), 6), s[1]))
+
+
+def fitting_strip(transport: AnyTransport, shots: Shots) -> AnyTransport:
+    """Return the transport with a strip that holds every target of the captures on its way."""
+    if not isinstance(transport, RadiometricTransport):
+        return transport
+    reach: NDArray[np.float64] = np.zeros(2)
+    for k, scene in enumerate(shots.scenes):
+        places = np.abs(scene.motion.position_m(shots.times_s(k))).max(axis=0)
+        reach = np.maximum(reach, places + scene.target.size_m / 2)
+    width, height = (max(s, round(float(2 * r), 9)) for s, r in zip(transport.strip_m, reach, strict=True))
+    return replace(transport, strip_m=(width, height))

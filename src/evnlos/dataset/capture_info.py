@@ -1,0 +1,175 @@
+"""What `capture.yaml` says about a shot; a user writes it, everything but the camera's size has a default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from evnlos.config import from_dict, read_yaml
+from evnlos.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """The event camera that watched the wall, and the frames beside it."""
+
+    width: int
+    """Sensor width, pixels."""
+    height: int
+    """Sensor height, pixels."""
+    name: str = "unknown"
+    """Maker and model."""
+    frame_rate_hz: float | None = None
+    """Frames a second, hertz; the frames' times where they carry none (frame 0 at 0 on the frames' clock)."""
+    exposure_s: float | None = None
+    """Exposure of a frame, seconds."""
+    clock_mhz: int | None = None
+    """Clock of a CeleX-V sensor, MHz, where the file's name does not say it."""
+
+
+@dataclass(frozen=True)
+class TargetInfo:
+    """The hidden plate, where it is known."""
+
+    name: str
+    """What it shows, e.g. a letter."""
+    mask: str | None = None
+    """Picture of the plate, a file in the folder; white shines."""
+    plate_m: float = 0.08
+    """Side of the plate, metres."""
+
+
+@dataclass(frozen=True)
+class MotionInfo:
+    """A straight, steady motion: the plate's centre is at start_m + speed (t - start_us) along `direction`."""
+
+    start_m: float | tuple[float, float]
+    """Centre at `start_us` relative to the middle of the travel: along the direction, or (x, y), metres."""
+    speed_m_s: float
+    """Speed, metres a second."""
+    direction: tuple[float, float] = (1.0, 0.0)
+    """Direction (x to the right, y downwards)."""
+    start_us: int = 0
+    """Instant of the start on the events' clock, microseconds: the time stamp that ties the truth to the
+    shot."""
+
+
+@dataclass(frozen=True)
+class AlignmentInfo:
+    """How the frames' clock becomes the events': event time = frame time + offset."""
+
+    offset_us: int | Literal["auto"] = 0
+    """Offset, microseconds, or auto: found from what both saw change at once (a blink, a jerk)."""
+    search_s: float = 1.0
+    """Largest offset that auto looks at, seconds."""
+    blocks: int = 8
+    """Blocks of pixels along the longer side that auto compares; 1 for cameras that see different things."""
+    trigger_channel: int | None = None
+    """Input of the event camera that frame exposures are wired to: frame k is at its k-th rising edge."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.search_s <= 60:
+            raise ConfigError(f"alignment.search_s is {self.search_s}; give more than 0 and at most 60 s")
+        if self.trigger_channel is not None and self.offset_us == "auto":
+            raise ConfigError("alignment has a trigger_channel and offset_us: auto; give one of them")
+
+
+@dataclass(frozen=True)
+class DotsInfo:
+    """A grid of dots that both cameras saw: bright in a frame, blinking for the events."""
+
+    rows: int
+    """Rows of dots."""
+    columns: int
+    """Dots a row."""
+    frame: str
+    """Picture of the grid by the frame camera, a file in the folder."""
+    events: str
+    """Recording of the blinking grid by the event camera, a file in the folder."""
+
+
+@dataclass(frozen=True)
+class RegistrationInfo:
+    """How frame pixels become event pixels; one of the three."""
+
+    homography: tuple[tuple[float, float, float], ...] | None = None
+    """Three rows of three numbers that map frame (x, y, 1) to event (x, y, 1), pixels."""
+    points: tuple[tuple[float, float, float, float], ...] | None = None
+    """At least four of (frame x, frame y, event x, event y), pixels."""
+    dots: DotsInfo | None = None
+    """A calibration shot of a grid of dots."""
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("homography", "points", "dots") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ConfigError(
+                f"registration has {' and '.join(given) or 'nothing'}; give homography, points or dots"
+            )
+
+
+@dataclass(frozen=True)
+class RegionInfo:
+    """The part of the event camera's sensor that is used."""
+
+    x: int
+    """First column, pixels."""
+    y: int
+    """First row, pixels."""
+    width: int
+    """Columns, pixels."""
+    height: int
+    """Rows, pixels."""
+
+
+@dataclass(frozen=True)
+class FilterInfo:
+    """Events that are left out."""
+
+    hot_pixel_factor: float | None = None
+    """A pixel with that many times the median of its surroundings is hot, e.g. 10; none = keep all."""
+    background_us: int | None = None
+    """Events without one of their 8 neighbours in that time before are noise, microseconds; none = keep all."""
+
+
+@dataclass(frozen=True)
+class CaptureInfo:
+    """What `capture.yaml` holds."""
+
+    camera: CameraInfo
+    """The camera."""
+    events: str = "events.raw"
+    """The event file, as the camera wrote it."""
+    frames: str = "frames.csv"
+    """Frames: a table t_us,file; a video; a folder of pictures; an AEDAT4 file; a CeleX-V recording of mode
+    F."""
+    frames_turned: bool = False
+    """Whether the frames are turned by 180 degrees against the events, as the CeleX-V program exports them."""
+    target: TargetInfo | None = None
+    """The target, where it is known."""
+    motion: MotionInfo | None = None
+    """Its motion, where it is known."""
+    alignment: AlignmentInfo = field(default_factory=AlignmentInfo)
+    """Clock of the frames."""
+    registration: RegistrationInfo | None = None
+    """Pixels of the frames; without it they are those of the events."""
+    dark: str | None = None
+    """Frame with the lens covered, a file in the folder, of the frame camera's size."""
+    flat: str | None = None
+    """Frame of an evenly lit surface, a file in the folder, of the frame camera's size."""
+    roi: RegionInfo | None = None
+    """Part of the event camera's sensor to use, after registration; none = all."""
+    filters: FilterInfo = field(default_factory=FilterInfo)
+    """Events to leave out."""
+    rig: dict[str, Any] = field(default_factory=dict)
+    """Notes about the rig: distance_m, wall, ambient."""
+
+
+def read_capture_info(folder: Path) -> CaptureInfo:
+    """Read the `capture.yaml` of a folder.
+
+    Raises:
+        ConfigError: It is missing, or has an unknown key or a wrong type.
+    """
+    path = folder / "capture.yaml"
+    return from_dict(CaptureInfo, read_yaml(path), source=str(path))

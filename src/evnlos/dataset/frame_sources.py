@@ -1,0 +1,136 @@
+"""The frames of a capture, in whatever form they lie in its folder."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from evnlos.dataset.capture_info import CaptureInfo
+from evnlos.errors import DataError
+from evnlos.events import read_timed_frames
+from evnlos.sensor.video import open_video
+
+_RECORDINGS = (".aedat4", ".bin")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSeries:
+    """Frames in the order of time.
+
+    Args:
+        images: uint8 or uint16 [N, H, W], digital numbers.
+        times_us: Times on the frames' own clock, int64 [N], microseconds.
+        what: What they were read from, for a message.
+    """
+
+    images: NDArray
+    times_us: NDArray[np.int64]
+    what: str
+
+
+def inside(folder: Path, name: str) -> Path:
+    """Return the path of a file or folder of the capture; a name never leads out of its folder."""
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
+    if not path.exists():
+        raise DataError(f"{path} does not exist; {folder / 'capture.yaml'} names it")
+    return path
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
+    """Read a grey picture as uint8 or uint16 [H, W]; `size` is (rows, columns)."""
+    try:
+        with Image.open(path) as image:
+            if size is not None and image.size != (size[1], size[0]):
+                wide, high = image.size
+                raise DataError(f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}")
+            array = np.asarray(image if image.mode.startswith("I;16") else image.convert("L"))
+    except (UnidentifiedImageError, OSError) as error:
+        raise DataError(f"{path} can't be read as a picture: {error}") from None
+    return array
+
+
+def read_frame_series(folder: Path, info: CaptureInfo) -> FrameSeries:
+    """Read the frames that a capture names.
+
+    Args:
+        folder: The capture's folder.
+        info: Its description.
+
+    Raises:
+        DataError: A file is missing or unreadable, or frames carry no time and no rate is stated.
+        EventFileError: A recording of the camera is damaged.
+    """
+    path = inside(folder, info.frames)
+    size = None if info.registration is not None else (info.camera.height, info.camera.width)
+    if path.suffix.lower() == ".csv":
+        return _from_table(folder, path, size)
+    if path.suffix.lower() in _RECORDINGS:
+        found = read_timed_frames(path)
+        times = found.t_us if found.t_us is not None else _at_rate(path, len(found.images), info)
+        series = FrameSeries(found.images, times, path.name)
+    else:
+        series = _from_video(path, info)
+    _check_times(path, series.times_us)
+    if size is not None and series.images.shape[1:] != size:
+        high, wide = series.images.shape[1:]
+        raise DataError(
+            f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}: state a registration"
+        )
+    return series
+
+
+def _rate(path: Path, info: CaptureInfo) -> float:
+    rate = info.camera.frame_rate_hz
+    if rate is None or not rate > 0:
+        raise DataError(f"{path}: its frames carry no times; state camera.frame_rate_hz in capture.yaml")
+    return rate
+
+
+def _at_rate(path: Path, count: int, info: CaptureInfo) -> NDArray[np.int64]:
+    return np.round(np.arange(count) * (1e6 / _rate(path, info))).astype(np.int64)
+
+
+def _from_video(path: Path, info: CaptureInfo) -> FrameSeries:
+    """Read a video, animation, array or folder of pictures as 16 bits."""
+    timed = path.is_file() and path.suffix.lower() != ".npy"
+    video = open_video(path, fps=None if timed else _rate(path, info))
+    times_s, images = [], []
+    for time_s, light in video:
+        times_s.append(time_s)
+        images.append(np.clip(np.round(light * (65_535 / 255)), 0, 65_535).astype(np.uint16))
+    if not images:
+        raise DataError(f"{path} holds no frames; give another file")
+    return FrameSeries(np.stack(images), np.round(np.array(times_s) * 1e6).astype(np.int64), path.name)
+
+
+def _from_table(folder: Path, path: Path, size: tuple[int, int] | None) -> FrameSeries:
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    if not rows or not {"t_us", "file"} <= rows[0].keys():
+        raise DataError(f"{path} holds no frames; give a header 't_us,file' and one line a frame")
+    try:
+        times = np.array([int(row["t_us"]) for row in rows], dtype=np.int64)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError(f"{path} holds a time that is not a whole number of microseconds") from None
+    _check_times(path, times)
+    images = [read_image(inside(folder, row["file"] or ""), size) for row in rows]
+    for k, image in enumerate(images):
+        if image.shape != images[0].shape or image.dtype != images[0].dtype:
+            raise DataError(
+                f"{path}: frame {k} is {image.dtype} {image.shape}, frame 0 {images[0].dtype} "
+                f"{images[0].shape}; give frames of one camera"
+            )
+    return FrameSeries(np.stack(images), times, path.name)
+
+
+def _check_times(path: Path, times: NDArray[np.int64]) -> None:
+    if (np.diff(times) <= 0).any():
+        i = int(np.argmax(np.diff(times) <= 0))
+        raise DataError(f"{path}: frame {i + 1} at {times[i + 1]} us follows {times[i]} us; times must ascend")

@@ -1,0 +1,58 @@
+"""The check picture of a calibration: held-out captures beside the fit."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from evnlos.calibration import RigFit
+from evnlos.errors import MissingDependencyError
+
+
+def draw_calibration(fit: RigFit, path: str | Path) -> None:
+    """Draw frame, model and residual of held-out captures, and the time surfaces where events were fitted.
+
+    Args:
+        fit: The calibration.
+        path: PNG file to write.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingDependencyError(
+            "the check picture needs matplotlib; install the extra evnlos[plot]"
+        ) from None
+
+    with_events = any(example.surface is not None for example in fit.example)
+    columns, rows = (6 if with_events else 3), len(fit.example)
+    figure = Figure(figsize=(2.6 * columns, 1.85 * rows + 0.4), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for line, example in zip(axes, fit.example, strict=True):
+        top = max(float(example.frame.max()), float(example.model.max()))
+        miss = example.frame - example.model
+        pictures = [(example.frame, "frame", "gray", 0.0, top), (example.model, "model", "gray", 0.0, top)]
+        pictures.append((miss, "frame - model, times 5", "RdBu_r", -top / 5, top / 5))
+        if example.surface is not None and example.model_surface is not None:
+            seen, made = (s[0] - s[1] for s in (example.surface, example.model_surface))
+            peak = float(np.abs(seen).max())
+            pictures += [
+                (seen, "events: ON - OFF", "RdBu_r", -peak, peak),
+                (made, "model", "RdBu_r", -peak, peak),
+                (seen - made, "difference", "RdBu_r", -peak, peak),
+            ]
+        for axis in line:
+            axis.set_axis_off()
+        for axis, (picture, title, colours, low, high) in zip(line, pictures, strict=False):
+            axis.imshow(picture, cmap=colours, vmin=low, vmax=high)
+            axis.set_title(f"{example.name}: {title}" if title == "frame" else title, fontsize=8)
+    # Noise hardly compresses: fewer colours keep the picture small.
+    drawn = BytesIO()
+    figure.savefig(drawn, dpi=60, format="png")
+    with Image.open(drawn) as picture:
+        picture.convert("RGB").quantize(200).save(Path(path), optimize=True)

@@ -1,0 +1,374 @@
+"""Calibration: settings come back from captures that were made with them, and a wrong model is refused."""
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from evnlos.calibration import Calibration, fit_rig, fit_transport, read_shots, rows_of, write_rig
+from evnlos.calibration.event_check import _block_counts
+from evnlos.calibration.event_fit import shortest_interval_s
+from evnlos.calibration.event_statistics import count_map, read_recordings, within
+from evnlos.calibration.frame_model import FrameModel, working_shape
+from evnlos.calibration.frame_noise import fit_frame_noise
+from evnlos.calibration.least_squares import levenberg_marquardt
+from evnlos.cli import main
+from evnlos.config import load_yaml, save_yaml
+from evnlos.dataset.lab import Lab, render_captures
+from evnlos.dataset.simulate import SensorSize, Simulation, simulate_object
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import FontGlyphs
+from evnlos.sensor import EventPixel, FrameCamera
+from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.types import Events
+
+RIG = RadiometricTransport(
+    roughness=0.07,
+    camera_angle_deg=26.0,
+    cell_m=0.005,
+    gain=1.0,
+    ambient=0.06,
+    ambient_gradient=(0.3, -0.2),
+)
+CAMERA = FrameCamera(exposure_s=0.016, full_well_e=8000.0, read_noise_e=20.0, prnu=0.02, dsnu_e=30.0)
+PIXEL = EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0)
+LAB = Lab(
+    glyphs=FontGlyphs(family="kalam", characters="ALT4EO"),
+    sensor=SensorSize(50, 80),
+    transport=RIG,
+    frame_rate_hz=2.0,
+    frame_camera=CAMERA,
+    pixel=PIXEL,
+    spread={},
+)
+START = RadiometricTransport(roughness=0.12, field_of_view_deg=26.0)
+HELD = ("4", "T")
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> list[Path]:
+    """Six captures of a known rig."""
+    return list(render_captures(LAB, tmp_path_factory.mktemp("rig")))
+
+
+@pytest.fixture(scope="module")
+def fit(folders):
+    settings = Calibration(holdout=HELD, start=Simulation(transport=START), event_captures=2, columns=32)
+    return fit_rig(folders, settings)
+
+
+@pytest.fixture
+def copies(folders, tmp_path) -> list[Path]:
+    return [Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in folders]
+
+
+def edit(folder: Path, **changes) -> None:
+    path = folder / "capture.yaml"
+    described = yaml.safe_load(path.read_text())
+    for key, value in changes.items():
+        if value is None:
+            del described[key]
+        else:
+            described[key] = {**described[key], **value}
+    path.write_text(yaml.safe_dump(described))
+
+
+def test_optics_come_back(fit) -> None:
+    found = fit.optics.transport
+    assert found.roughness == pytest.approx(RIG.roughness, rel=0.02)
+    assert found.gain == pytest.approx(RIG.gain, rel=0.03)
+    assert found.ambient == pytest.approx(RIG.ambient, rel=0.03)
+    assert found.ambient_gradient == pytest.approx(RIG.ambient_gradient, abs=0.03)
+    # Distance, angle and field of view of the camera trade against each other: what they show must agree.
+    shape = LAB.sensor.height, LAB.sensor.width
+    seen = [
+        rig.view(shape).wall_points_m()[25, 10] - rig.view(shape).wall_points_m()[25, 70]
+        for rig in (found, RIG)
+    ]
+    assert float(seen[0].norm()) == pytest.approx(float(seen[1].norm()), rel=0.04)
+    assert found.camera_angle_deg == pytest.approx(RIG.camera_angle_deg, abs=2.0)
+
+
+def test_residual_falls_to_the_noise_on_unseen_captures(fit) -> None:
+    for name in ("frames fit", "frames held out"):
+        found = fit.residuals[name]
+        assert found.before > 0.25
+        # Fixed pattern is in the residual, not in the temporal noise.
+        assert found.noise < found.after < 2 * found.noise + 0.01
+    assert fit.held_out == ("lab_4", "lab_T") and not set(fit.held_out) & set(fit.fitted)
+    assert fit.worse == ()
+
+
+def test_frame_noise_comes_back(fit) -> None:
+    camera = fit.noise.camera
+    assert camera.full_well_e == pytest.approx(CAMERA.full_well_e, rel=0.1)
+    assert camera.read_noise_e == pytest.approx(CAMERA.read_noise_e, rel=0.15)
+    assert camera.prnu == pytest.approx(CAMERA.prnu, abs=0.006)
+    assert camera.dsnu_e == pytest.approx(CAMERA.dsnu_e, rel=0.25)
+    assert camera.exposure_s == CAMERA.exposure_s
+
+
+def test_pixel_comes_back(fit) -> None:
+    pixel = fit.pixel.pixel
+    assert pixel.threshold_on == pytest.approx(PIXEL.threshold_on, rel=0.06)
+    assert pixel.threshold_off == pytest.approx(PIXEL.threshold_off, rel=0.06)
+    assert pixel.threshold_sigma == pytest.approx(PIXEL.threshold_sigma, abs=0.015)
+    assert pixel.shot_noise_rate_hz == pytest.approx(PIXEL.shot_noise_rate_hz, rel=0.1)
+    assert pixel.leak_rate_hz < 0.08
+    for kind in ("counts", "surfaces"):
+        found = fit.residuals[f"{kind} held out"]
+        assert found.noise * 0.9 < found.after < found.before
+
+
+def test_the_rig_file_simulates(fit, tmp_path) -> None:
+    rows = rows_of(fit, EventPixel(), FrameCamera())
+    rig = load_yaml(Simulation, write_rig(fit, rows, tmp_path))
+    assert rig == fit.simulation
+    assert rig.transport == fit.optics.transport and rig.pixel == fit.pixel.pixel
+    assert (rig.positions, rig.duration_s, rig.motion.start_m) == (16, 8.0, (-0.08, 0.0))
+    samples, _ = simulate_object(replace(rig, glyphs=FontGlyphs(family="kalam", characters="A")), "kalam_A")
+    assert samples.frame.shape == (16, 64, 96)
+    found = json.loads((tmp_path / "calibration.json").read_text())
+    assert found["held_out"] == ["lab_4", "lab_T"]
+    assert {row.name for row in rows} == set(found["parameters"])
+    with pytest.raises(ConfigError, match="exists"):
+        write_rig(fit, rows, tmp_path)
+
+
+def test_a_fit_that_fails_on_unseen_captures_is_refused(folders, tmp_path, capsys) -> None:
+    """The captures to fit show a rougher wall than those held out, from which the search starts."""
+    rougher = replace(LAB, transport=replace(RIG, roughness=0.2), glyphs=replace(LAB.glyphs, characters="IV"))
+    shots = list(render_captures(rougher, tmp_path / "other"))
+    noted = yaml.safe_load((folders[0] / "capture.yaml").read_text())["rig"]
+    for folder in shots:
+        edit(folder, rig=noted)  # the notes claim that nothing changed
+    shots += [folder for folder in folders if folder.name[-1] in "AL"]
+    start, out = tmp_path / "start.yaml", tmp_path / "out"
+    save_yaml(Calibration(start=Simulation(transport=RIG), columns=24), start)
+    words = ["calibrate", *shots, "--out", out, "--holdout", "A", "L", "--no-events", "--config", start]
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    error = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 2
+    assert len([line for line in error if "frames held out" in line and "no rig file" in line]) == 1, error
+    assert not (out / "rig.yaml").exists() and (out / "calibration.json").exists()
+
+
+def test_the_command_prints_and_writes(folders, tmp_path, capsys) -> None:
+    out = tmp_path / "rig"
+    words = ["--out", out, "--holdout", "4", "--exclude", "A", "E", "O", "--no-events", "--preset", "paper"]
+    words += ["--start.transport.field-of-view-m", 0.6, "--columns", 24]
+    main(["calibrate", *map(str, folders), *map(str, words)])
+    text = capsys.readouterr().out
+    assert "held out: lab_4" in text and "lab_E" not in text
+    assert "transport.tpsf_length_m" in text and "frames held out" in text
+    rig = load_yaml(Simulation, out / "rig.yaml")
+    assert isinstance(rig.transport, PaperTransport)
+    found = json.loads((out / "calibration.json").read_text())["residuals"]["frames held out"]
+    assert found["after"] < 0.25 < found["before"]
+
+
+def test_excluded_captures_are_not_even_read(copies) -> None:
+    (copies[0] / "capture.yaml").write_text("no: [capture")
+    fit, held = read_shots(copies, exclude=[copies[0].name], holdout=["4"])
+    assert copies[0].name not in fit.names + held.names
+    assert held.names == ("lab_4",)
+
+
+def test_the_draw_of_the_holdout_follows_the_seed(folders) -> None:
+    draws = {read_shots(folders, share=0.34, seed=seed)[1].names for seed in range(8)}
+    assert all(len(names) == 2 for names in draws) and len(draws) > 1
+    assert read_shots(folders, seed=3)[1].names == read_shots(folders[::-1], seed=3)[1].names
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"target": {"mask": None}}, "no known target mask"),
+        ({"motion": None}, "no known motion"),
+        ({"camera": {"name": "another"}}, "differ in camera"),
+        ({"rig": {"distance_m": 0.5}}, "differ in rig"),
+        ({"target": {"plate_m": 0.05}}, "differ in plate_m"),
+    ],
+)
+def test_unfit_captures_are_named(copies, change, words) -> None:
+    edit(copies[1], **change)
+    with pytest.raises(DataError, match=words) as error:
+        read_shots(copies)
+    assert copies[1].name in str(error.value) and "\n" not in str(error.value)
+
+
+def test_too_few_captures_and_unknown_names(folders) -> None:
+    with pytest.raises(DataError, match=r"2 capture\(s\) are left"):
+        read_shots(folders[:2])
+    with pytest.raises(DataError, match="no capture is named Z"):
+        read_shots(folders, exclude=["Z"])
+    with pytest.raises(DataError, match="leave 2 or more to fit"):
+        read_shots(folders[:3], holdout=[f.name for f in folders[:2]])
+    with pytest.raises(ConfigError, match="holdout_share"):
+        Calibration(holdout_share=1.0)
+    with pytest.raises(DataError, match=r"distance_m is '30 cm'"):
+        fit_rig(_with_distance(folders), Calibration())
+
+
+def _with_distance(folders: list[Path]) -> list[Path]:
+    copied = []
+    for folder in folders[:3]:
+        copy = folder.parent / "noted" / folder.name
+        shutil.copytree(folder, copy, dirs_exist_ok=True)
+        edit(copy, rig={"distance_m": "30 cm"})
+        copied.append(copy)
+    return copied
+
+
+def test_frames_that_do_not_follow_the_targets_are_refused(copies) -> None:
+    for folder in copies:
+        for path in (folder / "frames").iterdir():
+            Image.fromarray(np.asarray(Image.open(path))[:, ::-1]).save(path)
+    with pytest.raises(DataError, match="mirror the frames"):
+        fit_transport(read_shots(copies)[0], START, columns=24)
+    rng = np.random.default_rng(0)
+    for folder in copies:
+        for path in (folder / "frames").iterdir():
+            Image.fromarray(rng.integers(0, 9, (50, 80)).astype(np.uint8)).save(path)
+    with pytest.raises(DataError, match="explain"):
+        fit_transport(read_shots(copies)[0], START, columns=24)
+
+
+def test_light_is_solved_for_exactly(folders) -> None:
+    fit, _ = read_shots(folders)
+    model = FrameModel(fit, (10, 16), every=4)
+    light = torch.rand(model.frames.shape, generator=torch.Generator().manual_seed(0))
+    model.frames = 0.7 * light + 0.2 * (
+        1 + 0.3 * torch.linspace(-1, 1, 16) - 0.4 * torch.linspace(-1, 1, 10)[:, None]
+    )
+    model.weight = (light < 0.9).float()
+    model.frames = torch.where(light < 0.9, model.frames, torch.tensor(5.0))  # saturated pixels take no part
+    found, residual = model.fit(light)
+    assert (found.gain, found.ambient) == pytest.approx((0.7, 0.2), abs=1e-4)
+    assert found.gradient == pytest.approx((0.3, -0.4), abs=1e-3)
+    assert float(residual.abs().max()) < 1e-4
+
+
+def test_one_matrix_gives_what_the_walls_give(folders) -> None:
+    fit, _ = read_shots(folders)
+    model = FrameModel(fit, (25, 40), every=5)
+    together = model.light(RIG)
+    k = 2
+    wall = replace(RIG, gain=1.0, ambient=0.0).wall(fit.scenes[k], (25, 40))
+    alone = wall.irradiance(fit.times_s(k)[::5])
+    count = len(fit.times_s(k)[::5])
+    assert float((together[k * count : (k + 1) * count] - alone).abs().max()) < 2e-3 * float(alone.max())
+
+
+@given(rate=st.floats(0.5, 5.0), level=st.floats(0.2, 3.0))
+def test_least_squares_finds_the_minimum(rate: float, level: float) -> None:
+    t = torch.linspace(0, 2, 40, dtype=torch.float64)
+    truth = level * torch.exp(-rate * t)
+
+    def residual(p):
+        return p[1] * torch.exp(-p[0] * t) - truth
+
+    found = levenberg_marquardt(
+        residual, [1.5, 1.0], [1e-5, 1e-5], [(0.01, 20.0), (0.01, 20.0)], iterations=60, tolerance=1e-9
+    )
+    assert found.values == pytest.approx([rate, level], rel=1e-3)
+
+
+def test_standard_error_is_that_of_linear_theory() -> None:
+    generator = torch.Generator().manual_seed(1)
+    x = torch.stack([torch.ones(400), torch.linspace(-1, 1, 400)], 1).double()
+    y = x @ torch.tensor([1.0, 2.0]).double() + 0.1 * torch.randn(400, generator=generator).double()
+    found = levenberg_marquardt(
+        lambda p: x @ torch.from_numpy(p) - y, [0.0, 0.0], [1e-3] * 2, [(-9.0, 9.0)] * 2, tolerance=1e-12
+    )
+    expected = 0.1 * np.sqrt(np.diag(np.linalg.inv((x.T @ x).numpy())))
+    assert found.error == pytest.approx(expected, rel=0.1)
+    bounded = levenberg_marquardt(
+        lambda p: x @ torch.from_numpy(p) - y, [0.0, 0.0], [1e-3] * 2, [(-9.0, 9.0), (-9.0, 1.5)]
+    )
+    assert bounded.values[1] == 1.5
+    blind = levenberg_marquardt(lambda p: x[:, 0] * p[0] - y, [0.0, 0.0], [1e-3] * 2, [(-9.0, 9.0)] * 2)
+    assert math.isinf(blind.error[1]) and math.isfinite(blind.error[0])
+
+
+def test_noise_of_a_camera_without_light_on_it() -> None:
+    """Photon transfer on frames whose light is known exactly."""
+    rng = np.random.default_rng(0)
+    camera = FrameCamera(full_well_e=5000.0, read_noise_e=15.0, prnu=0.03, dsnu_e=25.0, exposure_s=0.0)
+    ramp = np.linspace(0.0, 0.8, 60)[None, :] * np.ones((40, 1))
+    light = 0.1 + ramp * rng.permutation(np.linspace(0, 1, 150))[:, None, None]
+    frames = camera.expose(light, seed=3)
+
+    class OneShot:
+        peak = 255
+        captures = (type("C", (), {"info": type("I", (), {"camera": type("K", (), {"exposure_s": 0.0})})}),)
+
+        def frames(self):
+            return frames
+
+        def frame_of(self):
+            return np.zeros(150, np.int64)
+
+    found = fit_frame_noise(OneShot(), light.astype(np.float32), FrameCamera()).camera  # type: ignore[arg-type]
+    assert found.full_well_e == pytest.approx(5000, rel=0.06)
+    assert found.read_noise_e == pytest.approx(15, rel=0.15)
+    assert found.prnu == pytest.approx(0.03, rel=0.15)
+    assert found.dsnu_e == pytest.approx(25, rel=0.15)
+
+
+def test_event_statistics_count_by_hand() -> None:
+    t = np.array([0, 10, 20, 20, 35], np.int64)
+    x, y = np.array([0, 1, 1, 6, 1], np.uint16), np.array([0, 0, 0, 5, 0], np.uint16)
+    p = np.array([True, True, False, True, True])
+    events = Events(t, x, y, p, 10, 10)
+    counts = count_map(events, True, 5)
+    assert counts.sum() == 3 and counts[0, 1] == 2 and counts[5, 6] == 1
+    part = within(events, 10e-6, 20e-6)
+    assert part.t_us.tolist() == [20, 20]
+    assert shortest_interval_s([events], share=0.0) == pytest.approx(10e-6)
+    blocks = _block_counts(events, np.array([0, 15, 40]))  # (0, 15] and (15, 40]
+    assert blocks.shape == (2, 2, 2, 2)
+    assert blocks[:, 0].sum((1, 2)) * 25 == pytest.approx([1, 2])
+    assert blocks[:, 1].sum((1, 2)) * 25 == pytest.approx([0, 1])
+
+
+def test_light_of_recordings_follows_the_wall(folders) -> None:
+    fit, _ = read_shots(folders)
+    found = read_recordings(fit, RIG, 2)
+    assert [r.index for r in found] == [0, len(fit.names) - 1]
+    assert found[0].times_s[[0, -1]].tolist() == [0.0, 8.0]
+    wall = RIG.wall(fit.scenes[0], fit.shape)
+    assert np.allclose(found[0].light[7], 255 * wall.irradiance(found[0].times_s[7]).numpy(), atol=1e-3)
+
+
+def test_working_shape_keeps_the_sensor_s_shape() -> None:
+    for shape in ((100, 160), (260, 346), (480, 640), (720, 1280), (7, 9)):
+        height, width = working_shape(shape, 40)
+        assert width <= shape[1]
+        assert height * shape[1] / (width * shape[0]) == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize(("group", "limit"), [("near", 0.11), ("far", 0.18)])
+def test_independent_captures_are_fitted(shared_data, group, limit) -> None:
+    """A few characters of captures that other optics made; docs/calibration.md has the full figures."""
+    folders = [shared_data / "captures" / f"{group}_{c}" for c in "ABHOTX"]
+    if not folders[0].is_dir():
+        pytest.skip(f"no captures at {folders[0].parent}")
+    fit, held = read_shots(folders, holdout=["A", "T"])
+    distance = fit.captures[0].info.rig["distance_m"]
+    start = RadiometricTransport(roughness=0.1, distance_m=distance)
+    found = fit_transport(fit, start, fixed=("distance_m",), columns=24, iterations=6)
+    model = FrameModel(held, held.shape, every=4)
+    after = model.relative(model.frames - model.predict(found.transport))
+    before = model.relative(model.frames - model.predict(found.before))
+    assert after < limit < before

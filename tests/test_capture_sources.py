@@ -1,0 +1,290 @@
+"""Loose recordings as a laboratory produces them become captures: every source of frames, clock and pixels."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from evnlos import EvnlosError, import_captures, open_dataset, read_capture
+from evnlos.dataset import check_picture, read_shard
+from evnlos.dataset.registration import homography_from_points
+from evnlos.events import write_aedat4, write_celex_frames, write_events
+from evnlos.types import Events
+
+WIDTH, HEIGHT = 64, 48
+
+
+def stream(
+    width: int = WIDTH, height: int = HEIGHT, span_us: int = 2_000_000, count: int = 4_000, **extra
+) -> Events:
+    draw = np.random.default_rng(11)
+    t = np.sort(draw.integers(0, span_us, count))
+    return Events(
+        t, draw.integers(0, width, count), draw.integers(0, height, count), draw.integers(0, 2, count),
+        width, height, **extra,
+    )  # fmt: skip
+
+
+def pictures(count: int = 6, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    x = np.arange(width)
+    rows = [np.exp(-((x - width * (0.3 + 0.05 * k)) ** 2) / 50) for k in range(count)]
+    return np.round(200 * np.array(rows)[:, None, :] * np.ones((1, height, 1)) + 20).astype(np.uint8)
+
+
+def folder_of(tmp_path: Path, name: str = "shot_A", **settings) -> Path:
+    folder = tmp_path / name
+    folder.mkdir()
+    content = {"camera": {"width": WIDTH, "height": HEIGHT, "frame_rate_hz": 5.0}} | settings
+    (folder / "capture.yaml").write_text(yaml.safe_dump(content))
+    return folder
+
+
+def test_a_celex_pair(tmp_path):
+    """EI events and F pictures: one pixel grid; the pictures carry no time, the offset ties the clocks."""
+    folder = folder_of(
+        tmp_path,
+        camera={"width": 1280, "height": 800, "frame_rate_hz": 10.0},
+        events="shot_EI_100M.bin",
+        frames="shot_F_100M.bin",
+        alignment={"offset_us": 30_000},
+    )
+    events = stream(1280, 800, 500_000, adc=np.random.default_rng(0).integers(0, 4096, 4_000))
+    write_events(folder / "shot_EI_100M.bin", events)
+    frames = np.random.default_rng(1).integers(0, 255, (3, 800, 1280)).astype(np.uint8)
+    write_celex_frames(folder / "shot_F_100M.bin", frames)
+    shot = read_capture(folder)
+    np.testing.assert_array_equal(shot.frames, frames)
+    assert shot.frame_times_us.tolist() == [30_000, 130_000, 230_000]
+    assert shot.events.polarity_known is None and len(shot.events) < len(events)
+    assert any("without polarity left out" in note for note in shot.notes)
+    list(import_captures([folder], tmp_path / "d"))
+    samples, _ = read_shard(open_dataset(tmp_path / "d").shard("shot_A"))
+    assert samples.frame.shape == (2, 64, 96) and samples.truth is None
+
+
+def test_an_aedat4_with_frames_and_events(tmp_path):
+    pytest.importorskip("aedat")
+    folder = folder_of(tmp_path, events="davis.aedat4", frames="davis.aedat4")
+    write_aedat4(folder / "davis.aedat4", stream(), pictures(), np.arange(6) * 200_000 + 9)
+    shot = read_capture(folder)
+    np.testing.assert_array_equal(shot.frames, pictures())
+    assert shot.events == stream() and shot.frame_times_us.tolist() == (np.arange(6) * 200_000 + 9).tolist()
+
+
+def test_a_raw_beside_a_folder_an_animation_or_an_array(tmp_path):
+    frames = pictures()
+
+    def save_pictures(path: Path) -> None:
+        path.mkdir()
+        for k, frame in enumerate(frames):
+            Image.fromarray(frame).save(path / f"{k}.png")
+
+    write = {
+        "pictures": save_pictures,
+        "video.gif": lambda path: Image.fromarray(frames[0]).save(
+            path, save_all=True, append_images=[Image.fromarray(f) for f in frames[1:]], duration=200
+        ),
+        "frames.npy": lambda path: np.save(path, frames),
+    }  # fmt: skip
+    for name, save in write.items():
+        folder = folder_of(tmp_path, name.split(".")[0], frames=name, alignment={"offset_us": 5_000})
+        write_events(folder / "events.raw", stream())
+        save(folder / name)
+        shot = read_capture(folder)
+        np.testing.assert_allclose(shot.frames / 65_535, frames / 255, atol=1e-4)
+        np.testing.assert_array_equal(shot.frame_times_us, np.arange(6) * 200_000 + 5_000)
+        assert shot.peak == 65_535
+
+
+def test_a_video_with_times_of_its_own(tmp_path):
+    av = pytest.importorskip("av")
+    folder = folder_of(tmp_path, frames="clip.mkv")
+    write_events(folder / "events.raw", stream())
+    with av.open(str(folder / "clip.mkv"), "w") as container:
+        video = container.add_stream("ffv1", rate=10)
+        video.width, video.height, video.pix_fmt = WIDTH, HEIGHT, "gray"
+        for picture in pictures():
+            for packet in video.encode(av.VideoFrame.from_ndarray(picture, format="gray")):
+                container.mux(packet)
+        for packet in video.encode():
+            container.mux(packet)
+    shot = read_capture(folder)
+    np.testing.assert_allclose(shot.frames / 65_535, pictures() / 255, atol=2e-3)
+    np.testing.assert_allclose(shot.frame_times_us, np.arange(6) * 100_000, atol=1_000)
+
+
+def test_frame_times_from_a_trigger(tmp_path):
+    folder = folder_of(tmp_path, frames="frames.npy", alignment={"trigger_channel": 2, "offset_us": 7})
+    words = [0x8000]
+    for k in range(6):
+        words += [0x6000 | (100 + 500 * k), 0xA201, 0x0005, 0x2807, 0x6000 | (110 + 500 * k), 0xA200, 0xA101]
+    (folder / "events.raw").write_bytes(
+        f"% evt 3.0\n% geometry {WIDTH}x{HEIGHT}\n".encode() + struct.pack(f"<{len(words)}H", *words)
+    )
+    np.save(folder / "frames.npy", pictures())
+    assert read_capture(folder).frame_times_us.tolist() == [107 + 500 * k for k in range(6)]
+    np.save(folder / "frames.npy", pictures(5))
+    with pytest.raises(EvnlosError, match="6 rising edges on channel 2 for 5 frames"):
+        read_capture(folder)
+
+
+def test_a_camera_of_its_own_with_a_grid_of_dots(tmp_path):
+    """Frames of 150 x 120 through a homography; both cameras saw 3 x 4 dots; a dark frame is taken away."""
+    from test_capture_alignment import dots_picture, project
+
+    to_frame = np.array([[2.0, 0.1, 8.0], [-0.08, 2.1, 6.0], [1e-4, 2e-4, 1.0]])  # event pixels to frame pixels
+    dark = np.random.default_rng(3).integers(5, 15, (120, 150)).astype(np.uint8)
+    events_grid = np.array([[0.5, 0, -10], [0, 0.5, -8], [0, 0, 1]])  # of `dots_picture` to event pixels
+    on_events, _ = dots_picture(events_grid, (HEIGHT, WIDTH), 3, 4, 24.0, 1.2)
+    on_frame, _ = dots_picture(to_frame @ events_grid, (120, 150), 3, 4, 24.0, 2.5)
+    folder = folder_of(
+        tmp_path,
+        frames="frames.npy",
+        registration={"dots": {"rows": 3, "columns": 4, "frame": "dots.png", "events": "dots.raw"}},
+        dark="dark.png",
+    )
+    Image.fromarray((dark + 200 * on_frame).astype(np.uint8)).save(folder / "dots.png")
+    Image.fromarray(dark).save(folder / "dark.png")
+    counts = np.round(30 * on_events).astype(int)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    xs, ys = np.repeat(x, counts.ravel()), np.repeat(y, counts.ravel())
+    write_events(folder / "dots.raw", Events(np.arange(len(xs)), xs, ys, np.ones(len(xs), bool), WIDTH, HEIGHT))
+    # A light spot at the event pixel (40, 20).
+    spot = project(to_frame, np.array([[40.0, 20.0]]))[0]
+    v, u = np.mgrid[:120, :150]
+    light = np.exp(-((u - spot[0]) ** 2 + (v - spot[1]) ** 2) / (2 * 4.0**2))
+    np.save(folder / "frames.npy", np.stack([(dark + 180 * light).astype(np.uint8)] * 3))
+    write_events(folder / "events.raw", stream())
+    shot = read_capture(folder)
+    assert shot.frames.shape == (3, HEIGHT, WIDTH)
+    weight = np.clip(shot.frames[0].astype(float) - shot.frames[0].max() * 0.2, 0, None)
+    centre = (weight * x).sum() / weight.sum(), (weight * y).sum() / weight.sum()
+    np.testing.assert_allclose(centre, (40, 20), atol=0.3)
+    assert any("3 x 4 dots (rms error 0." in note for note in shot.notes)
+    assert any("dark.png" in note for note in shot.notes)
+
+
+def test_points_region_and_filters(tmp_path):
+    matrix = np.array([[0.5, 0.0, 2.0], [0.0, 0.5, 1.0], [0.0, 0.0, 1.0]])
+    corners = [(0, 0), (120, 0), (120, 90), (0, 90)]
+    points = [[*map(float, c), 0.5 * c[0] + 2, 0.5 * c[1] + 1] for c in corners]
+    np.testing.assert_allclose(
+        homography_from_points([p[:2] for p in points], [p[2:] for p in points]), matrix, atol=1e-9
+    )
+    shots = []
+    for name, registration in (("p", {"points": points}), ("h", {"homography": matrix.tolist()})):
+        folder = folder_of(
+            tmp_path, name, frames="frames.npy", registration=registration,
+            roi={"x": 8, "y": 4, "width": 40, "height": 30},
+            filters={"hot_pixel_factor": 5, "background_us": 100_000},
+        )  # fmt: skip
+        np.save(folder / "frames.npy", pictures(6, 128, 96))
+        events = stream()
+        hot = Events(
+            np.arange(300) * 5_000, np.full(300, 20), np.full(300, 9), np.ones(300, bool), WIDTH, HEIGHT
+        )
+        order = np.argsort(np.concatenate([events.t_us, hot.t_us]), kind="stable")
+        columns = (
+            np.concatenate([events.columns()[n], hot.columns()[n]])[order] for n in ("t_us", "x", "y", "p")
+        )
+        write_events(folder / "events.raw", Events(*columns, WIDTH, HEIGHT))
+        shots.append(read_capture(folder))
+    shot = shots[0]
+    assert shot.frames.shape == (6, 30, 40) and shot.events.shape == (30, 40)
+    np.testing.assert_allclose(shot.frames, shots[1].frames, atol=1)
+    assert not ((shot.events.x == 12) & (shot.events.y == 5)).any()
+    text = "; ".join(shot.notes)
+    for said in (
+        "1 hot pixels",
+        "without a neighbour in 100000 us",
+        "4 points (rms error 0.00",
+        "region 40 x 30",
+    ):
+        assert said in text
+
+
+def test_turned_frames_and_unknown_polarity(tmp_path):
+    folder = folder_of(tmp_path, frames="frames.npy", frames_turned=True, events="events.h5")
+    np.save(folder / "frames.npy", pictures()[:, ::-1, ::-1])
+    write_events(folder / "events.h5", stream(polarity_known=np.zeros(4_000, bool)))
+    shot = read_capture(folder)
+    np.testing.assert_allclose(shot.frames / 65_535, pictures() / 255, atol=1e-4)
+    assert len(shot.events) == 4_000 and any("no polarity" in note for note in shot.notes)
+
+
+def test_the_check_picture_shows_frame_events_and_curves(tmp_path):
+    folder = folder_of(tmp_path, frames="frames.npy")
+    np.save(folder / "frames.npy", pictures())
+    write_events(folder / "events.raw", stream())
+    sheet = np.asarray(check_picture(read_capture(folder)))
+    high = round(HEIGHT * 320 / WIDTH)
+    panels = [sheet[48 : 48 + high, 12 + k * 332 : 332 + k * 332] for k in range(3)]
+    assert (panels[0][..., 0] == panels[0][..., 1]).all()  # grey
+    warmth = panels[1][..., 0].astype(int) - panels[1][..., 2]
+    assert (warmth > 60).sum() > 1_000 and (warmth < -60).sum() > 1_000
+    assert 200 < len(sheet) < 600
+
+
+WRONG = {
+    "no rate": ({"frames": "frames.npy", "camera": {"width": WIDTH, "height": HEIGHT}}, "frame_rate_hz"),
+    "no registration": (
+        {"frames": "frames.npy", "camera": {"width": 60, "height": 40, "frame_rate_hz": 5}},
+        "registration",
+    ),
+    "two ways": ({"frames": "frames.npy", "registration": {"points": [], "homography": []}}, "points"),
+    "few points": ({"frames": "frames.npy", "registration": {"points": [[0.0, 0.0, 0.0, 0.0]]}}, "at least 4"),
+    "region": ({"frames": "frames.npy", "roi": {"x": 40, "y": 0, "width": 40, "height": 9}}, "leaves"),
+    "uncertain clock": ({"frames": "frames.npy", "alignment": {"offset_us": "auto"}}, "uncertain"),
+    "both clocks": (
+        {"frames": "frames.npy", "alignment": {"offset_us": "auto", "trigger_channel": 1}},
+        "one of them",
+    ),
+    "no trigger": ({"frames": "frames.npy", "alignment": {"trigger_channel": 1}}, "0 rising edges"),
+    "missing dark": ({"frames": "frames.npy", "dark": "dark.png"}, "dark.png"),
+    "missing frames": ({"frames": "clip.mp4"}, "clip.mp4"),
+    "outside": ({"frames": "../clip.mp4"}, "outside"),
+    "offset text": ({"frames": "frames.npy", "alignment": {"offset_us": "soon"}}, "offset_us"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_does_not_fit_is_one_line(what, tmp_path):
+    settings, says = WRONG[what]
+    folder = folder_of(tmp_path, **settings)
+    np.save(folder / "frames.npy", pictures())
+    write_events(
+        folder / "events.raw",
+        stream(60 if "60" in str(settings) else WIDTH, 40 if "60" in str(settings) else HEIGHT),
+    )
+    with pytest.raises(EvnlosError, match=says) as caught:
+        read_capture(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_example_of_the_manual_is_a_description():
+    from evnlos.config import from_dict
+    from evnlos.dataset import CaptureInfo
+
+    text = (Path(__file__).parent.parent / "docs" / "own_camera.md").read_text()
+    info = from_dict(CaptureInfo, yaml.safe_load(text.split("```yaml")[1].split("```")[0]))
+    assert info.alignment.offset_us == "auto" and len(info.registration.points) == 4
+    assert info.roi.width == 560 and info.filters.background_us == 20_000 and info.motion.start_us == 1_250_000
+
+
+def test_the_command_tells_what_it_did_and_draws_it(tmp_path, capsys):
+    from evnlos.cli import main
+
+    folder = folder_of(tmp_path, frames="frames.npy", alignment={"offset_us": 40_000})
+    np.save(folder / "frames.npy", pictures())
+    write_events(folder / "events.raw", stream())
+    main(["import", str(folder), "--out", str(tmp_path / "d")])
+    said = capsys.readouterr()
+    assert "6 frames from frames.npy" in said.err and "shifted by 40000 us" in said.err
+    assert str(tmp_path / "d" / "checks") in said.out
+    with Image.open(tmp_path / "d" / "checks" / "shot_A.png") as sheet:
+        assert sheet.size[0] > 900
+    main(["import", str(folder), "--out", str(tmp_path / "e"), "--no-check-pictures"])
+    assert not (tmp_path / "e" / "checks").exists()
