@@ -163,26 +163,49 @@ def _unpack_words(data, words, groups):
 
 
 @njit(cache=True)
-def _place_words(words, state, events, t_us, y, segments, row_words, row_times, row_starts):
+def _spread(row_times, row_words, row_starts, t_us, y):
+    """Write time and place of each row to its events, 16 at a time.
+
+    Few rows are longer, so that hardly a branch is taken wrongly; what is written beyond a row's end is
+    overwritten by the next.
+    """
+    room = np.uint64(min(len(t_us), len(y)))
+    for row in range(np.uint64(len(row_times))):
+        start, stop = row_starts[row], row_starts[row + U64[1]]
+        time, line = row_times[row], np.uint16(row_words[row])
+        if start + U64[16] <= room:
+            block_t, block_y = t_us[start : start + U64[16]], y[start : start + U64[16]]
+            for place in range(16):
+                block_t[place] = time
+            for place in range(16):
+                block_y[place] = line
+            start += U64[16]
+        for event in range(start, stop):
+            t_us[event] = time
+            y[event] = line
+
+
+@njit(cache=True)
+def _place_words(words, state, events, t_us, y, row_words, row_times, row_starts):
     """Give the events among `words` their row and time; return how many, or -1 where anything is unusual.
 
-    Nobody can predict where the next row starts, so the first loop has no branch: it counts events and rows,
-    and keeps which row each event is in. Places are counted without a sign, or every access would be checked
-    for a negative index. `row_starts` receives the first event of each row.
-    It, `segments`, `row_words` and `row_times` are scratch, two longer than `words`.
+    Nobody can predict where the next row starts, so the first loop has no branch: it counts events and rows.
+    Places are counted without a sign, or every access would be checked for a negative index. `row_starts`
+    receives the first event of each row. It, `row_words` and `row_times` are scratch, two longer than `words`.
     """
-    one = np.uint32(1)
+    one = U64[1]
     count, rows = np.uint64(0), np.uint64(1)  # row 0 is the one that goes on from before
-    strange = np.uint32(0)
-    for word in words:
-        events[count] = word
-        segments[count] = np.uint16(rows - U64[1])
-        row_words[rows] = word
-        row_starts[rows] = count
-        is_event, is_row = word & one, (word >> one) & one
-        strange |= is_event & is_row
-        count += np.uint64(is_event)
-        rows += np.uint64(is_row)
+    strange = np.uint64(0)
+    for pair in range(np.uint64(len(words) // 2)):  # by twos: half as many sums that wait for the one before
+        first, second = words[pair + pair], words[pair + pair + one]
+        is_event, is_row = np.uint64(first) & one, (np.uint64(first) >> one) & one
+        is_event_2, is_row_2 = np.uint64(second) & one, (np.uint64(second) >> one) & one
+        count_2, rows_2 = count + is_event, rows + is_row
+        events[count], row_words[rows], row_starts[rows] = first, first, count
+        events[count_2], row_words[rows_2], row_starts[rows_2] = second, second, count_2
+        strange |= (is_event & is_row) | (is_event_2 & is_row_2)
+        count += is_event + is_event_2
+        rows += is_row + is_row_2
     row_starts[0], row_starts[rows] = U64[0], count
     row_words[0] = np.uint32(state[ROW]) << np.uint32(18)
     row_times[0] = state[TIME_US]
@@ -199,10 +222,7 @@ def _place_words(words, state, events, t_us, y, segments, row_words, row_times, 
     for row in range(rows):
         row_words[row] = row_words[row] >> np.uint32(18)
         lowest = max(lowest, row_words[row])
-    for event in range(count):
-        t_us[event] = row_times[segments[event]]
-    for event in range(count):
-        y[event] = np.uint16(row_words[segments[event]])
+    _spread(row_times[:rows], row_words[:rows], row_starts, t_us, y)
     last = rows - U64[1]
     unusual = (strange != 0) | (lowest >= HEIGHT) | (tick >= _MAX_TICK)
     if unusual or state[ROW_SEEN] == 0 or state[TIME_SEEN] == 0:
@@ -262,19 +282,19 @@ def decode_format_1(data, state, t_us, x, y, p, adc, known, last, scratch):
     groups = scratch[2 * CHUNK : 3 * CHUNK]
     row_times, row_starts = scratch[3 * CHUNK :][:room].view(np.int64), scratch[3 * CHUNK + room :][:room]
     row_words = scratch[3 * CHUNK + 2 * room :][: room // 2].view(np.uint32)
-    segments = scratch[3 * CHUNK + 2 * room + room // 2 :][: room // 4].view(np.uint16)
+    before_all = scratch[3 * CHUNK + 2 * room + room // 2 :][: room // 4].view(np.int16)
     count = 0
     for first in range(0, len(data) // 7 * 7, step):
         chunk = data[first : first + step]
         size = len(chunk) // 7 * 2
         _unpack_words(chunk, words, groups)
         before = state[ROW], state[TIME_US], state[TICK], state[STAMP]
-        out = t_us[count:], y[count:], segments, row_words, row_times, row_starts
+        out = t_us[count:], y[count:], row_words, row_times, row_starts
         found = _place_words(words[:size], state, events, *out)
         end = count + found
         if found >= 0 and _unpack_events(events[:found], x[count:end], adc[count:end]) < WIDTH:
             out = x[count:end], y[count:end], adc[count:end], last, p[count:end], known[count:end]
-            _sign_of_change(*out, events, row_starts, segments.view(np.int16))
+            _sign_of_change(*out, events, row_starts, before_all)
             count = end
         else:
             state[ROW], state[TIME_US], state[TICK], state[STAMP] = before
