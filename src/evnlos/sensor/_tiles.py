@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -59,5 +60,15 @@ def map_shares(work: Callable[[int, int], _T], count: int, tile_px: int, threads
         return
     # a few shares a thread, so that a busy part of the image does not keep the others waiting
     share = -(-count // (_SHARES * threads * tile_px)) * tile_px
-    with ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(lambda first: work(first, min(first + share, count)), range(0, count, share))
+    yield from _pool(threads).map(lambda first: work(first, min(first + share, count)), range(0, count, share))
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Return threads that stay: to start some for each block of frames would cost as much as the block saves."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="evnlos")
+
+
+# A forked process has the pool's queue, but none of its threads.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)
