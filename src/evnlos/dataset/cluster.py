@@ -60,8 +60,8 @@ def run_on_dask(
                 yield future.result()
             except KilledWorker:
                 raise EvnlosError(
-                    f"a task killed its worker {_RETRIES + 1} times (out of memory?); finished shards are kept: "
-                    "give it more memory and go on"
+                    f"a task killed its worker {_RETRIES + 1} times (out of memory?); finished shards are "
+                    "kept: give the workers more memory and run the command again"
                 ) from None
     finally:
         client.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from evnlos.claim import claim
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.capture import Capture, read_capture
 from evnlos.dataset.capture_info import read_capture_info
@@ -68,15 +69,17 @@ def import_captures(
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
     captures: dict[str, Capture] = {first.name: read_capture(first)}
-    create_dataset(dataset)
-    for name in dataset.missing():
-        capture = captures.pop(name, None) or read_capture(paths[name])
-        if look is not None:
-            look(capture)
-        samples = capture_samples(capture, sampling)
-        attributes = {"object": name, "config_hash": dataset.config_hash, "camera": capture.info.camera.name}
-        write_shard(dataset.shard(name), samples, attributes)
-        yield name, samples
+    with claim(dataset.folder):
+        create_dataset(dataset)
+        for name in dataset.missing():
+            capture = captures.pop(name, None) or read_capture(paths[name])
+            if look is not None:
+                look(capture)
+            samples = capture_samples(capture, sampling)
+            camera = capture.info.camera.name
+            attributes = {"object": name, "config_hash": dataset.config_hash, "camera": camera}
+            write_shard(dataset.shard(name), samples, attributes)
+            yield name, samples
 
 
 def character_of(name: str) -> str:

@@ -60,12 +60,13 @@ def map_shares(work: Callable[[int, int], _T], count: int, tile_px: int, threads
         return
     # a few shares a thread, so that a busy part of the image does not keep the others waiting
     share = -(-count // (_SHARES * threads * tile_px)) * tile_px
-    yield from _pool(threads).map(lambda first: work(first, min(first + share, count)), range(0, count, share))
+    starts = range(0, count, share)
+    yield from _pool(threads).map(lambda first: work(first, min(first + share, count)), starts)
 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Return threads that stay: to start some for each block of frames would cost as much as the block saves."""
+    """Return threads that stay: to start them for each block of frames costs much of what they save."""
     return ThreadPoolExecutor(threads, thread_name_prefix="evnlos")
 
 
