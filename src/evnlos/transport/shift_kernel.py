@@ -15,7 +15,7 @@ def _inside(
     tap_1: float,
     tap_2: float,
     tap_3: float,
-    scale: float,
+    scale: np.float32,
     ambient: NDArray[np.float32],
 ) -> None:
     """Write the part of a row whose taps all lie inside; the taps are numbers, so that the loop is vectors."""
@@ -30,7 +30,7 @@ def _outside(
     row: NDArray,
     start: int,
     taps: NDArray[np.float32],
-    scale: float,
+    scale: np.float32,
     ambient: NDArray[np.float32],
 ) -> None:
     """Write the part of a row that has taps outside, where the band is zero."""
