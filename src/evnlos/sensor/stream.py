@@ -20,7 +20,7 @@ from evnlos.types import Events
 Mode = Literal["exact", "v2e"]
 """How the pixel sees time: solved in continuous time, or stepped from frame to frame as v2e does."""
 
-_BLOCK_STEPS = 128
+_BLOCK_STEPS = 256
 
 
 class EventStream:
