@@ -138,8 +138,10 @@ def _load(path: str | Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
-    except (ValueError, EOFError) as error:
-        raise DataError(f"{path} is not an NPZ file of numbers ({error}); see docs/inversion.md") from None
+    except (ValueError, EOFError):
+        raise DataError(
+            f"{path} is not an NPZ file of plain numbers; docs/inversion.md lists what it must hold"
+        ) from None
 
 
 def _channels(data: dict[str, Any], name: str) -> torch.Tensor | None:
