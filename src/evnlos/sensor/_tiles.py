@@ -18,7 +18,7 @@ from evnlos.sensor._random import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_
 from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
 
 _T = TypeVar("_T")
-_SHARES = 4
+_SHARES = 8
 
 
 def pixel_thresholds(
