@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from evnlos.calibration import RigFit
-from evnlos.errors import MissingDependencyError
+from evnlos.plot.figure import new_figure
 
 
 def draw_calibration(fit: RigFit, path: str | Path) -> None:
@@ -22,16 +22,9 @@ def draw_calibration(fit: RigFit, path: str | Path) -> None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingDependencyError(
-            "the check picture needs matplotlib; install the extra evnlos[plot]"
-        ) from None
-
     with_events = any(example.surface is not None for example in fit.example)
     columns, rows = (6 if with_events else 3), len(fit.example)
-    figure = Figure(figsize=(2.6 * columns, 1.85 * rows + 0.4), layout="constrained")
+    figure = new_figure((2.6 * columns, 1.85 * rows + 0.4))
     axes = figure.subplots(rows, columns, squeeze=False)
     for line, example in zip(axes, fit.example, strict=True):
         top = max(float(example.frame.max()), float(example.model.max()))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evnlos.errors import MissingDependencyError
+from evnlos.plot.figure import new_figure
 
 if TYPE_CHECKING:
     from evnlos.evaluation.identify import Identification
@@ -29,7 +29,7 @@ def draw_identification(found: Identification, path: str | Path) -> Path:
     Raises:
         MissingDependencyError: Matplotlib is not installed.
     """
-    figure = _figure((10.5, 6.2))
+    figure = new_figure((10.5, 6.2))
     grid = figure.add_gridspec(2, 1, height_ratios=(1.5, 1))
     curves, pictures = grid[0].subgridspec(1, 2), grid[1].subgridspec(2, 6)
     _singular_values(figure.add_subplot(curves[0]), [found])
@@ -65,7 +65,7 @@ def draw_rigs(found: Sequence[Identification], path: str | Path) -> Path:
     Raises:
         MissingDependencyError: Matplotlib is not installed.
     """
-    figure = _figure((8.0, 4.6))
+    figure = new_figure((8.0, 4.6))
     _singular_values(figure.add_subplot(), found)
     return _saved(figure, path)
 
@@ -102,14 +102,6 @@ def _picture(axes: Any, image: Any, title: str, cmap: str = "gray", largest: flo
     axes.imshow(image.numpy(), cmap=cmap, vmin=low, vmax=high)
     axes.set_title(title, fontsize=8)
     axes.set_axis_off()
-
-
-def _figure(size: tuple[float, float]) -> Any:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingDependencyError("figures need matplotlib: pip install evnlos[plot]") from None
-    return Figure(size, layout="constrained")
 
 
 def _saved(figure: Any, path: str | Path) -> Path:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.errors import MissingDependencyError
+from evnlos.plot.figure import new_figure
 
 
 def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]]) -> Path:
@@ -27,11 +27,7 @@ def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]])
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingDependencyError("figures need matplotlib; pip install 'evnlos[plot]'") from None
-    figure = Figure((3.1 * len(panels), 3.0), layout="constrained")
+    figure = new_figure((3.1 * len(panels), 3.0))
     for axes, (title, image) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         axes.imshow(as_picture(image), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(title, fontsize=10)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.plot.figure import new_figure
 from evnlos.scene import FontGlyphs
 from evnlos.transport import DiffuseReflection, tpsf_kernel, tpsf_profile
 from evnlos.types import Plane
@@ -58,9 +59,7 @@ def draw_kernel(path: str | Path, letter: str = "R") -> Path:
     Returns:
         The path.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure((10.5, 5.6), layout="constrained")
+    figure = new_figure((10.5, 5.6))
     grid = figure.add_gridspec(2, len(PICTURES), height_ratios=(1.35, 1))
     axes = figure.add_subplot(grid[0, :])
     rho = np.linspace(0, 3, 301)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evnlos.plot.figure import new_figure
 from evnlos.types import Events
 
 _ON, _OFF = "#c84a00", "#185ebe"  # told apart with every common kind of colour blindness
@@ -49,9 +50,7 @@ def draw_time_stamps(
     Returns:
         The path.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure((10.5, 3.6), layout="constrained")
+    figure = new_figure((10.5, 3.6))
     panels = figure.subplots(1, len(streams), sharex=True, sharey=True, squeeze=False)[0]
     start, stop = window_s
     frames_ms = 1e3 * np.asarray(times_s, dtype=np.float64)
