@@ -10,7 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import DataError
 from evnlos.events.grids import as_edges
+from evnlos.events.prefetch import prefetch
 from evnlos.types import Events
+
+_AHEAD = 64  # events between asking for a pixel and using it: a map is larger than the caches
 
 
 def _starts(events: Events, edges_us: ArrayLike | None) -> NDArray[np.int64]:
@@ -20,15 +23,21 @@ def _starts(events: Events, edges_us: ArrayLike | None) -> NDArray[np.int64]:
     return np.searchsorted(events.t_us, as_edges(edges_us), side="right")
 
 
+@njit(cache=True, inline="always")
+def _pixel(x, y, index, width):
+    """Return the place of an event; without a sign, or every access would be checked for a negative index."""
+    return np.uint32(y[index]) * np.uint32(width) + np.uint32(x[index])
+
+
 @njit(cache=True)
 def _count(x, y, p, starts, height, width, out):
     off, one = np.uint32(height * width), out.dtype.type(1)
     for grid in range(len(starts) - 1):
         counts = out[grid].reshape(-1)
         for index in range(starts[grid], starts[grid + 1]):
-            # Places are counted without a sign, or every access would be checked for a negative index.
-            pixel = np.uint32(y[index]) * np.uint32(width) + np.uint32(x[index])
-            counts[pixel + (np.uint32(0) if p[index] else off)] += one
+            later = min(index + _AHEAD, len(x) - 1)
+            prefetch(counts, np.uint64(_pixel(x, y, later, width) + (np.uint32(0) if p[later] else off)))
+            counts[_pixel(x, y, index, width) + (np.uint32(0) if p[index] else off)] += one
 
 
 def event_histogram(events: Events, edges_us: ArrayLike | None = None) -> NDArray[np.float32]:
@@ -95,6 +104,7 @@ def _vote(t_us, x, y, p, first, scale, bins, out):
     """Add the votes; the two bins in use lie side by side in `pair`, so that an event touches one place."""
     height, width = out.shape[1], out.shape[2]
     pair = np.zeros((height * width, 2), np.float32)
+    places = pair.reshape(-1)
     bin_now = 0
     for index in range(len(t_us)):
         place = np.float64(t_us[index] - first) * scale
@@ -102,10 +112,10 @@ def _vote(t_us, x, y, p, first, scale, bins, out):
         while bin_now < low:
             _shift(pair, out[bin_now].reshape(-1))
             bin_now += 1
+        prefetch(places, np.uint64(2 * _pixel(x, y, min(index + _AHEAD, len(x) - 1), width)))
         part = np.float32(place - low)
         sign = np.float32(1.0) if p[index] else np.float32(-1.0)
-        # Places are counted without a sign, or every access would be checked for a negative index.
-        pixel = np.uint32(y[index]) * np.uint32(width) + np.uint32(x[index])
+        pixel = _pixel(x, y, index, width)
         pair[pixel, np.uint32(0)] += sign - sign * part
         pair[pixel, np.uint32(1)] += sign * part
     for last in range(bin_now, bins):

@@ -10,13 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from evnlos.events.io import celex_kernels as kernels
+from evnlos.events.io import celex_state as slots
+from evnlos.events.io.celex_format_1 import SCRATCH
+from evnlos.events.io.celex_kernels import DECODERS, EVENTS_A_GROUP, GROUP_BYTES
 from evnlos.events.io.celex_options import CelexOptions, clock_from_name, tick_divisor
+from evnlos.events.io.celex_state import HEIGHT, WIDTH
 from evnlos.events.io.columns import Columns, allocate, cut, shorten
 from evnlos.events.io.report import ReadReport, unreadable
 
 HEADER_BYTES = 12
-PICTURE_BYTES = kernels.WIDTH * kernels.HEIGHT * 3 // 2
+PICTURE_BYTES = WIDTH * HEIGHT * 3 // 2
 _MAX_PAYLOAD = PICTURE_BYTES + 1  # the longest that the camera sends; the last byte is the kind
 _FULL_PICTURE = 3  # a mode
 _SALVAGE = 'read it with on_error="salvage"'
@@ -138,11 +141,11 @@ class CelexSource:
         report.format = "CELEX"
         if not self._header.loop and self._header.modes[0] == _FULL_PICTURE and options.event_format is None:
             raise unreadable(path, 1, "a recording of full pictures", "read it with evnlos.read_frames(path)")
-        if width is not None and (width, height) != (kernels.WIDTH, kernels.HEIGHT):
+        if width is not None and (width, height) != (WIDTH, HEIGHT):
             raise unreadable(
                 path, 0, f"a sensor of {width} x {height}", "CeleX-V has 1280 x 800: leave the size out"
             )
-        report.set_geometry(kernels.WIDTH, kernels.HEIGHT, "format")
+        report.set_geometry(WIDTH, HEIGHT, "format")
         clock = options.clock_mhz or clock_from_name(path)
         if clock is None:
             found = "a file name without the sensor's clock"
@@ -150,7 +153,7 @@ class CelexSource:
             clock = 100
         self._divisor = tick_divisor(clock)
         self._buffer = np.empty(_MAX_PAYLOAD, np.uint8)
-        self._scratch = np.empty(kernels.SCRATCH, np.uint64)
+        self._scratch = np.empty(SCRATCH, np.uint64)
 
     def _names(self) -> tuple[str, ...]:
         names = ("t_us", "x", "y", "p", "polarity_known")
@@ -158,27 +161,29 @@ class CelexSource:
 
     def _bound(self, package: Package) -> int:
         format = self._header.event_format
-        return package.length // kernels.GROUP_BYTES[format] * kernels.EVENTS_A_GROUP[format]
+        return package.length // GROUP_BYTES[format] * EVENTS_A_GROUP[format]
 
     def _new_state(self) -> tuple[np.ndarray, np.ndarray]:
-        state = np.zeros(kernels.STATE_SIZE, np.int64)
-        state[kernels.DIVISOR] = self._divisor
+        state = np.zeros(slots.STATE_SIZE, np.int64)
+        state[slots.DIVISOR] = self._divisor
         # Twice the room: an array of 4 MB and more lies in large pages, and events fall anywhere in it.
-        return state, np.full((2, kernels.HEIGHT, kernels.WIDTH), -1, np.int16)[0]
+        last = np.empty((2, HEIGHT, WIDTH), np.int16)[0]
+        last.fill(-1)
+        return state, last
 
     def _decode(self, file: FileIO, package: Package, state: np.ndarray, last: np.ndarray, out: Columns) -> int:
         file.seek(package.offset)
         data = self._buffer[: package.length]
         data = data[: file.readinto(memoryview(data))]  # type: ignore[arg-type]
         format = self._header.event_format
-        left = package.length % kernels.GROUP_BYTES[format]
+        left = package.length % GROUP_BYTES[format]
         if left:
-            found = f"a package that ends {left} bytes into a group of {kernels.GROUP_BYTES[format]}"
+            found = f"a package that ends {left} bytes into a group of {GROUP_BYTES[format]}"
             self.report.fault(
                 "left_over", package.offset + package.length - left, found, _SALVAGE, lost_bytes=left
             )
         adc = out.get("adc", out["x"])  # format 2 has none and writes none
-        count = kernels.DECODERS[format](
+        count = DECODERS[format](
             data,
             state,
             out["t_us"],
@@ -191,8 +196,8 @@ class CelexSource:
             self._scratch,
         )
         for kind, slot, first, found in (
-            ("unknown", kernels.UNKNOWN, kernels.FIRST_UNKNOWN, "a word of an unknown kind"),
-            ("out_of_range", kernels.OUTSIDE, kernels.FIRST_OUTSIDE, "an event outside 1280 x 800"),
+            ("unknown", slots.UNKNOWN, slots.FIRST_UNKNOWN, "a word of an unknown kind"),
+            ("out_of_range", slots.OUTSIDE, slots.FIRST_OUTSIDE, "an event outside 1280 x 800"),
         ):
             if state[slot]:
                 offset = package.offset + int(state[first])
@@ -203,7 +208,7 @@ class CelexSource:
         return int(count)
 
     def _finish(self, state: np.ndarray, events: int, pictures: int) -> None:
-        self.report.skipped = int(state[kernels.SKIPPED])
+        self.report.skipped = int(state[slots.SKIPPED])
         if not events and pictures:
             raise unreadable(
                 self.path, 0, "a recording of full pictures", "read it with evnlos.read_frames(path)"

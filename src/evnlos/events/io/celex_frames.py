@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from evnlos.errors import DataError, EventFileError
 from evnlos.events.io.celex import parse_header, walk_packages
-from evnlos.events.io.celex_kernels import HEIGHT, WIDTH
 from evnlos.events.io.celex_options import CelexOptions
+from evnlos.events.io.celex_state import HEIGHT, WIDTH
 from evnlos.events.io.report import OnError, ReadReport, unreadable
 
 

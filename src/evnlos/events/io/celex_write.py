@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from evnlos.errors import DataError, EventFileError
 from evnlos.events.io.celex import PICTURE_BYTES
-from evnlos.events.io.celex_kernels import HEIGHT, WIDTH, pack_lanes
+from evnlos.events.io.celex_kernels import pack_lanes
 from evnlos.events.io.celex_options import clock_from_name, tick_divisor
+from evnlos.events.io.celex_state import HEIGHT, WIDTH
 from evnlos.events.io.sink import FileSink
 from evnlos.types import Events
 

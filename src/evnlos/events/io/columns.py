@@ -61,6 +61,20 @@ def trusted_events(columns: Columns, width: int, height: int) -> Events:
 
 
 @njit(cache=True)
+def _is_clean(t_us, x, y, width, height, newest):
+    """Return whether all events are inside the sensor and in order, in loops for vector code."""
+    largest_x, largest_y = np.uint16(0), np.uint16(0)
+    for value in x:
+        largest_x = max(largest_x, value)
+    for value in y:
+        largest_y = max(largest_y, value)
+    backwards = len(t_us) > 0 and t_us[0] < newest
+    for index in range(1, len(t_us)):
+        backwards |= t_us[index] < t_us[index - 1]
+    return largest_x < width and largest_y < height and not backwards
+
+
+@njit(cache=True)
 def _check_columns(t_us, x, y, width, height, newest):
     """Return index and kind (0 none, 1 out of range, 2 backwards) of the first fault and both tallies."""
     first, kind, outside, backwards = -1, 0, 0, 0
@@ -92,24 +106,29 @@ class ColumnCheck:
 
         `offsets` are the bytes of the file where the events stand, where that is known.
         """
-        report = self._report
+        report, count = self._report, len(columns["t_us"])
+        sides = report.width, report.height
+        if _is_clean(columns["t_us"], columns["x"], columns["y"], *sides, self._newest):
+            self._events += count
+            self._newest = columns["t_us"][-1] if count else self._newest
+            return columns
         first, kind, outside, backwards, self._newest = _check_columns(
-            columns["t_us"], columns["x"], columns["y"], report.width, report.height, self._newest
+            columns["t_us"], columns["x"], columns["y"], *sides, self._newest
         )
         if kind:
             number = self._events + first
             offset = int(offsets[first]) if offsets is not None else self._locate(number) if self._locate else 0
             order = ((1, outside), (2, backwards)) if kind == 1 else ((2, backwards), (1, outside))
-            for which, count in order:
-                if count and which == 1:
+            for which, many in order:
+                if many and which == 1:
                     found = f"event {number} at x={columns['x'][first]}, y={columns['y'][first]}"
                     cure = f"the sensor is {report.width} x {report.height}; give width= and height="
-                    report.fault("out_of_range", offset, found, cure, count=count)
-                elif count:
+                    report.fault("out_of_range", offset, found, cure, count=many)
+                elif many:
                     found = f"event {number} at {columns['t_us'][first]} us is earlier than the one before it"
                     cure = 'sort the file by time or read with on_error="salvage"'
-                    report.fault("backwards", offset, found, cure, count=count)
-        self._events += len(columns["t_us"])
+                    report.fault("backwards", offset, found, cure, count=many)
+        self._events += count
         if outside:
             inside = (columns["x"] < report.width) & (columns["y"] < report.height)
             columns = {name: column[inside] for name, column in columns.items()}

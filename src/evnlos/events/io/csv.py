@@ -2,126 +2,24 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.events.io.celex_options import CelexOptions, clock_from_name, tick_divisor
+from evnlos.events.io.celex_options import CelexOptions
 from evnlos.events.io.columns import ColumnCheck, Columns, join
+from evnlos.events.io.csv_celex_time import UnwrapTimes
 from evnlos.events.io.csv_kernels import FAULTS, FIRST_FAULT, parse_rows, print_rows
+from evnlos.events.io.csv_layout import MAX_LINE, find_layout
 from evnlos.events.io.report import ReadReport, unreadable
 from evnlos.events.io.sink import FileSink
 from evnlos.types import Events
 
 _BLOCK_BYTES = 1 << 20
-_MAX_LINE = 4096
 _SALVAGE = 'repair the line or read with on_error="salvage"'
-_ALIASES = {
-    "t": "t_us", "time": "t_us", "timestamp": "t_us", "ts": "t_us", "t_us": "t_us", "time_us": "t_us",
-    "x": "x", "col": "x", "column": "x", "y": "y", "row": "y",
-    "p": "p", "pol": "p", "polarity": "p", "on": "p",
-    "adc": "adc", "intensity": "adc", "polarity_known": "polarity_known", "t_in_pixel": "t_in_pixel",
-}  # fmt: skip
-_CELEX = {
-    3: ("y", "x", "t_us"),
-    4: ("y", "x", "t_in_pixel", "t_us"),
-    5: ("y", "x", "adc", "p", "t_us"),
-}
 _LIMITS = {"x": (0, 65_535), "y": (0, 65_535), "adc": (0, 65_535), "p": (-1, 1), "polarity_known": (0, 1)}
-_SDK_WRAP_TICKS = 1 << 22  # the camera's program prints times modulo this
-
-
-@dataclass(frozen=True)
-class Layout:
-    """What the columns of a file are.
-
-    Args:
-        names: Column names, left to right.
-        start: Byte offset of the first row.
-        in_seconds: Whether times have decimals and are seconds.
-        is_celex: Whether the file was exported by the CeleX-V program.
-        size: Sensor size (width, height) that comments state.
-        announced: Number of events that comments state.
-    """
-
-    names: tuple[str, ...]
-    start: int
-    in_seconds: bool = False
-    is_celex: bool = False
-    size: tuple[int, int] | None = None
-    announced: int | None = None
-
-
-def _comment(lines: list[bytes]) -> tuple[tuple[int, int] | None, int | None]:
-    """Return sensor size and number of events that comment lines state."""
-    text = b"\n".join(lines).decode("latin-1").lower()
-    pair = re.search(r"geometry\W+(\d{1,5})\s*[x,]\s*(\d{1,5})", text)
-    width, height = re.search(r"width\W+(\d{1,5})", text), re.search(r"height\W+(\d{1,5})", text)
-    size = (int(pair[1]), int(pair[2])) if pair else None
-    if size is None and width and height:
-        size = int(width[1]), int(height[1])
-    count = re.search(r"events=(\d{1,18})", text)
-    return size, int(count[1]) if count else None
-
-
-def _split(line: bytes) -> list[bytes]:
-    return [field for field in re.split(rb"[\s,;]+", line.strip()) if field]
-
-
-def _is_number(field: bytes) -> bool:
-    return re.fullmatch(rb"[+-]?\d{1,18}(\.\d*)?", field) is not None
-
-
-def _is_sign(field: bytes) -> bool:
-    return field in (b"0", b"1", b"-1", b"+1")
-
-
-def find_layout(start: bytes) -> Layout | None:
-    """Return the layout of a text file from its first bytes, None where they are no rows of numbers."""
-    if any(byte < 9 or 13 < byte < 32 or byte > 126 for byte in start[:_MAX_LINE]):
-        return None
-    offset, comments, names = 0, [], ()
-    for line in start.splitlines(keepends=True):
-        fields = _split(line)
-        if line[:1] in (b"#", b"%"):
-            comments.append(line)
-        elif fields and not names and not any(map(_is_number, fields)):
-            names = tuple(_ALIASES.get(field.decode("latin-1").lower(), "") for field in fields)
-            if not {"t_us", "x", "y"} <= set(names):
-                return None
-        elif fields:
-            break
-        offset += len(line)
-    else:
-        fields = []
-    size, announced = _comment(comments)
-    if names:
-        in_seconds = bool(fields) and len(fields) == len(names) and b"." in fields[names.index("t_us")]
-        return Layout(names, offset, in_seconds, "t_in_pixel" in names, size, announced)
-    if not fields or not all(map(_is_number, fields)):
-        return None
-    return _headless(start, offset, fields, size, announced)
-
-
-def _headless(
-    start: bytes, offset: int, fields: list[bytes], size: tuple[int, int] | None, announced: int | None
-) -> Layout | None:
-    """Return the layout of rows without names: seconds first, the CeleX-V program's, or x, y, p, t."""
-    rows = [_split(line) for line in start[offset:].splitlines()[:1000]]
-    rows = [row for row in rows if len(row) == len(fields)]
-    if len(fields) == 4 and b"." in fields[0]:
-        return Layout(("t_us", "x", "y", "p"), offset, True, False, size, announced)
-    if len(fields) == 4 and all(_is_sign(row[2]) for row in rows):
-        return Layout(("x", "y", "p", "t_us"), offset, False, False, size, announced)
-    if len(fields) == 4 and all(_is_sign(row[3]) for row in rows):
-        return Layout(("t_us", "x", "y", "p"), offset, False, False, size, announced)
-    if len(fields) in _CELEX:
-        return Layout(_CELEX[len(fields)], offset, False, True, size, announced)
-    return None
 
 
 class CsvSource:
@@ -187,8 +85,8 @@ class CsvSource:
                     cure = f"{columns} numbers belong there: {_SALVAGE}"
                     report.fault("unknown", offset + at, found, cure, count=int(state[FAULTS]))
                     state[:] = 0
-                if len(text) - used > _MAX_LINE and not last:
-                    found = f"a line of more than {_MAX_LINE} bytes"
+                if len(text) - used > MAX_LINE and not last:
+                    found = f"a line of more than {MAX_LINE} bytes"
                     lost = self.path.stat().st_size - offset - used
                     report.fault("unknown", offset + used, found, "the file is no CSV", lost_bytes=lost)
                     return
@@ -206,7 +104,7 @@ class CsvSource:
     def blocks(self) -> Iterator[Columns]:
         """Yield the events of about a megabyte of text at a time."""
         check = ColumnCheck(self.report)
-        unwrap = _Unwrap(self.path, self.report, self._options) if self._layout.is_celex else None
+        unwrap = UnwrapTimes(self.path, self.report, self._options) if self._layout.is_celex else None
         for values, offsets in self._rows(self.report):
             values, offsets = self._in_range(values, offsets)
             columns = {name: values[:, index] for index, name in enumerate(self._layout.names)}
@@ -251,38 +149,6 @@ def _typed(columns: dict[str, NDArray], is_celex: bool) -> Columns:
     if "adc" in columns:
         out["adc"] = columns["adc"].astype(np.uint16)
     return out
-
-
-class _Unwrap:
-    """Undoes the turns of the times that the CeleX-V program prints, and converts ticks to microseconds."""
-
-    def __init__(self, path: Path, report: ReadReport, options: CelexOptions) -> None:
-        self._path, self._report, self._ticks = path, report, options.csv_in_ticks
-        self._clock = options.clock_mhz or clock_from_name(path)
-        self._turns, self._last = 0, 0
-
-    def _divisor(self) -> int:
-        if self._clock is None:
-            found = "times that turn over or count ticks, and no clock"
-            self._report.fault("header", 0, found, "give celex=CelexOptions(clock_mhz=...)")
-            self._clock = 100
-        return tick_divisor(self._clock)
-
-    def __call__(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        if not len(times):
-            return times
-        steps = np.diff(times, prepend=self._last)
-        self._last = int(times[-1])
-        shortest = _SDK_WRAP_TICKS if self._ticks else _SDK_WRAP_TICKS * 1024 // 140
-        turned = steps < -shortest // 2  # a smaller step back is a fault, which the check of order reports
-        turns = self._turns + np.cumsum(turned)
-        self._turns = int(turns[-1])
-        if not self._ticks and not self._turns:
-            return times
-        divisor = self._divisor()
-        if self._ticks:
-            return ((times + turns * _SDK_WRAP_TICKS) * 2048 + divisor) // (2 * divisor)
-        return times + (turns * _SDK_WRAP_TICKS * 2048 + divisor) // (2 * divisor)
 
 
 class CsvSink(FileSink):

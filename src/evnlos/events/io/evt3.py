@@ -196,7 +196,7 @@ def _decode_chunk(words, state, places, counts, t_us, x, y, p, width, height):
             for place in range(SLACK):
                 t_out[place] = time
             for place in range(SLACK):
-                x_out[place] = start + places[mask, place]
+                x_out[place] = start + np.uint16(places[mask, place])
             for place in range(SLACK):
                 y_out[place] = row
             for place in range(SLACK):
@@ -238,9 +238,9 @@ def _decode_block(words, state, places, counts, t_us, x, y, p, width, height):
 
 
 @cache
-def _mask_table() -> tuple[NDArray[np.uint16], NDArray[np.uint64]]:
+def _mask_table() -> tuple[NDArray[np.uint8], NDArray[np.uint64]]:
     """Return the places of the bits set in each mask of 12, and how many they are."""
-    places = np.zeros((4096, SLACK), np.uint16)
+    places = np.zeros((4096, SLACK), np.uint8)
     for mask in range(4096):
         bits = [bit for bit in range(12) if mask >> bit & 1]
         places[mask, : len(bits)] = bits

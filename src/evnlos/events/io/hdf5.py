@@ -8,6 +8,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.events.io.columns import ColumnCheck, Columns
@@ -127,11 +128,26 @@ class Hdf5Source:
                 largest[name] = max(largest[name], int(datasets[name][start : start + (1 << 20)].max()))
         return self.report.set_geometry(largest["x"] + 1, largest["y"] + 1, "events")
 
+    def _entries(self, name: str, dataset: h5py.Dataset, start: int, stop: int) -> NDArray:
+        """Return entries in their type; narrow times are read into half of the column that they then fill."""
+        count = stop - start
+        fits = -(2**63) <= self._t_offset < 2**63 - 2**32
+        if name == "t_us" and dataset.dtype == np.uint32 and fits:
+            times = np.empty(count, np.int64)
+            narrow = times.view(np.uint32)[count:]
+            _read_into(narrow, dataset, start, stop)
+            _widen(narrow, self._t_offset, times)
+            return times
+        values = np.empty(count, dataset.dtype)
+        _read_into(values, dataset, start, stop)
+        return self._column(name, values)
+
     def _column(self, name: str, values: NDArray) -> NDArray:
         if name in ("p", "polarity_known"):
             if values.dtype == np.bool_:
                 return values
-            if values.size and not (int(values.max()) <= 1 and int(values.min()) >= -1):
+            least = 0 if values.dtype.kind == "u" or not values.size else int(values.min())
+            if least < -1 or (values.size and int(values.max()) > 1):
                 raise unreadable(self.path, 0, "events/p holds more than 0/1 or -1/+1", _CURE)
             return values.view(np.bool_) if values.dtype == np.uint8 else values > 0
         if name != "t_us":
@@ -159,12 +175,27 @@ class Hdf5Source:
             for start in range(0, self._count, size):
                 block = {}
                 for name, dataset in datasets.items():
-                    block[name] = self._column(name, dataset[start : start + size])
+                    block[name] = self._entries(name, dataset, start, min(start + size, self._count))
                 yield check(block)
 
     def read(self) -> Columns:
         """Return all events."""
         return next(self.blocks(max(self._count, 1)), {})
+
+
+def _read_into(values: NDArray, dataset: h5py.Dataset, start: int, stop: int) -> None:
+    """Read the entries start..stop; for a whole column the library need not work out what is chosen."""
+    if start == 0 and stop == dataset.shape[0] and stop:
+        dataset.read_direct(values)
+    else:
+        values[:] = dataset[start:stop]
+
+
+@njit(cache=True)
+def _widen(narrow, offset, times):
+    """Fill `times` with narrow + offset; `narrow` may be its upper half, as entries are used before that."""
+    for index in range(len(times)):
+        times[index] = np.int64(narrow[index]) + offset
 
 
 def _stored_at(dataset: h5py.Dataset, number: int) -> int:

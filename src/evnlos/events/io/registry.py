@@ -14,6 +14,7 @@ from evnlos.events.io import (
     celex,
     celex_write,
     csv,
+    csv_layout,
     dat,
     es,
     hdf5,
@@ -116,7 +117,7 @@ FORMATS = (
     Format(
         "CSV",
         (".csv", ".txt"),
-        lambda start: csv.find_layout(start) is not None,
+        lambda start: csv_layout.find_layout(start) is not None,
         csv.CsvSource,
         lambda path, first, _: csv.CsvSink(path, first),
     ),

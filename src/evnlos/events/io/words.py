@@ -152,12 +152,15 @@ class WordSource:
         return self._dated(columns)
 
     def _make_room(self, columns: Columns, count: int, words: NDArray, first: int) -> None:
-        """Enlarge the columns where a block may hold more events than they have room for."""
+        """Enlarge the columns where a block may hold more events than they have room for.
+
+        Before the first event nothing has to be copied: then for the whole file, if it goes on as it begins.
+        """
         room = len(columns["t_us"]) - count
-        if room >= self.codec.most_events * len(words) + _ROOM:
+        is_start = not count and self.codec.most_events > 1
+        if room >= self.codec.most_events * len(words) + _ROOM and not is_start:
             return
-        need = self.codec.bound(words)
-        if room < need:
-            done = first + len(words)
-            expected = (count + need) * self.words // done  # if the rest of the file is like its beginning
+        need, done = self.codec.bound(words), first + len(words)
+        expected = (count + need) * self.words // done
+        if room < need or (is_start and room < expected):
             enlarge(columns, count, max(count + need, expected + expected // 16))
