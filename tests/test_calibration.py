@@ -23,10 +23,11 @@ from evnlos.calibration.frame_noise import fit_frame_noise
 from evnlos.calibration.least_squares import levenberg_marquardt
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
+from evnlos.dataset import load_pattern
 from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.simulate import SensorSize, Simulation, simulate_object
 from evnlos.errors import ConfigError, DataError
-from evnlos.scene import FontGlyphs
+from evnlos.scene import FontGlyphs, pen_width
 from evnlos.sensor import EventPixel, FrameCamera
 from evnlos.transport import PaperTransport, RadiometricTransport
 from evnlos.types import Events
@@ -142,6 +143,26 @@ def test_the_rig_file_simulates(fit, tmp_path) -> None:
     assert {row.name for row in rows} == set(found["parameters"])
     with pytest.raises(ConfigError, match="exists"):
         write_rig(fit, rows, tmp_path)
+
+
+def test_the_fixed_pattern_is_found_and_left_out_of_the_training_set(fit, tmp_path) -> None:
+    folder = write_rig(fit, rows_of(fit, EventPixel(), FrameCamera()), tmp_path).parent
+    found = fit.residuals["frames held out, without pattern"]
+    # What stays is the temporal noise: the pattern of captures that were fitted is that of those held out.
+    assert found.after < 0.8 * found.before
+    assert found.after == pytest.approx(found.noise, rel=0.1)
+    assert load_pattern(folder).digest == fit.noise.pattern.digest
+    training = load_yaml(Simulation, folder / "training.yaml")
+    assert training == fit.training
+    camera = training.frame_camera
+    assert camera.prnu < CAMERA.prnu / 2 and camera.dsnu_e < CAMERA.dsnu_e / 2 and camera.pattern_seed is None
+    pens = [pen_width(LAB.glyphs.target(f"kalam_{c}").mask) for c in "ALEO"]
+    low, high = training.glyphs.strokes.pen
+    assert low == pytest.approx(0.9 * min(pens), abs=1e-3) and high == pytest.approx(1.1 * max(pens), abs=1e-3)
+    for path, (low, high) in training.vary.items():
+        section, name, *axis = path.split(".")
+        value = getattr(getattr(fit.simulation, section), name)
+        assert low <= (value[int(axis[0])] if axis else value) <= high
 
 
 def test_a_fit_that_fails_on_unseen_captures_is_refused(folders, tmp_path, capsys) -> None:

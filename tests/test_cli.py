@@ -207,13 +207,15 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp
 
 def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys) -> None:
     one = ["--pretrain-epochs", 1, "--finetune-epochs", 1, "--e2e-epochs", 1, "--writers", 1, "--width", 8]
-    call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, "--workers", 1, *one)
+    one += ["--workers", 1, "--no-calibrate"]
+    call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     shown = capsys.readouterr().out
     assert "EPNP fusion" in shown and "E2E event" in shown and "report:" in shown
+    assert "EPNP - E2E" in shown and "was not fitted to this rig" in shown
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "not recordings" not in page
     # A second call takes up what is there: nothing is made again, the table is the same.
-    call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, "--workers", 1, *one)
+    call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     assert shown.splitlines()[1] in capsys.readouterr().out
 
 

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from evnlos.config import save_yaml
 from evnlos.dataset import (
     NlosDataset,
+    Simulation,
     network_input,
     open_dataset,
     read_shard,
@@ -24,7 +25,9 @@ from evnlos.dataset import (
     write_shard,
 )
 from evnlos.dataset.pool import run_tasks
-from evnlos.errors import DataError, EvnlosError
+from evnlos.dataset.simulate import drawn_for
+from evnlos.errors import ConfigError, DataError, EvnlosError
+from evnlos.transport import RadiometricTransport
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -208,3 +211,19 @@ def test_bytes_do_not_depend_on_who_holds_the_objects_of_the_file(tiny_dataset, 
     write_shard(tmp_path / "held.h5", samples, attributes)
     assert len(held) == 6
     assert (tmp_path / "held.h5").read_bytes() == tiny_dataset.shard(name).read_bytes()
+
+
+def test_optics_are_drawn_for_groups_of_objects_and_light_for_each() -> None:
+    config = Simulation(
+        transport=RadiometricTransport(),
+        vary={"transport.roughness": (0.03, 0.08), "transport.gain": (0.5, 1.5), "pixel.cutoff_hz": (10, 90)},
+        rigs=3,
+    )
+    names = config.glyphs.objects()[:40]
+    drawn = [drawn_for(config, name) for name in names]
+    assert len({d.transport.roughness for d in drawn}) == 3
+    assert len({d.transport.gain for d in drawn}) == len({d.pixel.cutoff_hz for d in drawn}) == 40
+    own = [drawn_for(replace(config, rigs=0), name) for name in names]
+    assert len({d.transport.roughness for d in own}) == 40
+    with pytest.raises(ConfigError, match="rigs"):
+        Simulation(rigs=-1)

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from evnlos.errors import DataError
-from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, hand, held_out_writers, nist_like, render_glyph
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import (
+    TRAIN_WRITERS,
+    HandwritingGlyphs,
+    Strokes,
+    hand,
+    held_out_writers,
+    nist_like,
+    pen_width,
+    render_glyph,
+)
 from evnlos.scene.distance import signed_distance
 
 STEMS = "BDEFHIKLPRT"  # letters whose upright strokes show the slant
@@ -131,3 +140,30 @@ def test_bad_arguments_are_refused():
     for arguments in ((-1, "A", 0), (0, "A", 0, 4), (0, "A", 0, 64, 0.0), (0, "AB", 0)):
         with pytest.raises(DataError):
             nist_like(*arguments)
+
+
+def test_strokes_have_the_faces_and_pens_that_are_asked_for():
+    bold = Strokes("both", (0.12, 0.2))
+    hands = [hand(writer, 0, bold) for writer in range(22)]
+    assert {h.font.family for h in hands} >= {"Fredoka", "Nunito", "Quicksand", "Varela Round", "Caveat"}
+    assert all(0.12 <= h.pen <= 0.2 for h in hands)
+    widths = [pen_width(nist_like(writer, "H", 0, 128, strokes=bold)) for writer in range(11)]
+    assert min(widths) > 0.1 and max(widths) < 0.26
+    set_ = HandwritingGlyphs(writers=2, strokes=bold)
+    np.testing.assert_array_equal(set_.target("writer01_B", 4).mask, nist_like(1, "B", 4, strokes=bold))
+    # The default population is what it always was.
+    np.testing.assert_array_equal(nist_like(1, "B", 4), nist_like(1, "B", 4, strokes=Strokes()))
+
+
+def test_a_pen_is_measured_as_it_was_drawn():
+    mask = np.zeros((100, 100), np.float32)
+    mask[10:90, 40:52] = 1.0  # a bar of 12 pixels, 80 long
+    assert pen_width(mask) == pytest.approx(12 / 80, rel=0.1)
+    with pytest.raises(DataError, match="no ink"):
+        pen_width(np.zeros((9, 9), np.float32))
+
+
+@pytest.mark.parametrize(("arguments", "word"), [(("script",), "faces"), (("hand", (0.2, 0.1)), "pen")])
+def test_wrong_strokes_are_refused(arguments, word):
+    with pytest.raises(ConfigError, match=word):
+        Strokes(*arguments)

@@ -111,8 +111,12 @@ def write_atomically(path: str | Path, content: bytes) -> None:
 
 
 def config_hash(config: Any) -> str:
-    """Return a hash of a configuration's values: 16 hexadecimal digits, equal for equal settings."""
-    text = json.dumps(to_dict(config), sort_keys=True)
+    """Return a hash of a configuration's values: 16 hexadecimal digits, equal for equal settings.
+
+    Args:
+        config: A configuration dataclass, or a dictionary of plain values.
+    """
+    text = json.dumps(config if isinstance(config, dict) else to_dict(config), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

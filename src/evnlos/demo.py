@@ -1,4 +1,4 @@
-"""The main job on one page: simulate, pre-train, fine-tune on captures, train end to end, evaluate, report."""
+"""The main job on one page: calibrate, simulate the rig, pre-train, fine-tune, train end to end, report."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from tqdm import tqdm
-
-from evnlos.dataset import PARADIGMS, Dataset, Simulation, import_captures, open_dataset, simulate
+from evnlos.calibration import Calibration
 from evnlos.dataset.importer import character_of
 from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.presets import default
+from evnlos.errors import CalibrationError
+from evnlos.experiment import Arm, Place, Step, Study, gain_table, read_records, run_study, show
 from evnlos.model import UNetConfig
 from evnlos.report import gather, to_text, write_report
-from evnlos.scene import FontGlyphs, HandwritingGlyphs
-from evnlos.training import Training, train
+from evnlos.scene import FontGlyphs
+from evnlos.training import Training
 
 LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
 """What the rendered captures show."""
@@ -35,9 +34,9 @@ class Demo:
     captures: tuple[Path, ...] = ()
     """Capture folders; without any, pseudo-real ones are rendered."""
     test: tuple[str, ...] = _TEST
-    """Characters of the captures that no training sees."""
+    """Characters of the captures that neither calibration nor training sees."""
     writers: int = 2
-    """Writers of the simulated handwriting, 36 characters each."""
+    """Writers of the simulated characters, 36 objects each."""
     pretrain_epochs: int = 6
     """Passes over the simulated samples."""
     finetune_epochs: int = 8
@@ -48,6 +47,8 @@ class Demo:
     """Channels of the network at its finest level."""
     workers: int = 0
     """Processes that simulate; 0 = one for each core."""
+    calibrate: bool = True
+    """Fit the simulator to the rig of the captures first; without it, pre-train on the default simulation."""
     seed: int = 0
     """Seed of every draw."""
 
@@ -60,67 +61,73 @@ def run_demo(settings: Demo) -> Path:
     began, out = time.perf_counter(), settings.out
     out.mkdir(parents=True, exist_ok=True)
     notes = []
-    simulation = _simulation(settings)
-    total = len(simulation.glyphs.objects())
-    _drain(simulate(simulation, out / "simulation", settings.workers), total, "simulate")
-    pretraining = open_dataset(out / "simulation")
-
     folders = list(settings.captures)
     if not folders:
         lab = Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=settings.seed)
         notes.append(
             "The captures of this page are not recordings: they were rendered with a wall of rough aluminium, "
-            "which the training simulator does not know, and other cameras. Give --captures for recordings."
+            "cameras and noise that only calibration can tell the simulator. Give --captures for recordings."
         )
         notes += lab.glyphs.notes()
-        names = lab.glyphs.objects()
-        folders = list(_drain(render_captures(lab, out / "captures"), len(names), "render captures"))
-    test = _held_out(folders, settings.test)
-    _drain(import_captures(folders, out / "shots", test=test), len(folders), "import captures")
-    shots = open_dataset(out / "shots")
+        show(_rendered(lab, settings, folders))
+    study = _study(settings, _held_out(folders, settings.test))
+    try:
+        show(run_study(study, Place(tuple(sorted(folders)), out, settings.workers)))
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"{error}; or give --no-calibrate to go on with the default simulation"
+        ) from None
+    records = read_records(out / "records" / study.name)
+    if settings.calibrate:
+        notes.append("The simulator was fitted to this rig, without the test characters (rigs/demo/check.png).")
+    else:
+        notes.append("The simulator was not fitted to this rig.")
 
-    runs: list[str | Path] = []
-    network = UNetConfig(width=settings.width)
-    for paradigm in PARADIGMS:
-        plan = Training(paradigm=paradigm, network=network, seed=settings.seed)
-        pre = out / "runs" / f"pretrained-{paradigm}"
-        _fit(pretraining, dataclasses.replace(plan, epochs=settings.pretrain_epochs), pre, None)
-        e2e = out / "runs" / f"e2e-{paradigm}"
-        _fit(shots, dataclasses.replace(plan, epochs=settings.e2e_epochs), e2e, None)
-        epnp = out / "runs" / f"epnp-{paradigm}"
-        _fit(shots, dataclasses.replace(plan, epochs=settings.finetune_epochs), epnp, pre)
-        runs += [pre, e2e, epnp]
-
-    dataset, results = gather(runs, out / "shots")
-    notes.append(
-        f"{len(shots.objects('train'))} captures to learn from; the simulator was not fitted to this rig."
-    )
+    single = [record for record in records if record.arm in [arm.name for arm in study.arms]]
+    runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
+    dataset, results = gather(runs, out / "shots" / single[0].settings["captures"])
     path = write_report(out / "report.html", dataset, results, notes)
     for note in notes:
         print(note)
     print(to_text(results))
+    print(gain_table(records))
     print(f"report: {path} ({time.perf_counter() - began:.0f} s)")
     return path
 
 
-def _simulation(settings: Demo) -> Simulation:
-    base = default()
-    assert isinstance(base.glyphs, HandwritingGlyphs)
-    glyphs = dataclasses.replace(base.glyphs, writers=settings.writers)
-    return dataclasses.replace(base, glyphs=glyphs, seed=settings.seed)
+def _rendered(lab: Lab, settings: Demo, folders: list[Path]) -> Iterator[Step]:
+    """Render the captures, adding each folder to `folders`."""
+    total = len(lab.glyphs.objects())
+    for folder in render_captures(lab, settings.out / "captures", workers=settings.workers):
+        folders.append(folder)
+        yield Step("render captures", len(folders), total)
+
+
+def _study(settings: Demo, test: list[str]) -> Study:
+    """Return the comparison of E2E and EPNP, with one seed."""
+    plan = Training(network=UNetConfig(width=settings.width))
+    before = dataclasses.replace(plan, epochs=settings.pretrain_epochs)
+    after = dataclasses.replace(plan, epochs=settings.finetune_epochs)
+    alone = dataclasses.replace(plan, epochs=settings.e2e_epochs)
+    source = "calibrated" if settings.calibrate else "uncalibrated"
+    return Study(
+        "demo",
+        "demo",
+        (
+            Arm("simulation only", source, before, None),
+            Arm("E2E", "none", None, alone),
+            Arm("EPNP", source, before, after),
+        ),
+        seeds=(settings.seed,),
+        test=tuple(test),
+        writers=settings.writers,
+        simulation=dataclasses.replace(default(), seed=settings.seed),
+        calibration=Calibration(event_captures=2, columns=48, seed=settings.seed),
+        correct_pattern=settings.calibrate,
+    )
 
 
 def _held_out(folders: list[Path], wanted: tuple[str, ...]) -> list[str]:
     """Return the characters to test on; every seventh where the captures have none of the wanted ones."""
     there = [character_of(folder.resolve().name) for folder in folders]
     return [c for c in wanted if c in there] or there[::7]
-
-
-def _fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None) -> None:
-    records: Iterator[dict[str, Any]] = train(dataset, settings, out, weights)
-    _drain(records, settings.epochs, f"train {out.name}")
-
-
-def _drain(steps: Iterator[Any], total: int, title: str) -> list[Any]:
-    with tqdm(steps, total=total, desc=title.ljust(24)) as bar:
-        return list(bar)

@@ -13,6 +13,10 @@ class DataError(EvnlosError):
     """An array, image or dataset does not hold what it should."""
 
 
+class CalibrationError(DataError):
+    """The simulator cannot be fitted to captures, or the fit does not stand on those held out."""
+
+
 class EventFileError(EvnlosError):
     """An event file is damaged, of an unknown format, or contradicts its own header."""
 

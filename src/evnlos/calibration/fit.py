@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Shots, read_shots
@@ -17,6 +18,7 @@ from evnlos.calibration.frame_model import AnyTransport, FrameModel
 from evnlos.calibration.frame_noise import FrameNoise, fit_frame_noise
 from evnlos.calibration.residual import Residual
 from evnlos.calibration.settings import Calibration
+from evnlos.calibration.training_set import pens_of, training_simulation
 from evnlos.calibration.transport_fit import TransportFit, fit_transport
 from evnlos.dataset.simulate import SensorSize, Simulation
 from evnlos.errors import DataError
@@ -54,16 +56,19 @@ class RigFit:
 
     Args:
         simulation: The settings that make the simulator match the rig.
+        training: The same, varied around the fit, with strokes like the targets': what to pre-train on.
         fitted: Names of the captures that were fitted.
         held_out: Names of the captures that it was checked on.
         optics: The fitted transport, its start and its errors.
         noise: The frame camera's noise.
         pixel: The fitted event pixel; None where only frames were fitted.
-        residuals: By "frames fit" and "frames held out"; with events also of "counts" and "surfaces".
+        residuals: By "frames fit" and "frames held out"; with events also of "counts" and "surfaces"; and of
+            "frames held out, without pattern", before and after the fixed pattern is taken from the frames.
         example: Held-out captures beside the fit.
     """
 
     simulation: Simulation
+    training: Simulation
     fitted: tuple[str, ...]
     held_out: tuple[str, ...]
     optics: TransportFit
@@ -114,6 +119,12 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
         after = model.relative((model.frames - predicted[name]) * model.weight)
         spread = float(model.frames.std(correction=0))
         residuals[f"frames {name}"] = Residual(before, after, noise.temporal / spread)
+    lit = torch.from_numpy(noise.pattern.correct(held.frames(), held.peak))
+    seen = models["held out"]
+    corrected = seen.relative((lit - predicted["held out"]) * seen.weight)
+    residuals["frames held out, without pattern"] = replace(
+        residuals["frames held out"], before=residuals["frames held out"].after, after=corrected
+    )
     simulation = _simulation(settings, fit, optics.transport, noise, settings.start.pixel)
     pixel: PixelFit | None = None
     surfaces: Surfaces = {}
@@ -129,7 +140,9 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
             )
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
-    return RigFit(simulation, fit.names, held.names, optics, noise, pixel, residuals, examples)
+    strokes = pens_of([scene.target.mask for scene in fit.scenes])
+    training = training_simulation(simulation, noise, pixel, strokes)
+    return RigFit(simulation, training, fit.names, held.names, optics, noise, pixel, residuals, examples)
 
 
 def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[AnyTransport, tuple[str, ...]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Shots
+from evnlos.dataset.fixed_pattern import FixedPattern
 from evnlos.sensor import FrameCamera
 
 _BINS = 24
@@ -23,12 +24,15 @@ class FrameNoise:
     Args:
         camera: The frame camera that makes this noise.
         temporal: Standard deviation of the noise that changes from frame to frame, white levels.
-        pattern: Mean residual of each pixel, white levels, float64 [H, W]: fixed pattern and misfit.
+        pattern: Sensitivity and offset of each pixel, the most probable ones.
+        remaining: Standard deviations of sensitivity (fraction) and offset (electrons) that stay after
+            correction by the pattern.
     """
 
     camera: FrameCamera
     temporal: float
-    pattern: NDArray[np.float64]
+    pattern: FixedPattern
+    remaining: tuple[float, float]
 
 
 def fit_frame_noise(shots: Shots, model: NDArray, start: FrameCamera) -> FrameNoise:
@@ -73,7 +77,43 @@ def fit_frame_noise(shots: Shots, model: NDArray, start: FrameCamera) -> FrameNo
         gain=1.0,
         black_level=0.0,
     )
-    return FrameNoise(camera, temporal / peak, residual.mean(axis=0) / peak)
+    pattern, (left, offset_left) = most_probable_pattern(residual, signal, temporal, prnu, dsnu, peak)
+    return FrameNoise(camera, temporal / peak, pattern, (left, offset_left / dn_per_e))
+
+
+def most_probable_pattern(
+    residual: NDArray, signal: NDArray, temporal: float, prnu: float, dsnu: float, peak: float
+) -> tuple[FixedPattern, tuple[float, float]]:
+    """Return each pixel's sensitivity and offset, given the frames and how far the pixels spread.
+
+    residual_k = g signal_k + h + noise_k over the frames k, with normal g, h and noise: a linear regression
+    with priors for each pixel, two equations for (g, h).
+
+    Args:
+        residual: Camera minus model, DN [N, H, W].
+        signal: The model, DN [N, H, W].
+        temporal: Standard deviation of the noise, DN.
+        prnu: Standard deviation of g.
+        dsnu: Standard deviation of h, DN.
+        peak: Largest digital number.
+
+    Returns:
+        The pattern, and the root mean squares of what stays unknown: of g, over the light's swing, and of
+        g signal + h at a pixel's mean signal, DN.
+    """
+    s0, s1, s2 = len(signal), signal.sum(axis=0), (signal**2).sum(axis=0)
+    r0, r1 = residual.sum(axis=0), (residual * signal).sum(axis=0)
+    # In units of 1 / temporal^2; a spread of 0 leaves nothing to find.
+    a = s2 + (temporal / max(prnu, 1e-9)) ** 2
+    d = s0 + (temporal / max(dsnu, 1e-9)) ** 2
+    determinant = a * d - s1**2
+    g, h = (d * r1 - s1 * r0) / determinant, (a * r0 - s1 * r1) / determinant
+    pattern = FixedPattern((1 + g).astype(np.float32), (h / peak).astype(np.float32))
+    # The error at light s is e_mean + e_g (s - mean): what is left of g counts where the light swings.
+    mean, swing = s1 / s0, np.maximum(s2 - s1**2 / s0, 1e-12)
+    left_g = float(np.average(d / determinant, weights=swing))
+    left_mean = float(np.mean((a - 2 * mean * s1 + mean**2 * d) / determinant))
+    return pattern, (min(prnu, temporal * math.sqrt(left_g)), min(dsnu, temporal * math.sqrt(left_mean)))
 
 
 def _temporal(residual: NDArray, signal: NDArray, capture: NDArray) -> tuple[NDArray, NDArray]:

@@ -10,10 +10,11 @@ from typing import Any
 
 from evnlos.calibration.fit import RigFit
 from evnlos.config import save_yaml, write_atomically
+from evnlos.dataset.fixed_pattern import PATTERN_FILE, save_pattern
 from evnlos.errors import ConfigError, DataError
 from evnlos.version import __version__
 
-RIG_FILE, FIGURES_FILE = "rig.yaml", "calibration.json"
+RIG_FILE, TRAINING_FILE, FIGURES_FILE = "rig.yaml", "training.yaml", "calibration.json"
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,10 @@ def rows_of(fit: RigFit, start_pixel: Any, start_camera: Any) -> list[Row]:
     rows += [
         Row(f"frame_camera.{name}", getattr(start_camera, name), getattr(camera, name), None, unit)
         for name, unit in units.items()
+    ]
+    left = zip(("prnu", "dsnu_e"), fit.noise.remaining, strict=True)
+    rows += [
+        Row(f"{name} after correction", getattr(camera, name), value, None, units[name]) for name, value in left
     ]
     return rows + _pixel_rows(fit, start_pixel)
 
@@ -160,7 +165,10 @@ def check_out(out: Path, force: bool) -> None:
 
 
 def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> Path:
-    """Write `calibration.json`, and `rig.yaml` where the fit stands on captures that it has not seen.
+    """Write `calibration.json` and, where the fit stands on captures that it has not seen, the rig.
+
+    The rig is `rig.yaml` (the simulation that matches it), `training.yaml` (that simulation, varied, to
+    pre-train on) and `pattern.safetensors` (the frame camera's fixed pattern, for `import --pattern`).
 
     Args:
         fit: The calibration.
@@ -185,5 +193,7 @@ def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> P
             "of the rig and no rig file was written; check that all captures show one unmoved rig, try another "
             "--preset or start, or --no-events where only events got worse"
         )
+    save_pattern(fit.noise.pattern, out / PATTERN_FILE)
+    save_yaml(fit.training, out / TRAINING_FILE)
     save_yaml(fit.simulation, out / RIG_FILE)
     return out / RIG_FILE

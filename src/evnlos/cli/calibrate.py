@@ -19,7 +19,7 @@ class Command:
     captures: Folders
     """Capture folders of one rig and one camera."""
     out: Path
-    """Folder for rig.yaml, calibration.json and check.png."""
+    """Folder for rig.yaml, training.yaml, pattern.safetensors, calibration.json and check.png."""
     preset: str = "default"
     """Kind of wall: `default` is rough metal (GGX roughness, camera), `paper` the tPSF and an affine view."""
     config: Path | None = None
@@ -33,7 +33,7 @@ class Command:
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""
         from evnlos.calibration import figures, fit_rig, residual_table, rows_of, table, write_rig
-        from evnlos.calibration.summary import check_out
+        from evnlos.calibration.summary import TRAINING_FILE, check_out
         from evnlos.errors import MissingDependencyError
         from evnlos.plot.calibration import draw_calibration
 
@@ -52,4 +52,7 @@ class Command:
             say(f"note: {error}")
         path = write_rig(fit, rows, self.out, self.force)
         if not self.json:
-            print(f"\n{path}: evnlos simulate --config {path} --out DATASET")
+            print(
+                f"\nto pre-train on:   evnlos simulate --config {path.with_name(TRAINING_FILE)} --out DATASET"
+            )
+            print(f"captures alike:    evnlos import CAPTURE... --pattern {self.out} --out DATASET")

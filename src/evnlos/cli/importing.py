@@ -9,7 +9,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from evnlos.cli.console import Folders, progress
-from evnlos.dataset import Capture, Sampling, check_picture, import_captures, open_dataset
+from evnlos.dataset import Capture, Sampling, check_picture, import_captures, load_pattern, open_dataset
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,8 @@ class Command:
     """Captures or characters that are held out for testing, e.g. G K 4 9."""
     validation: tuple[str, ...] = ()
     """Captures or characters that are held out for validation."""
+    pattern: Path | None = None
+    """Fixed pattern of the frame camera to take from the frames: the file, or the folder of a calibrated rig."""
     check_pictures: bool = True
     """Draw one picture a capture (frame, events, both, curves over time) into the folder checks of the
     dataset."""
@@ -33,7 +35,13 @@ class Command:
     def run(self) -> None:
         """Import, with a progress bar over the captures."""
         imported = import_captures(
-            self.captures, self.out, self.sampling, test=self.test, validation=self.validation, look=self._look
+            self.captures,
+            self.out,
+            self.sampling,
+            test=self.test,
+            validation=self.validation,
+            pattern=load_pattern(self.pattern) if self.pattern else None,
+            look=self._look,
         )
         for _ in progress(imported, len(self.captures), "captures", self.out):
             pass

@@ -20,14 +20,18 @@ class Command:
     """Weights file, or a run's folder."""
     out: Path = Path("reconstruction")
     """Folder for the pictures; new or empty."""
+    pattern: Path | None = None
+    """Fixed pattern of the frame camera to take from the frames: the file, or the folder of a calibrated rig."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> None:
         """Reconstruct and print where the pictures are."""
+        from evnlos.dataset import load_pattern
         from evnlos.report import reconstruct_capture
 
-        found = reconstruct_capture(self.capture, self.weights, self.out)
+        pattern = load_pattern(self.pattern) if self.pattern else None
+        found = reconstruct_capture(self.capture, self.weights, self.out, pattern=pattern)
         if self.json:
             print(json.dumps(found | {"out": str(self.out)}))
             return

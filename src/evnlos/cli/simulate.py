@@ -25,7 +25,8 @@ class Command:
     out: Path
     """Folder of the dataset; new, or begun with the same settings."""
     preset: str = "default"
-    """`default`, or `paper` for the paper's table of settings."""
+    """`default`; `paper` for the paper's training set; `paper-nist-test`, `paper-comic-letters` or
+    `paper-comic-digits` for its test sets."""
     config: Path | None = None
     """YAML file with settings that replace the preset's."""
     workers: int = 0

@@ -9,14 +9,20 @@ from evnlos.claim import claim
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.capture import Capture, read_capture
 from evnlos.dataset.capture_info import read_capture_info
+from evnlos.dataset.fixed_pattern import FixedPattern
 from evnlos.dataset.sampling import Samples, Sampling, make_samples
 from evnlos.dataset.shard import write_shard
 from evnlos.dataset.store import Dataset, create_dataset
 from evnlos.errors import DataError
 
 
-def capture_samples(capture: Capture, sampling: Sampling) -> Samples:
+def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern | None = None) -> Samples:
     """Return one sample for each frame but the first: the frame, and the events since the frame before.
+
+    Args:
+        capture: The shot.
+        sampling: Resolution and representation.
+        pattern: Fixed pattern to take from the frames.
 
     Raises:
         DataError: The capture has fewer than two frames.
@@ -25,9 +31,10 @@ def capture_samples(capture: Capture, sampling: Sampling) -> Samples:
         raise DataError(
             f"{capture.name} has {len(capture.frames)} frame(s); a sample needs two, with events between"
         )
-    return make_samples(
-        capture.frames[1:], capture.peak, capture.events, capture.frame_times_us, capture.scene, sampling
-    )
+    frames, peak = capture.frames[1:], float(capture.peak)
+    if pattern is not None:
+        frames, peak = pattern.correct(frames, peak), 1.0
+    return make_samples(frames, peak, capture.events, capture.frame_times_us, capture.scene, sampling)
 
 
 def import_captures(
@@ -37,6 +44,7 @@ def import_captures(
     *,
     test: Iterable[str] = (),
     validation: Iterable[str] = (),
+    pattern: FixedPattern | None = None,
     look: Callable[[Capture], None] | None = None,
 ) -> Iterator[tuple[str, Samples]]:
     """Import capture folders, yielding each capture's name and samples as its shard is in place.
@@ -48,6 +56,7 @@ def import_captures(
         sampling: Resolution and representation.
         test: Names of captures, or characters, that are held out for testing.
         validation: The same for validation.
+        pattern: Fixed pattern of the frame camera, to be taken from all frames.
         look: Called with each capture that was read, before its samples are made: to tell of it, or to draw it.
 
     Raises:
@@ -65,7 +74,7 @@ def import_captures(
         if not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
     described = {name: config_hash(read_capture_info(path)) for name, path in sorted(paths.items())}
-    config = {"captures": described, "sampling": to_dict(sampling)}
+    config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
     captures: dict[str, Capture] = {first.name: read_capture(first)}
@@ -75,7 +84,7 @@ def import_captures(
             capture = captures.pop(name, None) or read_capture(paths[name])
             if look is not None:
                 look(capture)
-            samples = capture_samples(capture, sampling)
+            samples = capture_samples(capture, sampling, pattern)
             camera = capture.info.camera.name
             attributes = {"object": name, "config_hash": dataset.config_hash, "camera": camera}
             write_shard(dataset.shard(name), samples, attributes)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from evnlos.dataset.simulate import SensorSize, Simulation
-from evnlos.scene import HandwritingGlyphs
+from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
 from evnlos.sensor import EventPixel
 from evnlos.transport import PaperTransport
 
@@ -52,4 +53,31 @@ def paper() -> Simulation:
     )
 
 
-PRESETS: dict[str, Callable[[], Simulation]] = {"default": default, "paper": paper}
+def paper_nist_test() -> Simulation:
+    """Return the paper's first simulated test set: 1 x 26 letters of a writer that the training never saw."""
+    return _tested_on(HandwritingGlyphs(writers=1, first_writer=TRAIN_WRITERS))
+
+
+def paper_comic_letters() -> Simulation:
+    """Return the paper's second simulated test set: the 26 letters of the Comic face."""
+    return _tested_on(FontGlyphs(characters=UPPER_CASE))
+
+
+def paper_comic_digits() -> Simulation:
+    """Return the paper's third simulated test set: the 10 digits of the Comic face, smaller than the letters."""
+    return _tested_on(FontGlyphs(characters=DIGITS))
+
+
+def _tested_on(glyphs: HandwritingGlyphs | FontGlyphs) -> Simulation:
+    """Return the paper's simulation of other objects, none of them for training."""
+    return replace(paper(), glyphs=glyphs, validation=0.0)
+
+
+PRESETS: dict[str, Callable[[], Simulation]] = {
+    "default": default,
+    "paper": paper,
+    "paper-nist-test": paper_nist_test,
+    "paper-comic-letters": paper_comic_letters,
+    "paper-comic-digits": paper_comic_digits,
+}
+"""Simulations by name; `paper` is the paper's training set, the others of its name are its test sets."""

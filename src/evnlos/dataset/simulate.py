@@ -64,6 +64,9 @@ class Simulation:
     """Resolution and representation of the stored samples."""
     vary: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Settings drawn for each object from a range: dotted name -> (low, high)."""
+    rigs: int = 0
+    """Number of different walls and cameras that the ranges of the transport are drawn for, shared by the
+    objects (each costs a light-transport matrix); 0 = one for each object."""
     validation: float = 0.05
     """Share of the objects that is held out for validation, 0..1."""
     keep_events: bool = False
@@ -76,6 +79,8 @@ class Simulation:
             raise ConfigError(f"Simulation.duration_s is {self.duration_s}; give a positive number of seconds")
         if self.positions < 1:
             raise ConfigError(f"Simulation.positions is {self.positions}; give at least 1")
+        if self.rigs < 0:
+            raise ConfigError(f"Simulation.rigs is {self.rigs}; give 0 (one for each object) or a number of rigs")
         if not 0 <= self.validation < 1:
             raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
         check_ranges(self, self.vary)
@@ -94,6 +99,24 @@ class Simulation:
         return self.transport.figures(self.glyphs.plate.size_m, (self.sensor.height, self.sensor.width))
 
 
+def drawn_for(config: Simulation, name: str) -> Simulation:
+    """Return the settings that `vary` draws for an object; those of the optics are shared by `rigs` groups.
+
+    Gain and ambient light cost nothing, so they are always the object's own.
+    """
+    optics = {path: ends for path, ends in config.vary.items() if config.rigs and _needs_a_matrix(path)}
+    others = {path: ends for path, ends in config.vary.items() if path not in optics}
+    if optics:
+        group = derive_seed(config.seed, name, "rig") % config.rigs
+        config = varied(config, optics, config.seed, f"rig {group}")
+    return varied(config, others, config.seed, name)
+
+
+def _needs_a_matrix(path: str) -> bool:
+    section, name, *_ = path.split(".")
+    return section == "transport" and name not in ("gain", "ambient", "ambient_gradient")
+
+
 def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     """Simulate one object's pass: scene -> wall -> events and frames -> samples.
 
@@ -104,7 +127,7 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     Returns:
         The samples of all positions, and the events of the whole pass.
     """
-    drawn = varied(config, config.vary, config.seed, name)
+    drawn = drawn_for(config, name)
     target = config.glyphs.target(name, derive_seed(config.seed, "glyph"))
     scene = Scene(target, drawn.motion, drawn.duration_s)
     wall = drawn.transport.wall(scene, (config.sensor.height, config.sensor.width))

@@ -92,15 +92,39 @@ def evaluate(
     """
     check_sampling(weights, dataset.sampling)
     samples = NlosDataset(dataset, split, weights.paradigm)  # type: ignore[arg-type]
+    images = infer(weights.network, samples.inputs)
+    return assess(images, samples, dataset, split, weights.paradigm, weights.mean_image, perceptual)
+
+
+def assess(
+    images: Tensor,
+    samples: NlosDataset,
+    dataset: Dataset,
+    split: str,
+    paradigm: str,
+    mean_image: Tensor | None = None,
+    perceptual: Perceptual | None = None,
+) -> Evaluation:
+    """Score any pictures of a split, whoever made them, beside the same baselines.
+
+    Args:
+        images: Reconstructions on the whole canvas, float32 [N, H, W], 0..1, in the order of `samples`.
+        samples: The samples of the split.
+        dataset: Where they are from.
+        split: "train", "validation", "test" or "all".
+        paradigm: What the baseline "nearest" compares measurements by.
+        mean_image: The baseline "mean", [H, W]; None leaves it out.
+        perceptual: LPIPS, where its weights are at hand.
+    """
     rows = dataset.sampling.scored
     truth = samples.truth.float()[:, rows].contiguous()
-    images = infer(weights.network, samples.inputs)[:, rows].contiguous()
+    images = images[:, rows].contiguous()
     blank = {"zero": torch.zeros_like(truth)}
-    if weights.mean_image is not None:
-        blank["mean"] = weights.mean_image.float()[rows].expand_as(truth).contiguous()
+    if mean_image is not None:
+        blank["mean"] = mean_image.float()[rows].expand_as(truth).contiguous()
     checks = _reading(dataset, split, images, truth, samples.names)
     learned = dataset.split.get("train") and split in ("test", "validation")
-    if learned and (memory := recall(dataset, split, weights.paradigm)) is not None:
+    if learned and (memory := recall(dataset, split, paradigm)) is not None:
         blank["nearest"] = nearest_answer(memory, samples.inputs)[:, rows].contiguous()
         away = nearer_to_truth(images, truth, memory.truth[:, :, rows])
         checks["nearer_to_truth"] = round(float(away.mean()), 4)

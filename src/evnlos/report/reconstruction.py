@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from evnlos.config import from_dict, write_atomically
-from evnlos.dataset import Sampling, capture_samples, read_capture
+from evnlos.dataset import FixedPattern, Sampling, capture_samples, read_capture
 from evnlos.errors import DataError
 from evnlos.evaluation import reconstruct, score
 from evnlos.model import load_weights
@@ -18,7 +18,11 @@ from evnlos.report.pictures import grey, polarity, save_animation, save_png, str
 
 
 def reconstruct_capture(
-    capture: str | Path, weights: str | Path, out: str | Path, zoom: int = 4
+    capture: str | Path,
+    weights: str | Path,
+    out: str | Path,
+    zoom: int = 4,
+    pattern: FixedPattern | None = None,
 ) -> dict[str, Any]:
     """Reconstruct all positions of a capture and write them as pictures.
 
@@ -31,6 +35,7 @@ def reconstruct_capture(
         weights: A weights file or a run's folder.
         out: The folder for the pictures; must not exist or be empty.
         zoom: Size of a pixel in the pictures.
+        pattern: Fixed pattern of the frame camera, to be taken from the frames.
 
     Returns:
         Number of positions, the files, and, where the truth is known, the mean scores.
@@ -41,7 +46,7 @@ def reconstruct_capture(
     out = Path(out)
     loaded, shot = load_weights(weights), read_capture(capture)
     sampling = from_dict(Sampling, loaded.sampling, source="the weights' sampling")
-    samples = capture_samples(shot, sampling)
+    samples = capture_samples(shot, sampling, pattern)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DataError(f"{out} is not an empty folder; give a new one")
     images = reconstruct(loaded, samples.frame, samples.surface)

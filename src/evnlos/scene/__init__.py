@@ -13,7 +13,7 @@ from evnlos.scene.glyph_sets import (
     Plate,
 )
 from evnlos.scene.glyphs import DIGITS, UPPER_CASE, fit_to_plate, render_glyph
-from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, hand, held_out_writers, nist_like
+from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, Strokes, hand, held_out_writers, nist_like, pen_width
 from evnlos.scene.motion import LineMotion, Motion, PathMotion
 from evnlos.scene.nist_sd19 import Handwritten, list_sd19, read_sd19
 from evnlos.scene.scene import Scene
@@ -38,6 +38,7 @@ __all__ = [
     "PathMotion",
     "Plate",
     "Scene",
+    "Strokes",
     "Target",
     "find_font",
     "fit_to_plate",
@@ -46,6 +47,7 @@ __all__ = [
     "list_emnist",
     "list_sd19",
     "nist_like",
+    "pen_width",
     "read_emnist",
     "read_sd19",
     "render_glyph",

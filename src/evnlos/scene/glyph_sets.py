@@ -15,7 +15,7 @@ from evnlos.errors import ConfigError
 from evnlos.scene.emnist import list_emnist, read_emnist_images
 from evnlos.scene.fonts import FONT_SUFFIXES, Font, find_font
 from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, check_size, fit_to_plate, render_glyph
-from evnlos.scene.handwriting import nist_like
+from evnlos.scene.handwriting import Strokes, nist_like
 from evnlos.scene.nist_sd19 import list_sd19, read_sd19_image
 from evnlos.scene.target import Target
 
@@ -75,6 +75,7 @@ class HandwritingGlyphs:
         writers: Number of writers.
         first_writer: Number of the first writer; 39 and above are held out for testing.
         characters: Characters that each writer writes.
+        strokes: Base faces and pens.
         plate: The plate that carries a character.
     """
 
@@ -82,6 +83,7 @@ class HandwritingGlyphs:
     writers: int = 39
     first_writer: int = 0
     characters: str = UPPER_CASE
+    strokes: Strokes = field(default_factory=Strokes)
     plate: Plate = field(default_factory=Plate)
 
     def __post_init__(self) -> None:
@@ -96,7 +98,7 @@ class HandwritingGlyphs:
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one writer's character; the seed fixes the population of writers."""
         writer, char = _look_up(_handwriting_index(self), object_id)
-        mask = nist_like(writer, char, seed, self.plate.size_px, self.plate.fraction(char))
+        mask = nist_like(writer, char, seed, self.plate.size_px, self.plate.fraction(char), self.strokes)
         return Target(object_id, mask, self.plate.size_m)
 
     def notes(self) -> list[str]:

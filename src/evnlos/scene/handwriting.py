@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from evnlos.errors import DataError, MissingDependencyError
+from evnlos.errors import ConfigError, DataError, MissingDependencyError
 from evnlos.scene.distance import signed_distance
 from evnlos.scene.fonts import Font, find_font
 from evnlos.scene.glyphs import check_size, render_glyph
@@ -23,8 +24,14 @@ BASE_FACES = (
     "Caveat", "Kalam Light", "Shadows Into Light", "Indie Flower", "Kalam Bold", "Permanent Marker",
     "Caveat Bold",
 )  # fmt: skip
+PRINT_FACES = ("Fredoka SemiBold", "Nunito Black", "Quicksand Bold", "Varela Round")
+FACES = {"hand": BASE_FACES, "print": PRINT_FACES, "both": BASE_FACES + PRINT_FACES}
+"""Base faces by name: pens, the rounded faces of signs and cut plates, or all of them."""
+
 TRAIN_WRITERS = 39
-_PEN = (0.06, 0.18)  # pen width as a part of the glyph's height: from a ball-point pen to a marker
+PEN = (0.06, 0.18)
+"""Pen width as a part of the glyph's longer side: from a ball-point pen to a marker."""
+
 _SLANT_DEG = (-18.0, 14.0)  # the base faces lean to the right themselves, by 0 to 10 degrees
 _ASPECT = (0.80, 1.25)
 _HEIGHT = (0.85, 1.0)
@@ -69,7 +76,24 @@ class Hand:
     waves: NDArray[np.float64]
 
 
-def hand(writer: int, seed: int) -> Hand:
+@dataclass(frozen=True)
+class Strokes:
+    """Range of the writers' strokes."""
+
+    faces: Literal["hand", "print", "both"] = "hand"
+    """Base faces: handwriting, rounded printed letters as on signs and cut plates, or both."""
+    pen: tuple[float, float] = PEN
+    """Thinnest and thickest pen, parts of the glyph's longer side; a bold face has 0.12 to 0.2."""
+
+    def __post_init__(self) -> None:
+        if self.faces not in FACES:
+            raise ConfigError(f"Strokes.faces is {self.faces!r}; give one of {', '.join(FACES)}")
+        low, high = self.pen
+        if not 0.02 <= low <= high <= 0.4:
+            raise ConfigError(f"Strokes.pen is ({low}, {high}); give two ascending numbers from 0.02 to 0.4")
+
+
+def hand(writer: int, seed: int, strokes: Strokes = Strokes()) -> Hand:
     """Return the hand of a writer; the same for every character and in any order of calls.
 
     Slant, proportions and pen follow a low-discrepancy sequence over the writers, so that a few writers already
@@ -78,6 +102,7 @@ def hand(writer: int, seed: int) -> Hand:
     Args:
         writer: Number of the writer, 0 or more; `TRAIN_WRITERS` and above are held out for testing.
         seed: Seed of the whole population of writers.
+        strokes: Base faces and pens that the population has.
 
     Raises:
         DataError: The writer is negative.
@@ -90,22 +115,28 @@ def hand(writer: int, seed: int) -> Hand:
     start = _random(seed, "population").random(4)
     slant, aspect, height, pen = (start + (writer + 1) * steps) % 1.0
     # Faces are dealt out in shuffled rounds: a fixed cycle would tie each face to a few slants and pens.
-    deal, turn = divmod(writer, len(BASE_FACES))
-    order = np.argsort(_random(seed, "faces", deal).random(len(BASE_FACES)))
+    faces = FACES[strokes.faces]
+    deal, turn = divmod(writer, len(faces))
+    order = np.argsort(_random(seed, "faces", deal).random(len(faces)))
     rng = _random(seed, "hand", writer)
     return Hand(
-        font=_base_font(BASE_FACES[order[turn]]),
+        font=_base_font(faces[order[turn]]),
         slant_deg=_between(_SLANT_DEG, slant),
         tilt_deg=_between((-4.0, 4.0), rng.random()),
         aspect=_between(_ASPECT, aspect),
         height=_between(_HEIGHT, height),
-        pen=_between(_PEN, pen),
+        pen=_between(strokes.pen, pen),
         waves=_waves(rng, _HAND_BEND),
     )
 
 
 def nist_like(
-    writer: int, char: str, seed: int, size_px: int = 256, fraction: float = 1.0
+    writer: int,
+    char: str,
+    seed: int,
+    size_px: int = 256,
+    fraction: float = 1.0,
+    strokes: Strokes = Strokes(),
 ) -> NDArray[np.float32]:
     """Write one character in a writer's hand on a square plate: a stand-in for NIST's scanned handwriting.
 
@@ -115,6 +146,7 @@ def nist_like(
         seed: Seed of the population; the picture depends on (seed, writer, char) and on nothing else.
         size_px: Side of the mask, pixels, 8 to 2048.
         fraction: Room for the ink as a part of the plate's side, above 0 to 1.
+        strokes: Base faces and pens of the population of writers.
 
     Returns:
         float32 [size_px, size_px], 0..1, bright ink on dark ground, centred by its bounding box.
@@ -125,7 +157,7 @@ def nist_like(
         MissingDependencyError: A font package of the base faces is not installed.
     """
     check_size(size_px, fraction)
-    style = hand(writer, seed)
+    style = hand(writer, seed, strokes)
     rng = _random(seed, "glyph", writer, char)
     slant = np.tan(np.radians(style.slant_deg + _between((-2.0, 2.0), rng.random())))
     tilt = np.radians(style.tilt_deg + _between((-2.0, 2.0), rng.random()))
@@ -209,6 +241,19 @@ def _sample(image: NDArray, x: NDArray[np.float64], y: NDArray[np.float64]) -> N
     return upper * (1 - below) + lower * below
 
 
+def pen_width(mask: NDArray[np.float32]) -> float:
+    """Return the mean width of a drawing's strokes as a part of the longer side of its ink, 0..1.
+
+    Args:
+        mask: Bright ink on dark ground, [H, W], 0..1.
+
+    Raises:
+        DataError: The picture has no ink.
+    """
+    left, top, right, bottom = _ink_box(mask)
+    return _pen_width(mask) / max(right - left, bottom - top)
+
+
 def _pen_width(ink: NDArray[np.float32]) -> float:
     """Return the mean width of the strokes, pixels: four times the mean distance of the ink to its edge."""
     distance = signed_distance(ink, reach=40)
@@ -220,7 +265,7 @@ def _ink_box(ink: NDArray[np.float32]) -> tuple[float, float, float, float]:
     """Return left, top, right, bottom of the ink, pixels from the centre."""
     rows, columns = np.flatnonzero((ink > 0.5).any(1)), np.flatnonzero((ink > 0.5).any(0))
     if not len(rows):
-        raise DataError("a deformed glyph lost all its ink; choose another base face")
+        raise DataError("a glyph has no ink (no pixel above 0.5); choose another base face or drawing")
     half = len(ink) / 2
     return columns[0] - half, rows[0] - half, columns[-1] + 1 - half, rows[-1] + 1 - half
 

@@ -179,7 +179,7 @@ class RadiometricTransport:
             )
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _transport(rig: RadiometricTransport, shape: tuple[int, int]) -> MatrixTransport:
     source = rig.source()
     matrix = rig.matrix(shape, source, torch.float32)

@@ -1,0 +1,100 @@
+"""`evnlos experiment`: a named comparison in, records and tables out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from evnlos.config import write_atomically
+from evnlos.dataset import PARADIGMS, Paradigm
+from evnlos.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Command:
+    """Run an experiment on captures: calibrate, simulate, pre-train, fine-tune, compare; resumable."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss or width."""
+    captures: Path
+    """Folder of the capture folders."""
+    out: Path = Path("experiments")
+    """Folder for rigs, datasets, runs, records and tables; experiments in one folder share what they can."""
+    rig: str = "near"
+    """Which captures: those whose names begin with this and an underscore."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of initial weights and order of the samples."""
+    paradigms: tuple[Paradigm, ...] = PARADIGMS
+    """What the networks see."""
+    arms: tuple[str, ...] = ()
+    """Only these arms, by name; all by default."""
+    test: tuple[str, ...] = ("G", "K", "4", "9")
+    """Characters that nothing sees before the test."""
+    validation: tuple[str, ...] = ()
+    """Characters to choose settings on: only these are scored, the test characters are not even read."""
+    writers: int | None = None
+    """Writers of the simulation, 36 objects each; by default the experiment's own number."""
+    pretrain_epochs: int | None = None
+    """Passes over the simulation; by default the experiment's own number."""
+    finetune_epochs: int | None = None
+    """Passes over the captures after pre-training; by default the experiment's own number."""
+    e2e_epochs: int | None = None
+    """Passes over the captures in end-to-end training; by default the experiment's own number."""
+    workers: int = 0
+    """Processes that simulate; 0 = one for each core."""
+    metric: Literal["psnr_db", "psnr_box_db", "ssim", "ms_ssim", "haarpsi", "gmsd", "lpips"] = "psnr_db"
+    """What the printed tables show; the records hold all."""
+
+    def run(self) -> None:
+        """Run what is left, with a line of progress, and print the tables."""
+        from evnlos.experiment import STUDIES, Place, Study, captures_of, read_records, run_study, show
+
+        if self.name not in STUDIES:
+            raise ConfigError(f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}")
+        study: Study = STUDIES[self.name](self.rig)
+        unknown = set(self.arms) - {arm.name for arm in study.arms}
+        if unknown:
+            there = ", ".join(repr(arm.name) for arm in study.arms)
+            raise ConfigError(f"arm {sorted(unknown)[0]!r} is unknown; {self.name} has {there}")
+        arms = []
+        for arm in study.arms:
+            if self.arms and arm.name not in self.arms:
+                continue
+            pre, fine = arm.pretraining, arm.finetuning
+            tuned = self.finetune_epochs if pre else self.e2e_epochs
+            if pre and self.pretrain_epochs:
+                pre = replace(pre, epochs=self.pretrain_epochs)
+            if fine and tuned:
+                fine = replace(fine, epochs=tuned)
+            arms.append(replace(arm, pretraining=pre, finetuning=fine))
+        paradigms = tuple(p for p in study.paradigms if p in self.paradigms)
+        study = replace(
+            study,
+            arms=tuple(arms),
+            paradigms=paradigms,
+            seeds=self.seeds,
+            test=self.test,
+            validation=self.validation,
+            writers=self.writers or study.writers,
+        )
+        folders = tuple(captures_of(self.captures, self.rig))
+        show(run_study(study, Place(folders, self.out, self.workers)))
+        records = [r for r in read_records(self.out / "records" / study.name) if r.rig == self.rig]
+        records = [r for r in records if r.split == study.split]
+        text = _tables(study.name, records, self.metric)
+        write_atomically(self.out / f"{study.name}-{self.rig}-{study.split}.md", text.encode())
+        print(text)
+
+
+def _tables(name: str, records: list, metric: str) -> str:
+    from evnlos.experiment import character_table, checks_table, gain_table, summary_table
+
+    parts = [f"# {name}, {records[0].rig}, {records[0].split} characters", summary_table(records, metric)]
+    arms = {record.arm for record in records if record.seed >= 0}
+    if {"EPNP", "E2E"} <= arms:
+        parts += [gain_table(records), character_table(records, ("E2E", "EPNP"), metric)]
+    parts.append(checks_table(records))
+    return "\n\n".join(parts) + "\n"

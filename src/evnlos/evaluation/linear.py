@@ -1,0 +1,105 @@
+"""The best linear reconstruction, learned in closed form: what a network has to beat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evnlos.errors import DataError
+from evnlos.seeds import derive_seed
+
+_LAMBDAS = tuple(10.0 ** (k / 2) for k in range(-12, 5))  # in units of the mean power of a component
+_FOLDS = 5
+_EXTRA = 20  # columns of the random probe beyond the rank
+_POWERS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class LinearEstimate:
+    """y = mean_out + (x - mean_in) basis weights: a ridge regression on the main components of the input.
+
+    Args:
+        mean_in: Mean input, [D], D = C H W.
+        basis: Main directions of the inputs, [D, R], orthonormal.
+        weights: From their coefficients to the picture, [R, H W].
+        mean_out: Mean picture, [H, W].
+        lam: Weight of the ridge that was chosen, in units of the mean power of a component.
+    """
+
+    mean_in: Tensor
+    basis: Tensor
+    weights: Tensor
+    mean_out: Tensor
+    lam: float
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """Return pictures [N, H, W], 0..1, for inputs [N, C, H, W]."""
+        code = (inputs.float().flatten(1) - self.mean_in) @ self.basis  # [N, R]
+        return (self.mean_out + (code @ self.weights).unflatten(1, tuple(self.mean_out.shape))).clamp(0, 1)
+
+
+def fit_linear(
+    inputs: Tensor, truth: Tensor, objects: NDArray[np.str_], rank: int = 256, seed: int = 0
+) -> LinearEstimate:
+    """Fit the linear estimate with the least mean squared error on unseen objects.
+
+    The basis comes from a randomised singular value decomposition (Halko, Martinsson and Tropp, SIAM Review
+    53, 2011); the ridge is the best of a grid when one fold of the objects at a time is left out.
+
+    Args:
+        inputs: What the network would see, [N, C, H, W].
+        truth: True pictures, [N, H, W], 0..1.
+        objects: Object of each sample, [N].
+        rank: Most components of the input.
+        seed: Seed of the random probe and of the folds.
+
+    Raises:
+        DataError: The lengths differ, or there are fewer than two objects.
+    """
+    names = np.unique(objects)
+    if not len(inputs) == len(truth) == len(objects):
+        raise DataError(f"{len(inputs)} inputs, {len(truth)} pictures and {len(objects)} names; give as many")
+    if len(names) < 2:
+        raise DataError(f"{len(names)} object(s); a ridge is chosen on objects left out: give at least two")
+    x, y = inputs.float().flatten(1), truth.float().flatten(1)  # [N, D], [N, H W]
+    mean_in, mean_out = x.mean(dim=0), y.mean(dim=0)
+    x, y = x - mean_in, y - mean_out
+    basis = _main_directions(x, min(rank, *x.shape), seed)
+    code = x @ basis  # [N, R]
+    order = np.random.default_rng(derive_seed(seed, "folds")).permutation(len(names))
+    fold_of = dict(zip(names[order], np.arange(len(names)) % min(_FOLDS, len(names)), strict=True))
+    folds = torch.tensor([int(fold_of[name]) for name in objects])
+    errors = sum(_left_out(code, y, folds == fold) for fold in folds.unique())
+    lam = _LAMBDAS[int(torch.as_tensor(errors).argmin())]
+    weights = _ridge(code.T @ code, code.T @ y, lam)
+    return LinearEstimate(mean_in, basis, weights, mean_out.unflatten(0, tuple(truth.shape[1:])), lam)
+
+
+def _left_out(code: Tensor, y: Tensor, left: Tensor) -> Tensor:
+    """Return the squared error on the samples left out, for each ridge of the grid."""
+    kept = code[~left]
+    inner, outer = kept.T @ kept, kept.T @ y[~left]
+    return torch.stack(
+        [(code[left] @ _ridge(inner, outer, lam) - y[left]).square().sum() for lam in _LAMBDAS]
+    )
+
+
+def _ridge(inner: Tensor, outer: Tensor, lam: float) -> Tensor:
+    scale = inner.diagonal().mean().clamp_min(1e-30)
+    return torch.linalg.solve(inner + lam * scale * torch.eye(len(inner)), outer)
+
+
+def _main_directions(x: Tensor, rank: int, seed: int) -> Tensor:
+    """Return the main right singular directions of x [N, D], orthonormal [D, R]."""
+    draw = torch.Generator().manual_seed(derive_seed(seed, "probe") % 2**63)
+    probe = torch.randn(x.shape[1], min(rank + _EXTRA, *x.shape), generator=draw)
+    reached, _ = torch.linalg.qr(x @ probe)
+    for _ in range(_POWERS):
+        back, _ = torch.linalg.qr(x.T @ reached)
+        reached, _ = torch.linalg.qr(x @ back)
+    _, _, right = torch.linalg.svd(reached.T @ x, full_matrices=False)
+    return right[:rank].T.contiguous()

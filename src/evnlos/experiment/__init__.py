@@ -1,0 +1,27 @@
+"""Experiments: what is compared, run so that it can go on after any interruption, and put into tables."""
+
+from evnlos.experiment.presets import STUDIES
+from evnlos.experiment.progress import show
+from evnlos.experiment.records import read_records, write_record
+from evnlos.experiment.run import captures_of, run_study
+from evnlos.experiment.study import Arm, Place, Record, Step, Study
+from evnlos.experiment.table import character_table, checks_table, difference, gain_table, summary_table
+
+__all__ = [
+    "STUDIES",
+    "Arm",
+    "Place",
+    "Record",
+    "Step",
+    "Study",
+    "captures_of",
+    "character_table",
+    "checks_table",
+    "difference",
+    "gain_table",
+    "read_records",
+    "run_study",
+    "show",
+    "summary_table",
+    "write_record",
+]

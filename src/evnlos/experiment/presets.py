@@ -1,0 +1,131 @@
+"""The experiments by name: those of the paper's sections, and those that ask what the paper leaves open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from evnlos.dataset import Sampling
+from evnlos.experiment.study import Arm, Study
+from evnlos.model import UNetConfig
+from evnlos.training import Training, paper_finetuning, paper_pretraining
+
+PRETRAINING = Training(epochs=4)
+"""Pre-training of our own experiments; `--pretrain-epochs` changes the number of epochs."""
+FINETUNING = Training(epochs=10, learning_rate=5e-4)
+"""Fine-tuning on all captures; chosen on validation characters."""
+END_TO_END = Training(epochs=24)
+"""End-to-end training; more epochs overfit (chosen on validation characters)."""
+
+_E2E = Arm("E2E", "none", None, END_TO_END)
+_EPNP = Arm("EPNP", "calibrated", PRETRAINING, FINETUNING)
+
+
+def captures(rig: str) -> Study:
+    """Return the main comparison: E2E, simulation alone, EPNP on the uncalibrated and the calibrated one."""
+    return Study(
+        "captures",
+        rig,
+        (
+            _E2E,
+            Arm("simulation only", "calibrated", PRETRAINING, None),
+            Arm("EPNP uncalibrated", "uncalibrated", PRETRAINING, FINETUNING),
+            _EPNP,
+        ),
+    )
+
+
+def paper(rig: str) -> Study:
+    """Return the comparison with the paper's own settings: 200 epochs, 1e-4, L1 + 2/SSIM; a GPU's work."""
+    fine = paper_finetuning()
+    return Study(
+        "paper",
+        rig,
+        (
+            Arm("E2E", "none", None, replace(fine, learning_rate=1e-4)),
+            Arm("EPNP", "uncalibrated", paper_pretraining(), fine),
+        ),
+        writers=39,
+        correct_pattern=False,
+    )
+
+
+def frozen(rig: str) -> Study:
+    """Return the ablation of what stays as pre-trained in fine-tuning."""
+    parts = {"nothing": (), "encoder": ("encoder",), "latent": ("latent",), "both": ("encoder", "latent")}
+    arms = (
+        replace(_EPNP, name=f"frozen: {name}", finetuning=replace(FINETUNING, freeze=freeze))
+        for name, freeze in parts.items()
+    )
+    return Study("frozen", rig, tuple(arms))
+
+
+def shots(rig: str) -> Study:
+    """Return the ablation of the number of real shots, with and without pre-training."""
+    arms = [Arm("EPNP 0 shots", "calibrated", PRETRAINING, None)]
+    for count in (1, 2, 4, 8, 16, None):
+        words = f"{count or 'all'} shots"
+        # As many steps with few shots as with all: an epoch is shorter.
+        longer = 1 if count is None else round(28 / count)
+        fine = replace(FINETUNING, epochs=FINETUNING.epochs * min(longer, 8))
+        alone = replace(END_TO_END, epochs=END_TO_END.epochs * min(longer, 8))
+        arms.append(replace(_EPNP, name=f"EPNP {words}", shots=count, finetuning=fine))
+        arms.append(replace(_E2E, name=f"E2E {words}", shots=count, finetuning=alone))
+    return Study("shots", rig, tuple(arms))
+
+
+def surface(rig: str) -> Study:
+    """Return the ablation of the time surface: time constant, kind and radius; events alone."""
+    samplings = {f"sae, {tau:g} s": Sampling(tau_s=tau) for tau in (0.05, 0.1, 0.2, 0.4, 0.8)}
+    samplings |= {
+        f"{kind}, radius {r}": Sampling(surface=kind, radius=r) for kind in ("context", "hots") for r in (1, 3)
+    }  # type: ignore[arg-type]
+    arms = [
+        replace(arm, name=f"{arm.name} {name}", sampling=s)
+        for name, s in samplings.items()
+        for arm in (_E2E, _EPNP)
+    ]
+    return Study("surface", rig, tuple(arms), ("event",))
+
+
+def thresholds(rig: str) -> Study:
+    """Return the ablation of the simulated event thresholds: right, and wrong by factors; events alone."""
+    arms = []
+    for factor in (0.5, 0.75, 1.0, 1.5, 2.0):
+        ranges = {f"pixel.threshold_{p}": (0.2 * factor * 0.95, 0.2 * factor * 1.05) for p in ("on", "off")}
+        arms.append(replace(_EPNP, name=f"thresholds {0.2 * factor:.2f}", vary=ranges))
+    return Study("thresholds", rig, tuple(arms), ("event",))
+
+
+def loss(rig: str) -> Study:
+    """Return the ablation of the loss: the balanced one and the paper's."""
+    arms = []
+    for name in ("balanced", "paper"):
+        arms.append(replace(_E2E, name=f"E2E {name} loss", finetuning=replace(END_TO_END, loss=name)))
+        pre, fine = replace(PRETRAINING, loss=name), replace(FINETUNING, loss=name)
+        arms.append(replace(_EPNP, name=f"EPNP {name} loss", pretraining=pre, finetuning=fine))
+    return Study("loss", rig, tuple(arms))
+
+
+def width(rig: str) -> Study:
+    """Return the ablation of the network's width."""
+    arms = []
+    for channels in (8, 16, 24, 32):
+        net = UNetConfig(width=channels)
+        arms.append(replace(_E2E, name=f"E2E width {channels}", finetuning=replace(END_TO_END, network=net)))
+        pre = replace(PRETRAINING, network=net)
+        arms.append(replace(_EPNP, name=f"EPNP width {channels}", pretraining=pre))
+    return Study("width", rig, tuple(arms))
+
+
+STUDIES: dict[str, Callable[[str], Study]] = {
+    "captures": captures,
+    "paper": paper,
+    "frozen": frozen,
+    "shots": shots,
+    "surface": surface,
+    "thresholds": thresholds,
+    "loss": loss,
+    "width": width,
+}
+"""Experiments on captures by name."""

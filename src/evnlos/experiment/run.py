@@ -1,0 +1,162 @@
+"""Experiments, flat and resumable: calibrate, simulate, import, pre-train, fine-tune, score, record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evnlos.calibration import fit_rig, rows_of, write_rig
+from evnlos.config import config_hash, load_yaml, to_dict
+from evnlos.dataset import (
+    Dataset,
+    Paradigm,
+    Simulation,
+    import_captures,
+    load_pattern,
+    open_dataset,
+    simulate,
+)
+from evnlos.dataset.importer import character_of
+from evnlos.dataset.presets import default
+from evnlos.errors import CalibrationError, DataError
+from evnlos.experiment.scoring import score_arm
+from evnlos.experiment.study import Arm, Place, Step, Study, slug
+from evnlos.scene import HandwritingGlyphs
+from evnlos.seeds import derive_seed
+from evnlos.training import Training, train
+
+
+def run_study(study: Study, place: Place) -> Iterator[Step]:
+    """Run what is not done yet of a study, yielding each step; run it again to go on.
+
+    Rigs, datasets and runs have names that hold a hash of what decides them, so arms and studies share what
+    they have in common.
+
+    Args:
+        study: What to compare.
+        place: Where captures and results are.
+
+    Raises:
+        CalibrationError: Captures that no rig fits, or whose targets are unknown.
+    """
+    rig = place.out / "rigs" / study.rig
+    needs_rig = study.correct_pattern or any(arm.source == "calibrated" for arm in study.arms)
+    if needs_rig and not (rig / "rig.yaml").is_file():
+        settings = replace(study.calibration, exclude=(*study.calibration.exclude, *study.test))
+        yield Step(f"calibrate {study.rig}", 0, 1)
+        try:
+            fit = fit_rig(place.captures, settings)
+            write_rig(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), rig)
+        except DataError as error:
+            raise CalibrationError(str(error)) from None
+        yield Step(f"calibrate {study.rig}", 1, 1)
+    for arm in study.arms:
+        shots = yield from _import(study, arm, list(place.captures), place)
+        made = yield from _simulate(study, arm, place)
+        for paradigm in study.paradigms:
+            runs = []
+            for seed in study.seeds:
+                run, settings = yield from _train(study, arm, paradigm, seed, made, shots, place)
+                runs.append((run, settings))
+            yield from score_arm(study, arm, paradigm, runs, made, shots, place)
+
+
+def captures_of(root: Path, rig: str) -> list[Path]:
+    """Return the capture folders of a rig, by name.
+
+    Raises:
+        DataError: There are none.
+    """
+    folders = sorted(path.parent for path in Path(root).glob(f"{rig}_*/capture.yaml"))
+    if not folders:
+        raise DataError(f"{root} holds no captures {rig}_*; give the folder that holds them with --captures")
+    return folders
+
+
+def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
+    """Return the simulation that an arm is pre-trained on."""
+    if arm.source == "calibrated":
+        config = load_yaml(Simulation, place.out / "rigs" / study.rig / "training.yaml")
+    else:
+        config = study.simulation or default()
+    glyphs = config.glyphs
+    assert isinstance(glyphs, HandwritingGlyphs)
+    glyphs = replace(glyphs, writers=study.writers)
+    return replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
+
+
+def _simulate(study: Study, arm: Arm, place: Place) -> Iterator[Step]:
+    if arm.source == "none":
+        return None
+    config = simulation_of(study, arm, place)
+    folder = place.out / "simulations" / f"{arm.source}-{study.rig}-{config_hash(config)[:8]}"
+    total = len(config.glyphs.objects())
+    for k, _ in enumerate(simulate(config, folder, place.workers)):
+        yield Step(f"simulate {folder.name}", k + 1, total)
+    return open_dataset(folder)
+
+
+def _import(study: Study, arm: Arm, folders: list[Path], place: Place) -> Iterator[Step]:
+    held = study.test if not study.validation else ()
+    chosen = [f for f in folders if not (study.validation and character_of(f.name) in study.test)]
+    if arm.shots is not None:
+        chosen = _few(chosen, arm.shots, (*study.test, *study.validation))
+    pattern = load_pattern(place.out / "rigs" / study.rig) if study.correct_pattern else None
+    key = config_hash(
+        {
+            "captures": [f.name for f in chosen],
+            "sampling": to_dict(arm.sampling),
+            "test": list(held),
+            "validation": list(study.validation),
+            "pattern": pattern and pattern.digest,
+        }
+    )
+    out = place.out / "shots" / f"{study.rig}-{key[:8]}"
+    made = import_captures(chosen, out, arm.sampling, test=held, validation=study.validation, pattern=pattern)
+    for k, _ in enumerate(made):
+        yield Step(f"import {out.name}", k + 1, len(chosen))
+    return open_dataset(out)
+
+
+def _few(folders: list[Path], shots: int, held_out: tuple[str, ...]) -> list[Path]:
+    """Return `shots` captures to train on, the same order for every number, and those held out."""
+    train_on = [f for f in folders if character_of(f.name) not in held_out]
+    if shots > len(train_on):
+        raise DataError(f"{shots} shots are asked for, {len(train_on)} are there; ask for fewer")
+    order = np.random.default_rng(derive_seed(0, "shots")).permutation(len(train_on))
+    few = {train_on[i] for i in order[:shots]}
+    return [f for f in folders if f in few or character_of(f.name) in held_out]
+
+
+def _train(
+    study: Study, arm: Arm, paradigm: Paradigm, seed: int, made: Dataset | None, shots: Dataset, place: Place
+) -> Iterator[Step]:
+    """Train an arm's network and return its run and what decided it."""
+    run: Path | None = None
+    decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": shots.folder.name}
+    if arm.pretraining is not None:
+        assert made is not None
+        settings = replace(arm.pretraining, paradigm=paradigm, seed=seed)
+        key = config_hash({"data": made.config_hash, "settings": to_dict(settings)})[:8]
+        run = place.out / "runs" / f"{study.rig}-pretrained-{paradigm}-seed{seed}-{key}"
+        yield from _fit(made, settings, run, None)
+        decided |= {"simulation": made.config_hash}
+    if arm.finetuning is not None:
+        settings = replace(arm.finetuning, paradigm=paradigm, seed=seed)
+        start = run
+        key = config_hash(
+            {"data": shots.folder.name, "settings": to_dict(settings), "from": start.name if start else None}
+        )[:8]
+        run = place.out / "runs" / f"{study.rig}-{slug(arm.name)}-{paradigm}-seed{seed}-{key}"
+        yield from _fit(shots, settings, run, start)
+    assert run is not None
+    return run, decided
+
+
+def _fit(data: Dataset, settings: Training, out: Path, weights: Path | None) -> Iterator[Step]:
+    for record in train(data, settings, out, weights):
+        yield Step(f"train {out.name}", record["epoch"], settings.epochs)

@@ -1,0 +1,173 @@
+"""What an experiment is: arms that are compared on the same captures, paradigms, and seeds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from evnlos.calibration import Calibration
+from evnlos.dataset import PARADIGMS, Paradigm, Sampling, Simulation
+from evnlos.errors import ConfigError
+from evnlos.training import Training
+
+Source = Literal["calibrated", "uncalibrated", "none"]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One way from data to weights.
+
+    Pre-training and fine-tuning take paradigm and seed from the study; without fine-tuning the weights have
+    seen no capture (simulation only), without pre-training they have seen nothing else (E2E).
+    """
+
+    name: str
+    """Name in the tables; also of the runs' folders."""
+    source: Source = "calibrated"
+    """Simulation to pre-train on: of the calibrated rig, the uncalibrated default, or none."""
+    pretraining: Training | None = None
+    """Settings of the pre-training."""
+    finetuning: Training | None = None
+    """Settings of the fine-tuning, or of the end-to-end training where there is no pre-training."""
+    shots: int | None = None
+    """Captures to train on; None is all that are there, otherwise the first of a seeded order."""
+    sampling: Sampling = field(default_factory=Sampling)
+    """Resolution and representation."""
+    vary: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Ranges that replace those of the simulation: dotted name -> (low, high)."""
+
+    def __post_init__(self) -> None:
+        if (self.source == "none") != (self.pretraining is None):
+            raise ConfigError(
+                f"arm {self.name!r}: pre-training needs a simulation, and a simulation pre-training"
+            )
+        if self.pretraining is None and self.finetuning is None:
+            raise ConfigError(f"arm {self.name!r} trains nothing; give pre-training, fine-tuning or both")
+        if self.shots is not None and self.shots < 1:
+            raise ConfigError(
+                f"arm {self.name!r}: shots is {self.shots}; give at least 1, or leave out fine-tuning"
+            )
+
+
+@dataclass(frozen=True)
+class Study:
+    """Arms, compared on the captures of one rig."""
+
+    name: str
+    """Name of the experiment."""
+    rig: str = "near"
+    """Name of the rig; the calibrated rig and all that follows from it are kept under this name."""
+    arms: tuple[Arm, ...] = ()
+    """What is compared."""
+    paradigms: tuple[Paradigm, ...] = PARADIGMS
+    """What the networks see."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of initial weights and of the order of the samples."""
+    test: tuple[str, ...] = ("G", "K", "4", "9")
+    """Characters that nothing sees: neither calibration nor fine-tuning nor the choice of a setting."""
+    validation: tuple[str, ...] = ()
+    """Characters that settings are chosen on. Where there are any, only these are scored, and the test
+    characters are not even read."""
+    writers: int = 8
+    """Writers of the simulated characters, 36 objects each."""
+    simulation: Simulation | None = None
+    """What an uncalibrated arm is pre-trained on; None is the default simulation."""
+    calibration: Calibration = field(default_factory=Calibration)
+    """How the rig is calibrated; the test characters are left out of it whatever it says."""
+    correct_pattern: bool = True
+    """Take the frame camera's fixed pattern, as the calibration found it, from all frames."""
+
+    def __post_init__(self) -> None:
+        if not self.arms or not self.paradigms or not self.seeds:
+            raise ConfigError(f"the study {self.name!r} has no arm, no paradigm or no seed")
+        names = [arm.name for arm in self.arms]
+        if len(set(names)) != len(names):
+            raise ConfigError(f"the study {self.name!r} has two arms of one name among {', '.join(names)}")
+        if set(self.test) & set(self.validation):
+            raise ConfigError("a character is for testing or for validation, not for both")
+
+    @property
+    def split(self) -> str:
+        """The split that is scored."""
+        return "validation" if self.validation else "test"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an experiment finds its captures and keeps what it makes.
+
+    Args:
+        captures: Capture folders of the study's rig.
+        out: Folder for rigs, datasets, runs and records.
+        workers: Processes that simulate; 0 is one for each core.
+    """
+
+    captures: tuple[Path, ...]
+    out: Path
+    workers: int = 0
+
+
+@dataclass(frozen=True)
+class Record:
+    """Scores of one network (or ensemble, or refined one) of a study.
+
+    Args:
+        study: Name of the study.
+        rig: Rig of the captures.
+        arm: Name of the arm.
+        paradigm: What the network saw.
+        seed: Its seed; -1 for an ensemble over the seeds.
+        split: What was scored.
+        scores: Metric -> object -> mean over its positions.
+        positions: PSNR in dB, object -> one value a position.
+        baselines: Baseline -> metric -> object -> mean.
+        checks: Shares of pictures (see `evnlos.evaluation.CHECKS`).
+        settings: Everything that decided the weights.
+    """
+
+    study: str
+    rig: str
+    arm: str
+    paradigm: str
+    seed: int
+    split: str
+    scores: dict[str, dict[str, float]]
+    positions: dict[str, list[float]]
+    baselines: dict[str, dict[str, dict[str, float]]]
+    checks: dict[str, float]
+    settings: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """File name of the record."""
+        seed = "ensemble" if self.seed < 0 else f"seed{self.seed}"
+        return f"{self.rig}-{self.split}-{slug(self.arm)}-{self.paradigm}-{seed}"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One piece of work that is done, for a progress display.
+
+    Args:
+        what: What was done.
+        part: Steps done of this piece.
+        total: Steps of this piece.
+        record: The scores, where this step brought some.
+    """
+
+    what: str
+    part: int
+    total: int
+    record: Record | None = None
+
+
+def slug(text: str) -> str:
+    """Return a name as part of a file name.
+
+    Example:
+        >>> slug("EPNP + consistency")
+        'epnp-consistency'
+    """
+    words = "".join(c if c.isalnum() else " " for c in text.lower()).split()
+    return "-".join(words)

@@ -1,0 +1,205 @@
+"""Experiments: resumable, honest about what was held out, and put into tables that say what the records say."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evnlos.cli import main
+from evnlos.config import save_yaml
+from evnlos.dataset import FixedPattern, Sampling, SensorSize, Simulation, open_dataset, save_pattern
+from evnlos.errors import CalibrationError, ConfigError, DataError
+from evnlos.experiment import (
+    STUDIES,
+    Arm,
+    Place,
+    Record,
+    Study,
+    captures_of,
+    character_table,
+    checks_table,
+    difference,
+    gain_table,
+    read_records,
+    run_study,
+    show,
+    summary_table,
+    write_record,
+)
+from evnlos.model import UNetConfig
+from evnlos.scene import HandwritingGlyphs
+from evnlos.training import Training
+from evnlos.transport import RadiometricTransport
+
+SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
+SMALL = Training(epochs=1, network=UNetConfig(width=4, depth=1))
+ARMS = (
+    Arm("E2E", "none", None, SMALL, sampling=SAMPLING),
+    Arm("simulation only", "calibrated", SMALL, None, sampling=SAMPLING),
+    Arm("EPNP", "calibrated", SMALL, SMALL, sampling=SAMPLING),
+)
+STUDY = Study("captures", "lab", ARMS, ("fusion",), (0, 1), ("4",), writers=1)
+
+
+@pytest.fixture(scope="module")
+def place(tiny_captures, tmp_path_factory) -> Place:
+    """A place whose rig is calibrated already, with few objects to simulate."""
+    out = tmp_path_factory.mktemp("experiment")
+    rig = out / "rigs" / "lab"
+    rig.mkdir(parents=True)
+    simulation = Simulation(
+        glyphs=HandwritingGlyphs(characters="AB"),
+        transport=RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06),
+        sensor=SensorSize(48, 72),
+        positions=8,
+        validation=0.0,
+    )
+    save_yaml(simulation, rig / "rig.yaml")
+    save_yaml(simulation, rig / "training.yaml")
+    flat = FixedPattern(np.ones((48, 72), np.float32), np.zeros((48, 72), np.float32))
+    save_pattern(flat, rig / "pattern.safetensors")
+    return Place(tuple(tiny_captures), out, workers=1)
+
+
+@pytest.fixture(scope="module")
+def records(place) -> list[Record]:
+    return show(run_study(STUDY, place))
+
+
+def test_every_arm_seed_and_refinement_has_its_record(records, place) -> None:
+    found = {(r.arm, r.seed) for r in records}
+    single = {(arm, seed) for arm in ("E2E", "simulation only", "EPNP") for seed in (0, 1, -1)}
+    refined = {(f"{arm} + consistency", seed) for arm in ("simulation only", "EPNP") for seed in (0, 1, -1)}
+    blind = {("linear, captures", 0), ("linear, simulation", 0)}
+    assert found == single | refined | blind
+    assert {r.name for r in read_records(place.out / "records" / "captures")} == {r.name for r in records}
+    for record in records:
+        assert set(record.scores["psnr_db"]) == {"lab_4"} == set(record.positions)
+        assert record.scores["psnr_db"]["lab_4"] == pytest.approx(np.mean(record.positions["lab_4"]), abs=1e-3)
+        assert {"zero", "mean", "nearest"} <= set(record.baselines)
+
+
+def test_a_second_run_does_nothing_again(records, place) -> None:
+    before = {path: path.stat().st_mtime_ns for path in place.out.rglob("*") if path.is_file()}
+    assert show(run_study(STUDY, place)) == []
+    after = {path: path.stat().st_mtime_ns for path in place.out.rglob("*") if path.is_file()}
+    assert after == before
+
+
+def test_arms_share_what_they_have_in_common(records, place) -> None:
+    names = [path.name for path in (place.out / "runs").iterdir()]
+    assert len([name for name in names if "pretrained" in name]) == 2  # one a seed, for two arms
+    assert len(list((place.out / "simulations").iterdir())) == 1
+    assert len(list((place.out / "shots").iterdir())) == 1
+
+
+def test_an_ensemble_is_the_mean_of_its_pictures(records) -> None:
+    """Squared error is convex: the mean picture is at least as good as the mean error of its members."""
+    by = {(r.arm, r.seed): np.array(r.positions["lab_4"]) for r in records}
+    error = {key: 10 ** (-psnr / 10) for key, psnr in by.items()}
+    for arm in ("E2E", "EPNP"):
+        members = (error[arm, 0] + error[arm, 1]) / 2
+        assert (error[arm, -1] <= members * (1 + 1e-3)).all()
+
+
+def test_validation_leaves_the_test_characters_unread(place) -> None:
+    study = replace(STUDY, name="choose", arms=ARMS[:1], seeds=(0,), validation=("L",))
+    found = show(run_study(study, place))
+    assert [r.split for r in found] == ["validation"]
+    shots = open_dataset(place.out / "shots" / found[0].settings["captures"])
+    assert sorted(shots.objects()) == ["lab_A", "lab_L", "lab_T"]
+    assert shots.objects("validation") == ["lab_L"]
+
+
+def test_few_shots_are_nested_and_keep_the_test(place) -> None:
+    kept = []
+    for count in (1, 2):
+        arm = replace(ARMS[0], name=f"{count} shots", shots=count)
+        found = show(run_study(replace(STUDY, name="few", arms=(arm,), seeds=(0,)), place))
+        shots = open_dataset(place.out / "shots" / found[0].settings["captures"])
+        assert shots.objects("test") == ["lab_4"] and len(shots.objects("train")) == count
+        kept.append(set(shots.objects("train")))
+    assert kept[0] < kept[1]
+    with pytest.raises(DataError, match="9 shots"):
+        show(run_study(replace(STUDY, arms=(replace(ARMS[0], shots=9),)), place))
+
+
+def test_captures_that_no_rig_fits_say_so(tiny_captures, tmp_path) -> None:
+    place = Place(tuple(tiny_captures[:1]), tmp_path)
+    with pytest.raises(CalibrationError, match="capture"):
+        show(run_study(replace(STUDY, test=()), place))
+
+
+def test_wrong_plans_are_refused(tmp_path) -> None:
+    with pytest.raises(ConfigError, match="pre-training needs a simulation"):
+        Arm("x", "none", SMALL, None)
+    with pytest.raises(ConfigError, match="pre-training needs a simulation"):
+        Arm("x", "calibrated", None, SMALL)
+    with pytest.raises(ConfigError, match="trains nothing"):
+        Arm("x", "none", None, None)
+    with pytest.raises(ConfigError, match="shots is 0"):
+        Arm("x", "none", None, SMALL, shots=0)
+    with pytest.raises(ConfigError, match="no arm"):
+        Study("x")
+    with pytest.raises(ConfigError, match="two arms"):
+        Study("x", arms=(ARMS[0], ARMS[0]))
+    with pytest.raises(ConfigError, match="not for both"):
+        Study("x", arms=ARMS, validation=("4",), test=("4",))
+    with pytest.raises(DataError, match="no captures near_"):
+        captures_of(tmp_path, "near")
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_presets_are_whole(name) -> None:
+    study = STUDIES[name]("near")
+    assert study.name == name and study.test == ("G", "K", "4", "9") and len(study.arms) >= 2
+
+
+def made(arm: str, seed: int, shift: float) -> Record:
+    positions = {"near_G": [20.0 + shift, 22.0 + shift], "near_K": [18.0 + shift, 19.0 + 3 * shift]}
+    means = {name: float(np.mean(values)) for name, values in positions.items()}
+    base = {"zero": {"psnr_db": {"near_G": 13.0, "near_K": 14.0}}}
+    return Record(
+        "s", "near", arm, "frame", seed, "test", {"psnr_db": means}, positions, base, {"read": 0.5}, {}
+    )
+
+
+def test_tables_say_what_the_records_say(tmp_path) -> None:
+    every = [made("E2E", 0, 0.0), made("E2E", 1, 0.2), made("EPNP", 0, 2.0), made("EPNP", 1, 2.2)]
+    for record in every:
+        write_record(record, tmp_path)
+    again = read_records(tmp_path)
+    assert sorted(r.name for r in again) == sorted(r.name for r in every)
+    gain = difference(again, "EPNP", "E2E", "frame")
+    assert gain.mean == pytest.approx((2 + 2 + 2 + 6) / 4) and gain.low <= gain.mean <= gain.high
+    text = summary_table(again)
+    e2e = np.mean([np.mean([21, 18.5]), np.mean([21.2, 18.9])])
+    assert f"| E2E | {e2e:.2f} +- 0.21 |" in text and "| all-black | 13.50 |" in text
+    assert "| G |" in character_table(again, ("E2E", "EPNP")) and "**23.10**" in character_table(
+        again, ("E2E", "EPNP")
+    )
+    assert f"| frame | {gain} |" in gain_table(again)
+    assert "| E2E frame | 50 % |" in checks_table(again)
+
+
+def test_a_broken_record_is_named(tmp_path) -> None:
+    with pytest.raises(DataError, match="no records"):
+        read_records(tmp_path)
+    (tmp_path / "bad.json").write_text(json.dumps({"arm": "x"}))
+    with pytest.raises(DataError, match=r"bad\.json"):
+        read_records(tmp_path)
+
+
+def test_the_command_names_what_is_wrong(tmp_path, capsys) -> None:
+    for arguments, word in (
+        (["capture"], "captures, paper"),
+        (["captures", "--arms", "EPMP"], "EPNP"),
+        (["captures"], "no captures near_"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(["experiment", *arguments, "--captures", str(tmp_path), "--out", str(tmp_path / "o")])
+        error = capsys.readouterr().err
+        assert stop.value.code == 2 and word in error and len(error.strip().splitlines()) == 1
+    assert not Path(tmp_path / "o").exists()
