@@ -22,10 +22,12 @@ STAGES = [
     "dataset",
     "model",
     "solver",
+    "tracking",
     "calibration",
     "training",
     "evaluation",
     "report",
+    "experiment",
 ]
 LEAVES = {"claim", "types", "errors", "config", "metrics", "seeds", "version"}
 FILES = sorted(SOURCE.rglob("*.py"))
@@ -69,16 +71,17 @@ def test_no_file_is_long() -> None:
     assert {name: n for name, n in lengths.items() if n > 400} == {}
 
 
-def test_import_costs_torch_and_half_a_second() -> None:
+def test_import_costs_little_beside_torch() -> None:
+    """A share of torch's own import, not seconds: machines differ by more than any budget."""
     code = (
         "import json, sys, time\n"
-        "import torch\nb = time.process_time()\nimport evnlos\nc = time.process_time()\n"
-        "print(json.dumps([c - b, sorted(sys.modules)]))"
+        "a = time.process_time()\nimport torch\nb = time.process_time()\nimport evnlos\n"
+        "c = time.process_time()\nprint(json.dumps([(c - b) / (b - a), sorted(sys.modules)]))"
     )
     runs = [json.loads(subprocess.check_output([sys.executable, "-c", code])) for _ in range(5)]
     # numba looks for scipy by itself and takes it where it is installed.
     assert not {name.split(".")[0] for name in runs[0][1]} & (FORBIDDEN - {"scipy"})
-    assert min(seconds for seconds, _ in runs) < 0.5
+    assert min(share for share, _ in runs) < 0.6
 
 
 @pytest.mark.parametrize("name", evnlos.__all__)

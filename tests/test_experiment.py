@@ -10,6 +10,7 @@ import pytest
 from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.dataset import FixedPattern, Sampling, SensorSize, Simulation, open_dataset, save_pattern
+from evnlos.dataset.simulate import split_of
 from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import (
     STUDIES,
@@ -23,13 +24,14 @@ from evnlos.experiment import (
     difference,
     gain_table,
     read_records,
+    run_simulated,
     run_study,
     show,
     summary_table,
     write_record,
 )
 from evnlos.model import UNetConfig
-from evnlos.scene import HandwritingGlyphs
+from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.training import Training
 from evnlos.transport import RadiometricTransport
 
@@ -203,3 +205,44 @@ def test_the_command_names_what_is_wrong(tmp_path, capsys) -> None:
         error = capsys.readouterr().err
         assert stop.value.code == 2 and word in error and len(error.strip().splitlines()) == 1
     assert not Path(tmp_path / "o").exists()
+
+
+def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeypatch) -> None:
+    from evnlos.dataset.presets import paper
+    from evnlos.experiment import simulated
+
+    sets = simulated.simulations(simulated.Simulated(tmp_path))
+    assert [len(c.glyphs.objects()) for c in sets.values()] == [39 * 26, 26, 36]
+    assert split_of(sets["nist"])["test"] == sets["nist"].glyphs.objects()
+    assert [name[-1] for name in split_of(sets["comic"])["test"]] == ["G", "K", "4", "9"]
+
+    small = replace(paper(), sensor=SensorSize(20, 30), positions=4, sampling=SAMPLING, validation=0.0)
+    monkeypatch.setattr(
+        simulated,
+        "simulations",
+        lambda _: {
+            "train": replace(small, glyphs=HandwritingGlyphs(characters="AB", writers=1)),
+            "nist": replace(
+                small, glyphs=HandwritingGlyphs(characters="A", first_writer=39, writers=1), held_out="A"
+            ),
+            "comic": replace(small, glyphs=FontGlyphs(family="kalam", characters="AGT"), held_out="G"),
+        },
+    )
+    settings = simulated.Simulated(
+        tmp_path,
+        pretraining=SMALL,
+        finetuning=SMALL,
+        end_to_end=SMALL,
+        paradigms=("frame",),
+        seeds=(0,),
+        workers=1,
+    )
+    found = show(run_simulated(settings))
+    assert [(r.rig, r.arm) for r in found] == [
+        ("nist", "pre-trained"),
+        ("comic", "pre-trained"),
+        ("comic", "EPNP"),
+        ("comic", "E2E"),
+    ]
+    assert [list(r.positions) for r in found[1:]] == [["kalam_G"]] * 3
+    assert show(run_simulated(settings)) == []

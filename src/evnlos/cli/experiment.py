@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -12,14 +13,19 @@ from evnlos.config import write_atomically
 from evnlos.dataset import PARADIGMS, Paradigm
 from evnlos.errors import ConfigError
 
+if TYPE_CHECKING:
+    from evnlos.experiment import Step
+
 
 @dataclass(frozen=True)
 class Command:
     """Run an experiment on captures: calibrate, simulate, pre-train, fine-tune, compare; resumable."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss or width."""
-    captures: Path
+    """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss or width;
+    without captures: simulation (handwriting, transfer to Comic) and conditions (frames against events over
+    light, noise, exposure and speed)."""
+    captures: Path | None = None
     """Folder of the capture folders."""
     out: Path = Path("experiments")
     """Folder for rigs, datasets, runs, records and tables; experiments in one folder share what they can."""
@@ -52,8 +58,18 @@ class Command:
         """Run what is left, with a line of progress, and print the tables."""
         from evnlos.experiment import STUDIES, Place, Study, captures_of, read_records, run_study, show
 
+        if self.name == "conditions":
+            self._conditions()
+            return
+        if self.name == "simulation":
+            self._simulation()
+            return
         if self.name not in STUDIES:
-            raise ConfigError(f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}")
+            raise ConfigError(
+                f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}, conditions"
+            )
+        if self.captures is None:
+            raise ConfigError(f"the experiment {self.name} needs --captures, the folder of the capture folders")
         study: Study = STUDIES[self.name](self.rig)
         unknown = set(self.arms) - {arm.name for arm in study.arms}
         if unknown:
@@ -86,6 +102,41 @@ class Command:
         records = [r for r in records if r.split == study.split]
         text = _tables(study.name, records, self.metric)
         write_atomically(self.out / f"{study.name}-{self.rig}-{study.split}.md", text.encode())
+        print(text)
+
+    def _simulation(self) -> None:
+        from evnlos.experiment import Simulated, read_records, run_simulated, show
+
+        settings = Simulated(self.out, paradigms=self.paradigms, seeds=self.seeds, workers=self.workers)
+        epochs = {
+            "pretraining": self.pretrain_epochs,
+            "finetuning": self.finetune_epochs,
+            "end_to_end": self.e2e_epochs,
+        }
+        changed = {name: replace(getattr(settings, name), epochs=n) for name, n in epochs.items() if n}
+        settings = replace(settings, writers=self.writers or settings.writers, **changed)
+        show(run_simulated(settings))
+        text = ""
+        for tested in ("nist", "comic"):
+            records = [r for r in read_records(self.out / "records" / "simulation") if r.rig == tested]
+            text += _tables("simulation", records, self.metric) + "\n"
+        write_atomically(self.out / "simulation.md", text.encode())
+        print(text)
+
+    def _conditions(self) -> None:
+        from evnlos.experiment import base_simulation, conditions, conditions_table, map_conditions, show
+
+        chosen = conditions(base_simulation(self.writers or 2))
+        findings = []
+
+        def steps() -> Iterator[Step]:
+            for step, finding in map_conditions(chosen, self.out / "conditions", self.workers):
+                findings.append(finding)
+                yield step
+
+        show(steps())
+        text = conditions_table(findings) + "\n"
+        write_atomically(self.out / "conditions.md", text.encode())
         print(text)
 
 

@@ -43,7 +43,7 @@ class FixedPattern:
                 f"the fixed pattern is of {width} x {height} pixels, the frames have {frames.shape[2]} x "
                 f"{frames.shape[1]}; calibrate the camera that took them"
             )
-        light = frames / np.float32(peak) - self.offset
+        light = frames.astype(np.float32) / np.float32(peak) - self.offset
         return light / np.maximum(self.sensitivity, np.float32(_LEAST))
 
     @property

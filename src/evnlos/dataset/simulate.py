@@ -69,6 +69,8 @@ class Simulation:
     objects (each costs a light-transport matrix); 0 = one for each object."""
     validation: float = 0.05
     """Share of the objects that is held out for validation, 0..1."""
+    held_out: str = ""
+    """Characters whose objects are for testing alone."""
     keep_events: bool = False
     """Store the events of each object beside the maps."""
     seed: int = 0
@@ -80,7 +82,9 @@ class Simulation:
         if self.positions < 1:
             raise ConfigError(f"Simulation.positions is {self.positions}; give at least 1")
         if self.rigs < 0:
-            raise ConfigError(f"Simulation.rigs is {self.rigs}; give 0 (one for each object) or a number of rigs")
+            raise ConfigError(
+                f"Simulation.rigs is {self.rigs}; give 0 (one for each object) or a number of rigs"
+            )
         if not 0 <= self.validation < 1:
             raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
         check_ranges(self, self.vary)
@@ -142,15 +146,17 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
 
 
 def split_of(config: Simulation) -> dict[str, list[str]]:
-    """Return the split by object: a seeded share for validation, the others for training."""
-    names = config.glyphs.objects()
+    """Return the split by object: those held out for testing, a seeded share for validation, the others."""
+    every = config.glyphs.objects()
+    tested = [name for name in every if name.rsplit("_", 1)[-1] in config.held_out]
+    names = [name for name in every if name not in set(tested)]
     count = round(config.validation * len(names))
     order = np.random.default_rng(derive_seed(config.seed, "split")).permutation(len(names))
-    held_out = {names[i] for i in order[:count]}
+    chosen = {names[i] for i in order[:count]}
     return {
-        "train": [name for name in names if name not in held_out],
-        "validation": [name for name in names if name in held_out],
-        "test": [],
+        "train": [name for name in names if name not in chosen],
+        "validation": [name for name in names if name in chosen],
+        "test": tested,
     }
 
 

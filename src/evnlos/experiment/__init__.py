@@ -1,25 +1,42 @@
 """Experiments: what is compared, run so that it can go on after any interruption, and put into tables."""
 
+from evnlos.experiment.conditions import (
+    Condition,
+    Finding,
+    base_simulation,
+    conditions,
+    conditions_table,
+    map_conditions,
+)
 from evnlos.experiment.presets import STUDIES
 from evnlos.experiment.progress import show
 from evnlos.experiment.records import read_records, write_record
 from evnlos.experiment.run import captures_of, run_study
+from evnlos.experiment.simulated import Simulated, run_simulated
 from evnlos.experiment.study import Arm, Place, Record, Step, Study
 from evnlos.experiment.table import character_table, checks_table, difference, gain_table, summary_table
 
 __all__ = [
     "STUDIES",
     "Arm",
+    "Condition",
+    "Finding",
     "Place",
     "Record",
+    "Simulated",
     "Step",
     "Study",
+    "base_simulation",
     "captures_of",
     "character_table",
     "checks_table",
+    "conditions",
+    "conditions_table",
     "difference",
     "gain_table",
+    "map_conditions",
     "read_records",
+    "run_simulated",
     "run_study",
     "show",
     "summary_table",

@@ -1,0 +1,235 @@
+"""Where events win: frames and events of the same passes, over light, noise, exposure and speed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from evnlos.config import config_hash, write_atomically
+from evnlos.dataset import PARADIGMS, Simulation, network_input, simulate_object
+from evnlos.dataset.pool import run_in_order
+from evnlos.evaluation.intervals import paired_difference
+from evnlos.evaluation.linear import fit_linear
+from evnlos.experiment.study import Step
+from evnlos.metrics import psnr
+from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs
+from evnlos.transport import RadiometricTransport
+
+FULL = 0.85
+"""White levels of the brightest pixel: as if the exposure had been set so that nothing is clipped."""
+
+EVENT_BYTES = 4
+"""Bytes of an event in a plain stream of 32-bit words."""
+
+FRAME_RATE_HZ = 100.0
+"""Frames a second of the paper's frame camera: what its data volume is counted with."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One setting of the world, changed from the base.
+
+    Args:
+        factor: What was changed.
+        value: Its value.
+        unit: Its unit.
+        simulation: The whole simulation.
+    """
+
+    factor: str
+    value: float
+    unit: str
+    simulation: Simulation
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What frames and events showed under one condition.
+
+    Args:
+        factor: What was changed.
+        value: Its value.
+        unit: Its unit.
+        psnr_db: Paradigm -> mean PSNR of the linear estimate on the test writer, dB.
+        mean_db: PSNR of the mean picture, dB.
+        gain_db: PSNR of events minus that of frames: mean, low and high end of the 95 % interval over objects.
+        events_per_pixel: Events a pixel and pass.
+        event_bytes_s: Data of the events, bytes a second.
+        frame_bytes_s: Data of 8-bit frames at `FRAME_RATE_HZ`, bytes a second.
+    """
+
+    factor: str
+    value: float
+    unit: str
+    psnr_db: dict[str, float]
+    mean_db: float
+    gain_db: tuple[float, float, float]
+    events_per_pixel: float
+    event_bytes_s: float
+    frame_bytes_s: float
+
+
+def base_simulation(writers: int = 2) -> Simulation:
+    """Return the world that the conditions are changed from: rough metal, 0.30 m, and the paper's pixel.
+
+    Args:
+        writers: Writers to learn from.
+    """
+    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
+    return _lit(
+        Simulation(
+            glyphs=HandwritingGlyphs(characters=letters, writers=writers),
+            transport=RadiometricTransport(cell_m=0.005),
+            validation=0.0,
+        ),
+        0.1,
+    )
+
+
+def conditions(base: Simulation) -> list[Condition]:
+    """Return all conditions: the base, then one factor at a time.
+
+    - ambient: ambient light over the largest signal; the exposure is set so that nothing is clipped.
+    - light: share of the base's light that is left, with the same exposure.
+    - read noise of the frame camera, electrons.
+    - exposure of the frames, seconds; their gain is set so that the level stays.
+    - speed of the target, metres a second, over the same way; the surface's time constant follows it.
+    """
+    found = [Condition("base", 1.0, "", base)]
+    found += [Condition("ambient", r, "of the signal", _lit(base, r)) for r in (0.0, 0.5, 2.0, 8.0)]
+    for share in (0.3, 0.1, 0.03):
+        light = replace(
+            base.transport, gain=base.transport.gain * share, ambient=base.transport.ambient * share
+        )
+        found.append(Condition("light", share, "of the base", replace(base, transport=light)))
+    for noise in (30.0, 100.0, 300.0):
+        camera = replace(base.frame_camera, read_noise_e=noise)
+        found.append(Condition("read noise", noise, "electrons", replace(base, frame_camera=camera)))
+    for exposure in (0.03, 0.1, 0.3):
+        camera = replace(base.frame_camera, exposure_s=exposure)
+        found.append(Condition("exposure", exposure, "s", replace(base, frame_camera=camera)))
+    length = base.motion.speed_m_s * base.duration_s
+    for speed in (0.005, 0.08, 0.32):
+        # The time constant follows the time in which the target moves by a stroke.
+        tau_s = base.sampling.tau_s * base.motion.speed_m_s / speed
+        moved = replace(
+            base,
+            motion=replace(base.motion, speed_m_s=speed),
+            duration_s=length / speed,
+            sampling=replace(base.sampling, tau_s=tau_s),
+        )
+        found.append(Condition("speed", speed, "m/s", moved))
+    return found
+
+
+def map_conditions(
+    chosen: list[Condition], out: Path, workers: int = 0, rank: int = 192
+) -> Iterator[tuple[Step, Finding]]:
+    """Measure each condition, yielding its finding; what is done is read back.
+
+    All paradigms get the same estimator, the linear one that is best for each, fitted anew to each condition:
+    a network would add its own luck to every difference.
+
+    Args:
+        chosen: The conditions.
+        out: Folder for one JSON file a condition.
+        workers: Processes; 0 is one for each core.
+        rank: Components of the linear estimate.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    for k, condition in enumerate(chosen):
+        path = out / f"{config_hash(condition.simulation)}.json"
+        if path.is_file():
+            known = json.loads(path.read_text())
+            finding = Finding(**known | {"gain_db": tuple(known["gain_db"])})
+        else:
+            finding = measure(condition, workers, rank)
+            write_atomically(path, json.dumps(asdict(finding), indent=1).encode())
+        what = f"{condition.factor} {condition.value:g} {condition.unit}".strip()
+        yield Step(f"conditions ({what})", k + 1, len(chosen)), finding
+
+
+def measure(condition: Condition, workers: int = 0, rank: int = 192) -> Finding:
+    """Simulate passes, fit the linear estimate to some writers, and score it on one that it has not seen.
+
+    Args:
+        condition: The world.
+        workers: Processes; 0 is one for each core.
+        rank: Components of the linear estimate.
+    """
+    config = condition.simulation
+    assert isinstance(config.glyphs, HandwritingGlyphs)
+    unseen = replace(config, glyphs=replace(config.glyphs, writers=1, first_writer=TRAIN_WRITERS))
+    learned = list(run_in_order(_pass, [(config, name) for name in config.glyphs.objects()], workers))
+    tested = list(run_in_order(_pass, [(unseen, name) for name in unseen.glyphs.objects()], workers))
+    rows = config.sampling.scored
+    truth = torch.cat([p.truth for p in tested])[:, rows]
+    names = np.concatenate([[p.name] * len(p.truth) for p in tested])
+    scores: dict[str, np.ndarray] = {}
+    for paradigm in PARADIGMS:
+        seen, known = (
+            [network_input(p.frame, p.surface, paradigm) for p in part] for part in (learned, tested)
+        )
+        owners = np.concatenate([[p.name] * len(p.truth) for p in learned])
+        estimate = fit_linear(torch.cat(seen), torch.cat([p.truth for p in learned]), owners, rank)
+        scores[paradigm] = psnr(estimate(torch.cat(known))[:, rows], truth).numpy()
+    blank = torch.cat([p.truth for p in learned]).mean(dim=0)[rows].expand_as(truth)
+    gain = paired_difference(scores["event"], scores["frame"], names)
+    pixels = config.sensor.height * config.sensor.width
+    events = float(np.mean([p.events for p in tested]))
+    return Finding(
+        condition.factor,
+        condition.value,
+        condition.unit,
+        {name: round(float(values.mean()), 3) for name, values in scores.items()},
+        round(float(psnr(blank, truth).mean()), 3),
+        (round(gain.mean, 3), round(gain.low, 3), round(gain.high, 3)),
+        round(events / pixels, 3),
+        round(events * EVENT_BYTES / config.duration_s),
+        round(FRAME_RATE_HZ * pixels),
+    )
+
+
+def conditions_table(findings: list[Finding]) -> str:
+    """Return Markdown: a row a condition."""
+    lines = [
+        "| condition | frame dB | event dB | fusion dB | mean picture dB | event - frame dB, 95 % interval | "
+        "events a pixel | events kB/s | frames kB/s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for f in findings:
+        what = "base" if f.factor == "base" else f"{f.factor} {f.value:g} {f.unit}"
+        mean, low, high = f.gain_db
+        scores = " | ".join(f"{f.psnr_db[p]:.2f}" for p in PARADIGMS)
+        lines.append(
+            f"| {what} | {scores} | {f.mean_db:.2f} | {mean:+.2f} [{low:+.2f}, {high:+.2f}] | "
+            f"{f.events_per_pixel:.1f} | {f.event_bytes_s / 1e3:.0f} | {f.frame_bytes_s / 1e3:.0f} |"
+        )
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    name: str
+    frame: np.ndarray
+    surface: np.ndarray
+    truth: torch.Tensor
+    events: int
+
+
+def _pass(task: tuple[Simulation, str]) -> _Pass:
+    config, name = task
+    samples, events = simulate_object(config, name)
+    assert samples.truth is not None  # a simulation knows its target
+    return _Pass(name, samples.frame, samples.surface, torch.from_numpy(samples.truth), len(events))
+
+
+def _lit(config: Simulation, ratio: float) -> Simulation:
+    """Return the simulation with ambient light of `ratio` times the largest signal, both within the range."""
+    gain = FULL / (1 + ratio)
+    return replace(config, transport=replace(config.transport, gain=gain, ambient=gain * ratio))
