@@ -4,7 +4,8 @@
     python benchmarks/reconstruct.py --threads 1 --weights RUN
 
 One position of a capture at 160 x 100: the time surface of the events since the position before, both maps
-brought to 96 x 64, and the network. Wall time, medians; the first runs are left out.
+brought to 96 x 64, and the network, as a graph (`Reconstructor`) and layer by layer. Wall time, medians; the
+first runs are left out.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ import numpy as np
 import torch
 
 from event_pixel import machine
+from evnlos.config import to_dict
 from evnlos.dataset import CHANNELS, PARADIGMS, Sampling, network_input
 from evnlos.dataset.sampling import make_samples
-from evnlos.evaluation import infer
-from evnlos.model import ResidualUNet, UNetConfig, load_weights
+from evnlos.evaluation import Reconstructor, infer
+from evnlos.model import ResidualUNet, UNetConfig, Weights, load_weights
 from evnlos.types import Events
 
 
@@ -44,21 +46,27 @@ def main() -> None:
     edges = np.array([0, 200_000])
     print(machine())
     print(f"{args.events} events a position, {args.threads} threads")
-    print("| paradigm | surface and maps, ms | network, ms | together, ms |\n|---|---|---|---|")
+    print("| paradigm | surface and maps, ms | network, ms | together, ms | network layer by layer, ms |")
+    print("|---|---|---|---|---|")
     for paradigm in [load_weights(args.weights).paradigm] if args.weights else PARADIGMS:
-        loaded = load_weights(args.weights).network if args.weights else None
-        network = loaded or ResidualUNet(CHANNELS[paradigm], UNetConfig())
-        parts: list[tuple[float, float]] = []
+        if args.weights:
+            weights = load_weights(args.weights)
+        else:
+            network = ResidualUNet(CHANNELS[paradigm], UNetConfig()).eval()
+            weights = Weights(network, paradigm, to_dict(Sampling()), [])
+        see = Reconstructor(weights)
+        parts: list[tuple[float, float, float]] = []
         for n in range(args.rounds + 5):
             events = events_of_a_position(args.events, n)
             began = time.perf_counter()
             samples = make_samples(frame, 255.0, events, edges, None, Sampling())
-            seen = network_input(samples.frame, samples.surface, paradigm)
-            middle = time.perf_counter()
-            infer(network, seen)
-            parts.append((middle - began, time.perf_counter() - middle))
-        maps, net = (1e3 * statistics.median(part) for part in zip(*parts[5:], strict=True))
-        print(f"| {paradigm} | {maps:.2f} | {net:.2f} | {maps + net:.2f} |")
+            mapped = time.perf_counter()
+            see(samples.frame[0], samples.surface[0])
+            seen = time.perf_counter()
+            infer(weights.network, network_input(samples.frame, samples.surface, paradigm))
+            parts.append((mapped - began, seen - mapped, time.perf_counter() - seen))
+        maps, net, slow = (1e3 * statistics.median(part) for part in zip(*parts[5:], strict=True))
+        print(f"| {paradigm} | {maps:.2f} | {net:.2f} | {maps + net:.2f} | {slow:.2f} |")
 
 
 if __name__ == "__main__":

@@ -8,8 +8,11 @@ import torch
 import torch.nn.functional as F
 
 from evnlos import EvnlosError
-from evnlos.evaluation import load_lpips, score
+from evnlos.dataset import CHANNELS
+from evnlos.errors import DataError
+from evnlos.evaluation import Reconstructor, load_lpips, reconstruct, score
 from evnlos.evaluation import lpips as module
+from evnlos.model import ResidualUNet, UNetConfig, Weights
 from evnlos.report.curves import curves_svg
 from evnlos.report.gather import method_of
 from evnlos.report.tables import best_two
@@ -114,3 +117,19 @@ def test_curves_hold_every_point_and_name() -> None:
     assert svg.count("<polyline") == 1
     assert "a&lt;b" in svg
     assert curves_svg({}, "x", "y") == ""
+
+
+def test_a_reconstructor_gives_the_same_pictures_one_at_a_time() -> None:
+    draw = np.random.default_rng(0)
+    frame, surface = draw.random((3, 22, 34), np.float32), draw.random((3, 2, 22, 34), np.float32)
+    for paradigm, channels in CHANNELS.items():
+        network = ResidualUNet(channels, UNetConfig(width=8, depth=2)).eval()
+        for parameter in network.parameters():
+            torch.nn.init.normal_(parameter, std=0.1)
+        weights = Weights(network, paradigm, {"height": 22, "width": 34, "scored_rows": 16}, [])
+        expected = reconstruct(weights, frame, surface)
+        see = Reconstructor(weights)
+        for k in range(3):
+            torch.testing.assert_close(see(frame[k], surface[k]), expected[k], atol=1e-5, rtol=1e-4)
+    with pytest.raises(DataError, match="do not fit"):
+        see(frame[0, :20], surface[0])

@@ -13,6 +13,7 @@ from evnlos.evaluation.evaluate import (
 from evnlos.evaluation.identify import Identification, identify
 from evnlos.evaluation.identify_rig import Bench
 from evnlos.evaluation.lpips import available_lpips, load_lpips
+from evnlos.evaluation.reconstructor import Reconstructor
 from evnlos.evaluation.score import Scores, score
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "Bench",
     "Evaluation",
     "Identification",
+    "Reconstructor",
     "Scores",
     "assess",
     "available_lpips",

@@ -83,9 +83,7 @@ def _left_out(code: Tensor, y: Tensor, left: Tensor) -> Tensor:
     """Return the squared error on the samples left out, for each ridge of the grid."""
     kept = code[~left]
     inner, outer = kept.T @ kept, kept.T @ y[~left]
-    return torch.stack(
-        [(code[left] @ _ridge(inner, outer, lam) - y[left]).square().sum() for lam in _LAMBDAS]
-    )
+    return torch.stack([(code[left] @ _ridge(inner, outer, lam) - y[left]).square().sum() for lam in _LAMBDAS])
 
 
 def _ridge(inner: Tensor, outer: Tensor, lam: float) -> Tensor:
