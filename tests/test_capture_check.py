@@ -1,0 +1,133 @@
+"""The protocol for the lab: a folder that explains itself, and faults that are named with their cure."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evnlos.cli import main
+from evnlos.dataset import read_capture
+from evnlos.dataset.capture_check import check_capture
+from evnlos.dataset.capture_info import read_capture_info
+from evnlos.dataset.capture_template import begin_capture
+from evnlos.errors import DataError
+from evnlos.types import Events
+
+
+@pytest.fixture(scope="module")
+def capture(tiny_captures):
+    return read_capture(tiny_captures[0])
+
+
+def levels(capture) -> dict[str, str]:
+    return {one.what: one.level for one in check_capture(capture)}
+
+
+def cures(capture) -> dict[str, str]:
+    return {one.what: one.cure for one in check_capture(capture)}
+
+
+def test_a_good_shot_is_called_good(capture) -> None:
+    found = check_capture(capture)
+    assert {one.what for one in found if one.level != "good"} == set()
+    assert all(one.cure == "" for one in found)
+
+
+def test_light_that_is_wrong_is_named(capture) -> None:
+    bright = replace(capture, frames=np.maximum(capture.frames, 255).astype(np.uint8))
+    assert levels(bright)["saturation"] == "bad" and "exposure" in cures(bright)["saturation"]
+    dim = replace(capture, frames=(capture.frames // 100).astype(np.uint8))
+    assert levels(dim)["brightness"] == "bad" and "lengthen" in cures(dim)["brightness"]
+
+
+def test_a_target_that_did_not_move_is_named(capture) -> None:
+    draw = np.random.default_rng(0)
+    still = (100 + 3 * draw.standard_normal(capture.frames.shape)).astype(np.uint8)
+    found = levels(replace(capture, frames=still))
+    assert found["movement"] == "bad" and found["wall contrast"] == "bad" and "region" not in found
+
+
+def test_light_that_leaves_the_picture_is_named(capture) -> None:
+    """All movement at the left border of a wall that is dark elsewhere."""
+    frames = np.full((12, 48, 72), 100, np.uint8)
+    frames += np.random.default_rng(0).integers(0, 3, frames.shape).astype(np.uint8)
+    for k in range(12):
+        frames[k, :, :5] += np.uint8(60 * (k % 2 if k < 6 else k / 12))
+    times = np.arange(12) * 500_000
+    found = check_capture(replace(capture, frames=frames, frame_times_us=times))
+    assert {one.what: one.level for one in found}["region"] == "bad"
+
+
+def test_events_that_are_wrong_are_named(capture) -> None:
+    events = capture.events
+    few = replace(capture, events=events[::2000])
+    assert levels(few)["event rate"] == "bad" and "thresholds" in cures(few)["event rate"]
+    assert levels(few)["silent pixels"] == "bad"
+    columns = events.columns()
+    one_sided = Events(
+        width=events.width, height=events.height, **(columns | {"p": np.ones(len(events), bool)})
+    )
+    assert levels(replace(capture, events=one_sided))["polarity balance"] == "bad"
+    at_one = np.sort(np.concatenate([np.arange(len(events)), np.full(len(events), 5)]))
+    x, y = columns["x"][at_one].copy(), columns["y"][at_one].copy()
+    x[at_one == 5], y[at_one == 5] = 7, 7
+    hot = Events(np.sort(columns["t_us"][at_one]), x, y, columns["p"][at_one], events.width, events.height)
+    found = replace(capture, events=hot)
+    assert levels(found)["hot pixels"] == "bad" and "hot_pixel_factor" in cures(found)["hot pixels"]
+
+
+@pytest.mark.parametrize("hertz", [100, 120])
+def test_lamps_on_mains_are_found_and_sunlight_is_not(capture, hertz) -> None:
+    draw = np.random.default_rng(hertz)
+    even = np.sort(draw.integers(0, 8_000_000, 40_000))
+    phase = np.sin(2 * np.pi * hertz * even * 1e-6)
+    for depth, level in ((0.0, "good"), (0.5, "bad")):
+        t_us = even[draw.random(len(even)) < (1 + depth * phase) / (1 + depth)]
+        n = len(t_us)
+        x, y = draw.integers(0, 72, n), draw.integers(0, 48, n)
+        events = Events(t_us, x.astype(np.uint16), y.astype(np.uint16), draw.random(n) < 0.5, 72, 48)
+        found = {one.what: one for one in check_capture(replace(capture, events=events))}
+        assert found["flicker"].level == level
+        if depth:
+            assert f"{hertz} Hz" in found["flicker"].found and "direct current" in found["flicker"].cure
+
+
+def test_clocks_that_do_not_meet_are_named(capture) -> None:
+    late = replace(capture, frame_times_us=capture.frame_times_us + 6_000_000)
+    assert levels(late)["clock"] == "bad" and "alignment" in cures(late)["clock"]
+    times = capture.frame_times_us.copy()
+    times[4:] += 700_000
+    assert levels(replace(capture, frame_times_us=times))["frame times"] == "doubtful"
+
+
+def test_a_new_folder_explains_itself_and_is_read_back(tmp_path, capsys) -> None:
+    main(["capture", "init", str(tmp_path / "shot"), "--width", "640", "--height", "480", "--camera", "EVK: 4"])
+    assert "evnlos capture check" in capsys.readouterr().out
+    info = read_capture_info(tmp_path / "shot")
+    assert (info.camera.width, info.camera.height, info.camera.name) == (640, 480, "EVK  4")
+    text = (tmp_path / "shot" / "capture.yaml").read_text()
+    # Every setting that is offered in a comment is one that the reader knows.
+    offered = [line[2:] for line in text.splitlines() if line.startswith("# ") and ": {" in line]
+    assert len(offered) >= 7
+    for line in offered:
+        (tmp_path / "capture.yaml").write_text("camera: {width: 640, height: 480}\n" + line + "\n")
+        read_capture_info(tmp_path)
+    with pytest.raises(DataError, match="exists"):
+        begin_capture(tmp_path / "shot", 640, 480)
+    with pytest.raises(DataError, match="0 x 480"):
+        begin_capture(tmp_path / "other", 0, 480)
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="is a file"):
+        begin_capture(tmp_path / "file", 640, 480)
+
+
+def test_the_command_prints_and_its_exit_code_tells(tiny_captures, tmp_path, capsys) -> None:
+    main(["capture", "check", str(tiny_captures[0]), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert {one["what"] for one in found["findings"]} >= {"saturation", "movement", "flicker", "clock"}
+    main(["capture", "check", str(tiny_captures[0])])
+    assert "good   saturation" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        main(["capture", "check", str(tmp_path)])
+    assert stop.value.code == 2 and "capture.yaml" in capsys.readouterr().err
