@@ -10,11 +10,12 @@ import torch.nn.functional as F
 from evnlos import EvnlosError
 from evnlos.dataset import CHANNELS
 from evnlos.errors import DataError
-from evnlos.evaluation import Reconstructor, load_lpips, reconstruct, score
+from evnlos.evaluation import Evaluation, Reconstructor, load_lpips, reconstruct, score
 from evnlos.evaluation import lpips as module
 from evnlos.model import ResidualUNet, UNetConfig, Weights
 from evnlos.report.curves import curves_svg
-from evnlos.report.gather import method_of
+from evnlos.report.gather import RunResult, method_of
+from evnlos.report.lead import gains_of, lead
 from evnlos.report.tables import best_two
 
 CONVOLUTIONS = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]  # places in torchvision's vgg16.features
@@ -133,3 +134,24 @@ def test_a_reconstructor_gives_the_same_pictures_one_at_a_time() -> None:
             torch.testing.assert_close(see(frame[k], surface[k]), expected[k], atol=1e-5, rtol=1e-4)
     with pytest.raises(DataError, match="do not fit"):
         see(frame[0, :20], surface[0])
+
+
+def test_a_report_leads_with_what_is_gained() -> None:
+    draw = torch.Generator().manual_seed(0)
+    truth = (torch.rand(6, 24, 24, generator=draw) > 0.8).float()
+    names = np.array(["near_G"] * 3 + ["near_K"] * 3)
+    results, errors = [], {}
+    for method, noise in (("E2E", 0.4), ("EPNP", 0.2)):
+        for seed in range(2):
+            image = (truth + noise * torch.randn(truth.shape, generator=draw)).clamp(0, 1)
+            found = score(image, truth)
+            errors.setdefault(method, []).append(found.psnr_db)
+            blank = {"zero": score(torch.zeros_like(truth), truth)}
+            one = Evaluation(image, truth, names, found, blank)
+            results.append(RunResult(f"{method}-{seed}", "frame", method, one, [], []))
+    gain = gains_of(results)["frame"]
+    assert gain.mean == pytest.approx(np.mean(errors["EPNP"]) - np.mean(errors["E2E"]))
+    assert list(gains_of(results)) == ["frame"] and gains_of(results[:2]) == {}
+    page = lead(results)
+    assert f"frame {gain} dB" in page and f">{np.mean(errors['EPNP']):.2f}</text>" in page
+    assert "all-black" in page and page.count("<rect") == 2

@@ -14,6 +14,7 @@ from evnlos.dataset import Dataset, character_of, read_shard
 from evnlos.evaluation import CHECKS
 from evnlos.report.curves import curves_svg
 from evnlos.report.gather import RunResult
+from evnlos.report.lead import lead
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
 from evnlos.report.tables import (
     available_metrics,
@@ -53,6 +54,7 @@ def write_report(
             "<meta name=viewport content='width=device-width,initial-scale=1'>",
             f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
             _head(dataset, results, notes, split),
+            lead(results),
             *(_table(results, metric, *about) for metric, about in available_metrics(results).items()),
             _checks(results),
             _pictures(dataset, results),

@@ -1,0 +1,95 @@
+"""The figure that a report leads with: what pre-training gains, beside what one scores without looking."""
+
+from __future__ import annotations
+
+import html
+
+import numpy as np
+
+from evnlos.dataset import PARADIGMS
+from evnlos.evaluation import BASELINES
+from evnlos.evaluation.intervals import Interval, paired_difference
+from evnlos.report.gather import METHODS, RunResult
+from evnlos.report.tables import baselines_of
+
+_COLOURS = {"simulation only": "#8a93a0", "E2E": "#b8862b", "EPNP": "#0b5fa5"}
+_WIDTH, _LEFT, _RIGHT, _BAR, _GAP, _GROUP = 760, 150, 60, 17, 3, 16
+
+
+def gains_of(results: list[RunResult]) -> dict[str, Interval]:
+    """Return for each paradigm PSNR of EPNP minus that of E2E, dB, with a 95 % interval over the objects.
+
+    Runs of one method and paradigm (seeds) are averaged.
+    """
+    found = {}
+    for paradigm in PARADIGMS:
+        stacks = {
+            method: [
+                r.evaluation.scores.psnr_db for r in results if (r.method, r.paradigm) == (method, paradigm)
+            ]
+            for method in ("EPNP", "E2E")
+        }
+        if stacks["EPNP"] and stacks["E2E"]:
+            found[paradigm] = paired_difference(
+                np.stack(stacks["EPNP"]), np.stack(stacks["E2E"]), results[0].evaluation.names
+            )
+    return found
+
+
+def lead(results: list[RunResult]) -> str:
+    """Return the first section of the page: bars of mean PSNR, and what EPNP gains over E2E in words."""
+    gains = gains_of(results)
+    words = "; ".join(f"{paradigm} {gain} dB" for paradigm, gain in gains.items())
+    said = (
+        f"<p><b>EPNP over E2E: {html.escape(words)}</b> (mean, 95 % interval over the objects).</p>"
+        if words
+        else ""
+    )
+    return f"<h2>What is gained</h2>{said}{_bars(results)}"
+
+
+def _bars(results: list[RunResult]) -> str:
+    """Return mean PSNR of each method and paradigm as bars; baselines are upright lines."""
+    means: dict[tuple[str, str], float] = {}
+    for paradigm in PARADIGMS:
+        for method in METHODS:
+            values = [
+                r.evaluation.scores.psnr_db.mean()
+                for r in results
+                if (r.method, r.paradigm) == (method, paradigm)
+            ]
+            if values:
+                means[paradigm, method] = float(np.mean(values))
+    blanks = {name: float(scores.psnr_db.mean()) for name, scores in baselines_of(results).items()}
+    low = np.floor(min([*means.values(), *blanks.values()]) - 1)
+    high = np.ceil(max([*means.values(), *blanks.values()]) + 0.5)
+
+    def x(value: float) -> float:
+        return _LEFT + (value - low) / (high - low) * (_WIDTH - _LEFT - _RIGHT)
+
+    parts, y = [], 34.0
+    for paradigm in PARADIGMS:
+        shown = [method for method in METHODS if (paradigm, method) in means]
+        for method in shown:
+            value = means[paradigm, method]
+            parts.append(
+                _text(_LEFT - 8, y + 13, "end", f"{method} {paradigm}")
+                + f"<rect x={x(low):.1f} y={y} width={x(value) - x(low):.1f} height={_BAR} "
+                f"fill='{_COLOURS[method]}'/>" + _text(x(value) + 5, y + 13, "start", f"{value:.2f}")
+            )
+            y += _BAR + _GAP
+        y += _GROUP if shown else 0
+    for k, (name, value) in enumerate(blanks.items()):
+        title = BASELINES[name]
+        parts.append(
+            f"<path d='M{x(value):.1f} 30V{y - _GROUP:.1f}' stroke=currentColor stroke-dasharray='3 3'/>"
+            + _text(x(value), 12 + 12 * (k % 2), "middle", f"{title} {value:.1f}")
+        )
+    parts.append(_text(_WIDTH - 4, y + 8, "end", f"mean PSNR, dB; from {low:g} dB"))
+    box = f"viewBox='0 0 {_WIDTH} {y + 14:.0f}'"
+    label = "mean PSNR of each method beside the baselines"
+    return f"<svg {box} role=img aria-label='{label}' font-size=12>{''.join(parts)}</svg>"
+
+
+def _text(x: float, y: float, anchor: str, words: str) -> str:
+    return f"<text x={x:.1f} y={y:g} text-anchor={anchor} fill=currentColor>{html.escape(words)}</text>"
