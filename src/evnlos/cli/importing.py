@@ -25,7 +25,7 @@ class Command:
     validation: tuple[str, ...] = ()
     """Captures or characters that are held out for validation."""
     pattern: Path | None = None
-    """Fixed pattern of the frame camera to take from the frames: the file, or the folder of a calibrated rig."""
+    """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
     check_pictures: bool = True
     """Draw one picture a capture (frame, events, both, curves over time) into the folder checks of the
     dataset."""

@@ -21,7 +21,7 @@ class Command:
     out: Path = Path("reconstruction")
     """Folder for the pictures; new or empty."""
     pattern: Path | None = None
-    """Fixed pattern of the frame camera to take from the frames: the file, or the folder of a calibrated rig."""
+    """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
     json: bool = False
     """Print one JSON object."""
 

@@ -1,0 +1,24 @@
+"""`evnlos cite`: BibTeX for what was used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Command:
+    """Print BibTeX for exactly what a settings file, a dataset or a run uses; for everything without one."""
+
+    used: Annotated[Path | None, tyro.conf.Positional] = None
+    """Settings file, dataset's folder or run's folder."""
+
+    def run(self) -> None:
+        """Print the entries, each under what it is for."""
+        from evnlos.cite import entries_for
+
+        for name, text in entries_for(self.used).items():
+            print(f"% {name}\n{text}\n")

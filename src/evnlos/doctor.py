@@ -1,0 +1,142 @@
+"""Is this installation whole? Each part, what was found, and what to do where it is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+import platform
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from evnlos.errors import EvnlosError
+from evnlos.version import __version__
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the installation.
+
+    Args:
+        name: What it is.
+        there: Whether it works.
+        found: What was found.
+        cure: What to do; empty where it works.
+        needed: Whether the package is broken without it; else it is optional.
+    """
+
+    name: str
+    there: bool
+    found: str
+    cure: str = ""
+    needed: bool = False
+
+
+_EXTRAS = {
+    "aedat": ("aedat", "reads AEDAT4 recordings"),
+    "av": ("video", "reads and writes videos"),
+    "matplotlib": ("plot", "draws figures"),
+    "mitsuba": ("lab", "checks the optics against a path tracer"),
+    "distributed": ("cluster", "simulates on a Dask cluster"),
+}
+
+
+def examine() -> list[Part]:
+    """Return all parts, needed ones first."""
+    checks: list[Callable[[], Part]] = [_python, _torch, _numba, _hdf5, _fonts, _comic, _disk]
+    return [*(check() for check in checks), *(_extra(module) for module in _EXTRAS)]
+
+
+def _python() -> Part:
+    good = sys.version_info >= (3, 11)
+    found = f"evnlos {__version__}, Python {platform.python_version()} on {platform.machine()}"
+    return Part("python", good, found, "" if good else "install Python 3.11 or newer", needed=True)
+
+
+def _torch() -> Part:
+    import torch
+
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
+    capability = torch.backends.cpu.get_cpu_capability()
+    value = float(torch.ones(3, 3).matmul(torch.ones(3, 3)).sum())
+    found = f"torch {torch.__version__}, {device}, CPU {capability}, {torch.get_num_threads()} threads"
+    return Part("torch", value == 27.0, found, "" if value == 27.0 else "reinstall torch", needed=True)
+
+
+def _numba() -> Part:
+    """Compile a small kernel and see that the cache beside the package can be written."""
+    import numba
+
+    compiled = numba.njit(lambda x: x + 1)(1) == 2
+    cache = Path(__file__).parent / "sensor" / "__pycache__"
+    writable = _can_write(cache if cache.is_dir() else cache.parent)
+    cure = (
+        "" if writable else "set NUMBA_CACHE_DIR to a folder that you may write: kernels compile anew each run"
+    )
+    if not compiled:
+        cure = "reinstall numba and llvmlite"
+    found = f"numba {numba.__version__}, kernels {'are kept' if writable else 'cannot be kept'} between runs"
+    return Part("numba", compiled and writable, found, cure, needed=not compiled)
+
+
+def _hdf5() -> Part:
+    import h5py
+
+    good = h5py.h5z.filter_avail(h5py.h5z.FILTER_FLETCHER32)
+    found = (
+        f"h5py {h5py.__version__}, HDF5 {h5py.version.hdf5_version}, checksums {'on' if good else 'missing'}"
+    )
+    return Part("hdf5", good, found, "" if good else "reinstall h5py from its wheel", needed=True)
+
+
+def _fonts() -> Part:
+    from evnlos.scene.fonts import find_font
+    from evnlos.scene.handwriting import FACES
+
+    try:
+        missing = [name for name in FACES["both"] if find_font(name).substituted_for is not None]
+    except EvnlosError as error:
+        return Part("fonts", False, str(error), "reinstall evnlos with its font packages", needed=True)
+    found = f"{len(FACES['both']) - len(missing)} of {len(FACES['both'])} faces of the simulated characters"
+    cure = f"reinstall evnlos: {', '.join(missing)} is missing" if missing else ""
+    return Part("fonts", not missing, found, cure, needed=True)
+
+
+def _comic() -> Part:
+    from evnlos.scene.fonts import find_font
+
+    font = find_font("Comic Neue Bold")
+    if font.substituted_for is None:
+        return Part("comic face", True, f"{font.family} at weight {font.weight}: the paper's test face")
+    return Part(
+        "comic face", False, f"{font.family} stands in for Comic Neue", "install fonts-comic-neue (Debian)"
+    )
+
+
+def _disk() -> Part:
+    free = shutil.disk_usage(Path.cwd()).free / 2**30
+    good = free > 2
+    return Part(
+        "disk", good, f"{free:.0f} GiB free here", "" if good else "free some: a dataset takes about 1 GiB"
+    )
+
+
+def _extra(module: str) -> Part:
+    extra, use = _EXTRAS[module]
+    there = importlib.util.find_spec(module) is not None
+    return Part(
+        f"[{extra}]",
+        there,
+        use if there else f"not installed; {use}",
+        "" if there else f"pip install evnlos[{extra}]",
+    )
+
+
+def _can_write(folder: Path) -> bool:
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
