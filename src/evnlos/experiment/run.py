@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,7 +89,7 @@ def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     return replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
 
 
-def _simulate(study: Study, arm: Arm, place: Place) -> Iterator[Step]:
+def _simulate(study: Study, arm: Arm, place: Place) -> Generator[Step, None, Dataset | None]:
     if arm.source == "none":
         return None
     config = simulation_of(study, arm, place)
@@ -100,7 +100,7 @@ def _simulate(study: Study, arm: Arm, place: Place) -> Iterator[Step]:
     return open_dataset(folder)
 
 
-def _import(study: Study, arm: Arm, folders: list[Path], place: Place) -> Iterator[Step]:
+def _import(study: Study, arm: Arm, folders: list[Path], place: Place) -> Generator[Step, None, Dataset]:
     held = study.test if not study.validation else ()
     chosen = [f for f in folders if not (study.validation and character_of(f.name) in study.test)]
     if arm.shots is not None:
@@ -134,7 +134,7 @@ def _few(folders: list[Path], shots: int, held_out: tuple[str, ...]) -> list[Pat
 
 def _train(
     study: Study, arm: Arm, paradigm: Paradigm, seed: int, made: Dataset | None, shots: Dataset, place: Place
-) -> Iterator[Step]:
+) -> Generator[Step, None, tuple[Path, dict[str, Any]]]:
     """Train an arm's network and return its run and what decided it."""
     run: Path | None = None
     decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": shots.folder.name}
