@@ -1,5 +1,6 @@
 """What can go wrong on a long run: damaged shards, full disks, two runs in one folder, ctrl-C."""
 
+import json
 import os
 import shutil
 import signal
@@ -8,9 +9,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from evnlos import EvnlosError, open_dataset
+from evnlos import Events, EvnlosError, open_dataset, write_events
 from evnlos.claim import claim, is_empty
 from evnlos.cli import main
 from evnlos.config import save_yaml
@@ -18,6 +20,8 @@ from evnlos.dataset import simulate
 from evnlos.dataset.verify import find_faults
 
 COMMAND = [sys.executable, "-m", "evnlos"]
+TINY_RUN = ["train", "--epochs", "2", "--network.width", "8", "--network.depth", "2", "--network.shuffle", "1"]
+TINY_RUN += ["--precision", "float32"]
 
 
 @pytest.fixture
@@ -32,6 +36,14 @@ def settings(tiny, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("settings") / "tiny.yaml"
     save_yaml(tiny, path)
     return path
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tiny_dataset, tmp_path_factory) -> Path:
+    """A training that nobody disturbed."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    main([*TINY_RUN, "--data", str(tiny_dataset.folder), "--out", str(out)])
+    return out
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
@@ -189,3 +201,90 @@ def test_ctrl_c_ends_all_processes_within_seconds(settings, tmp_path) -> None:
     while alive(process.pid) and time.monotonic() - began < 20:
         time.sleep(0.1)
     assert not alive(process.pid)
+
+
+DIES = """
+import os, signal, sys
+from pathlib import Path
+from evnlos.cli import main
+left, rename = int(sys.argv[1]), Path.replace
+def dying(path, target):
+    global left
+    left -= 1
+    if not left:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return rename(path, target)
+Path.replace = dying
+main(sys.argv[2:])
+"""
+"""A command that is killed just before its n-th file gets its name: the worst moment there is."""
+
+
+def dies_at(rename: int, arguments: list[str]) -> None:
+    """Run a command until kill -9 at its n-th rename."""
+    run = subprocess.run(
+        [sys.executable, "-c", DIES, str(rename), *arguments], capture_output=True, text=True, timeout=120
+    )
+    assert run.returncode == -signal.SIGKILL, run.stderr
+
+
+@pytest.mark.parametrize("rename", [1, 2, 4])
+def test_a_killed_import_ends_with_the_same_bytes(rename: int, tiny_captures, tmp_path) -> None:
+    arguments = ["import", *map(str, tiny_captures), "--sampling.height", "32", "--sampling.width", "48"]
+    arguments += ["--sampling.scored-rows", "24", "--test", "4", "--out"]
+    main([*arguments, str(tmp_path / "whole")])
+    dies_at(rename, [*arguments, str(tmp_path / "killed")])
+    assert len(list((tmp_path / "killed").glob("*.h5"))) == max(0, rename - 2)
+    main([*arguments, str(tmp_path / "killed")])
+    for part in ("", "checks"):
+        whole = {
+            path.name: path.read_bytes() for path in (tmp_path / "whole" / part).iterdir() if path.is_file()
+        }
+        again = {
+            path.name: path.read_bytes() for path in (tmp_path / "killed" / part).iterdir() if path.is_file()
+        }
+        assert whole == again
+    assert len(list((tmp_path / "killed").glob("*.h5"))) == 4
+
+
+@pytest.mark.parametrize(("rename", "epochs"), [(1, 0), (2, 0), (3, 1), (4, 1), (5, 2), (6, 2)])
+def test_a_killed_training_ends_with_the_same_bytes(rename, epochs, tiny_dataset, tiny_run, tmp_path) -> None:
+    """Renames: run.yaml, then checkpoint and metrics of each of the two epochs, then the weights."""
+    arguments = [*TINY_RUN, "--data", str(tiny_dataset.folder), "--out", str(tmp_path / "killed")]
+    dies_at(rename, arguments)
+    assert not (tmp_path / "killed" / "weights.safetensors").exists()
+    if epochs:
+        metrics = tmp_path / "killed" / "metrics.jsonl"
+        assert (len(metrics.read_text().splitlines()) if metrics.exists() else 0) == (rename - 2) // 2
+    main(arguments)
+    whole, killed = bytes_of(tiny_run), bytes_of(tmp_path / "killed")
+    assert set(whole) == set(killed) == {"run.yaml", "metrics.jsonl", "weights.safetensors"}
+    assert whole["weights.safetensors"] == killed["weights.safetensors"]
+    assert whole["run.yaml"] == killed["run.yaml"]
+    lines = [
+        [{**json.loads(line), "seconds": 0} for line in files["metrics.jsonl"].splitlines()]
+        for files in (whole, killed)
+    ]
+    assert lines[0] == lines[1]
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".raw", ".csv", ".npz", ".aedat4"])
+def test_a_killed_conversion_ends_with_the_same_bytes(suffix: str, tmp_path) -> None:
+    draw = np.random.default_rng(0)
+    count = 5000
+    events = Events(
+        np.sort(draw.integers(0, 10**6, count)),
+        draw.integers(0, 64, count),
+        draw.integers(0, 48, count),
+        draw.integers(0, 2, count).astype(bool),
+        width=64,
+        height=48,
+    )
+    write_events(tmp_path / "in.raw", events, format="EVT2")
+    whole, killed = tmp_path / f"whole{suffix}", tmp_path / "b" / f"whole{suffix}"
+    killed.parent.mkdir()
+    main(["convert", str(tmp_path / "in.raw"), str(whole)])
+    dies_at(1, ["convert", str(tmp_path / "in.raw"), str(killed)])
+    assert not killed.exists()
+    main(["convert", str(tmp_path / "in.raw"), str(killed)])
+    assert killed.read_bytes() == whole.read_bytes()

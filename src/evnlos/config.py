@@ -20,6 +20,25 @@ from evnlos.errors import ConfigError
 T = TypeVar("T")
 
 
+class _Loader(yaml.SafeLoader):
+    """Plain YAML without aliases: with them, a few lines of a stranger's file stand for more than memory."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.composer.ComposerError(
+                None, None, "an alias (*name) stands here; write the value out", mark
+            )
+        return super().compose_node(parent, index)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes a value that occurs twice twice, so that `_Loader` takes it."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Return a configuration dataclass as plain nested dictionaries, lists and scalars.
 
@@ -75,12 +94,12 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except FileNotFoundError:
         raise ConfigError(f"{path} does not exist; give the path of a YAML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} can't be read as a YAML file: {error}") from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path} is not valid YAML: {reason}") from None
     if not isinstance(values, dict):
@@ -91,7 +110,8 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 def save_yaml(config: Any, path: str | Path) -> None:
     """Write a configuration dataclass (or a plain mapping) as YAML, atomically."""
     values = to_dict(config) if dataclasses.is_dataclass(config) else config
-    write_atomically(path, yaml.safe_dump(values, sort_keys=False, allow_unicode=True).encode())
+    text = yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+    write_atomically(path, text.encode())
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:

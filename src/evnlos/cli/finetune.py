@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from evnlos.cli.console import Flat, train_with_bar
+from evnlos.cli.console import Flat
+from evnlos.cli.train import fit
+from evnlos.dataset import open_dataset
 from evnlos.training import Training, paper_finetuning
 
 PRESETS = {"default": Training, "paper": paper_finetuning}
@@ -29,4 +31,4 @@ class Command:
 
     def run(self) -> None:
         """Train, with a progress bar over the epochs."""
-        train_with_bar(self.data, self.settings, self.out, self.weights)
+        fit(open_dataset(self.data), self.settings, self.out, self.weights)

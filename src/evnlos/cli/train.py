@@ -1,12 +1,19 @@
-"""`evnlos train`: dataset in, run out."""
+"""`evnlos train`: dataset or simulation in, run out."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from evnlos.cli.console import Flat, train_with_bar
-from evnlos.training import Training, paper_pretraining
+from tqdm import tqdm
+
+from evnlos.cli.console import Flat, say
+from evnlos.config import load_yaml
+from evnlos.dataset import Dataset, Simulation, live_dataset, open_dataset
+from evnlos.errors import ConfigError
+from evnlos.training import Training, paper_pretraining, train
 
 PRESETS = {"default": Training, "paper": paper_pretraining}
 
@@ -15,10 +22,15 @@ PRESETS = {"default": Training, "paper": paper_pretraining}
 class Command:
     """Train a network from random weights: pre-training on a simulation, or end to end (E2E) on captures."""
 
-    data: Path
-    """Folder of the dataset."""
     out: Path
     """Folder of the run; new, or begun with the same settings."""
+    data: Path | None = None
+    """Folder of the dataset."""
+    simulate: Path | None = None
+    """YAML file with the settings of a simulation, instead of --data: samples are made while the network
+    trains, other ones in each epoch, and nothing is stored."""
+    workers: int = 1
+    """Processes that simulate beside the training, for --simulate; 0 = one for each core."""
     preset: str = "default"
     """`default`, or `paper` for the paper's 200 epochs, step sizes and loss."""
     config: Path | None = None
@@ -27,4 +39,32 @@ class Command:
 
     def run(self) -> None:
         """Train, with a progress bar over the epochs."""
-        train_with_bar(self.data, self.settings, self.out, None)
+        if (self.data is None) == (self.simulate is None):
+            raise ConfigError("give --data DATASET or --simulate SETTINGS.yaml, one of the two")
+        if self.data is not None:
+            fit(open_dataset(self.data), self.settings, self.out, None)
+        else:
+            assert self.simulate is not None
+            config = load_yaml(Simulation, self.simulate)
+            fit(live_dataset(config, self.workers), self.settings, self.out, None)
+
+
+def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None) -> None:
+    """Train with a progress bar over the epochs, and warn of a network that ignores its input.
+
+    Of several processes that `torchrun` started, only the first speaks.
+    """
+    quiet = int(os.environ.get("RANK", "0")) > 0
+    record: dict[str, Any] = {}
+    records = train(dataset, settings, out, weights)
+    with tqdm(records, total=settings.epochs, desc=out.name, unit="epoch", disable=quiet) as bar:
+        for record in bar:
+            bar.set_postfix({key: record[key] for key in ("loss", "psnr_db") if key in record})
+    if quiet:
+        return
+    if record.get("collapsed"):
+        say(
+            f"warning: the network answers the same to every input ({record['psnr_db']} dB; all-black has "
+            f"{record['zero_db']} dB): it has collapsed; use --loss balanced, or train for more epochs"
+        )
+    print(f"{out}: {record['epoch']} epochs, loss {record['loss']}, weights in {out / 'weights.safetensors'}")

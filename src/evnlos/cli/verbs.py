@@ -8,6 +8,7 @@ from types import ModuleType
 VERBS: dict[str, str] = {
     "demo": "demo",
     "simulate": "simulate",
+    "capture": "capture",
     "import": "importing",
     "verify": "verify",
     "lab": "lab",
@@ -15,14 +16,18 @@ VERBS: dict[str, str] = {
     "train": "train",
     "finetune": "finetune",
     "evaluate": "evaluate",
+    "experiment": "experiment",
     "identify": "identify",
     "reconstruct": "reconstruct",
     "invert": "invert",
+    "track": "track",
     "report": "report",
     "events": "events",
     "info": "info",
     "convert": "convert",
     "preview": "preview",
+    "cite": "cite",
+    "doctor": "doctor",
 }
 """The module of each verb in `evnlos.cli`; it holds `Command`, and `PRESETS` where settings have presets."""
 

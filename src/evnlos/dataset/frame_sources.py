@@ -35,10 +35,14 @@ class FrameSeries:
 
 def inside(folder: Path, name: str) -> Path:
     """Return the path of a file or folder of the capture; a name never leads out of its folder."""
-    path = (folder / name).resolve()
+    try:
+        path = (folder / name).resolve()
+        there = path.exists()
+    except (OSError, ValueError) as error:
+        raise DataError(f"{folder}: {name[:80]!r} is no name of a file ({error})") from None
     if not path.is_relative_to(folder.resolve()):
         raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
-    if not path.exists():
+    if not there:
         raise DataError(f"{path} does not exist; {folder / 'capture.yaml'} names it")
     return path
 
@@ -51,7 +55,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
                 wide, high = image.size
                 raise DataError(f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}")
             array = np.asarray(image if image.mode.startswith("I;16") else image.convert("L"))
-    except (UnidentifiedImageError, OSError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise DataError(f"{path} can't be read as a picture: {error}") from None
     return array
 
@@ -111,8 +115,11 @@ def _from_video(path: Path, info: CaptureInfo) -> FrameSeries:
 
 
 def _from_table(folder: Path, path: Path, size: tuple[int, int] | None) -> FrameSeries:
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path} can't be read as a table: {error}") from None
     if not rows or not {"t_us", "file"} <= rows[0].keys():
         raise DataError(f"{path} holds no frames; give a header 't_us,file' and one line a frame")
     try:

@@ -75,6 +75,14 @@ class NlosDataset(torch.utils.data.Dataset):
     def __len__(self) -> int:
         return len(self.inputs)
 
+    def bytes(self) -> int:
+        """Return the size of inputs and truth, bytes."""
+        return self.inputs.nbytes + self.truth.nbytes
+
+    def to(self, device: torch.device) -> None:
+        """Move inputs and truth to a device, where batches are then cut without a copy from main memory."""
+        self.inputs, self.truth = self.inputs.to(device), self.truth.to(device)
+
     def __getitem__(self, index: int | Tensor | slice) -> tuple[Tensor, Tensor]:
         """Return one sample, or a batch for a tensor of indices."""
         return self.inputs[index].float(), self.truth[index].unsqueeze(-3).float()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -54,6 +55,39 @@ def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
+
+
+def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+    """Run `function` on each task ahead of its use and yield the results in the order of the tasks.
+
+    Args:
+        function: A picklable function of one task.
+        tasks: The tasks.
+        workers: Processes; 1 runs each task in this process when its result is asked for, 0 means one a core.
+
+    Raises:
+        EvnlosError: A worker died; other errors pass through.
+    """
+    pending = list(tasks)
+    workers = min(workers or os.cpu_count() or 1, len(pending))
+    if workers <= 1:
+        yield from map(function, pending)
+        return
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _quiet_threads)
+    try:
+        flying: deque[Future] = deque()
+        for task in pending:
+            flying.append(pool.submit(function, task))
+            if len(flying) >= 2 * workers:
+                yield flying.popleft().result()
+        while flying:
+            yield flying.popleft().result()
+    except BrokenProcessPool:
+        raise EvnlosError(
+            "a worker process died (killed, or out of memory?); run the command again with fewer --workers"
+        ) from None
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _drain(

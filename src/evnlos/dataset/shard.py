@@ -16,6 +16,9 @@ from evnlos.types import Events
 
 SUFFIX = ".h5"
 _MAPS = ("frame", "surface", "truth")
+_AXES = {"frame": 3, "surface": 4, "truth": 3, "time_s": 1, "position_m": 2, "event_count": 1}
+_DEFLATE = 1032  # no compressed byte holds more
+_MOST_BYTES = 4 << 30
 
 
 def write_shard(path: str | Path, samples: Samples, attributes: dict, events: Events | None = None) -> None:
@@ -68,16 +71,18 @@ def _put(file: h5py.File, name: str, values: np.ndarray, chunks: tuple[int, ...]
 def read_shard(path: str | Path) -> tuple[Samples, dict]:
     """Read a shard's samples and its attributes; every checksum is verified on the way.
 
+    A shard may be a stranger's: no other file is read, and memory is taken only for what this one can hold.
+
     Raises:
         DataError: The file is missing, is not a shard, or a checksum does not fit.
     """
     try:
         with h5py.File(path, "r") as file:
-            found = {name: _array(file, name) for name in (*_MAPS, "time_s", "position_m", "event_count")}
+            found = {name: _array(file, name, axes) for name, axes in _AXES.items()}
             attributes = {key: _plain(value) for key, value in file.attrs.items()}
     except FileNotFoundError:
         raise DataError(f"{path} does not exist; run the command that made the dataset again") from None
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
         raise DataError(
             f"{path} is damaged ({_one_line(error)}); delete it and run the command again"
         ) from None
@@ -86,22 +91,47 @@ def read_shard(path: str | Path) -> tuple[Samples, dict]:
         raise DataError(
             f"{path} is not a shard: it lacks a map or its times; delete it and run the command again"
         )
-    truth = found["truth"]
+    truth, position_m = found["truth"], found["position_m"]
+    maps = (len(time_s), *frame.shape[1:])
+    if (
+        frame.shape != maps
+        or surface.shape != (maps[0], 2, *maps[1:])
+        or (truth is not None and truth.shape != maps)
+        or (position_m is not None and position_m.shape != (maps[0], 2))
+        or count.shape != time_s.shape
+    ):
+        raise DataError(
+            f"{path} contradicts itself: its maps are of different numbers or sizes; make the dataset again"
+        )
     samples = Samples(
         frame=frame.astype(np.float32),
         surface=surface.astype(np.float32),
         truth=None if truth is None else truth.astype(np.float32),
         time_s=time_s,
-        position_m=found["position_m"],
+        position_m=position_m,
         event_count=count,
     )
     return samples, attributes
 
 
-def _array(file: h5py.File, name: str) -> NDArray | None:
-    """Return a dataset's values, or None where the file has none of that name."""
-    node = file.get(name)
-    return node[()] if isinstance(node, h5py.Dataset) else None
+def _array(file: h5py.File, name: str, axes: int) -> NDArray | None:
+    """Return a dataset's values, or None where the file has none of that name.
+
+    Raises:
+        ValueError: The values lie outside the file, are no numbers, or are more than the file can hold.
+    """
+    link = file.get(name, getlink=True)
+    if link is None:
+        return None
+    node = file[name] if isinstance(link, h5py.HardLink) else None
+    if not isinstance(node, h5py.Dataset) or node.external or node.is_virtual:
+        raise ValueError(f"{name} is not stored in this file")
+    if node.dtype.kind not in "fiu" or node.ndim != axes:
+        raise ValueError(f"{name} is {node.dtype} with {node.ndim} axes")
+    size, stored = node.size * node.dtype.itemsize, node.id.get_storage_size()
+    if size > min(_DEFLATE * stored, _MOST_BYTES):
+        raise ValueError(f"{name} claims {size} bytes and stores {stored}")
+    return node[()]
 
 
 def _plain(value: object) -> object:

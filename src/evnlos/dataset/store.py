@@ -103,18 +103,30 @@ def open_dataset(folder: str | Path) -> Dataset:
         )
     values = read_yaml(path)
     try:
-        split = {str(key): [str(name) for name in names] for key, names in values["split"].items()}
+        split = {str(key): list(names) for key, names in values["split"].items()}
         sampling = from_dict(Sampling, values["sampling"], source=str(path))
-        origin, version = str(values["origin"]), str(values["version"])
+        origin, version = values["origin"], values["version"]
     except (KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path} lacks or garbles {error}; make the dataset again") from None
     names = [name for group in split.values() for name in group]
+    if not all(isinstance(name, str) for name in names):
+        raise DataError(f"{path}: an object's name is no text; make the dataset again")
     if len(names) != len(set(names)):
         raise DataError(f"{path}: an object stands in two splits; each belongs to exactly one")
-    if any("/" in name or "\\" in name or name.startswith(".") for name in names):
+    if not all(_is_plain(name) for name in names):
         raise DataError(f"{path}: an object's name leads out of the folder; names are plain file names")
     settings, key, optics = values.get("config", {}), values.get("config_hash", ""), values.get("optics", {})
+    plain = all(isinstance(text, str) for text in (origin, version, key))
+    if not (plain and isinstance(settings, dict) and isinstance(optics, dict)):
+        raise DataError(f"{path} garbles origin, version or settings; make the dataset again")
     return Dataset(folder, origin, sampling, split, settings, key, optics, version)
+
+
+def _is_plain(name: str) -> bool:
+    """Return whether a name can only be a file of the folder itself: no path, no drive, nothing hidden."""
+    return name.isprintable() and not (
+        set(name[:200]) & set("/\\") or name[:1] in ("", ".") or name[1:2] == ":"
+    )
 
 
 def _content(dataset: Dataset) -> dict[str, Any]:

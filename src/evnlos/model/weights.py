@@ -72,32 +72,45 @@ def load_weights(path: str | Path) -> Weights:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("evnlos", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path} is not a readable safetensors file: {' '.join(str(error).split())}") from None
-    if about.get("format") != _FORMAT:
-        raise DataError(f"{path} holds {about.get('format', 'no format')!r}; give weights of format {_FORMAT}")
-    if about.get("paradigm") not in CHANNELS:
-        raise DataError(
-            f"{path} names the paradigm {about.get('paradigm')!r}; give one of {', '.join(CHANNELS)}"
-        )
-    config = from_dict(UNetConfig, about["network"], source=str(path))
-    _refuse_oversized(config, tensors, path)
+    if not isinstance(about, dict) or about.get("format") != _FORMAT:
+        found = about.get("format", "no format") if isinstance(about, dict) else about
+        raise DataError(f"{path} holds {str(found)[:40]!r}; give weights of format {_FORMAT}")
+    paradigm, sampling, history = about.get("paradigm"), about.get("sampling", {}), about.get("history", [])
+    if not isinstance(paradigm, str) or paradigm not in CHANNELS:
+        raise DataError(f"{path} names the paradigm {str(paradigm)[:40]!r}; give one of {', '.join(CHANNELS)}")
     mean_image = tensors.pop(_MEAN, None)
-    network = ResidualUNet(CHANNELS[about["paradigm"]], config)
+    if not (
+        isinstance(sampling, dict)
+        and isinstance(history, list)
+        and all(isinstance(step, dict) for step in history)
+        and (mean_image is None or mean_image.ndim == 2)
+    ):
+        raise DataError(f"{path} garbles its sampling, its history or its mean picture; the file is damaged")
+    config = from_dict(UNetConfig, about.get("network"), source=str(path))  # type: ignore[arg-type]
+    network = _matching_network(CHANNELS[paradigm], config, tensors, path)
+    network.load_state_dict({name: value.float() for name, value in tensors.items()})
+    return Weights(network.eval(), paradigm, sampling, history, mean_image)
+
+
+def _matching_network(
+    channels: int, config: UNetConfig, tensors: dict[str, torch.Tensor], path: Path
+) -> ResidualUNet:
+    """Return an empty network of the size that the tensors have; a stranger's config alone takes no memory.
+
+    Raises:
+        DataError: The config does not describe the tensors.
+    """
+    wanted: dict[str, tuple[int, ...]] = {}
     try:
-        network.load_state_dict({name: value.float() for name, value in tensors.items()})
-    except RuntimeError as error:
-        raise DataError(f"{path} does not fit its own config: {' '.join(str(error).split())[:160]}") from None
-    return Weights(
-        network.eval(), about["paradigm"], about.get("sampling", {}), about.get("history", []), mean_image
-    )
-
-
-def _refuse_oversized(config: UNetConfig, tensors: dict[str, torch.Tensor], path: Path) -> None:
-    """A stranger's config must not make us allocate more than its own tensors prove."""
-    claimed, there = (
-        config.width * min(2**config.depth, 8),
-        max(max(t.shape, default=0) for t in tensors.values()),
-    )
-    if claimed > max(there, 1) or config.depth > 16 or config.blocks > 64:
-        raise DataError(f"{path} claims {claimed} channels but holds at most {there}; the file is damaged")
+        if config.depth * config.blocks <= len(tensors):  # each block has more than one tensor
+            with torch.device("meta"):
+                network = ResidualUNet(channels, config)
+            wanted = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    except (RuntimeError, OverflowError, MemoryError):
+        pass
+    found = {name: tuple(value.shape) for name, value in tensors.items()}
+    if wanted != found:
+        raise DataError(f"{path} does not fit its own config ({config}); the file is damaged")
+    return network.to_empty(device="cpu")

@@ -54,7 +54,12 @@ def _grown(column):
     return longer
 
 
-@njit(cache=True, error_model="numpy")
+# The functions of single events own no array. Without `_nrt=False` numba would count references to those that
+# they are handed, by locked instructions that cost a sixth of all.
+_owns_nothing = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+
+
+@_owns_nothing
 def _emit(out_time, out_pixel, out_on, count, time_s, pixel, on, jitter, window, seed, sent):
     """Append an event to the columns and return their fill; where they are full it is only counted."""
     if jitter > 0.0:
@@ -85,7 +90,7 @@ def _shot(seed, pixel, counter, intensity, rate_on, rate_off, rate_hot):
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@_owns_nothing
 def _piece(
     out_time, out_pixel, out_on, count, pixel, start, length, light_a, light_b, log_a, log_b, filtered,
     state, constants, jitter, window, drawn, sent,
@@ -165,7 +170,7 @@ def _piece(
     return count, arrival
 
 
-@njit(cache=True, error_model="numpy")
+@_owns_nothing
 def _step(
     out_time, out_pixel, out_on, count, pixel, start, stop, light_a, light_b, log_a, log_b, filtered,
     state, constants, jitter, window, drawn, sent,

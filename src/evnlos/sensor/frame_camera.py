@@ -120,12 +120,14 @@ class FrameCamera:
         nodes = _GAUSS[3 if self.exposure_s > 0 else 1]
         height, width = wall.shape
         frames = np.empty((len(times), height, width), np.uint8 if self.bit_depth == 8 else np.uint16)
+        seed = check_seed(seed)
+        pattern = self.fixed_pattern((height, width), seed)
         for n, time in enumerate(times):
             instants = np.array([time + 0.5 * self.exposure_s * offset for offset, _ in nodes])
             light = wall.irradiance(instants).detach().to("cpu", torch.float64)  # [Q, H, W]
             weights = torch.tensor([weight for _, weight in nodes], dtype=torch.float64)
             mean = torch.einsum("q,qhw->hw", weights, light).numpy()
-            frames[n] = self.expose(mean[None], seed=seed, first_frame=n)[0]
+            frames[n] = self._frame(_checked(mean), seed, n, pattern)
         return frames
 
     def expose(
@@ -149,20 +151,29 @@ class FrameCamera:
         light = np.asarray(irradiance, dtype=np.float64)
         if light.ndim != 3:
             raise DataError(f"irradiance has shape {light.shape}; give [N, H, W]")
-        if light.size and not (np.isfinite(light).all() and light.min() >= 0):
-            raise DataError("irradiance holds NaN, infinity or negative light; give at least 0, 1.0 = white")
+        _checked(light)
         seed = check_seed(seed)
-        sensitivity, offset_e = self.fixed_pattern(light.shape[1:], seed)  # type: ignore[arg-type]
+        pattern = self.fixed_pattern(light.shape[1:], seed)  # type: ignore[arg-type]
         frames = np.empty(light.shape, np.uint8 if self.bit_depth == 8 else np.uint16)
         for n, image in enumerate(light):
-            draw = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, 1, first_frame + n])))
-            mean_e = np.maximum(self.full_well_e * sensitivity * image, 0.0)
-            electrons = draw.poisson(mean_e) + offset_e
-            if self.read_noise_e > 0:
-                electrons += self.read_noise_e * draw.standard_normal(image.shape)
-            span = (self.white - self.black_level) * self.gain / self.full_well_e
-            frames[n] = np.clip(np.rint(self.black_level + span * electrons), 0, self.white)
+            frames[n] = self._frame(image, seed, first_frame + n, pattern)
         return frames
+
+    def _frame(
+        self,
+        image: NDArray[np.float64],
+        seed: int,
+        number: int,
+        pattern: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Return the digital numbers of one frame, light [H, W], as whole float64."""
+        sensitivity, offset_e = pattern
+        draw = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, 1, number])))
+        electrons = draw.poisson(np.maximum(self.full_well_e * sensitivity * image, 0.0)) + offset_e
+        if self.read_noise_e > 0:
+            electrons += self.read_noise_e * draw.standard_normal(image.shape)
+        span = (self.white - self.black_level) * self.gain / self.full_well_e
+        return np.clip(np.rint(self.black_level + span * electrons), 0, self.white)
 
     def fixed_pattern(
         self, shape: tuple[int, int], seed: int = 0
@@ -177,3 +188,10 @@ class FrameCamera:
         draw = np.random.Generator(np.random.Philox(np.random.SeedSequence([own, 0])))
         sensitivity = np.maximum(1.0 + self.prnu * draw.standard_normal(shape), 0.0)
         return sensitivity, self.dsnu_e * draw.standard_normal(shape)
+
+
+def _checked(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return light, refusing what is none."""
+    if light.size and not (np.isfinite(light).all() and light.min() >= 0):
+        raise DataError("irradiance holds NaN, infinity or negative light; give at least 0, 1.0 = white")
+    return light

@@ -43,17 +43,46 @@ def load_checkpoint(
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()["evnlos"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        epoch, log, their_key = int(about["epoch"]), [dict(line) for line in about["log"]], about["key"]
+        if their_key == key:
+            weights = {name[8:]: value for name, value in tensors.items() if name.startswith("network.")}
+            state = _optimiser_state(tensors, optimiser)
+            network.load_state_dict(weights)
+            optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+    except (
+        SafetensorError,
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        RuntimeError,
+    ) as error:
         raise DataError(
-            f"{path} is damaged ({' '.join(str(error).split())}); delete it to start afresh"
+            f"{path} is damaged ({' '.join(str(error).split())[:160]}); delete it to start afresh"
         ) from None
-    if about["key"] != key:
+    if their_key != key:
         raise DataError(f"{path} belongs to a training with other settings; give another --out")
-    network.load_state_dict({name[8:]: value for name, value in tensors.items() if name.startswith("network.")})
+    return epoch, log
+
+
+def _optimiser_state(
+    tensors: dict[str, torch.Tensor], optimiser: torch.optim.Adam
+) -> dict[int, dict[str, torch.Tensor]]:
+    """Return the optimiser's state, each tensor laid out in memory as its parameter is.
+
+    Another layout would be added up in another order, and the training would not end with the same bytes.
+    """
+    trained = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, torch.Tensor]] = {}
     for name, value in tensors.items():
-        if name.startswith("optimiser."):
-            _, index, field = name.split(".")
-            state.setdefault(int(index), {})[field] = value
-    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
-    return about["epoch"], about["log"]
+        if not name.startswith("optimiser."):
+            continue
+        _, index, field = name.split(".")
+        parameter = trained[int(index)]
+        if value.ndim and value.shape != parameter.shape:
+            raise ValueError(f"{name} is {tuple(value.shape)}, not {tuple(parameter.shape)}")
+        if value.ndim:
+            value = torch.empty_like(parameter, requires_grad=False).copy_(value)
+        state.setdefault(int(index), {})[field] = value
+    return state

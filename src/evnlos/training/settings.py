@@ -38,6 +38,8 @@ class Training:
     """Parts of the network whose weights stay as they are."""
     precision: Literal["auto", "bf16", "float32"] = "auto"
     """Arithmetic of the convolutions; `auto` takes bf16 where the processor has it."""
+    compile: bool = False
+    """Let torch.compile fuse the network's operations: minutes at the start; for long trainings on a GPU."""
     network: UNetConfig = field(default_factory=UNetConfig)
     """Size of the network (fine-tuning keeps that of its weights)."""
     seed: int = 0

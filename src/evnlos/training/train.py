@@ -6,25 +6,30 @@ import json
 import platform
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.data import TensorDataset
 
 from evnlos.claim import claim, is_empty
 from evnlos.config import config_hash, differing_keys, read_yaml, save_yaml, to_dict, write_atomically
-from evnlos.dataset import CHANNELS, Dataset, NlosDataset
+from evnlos.dataset import CHANNELS, Dataset, LiveDataset, NlosDataset
 from evnlos.errors import DataError
 from evnlos.metrics import psnr
 from evnlos.model import ResidualUNet, Weights, load_weights, save_weights
 from evnlos.seeds import derive_seed
 from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
-from evnlos.training.loss import LOSSES
+from evnlos.training.loss import LOSSES, light_of
 from evnlos.training.settings import Training, step_size
+from evnlos.training.source import Live, Source, Stored
+from evnlos.training.team import Team, team
 from evnlos.version import __version__
 
+HeldOut = NlosDataset | TensorDataset
 _PARTS = {"encoder": ("stem", "encoder", "down"), "latent": ("latent",), "decoder": ("up", "decoder", "head")}
 
 
@@ -36,16 +41,19 @@ def train(
     From random weights this is pre-training (on simulation) or the end-to-end baseline (on captures);
     from `weights` it is fine-tuning. The run's folder holds `run.yaml` (settings, data, versions),
     `metrics.jsonl`, a checkpoint after each epoch, and in the end `weights.safetensors`. A run that was
-    killed goes on when it is started again, and ends with the same bytes.
+    killed goes on when it is started again, and ends with the same bytes. Processes that `torchrun` started
+    share each batch: the gradient is that of one process, up to the order of its sums.
 
     Args:
-        dataset: Where the samples are; its split `validation` is scored each epoch where there is one.
+        dataset: Where the samples are, or a simulation that makes them meanwhile; the split `validation` is
+            scored each epoch where there is one.
         settings: What decides the training.
         out: The run's folder; new, or begun with the same settings.
         weights: Weights (or a run) to start from.
 
     Yields:
-        Records with epoch, loss, learning_rate, seconds, and psnr_db, zero_db and collapsed of the validation.
+        Records with epoch, loss, learning_rate, seconds, and psnr_db, zero_db and collapsed of the validation,
+        which the first process does.
 
     Raises:
         DataError: The folder holds another run, another process is at work in it, a sample is damaged, or
@@ -55,21 +63,31 @@ def train(
     start = load_weights(weights) if weights else None
     network, settings = _network(settings, start)
     about = _about(dataset, settings, start)
-    with claim(out):
-        _take_up(out, about)
-        yield from _epochs(network, dataset, settings, out, [*(start.history if start else []), about])
+    with team() as processes, claim(out) if processes.rank == 0 else nullcontext():
+        if processes.rank == 0:
+            _take_up(out, about)
+        processes.wait()
+        yield from _epochs(
+            network, dataset, settings, out, [*(start.history if start else []), about], processes
+        )
 
 
 def _epochs(
-    network: ResidualUNet, dataset: Dataset, settings: Training, out: Path, history: list[dict[str, Any]]
+    network: ResidualUNet,
+    dataset: Dataset,
+    settings: Training,
+    out: Path,
+    history: list[dict[str, Any]],
+    processes: Team,
 ) -> Iterator[dict[str, Any]]:
     """Run the epochs that are left, and write the weights after the last."""
+    checkpoint, metrics = out / "checkpoint.safetensors", out / "metrics.jsonl"
     if (out / "weights.safetensors").is_file():
-        for line in (out / "metrics.jsonl").read_text().splitlines():
+        for line in metrics.read_text().splitlines():
             yield json.loads(line)
         return
 
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device, leads = processes.device, processes.rank == 0
     network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     for part in settings.freeze:
         for name in _PARTS[part]:
@@ -79,50 +97,60 @@ def _epochs(
         raise DataError(f"freeze is {settings.freeze}; leave at least one part of the network to train")
     optimiser = torch.optim.Adam(trained, lr=settings.learning_rate)
     loss_of, half = LOSSES[settings.loss], _half(settings, device)
-    samples = NlosDataset(dataset, "train", settings.paradigm)
-    held_out = (
-        NlosDataset(dataset, "validation", settings.paradigm) if dataset.split.get("validation") else None
-    )
+    source = _source(dataset, settings, processes)
+    held_out = _held_out(dataset, settings, device) if leads else None
 
     done, log = 0, []
-    checkpoint, key = out / "checkpoint.safetensors", config_hash(settings)
+    key = config_hash(settings)
     if checkpoint.is_file():
         done, log = load_checkpoint(checkpoint, network, optimiser, key)
+        if leads:
+            _write_log(metrics, log)
         yield from log
+    processes.wait()  # nobody writes before all have read
+    joined = processes.joined(network)
+    run = torch.compile(joined) if settings.compile else joined
     for epoch in range(done, settings.epochs):
         began, rate, total = time.perf_counter(), 0.0, torch.zeros((), device=device)
         network.train()
-        order = torch.randperm(
-            len(samples), generator=torch.Generator().manual_seed(_order_seed(settings, epoch))
-        )
-        batches = order.split(settings.batch_size)
-        for step, batch in enumerate(batches):
-            rate = step_size(settings, epoch + step / len(batches))
+        for step, batch in enumerate(source.batches(epoch)):
+            rate = step_size(settings, epoch + step / source.steps)
             for group in optimiser.param_groups:
                 group["lr"] = rate
-            seen, truth = (part.to(device, non_blocking=True) for part in samples[batch])
+            seen, truth = (part.to(device, non_blocking=True) for part in (batch.seen, batch.truth))
+            light = processes.total(light_of(truth) * batch.share)
             with torch.autocast(device.type, torch.bfloat16, enabled=half):
-                image = network(seen.contiguous(memory_format=torch.channels_last))
-            loss = loss_of(image, truth)
+                image = run(seen.contiguous(memory_format=torch.channels_last))
+            loss = loss_of(image, truth, light) * batch.share
             optimiser.zero_grad(set_to_none=True)
-            loss.backward()
+            (loss * processes.size).backward()  # the mean over the processes is then the whole batch's gradient
             torch.nn.utils.clip_grad_norm_(trained, 1.0)
             optimiser.step()
-            total += loss.detach() * (len(batch) / len(samples))
-        record: dict[str, Any] = {"epoch": epoch + 1, "loss": round(float(total), 6), "learning_rate": rate}
+            total += loss.detach() * batch.weight
+        record: dict[str, Any] = {
+            "epoch": epoch + 1,
+            "loss": round(float(processes.total(total)), 6),
+            "learning_rate": rate,
+        }
         if held_out is not None:
             record |= _validate(network, held_out, dataset, device, half)
         record["seconds"] = round(time.perf_counter() - began, 2)
         log.append(record)
-        save_checkpoint(checkpoint, network, optimiser, epoch + 1, log, key)
-        write_atomically(out / "metrics.jsonl", "".join(json.dumps(line) + "\n" for line in log).encode())
+        if leads:
+            save_checkpoint(checkpoint, network, optimiser, epoch + 1, log, key)
+            _write_log(metrics, log)
         yield record
-    mean_image = samples.truth.float().mean(dim=0)  # [H, W]
-    done_weights = Weights(
-        network.cpu().eval(), settings.paradigm, to_dict(dataset.sampling), history, mean_image
-    )
-    save_weights(out / "weights.safetensors", done_weights)
-    checkpoint.unlink(missing_ok=True)
+    if leads:
+        done_weights = Weights(
+            network.cpu().eval(),
+            settings.paradigm,
+            to_dict(dataset.sampling),
+            history,
+            source.mean_image(),
+        )
+        save_weights(out / "weights.safetensors", done_weights)
+        checkpoint.unlink(missing_ok=True)
+    processes.wait()
 
 
 def _network(settings: Training, start: Weights | None) -> tuple[ResidualUNet, Training]:
@@ -135,8 +163,26 @@ def _network(settings: Training, start: Weights | None) -> tuple[ResidualUNet, T
     return start.network, settings
 
 
-def _order_seed(settings: Training, epoch: int) -> int:
-    return derive_seed(settings.seed, "order", epoch)
+def _source(dataset: Dataset, settings: Training, processes: Team) -> Source:
+    """Return where the training's batches come from."""
+    if isinstance(dataset, LiveDataset):
+        return Live(dataset, settings.paradigm, settings.batch_size, settings.seed, processes)
+    samples = NlosDataset(dataset, "train", settings.paradigm)
+    return Stored(samples, settings.batch_size, settings.seed, processes)
+
+
+def _held_out(dataset: Dataset, settings: Training, device: torch.device) -> HeldOut | None:
+    """Return the samples to validate on, or None where the dataset holds none out."""
+    if not dataset.split.get("validation"):
+        return None
+    if isinstance(dataset, LiveDataset):
+        made = dataset.stream(dataset.objects("validation"), 0, settings.paradigm, device)
+        return TensorDataset(*(torch.cat(parts) for parts in zip(*made, strict=True)))
+    return NlosDataset(dataset, "validation", settings.paradigm)
+
+
+def _write_log(path: Path, log: list[dict[str, Any]]) -> None:
+    write_atomically(path, "".join(json.dumps(line) + "\n" for line in log).encode())
 
 
 def _half(settings: Training, device: torch.device) -> bool:
@@ -188,7 +234,7 @@ def _take_up(out: Path, about: dict[str, Any]) -> None:
 
 @torch.inference_mode()
 def _validate(
-    network: ResidualUNet, held_out: NlosDataset, dataset: Dataset, device: torch.device, half: bool
+    network: ResidualUNet, held_out: HeldOut, dataset: Dataset, device: torch.device, half: bool
 ) -> dict[str, Any]:
     network.eval()
     scored = dataset.sampling.scored
@@ -197,7 +243,7 @@ def _validate(
         seen, truth = held_out[slice(first, first + 64)]
         with torch.autocast(device.type, torch.bfloat16, enabled=half):
             image: Tensor = network(seen.to(device)).cpu()
-        image, truth = image[..., scored, :], truth[..., scored, :]
+        image, truth = image[..., scored, :], truth[..., scored, :].cpu()
         values.append(psnr(image, truth))
         blanks.append(psnr(torch.zeros_like(truth), truth))
         spread.append(image.flatten(1))

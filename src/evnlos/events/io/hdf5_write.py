@@ -108,6 +108,7 @@ def _put_compact(file: h5py.File, name: str, value: int) -> None:
     """Store one number inside the object header, which has a checksum; a plain scalar has none."""
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     layout.set_layout(h5py.h5d.COMPACT)
+    layout.set_obj_track_times(False)  # the same events give the same bytes
     space = h5py.h5s.create(h5py.h5s.SCALAR)
     dataset = h5py.h5d.create(file.id, name.encode(), h5py.h5t.NATIVE_INT64, space, layout)
     dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.array(value, np.int64))

@@ -1,0 +1,127 @@
+"""Several processes train what one would: parts of a loss add up, and so do gradients under `torchrun`."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from evnlos import Training, UNetConfig, train
+from evnlos.dataset import NlosDataset, live_dataset
+from evnlos.errors import ConfigError
+from evnlos.training import LOSSES
+from evnlos.training.loss import light_of
+from evnlos.training.source import Live, Stored
+from evnlos.training.team import Team, team
+
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+SETTINGS = Training(
+    epochs=2,
+    batch_size=103,  # of 104 samples: in the second batch one process has no sample
+    network=UNetConfig(width=8, depth=2, shuffle=1),
+    precision="float32",
+)
+FLAGS = ["--batch-size", "103", "--precision", "float32"]
+FLAGS += ["--network.width", "8", "--network.depth", "2", "--network.shuffle", "1"]
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_the_losses_of_parts_add_up_with_their_gradients(name: str) -> None:
+    draw = torch.Generator().manual_seed(0)
+    image = torch.rand(5, 1, 24, 32, generator=draw, dtype=torch.float64).requires_grad_()
+    truth = (torch.rand(5, 1, 24, 32, generator=draw, dtype=torch.float64) > 0.9).double()
+    whole = LOSSES[name](image, truth)
+    (gradient,) = torch.autograd.grad(whole, image)
+    light = sum(light_of(truth[part]) * (len(truth[part]) / 5) for part in (slice(0, 2), slice(2, 5)))
+    parts = [
+        LOSSES[name](image[part], truth[part], light) * (len(truth[part]) / 5)
+        for part in (slice(0, 2), slice(2, 5))
+    ]
+    (pieces,) = torch.autograd.grad(sum(parts), image)
+    assert sum(parts).item() == pytest.approx(whole.item(), rel=1e-12)
+    torch.testing.assert_close(pieces, gradient, rtol=1e-10, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_the_parts_of_a_batch_are_the_batch_of_one_process(size: int, tiny_dataset) -> None:
+    samples = NlosDataset(tiny_dataset, "train", "frame")
+    cpu = torch.device("cpu")
+    alone = list(Stored(samples, 10, 3, Team(0, 1, cpu)).batches(1))
+    assert len(alone) == Stored(samples, 10, 3, Team(0, 1, cpu)).steps
+    assert sum(batch.weight for batch in alone) == pytest.approx(1)
+    shared = [list(Stored(samples, 10, 3, Team(rank, size, cpu)).batches(1)) for rank in range(size)]
+    for whole, *parts in zip(alone, *shared, strict=True):
+        assert sum(part.share for part in parts) == pytest.approx(1)
+        rows = torch.cat([part.truth for part in parts if part.share])
+        found = sorted(row.sum().item() for row in rows)
+        assert found == sorted(row.sum().item() for row in whole.truth)
+
+
+def test_two_processes_train_what_one_does_and_survive_a_kill(tiny_dataset, tmp_path) -> None:
+    log = list(train(tiny_dataset, SETTINGS, tmp_path / "one"))
+    command = [*TORCHRUN, "-m", "evnlos", "train", *FLAGS, "--epochs", "2"]
+    command += ["--data", str(tiny_dataset.folder), "--out"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    quiet = {"env": environment, "capture_output": True, "text": True, "timeout": 240}
+    done = subprocess.run([*command, str(tmp_path / "two")], **quiet)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("2 epochs") == 1  # one process speaks
+    records = [json.loads(line) for line in (tmp_path / "two" / "metrics.jsonl").read_text().splitlines()]
+    for one, two in zip(log, records, strict=True):
+        assert two["loss"] == pytest.approx(one["loss"], abs=2e-5)
+        assert two["psnr_db"] == pytest.approx(one["psnr_db"], abs=0.01)
+    one, two = (load_file(tmp_path / name / "weights.safetensors") for name in ("one", "two"))
+    moved = max((one[name] - two[name]).abs().max().item() for name in one)
+    assert moved < 1e-4
+
+    process = subprocess.Popen(
+        [*command, str(tmp_path / "killed")],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "killed" / "checkpoint.safetensors").exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "killed" / "weights.safetensors").exists()
+    again = subprocess.run([*command, str(tmp_path / "killed")], **quiet)
+    assert again.returncode == 0, again.stderr
+    two, killed = ((tmp_path / name / "weights.safetensors").read_bytes() for name in ("two", "killed"))
+    assert two == killed
+
+
+def test_a_training_without_torchrun_is_a_team_of_one(monkeypatch) -> None:
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    with team() as processes:
+        assert (processes.rank, processes.size) == (0, 1)
+        value = torch.ones(2)
+        assert processes.total(value) is value
+        network = torch.nn.Linear(1, 1)
+        assert processes.joined(network) is network
+    assert not torch.distributed.is_initialized()
+
+
+def test_processes_simulate_other_objects_each(tiny) -> None:
+    dataset = live_dataset(replace(tiny, positions=2))
+    cpu = torch.device("cpu")
+    with pytest.raises(ConfigError, match="batch_size that they divide"):
+        Live(dataset, "frame", 7, 0, Team(0, 2, cpu))
+    sides = [list(Live(dataset, "frame", 6, 0, Team(rank, 2, cpu)).batches(0)) for rank in (0, 1)]
+    # 13 objects: 6 each, one is left out; 2 samples each in batches of 3
+    assert [len(side) for side in sides] == [4, 4]
+    pictures = [np.concatenate([batch.truth.numpy() for batch in side]) for side in sides]
+    keys = [{picture.tobytes() for picture in side} for side in pictures]
+    assert len(keys[0]) == len(keys[1]) == 12
+    assert not keys[0] & keys[1]
+    for side in sides:
+        assert sum(batch.weight for batch in side) == pytest.approx(1)
