@@ -44,7 +44,7 @@ class FixedPattern:
                 f"{frames.shape[1]}; calibrate the camera that took them"
             )
         light = frames.astype(np.float32) / np.float32(peak) - self.offset
-        return light / np.maximum(self.sensitivity, np.float32(_LEAST))
+        return (light / np.maximum(self.sensitivity, _LEAST)).astype(np.float32)
 
     @property
     def digest(self) -> str:

@@ -64,7 +64,7 @@ def paper_comic_letters() -> Simulation:
 
 
 def paper_comic_digits() -> Simulation:
-    """Return the paper's third simulated test set: the 10 digits of the Comic face, smaller than the letters."""
+    """Return the paper's third simulated test set: the 10 digits of the Comic face, smaller than letters."""
     return _tested_on(FontGlyphs(characters=DIGITS))
 
 

@@ -102,15 +102,15 @@ def _matching_network(
     Raises:
         DataError: The config does not describe the tensors.
     """
-    wanted: dict[str, tuple[int, ...]] = {}
+    network = None
     try:
         if config.depth * config.blocks <= len(tensors):  # each block has more than one tensor
             with torch.device("meta"):
                 network = ResidualUNet(channels, config)
-            wanted = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     except (RuntimeError, OverflowError, MemoryError):
         pass
+    wanted = {} if network is None else {n: tuple(v.shape) for n, v in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in tensors.items()}
-    if wanted != found:
+    if network is None or wanted != found:
         raise DataError(f"{path} does not fit its own config ({config}); the file is damaged")
     return network.to_empty(device="cpu")
