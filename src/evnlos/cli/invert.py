@@ -1,4 +1,4 @@
-"""`evnlos invert`: a photograph of a wall and its geometry in, a picture of what is hidden out."""
+"""`evnlos invert`: a photograph, or captures of a calibrated rig, in; a picture of what is hidden out."""
 
 from __future__ import annotations
 
@@ -15,17 +15,36 @@ import tyro
 from evnlos.cli.console import say
 from evnlos.errors import ConfigError
 
+LAM_TIKHONOV, LAM_TV = 4.0, 0.3  # best on eight characters of one rig, docs/inversion.md
+
 
 @dataclass(frozen=True)
 class Command:
-    """Invert a photograph of a matte wall, with what stands in between as the aperture; nothing is learned."""
+    """Invert a photograph of a matte wall, or whole passes of captures, by the operator alone."""
 
-    file: Annotated[Path, tyro.conf.Positional]
-    """NPZ file with the wall's picture and the geometry; docs/inversion.md lists its keys."""
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --rig."""
+    rig: Path | None = None
+    """Rig file of the captures, as `evnlos calibrate` writes it."""
+    positions: tuple[int, ...] = ()
+    """Captures: how many of the frames 1, 2, ... to use, equally spaced; none = all, several = a curve."""
+    pattern: Path | None = None
+    """Captures: the camera's fixed pattern, to be removed; a file, or the folder of its calibrated rig."""
+    track: bool = False
+    """Captures: find the motion in the recording also where capture.yaml states it."""
+    static: float = 1.0
+    """Captures: standard deviation of a pixel's constant offset over that of its noise."""
+    cells: int = 24
+    """Captures: cells a side of the plate."""
+    columns: int = 64
+    """Captures: columns to which frames are reduced, pixels."""
+    subsets: int = 1
+    """Captures: choices of so many positions to average the scores over."""
     solver: Literal["all", "tikhonov", "tv"] = "all"
     """Smooth (`tikhonov`), sharp and not below 0 (`tv`), or both and, as a control, without the occluders."""
     lam: str = "cv"
-    """Weight of the prior: `cv`, `gcv` (tikhonov only), `discrepancy`, or a number (operator's norm = 1)."""
+    """Weight of the prior: `cv`, `gcv` (tikhonov only), `discrepancy`, or a number (operator's norm = 1);
+    captures: `gcv`, or a number in units of the noise's variance (by default 4 for tikhonov, 0.3 for tv)."""
     noise_sigma: float | None = None
     """Noise of a wall sample over the largest, for `discrepancy`; by default it is estimated."""
     background_degree: int | None = None
@@ -43,6 +62,13 @@ class Command:
 
     def run(self) -> None:
         """Invert, print the figures, write the picture."""
+        if self.rig is not None:
+            self._invert_captures(self.rig)
+            return
+        if len(self.files) != 1 or self.files[0].is_dir():
+            raise ConfigError(
+                f"{len(self.files)} paths without --rig; give one NPZ file, or capture folders and their --rig"
+            )
         from evnlos.plot.inversion import draw_inversion
         from evnlos.solver import prepare_inversion, read_photograph
 
@@ -52,7 +78,7 @@ class Command:
         # Matrices of a thousand rows: threads that wait for each other cost more than they save.
         torch.set_num_threads(1)
         clock = time.perf_counter()
-        photograph = read_photograph(self.file, self.emission_exponent)
+        photograph = read_photograph(self.files[0], self.emission_exponent)
         occluded = bool(photograph.occluders) and not self.no_occluder
         options = {"occluded": occluded, "bin": self.bin}
         inversion = prepare_inversion(photograph, degree=self.background_degree, **options)
@@ -64,7 +90,7 @@ class Command:
             control = prepare_inversion(photograph, degree=inversion.degree, **options)
             solved["without occluder"] = control.solve("tikhonov", lam, rule, self.noise_sigma)
         found: dict[str, Any] = {
-            "file": str(self.file),
+            "file": str(self.files[0]),
             "wall": list(inversion.operator.shape),
             "background_degree": inversion.degree,
             "solutions": {},
@@ -86,6 +112,40 @@ class Command:
         np.savez(self.out.with_suffix(".npz"), **arrays)
         found["seconds"] = round(time.perf_counter() - clock, 1)
         print(json.dumps(found) if self.json else to_text(found))
+
+    def _invert_captures(self, rig: Path) -> None:
+        from evnlos.cli.invert_pass import PassOptions, invert_captures, print_pass
+        from evnlos.plot.inversion import draw_inversion
+
+        torch.set_num_threads(1)
+        lam: dict[str, float | None] = {"tikhonov": LAM_TIKHONOV, "tv": LAM_TV}
+        if self.lam == "gcv" and self.solver != "tikhonov":
+            raise ConfigError("--lam gcv serves --solver tikhonov only; give a number, or leave --lam out")
+        if self.lam != "cv":
+            number, rule = _weight(self.lam)
+            if number is None and rule != "gcv":
+                raise ConfigError(f"--lam is {self.lam!r}; with captures give gcv or a number")
+            lam = dict.fromkeys(lam, number)
+        solvers = tuple(lam) if self.solver == "all" else (self.solver,)
+        options = PassOptions(
+            rig,
+            self.positions,
+            self.pattern,
+            self.track,
+            solvers,
+            lam,
+            self.cells,
+            self.columns,
+            self.static,
+            self.subsets,
+        )
+        found, pictures = invert_captures(self.files, options)
+        most = max(row["positions"] for row in found["rows"])
+        best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
+        found["picture"] = str(draw_inversion(self.out, [(name, image[None]) for name, image in best.items()]))
+        arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
+        np.savez(self.out.with_suffix(".npz"), **arrays)
+        print_pass(found, self.json)
 
 
 def correlation(image: torch.Tensor, truth: torch.Tensor) -> float:

@@ -1,0 +1,80 @@
+"""How exactly does a recording tell the hidden object's motion, against the path, the wall and the light?
+
+    python benchmarks/tracking.py            # all, minutes
+    python benchmarks/tracking.py curve      # the paths whose name starts so
+
+Simulated passes of a handwritten letter at 0.3 m, 48 x 32 pixels, 21 frames in 8 s. Error of the position: root
+mean square about its mean, in stroke widths; of the speed: root mean square over the true speed's, per cent;
+"frames": without events.
+"""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from evnlos.errors import EvnlosError
+from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion, Scene
+from evnlos.scene.distance import signed_distance
+from evnlos.sensor import EventCamera, EventPixel, FrameCamera
+from evnlos.tracking import Tracking, track_frames
+from evnlos.transport import RadiometricTransport
+
+SENSOR, SECONDS, FRAMES = (32, 48), 8.0, 21
+PIXEL = EventPixel(0.18, 0.21, 0.04, 40.0, 0.0, 0.3, 0.0)
+CAMERA = FrameCamera(exposure_s=0.016, full_well_e=10_000.0, read_noise_e=48.0, prnu=0.02, dsnu_e=38.0)
+RIG = RadiometricTransport(
+    cell_m=0.005, strip_m=(0.28, 0.16), gain=0.7, ambient=0.055, ambient_gradient=(0.1, 0.0)
+)
+T = np.linspace(0, SECONDS, 17)
+PATHS = {
+    "line": LineMotion(),
+    "curve": PathMotion(
+        tuple(T), tuple(zip(-0.08 * np.cos(np.pi * T / 8), 0.03 * np.sin(0.9 * T), strict=True))
+    ),
+    "accelerating": PathMotion((0.0, 4.0, 8.0), ((-0.08, 0.0), (-0.05, 0.0), (0.08, 0.0))),
+    "start and stop": PathMotion((1.5, 3.0, 5.0, 6.5), ((-0.06, 0.0), (0.0, 0.0), (0.0, 0.0), (0.06, 0.0))),
+}
+
+
+def measured(path: str, rig: RadiometricTransport, camera: FrameCamera, pixel: EventPixel) -> str:
+    target = HandwritingGlyphs().target("writer03_R")
+    inside = signed_distance(target.mask, 40)
+    # The mean distance to the edge of a stroke is a quarter of its width.
+    stroke = -4 * float(inside[inside < 0].mean()) * target.size_m / len(target.mask)
+    scene = Scene(target, PATHS[path], SECONDS)
+    wall = rig.wall(scene, SENSOR)
+    times = np.linspace(0, SECONDS, FRAMES)
+    frames = camera.capture(wall, times, seed=1) / np.float32(255)
+    events = EventCamera(pixel).record(wall, 0.0, SECONDS, seed=2)
+    columns = []
+    for settings in (Tracking(), Tracking(events=False)):
+        track = track_frames(frames, times, events, rig, settings)
+        truth = scene.motion.position_m(track.time_s)
+        error = track.position - truth
+        error = np.sqrt(np.square(error - error.mean(axis=0)).sum(axis=1).mean())
+        after, before = (scene.motion.position_m(track.time_s + dt) for dt in (1e-4, -1e-4))
+        rate = np.hypot(*((after - before) / 2e-4).T)
+        off = np.sqrt(np.mean((track.speed - rate) ** 2) / np.mean(rate**2))
+        columns.append(f"{error / stroke:9.3f} {100 * off:7.1f}")
+    return "   ".join(columns)
+
+
+def main() -> None:
+    rows = [(name, "roughness 0.05", RIG, CAMERA, PIXEL) for name in PATHS]
+    rows += [("curve", f"roughness {r}", replace(RIG, roughness=r), CAMERA, PIXEL) for r in (0.02, 0.1)]
+    for factor in (0.1, 0.02):
+        dim = replace(RIG, gain=RIG.gain * factor, ambient=RIG.ambient * factor)
+        rows.append(("curve", f"light x {factor}", dim, CAMERA, PIXEL))
+    rows.append(("curve", "ambient 0.5", replace(RIG, gain=0.4, ambient=0.5), CAMERA, PIXEL))
+    print(f"{'path':15} {'':15}  position   speed %   frames: position   speed %")
+    for path, what, rig, camera, pixel in rows:
+        if path.startswith(sys.argv[1] if len(sys.argv) > 1 else ""):
+            try:
+                print(f"{path:15} {what:15} {measured(path, rig, camera, pixel)}", flush=True)
+            except EvnlosError as error:
+                print(f"{path:15} {what:15} {error}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

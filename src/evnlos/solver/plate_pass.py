@@ -1,0 +1,183 @@
+"""One plate seen at many positions: the operator from its cells to all pictures, and its Gram matrix."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.types import Plane
+
+
+@dataclass(frozen=True, eq=False)
+class PlatePass:
+    """The linear map x -> (A S_1 x, ..., A S_N x), S_k the plate's cells drawn on the strip at position k.
+
+    A strip's cell gets the exact mean of the plate over it, so positions need not fall on cells. Cells beyond
+    the strip's border are lost.
+
+    Args:
+        transport: A, from the strip's cells to the camera, white levels a unit of brightness.
+        plate: The plate's cells, in coordinates relative to its centre.
+        positions_m: Centre (x, y) of the plate at each position, [N, 2], metres.
+
+    Raises:
+        DataError: The positions are not [N, 2] finite numbers, or the plate never touches the strip.
+        ConfigError: The transport starts from patches.
+    """
+
+    transport: MatrixTransport
+    plate: Plane
+    positions_m: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        positions = np.array(self.positions_m, dtype=np.float64)
+        if positions.ndim != 2 or positions.shape[1] != 2 or not len(positions):
+            raise DataError(f"positions_m has shape {positions.shape}; give [N, 2], one (x, y) a position")
+        if not np.isfinite(positions).all():
+            raise DataError("positions_m holds NaN or infinity; give finite metres")
+        if not isinstance(self.transport.source, Plane):
+            raise ConfigError("the matrix starts from patches; a moving plate needs a Plane of square cells")
+        object.__setattr__(self, "positions_m", positions)
+        if not any(bool(y.any() and x.any()) for y, x in self._shares):
+            raise DataError("the plate lies off the strip at every position; check the positions or the strip")
+
+    def __len__(self) -> int:
+        return len(self.positions_m)
+
+    def __call__(self, plate: torch.Tensor, /) -> torch.Tensor:
+        """Return the pictures [..., N, H, W] of a plate [..., n, n]."""
+        return self.transport(self.drawn(plate))
+
+    def adjoint(self, images: torch.Tensor, /) -> torch.Tensor:
+        """Return the transpose, [..., N, H, W] -> [..., n, n]."""
+        strips = self.transport.adjoint(images)  # [..., N, h, w]
+        back = strips.new_zeros((*strips.shape[:-3], *self.plate.shape))
+        for k, (y, x) in enumerate(self._shares):
+            back += y.to(strips).mT @ strips[..., k, :, :] @ x.to(strips)
+        return back
+
+    def drawn(self, plate: torch.Tensor) -> torch.Tensor:
+        """Return the strip at each position, [..., N, h, w], of a plate [..., n, n]."""
+        return torch.stack([y.to(plate) @ plate @ x.to(plate).mT for y, x in self._shares], dim=-3)
+
+    def gram(self, strip_gram: torch.Tensor, static: float = 0.0) -> torch.Tensor:
+        """Return sum S_k^T G S_k - (1 - rho) N S^T G S with S the mean of S_k, rho = 1 / (1 + N static^2).
+
+        That is the pass's A^T C^-1 A where each camera pixel has independent noise of variance 1 and one
+        unknown offset of variance static^2 in all positions. It costs N small products once G is known.
+
+        Args:
+            strip_gram: G = A^T A, [cells, cells], the same for every motion.
+            static: Standard deviation of a pixel's constant offset over that of its noise, 0 or more; infinity
+                ignores whatever does not move.
+
+        Returns:
+            float64 [n n, n n].
+        """
+        cells = self.plate.height * self.plate.width
+        strip, total = self.transport.source.shape, torch.zeros(cells, cells, dtype=torch.float64)
+        for y, x in self._shares:
+            total += _sandwich(strip_gram, strip, y, x)
+        kept = mean_weight(len(self), static)
+        if kept < 1:
+            mean = sum(torch.kron(y, x) for y, x in self._shares) / len(self)  # [strip cells, plate cells]
+            assert isinstance(mean, torch.Tensor)
+            total -= (1 - kept) * len(self) * (mean.mT @ (strip_gram.double() @ mean))
+        return (total + total.mT) / 2
+
+    @cached_property
+    def _shares(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Return of each position how much of a strip's row, column each row, column of the plate covers."""
+        strip = self.transport.source
+        assert isinstance(strip, Plane)  # checked above
+        return [
+            (
+                _share(strip.y_m, strip.pitch_m, self.plate.y_m + y, self.plate.pitch_m),
+                _share(strip.x_m, strip.pitch_m, self.plate.x_m + x, self.plate.pitch_m),
+            )
+            for x, y in self.positions_m
+        ]
+
+
+def mean_weight(positions: int, static: float) -> float:
+    """Return what the mean over the positions still counts, 1 / (1 + N static^2).
+
+    Raises:
+        ConfigError: `static` is negative.
+
+    Example:
+        >>> mean_weight(4, 0.5), mean_weight(40, float("inf"))
+        (0.5, 0.0)
+    """
+    if not static >= 0:
+        raise ConfigError(f"static is {static}; give 0 or more, infinity to ignore all that rests")
+    return 1 / (1 + positions * static**2)
+
+
+def strip_of(positions_m: ArrayLike, plate: Plane) -> Plane:
+    """Return the strip of cells, of the plate's pitch, that holds the plate at all positions [N, 2], metres.
+
+    Example:
+        >>> strip_of([(-0.08, 0.0), (0.08, 0.0)], Plane(32, 32, 0.0025)).extent_m
+        (0.08, 0.24)
+    """
+    places = np.asarray(positions_m, dtype=np.float64)
+    low, high = places.min(axis=0), places.max(axis=0)
+    width, height = (
+        side + math.ceil(reach / plate.pitch_m - 1e-6)
+        for side, reach in zip((plate.width, plate.height), (high - low).tolist(), strict=True)
+    )
+    middle_x, middle_y = ((low + high) / 2 + plate.center_m).tolist()
+    return Plane(height, width, plate.pitch_m, (middle_x, middle_y))
+
+
+def strip_transport(
+    rig: RadiometricTransport, sensor: tuple[int, int], shape: tuple[int, int], strip: Plane
+) -> MatrixTransport:
+    """Return a rig's matrix from other cells to a smaller picture, in the same white levels, gain included.
+
+    Args:
+        rig: The rig; its gain is defined for a camera of `sensor` pixels.
+        sensor: Size (H, W) of the sensor, pixels.
+        shape: Size (h, w) of the picture, to which frames are reduced by area averaging.
+        strip: Cells in the coordinates of the target's motion.
+    """
+    matrix = rig.matrix(shape, strip)
+    # The rig's own cells at both sizes tell the scale: area averages keep the mean.
+    seen, own = rig.transport(sensor).matrix.mean(dim=0), rig.matrix(shape, rig.source(), torch.float32)
+    scale = rig.gain * float(seen.double().sum() / own.double().mean(dim=0).sum())
+    return MatrixTransport(matrix * scale, strip, shape)
+
+
+def strip_gram_of(transport: MatrixTransport) -> torch.Tensor:
+    """Return A^T A, float64 [cells, cells]: its small eigenvalues would drown in float32's rounding."""
+    matrix = transport.matrix.double()
+    return matrix.mT @ matrix
+
+
+def _share(
+    strip_m: NDArray[np.float64], strip_pitch: float, cell_m: NDArray[np.float64], cell_pitch: float
+) -> torch.Tensor:
+    """Return the share of each of the strip's cells that each of the plate's covers, [strip, plate]."""
+    low = np.maximum(strip_m[:, None] - strip_pitch / 2, cell_m - cell_pitch / 2)
+    high = np.minimum(strip_m[:, None] + strip_pitch / 2, cell_m + cell_pitch / 2)
+    return torch.from_numpy(np.maximum(high - low, 0.0) / strip_pitch)
+
+
+def _sandwich(gram: torch.Tensor, shape: tuple[int, int], y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """Return (y kron x)^T G (y kron x) for a symmetric G; only cells that the plate touches are looked at."""
+    rows, columns = torch.nonzero(y.any(dim=1)).flatten(), torch.nonzero(x.any(dim=1)).flatten()
+    index = (rows[:, None] * shape[1] + columns).flatten()
+    product = gram[index][:, index].double()  # [r c, r c]
+    for _ in range(2):
+        parts = product.unflatten(0, (len(rows), len(columns)))  # [r, c, m]
+        product = torch.einsum("rcm,rj->jcm", parts, y[rows])
+        product = torch.einsum("jcm,ci->jim", product, x[columns]).flatten(0, 1).mT  # [m, n n]
+    return product

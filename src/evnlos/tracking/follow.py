@@ -1,0 +1,185 @@
+"""From a recording to a track: frames give places, events give velocities, a smoother joins them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.dataset.capture import Capture
+from evnlos.dataset.fixed_pattern import FixedPattern
+from evnlos.dataset.sampling import reduce_by_area
+from evnlos.errors import ConfigError, DataError
+from evnlos.tracking.background import static_light, temporal_noise
+from evnlos.tracking.event_velocity import EventVelocity, event_velocity
+from evnlos.tracking.geometry import plane_map
+from evnlos.tracking.registration import Registration, register
+from evnlos.tracking.rig_shift import rig_shift
+from evnlos.tracking.smoother import Measurements, most_likely_acceleration, smooth
+from evnlos.tracking.track import Track
+from evnlos.transport import RadiometricTransport
+from evnlos.types import Events
+
+_LEAST_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How a recording is followed."""
+
+    columns: int = 80
+    """Columns to which frames and counts are reduced, pixels."""
+    window_s: float = 0.05
+    """Length of a window of events that gives one velocity, seconds."""
+    events: bool = True
+    """Use the events; without them only the frames speak."""
+    plate_m: float = 0.1
+    """With a rig: side of a square that surely holds the object, metres."""
+    cells: int = 20
+    """With a rig: cells a side of that square."""
+    degree: int = 2
+    """Degree of the ambient light over the wall, as a polynomial."""
+
+    def __post_init__(self) -> None:
+        if self.columns < 16:
+            raise ConfigError(f"Tracking.columns is {self.columns}; give 16 pixels or more")
+        for name in ("window_s", "plate_m"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"Tracking.{name} is {getattr(self, name)}; give a positive number")
+
+
+def track_capture(
+    capture: Capture,
+    rig: RadiometricTransport | None = None,
+    settings: Tracking | None = None,
+    pattern: FixedPattern | None = None,
+) -> Track:
+    """Return where the hidden object was; whatever `capture.yaml` says of its motion is not looked at.
+
+    Args:
+        capture: The recording.
+        rig: The calibrated rig; with it the track is in metres on the target's plane.
+        settings: How to follow.
+        pattern: The frame camera's fixed pattern, to be taken off first.
+
+    Raises:
+        DataError: Too few frames, or the object does not stand out.
+    """
+    frames = capture.frames / np.float32(capture.peak)
+    if pattern is not None:
+        frames = pattern.correct(capture.frames, capture.peak)
+    return track_frames(frames, capture.frame_times_us.astype(np.float64) * 1e-6, capture.events, rig, settings)
+
+
+def track_frames(
+    frames: NDArray,
+    times_s: NDArray[np.float64],
+    events: Events | None = None,
+    rig: RadiometricTransport | None = None,
+    settings: Tracking | None = None,
+) -> Track:
+    """Return the track of one moving object.
+
+    Args:
+        frames: White levels, real [N, H, W].
+        times_s: Their instants, [N], seconds, on the events' clock.
+        events: The events of the same pixels, or None.
+        rig: The calibrated rig, or None.
+        settings: How to follow.
+
+    Raises:
+        DataError: Too few frames, or the object does not stand out.
+    """
+    settings = settings or Tracking()
+    if len(frames) < _LEAST_FRAMES:
+        raise DataError(f"{len(frames)} frames; tracking needs {_LEAST_FRAMES} or more")
+    sensor = (int(frames.shape[1]), int(frames.shape[2]))
+    columns = min(settings.columns, sensor[1])
+    shape = (max(1, round(sensor[0] * columns / sensor[1])), columns)
+    small = reduce_by_area(frames, shape)
+    noise = temporal_noise(small)
+    found = register(small, static_light(small, settings.degree), noise)
+    by_events = None
+    if events is not None and settings.events:
+        by_events = event_velocity(events, found, times_s, settings.window_s)
+    if rig is None:
+        return _in_pixels(found, by_events, times_s, sensor[1] / columns)
+    return _in_metres(found, by_events, times_s, small, rig, noise, settings)
+
+
+def _in_pixels(
+    found: Registration, by_events: EventVelocity | None, times_s: NDArray[np.float64], pixel: float
+) -> Track:
+    place = (found.place_px - found.place_px.mean(axis=0)) * pixel
+    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :2]) * pixel
+    velocity = None if by_events is None else (by_events.velocity * pixel, by_events.variance * pixel**2)
+    return _joined(place, sigma, velocity, by_events, times_s, "px", found)
+
+
+def _in_metres(
+    found: Registration,
+    by_events: EventVelocity | None,
+    times_s: NDArray[np.float64],
+    small: NDArray,
+    rig: RadiometricTransport,
+    noise: float,
+    settings: Tracking,
+) -> Track:
+    shape = (small.shape[1], small.shape[2])
+    to_plane = plane_map(rig, shape)
+    light = torch.from_numpy(small - found.background)
+    fitted = rig_shift(light, rig, to_plane(found.place_px), noise, settings.plate_m, settings.cells)
+    sigma = np.sqrt(np.diagonal(fitted.covariance, axis1=1, axis2=2))
+    velocity = None
+    if by_events is not None:
+        where = np.stack(
+            [np.interp(by_events.time_s, times_s, found.place_px[:, k]) for k in range(2)], axis=-1
+        )
+        slope = to_plane.slope(where)  # [M, 2, 2]
+        velocity = (
+            np.einsum("mab,mb->ma", slope, by_events.velocity),
+            np.einsum("mab,mb->ma", slope**2, by_events.variance),
+        )
+    return _joined(fitted.position_m, sigma, velocity, by_events, times_s, "m", found)
+
+
+def _joined(
+    place: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    velocity: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+    by_events: EventVelocity | None,
+    times_s: NDArray[np.float64],
+    unit: str,
+    found: Registration,
+) -> Track:
+    """Return the smoothed track over the instants of frames and windows."""
+    windows = np.zeros(0) if by_events is None else by_events.time_s
+    instants = np.unique(np.concatenate([times_s, windows]))
+    at_frames, at_windows = np.searchsorted(instants, times_s), np.searchsorted(instants, windows)
+    axes = []
+    for axis in range(2):
+        columns = np.full((4, len(instants)), np.nan)
+        columns[0, at_frames], columns[1, at_frames] = place[:, axis], sigma[:, axis] ** 2
+        if velocity is not None:
+            columns[2, at_windows], columns[3, at_windows] = velocity[0][:, axis], velocity[1][:, axis]
+        axes.append(Measurements(instants, *columns))
+    acceleration = most_likely_acceleration(axes)
+    smoothed = [smooth(one, acceleration) for one in axes]
+    mean = np.stack([one.mean for one in smoothed], axis=-1)  # [T, 2 (value, rate), 2 (x, y)]
+    spread = np.stack([np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2)) for one in smoothed], axis=-1)
+    return Track(
+        instants,
+        mean[:, 0],
+        mean[:, 1],
+        spread[:, 0],
+        spread[:, 1],
+        "m" if unit == "m" else "px",
+        times_s,
+        place,
+        sigma,
+        found.size,
+        found.size * np.sqrt(found.covariance[:, 2, 2]),
+        len(windows),
+    )

@@ -1,0 +1,193 @@
+"""Where the object's picture lies in each frame: the likeliest shift against a template made of them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.errors import DataError
+from evnlos.transport.spline import MARGIN, spline_coefficients
+
+_EDGE = 0.02  # of the template's peak; weaker light is left to the background
+_LEAST_SIGNAL = 6.0  # standard deviations of the noise that the object's peak must have
+_STEP = np.array([2.0, 2.0, 0.2, 0.2])  # largest step of (x, y, ln size, ln brightness), pixels and shares
+_FIT_STEPS = 2
+_ROUNDS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The object's picture and its place in every frame.
+
+    Args:
+        place_px: Middle of the object's light (x, y), float64 [N, 2], pixels of these frames.
+        size: Size of the picture over the template's, [N].
+        covariance: Of (x, y, log size, log brightness) of each frame, [N, 4, 4].
+        template: The picture with its middle in the array's middle, float64 [h, w].
+        light: Brightness of each frame over the template's, [N].
+        background: What rests, [H, W].
+    """
+
+    place_px: NDArray[np.float64]
+    size: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    template: torch.Tensor
+    light: NDArray[np.float64]
+    background: NDArray[np.float64]
+
+    def picture(self, place_px: NDArray[np.float64], shape: tuple[int, int]) -> torch.Tensor:
+        """Return the object's light alone with its middle at (x, y), pixels, [H, W], at the mean size."""
+        row = torch.arange(shape[0], dtype=torch.float64) - place_px[1] + (self.template.shape[0] - 1) / 2
+        column = torch.arange(shape[1], dtype=torch.float64) - place_px[0] + (self.template.shape[1] - 1) / 2
+        return _sampled(spline_coefficients(self.template), row, column)
+
+
+def register(frames: NDArray, background: NDArray, noise: float) -> Registration:
+    """Fit every frame as background + g T((p - m) / s), T common to all, by alternation.
+
+    T is the mean of the frames' light, each moved back to the middle; then each frame's (m, ln s, ln g) is
+    fitted to T by Gauss-Newton (Lucas and Kanade 1981), and the background takes up what no frame's light
+    explains. Where the picture does not keep its shape, T is the mean shape and the misfit enters the
+    covariance.
+
+    Args:
+        frames: Real [N, H, W].
+        background: First guess of what rests, [H, W].
+        noise: Standard deviation of a sample's noise.
+
+    Raises:
+        DataError: No frame shows light that stands out from the noise.
+    """
+    light = torch.from_numpy(np.asarray(frames, np.float64) - background)  # [N, H, W]
+    shape = (int(light.shape[1]), int(light.shape[2]))
+    values = np.zeros((len(frames), 4))
+    values[:, :2] = [_middle(picture, noise) for picture in light]
+    rest = torch.zeros(shape, dtype=torch.float64)
+    template = torch.zeros(shape, dtype=torch.float64)
+    covariance = np.zeros((len(frames), 4, 4))
+    for turn in range(_ROUNDS):
+        template = _template(light - rest, values)
+        coefficients = spline_coefficients(template)
+        drawn = []
+        for k in range(len(frames)):
+            values[k], covariance[k] = _fit(coefficients, light[k] - rest, values[k], noise)
+            drawn.append(_draw(coefficients, values[k], shape)[0])
+        # The template's own size and brightness are free: hold their means at one.
+        values[:, 2:] -= values[:, 2:].mean(axis=0)
+        if turn + 1 < _ROUNDS:
+            rest = (light - torch.stack(drawn)).mean(dim=0)
+    return Registration(
+        values[:, :2].copy(),
+        np.exp(values[:, 2]),
+        covariance,
+        template,
+        np.exp(values[:, 3]),
+        background + rest.numpy(),
+    )
+
+
+def middle_of_light(light: NDArray) -> NDArray[np.float64]:
+    """Return the first moments (x, y) of pictures [..., H, W], pixels, [..., 2]."""
+    total = light.sum(axis=(-2, -1))
+    x = (light.sum(axis=-2) * np.arange(light.shape[-1])).sum(axis=-1) / total
+    y = (light.sum(axis=-1) * np.arange(light.shape[-2])).sum(axis=-1) / total
+    return np.stack([x, y], axis=-1)
+
+
+def _middle(light: torch.Tensor, noise: float) -> NDArray[np.float64]:
+    """Return the middle of the light above a tenth of its peak.
+
+    Raises:
+        DataError: The peak does not stand out.
+    """
+    smooth = torch.nn.functional.avg_pool2d(light[None, None], 3, 1, 1)[0, 0]
+    peak = float(smooth.max())
+    if peak < _LEAST_SIGNAL * noise / 3:
+        raise DataError(
+            f"a frame's brightest light is {peak / noise * 3:.1f} standard deviations above the background, "
+            f"{_LEAST_SIGNAL:g} is the least; leave out frames before and after the object's pass"
+        )
+    return middle_of_light((light * (smooth > 0.1 * peak)).clamp(min=0).numpy())
+
+
+def _template(light: torch.Tensor, values: NDArray[np.float64]) -> torch.Tensor:
+    """Return the mean of the frames, each moved to the middle, scaled and weighed back."""
+    height, width = (int(side) for side in light.shape[1:])
+    middle = ((height - 1) / 2, (width - 1) / 2)
+    v, u = torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64)
+    total, seen = light.new_zeros(height, width), light.new_zeros(height, width)
+    for coefficients, (x, y, log_size, log_light) in zip(_padded(light), values.tolist(), strict=True):
+        size, brightness = np.exp(log_size), np.exp(log_light)
+        row, column = (v - middle[0]) * size + y, (u - middle[1]) * size + x
+        inside = ((row >= 0) & (row <= height - 1))[:, None] & (column >= 0) & (column <= width - 1)
+        moved = _sampled(coefficients, row + MARGIN, column + MARGIN)
+        total += torch.where(inside, moved, 0.0) * brightness
+        seen += inside * brightness**2
+    mean = total / seen.clamp(min=1e-9)
+    # Compact: what is left far from the light belongs to the background.
+    lit = torch.nn.functional.avg_pool2d(mean[None, None], 3, 1, 1)[0, 0] > _EDGE * mean.max()
+    mean = (mean * lit).clamp(min=0)
+    x, y = middle_of_light(mean.numpy()).tolist()
+    centred = _sampled(_padded(mean), v + y - middle[0] + MARGIN, u + x - middle[1] + MARGIN)
+    return torch.nn.functional.pad(centred, (MARGIN,) * 4)
+
+
+def _padded(images: torch.Tensor) -> torch.Tensor:
+    return spline_coefficients(torch.nn.functional.pad(images, (MARGIN,) * 4))
+
+
+def _sampled(coefficients: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
+    """Return a spline on the grid of rows [H] and columns [W]; zero outside the array."""
+    height, width = coefficients.shape
+    return _basis(row, height) @ coefficients @ _basis(column, width).mT
+
+
+def _basis(at: torch.Tensor, count: int) -> torch.Tensor:
+    """Return the values [len(at), count] of the cubic B-splines at whole numbers."""
+    x = (at[:, None] - torch.arange(count, dtype=at.dtype)).abs()
+    return (2 - x).clamp(min=0) ** 3 / 6 - 4 * (1 - x).clamp(min=0) ** 3 / 6
+
+
+def _draw(
+    coefficients: torch.Tensor, values: NDArray[np.float64], shape: tuple[int, int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return g T((p - m) / s) [H, W] and its derivatives by (x, y, ln s, ln g), [4, H, W]."""
+    x, y, log_size, log_light = (float(v) for v in values)
+    size, brightness = np.exp(log_size), np.exp(log_light)
+    dv = (torch.arange(shape[0], dtype=torch.float64) - y) / size
+    du = (torch.arange(shape[1], dtype=torch.float64) - x) / size
+    row, column = dv + (coefficients.shape[0] - 1) / 2, du + (coefficients.shape[1] - 1) / 2
+    picture = brightness * _sampled(coefficients, row, column)
+    across, down = (
+        brightness * (_sampled(coefficients, row + b, column + a) - _sampled(coefficients, row - b, column - a))
+        for a, b in ((0.5, 0.0), (0.0, 0.5))
+    )
+    along = across * du + down * dv[:, None]
+    return picture, torch.stack([-across / size, -down / size, -along, picture])
+
+
+def _fit(
+    coefficients: torch.Tensor, light: torch.Tensor, values: NDArray[np.float64], noise: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the fitted (x, y, ln s, ln g) of a frame and their covariance."""
+    shape = (int(light.shape[0]), int(light.shape[1]))
+    for _ in range(_FIT_STEPS):
+        step = _newton(coefficients, light, values, shape)[0]
+        values = values + np.clip(step, -_STEP, _STEP)
+    _, normal, picture = _newton(coefficients, light, values, shape)
+    left = float((light - picture)[picture > _EDGE * picture.max()].square().mean())
+    return values, max(noise**2, left) * torch.linalg.inv(normal).numpy()
+
+
+def _newton(
+    coefficients: torch.Tensor, light: torch.Tensor, values: NDArray[np.float64], shape: tuple[int, int]
+) -> tuple[NDArray[np.float64], torch.Tensor, torch.Tensor]:
+    """Return the Gauss-Newton step [4], the normal matrix [4, 4] and the picture drawn."""
+    picture, slopes = _draw(coefficients, values, shape)
+    flat = slopes.flatten(1)  # [4, P]
+    normal = flat @ flat.mT
+    normal += 1e-9 * torch.diag(normal.diagonal() + 1e-300)
+    return torch.linalg.solve(normal, flat @ (light - picture).flatten()).numpy(), normal, picture

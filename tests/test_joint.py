@@ -1,0 +1,178 @@
+"""One plate from many positions: the compressed problem is the stacked one; what rests does not disturb it."""
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import Target
+from evnlos.solver import Gradient, JointProblem, PlatePass, total_variation
+from evnlos.solver.operators import normal_matrix
+from evnlos.solver.plate_pass import strip_gram_of, strip_of, strip_transport
+from evnlos.solver.recording import position_subsets
+from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.types import Plane
+
+PLATE = Plane(4, 4, 0.01)
+POSITIONS = np.array([(-0.02, 0.0), (0.003, 0.004), (0.021, -0.003)])
+STRIP = strip_of(POSITIONS, PLATE)
+SHAPE = (5, 7)
+
+
+@pytest.fixture(scope="module")
+def sight() -> PlatePass:
+    generator = torch.Generator().manual_seed(3)
+    matrix = torch.rand(35, STRIP.height * STRIP.width, generator=generator, dtype=torch.float64)
+    return PlatePass(MatrixTransport(matrix, STRIP, SHAPE), PLATE, POSITIONS)
+
+
+def random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def stacked(sight: PlatePass) -> torch.Tensor:
+    """The whole pass as a matrix [N P, n n], column by column."""
+    return sight(torch.eye(16, dtype=torch.float64).reshape(16, 4, 4)).flatten(1).mT
+
+
+def precision(static: float) -> torch.Tensor:
+    """C^-1 over three positions: independent noise of variance 1, one offset of variance static^2."""
+    eye = torch.eye(3, dtype=torch.float64)
+    if static == np.inf:
+        return eye - 1 / 3
+    return torch.linalg.inv(eye + static**2)
+
+
+def test_adjoint(sight) -> None:
+    x, y = random(2, 4, 4), random(2, 3, *SHAPE, seed=1)
+    torch.testing.assert_close((sight(x) * y).sum(), (x * sight.adjoint(y)).sum(), rtol=1e-12, atol=0)
+
+
+def test_the_strip_is_drawn_as_the_target_draws_itself(sight) -> None:
+    mask = random(4, 4).float()
+    drawn = Target("plate", mask.numpy(), 0.04).rasterise(STRIP, POSITIONS)
+    torch.testing.assert_close(sight.drawn(mask.double()).float(), torch.from_numpy(drawn), rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("static", [0.0, 0.7, np.inf])
+def test_gram_and_solution_are_those_of_the_stacked_problem(sight, static) -> None:
+    whole = stacked(sight)
+    weight = torch.kron(precision(static).contiguous(), torch.eye(35, dtype=torch.float64))
+    problem = JointProblem(sight, static)
+    torch.testing.assert_close(problem.gram, whole.mT @ weight @ whole, rtol=1e-9, atol=1e-9)
+    images, lam = random(3, *SHAPE, seed=2), 0.3
+    smooth = normal_matrix(Gradient("dark"), torch.zeros(4, 4, dtype=torch.float64))
+    expected = torch.linalg.solve(
+        whole.mT @ weight @ whole + lam * smooth, whole.mT @ weight @ images.flatten()
+    )
+    found = problem.tikhonov(images, lam)
+    torch.testing.assert_close(found.image.flatten(), expected, rtol=1e-8, atol=1e-8)
+    left = images.flatten() - whole @ expected
+    assert float(found.residual) == pytest.approx(float(left @ weight @ left) ** 0.5, rel=1e-8)
+
+
+def test_batch_equals_loop(sight) -> None:
+    images, problem = random(2, 3, *SHAPE, seed=4), JointProblem(sight, 0.5)
+    both = problem.tikhonov(images, 0.1).image
+    for k in range(2):
+        torch.testing.assert_close(both[k], problem.tikhonov(images[k], 0.1).image)
+
+
+def test_what_rests_says_nothing(sight) -> None:
+    images, still = random(3, *SHAPE, seed=5), random(*SHAPE, seed=6)
+    problem = JointProblem(sight, np.inf)
+    torch.testing.assert_close(
+        problem.tikhonov(images, 0.1).image,
+        problem.tikhonov(images + 5 * still, 0.1).image,
+        rtol=1e-8,
+        atol=1e-8,
+    )
+
+
+def test_gcv_finds_the_weight_where_the_noise_is_white(sight) -> None:
+    """Against the best weight on a grid, with noise that dominates the small modes."""
+    generator = torch.Generator().manual_seed(1)
+    plate = random(4, 4, seed=7)
+    clean = sight(plate)
+    noisy = clean + 0.3 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
+    problem = JointProblem(sight)
+    chosen = problem.tikhonov(noisy)
+
+    def risk(lam: float) -> float:
+        return float((sight(problem.tikhonov(noisy, lam).image) - clean).square().sum())
+
+    assert risk(chosen.lam) < 1.3 * min(risk(float(lam)) for lam in np.logspace(-4, 3, 30))
+    assert chosen.noise_sigma == pytest.approx(0.3, rel=0.2)
+
+
+def test_total_variation_is_that_of_one_picture(sight) -> None:
+    one = PlatePass(sight.transport, PLATE, POSITIONS[:1])
+    images = one(random(4, 4, seed=8)) + 0.1 * random(1, *SHAPE, seed=9)
+    operator = MatrixTransport(one(torch.eye(16).double().reshape(16, 4, 4)).flatten(1).mT, PLATE, SHAPE)
+    expected = total_variation(operator, images[0], 0.05, box=(0.0, 1.0), border="dark", tolerance=1e-4)
+    found = JointProblem(one).total_variation(images, 0.05, tolerance=1e-4)
+    assert found.converged and expected.converged
+
+    def objective(image: torch.Tensor) -> float:
+        edges = Gradient("dark")(image).square().sum(dim=0).sqrt().sum()
+        return float(0.5 * (operator(image) - images[0]).square().sum() + 0.05 * edges)
+
+    # Each is within the gap of the least value.
+    assert abs(objective(found.image) - objective(expected.image)) < 1e-4 * float(images.square().sum())
+    assert objective(found.image) < 0.9 * objective(torch.zeros(4, 4, dtype=torch.float64))
+    assert float(found.residual) == pytest.approx(float((operator(found.image) - images[0]).norm()), rel=1e-6)
+
+
+def test_a_pass_shows_more_than_a_picture() -> None:
+    rig = RadiometricTransport(roughness=0.05, cell_m=0.01, gain=1.0)
+    plate = Plane(10, 10, 0.008)
+    positions = np.stack([np.linspace(-0.06, 0.06, 8), np.zeros(8)], axis=1)
+    transport = strip_transport(rig, (16, 24), (16, 24), strip_of(positions, plate))
+    truth = torch.zeros(10, 10, dtype=torch.float64)
+    truth[2:8, 2:4] = truth[6:8, 2:8] = 1
+    generator = torch.Generator().manual_seed(0)
+    gram, error = strip_gram_of(transport), {}
+    for count in (1, 8):
+        sight = PlatePass(transport, plate, positions[:count])
+        clean = sight(truth)
+        noisy = clean + 5e-3 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
+        found = JointProblem(sight, 0.0, gram).tikhonov(noisy, 4 * 5e-3**2)
+        error[count] = float((found.image - truth).square().mean())
+    assert error[8] < 0.9 * error[1]
+
+
+def test_white_levels_are_the_rigs() -> None:
+    """A strip of other cells at a smaller size shows a plate as bright as the rig's own wall does."""
+    rig = RadiometricTransport(roughness=0.08, cell_m=0.008, gain=0.9)
+    lit = torch.ones(10, 10, dtype=torch.float64)
+    plate, place = Plane(10, 10, 0.008), np.array([(0.01, 0.0)])
+    small = strip_transport(rig, (20, 32), (10, 16), strip_of(place, plate))
+    own = rig.transport((20, 32))
+    wall = rig.gain * own(torch.from_numpy(Target("square", np.ones((4, 4))).rasterise(own.source, place[0])))
+    wall = wall.unflatten(0, (10, 2)).unflatten(2, (16, 2)).mean(dim=(1, 3))
+    torch.testing.assert_close(PlatePass(small, plate, place)(lit)[0].float(), wall, rtol=0.03, atol=0.01)
+
+
+def test_position_subsets_are_equally_spaced() -> None:
+    assert [one.tolist() for one in position_subsets(6, 3, 5)] == [[0, 2, 4], [1, 3, 5]]
+    assert [one.tolist() for one in position_subsets(4, 4, 3)] == [[0, 1, 2, 3]]
+
+
+def test_wrong_input_is_named(sight) -> None:
+    problem = JointProblem(sight)
+    with pytest.raises(DataError, match="real"):
+        problem.tikhonov(random(2, *SHAPE))
+    with pytest.raises(DataError, match="NaN"):
+        problem.tikhonov(torch.full((3, *SHAPE), torch.nan))
+    with pytest.raises(ConfigError, match="lam is -1"):
+        problem.tikhonov(random(3, *SHAPE), -1.0)
+    with pytest.raises(ConfigError, match=r"static is -0\.5"):
+        JointProblem(sight, -0.5)
+    with pytest.raises(DataError, match="off the strip"):
+        PlatePass(sight.transport, PLATE, np.array([(1.0, 0.0)]))
+    with pytest.raises(DataError, match="shape"):
+        PlatePass(sight.transport, PLATE, np.zeros(2))
+    with pytest.raises(DataError, match="nothing of the plate"):
+        JointProblem(PlatePass(sight.transport, PLATE, POSITIONS[:1]), np.inf)
+    with pytest.raises(ConfigError, match="7 positions of 6"):
+        position_subsets(6, 7, 1)

@@ -1,0 +1,304 @@
+"""Tracking: shifts, velocities and the smoother against known motion and slow references."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos.cli import main
+from evnlos.config import save_yaml
+from evnlos.dataset.lab import Lab, render_captures
+from evnlos.dataset.simulate import SensorSize, Simulation
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
+from evnlos.sensor import EventCamera, EventPixel, FrameCamera
+from evnlos.tracking import (
+    Measurements,
+    Track,
+    Tracking,
+    event_velocity,
+    most_likely_acceleration,
+    plane_map,
+    register,
+    rig_shift,
+    smooth,
+    static_light,
+    temporal_noise,
+    track_frames,
+)
+from evnlos.transport import RadiometricTransport, SlidingWall, View
+from evnlos.types import Events, Plane
+
+SHAPE = (24, 36)
+RIG = RadiometricTransport(
+    roughness=0.04, camera_angle_deg=20.0, field_of_view_deg=40.0, cell_m=0.008, gain=0.8, ambient=0.05
+)
+
+
+def blobs(places: np.ndarray, sigma: float = 3.0) -> np.ndarray:
+    """Two spots of light whose middle is at (x, y), pixels."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    return np.stack(
+        [
+            0.6 * np.exp(-((x - px + 1) ** 2 + (y - py + 2) ** 2) / (2 * sigma**2))
+            + 0.3 * np.exp(-((x - px - 2) ** 2 + (y - py - 4) ** 2) / (2 * (sigma / 1.5) ** 2))
+            for px, py in places
+        ]
+    )
+
+
+def ambient() -> np.ndarray:
+    y, x = np.mgrid[-1 : 1 : SHAPE[0] * 1j, -1 : 1 : SHAPE[1] * 1j]
+    return 0.1 + 0.02 * x - 0.01 * y + 0.01 * x * y
+
+
+PLACES = np.stack([np.linspace(12, 23, 12), 11 + 2 * np.sin(np.linspace(0, 3, 12))], axis=1)
+
+
+def test_static_light_is_found_under_a_slow_object() -> None:
+    """The object never leaves the middle: a mean over time is wrong there, the fit is not."""
+    slow = np.stack([np.linspace(16, 19, 12), np.full(12, 11.0)], axis=1)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((12, *SHAPE))
+    frames = ambient() + blobs(slow) + noise
+    found = static_light(frames)
+    assert np.abs(found - ambient()).max() < 3e-3
+    assert np.abs(frames.mean(axis=0) - ambient()).max() > 0.1
+
+
+def test_temporal_noise_does_not_see_the_motion() -> None:
+    noise = 4e-3 * np.random.default_rng(1).standard_normal((12, *SHAPE))
+    assert temporal_noise(ambient() + blobs(PLACES) + noise) == pytest.approx(4e-3, rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def registered():
+    noise = 2e-3 * np.random.default_rng(2).standard_normal((12, *SHAPE))
+    frames = ambient() + blobs(PLACES) + noise
+    kept = frames.copy()
+    found = register(frames, static_light(frames), temporal_noise(frames))
+    assert np.array_equal(frames, kept)
+    return found
+
+
+def test_registration_finds_sub_pixel_places_within_its_own_error(registered) -> None:
+    error = registered.place_px - PLACES
+    error -= error.mean(axis=0)
+    sigma = np.sqrt(np.diagonal(registered.covariance, axis1=1, axis2=2)[:, :2])
+    assert np.abs(error).max() < 0.05
+    assert 0.3 < np.sqrt(np.mean((error / sigma) ** 2)) < 3.0
+
+
+def test_registration_finds_growth() -> None:
+    size = np.linspace(0.9, 1.1, 8)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    frames = np.stack([np.exp(-((x - 17.0) ** 2 + (y - 11.0) ** 2) / (2 * (3 * s) ** 2)) for s in size])
+    found = register(0.1 + frames, np.full(SHAPE, 0.1), 1e-3)
+    np.testing.assert_allclose(found.size / found.size.mean(), size / size.mean(), rtol=0.02)
+
+
+def test_nothing_to_see_is_refused() -> None:
+    frames = 0.1 + 1e-3 * np.random.default_rng(3).standard_normal((6, *SHAPE))
+    with pytest.raises(DataError, match="stand"):
+        register(frames, np.full(SHAPE, 0.1), 1e-2)
+
+
+def test_smoother_is_the_gaussian_posterior() -> None:
+    """Against one big linear system: a random walk of the rate as the prior, measured values and rates."""
+    times = np.array([0.0, 0.3, 0.5, 1.1, 1.4])
+    nan = np.nan
+    measured = Measurements(
+        times,
+        np.array([0.1, nan, 0.6, nan, 1.2]),
+        np.array([0.01, nan, 0.02, nan, 0.01]),
+        np.array([nan, 1.1, nan, 0.7, nan]),
+        np.array([nan, 0.05, nan, 0.04, nan]),
+    )
+    q = 0.8
+    # The prior as x_0 wide, then increments; states [v_k, r_k].
+    wide = (1e3 * 1.1) ** 2
+    prior = np.zeros((10, 10))
+    prior[:2, :2] = np.diag([1 / wide, 1.4**2 / wide])
+    linear = np.zeros(10)
+    linear[0] = 0.1 / wide
+    for k in range(4):
+        dt = times[k + 1] - times[k]
+        step = np.linalg.inv(q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]))
+        both = np.hstack([-np.array([[1, dt], [0, 1]]), np.eye(2)])
+        prior[2 * k : 2 * k + 4, 2 * k : 2 * k + 4] += both.T @ step @ both
+    for k in range(5):
+        for axis, (value, variance) in enumerate(
+            [
+                (measured.position[k], measured.position_variance[k]),
+                (measured.velocity[k], measured.velocity_variance[k]),
+            ]
+        ):
+            if np.isfinite(value):
+                prior[2 * k + axis, 2 * k + axis] += 1 / variance
+                linear[2 * k + axis] += value / variance
+    covariance = np.linalg.inv(prior)
+    found = smooth(measured, q)
+    np.testing.assert_allclose(found.mean.ravel(), covariance @ linear, rtol=1e-6, atol=1e-8)
+    blocks = np.stack([covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(5)])
+    np.testing.assert_allclose(found.covariance, blocks, rtol=1e-5, atol=1e-9)
+
+
+def walk(acceleration: float, seed: int, steps: int = 100) -> Measurements:
+    rng, dt = np.random.default_rng(seed), 0.1
+    rate = np.cumsum(rng.standard_normal(steps) * np.sqrt(acceleration * dt))
+    value = np.cumsum(rate) * dt
+    seen = value + 0.01 * rng.standard_normal(steps)
+    nan = np.full(steps, np.nan)
+    return Measurements(np.arange(steps) * dt, seen, np.full(steps, 1e-4), nan, nan)
+
+
+def test_the_likeliest_acceleration_is_the_true_one() -> None:
+    found = [most_likely_acceleration([walk(1.0, seed)]) for seed in range(2)]
+    assert np.exp(np.mean(np.log(found))) == pytest.approx(1.0, rel=0.8)
+
+
+def test_events_tell_the_velocity(registered) -> None:
+    """Events of a picture that slides at a known, changing speed, between frames that know its places."""
+    side = 48
+    picture = torch.from_numpy(np.pad(blobs(np.array([(17.5, 11.5)]))[0], ((12, 12), (6, 6))))
+    path = PathMotion((0.0, 4.0), ((-6e-3, 0.0), (6e-3, 0.0)))  # a pixel is a millimetre
+    view = View.affine(SHAPE, 1000.0)
+    wall = SlidingWall(picture, Plane(side, side, 1e-3), view, path, ambient=0.1)
+    events = EventCamera(EventPixel(0.08, 0.1, 0.0, 0.0, 0.0, 0.05, 0.0)).record(wall, 0.0, 4.0, seed=1)
+    times = np.linspace(0, 4, 21)
+    frames = wall.irradiance(times).numpy()
+    found = register(frames, np.full(SHAPE, 0.1), 1e-3)
+    speeds = event_velocity(events, found, times, 0.2)
+    assert speeds is not None
+    rate = 1e3 * (path.position_m(speeds.time_s + 1e-3) - path.position_m(speeds.time_s - 1e-3))[:, 0] / 2e-3
+    off = speeds.velocity[:, 0] - rate
+    assert np.sqrt(np.mean(off**2)) < 0.12 * rate.max()
+    assert np.abs(speeds.velocity[:, 1]).mean() < 0.1 * rate.max()
+
+
+def test_too_few_events_say_nothing(registered) -> None:
+    assert event_velocity(Events.empty(36, 24), registered, np.linspace(0, 1, 12), 0.05) is None
+
+
+def test_the_plane_map_leads_back_to_the_cell() -> None:
+    to_plane = plane_map(RIG, SHAPE)
+    cell = Plane(1, 1, 0.01, (0.03, -0.02))
+    picture = RIG.matrix(SHAPE, cell).reshape(SHAPE).numpy()
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    middle = np.array([(picture * x).sum(), (picture * y).sum()]) / picture.sum()
+    np.testing.assert_allclose(to_plane(middle), (0.03, -0.02), atol=2e-3)
+    step = np.array([0.7, -0.4])
+    np.testing.assert_allclose(
+        to_plane.slope(middle) @ step, to_plane(middle + step / 2) - to_plane(middle - step / 2), rtol=0.02
+    )
+
+
+def test_a_matte_wall_shows_no_place() -> None:
+    with pytest.raises(DataError, match="without the rig"):
+        plane_map(RadiometricTransport(wall_material="lambert"), SHAPE)
+
+
+def letter() -> Target:
+    mask = np.zeros((16, 16), np.float32)
+    mask[2:14, 4:7] = mask[11:14, 4:13] = 1
+    return Target("L", mask, 0.08)
+
+
+def test_the_calibrated_operator_finds_the_path() -> None:
+    own = RIG.transport(SHAPE)
+    positions = np.stack([np.linspace(-0.06, 0.06, 5), np.zeros(5)], axis=1)
+    light = RIG.gain * own(torch.from_numpy(letter().rasterise(own.source, positions)))
+    found = rig_shift(light, RIG, positions + 0.002, 2e-3, 0.1, cells=10)
+    error = found.position_m - positions
+    assert np.abs(error - error.mean(axis=0)).max() < 1e-3
+    along = (np.arange(16) + 0.5) / 16 * 0.08 - 0.04
+    mask = letter().mask
+    middle = np.array([mask.sum(axis=0) @ along, mask.sum(axis=1) @ along]) / mask.sum()
+    np.testing.assert_allclose(error.mean(axis=0), middle, atol=4e-3)
+
+
+def test_a_track_in_pixels_needs_no_rig(registered) -> None:
+    frames = ambient() + blobs(PLACES) + 2e-3 * np.random.default_rng(5).standard_normal((12, *SHAPE))
+    track = track_frames(frames, np.linspace(0, 1.1, 12))
+    assert track.unit == "px" and track.event_windows == 0
+    np.testing.assert_allclose(track.at(track.time_s), track.position, atol=1e-12)
+    truth = PLACES - PLACES.mean(axis=0)
+    np.testing.assert_allclose(track.position, truth, atol=0.1)
+    assert json.loads(json.dumps(track.summary()))["unit"] == "px"
+    with pytest.raises(DataError, match="ask within"):
+        track.at(2.0)
+
+
+def test_speed_and_direction() -> None:
+    zero = np.zeros((2, 2))
+    velocity = np.array([(3.0, 4.0), (0.0, -2.0)])
+    sigma = np.array([(0.1, 0.0), (0.0, 0.3)])
+    times = np.array([0.0, 1.0])
+    track = Track(times, zero, velocity, zero, sigma, "m", times, zero, zero, times, times, 0)
+    np.testing.assert_allclose(track.speed, (5, 2))
+    np.testing.assert_allclose(track.direction_deg, (np.degrees(np.arctan2(4, 3)), -90))
+    np.testing.assert_allclose(track.speed_sigma, (0.06, 0.3))
+
+
+def test_settings_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ConfigError, match="columns is 4"):
+        Tracking(columns=4)
+    with pytest.raises(ConfigError, match="window_s is 0"):
+        Tracking(window_s=0.0)
+    with pytest.raises(DataError, match="3 frames"):
+        track_frames(np.zeros((3, *SHAPE)), np.arange(3.0))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    lab = Lab(
+        glyphs=FontGlyphs(family="kalam", characters="L"),
+        sensor=SensorSize(24, 40),
+        transport=RIG,
+        motion=LineMotion((-0.04, 0.0), 0.02),
+        duration_s=4.0,
+        frame_rate_hz=2.0,
+        frame_camera=FrameCamera(exposure_s=0.016, full_well_e=8000.0, read_noise_e=20.0),
+        pixel=EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0),
+        spread={},
+    )
+    folder = tmp_path_factory.mktemp("rig")
+    (made,) = render_captures(lab, folder / "captures")
+    save_yaml(Simulation(transport=RIG), folder / "rig.yaml")
+    return made, folder / "rig.yaml"
+
+
+def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
+    folder, rig = capture
+    pytest.importorskip("matplotlib")
+    main(["track", str(folder), "--rig", str(rig), "--cells", "10", "--out", str(tmp_path / "t.png"), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["unit"] == "m"
+    assert found["travel"] == pytest.approx(0.08, rel=0.05)
+    assert found["mean_speed"] == pytest.approx(0.02, rel=0.1)
+    assert found["position_error"] < 2e-3
+    assert (tmp_path / "t.png").exists()
+    assert len(json.loads((tmp_path / "t.json").read_text())["track"]["frame_time_s"]) == 9
+
+
+def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:
+    folder, rig = capture
+    pytest.importorskip("matplotlib")
+    options = ["--rig", str(rig), "--positions", "1", "8", "--cells", "10", "--solver", "tikhonov", "--json"]
+    out = ["--out", str(tmp_path / "j.png")]
+    main(["invert", str(folder), *options, "--out", str(tmp_path / "i.png")])
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    main(
+        ["invert", str(folder), "--rig", str(rig), "--cells", "8", "--lam", "gcv", "--solver", "tikhonov", *out]
+    )
+    assert capsys.readouterr().out.splitlines()[2].split()[0] == "8"
+    db = {(row["solver"], row["positions"]): row["psnr_db"] for row in rows}
+    assert db["tikhonov", 8] > db["tikhonov", 1]
+    assert db["tikhonov", 8] > 14
+    assert set(np.load(tmp_path / "i.npz")) == {f"{folder.name}_tikhonov_{n}" for n in (1, 8)}
+
+
+def test_a_folder_without_a_rig_is_no_photograph(capture, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(["invert", str(capture[0])])
+    assert "give one NPZ file, or capture folders and their --rig" in capsys.readouterr().err
