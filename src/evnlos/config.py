@@ -27,9 +27,7 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark
-            raise ComposerError(
-                None, None, "an alias (*name) stands here; write the value out", mark
-            )
+            raise ComposerError(None, None, "an alias (*name) stands here; write the value out", mark)
         return super().compose_node(parent, index)
 
 
