@@ -123,6 +123,8 @@ def _study(settings: Demo, test: list[str]) -> Study:
         writers=settings.writers,
         simulation=dataclasses.replace(default(), seed=settings.seed),
         calibration=Calibration(event_captures=2, columns=48, seed=settings.seed),
+        rigs=2,
+        refine=False,
         correct_pattern=settings.calibrate,
     )
 

@@ -81,6 +81,7 @@ def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     """Return the simulation that an arm is pre-trained on."""
     if arm.source == "calibrated":
         config = load_yaml(Simulation, place.out / "rigs" / study.rig / "training.yaml")
+        config = replace(config, rigs=config.rigs if study.rigs is None else study.rigs)
     else:
         config = study.simulation or default()
     glyphs = config.glyphs

@@ -51,7 +51,7 @@ def score_arm(
     there = {record.name for record in read_records(folder)} if any(folder.glob("*.json")) else set()
     samples = NlosDataset(shots, study.split, paradigm)
     means = NlosDataset(shots, "train", paradigm).truth.float().mean(dim=0)
-    refined = paradigm != "event" and arm.source == "calibrated" and study.correct_pattern
+    refined = study.refine and study.correct_pattern and paradigm != "event" and arm.source == "calibrated"
 
     def record(name: str, seed: int, settings: dict[str, Any]) -> Record:
         return Record(study.name, study.rig, name, paradigm, seed, study.split, {}, {}, {}, {}, settings)

@@ -75,6 +75,10 @@ class Study:
     """What an uncalibrated arm is pre-trained on; None is the default simulation."""
     calibration: Calibration = field(default_factory=Calibration)
     """How the rig is calibrated; the test characters are left out of it whatever it says."""
+    rigs: int | None = None
+    """Different walls and cameras in the calibrated simulation; None is as many as the calibration says."""
+    refine: bool = True
+    """Also score pictures after data consistency, where there are a frame and a calibrated rig."""
     correct_pattern: bool = True
     """Take the frame camera's fixed pattern, as the calibration found it, from all frames."""
 
