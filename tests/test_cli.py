@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,13 +65,17 @@ def runs(shots, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
     return found
 
 
+WITHOUT_OUT = ("evaluate", "verify", "info", "convert", "capture", "cite", "doctor")
+"""Commands that write nothing, or name what they write in another way."""
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_shows_every_command_with_its_defaults(verb: str, capsys) -> None:
     with pytest.raises(SystemExit) as stop:
         call(verb, "--help")
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    assert "--out" in text or verb in ("evaluate", "verify", "info", "convert")
+    assert "--out" in text or verb in WITHOUT_OUT
     assert "default" in text
     call("--help")
     assert verb in capsys.readouterr().out
@@ -205,7 +210,15 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp
     assert not out.exists()
 
 
-def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys) -> None:
+def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkeypatch) -> None:
+    from evnlos import demo
+    from evnlos.dataset import SensorSize
+    from evnlos.scene import HandwritingGlyphs
+
+    few = replace(
+        demo.default(), glyphs=HandwritingGlyphs(characters="AB"), sensor=SensorSize(25, 40), positions=8
+    )
+    monkeypatch.setattr(demo, "default", lambda: few)
     one = ["--pretrain-epochs", 1, "--finetune-epochs", 1, "--e2e-epochs", 1, "--writers", 1, "--width", 8]
     one += ["--workers", 1, "--no-calibrate"]
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
