@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -104,7 +103,6 @@ def consistent(
     return moved.clamp(0, 1)
 
 
-@lru_cache(maxsize=2)
 def _matrix(
     transport: RadiometricTransport, shape: tuple[int, int], sampling: Sampling
 ) -> tuple[Tensor, Plane]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from evnlos.config import to_dict, write_atomically
 from evnlos.errors import DataError
 from evnlos.evaluation import Evaluation, Scores
-from evnlos.experiment.study import Record
+from evnlos.experiment.study import Record, Step
 
 
 def scores_of(evaluation: Evaluation) -> tuple[dict, dict, dict]:
@@ -29,6 +29,19 @@ def scores_of(evaluation: Evaluation) -> tuple[dict, dict, dict]:
     }
     baselines = {name: table(scores) for name, scores in evaluation.baselines.items()}
     return table(evaluation.scores), positions, baselines
+
+
+def keep_scores(blank: Record, evaluation: Evaluation, folder: Path) -> Step:
+    """Fill a record with an evaluation's scores, write it, and return the step that brought it."""
+    scores, positions, baselines = scores_of(evaluation)
+    record = replace(blank, scores=scores, positions=positions, baselines=baselines, checks=evaluation.checks)
+    write_record(record, folder)
+    return Step(f"score {record.name}", 1, 1, record)
+
+
+def names_there(folder: Path) -> set[str]:
+    """Return the names of the records that a folder holds; none where it is not there."""
+    return {record.name for record in read_records(folder)} if any(folder.glob("*.json")) else set()
 
 
 def write_record(record: Record, folder: Path) -> Path:

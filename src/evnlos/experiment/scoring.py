@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,10 @@ from torch import Tensor
 
 from evnlos.config import load_yaml
 from evnlos.dataset import Dataset, NlosDataset, Paradigm, Sampling, Simulation, read_shard
-from evnlos.evaluation import Evaluation, assess, available_lpips, check_sampling, infer
+from evnlos.evaluation import assess, available_lpips, check_sampling, infer
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.linear import fit_linear
-from evnlos.experiment.records import read_records, scores_of, write_record
+from evnlos.experiment.records import keep_scores, names_there
 from evnlos.experiment.study import Arm, Place, Record, Step, Study
 from evnlos.model import load_weights
 
@@ -48,7 +47,7 @@ def score_arm(
         place: Where records are kept.
     """
     folder = place.out / "records" / study.name
-    there = {record.name for record in read_records(folder)} if any(folder.glob("*.json")) else set()
+    there = names_there(folder)
     samples = NlosDataset(shots, study.split, paradigm)
     means = NlosDataset(shots, "train", paradigm).truth.float().mean(dim=0)
     refined = study.refine and study.correct_pattern and paradigm != "event" and arm.source == "calibrated"
@@ -58,30 +57,33 @@ def score_arm(
 
     def scored(blank: Record, images: Tensor, mean_image: Tensor | None) -> Step:
         found = assess(images, samples, shots, study.split, paradigm, mean_image, available_lpips())
-        return _written(blank, found, folder)
+        return keep_scores(blank, found, folder)
 
-    def variants(name: str, images: Tensor) -> Iterator[tuple[str, Tensor]]:
-        yield name, images
-        if refined:
-            operator = _operator(place.out / "rigs" / study.rig / "rig.yaml", arm.sampling)
-            yield f"{name} + consistency", consistent(images, _frames(shots, study.split), operator, TRUST)
+    def variants(
+        images: Tensor, seed: int, settings: dict[str, Any], mean_image: Tensor | None
+    ) -> Iterator[Step]:
+        plain = record(arm.name, seed, settings)
+        if plain.name not in there:
+            yield scored(plain, images, mean_image)
+        moved = record(f"{arm.name} + consistency", seed, settings)
+        if refined and moved.name not in there:
+            yield scored(moved, _consistent(study, arm, shots, place, images), mean_image)
 
     pictures = []
     for (run, settings), seed in zip(runs, study.seeds, strict=True):
         weights = load_weights(run)
         check_sampling(weights, shots.sampling)
         pictures.append(infer(weights.network, samples.inputs))
-        for name, images in variants(arm.name, pictures[-1]):
-            blank = record(name, seed, settings | {"run": run.name})
-            if blank.name not in there:
-                yield scored(blank, images, weights.mean_image)
+        yield from variants(pictures[-1], seed, settings | {"run": run.name}, weights.mean_image)
     if len(runs) > 1:
-        for name, images in variants(arm.name, torch.stack(pictures).mean(dim=0)):
-            blank = record(name, ENSEMBLE, {"runs": [run.name for run, _ in runs]})
-            if blank.name not in there:
-                yield scored(blank, images, means)
-    for name, images in _without_network(study, arm, paradigm, samples, means, made, shots, place, there):
-        yield scored(record(name, 0, {"captures": shots.folder.name}), images, means)
+        together = torch.stack(pictures).mean(dim=0)
+        yield from variants(together, ENSEMBLE, {"runs": [run.name for run, _ in runs]}, means)
+    if study.name != "captures":
+        return
+    for name, make in _without_network(study, arm, paradigm, samples, means, made, shots, place):
+        blank = record(name, 0, {"captures": shots.folder.name})
+        if blank.name not in there:
+            yield scored(blank, make(), means)
 
 
 def _without_network(
@@ -93,21 +95,15 @@ def _without_network(
     made: Dataset | None,
     shots: Dataset,
     place: Place,
-    there: set[str],
-) -> Iterator[tuple[str, Tensor]]:
-    """Yield name and pictures of the baselines that belong to an arm: linear estimates, classical inversion."""
-    if study.name != "captures":
-        return
-    prefix = f"{study.rig}-{study.split}"
-    if arm.pretraining is None and f"{prefix}-linear-captures-{paradigm}-seed0" not in there:
-        yield "linear, captures", _linear(shots, paradigm, samples)
+) -> Iterator[tuple[str, Callable[[], Tensor]]]:
+    """Yield the baselines that belong to an arm, each with what makes its pictures: linear, classical."""
+    if arm.pretraining is None:
+        yield "linear, captures", lambda: _linear(shots, paradigm, samples)
     if arm.finetuning is None and made is not None:
-        if f"{prefix}-linear-simulation-{paradigm}-seed0" not in there:
-            yield "linear, simulation", _linear(made, paradigm, samples)
-        if paradigm == "frame" and f"{prefix}-classical-inversion-frame-seed0" not in there:
-            operator = _operator(place.out / "rigs" / study.rig / "rig.yaml", arm.sampling)
+        yield "linear, simulation", lambda: _linear(made, paradigm, samples)
+        if paradigm == "frame":
             start = mean_image.expand(len(samples), -1, -1)
-            yield "classical inversion", consistent(start, _frames(shots, study.split), operator, TRUST)
+            yield "classical inversion", lambda: _consistent(study, arm, shots, place, start)
 
 
 def _linear(data: Dataset, paradigm: Paradigm, samples: NlosDataset) -> Tensor:
@@ -115,17 +111,14 @@ def _linear(data: Dataset, paradigm: Paradigm, samples: NlosDataset) -> Tensor:
     return fit_linear(known.inputs, known.truth, known.names)(samples.inputs)
 
 
-def _written(blank: Record, found: Evaluation, folder: Path) -> Step:
-    scores, positions, baselines = scores_of(found)
-    record = replace(blank, scores=scores, positions=positions, baselines=baselines, checks=found.checks)
-    write_record(record, folder)
-    return Step(f"score {record.name}", 1, 1, record)
+def _consistent(study: Study, arm: Arm, shots: Dataset, place: Place, images: Tensor) -> Tensor:
+    """Return pictures of the scored split after data consistency with the calibrated rig."""
+    operator = _operator(place.out / "rigs" / study.rig / "rig.yaml", arm.sampling)
+    names = shots.objects(study.split)
+    frames = torch.cat([torch.from_numpy(read_shard(shots.shard(name))[0].frame) for name in names])
+    return consistent(images, frames, operator, TRUST)
 
 
 @lru_cache(maxsize=2)
 def _operator(rig: Path, sampling: Sampling) -> FrameOperator:
     return FrameOperator(load_yaml(Simulation, rig), sampling)
-
-
-def _frames(shots: Dataset, split: str) -> Tensor:
-    return torch.cat([torch.from_numpy(read_shard(shots.shard(n))[0].frame) for n in shots.objects(split)])

@@ -11,7 +11,7 @@ from evnlos.config import config_hash, to_dict
 from evnlos.dataset import PARADIGMS, Dataset, Paradigm, SensorSize, Simulation, open_dataset, simulate
 from evnlos.dataset.presets import paper
 from evnlos.evaluation import available_lpips, evaluate
-from evnlos.experiment.records import read_records, scores_of, write_record
+from evnlos.experiment.records import keep_scores, names_there
 from evnlos.experiment.study import Record, Step
 from evnlos.model import load_weights
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
@@ -23,7 +23,7 @@ NAME = "simulation"
 
 @dataclass(frozen=True)
 class Simulated:
-    """Settings of the experiment; `full` ones are the paper's."""
+    """Settings of the experiment."""
 
     out: Path
     """Folder for datasets, runs and records."""
@@ -112,12 +112,6 @@ def _score(
     decided: dict[str, Any],
 ) -> Iterator[Step]:
     folder = settings.out / "records" / NAME
-    there = {record.name for record in read_records(folder)} if any(folder.glob("*.json")) else set()
     record = Record(NAME, tested, arm, paradigm, seed, "test", {}, {}, {}, {}, decided | {"run": run.name})
-    if record.name in there:
-        return
-    found = evaluate(load_weights(run), data, "test", available_lpips())
-    scores, positions, baselines = scores_of(found)
-    record = replace(record, scores=scores, positions=positions, baselines=baselines, checks=found.checks)
-    write_record(record, folder)
-    yield Step(f"score {record.name}", 1, 1, record)
+    if record.name not in names_there(folder):
+        yield keep_scores(record, evaluate(load_weights(run), data, "test", available_lpips()), folder)
