@@ -54,22 +54,32 @@ def check_capture(capture: Capture) -> list[Finding]:
     ]
 
 
+def _judged(what: str, good: bool, bearable: bool, found: str, cure: str) -> Finding:
+    """Return a finding with its level; the cure stands only where something is to do."""
+    if good:
+        return Finding(what, "good", found)
+    return Finding(what, "doubtful" if bearable else "bad", found, cure)
+
+
 def _light(capture: Capture) -> Iterator[Finding]:
     frames, peak = capture.frames, capture.peak
     clipped = float((frames >= peak).mean())
-    cure = "" if clipped < 1e-3 else "shorten the exposure, close the aperture, or dim the ambient light"
-    level: Level = "good" if clipped < 1e-3 else "doubtful" if clipped < 0.02 else "bad"
-    yield Finding("saturation", level, f"{100 * clipped:.2f} % of the frames' pixels are clipped", cure)
+    yield _judged(
+        "saturation",
+        clipped < 1e-3,
+        clipped < 0.02,
+        f"{100 * clipped:.2f} % of the frames' pixels are clipped",
+        "shorten the exposure, close the aperture, or dim the ambient light",
+    )
     share = float(np.median(frames) / peak)
     dark = float((frames <= _DARK_DN).mean())
-    level = "good" if dark < 0.05 else "doubtful" if dark < 0.5 else "bad"
-    cure = "" if level == "good" else "lengthen the exposure, open the aperture, or bring the wall nearer"
-    yield Finding(
+    yield _judged(
         "brightness",
-        level,
+        dark < 0.05,
+        dark < 0.5,
         f"the middle pixel is at {100 * share:.0f} % of the range; {100 * dark:.0f} % are darker than "
         f"{_DARK_DN + 1} digital numbers",
-        cure,
+        "lengthen the exposure, open the aperture, or bring the wall nearer",
     )
 
 
@@ -85,22 +95,22 @@ def _movement(capture: Capture) -> Iterator[Finding]:
     # Of noise alone the block's variance is this sure, as a fraction; three times that is no movement.
     sure = np.sqrt(2 / ((len(frames) - 1) * frames[0].size / (height * width)))
     moved = np.sqrt(np.maximum(variance - noise**2 * (1 + 3 * sure), 0.0))
-    ratio = float(np.quantile(moved, 0.95) / max(noise, 1e-6))
-    level: Level = "good" if ratio > 1.0 else "doubtful" if ratio > 0.25 else "bad"
-    cure = (
-        "" if level == "good" else "check that the target moved and is lit, dim the ambient light, roughen less"
+    largest = float(np.quantile(moved, 0.95))
+    ratio = largest / max(noise, 1e-6)
+    yield _judged(
+        "movement",
+        ratio > 1.0,
+        ratio > 0.25,
+        f"the wall's light changes by {ratio:.2f} times the frames' noise (1 is safe)",
+        "check that the target moved and is lit, dim the ambient light, roughen less",
     )
-    yield Finding(
-        "movement", level, f"the wall's light changes by {ratio:.2f} times the frames' noise (1 is safe)", cure
-    )
-    contrast = float(np.quantile(moved, 0.95) / max(float(np.median(frames)), 1.0))
-    level = "good" if contrast > 0.05 else "doubtful" if contrast > 0.01 else "bad"
-    cure = "" if level == "good" else "dim the ambient light, light the target more, take a shinier wall"
-    yield Finding(
+    contrast = largest / max(float(np.median(frames)), 1.0)
+    yield _judged(
         "wall contrast",
-        level,
+        contrast > 0.05,
+        contrast > 0.01,
         f"the light that moves is {contrast:.2f} times the wall's own (0.05 is safe)",
-        cure,
+        "dim the ambient light, light the target more, take a shinier wall",
     )
     if ratio <= 0.25:
         return
@@ -110,13 +120,12 @@ def _movement(capture: Capture) -> Iterator[Finding]:
     inner = moved[v:-v, u:-u]
     edge = np.concatenate([moved[:v].ravel(), moved[-v:].ravel(), moved[:, :u].ravel(), moved[:, -u:].ravel()])
     outside = float(edge.mean() / max(inner.mean(), 1e-6))
-    level = "good" if outside < 0.7 else "doubtful" if outside < 1.2 else "bad"
-    cure = "" if level == "good" else "turn the camera to where the light moves, or take a wider lens or region"
-    yield Finding(
+    yield _judged(
         "region",
-        level,
+        outside < 0.7,
+        outside < 1.2,
         f"the border changes {outside:.2f} times as much as the inside (below 0.7 is safe)",
-        cure,
+        "turn the camera to where the light moves, or take a wider lens or region",
     )
 
 
@@ -125,37 +134,40 @@ def _events(capture: Capture) -> Iterator[Finding]:
     span_s = max(float(events.t_us[-1] - events.t_us[0]) * 1e-6, 1e-6)
     pixels = events.width * events.height
     rate = len(events) / span_s / pixels
-    level: Level = "good" if 0.05 <= rate <= 50 else "doubtful" if 0.01 <= rate <= 200 else "bad"
-    cure = ""
-    if rate < 0.05:
-        cure = "lower the thresholds, dim the ambient light, light the target more, or move it faster"
-    elif rate > 50:
-        cure = "raise the thresholds, or look for flicker and a camera that shakes"
-    yield Finding("event rate", level, f"{rate:.2f} events a pixel and second (0.05 to 50 is safe)", cure)
-    on = float(events.p.mean())
-    level = "good" if 0.25 < on < 0.75 else "doubtful" if 0.1 < on < 0.9 else "bad"
-    cure = (
-        "" if level == "good" else "set the thresholds of both polarities alike; a leak makes ON events alone"
+    yield _judged(
+        "event rate",
+        0.05 <= rate <= 50,
+        0.01 <= rate <= 200,
+        f"{rate:.2f} events a pixel and second (0.05 to 50 is safe)",
+        "lower the thresholds, dim the ambient light, light the target more, or move it faster"
+        if rate < 0.05
+        else "raise the thresholds, or look for flicker and a camera that shakes",
     )
-    yield Finding(
-        "polarity balance", level, f"{100 * on:.0f} % of the events are ON (25 to 75 % is safe)", cure
+    on = float(events.p.mean())
+    yield _judged(
+        "polarity balance",
+        0.25 < on < 0.75,
+        0.1 < on < 0.9,
+        f"{100 * on:.0f} % of the events are ON (25 to 75 % is safe)",
+        "set the thresholds of both polarities alike; a leak makes ON events alone",
     )
     counts = np.bincount(events.y.astype(np.int64) * events.width + events.x, minlength=pixels)
     silent = float((counts == 0).mean())
-    level = "good" if silent < 0.5 else "doubtful" if silent < 0.9 else "bad"
-    cure = "" if level == "good" else "lower the thresholds; a linear map of so few events shows little"
-    yield Finding(
-        "silent pixels", level, f"{100 * silent:.0f} % of the pixels sent nothing (below 50 % is safe)", cure
+    yield _judged(
+        "silent pixels",
+        silent < 0.5,
+        silent < 0.9,
+        f"{100 * silent:.0f} % of the pixels sent nothing (below 50 % is safe)",
+        "lower the thresholds; a linear map of so few events shows little",
     )
     hot = find_hot_pixels(events)
     share = float(counts.reshape(events.shape)[hot].sum() / len(events))
-    level = "good" if share < 0.02 else "doubtful" if share < 0.2 else "bad"
-    cure = "" if level == "good" else "set filters: {hot_pixel_factor: 10} in capture.yaml"
-    yield Finding(
+    yield _judged(
         "hot pixels",
-        level,
+        share < 0.02,
+        share < 0.2,
         f"{int(hot.sum())} pixels send {100 * share:.1f} % of the events (2 % is safe)",
-        cure,
+        "set filters: {hot_pixel_factor: 10} in capture.yaml",
     )
 
 
@@ -176,13 +188,12 @@ def _flicker(capture: Capture) -> Iterator[Finding]:
         found[round((low + high) / 2)] = float(line / max(around, 1e-12))
     worst = max(found, key=lambda hertz: found[hertz])
     # The power of noise is exponential: a line 30 times its median has a chance of 1e-9 a bin.
-    level: Level = "good" if found[worst] < 30 else "doubtful" if found[worst] < 300 else "bad"
-    cure = "" if level == "good" else "light with direct current, or with daylight; mains lamps flicker"
-    yield Finding(
+    yield _judged(
         "flicker",
-        level,
+        found[worst] < 30,
+        found[worst] < 300,
         f"the rate's line at {worst} Hz is {found[worst]:.0f} times its surroundings (30 is safe)",
-        cure,
+        "light with direct current, or with daylight; mains lamps flicker",
     )
 
 
@@ -190,15 +201,19 @@ def _clock(capture: Capture) -> Iterator[Finding]:
     frames, events = capture.frame_times_us, capture.events.t_us
     both = min(frames[-1], events[-1]) - max(frames[0], events[0])
     share = float(max(both, 0) / max(frames[-1] - frames[0], 1))
-    level: Level = "good" if share > 0.95 else "doubtful" if share > 0.5 else "bad"
-    cure = "" if level == "good" else "check alignment in capture.yaml: offset_us, auto, or a trigger_channel"
-    yield Finding("clock", level, f"events cover {100 * share:.0f} % of the frames' time (95 % is safe)", cure)
+    yield _judged(
+        "clock",
+        share > 0.95,
+        share > 0.5,
+        f"events cover {100 * share:.0f} % of the frames' time (95 % is safe)",
+        "check alignment in capture.yaml: offset_us, auto, or a trigger_channel",
+    )
     steps = np.diff(frames)
     uneven = float(np.abs(steps - np.median(steps)).max() / max(float(np.median(steps)), 1.0))
-    level = "good" if uneven < 0.2 else "doubtful"
-    cure = (
-        "" if level == "good" else "frames were dropped or the rate changed; a position is as long as its step"
-    )
-    yield Finding(
-        "frame times", level, f"the most uneven step is off by {100 * uneven:.0f} % (20 % is safe)", cure
+    yield _judged(
+        "frame times",
+        uneven < 0.2,
+        True,
+        f"the most uneven step is off by {100 * uneven:.0f} % (20 % is safe)",
+        "frames were dropped or the rate changed; a position is as long as its step",
     )

@@ -24,6 +24,7 @@ from evnlos.events.io.celex_state import (
     UNKNOWN,
     WIDTH,
     advance,
+    lanes_of,
     note,
 )
 from evnlos.events.prefetch import prefetch
@@ -43,17 +44,7 @@ def _carefully_1(data, first, state, t_us, x, y, p, adc, known, last):
     count = 0
     for group in range(len(data) // 7):
         at = 7 * group
-        b1, b2, b3, b4 = (
-            np.int64(data[at]),
-            np.int64(data[at + 1]),
-            np.int64(data[at + 2]),
-            np.int64(data[at + 3]),
-        )
-        b5, b6, b7 = np.int64(data[at + 4]), np.int64(data[at + 5]), np.int64(data[at + 6])
-        s0 = (b1 << 6) | (b5 & 0x3F)
-        s1 = (b2 << 6) | (b5 >> 6) | ((b6 & 0xF) << 2)
-        s2 = (b3 << 6) | (b6 >> 4) | ((b7 & 3) << 4)
-        s3 = (b4 << 6) | (b7 >> 2)
+        s0, s1, s2, s3 = lanes_of(data, at)
         for half in range(2):
             word = (s3 << 14) | s2 if half else (s1 << 14) | s0
             kind = word & 3

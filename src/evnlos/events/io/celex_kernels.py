@@ -19,6 +19,7 @@ from evnlos.events.io.celex_state import (
     UNKNOWN,
     WIDTH,
     advance,
+    lanes_of,
     note,
 )
 
@@ -62,22 +63,10 @@ def decode_format_0(data, state, t_us, x, y, p, adc, known, last, scratch):
 @njit(cache=True)
 def decode_format_2(data, state, t_us, x, y, p, adc, known, last, scratch):
     """Decode groups of 7 bytes into four lanes of 14 bits; return the number of events."""
-    lanes = np.empty(4, np.int64)
     count = 0
     for group in range(len(data) // 7):
         at = 7 * group
-        b1, b2, b3, b4 = (
-            np.int64(data[at]),
-            np.int64(data[at + 1]),
-            np.int64(data[at + 2]),
-            np.int64(data[at + 3]),
-        )
-        b5, b6, b7 = np.int64(data[at + 4]), np.int64(data[at + 5]), np.int64(data[at + 6])
-        lanes[0] = (b1 << 6) | (b5 & 0x3F)
-        lanes[1] = (b2 << 6) | (b5 >> 6) | ((b6 & 0xF) << 2)
-        lanes[2] = (b3 << 6) | (b6 >> 4) | ((b7 & 3) << 4)
-        lanes[3] = (b4 << 6) | (b7 >> 2)
-        for lane in lanes:
+        for lane in lanes_of(data, at):
             kind = lane & 3
             if kind == 1:
                 column = lane >> 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 WIDTH, HEIGHT = 1280, 800
@@ -31,3 +32,15 @@ def advance(state, stamp, turn):
         state[TIME_US] = (state[TICK] * 2048 + state[DIVISOR]) // (2 * state[DIVISOR])
     state[STAMP] = stamp
     state[TIME_SEEN] = 1
+
+
+@njit(cache=True)
+def lanes_of(data, at):
+    """Return the four lanes of 14 bits of the group of 7 bytes that begins at `at`."""
+    b5, b6, b7 = np.int64(data[at + 4]), np.int64(data[at + 5]), np.int64(data[at + 6])
+    return (
+        (np.int64(data[at]) << 6) | (b5 & 0x3F),
+        (np.int64(data[at + 1]) << 6) | (b5 >> 6) | ((b6 & 0xF) << 2),
+        (np.int64(data[at + 2]) << 6) | (b6 >> 4) | ((b7 & 3) << 4),
+        (np.int64(data[at + 3]) << 6) | (b7 >> 2),
+    )
