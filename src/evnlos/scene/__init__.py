@@ -13,7 +13,8 @@ from evnlos.scene.glyph_sets import (
     Plate,
 )
 from evnlos.scene.glyphs import DIGITS, UPPER_CASE, fit_to_plate, render_glyph
-from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, Strokes, hand, held_out_writers, nist_like, pen_width
+from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, Strokes, hand, held_out_writers, nist_like
+from evnlos.scene.ink import pen_width
 from evnlos.scene.motion import LineMotion, Motion, PathMotion
 from evnlos.scene.nist_sd19 import Handwritten, list_sd19, read_sd19
 from evnlos.scene.scene import Scene

@@ -18,6 +18,7 @@ from evnlos.errors import ConfigError, DataError, MissingDependencyError
 from evnlos.scene.distance import signed_distance
 from evnlos.scene.fonts import Font, find_font
 from evnlos.scene.glyphs import check_size, render_glyph
+from evnlos.scene.ink import ink_box, pen_px
 from evnlos.seeds import derive_seed
 
 BASE_FACES = (
@@ -172,12 +173,12 @@ def nist_like(
     base = _base_glyph(char, style.font)
     # A smaller draft shows how large the deformed ink and its pen come out; the second drawing fits the room.
     draft = _deform(base, 0.5 * shape, waves, (0.0, 0.0), _CANVAS_PX // 2)
-    (left, top, right, bottom), drawn_pen = _ink_box(draft), _pen_width(draft)
+    (left, top, right, bottom), drawn_pen = ink_box(draft), pen_px(draft)
     pen = style.pen * room
     growth = (room - pen) / max(right - left - drawn_pen, bottom - top - drawn_pen, 1.0)
     middle = growth * np.array([(left + right) / 2, (top + bottom) / 2])
     drawn = _deform(base, 0.5 * growth * shape, waves, (-middle[0], -middle[1]), _CANVAS_PX)
-    now = _pen_width(drawn)
+    now = pen_px(drawn)
     # Thinning stops early: beyond it the thin parts of a stroke would break.
     thicken = max((pen - now) / 2, -0.22 * now)
     distance = signed_distance(drawn, reach=int(np.ceil(abs(thicken))) + 3)
@@ -186,7 +187,7 @@ def nist_like(
 
 def _to_plate(ink: NDArray[np.float32], size_px: int, room: float) -> NDArray[np.float32]:
     """Centre the ink, shrink it to `room` where it came out larger, and sample it at `size_px`."""
-    left, top, right, bottom = _ink_box(ink)
+    left, top, right, bottom = ink_box(ink)
     excess = max((right - left) / room, (bottom - top) / room, 1.0)
     side = _WORK_PX * excess
     margin = _WORK_PX
@@ -239,35 +240,6 @@ def _sample(image: NDArray, x: NDArray[np.float64], y: NDArray[np.float64]) -> N
     upper = flat[start] * (1 - right) + flat[start + 1] * right
     lower = flat[start + width] * (1 - right) + flat[start + width + 1] * right
     return upper * (1 - below) + lower * below
-
-
-def pen_width(mask: NDArray[np.float32]) -> float:
-    """Return the mean width of a drawing's strokes as a part of the longer side of its ink, 0..1.
-
-    Args:
-        mask: Bright ink on dark ground, [H, W], 0..1.
-
-    Raises:
-        DataError: The picture has no ink.
-    """
-    left, top, right, bottom = _ink_box(mask)
-    return _pen_width(mask) / max(right - left, bottom - top)
-
-
-def _pen_width(ink: NDArray[np.float32]) -> float:
-    """Return the mean width of the strokes, pixels: four times the mean distance of the ink to its edge."""
-    distance = signed_distance(ink, reach=40)
-    inside = distance < 0
-    return 4.0 * float(-distance[inside].mean()) if inside.any() else 1.0
-
-
-def _ink_box(ink: NDArray[np.float32]) -> tuple[float, float, float, float]:
-    """Return left, top, right, bottom of the ink, pixels from the centre."""
-    rows, columns = np.flatnonzero((ink > 0.5).any(1)), np.flatnonzero((ink > 0.5).any(0))
-    if not len(rows):
-        raise DataError("a glyph has no ink (no pixel above 0.5); choose another base face or drawing")
-    half = len(ink) / 2
-    return columns[0] - half, rows[0] - half, columns[-1] + 1 - half, rows[-1] + 1 - half
 
 
 def _waves(rng: np.random.Generator, amplitude: float) -> NDArray[np.float64]:
