@@ -25,7 +25,7 @@ TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--np
 SETTINGS = Training(
     epochs=2,
     batch_size=103,  # of 104 samples: in the second batch one process has no sample
-    network=UNetConfig(width=8, depth=2, shuffle=1),
+    network=UNetConfig(width=8, depth=2, shuffle=1, rank=8),
     precision="float32",
 )
 FLAGS = ["--batch-size", "103", "--precision", "float32"]

@@ -124,7 +124,7 @@ def test_a_reconstructor_gives_the_same_pictures_one_at_a_time() -> None:
     draw = np.random.default_rng(0)
     frame, surface = draw.random((3, 22, 34), np.float32), draw.random((3, 2, 22, 34), np.float32)
     for paradigm, channels in CHANNELS.items():
-        network = ResidualUNet(channels, UNetConfig(width=8, depth=2)).eval()
+        network = ResidualUNet(channels, UNetConfig(width=8, depth=2, rank=0)).eval()
         for parameter in network.parameters():
             torch.nn.init.normal_(parameter, std=0.1)
         weights = Weights(network, paradigm, {"height": 22, "width": 34, "scored_rows": 16}, [])

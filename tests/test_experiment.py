@@ -36,7 +36,7 @@ from evnlos.training import Training
 from evnlos.transport import RadiometricTransport
 
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
-SMALL = Training(epochs=1, network=UNetConfig(width=4, depth=1))
+SMALL = Training(epochs=1, network=UNetConfig(width=4, depth=1, rank=8))
 ARMS = (
     Arm("E2E", "none", None, SMALL, sampling=SAMPLING),
     Arm("simulation only", "calibrated", SMALL, None, sampling=SAMPLING),

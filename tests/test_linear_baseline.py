@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from evnlos.errors import DataError
-from evnlos.evaluation.linear import fit_linear
+from evnlos.model import fit_linear
 
 
 def world(noise: float, objects: int = 30, positions: int = 10, seed: int = 0):

@@ -20,7 +20,7 @@ from evnlos.training.team import Team
 CPU = torch.device("cpu")
 ALONE = Team(0, 1, CPU)
 SETTINGS = Training(
-    epochs=2, network=UNetConfig(width=8, depth=1, shuffle=1), precision="float32", batch_size=7
+    epochs=2, network=UNetConfig(width=8, depth=1, shuffle=1, rank=8), precision="float32", batch_size=7
 )
 
 

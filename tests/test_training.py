@@ -17,8 +17,10 @@ from evnlos.errors import DataError
 from evnlos.model import save_weights
 from evnlos.training import LOSSES, balanced_loss, paper_loss, step_size
 
-SMALL = UNetConfig(width=8, depth=2, shuffle=1)
-QUICK = Training(epochs=2, network=SMALL, precision="float32")
+SMALL = UNetConfig(width=8, depth=2, shuffle=1, rank=0)
+QUICK = Training(
+    epochs=2, network=replace(SMALL, rank=8), precision="float32", batch_size=16, learning_rate=1e-3
+)
 
 
 def run(dataset, settings, out, weights=None) -> list[dict]:
@@ -34,7 +36,7 @@ def trained(tiny_dataset, tmp_path_factory):
 
 @pytest.mark.parametrize(("height", "width"), [(64, 96), (37, 51), (16, 16), (1, 3)])
 def test_the_network_takes_any_size(height: int, width: int) -> None:
-    net = ResidualUNet(3, UNetConfig(width=8, depth=3))
+    net = ResidualUNet(3, UNetConfig(width=8, depth=3, rank=0))
     out = net(torch.zeros(2, 3, height, width))
     assert out.shape == (2, 1, height, width)
     assert out.min() >= 0 and out.max() <= 1
@@ -134,7 +136,7 @@ def test_fine_tuning_starts_from_the_weights_and_keeps_frozen_parts(trained, tin
     assert new.paradigm == "frame"  # that of the weights
     assert [step["data"]["origin"] for step in new.history] == ["simulation", "simulation"]
     for name, value in old.network.state_dict().items():
-        frozen = name.split(".")[0] in ("stem", "encoder", "down", "latent")
+        frozen = name.split(".")[0] in ("standardise", "embedding", "stem", "encoder", "down", "latent")
         assert torch.equal(value, new.network.state_dict()[name]) == frozen, name
 
 

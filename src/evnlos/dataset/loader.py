@@ -21,9 +21,8 @@ CHANNELS: dict[Paradigm, int] = {"frame": 1, "event": 2, "fusion": 3}
 def network_input(frame: NDArray | Tensor, surface: NDArray | Tensor, paradigm: Paradigm) -> Tensor:
     """Return what a network of a paradigm sees: frame [N, H, W] and surface [N, 2, H, W] -> [N, C, H, W].
 
-    The frame is standardised (mean 0, standard deviation 1 in each picture): gain and a constant ambient
-    light drop out. The two polarities are standardised together, by the root mean square of both, which
-    keeps 0 = "no event" at 0 and their ratio as it is. Fusion is the two, concatenated.
+    The levels stay as they were measured, 0..1; a network brings them to its own scale. Fusion is the frame and
+    the two polarities of the surface.
 
     Raises:
         DataError: The paradigm is unknown.
@@ -32,12 +31,9 @@ def network_input(frame: NDArray | Tensor, surface: NDArray | Tensor, paradigm: 
         raise DataError(f"paradigm is {paradigm!r}; give one of {', '.join(PARADIGMS)}")
     parts = []
     if paradigm in ("frame", "fusion"):
-        picture = torch.as_tensor(frame, dtype=torch.float32)[:, None]  # [N, 1, H, W]
-        picture = picture - picture.mean(dim=(-2, -1), keepdim=True)
-        parts.append(picture / picture.square().mean(dim=(-2, -1), keepdim=True).sqrt().clamp_min(1e-3))
+        parts.append(torch.as_tensor(frame, dtype=torch.float32)[:, None])  # [N, 1, H, W]
     if paradigm in ("event", "fusion"):
-        maps = torch.as_tensor(surface, dtype=torch.float32)  # [N, 2, H, W]
-        parts.append(maps / maps.square().mean(dim=(-3, -2, -1), keepdim=True).sqrt().clamp_min(1e-3))
+        parts.append(torch.as_tensor(surface, dtype=torch.float32))  # [N, 2, H, W]
     return torch.cat(parts, dim=1)
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from evnlos.dataset import Dataset, network_input, read_shard
 from evnlos.metrics import psnr
+from evnlos.model.embedding import Standardise
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,11 @@ def nearest_answer(memory: Memory, inputs: Tensor) -> Tensor:
     Returns:
         Pictures, float32 [N, H, W].
     """
-    distance = (memory.inputs - inputs.float()).square().flatten(2).mean(dim=2)  # [G, N]
+    scale = Standardise(inputs.shape[1], "dataset")  # frames and events in units that can be compared
+    scale.fit(memory.inputs.flatten(0, 1))
+    distance = torch.stack(
+        [(scale(known) - scale(inputs.float())).square().flatten(1).mean(dim=1) for known in memory.inputs]
+    )  # [G, N]
     return memory.truth[distance.argmin(dim=0), torch.arange(len(inputs))]
 
 

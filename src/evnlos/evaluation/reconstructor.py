@@ -25,7 +25,7 @@ class Reconstructor:
 
     Example:
         >>> from evnlos.model import ResidualUNet, UNetConfig
-        >>> network = ResidualUNet(1, UNetConfig(width=4, depth=1)).eval()
+        >>> network = ResidualUNet(1, UNetConfig(width=4, depth=1, rank=0)).eval()
         >>> sampling = {"height": 16, "width": 24, "scored_rows": 12}
         >>> see = Reconstructor(Weights(network, "frame", sampling, []))
         >>> see(np.zeros((16, 24)), np.zeros((2, 16, 24))).shape

@@ -1,4 +1,4 @@
-"""The reconstruction network on one page: a U-Net of residual blocks."""
+"""The reconstruction network on one page: a U-Net of residual blocks behind the light path undone linearly."""
 
 from __future__ import annotations
 
@@ -10,27 +10,38 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.model.embedding import LinearEmbedding, Scaling, Standardise
 
 
 @dataclass(frozen=True)
 class UNetConfig:
     """Size of a `ResidualUNet`."""
 
-    width: int = 24
+    width: int = 48
     """Channels at the finest level; they double at each level down, up to 8 times."""
-    depth: int = 4
+    depth: int = 2
     """Number of levels below the finest one; each halves the sides."""
     blocks: int = 1
     """Residual blocks at each level, on the way down and on the way up."""
-    shuffle: int = 2
+    shuffle: int = 4
     """Side of the input cells that are folded into channels before the first level, pixels (1 = none)."""
     groups: int = 4
     """Groups of each group normalisation; divides `width`."""
+    scaling: Scaling = "dataset"
+    """Whose mean and size the inputs are divided by: the `dataset`'s, or each `picture`'s own."""
+    rank: int = 256
+    """Components of the linear embedding in front of the U-Net (0 = none: the U-Net sees the maps themselves)."""
+    strengths: tuple[float, ...] = (0.03, 1.0, 30.0)
+    """Ridges of the linear embedding, in units of the best one; each gives the U-Net one picture."""
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "blocks", "shuffle", "groups"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"UNetConfig.{name} is {getattr(self, name)}; give at least 1")
+        if self.rank < 0:
+            raise ConfigError(f"UNetConfig.rank is {self.rank}; give 0 (no embedding) or more")
+        if self.rank and not (self.strengths and all(0 < s < float("inf") for s in self.strengths)):
+            raise ConfigError(f"UNetConfig.strengths is {self.strengths}; give one positive number or several")
         if self.width % self.groups:
             raise ConfigError(f"UNetConfig.groups is {self.groups}; give a divisor of the width {self.width}")
 
@@ -57,23 +68,38 @@ class ResidualBlock(nn.Module):
 class ResidualUNet(nn.Module):
     """U-Net of residual blocks with skip connections: what the camera saw [B, C, H, W] -> picture [B, 1, H, W].
 
-    The output is in 0..1 (a sigmoid). Sides of any length: the network pads its input by repeating the
-    border up to a multiple of shuffle * 2^depth and crops its output. After Ronneberger, Fischer and
-    Brox, MICCAI 2015 (U-Net) and He et al., ECCV 2016 (pre-activation residual block).
+    The inputs are standardised and, where `config.rank` is not 0, turned into pictures by the linear embedding;
+    both hold numbers of the training's dataset. The output is in 0..1 (a sigmoid). The network pads by repeating
+    the border up to a multiple of shuffle * 2^depth and crops its output; without embedding it takes sides of any
+    length. After Ronneberger, Fischer and Brox, MICCAI 2015 (U-Net) and He et al., ECCV 2016 (pre-activation
+    residual block).
 
     Args:
         channels: Channels of the input: frame 1, event 2, fusion 3.
-        config: Width, depth and blocks.
+        config: Width, depth, blocks, embedding.
+        size: Height and width of the input, pixels; the embedding needs them.
+
+    Raises:
+        ConfigError: There is to be an embedding, and the size is missing.
 
     Example:
-        >>> net = ResidualUNet(3, UNetConfig(width=8, depth=2))
+        >>> net = ResidualUNet(3, UNetConfig(width=8), size=(50, 75))
         >>> net(torch.zeros(1, 3, 50, 75)).shape
         torch.Size([1, 1, 50, 75])
     """
 
-    def __init__(self, channels: int, config: UNetConfig = UNetConfig()) -> None:
+    def __init__(
+        self, channels: int, config: UNetConfig = UNetConfig(), size: tuple[int, int] | None = None
+    ) -> None:
         super().__init__()
         self.channels, self.config = channels, config
+        self.standardise = Standardise(channels, config.scaling)
+        self.embedding: LinearEmbedding | None = None
+        if config.rank:
+            if size is None:
+                raise ConfigError(f"UNetConfig.rank is {config.rank}; give the size of the inputs, or rank=0")
+            self.embedding = LinearEmbedding(channels, size, config.rank, config.strengths)
+            channels = len(config.strengths)
         cell, groups, blocks = config.shuffle**2, config.groups, config.blocks
         widths = [config.width * min(2**level, 8) for level in range(config.depth + 1)]
 
@@ -105,6 +131,9 @@ class ResidualUNet(nn.Module):
         if x.ndim != 4 or x.shape[1] != self.channels:
             raise DataError(f"input is {tuple(x.shape)}; this network takes [B, {self.channels}, H, W]")
         height, width = x.shape[-2:]
+        x = self.standardise(x)
+        if self.embedding is not None:
+            x = self.embedding(x)  # [B, strengths, H, W]
         x = F.pad(x, (0, -width % self.multiple, 0, -height % self.multiple), mode="replicate")
         x = self.stem(F.pixel_unshuffle(x, self.config.shuffle))  # [B, width, H/s, W/s]
         skips = []

@@ -16,7 +16,7 @@ from evnlos.dataset import CHANNELS
 from evnlos.errors import DataError
 from evnlos.model.unet import ResidualUNet, UNetConfig
 
-_FORMAT = "evnlos-weights-1"
+_FORMAT = "evnlos-weights-2"
 _MEAN = "baseline.mean_image"
 
 
@@ -39,9 +39,16 @@ class Weights:
     mean_image: torch.Tensor | None = None
 
 
-def save_weights(path: str | Path, weights: Weights) -> None:
-    """Write weights as one safetensors file, atomically."""
-    tensors = {name: value.detach().cpu().contiguous() for name, value in weights.network.state_dict().items()}
+def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.float32) -> None:
+    """Write weights as one safetensors file, atomically.
+
+    Args:
+        path: The file.
+        weights: What to write.
+        dtype: Precision on disk; `torch.float16` halves the file.
+    """
+    state = weights.network.state_dict()
+    tensors = {name: value.detach().cpu().to(dtype).contiguous() for name, value in state.items()}
     if weights.mean_image is not None:
         tensors[_MEAN] = weights.mean_image.contiguous()
     about = {
@@ -89,13 +96,14 @@ def load_weights(path: str | Path) -> Weights:
     ):
         raise DataError(f"{path} garbles its sampling, its history or its mean picture; the file is damaged")
     config = from_dict(UNetConfig, about.get("network"), source=str(path))  # type: ignore[arg-type]
-    network = _matching_network(CHANNELS[paradigm], config, tensors, path)
+    size = sampling.get("height"), sampling.get("width")
+    network = _matching_network(CHANNELS[paradigm], config, size, tensors, path)
     network.load_state_dict({name: value.float() for name, value in tensors.items()})
     return Weights(network.eval(), paradigm, sampling, history, mean_image)
 
 
 def _matching_network(
-    channels: int, config: UNetConfig, tensors: dict[str, torch.Tensor], path: Path
+    channels: int, config: UNetConfig, size: tuple[Any, Any], tensors: dict[str, torch.Tensor], path: Path
 ) -> ResidualUNet:
     """Return an empty network of the size that the tensors have; a stranger's config alone takes no memory.
 
@@ -106,8 +114,8 @@ def _matching_network(
     try:
         if config.depth * config.blocks <= len(tensors):  # each block has more than one tensor
             with torch.device("meta"):
-                network = ResidualUNet(channels, config)
-    except (RuntimeError, OverflowError, MemoryError):
+                network = ResidualUNet(channels, config, size)
+    except (RuntimeError, OverflowError, MemoryError, TypeError):
         pass
     wanted = {} if network is None else {n: tuple(v.shape) for n, v in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in tensors.items()}

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from evnlos.dataset import Paradigm
+from evnlos.model import UNetConfig
 from evnlos.training.settings import Training
+
+PLAIN_NETWORK = UNetConfig(width=24, depth=4, shuffle=2, scaling="picture", rank=0)
+"""A U-Net as the paper has it: it sees the maps, each picture standardised by itself, and no embedding."""
 
 
 def paper_pretraining(paradigm: Paradigm = "fusion") -> Training:
@@ -16,6 +20,7 @@ def paper_pretraining(paradigm: Paradigm = "fusion") -> Training:
         schedule="step",
         step_epoch=100,
         loss="paper",
+        network=PLAIN_NETWORK,
     )
 
 

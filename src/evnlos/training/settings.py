@@ -22,9 +22,9 @@ class Training:
     """What the network sees."""
     epochs: int = 20
     """Passes over the training samples."""
-    batch_size: int = 16
+    batch_size: int = 32
     """Samples a step."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Adam's step size at the start."""
     schedule: Literal["cosine", "constant", "step"] = "cosine"
     """How the step size falls: to zero along a cosine, not at all, or at once at `step_epoch`."""
@@ -34,6 +34,8 @@ class Training:
     """Factor of the schedule `step`."""
     loss: LossName = "balanced"
     """`balanced` (bounded, does not collapse to black) or `paper` (L1 + 2/SSIM)."""
+    restandardise: bool = True
+    """Fine-tuning: take mean and size of the inputs from the new data, as a rig that is not calibrated needs it."""
     freeze: tuple[Part, ...] = ()
     """Parts of the network whose weights stay as they are."""
     precision: Literal["auto", "bf16", "float32"] = "auto"

@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.dataset import LiveDataset, NlosDataset, Paradigm
@@ -28,6 +29,9 @@ class Batch(NamedTuple):
     """The part of the epoch's samples that the whole batch is, 0..1."""
 
 
+Samples = tuple[Tensor, Tensor, NDArray[np.str_]]
+
+
 class Source(Protocol):
     """Batches of any epoch, always the same for the same seed and epoch."""
 
@@ -40,6 +44,11 @@ class Source(Protocol):
 
     def mean_image(self) -> Tensor:
         """Return the mean of the true pictures, float32 [H, W]."""
+        ...
+
+    def some(self, count: int) -> Samples:
+        """Return about `count` samples at most, the same in every process: inputs [n, C, H, W], pictures
+        [n, H, W] and the object of each."""
         ...
 
 
@@ -72,6 +81,15 @@ class Stored:
     def mean_image(self) -> Tensor:
         """Return the mean of the true pictures, float32 [H, W]."""
         return self._samples.truth.float().mean(dim=0).cpu()
+
+    def some(self, count: int) -> Samples:
+        """Return at most `count` samples, chosen by the seed, on the CPU."""
+        draw = torch.Generator().manual_seed(derive_seed(self._seed, "some"))
+        chosen = torch.randperm(len(self._samples), generator=draw)[:count].sort().values
+        inputs, truth = (
+            part[chosen.to(part.device)].cpu() for part in (self._samples.inputs, self._samples.truth)
+        )
+        return inputs, truth, self._samples.names[chosen.numpy()]
 
 
 class Live:
@@ -130,3 +148,11 @@ class Live:
         """Return the mean of the true pictures of the first epoch, float32 [H, W]; it takes no simulation."""
         total = sum(self._dataset.truth(name).mean(axis=0, dtype=np.float64) for name in self._names)
         return torch.from_numpy(total / len(self._names)).float()
+
+    def some(self, count: int) -> Samples:
+        """Return the samples of the first objects of the first epoch, of as many as `count` allows."""
+        objects = max(1, min(len(self._names), count // self._dataset.simulation.positions))
+        names = self._names[:: max(1, len(self._names) // objects)][:objects]  # some of every hand
+        made = list(self._dataset.stream(names, 0, self._paradigm, self._team.device))
+        inputs, truth = (torch.cat(parts).cpu() for parts in zip(*made, strict=True))
+        return inputs, truth[:, 0], np.repeat(names, [len(seen) for seen, _ in made])

@@ -17,13 +17,14 @@ from torch.utils.data import TensorDataset
 
 from evnlos.claim import claim, is_empty
 from evnlos.config import config_hash, differing_keys, read_yaml, save_yaml, to_dict, write_atomically
-from evnlos.dataset import CHANNELS, Dataset, LiveDataset, NlosDataset
+from evnlos.dataset import CHANNELS, Dataset, LiveDataset, NlosDataset, Sampling
 from evnlos.errors import DataError
 from evnlos.metrics import psnr
 from evnlos.model import ResidualUNet, Weights, load_weights, save_weights
 from evnlos.seeds import derive_seed
 from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
 from evnlos.training.loss import LOSSES, light_of
+from evnlos.training.prepare import prepare
 from evnlos.training.settings import Training, step_size
 from evnlos.training.source import Live, Source, Stored
 from evnlos.training.team import Team, team
@@ -61,15 +62,14 @@ def train(
     """
     out = Path(out)
     start = load_weights(weights) if weights else None
-    network, settings = _network(settings, start)
+    network, settings = _network(settings, start, dataset.sampling)
     about = _about(dataset, settings, start)
     with team() as processes, claim(out) if processes.rank == 0 else nullcontext():
         if processes.rank == 0:
             _take_up(out, about)
         processes.wait()
-        yield from _epochs(
-            network, dataset, settings, out, [*(start.history if start else []), about], processes
-        )
+        history = [*(start.history if start else []), about]
+        yield from _epochs(network, dataset, settings, out, history, processes, is_new=start is None)
 
 
 def _epochs(
@@ -79,6 +79,8 @@ def _epochs(
     out: Path,
     history: list[dict[str, Any]],
     processes: Team,
+    *,
+    is_new: bool,
 ) -> Iterator[dict[str, Any]]:
     """Run the epochs that are left, and write the weights after the last."""
     checkpoint, metrics = out / "checkpoint.safetensors", out / "metrics.jsonl"
@@ -107,6 +109,8 @@ def _epochs(
         if leads:
             _write_log(metrics, log)
         yield from log
+    else:
+        prepare(network, source, settings.seed, is_new=is_new, restandardise=settings.restandardise)
     processes.wait()  # nobody writes before all have read
     joined = processes.joined(network)
     run = torch.compile(joined) if settings.compile else joined
@@ -153,12 +157,13 @@ def _epochs(
     processes.wait()
 
 
-def _network(settings: Training, start: Weights | None) -> tuple[ResidualUNet, Training]:
+def _network(settings: Training, start: Weights | None, sampling: Sampling) -> tuple[ResidualUNet, Training]:
     """Return the network to train; fine-tuning takes paradigm and size from its weights."""
     if start is None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(settings.seed, "weights"))
-            return ResidualUNet(CHANNELS[settings.paradigm], settings.network), settings
+            size = (sampling.height, sampling.width)
+            return ResidualUNet(CHANNELS[settings.paradigm], settings.network, size), settings
     settings = replace(settings, paradigm=start.paradigm, network=start.network.config)  # type: ignore[arg-type]
     return start.network, settings
 

@@ -1,4 +1,4 @@
-"""The best linear reconstruction, learned in closed form: what a network has to beat."""
+"""The best linear reconstruction, learned in closed form: what a network starts from, and has to beat."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ _LAMBDAS = tuple(10.0 ** (k / 2) for k in range(-12, 5))  # in units of the mean
 _FOLDS = 5
 _EXTRA = 20  # columns of the random probe beyond the rank
 _POWERS = 2
+_TINY = 1e-30
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,17 +25,28 @@ class LinearEstimate:
 
     Args:
         mean_in: Mean input, [D], D = C H W.
-        basis: Main directions of the inputs, [D, R], orthonormal.
-        weights: From their coefficients to the picture, [R, H W].
+        basis: Main directions of the inputs, [D, R], orthonormal, their coefficients uncorrelated.
+        powers: Power of each coefficient, summed over the samples, [R].
+        weights: From the coefficients to the picture, [R, H W].
         mean_out: Mean picture, [H, W].
         lam: Weight of the ridge that was chosen, in units of the mean power of a component.
     """
 
     mean_in: Tensor
     basis: Tensor
+    powers: Tensor
     weights: Tensor
     mean_out: Tensor
     lam: float
+
+    def shrinkage(self, strength: float) -> Tensor:
+        """Return the factors of the coefficients, [R], that make the ridge `strength` times as strong.
+
+        Along uncorrelated coefficients a ridge regression is one division each, so that those of all strengths
+        share basis and weights: W(s) = diag((p + l) / (p + s l)) W(1), p the powers, l the ridge.
+        """
+        ridge = self.lam * self.powers.mean().clamp_min(_TINY)
+        return (self.powers + ridge) / (self.powers + strength * ridge)
 
     def __call__(self, inputs: Tensor) -> Tensor:
         """Return pictures [N, H, W], 0..1, for inputs [N, C, H, W]."""
@@ -70,13 +82,16 @@ def fit_linear(
     x, y = x - mean_in, y - mean_out
     basis = _main_directions(x, min(rank, *x.shape), seed)
     code = x @ basis  # [N, R]
+    powers, turn = torch.linalg.eigh((code.T @ code).double())
+    powers, turn = powers.clamp_min(0).float().flip(0), turn.float().flip(1)
+    basis, code = basis @ turn, code @ turn
     order = np.random.default_rng(derive_seed(seed, "folds")).permutation(len(names))
     fold_of = dict(zip(names[order], np.arange(len(names)) % min(_FOLDS, len(names)), strict=True))
     folds = torch.tensor([int(fold_of[name]) for name in objects])
     errors = sum(_left_out(code, y, folds == fold) for fold in folds.unique())
     lam = _LAMBDAS[int(torch.as_tensor(errors).argmin())]
-    weights = _ridge(code.T @ code, code.T @ y, lam)
-    return LinearEstimate(mean_in, basis, weights, mean_out.unflatten(0, tuple(truth.shape[1:])), lam)
+    weights = (code.T @ y) / (powers + lam * powers.mean().clamp_min(_TINY))[:, None]
+    return LinearEstimate(mean_in, basis, powers, weights, mean_out.unflatten(0, tuple(truth.shape[1:])), lam)
 
 
 def _left_out(code: Tensor, y: Tensor, left: Tensor) -> Tensor:
@@ -87,7 +102,7 @@ def _left_out(code: Tensor, y: Tensor, left: Tensor) -> Tensor:
 
 
 def _ridge(inner: Tensor, outer: Tensor, lam: float) -> Tensor:
-    scale = inner.diagonal().mean().clamp_min(1e-30)
+    scale = inner.diagonal().mean().clamp_min(_TINY)
     return torch.linalg.solve(inner + lam * scale * torch.eye(len(inner)), outer)
 
 

@@ -1,0 +1,142 @@
+"""What a network knows before its first step: the scale of the data, and the light path undone linearly."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos import EvnlosError, ResidualUNet, Training, UNetConfig, load_weights, train
+from evnlos.dataset import NlosDataset
+from evnlos.errors import ConfigError
+from evnlos.evaluation import Reconstructor, infer
+from evnlos.model import Weights, fit_linear, save_weights
+from evnlos.model.embedding import LinearEmbedding, Standardise
+
+NET = UNetConfig(width=8, depth=1, rank=12, strengths=(0.1, 1.0, 10.0))
+
+
+@pytest.fixture(scope="module")
+def samples() -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
+    draw = torch.Generator().manual_seed(0)
+    truth = torch.rand(60, 6, 8, generator=draw)
+    matrix = torch.randn(48, 2 * 48, generator=draw) / 10
+    seen = truth.flatten(1) @ matrix + 0.1 * torch.randn(60, 96, generator=draw)
+    return seen.unflatten(1, (2, 6, 8)), truth, np.repeat([f"o{k}" for k in range(12)], 5)
+
+
+def test_each_strength_is_a_ridge_regression_of_its_own(samples) -> None:
+    inputs, truth, names = samples
+    estimate = fit_linear(inputs, truth, names, rank=96)
+    embedding = LinearEmbedding(2, (6, 8), 96, NET.strengths)
+    embedding.take(estimate)
+    x = (inputs.flatten(1) - inputs.flatten(1).mean(0)).double()
+    y = (truth.flatten(1) - truth.flatten(1).mean(0)).double()
+    inner = x.T @ x
+    # sixty samples span at most sixty directions: the mean power is over those that were kept
+    unit = estimate.lam * inner.diagonal().sum() / len(estimate.powers)
+    for k, strength in enumerate(NET.strengths):
+        weights = torch.linalg.solve(inner + strength * unit * torch.eye(96, dtype=torch.float64), x.T @ y)
+        expected = truth.double().mean(0) + (x @ weights).unflatten(1, (6, 8))
+        torch.testing.assert_close(embedding(inputs)[:, k].double(), expected, atol=2e-4, rtol=0)
+
+
+def test_fewer_samples_than_components_leave_the_rest_empty(samples) -> None:
+    inputs, truth, names = samples
+    embedding = LinearEmbedding(2, (6, 8), 96, (1.0,))
+    embedding.take(fit_linear(inputs, truth, names, rank=96))
+    before = embedding(inputs[:2])
+    embedding.take(fit_linear(inputs[:10], truth[:10], names[:10], rank=96))
+    assert not torch.allclose(embedding(inputs[:2]), before)
+    assert (embedding.basis.abs().sum(0) > 0).sum() <= 10
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3])
+@pytest.mark.parametrize("scaling", ["dataset", "picture"])
+def test_frames_lose_their_mean_and_events_keep_their_zero(channels: int, scaling: str) -> None:
+    draw = torch.Generator().manual_seed(channels)
+    x = torch.rand(5, channels, 6, 8, generator=draw) * torch.arange(1, 6)[:, None, None, None]
+    layer = Standardise(channels, scaling)
+    layer.fit(x)
+    found = layer(x)
+    for k in range(5):
+        whole = x if scaling == "dataset" else x[k : k + 1]
+        frames, events = whole[:, : channels % 2], whole[:, channels % 2 :]
+        expected = []
+        if channels % 2:
+            expected.append((x[k, :1] - frames.mean()) / frames.std(correction=0))
+        if channels > 1:
+            expected.append(x[k, channels % 2 :] / events.square().mean().sqrt())
+        torch.testing.assert_close(found[k], torch.cat(expected))
+
+
+def test_scaled_by_itself_a_picture_tells_neither_gain_nor_ambient_light() -> None:
+    layer = Standardise(1, "picture")
+    x = torch.rand(2, 1, 6, 8)
+    torch.testing.assert_close(layer(0.5 * x + 0.2), layer(x), atol=1e-5, rtol=0)
+    assert torch.isfinite(layer(torch.zeros(1, 1, 6, 8))).all()
+
+
+def test_training_gives_a_new_network_both_and_weights_keep_them(tiny_dataset, tmp_path) -> None:
+    plan = Training(epochs=1, network=NET, precision="float32", paradigm="fusion")
+    list(train(tiny_dataset, plan, tmp_path / "first"))
+    weights = load_weights(tmp_path / "first")
+    known = NlosDataset(tiny_dataset, "train", "fusion")
+    standardise, embedding = weights.network.standardise, weights.network.embedding
+    assert embedding is not None and embedding.rank == NET.rank
+    wanted = Standardise(3, "dataset")
+    wanted.fit(known.inputs.float())
+    torch.testing.assert_close(standardise.mean, wanted.mean)
+    seen = standardise(known.inputs.float())
+    pictures, truth = embedding(seen)[:, 1], known.truth.float()
+    assert (pictures - truth).square().mean() < 0.8 * (truth.mean(0) - truth).square().mean()
+
+    list(train(tiny_dataset, replace(plan, seed=1), tmp_path / "second", tmp_path / "first"))
+    later = load_weights(tmp_path / "second").network
+    assert torch.equal(later.embedding.basis, embedding.basis)
+
+    save_weights(tmp_path / "half.safetensors", weights, torch.float16)
+    half = load_weights(tmp_path / "half.safetensors")
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.55 * (
+        tmp_path / "first" / "weights.safetensors"
+    ).stat().st_size
+    one, other = (infer(w.network, known.inputs[:4]) for w in (weights, half))
+    torch.testing.assert_close(one, other, atol=0.02, rtol=0)
+
+
+def test_fine_tuning_takes_the_scale_of_the_new_data_only_where_it_shall(tiny_dataset, tmp_path) -> None:
+    plan = Training(epochs=1, network=NET, precision="float32")
+    list(train(tiny_dataset, plan, tmp_path / "first"))
+    weights = load_weights(tmp_path / "first")
+    weights.network.standardise.mean.fill_(7.0)
+    save_weights(tmp_path / "other.safetensors", weights)
+    for keep in (False, True):
+        settings = replace(plan, restandardise=not keep)
+        list(train(tiny_dataset, settings, tmp_path / f"{keep}", tmp_path / "other.safetensors"))
+        mean = load_weights(tmp_path / f"{keep}").network.standardise.mean
+        assert (float(mean) == 7.0) == keep
+
+
+def test_a_single_position_is_seen_as_in_a_batch(tiny_dataset, tmp_path) -> None:
+    sampling = tiny_dataset.sampling
+    network = ResidualUNet(1, NET, (sampling.height, sampling.width)).eval()
+    known = NlosDataset(tiny_dataset, "train", "frame")
+    network.embedding.take(fit_linear(known.inputs, known.truth, known.names, NET.rank))
+    about = {"height": sampling.height, "width": sampling.width, "scored_rows": sampling.scored_rows}
+    see = Reconstructor(Weights(network, "frame", about, []))
+    surface = np.zeros((2, sampling.height, sampling.width))
+    frame = known.inputs[3, 0].float()
+    torch.testing.assert_close(
+        see(frame.numpy(), surface), infer(network, known.inputs[3:4])[0], atol=1e-4, rtol=0
+    )
+
+
+def test_wrong_sizes_and_settings_are_named() -> None:
+    with pytest.raises(ConfigError, match="give the size"):
+        ResidualUNet(1, NET)
+    with pytest.raises(EvnlosError, match=r"takes \[B, 1, 6, 8\]"):
+        ResidualUNet(1, NET, (6, 8))(torch.zeros(1, 1, 8, 8))
+    with pytest.raises(ConfigError, match=r"rank is -1"):
+        UNetConfig(rank=-1)
+    with pytest.raises(ConfigError, match="strengths"):
+        UNetConfig(strengths=(1.0, 0.0))
