@@ -14,9 +14,9 @@ from evnlos.config import config_hash, write_atomically
 from evnlos.dataset import PARADIGMS, Simulation, network_input, simulate_object
 from evnlos.dataset.pool import run_in_order
 from evnlos.evaluation.intervals import paired_difference
-from evnlos.model import fit_linear
 from evnlos.experiment.study import Step
 from evnlos.metrics import psnr
+from evnlos.model import fit_linear
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs
 from evnlos.transport import RadiometricTransport
 

@@ -14,10 +14,9 @@ from evnlos.config import load_yaml
 from evnlos.dataset import Dataset, NlosDataset, Paradigm, Sampling, Simulation, read_shard
 from evnlos.evaluation import assess, available_lpips, check_sampling, infer
 from evnlos.evaluation.consistency import FrameOperator, consistent
-from evnlos.model import fit_linear
 from evnlos.experiment.records import keep_scores, names_there
 from evnlos.experiment.study import Arm, Place, Record, Step, Study
-from evnlos.model import load_weights
+from evnlos.model import fit_linear, load_weights
 
 TRUST = 1.0
 """How far the frames may move the pictures of `+ consistency`: the variance that a probability itself has."""

@@ -69,7 +69,7 @@ class Study:
     validation: tuple[str, ...] = ()
     """Characters that settings are chosen on. Where there are any, only these are scored, and the test
     characters are not even read."""
-    writers: int = 8
+    writers: int = 11
     """Writers of the simulated characters, 36 objects each."""
     simulation: Simulation | None = None
     """What an uncalibrated arm is pre-trained on; None is the default simulation."""

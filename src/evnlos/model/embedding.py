@@ -19,9 +19,9 @@ class Standardise(nn.Module):
     """Bring inputs [B, C, H, W] to mean 0 and size 1.
 
     A frame loses its mean and is divided by its standard deviation; the two maps of events keep 0 = "no event",
-    and are divided by the root mean square of both. With the scaling "dataset" these numbers are those of a whole
-    dataset, so that the brightness of one picture against another still counts; with "picture" they are each
-    picture's own, and gain and a constant ambient light drop out.
+    and are divided by the root mean square of both. With the scaling "dataset" these numbers are those of a
+    whole dataset, so that the brightness of one picture against another still counts; with "picture" they are
+    each picture's own, and gain and a constant ambient light drop out.
 
     Args:
         channels: 1 (frame), 2 (event) or 3 (fusion, the frame first).
@@ -70,9 +70,9 @@ class LinearEmbedding(nn.Module):
     """The light path undone by ridge regressions of several strengths: [B, C, H, W] -> [B, S, H, W].
 
     Fitted in closed form to simulated samples it carries the physics of their rig: it sees the whole wall at
-    once, which convolutions would have to learn layer by layer. The weak ridge is sharp and noisy, the strong one
-    smooth; what to believe where is left to the network behind it. All strengths share one basis and one matrix of
-    weights (`LinearEstimate.shrinkage`). These numbers are not trained by gradients.
+    once, which convolutions would have to learn layer by layer. The weak ridge is sharp and noisy, the strong
+    one smooth; what to believe where is left to the network behind it. All strengths share one basis and one
+    matrix of weights (`LinearEstimate.shrinkage`). These numbers are not trained by gradients.
 
     Args:
         channels: Channels of the input.

@@ -30,7 +30,7 @@ class UNetConfig:
     scaling: Scaling = "dataset"
     """Whose mean and size the inputs are divided by: the `dataset`'s, or each `picture`'s own."""
     rank: int = 256
-    """Components of the linear embedding in front of the U-Net (0 = none: the U-Net sees the maps themselves)."""
+    """Components of the linear embedding in front of the U-Net (0 = none: the U-Net sees the maps)."""
     strengths: tuple[float, ...] = (0.03, 1.0, 30.0)
     """Ridges of the linear embedding, in units of the best one; each gives the U-Net one picture."""
 
@@ -69,10 +69,10 @@ class ResidualUNet(nn.Module):
     """U-Net of residual blocks with skip connections: what the camera saw [B, C, H, W] -> picture [B, 1, H, W].
 
     The inputs are standardised and, where `config.rank` is not 0, turned into pictures by the linear embedding;
-    both hold numbers of the training's dataset. The output is in 0..1 (a sigmoid). The network pads by repeating
-    the border up to a multiple of shuffle * 2^depth and crops its output; without embedding it takes sides of any
-    length. After Ronneberger, Fischer and Brox, MICCAI 2015 (U-Net) and He et al., ECCV 2016 (pre-activation
-    residual block).
+    both hold numbers of the training's dataset. The output is in 0..1 (a sigmoid). The network pads by
+    repeating the border up to a multiple of shuffle * 2^depth and crops its output; without embedding it takes
+    sides of any length. After Ronneberger, Fischer and Brox, MICCAI 2015 (U-Net) and He et al., ECCV 2016
+    (pre-activation residual block).
 
     Args:
         channels: Channels of the input: frame 1, event 2, fusion 3.

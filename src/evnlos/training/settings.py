@@ -35,7 +35,7 @@ class Training:
     loss: LossName = "balanced"
     """`balanced` (bounded, does not collapse to black) or `paper` (L1 + 2/SSIM)."""
     restandardise: bool = True
-    """Fine-tuning: take mean and size of the inputs from the new data, as a rig that is not calibrated needs it."""
+    """Fine-tuning: take the inputs' mean and size from the new data, as an uncalibrated simulation needs it."""
     freeze: tuple[Part, ...] = ()
     """Parts of the network whose weights stay as they are."""
     precision: Literal["auto", "bf16", "float32"] = "auto"

@@ -48,7 +48,8 @@ class Source(Protocol):
 
     def some(self, count: int) -> Samples:
         """Return about `count` samples at most, the same in every process: inputs [n, C, H, W], pictures
-        [n, H, W] and the object of each."""
+        [n, H, W] and the object of each.
+        """
         ...
 
 
