@@ -21,8 +21,8 @@ from event_pixel import machine
 from evnlos.config import to_dict
 from evnlos.dataset import CHANNELS, PARADIGMS, Sampling, network_input
 from evnlos.dataset.sampling import make_samples
-from evnlos.evaluation import Reconstructor, infer
-from evnlos.model import ResidualUNet, UNetConfig, Weights, load_weights
+from evnlos.evaluation import Reconstructor
+from evnlos.model import ResidualUNet, UNetConfig, Weights, infer, load_weights
 from evnlos.types import Events
 
 

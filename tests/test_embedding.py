@@ -9,8 +9,8 @@ import torch
 from evnlos import EvnlosError, ResidualUNet, Training, UNetConfig, load_weights, train
 from evnlos.dataset import NlosDataset
 from evnlos.errors import ConfigError
-from evnlos.evaluation import Reconstructor, infer
-from evnlos.model import Weights, fit_linear, save_weights
+from evnlos.evaluation import Reconstructor
+from evnlos.model import Weights, fit_linear, infer, save_weights
 from evnlos.model.embedding import LinearEmbedding, Standardise
 
 NET = UNetConfig(width=8, depth=1, rank=12, strengths=(0.1, 1.0, 10.0))

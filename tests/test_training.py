@@ -182,3 +182,9 @@ def test_weights_round_trip(trained, tmp_path) -> None:
     weights = load_weights(trained[0])
     save_weights(tmp_path / "w.safetensors", weights)
     assert (tmp_path / "w.safetensors").read_bytes() == (trained[0] / "weights.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("part", ["encoder", "latent", "decoder"])
+def test_any_part_can_be_frozen(part: str, tiny_dataset, trained, tmp_path) -> None:
+    log = run(tiny_dataset, replace(QUICK, epochs=1, freeze=(part,)), tmp_path / part, trained[0])
+    assert np.isfinite(log[-1]["loss"])

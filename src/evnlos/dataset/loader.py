@@ -49,13 +49,14 @@ class NlosDataset(torch.utils.data.Dataset):
         inputs: float16 [N, C, H, W].
         truth: float16 [N, H, W].
         names: The object of each sample, [N].
+        position_m: The target's centre, (x, y) in metres, float32 [N, 2]; NaN where it is unknown.
 
     Raises:
         DataError: A shard is missing or damaged, or an object has no truth to learn from.
     """
 
     def __init__(self, dataset: Dataset, split: str, paradigm: Paradigm) -> None:
-        inputs, truth, names = [], [], []
+        inputs, truth, names, places = [], [], [], []
         for name in dataset.objects(split):
             samples, _ = read_shard(dataset.shard(name))
             if samples.truth is None:
@@ -65,8 +66,11 @@ class NlosDataset(torch.utils.data.Dataset):
             inputs.append(network_input(samples.frame, samples.surface, paradigm).half())
             truth.append(torch.from_numpy(samples.truth).half())
             names += [name] * len(samples)
+            unknown = np.full((len(samples), 2), np.nan, dtype=np.float32)
+            places.append(unknown if samples.position_m is None else samples.position_m.astype(np.float32))
         self.inputs, self.truth = torch.cat(inputs), torch.cat(truth)
         self.names = np.array(names)
+        self.position_m = np.concatenate(places)
 
     def __len__(self) -> int:
         return len(self.inputs)

@@ -7,7 +7,6 @@ from evnlos.evaluation.evaluate import (
     assess,
     check_sampling,
     evaluate,
-    infer,
     reconstruct,
 )
 from evnlos.evaluation.identify import Identification, identify
@@ -29,7 +28,6 @@ __all__ = [
     "check_sampling",
     "evaluate",
     "identify",
-    "infer",
     "load_lpips",
     "reconstruct",
     "score",

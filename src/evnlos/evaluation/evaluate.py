@@ -15,7 +15,7 @@ from evnlos.errors import DataError
 from evnlos.evaluation.classifier import CHARACTERS, plates, read_characters
 from evnlos.evaluation.memory import nearer_to_truth, nearest_answer, recall
 from evnlos.evaluation.score import Perceptual, Scores, score
-from evnlos.model import ResidualUNet, Weights
+from evnlos.model import Weights, infer
 from evnlos.types import Plane
 
 BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest shot"}
@@ -92,7 +92,7 @@ def evaluate(
     """
     check_sampling(weights, dataset.sampling)
     samples = NlosDataset(dataset, split, weights.paradigm)  # type: ignore[arg-type]
-    images = infer(weights.network, samples.inputs)
+    images = infer(weights.network, samples.inputs, samples.position_m, samples.names)
     return assess(images, samples, dataset, split, weights.paradigm, weights.mean_image, perceptual)
 
 
@@ -149,25 +149,25 @@ def _reading(
     return found
 
 
-@torch.inference_mode()
-def infer(network: ResidualUNet, inputs: Tensor, batch_size: int = 40) -> Tensor:
-    """Run a network on inputs [N, C, H, W] in batches; return pictures, float32 [N, H, W], 0..1."""
-    network = network.eval()
-    return torch.cat([network(part.float())[:, 0] for part in inputs.split(batch_size)])
-
-
-def reconstruct(weights: Weights, frame: np.ndarray, surface: np.ndarray) -> Tensor:
+def reconstruct(
+    weights: Weights, frame: np.ndarray, surface: np.ndarray, position_m: np.ndarray | None = None
+) -> Tensor:
     """Reconstruct samples, also those without a truth.
 
     Args:
         weights: The network and its paradigm.
         frame: Frames, float32 [N, H, W], 0..1, as in `Samples`.
         surface: Time surfaces, float32 [N, 2, H, W].
+        position_m: The target's centre, (x, y) in metres, [N, 2], which joint weights need.
 
     Returns:
         Pictures, float32 [N, H, W], 0..1.
+
+    Raises:
+        DataError: The weights are joint ones and the positions are unknown.
     """
-    return infer(weights.network, network_input(frame, surface, weights.paradigm))  # type: ignore[arg-type]
+    seen = network_input(frame, surface, weights.paradigm)  # type: ignore[arg-type]
+    return infer(weights.network, seen, position_m)
 
 
 def check_sampling(weights: Weights, sampling: Sampling) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from evnlos.config import from_dict
 from evnlos.dataset import CHANNELS, Sampling, network_input
 from evnlos.errors import DataError
-from evnlos.model import Weights
+from evnlos.model import JointNetwork, Weights
 
 
 class Reconstructor:
@@ -34,6 +34,10 @@ class Reconstructor:
 
     def __init__(self, weights: Weights) -> None:
         self.paradigm = weights.paradigm
+        if isinstance(weights.network, JointNetwork):
+            raise DataError(
+                "these weights see a whole pass; give weights of single positions (without --joint)"
+            )
         self.sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
         shape = (1, CHANNELS[weights.paradigm], self.sampling.height, self.sampling.width)  # type: ignore[index]
         network = weights.network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -141,6 +141,18 @@ def embedding(rig: str) -> Study:
     return Study("embedding", rig, tuple(arms))
 
 
+def joint(rig: str) -> Study:
+    """Return the comparison of E2E and EPNP where all positions of a pass are seen together."""
+    net = replace(UNetConfig(), rank=512, strengths=(0.001, 0.01, 0.1, 1.0))
+    before = Training(joint=True, epochs=12, batch_size=16, network=net)
+    arms = (
+        Arm("E2E joint", "none", None, replace(before, epochs=60)),
+        Arm("simulation only joint", "calibrated", before, None),
+        Arm("EPNP joint", "calibrated", before, replace(FINETUNING, epochs=8, batch_size=16)),
+    )
+    return Study("joint", rig, arms)
+
+
 STUDIES: dict[str, Callable[[str], Study]] = {
     "captures": captures,
     "paper": paper,
@@ -151,5 +163,6 @@ STUDIES: dict[str, Callable[[str], Study]] = {
     "loss": loss,
     "width": width,
     "embedding": embedding,
+    "joint": joint,
 }
 """Experiments on captures by name."""

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from evnlos.config import load_yaml
 from evnlos.dataset import Dataset, NlosDataset, Paradigm, Sampling, Simulation, read_shard
-from evnlos.evaluation import assess, available_lpips, check_sampling, infer
+from evnlos.evaluation import assess, available_lpips, check_sampling
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.experiment.records import keep_scores, names_there
 from evnlos.experiment.study import Arm, Place, Record, Step, Study
-from evnlos.model import fit_linear, load_weights
+from evnlos.model import fit_linear, infer, load_weights
 
 TRUST = 1.0
 """How far the frames may move the pictures of `+ consistency`: the variance that a probability itself has."""
@@ -72,7 +72,7 @@ def score_arm(
     for (run, settings), seed in zip(runs, study.seeds, strict=True):
         weights = load_weights(run)
         check_sampling(weights, shots.sampling)
-        pictures.append(infer(weights.network, samples.inputs))
+        pictures.append(infer(weights.network, samples.inputs, samples.position_m, samples.names))
         yield from variants(pictures[-1], seed, settings | {"run": run.name}, weights.mean_image)
     if len(runs) > 1:
         together = torch.stack(pictures).mean(dim=0)

@@ -60,6 +60,10 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [B, inside, H, W] to [B, outside, H, W]."""
+        if torch.is_grad_enabled() and not x.requires_grad:
+            # Behind frozen layers: on a CPU torch 2.13 crashes in the backward pass of a group norm, in
+            # channels-last layout, whose input needs no gradient.
+            x = x.detach().requires_grad_()
         y = self.conv1(F.silu(self.norm1(x)))
         y = self.conv2(F.silu(self.norm2(y)))
         return self.skip(x) + y

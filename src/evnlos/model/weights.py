@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from safetensors.torch import save
 
 from evnlos.config import from_dict, to_dict, write_atomically
 from evnlos.dataset import CHANNELS
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
+from evnlos.model.joint import JointNetwork
 from evnlos.model.unet import ResidualUNet, UNetConfig
 
 _FORMAT = "evnlos-weights-2"
@@ -25,14 +27,14 @@ class Weights:
     """A network and what a user of it must know: its paradigm, its sampling, where it comes from.
 
     Args:
-        network: The network, in evaluation mode.
+        network: The network, in evaluation mode; of single positions, or a joint one of whole passes.
         paradigm: What it sees: "frame", "event" or "fusion".
         sampling: Resolution and representation of the samples that it was trained on.
         history: The trainings behind it, oldest first: settings, data, version.
         mean_image: Mean of the true pictures of the last training, float32 [H, W]: the baseline to beat.
     """
 
-    network: ResidualUNet
+    network: ResidualUNet | JointNetwork
     paradigm: str
     sampling: dict[str, Any]
     history: list[dict[str, Any]]
@@ -54,6 +56,7 @@ def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.
     about = {
         "format": _FORMAT,
         "paradigm": weights.paradigm,
+        "joint": isinstance(weights.network, JointNetwork),
         "network": to_dict(weights.network.config),
         "sampling": weights.sampling,
         "history": weights.history,
@@ -96,29 +99,36 @@ def load_weights(path: str | Path) -> Weights:
     ):
         raise DataError(f"{path} garbles its sampling, its history or its mean picture; the file is damaged")
     config = from_dict(UNetConfig, about.get("network"), source=str(path))  # type: ignore[arg-type]
-    size = sampling.get("height"), sampling.get("width")
-    network = _matching_network(CHANNELS[paradigm], config, size, tensors, path)
+    make: Callable[[], ResidualUNet | JointNetwork]
+    size: Any = (sampling.get("height"), sampling.get("width"))
+    if about.get("joint"):
+        make = lambda: JointNetwork(CHANNELS[paradigm], config, size, sampling["pitch_m"])  # noqa: E731
+    else:
+        make = lambda: ResidualUNet(CHANNELS[paradigm], config, size)  # noqa: E731
+    network = _matching_network(make, config, tensors, path)
     network.load_state_dict({name: value.float() for name, value in tensors.items()})
     return Weights(network.eval(), paradigm, sampling, history, mean_image)
 
 
 def _matching_network(
-    channels: int, config: UNetConfig, size: tuple[Any, Any], tensors: dict[str, torch.Tensor], path: Path
-) -> ResidualUNet:
+    make: Callable[[], ResidualUNet | JointNetwork],
+    config: UNetConfig,
+    tensors: dict[str, torch.Tensor],
+    path: Path,
+) -> ResidualUNet | JointNetwork:
     """Return an empty network of the size that the tensors have; a stranger's config alone takes no memory.
 
     Raises:
         DataError: The config does not describe the tensors.
     """
-    network = None
+    wanted: dict[str, tuple[int, ...]] = {}
     try:
         if config.depth * config.blocks <= len(tensors):  # each block has more than one tensor
             with torch.device("meta"):
-                network = ResidualUNet(channels, config, size)
-    except (RuntimeError, OverflowError, MemoryError, TypeError):
+                wanted = {name: tuple(value.shape) for name, value in make().state_dict().items()}
+    except (RuntimeError, OverflowError, MemoryError, TypeError, LookupError, ConfigError):
         pass
-    wanted = {} if network is None else {n: tuple(v.shape) for n, v in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in tensors.items()}
-    if network is None or wanted != found:
+    if not wanted or wanted != found:
         raise DataError(f"{path} does not fit its own config ({config}); the file is damaged")
-    return network.to_empty(device="cpu")
+    return make()

@@ -49,7 +49,7 @@ def reconstruct_capture(
     samples = capture_samples(shot, sampling, pattern)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DataError(f"{out} is not an empty folder; give a new one")
-    images = reconstruct(loaded, samples.frame, samples.surface)
+    images = reconstruct(loaded, samples.frame, samples.surface, samples.position_m)
     pictures = [grey(image) for image in images]
     out.mkdir(parents=True, exist_ok=True)
     for k, picture in enumerate(pictures):

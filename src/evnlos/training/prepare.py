@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from evnlos.model import ResidualUNet, fit_linear
+from evnlos.model import JointNetwork, ResidualUNet, fit_linear
 from evnlos.training.source import Source
 
 MOST_SAMPLES = 16_384
@@ -13,7 +13,9 @@ MOST_SAMPLES = 16_384
 
 
 @torch.inference_mode()
-def prepare(network: ResidualUNet, source: Source, seed: int, *, is_new: bool, restandardise: bool) -> None:
+def prepare(
+    network: ResidualUNet | JointNetwork, source: Source, seed: int, *, is_new: bool, restandardise: bool
+) -> None:
     """Give a new network the scale of the data and its linear embedding; one with weights, at most the scale.
 
     Args:

@@ -34,6 +34,10 @@ class Training:
     """Factor of the schedule `step`."""
     loss: LossName = "balanced"
     """`balanced` (bounded, does not collapse to black) or `paper` (L1 + 2/SSIM)."""
+    joint: bool = False
+    """Train a joint network: all positions of a pass together give one picture of the plate."""
+    views: int = 3
+    """Joint training: views of each pass; all its positions, every other one, then random subsets."""
     restandardise: bool = True
     """Fine-tuning: take the inputs' mean and size from the new data, as an uncalibrated simulation needs it."""
     freeze: tuple[Part, ...] = ()
@@ -48,7 +52,7 @@ class Training:
     """Seed of the initial weights and of the order of the samples."""
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size"):
+        for name in ("epochs", "batch_size", "views"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"Training.{name} is {getattr(self, name)}; give at least 1")
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):

@@ -13,6 +13,7 @@ from torch import Tensor
 from evnlos.dataset import LiveDataset, NlosDataset, Paradigm
 from evnlos.errors import ConfigError
 from evnlos.seeds import derive_seed
+from evnlos.training.pooled import PooledSamples
 from evnlos.training.team import Team
 
 
@@ -59,13 +60,13 @@ class Stored:
     A batch is cut into as many parts as there are processes; together they are the batch of one process.
 
     Args:
-        samples: The samples.
+        samples: The samples: positions, or passes.
         batch_size: Samples a step, of all processes together.
         seed: Seed of the order.
         team: The processes.
     """
 
-    def __init__(self, samples: NlosDataset, batch_size: int, seed: int, team: Team) -> None:
+    def __init__(self, samples: NlosDataset | PooledSamples, batch_size: int, seed: int, team: Team) -> None:
         self._samples, self._batch_size, self._seed, self._team = samples, batch_size, seed, team
         self.steps = -(-len(samples) // batch_size)
         if team.device.type == "cuda" and samples.bytes() < torch.cuda.mem_get_info(team.device)[0] // 2:

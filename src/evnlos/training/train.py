@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.utils.data import TensorDataset
 
 from evnlos.claim import claim, is_empty
 from evnlos.config import config_hash, differing_keys, read_yaml, save_yaml, to_dict, write_atomically
 from evnlos.dataset import CHANNELS, Dataset, LiveDataset, NlosDataset, Sampling
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
 from evnlos.metrics import psnr
-from evnlos.model import ResidualUNet, Weights, load_weights, save_weights
+from evnlos.model import JointNetwork, ResidualUNet, Weights, infer, load_weights, save_weights
 from evnlos.seeds import derive_seed
 from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
 from evnlos.training.loss import LOSSES, light_of
+from evnlos.training.pooled import PooledSamples
 from evnlos.training.prepare import prepare
 from evnlos.training.settings import Training, step_size
 from evnlos.training.source import Live, Source, Stored
@@ -73,7 +73,7 @@ def train(
 
 
 def _epochs(
-    network: ResidualUNet,
+    network: ResidualUNet | JointNetwork,
     dataset: Dataset,
     settings: Training,
     out: Path,
@@ -93,13 +93,13 @@ def _epochs(
     network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     for part in settings.freeze:
         for name in _PARTS[part]:
-            getattr(network, name).requires_grad_(False)
+            getattr(_unet(network), name).requires_grad_(False)
     trained = [p for p in network.parameters() if p.requires_grad]
     if not trained:
         raise DataError(f"freeze is {settings.freeze}; leave at least one part of the network to train")
     optimiser = torch.optim.Adam(trained, lr=settings.learning_rate)
     loss_of, half = LOSSES[settings.loss], _half(settings, device)
-    source = _source(dataset, settings, processes)
+    positions = source = _source(dataset, settings, processes)
     held_out = _held_out(dataset, settings, device) if leads else None
 
     done, log = 0, []
@@ -110,7 +110,14 @@ def _epochs(
             _write_log(metrics, log)
         yield from log
     else:
-        prepare(network, source, settings.seed, is_new=is_new, restandardise=settings.restandardise)
+        prepare(network, positions, settings.seed, is_new=is_new, restandardise=settings.restandardise)
+    if isinstance(network, JointNetwork):
+        passes = PooledSamples(
+            NlosDataset(dataset, "train", settings.paradigm), network, settings.views, settings.seed
+        )
+        if is_new and not done:
+            network.fit_scale(passes.inputs)
+        source = Stored(passes, settings.batch_size, settings.seed, processes)
     processes.wait()  # nobody writes before all have read
     joined = processes.joined(network)
     run = torch.compile(joined) if settings.compile else joined
@@ -150,27 +157,37 @@ def _epochs(
             settings.paradigm,
             to_dict(dataset.sampling),
             history,
-            source.mean_image(),
+            positions.mean_image(),
         )
         save_weights(out / "weights.safetensors", done_weights)
         checkpoint.unlink(missing_ok=True)
     processes.wait()
 
 
-def _network(settings: Training, start: Weights | None, sampling: Sampling) -> tuple[ResidualUNet, Training]:
-    """Return the network to train; fine-tuning takes paradigm and size from its weights."""
+def _network(
+    settings: Training, start: Weights | None, sampling: Sampling
+) -> tuple[ResidualUNet | JointNetwork, Training]:
+    """Return the network to train; fine-tuning takes kind, paradigm and size from its weights."""
     if start is None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(settings.seed, "weights"))
-            size = (sampling.height, sampling.width)
-            return ResidualUNet(CHANNELS[settings.paradigm], settings.network, size), settings
-    settings = replace(settings, paradigm=start.paradigm, network=start.network.config)  # type: ignore[arg-type]
-    return start.network, settings
+            channels, size = CHANNELS[settings.paradigm], (sampling.height, sampling.width)
+            if settings.joint:
+                return JointNetwork(channels, settings.network, size, sampling.pitch_m), settings
+            return ResidualUNet(channels, settings.network, size), settings
+    known = {"paradigm": start.paradigm, "joint": isinstance(start.network, JointNetwork)}
+    return start.network, replace(settings, network=start.network.config, **known)  # type: ignore[arg-type]
+
+
+def _unet(network: ResidualUNet | JointNetwork) -> ResidualUNet:
+    return network.unet if isinstance(network, JointNetwork) else network
 
 
 def _source(dataset: Dataset, settings: Training, processes: Team) -> Source:
     """Return where the training's batches come from."""
     if isinstance(dataset, LiveDataset):
+        if settings.joint:
+            raise ConfigError("joint training pools passes on disk; write them with `evnlos simulate` first")
         return Live(dataset, settings.paradigm, settings.batch_size, settings.seed, processes)
     samples = NlosDataset(dataset, "train", settings.paradigm)
     return Stored(samples, settings.batch_size, settings.seed, processes)
@@ -239,20 +256,22 @@ def _take_up(out: Path, about: dict[str, Any]) -> None:
 
 @torch.inference_mode()
 def _validate(
-    network: ResidualUNet, held_out: HeldOut, dataset: Dataset, device: torch.device, half: bool
+    network: ResidualUNet | JointNetwork,
+    held_out: HeldOut,
+    dataset: Dataset,
+    device: torch.device,
+    half: bool,
 ) -> dict[str, Any]:
-    network.eval()
-    scored = dataset.sampling.scored
-    values, blanks, spread = [], [], []
-    for first in range(0, len(held_out), 64):
-        seen, truth = held_out[slice(first, first + 64)]
-        with torch.autocast(device.type, torch.bfloat16, enabled=half):
-            image: Tensor = network(seen.to(device)).cpu()
-        image, truth = image[..., scored, :], truth[..., scored, :].cpu()
-        values.append(psnr(image, truth))
-        blanks.append(psnr(torch.zeros_like(truth), truth))
-        spread.append(image.flatten(1))
-    score, blank = torch.cat(values).mean().item(), torch.cat(blanks).mean().item()
+    if isinstance(held_out, NlosDataset):
+        inputs, truth = held_out.inputs, held_out.truth.float().cpu()
+        places, names = held_out.position_m, held_out.names
+    else:
+        inputs, truth = held_out.tensors[0], held_out.tensors[1][:, 0].cpu()
+        places = names = None
+    with torch.autocast(device.type, torch.bfloat16, enabled=half):
+        images = infer(network, inputs.to(device), places, names).float().cpu()
+    images, truth = (part[:, dataset.sampling.scored] for part in (images, truth))
+    score, blank = psnr(images, truth).mean().item(), psnr(torch.zeros_like(truth), truth).mean().item()
     # A network that has collapsed answers the same to every input.
-    collapsed = bool(torch.cat(spread).std(dim=0).mean() < 1e-3) if len(held_out) > 1 else False
+    collapsed = bool(images.flatten(1).std(dim=0).mean() < 1e-3) if len(images) > 1 else False
     return {"psnr_db": round(score, 3), "zero_db": round(blank, 3), "collapsed": collapsed}

@@ -1,0 +1,104 @@
+"""A whole pass as one measurement: aligned by the motion, pooled, and better than its best position."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos import EvnlosError, Training, UNetConfig, evaluate, load_weights, train
+from evnlos.dataset import NlosDataset
+from evnlos.errors import ConfigError, DataError
+from evnlos.evaluation import Reconstructor
+from evnlos.model import JointNetwork, infer
+from evnlos.scene import FontGlyphs
+from evnlos.types import Plane
+
+NET = UNetConfig(width=8, depth=1, shuffle=2, rank=24, strengths=(0.01, 1.0))
+PLAN = Training(epochs=6, network=NET, precision="float32", joint=True, batch_size=4, views=2)
+PITCH_M = 0.0025
+
+
+def network(channels: int = 1) -> JointNetwork:
+    return JointNetwork(channels, NET, (64, 96), PITCH_M)
+
+
+def test_pictures_of_a_moving_plate_meet_on_the_plate_and_come_back() -> None:
+    target = FontGlyphs(characters="F").target("comic_neue_bold_F")
+    places = np.array([[-0.05, -0.01], [0.0, 0.0], [0.0313, 0.0117], [0.06, 0.02]])
+    truth = torch.from_numpy(target.rasterise(Plane(64, 96, PITCH_M), places)).float()
+    at = torch.from_numpy(places).float()
+    net = network()
+    plate = net.plate_of(truth, at)
+    assert plate.shape == (80, 80)
+    error = (net.drawn(plate, at) - truth).square().mean()
+    assert 10 * torch.log10(1 / error) > 27
+    shuffled = net.plate_of(truth, at.flip(0))
+    assert (net.drawn(shuffled, at) - truth).square().mean() > 4 * error
+
+
+def test_the_mean_is_over_the_positions_that_see_a_pixel() -> None:
+    net = network()
+    net.embedding.mean_out.fill_(0.5)  # every position answers one half everywhere
+    inputs, places = torch.zeros(3, 1, 64, 96), torch.tensor([[0.0, 0.0], [0.1, 0.0], [-0.03, 0.0]])
+    pooled = net.pooled(inputs, places)
+    inner = pooled[:, 4:-4, 4:-4]
+    torch.testing.assert_close(inner, torch.full_like(inner, 0.5))
+    with pytest.raises(DataError, match="off the canvas"):
+        net.pooled(inputs, places + 1.0)
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_dataset, tmp_path_factory):
+    out = tmp_path_factory.mktemp("joint") / "run"
+    return out, list(train(tiny_dataset, PLAN, out))
+
+
+def test_a_joint_run_learns_scores_and_is_read_back(trained, tiny_dataset) -> None:
+    out, log = trained
+    assert log[-1]["loss"] < log[0]["loss"]
+    weights = load_weights(out)
+    assert isinstance(weights.network, JointNetwork)
+    found = evaluate(weights, tiny_dataset, "train")
+    assert found.images.shape == found.truth.shape
+    assert found.scores.mean()["psnr_db"] > found.baselines["zero"].mean()["psnr_db"]
+    samples = NlosDataset(tiny_dataset, "train", "frame")
+    both = infer(weights.network, samples.inputs, samples.position_m, samples.names)
+    name = samples.names[0]
+    mine = samples.names == name
+    alone = infer(weights.network, samples.inputs[torch.from_numpy(mine)], samples.position_m[mine])
+    torch.testing.assert_close(both[torch.from_numpy(mine)], alone)
+
+
+def test_a_killed_joint_run_goes_on_to_the_same_bytes(trained, tiny_dataset, tmp_path) -> None:
+    out, _ = trained
+    going = train(tiny_dataset, PLAN, tmp_path / "again")
+    next(going), next(going)
+    going.close()
+    list(train(tiny_dataset, PLAN, tmp_path / "again"))
+    one, other = (load_weights(run).network.state_dict() for run in (out, tmp_path / "again"))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_fine_tuning_keeps_the_kind_and_frozen_parts(trained, tiny_dataset, tmp_path) -> None:
+    out, _ = trained
+    plan = replace(PLAN, joint=False, epochs=1, freeze=("encoder",))
+    list(train(tiny_dataset, plan, tmp_path / "fine", out))
+    old, new = load_weights(out).network, load_weights(tmp_path / "fine").network
+    assert isinstance(new, JointNetwork)
+    assert torch.equal(old.unet.stem.weight, new.unet.stem.weight)
+    assert not torch.equal(old.unet.head.weight, new.unet.head.weight)
+
+
+def test_what_a_joint_network_cannot_do_is_said(trained, tiny_dataset) -> None:
+    weights = load_weights(trained[0])
+    samples = NlosDataset(tiny_dataset, "train", "frame")
+    with pytest.raises(DataError, match="where the target was"):
+        infer(weights.network, samples.inputs)
+    unknown = np.full_like(samples.position_m, np.nan)
+    with pytest.raises(EvnlosError, match=r"capture\.yaml"):
+        infer(weights.network, samples.inputs, unknown)
+    with pytest.raises(DataError, match="whole pass"):
+        Reconstructor(weights)
+    with pytest.raises(ConfigError, match="rank"):
+        JointNetwork(1, replace(NET, rank=0), (64, 96), PITCH_M)
