@@ -109,7 +109,7 @@ def _of_simulation(values: dict[str, Any]) -> set[str]:
         wanted.add("event pixel")
         if transport.get("kind", "paper") == "paper":
             wanted.add("angular spectrum")
-        elif transport.get("wall_material", "ggx") == "ggx":
+        elif transport["kind"] != "measured" and transport.get("wall_material", "ggx") == "ggx":
             wanted.add("rough metal")
     if isinstance(values.get("sampling"), dict):
         wanted.add("time surface")

@@ -24,6 +24,7 @@ from evnlos.dataset.simulate import SensorSize, Simulation
 from evnlos.errors import DataError
 from evnlos.scene import LineMotion
 from evnlos.sensor import EventPixel
+from evnlos.transport import MeasuredTransport
 
 _EXAMPLES = 3
 
@@ -149,6 +150,7 @@ def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[AnyTranspor
     """Return the start at the measured distance of target and wall, and the names of what is known."""
     noted = shots.captures[0].info.rig.get("distance_m")
     transport = settings.start.transport
+    assert not isinstance(transport, MeasuredTransport)  # `Calibration` refuses it
     if noted is not None:
         if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not noted > 0:
             raise DataError(

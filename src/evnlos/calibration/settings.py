@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from evnlos.dataset.simulate import Simulation
 from evnlos.errors import ConfigError
 from evnlos.scene import HandwritingGlyphs
-from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.transport import MeasuredTransport, PaperTransport, RadiometricTransport
 
 
 def _rough_metal() -> Simulation:
@@ -45,6 +45,10 @@ class Calibration:
         if not 0 < self.holdout_share < 1:
             raise ConfigError(
                 f"Calibration.holdout_share is {self.holdout_share}; give a share between 0 and 1"
+            )
+        if isinstance(self.start.transport, MeasuredTransport):
+            raise ConfigError(
+                "start.transport is measured, which leaves no optics to fit; give paper or radiometric"
             )
         if self.columns < 16:
             raise ConfigError(f"Calibration.columns is {self.columns}; give 16 pixels or more")

@@ -1,4 +1,4 @@
-"""`evnlos invert`: a photograph, or captures of a calibrated rig, in; a picture of what is hidden out."""
+"""`evnlos invert`: a photograph, captures or pictures of a known rig in; what is hidden out."""
 
 from __future__ import annotations
 
@@ -23,9 +23,12 @@ class Command:
     """Invert a photograph of a matte wall, or whole passes of captures, by the operator alone."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --rig."""
+    """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --rig, or
+    pictures of the wall with a measured --rig."""
     rig: Path | None = None
-    """Rig file of the captures, as `evnlos calibrate` writes it."""
+    """Rig file of the captures, as `evnlos calibrate` writes it, or the transport of `evnlos scan import`."""
+    dark: Path | None = None
+    """Pictures: one taken without the hidden object; by default the scan's own dark frames."""
     positions: tuple[int, ...] = ()
     """Captures: how many of the frames 1, 2, ... to use, equally spaced; none = all, several = a curve."""
     pattern: Path | None = None
@@ -63,7 +66,8 @@ class Command:
     def run(self) -> None:
         """Invert, print the figures, write the picture."""
         if self.rig is not None:
-            self._invert_captures(self.rig)
+            still = all(path.is_file() for path in self.files)
+            (self._invert_stills if still else self._invert_captures)(self.rig)
             return
         if len(self.files) != 1 or self.files[0].is_dir():
             raise ConfigError(
@@ -111,6 +115,35 @@ class Command:
         arrays: dict[str, Any] = {name.replace(" ", "_"): s.image.numpy() for name, s in solved.items()}
         np.savez(self.out.with_suffix(".npz"), **arrays)
         found["seconds"] = round(time.perf_counter() - clock, 1)
+        print(json.dumps(found) if self.json else to_text(found))
+
+    def _invert_stills(self, path: Path) -> None:
+        from evnlos.cli.invert_pass import matrix_rig
+        from evnlos.cli.invert_still import StillOptions, invert_stills
+        from evnlos.plot.inversion import draw_inversion
+        from evnlos.transport import MeasuredTransport
+
+        rig = matrix_rig(path)
+        if not isinstance(rig, MeasuredTransport):
+            raise ConfigError(f"{path} is a {rig.kind} rig; pictures need a measured one, captures are folders")
+        lam, rule = _weight(self.lam)
+        if rule == "gcv" and self.solver != "tikhonov":
+            raise ConfigError("--lam gcv serves --solver tikhonov only; use cv, discrepancy or a number")
+        torch.set_num_threads(1)
+        solvers = ("tikhonov", "tv") if self.solver == "all" else (self.solver,)
+        options = StillOptions(
+            self.dark, solvers, lam, rule, self.noise_sigma, self.background_degree, self.bin
+        )
+        found, pictures = invert_stills(self.files, rig, options)
+        panels = [
+            (f"{file.stem}, {name}", image[None])
+            for name, images in pictures.items()
+            for file, image in zip(self.files, images, strict=True)
+        ]
+        found["picture"] = str(draw_inversion(self.out, panels))
+        arrays: dict[str, Any] = {name: images.numpy() for name, images in pictures.items()}
+        np.savez(self.out.with_suffix(".npz"), **arrays)
+        found["file"] = " ".join(found["files"])
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, rig: Path) -> None:

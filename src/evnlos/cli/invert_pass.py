@@ -23,7 +23,8 @@ from evnlos.scene import Target
 from evnlos.solver import JointProblem, PlatePass
 from evnlos.solver.plate_pass import strip_gram_of, strip_of, strip_transport
 from evnlos.solver.recording import object_light, position_subsets
-from evnlos.transport import RadiometricTransport
+from evnlos.transport import MeasuredTransport, RadiometricTransport
+from evnlos.transport.measured_file import SUFFIX
 from evnlos.types import Plane
 
 
@@ -49,9 +50,25 @@ def radiometric_rig(path: Path) -> RadiometricTransport:
     Raises:
         ConfigError: It is another kind of transport.
     """
-    rig = load_yaml(Simulation, path).transport
+    rig = matrix_rig(path)
     if not isinstance(rig, RadiometricTransport):
         raise ConfigError(f"{path} holds a transport of kind {rig.kind}; give a rig of kind radiometric")
+    return rig
+
+
+def matrix_rig(path: Path) -> RadiometricTransport | MeasuredTransport:
+    """Return the rig of a simulation file, or the measured transport that a .safetensors file is.
+
+    Raises:
+        ConfigError: It is another kind of transport.
+    """
+    if path.suffix == SUFFIX:
+        return MeasuredTransport(file=str(path))
+    rig = load_yaml(Simulation, path).transport
+    if not isinstance(rig, RadiometricTransport | MeasuredTransport):
+        raise ConfigError(
+            f"{path} holds a transport of kind {rig.kind}; give a rig of kind radiometric or measured"
+        )
     return rig
 
 
@@ -60,7 +77,7 @@ def invert_captures(
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and the plates [cells, cells] by name, of every capture and solver."""
     clock = time.perf_counter()
-    rig = radiometric_rig(options.rig)
+    rig = matrix_rig(options.rig)
     captures = [read_capture(folder) for folder in folders]
     pattern = None if options.pattern is None else load_pattern(options.pattern)
     height, width = captures[0].frames.shape[1:]
@@ -132,7 +149,7 @@ def _solve(problem: JointProblem, images: torch.Tensor, solver: str, factor: flo
 
 
 def _by_motion(
-    captures: Sequence[Capture], options: PassOptions, rig: RadiometricTransport
+    captures: Sequence[Capture], options: PassOptions, rig: RadiometricTransport | MeasuredTransport
 ) -> list[tuple[NDArray[np.float64], list[int]]]:
     """Return each motion [N, 2], metres, of frames 1..N with the captures that share it."""
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
@@ -140,6 +157,10 @@ def _by_motion(
         if options.track or capture.scene is None:
             from evnlos.tracking import track_capture
 
+            if isinstance(rig, MeasuredTransport):
+                raise ConfigError(
+                    f"{capture.name}: a measured transport does not tell motion; state `motion` in capture.yaml"
+                )
             found = track_capture(capture, rig)
             motion = found.at(capture.frame_times_us[1:] * 1e-6)
         else:

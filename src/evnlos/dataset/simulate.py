@@ -19,7 +19,7 @@ from evnlos.errors import ConfigError
 from evnlos.scene import EmnistGlyphs, FontGlyphs, HandwritingGlyphs, LineMotion, NistGlyphs, Scene
 from evnlos.seeds import derive_seed
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
-from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.transport import MeasuredTransport, PaperTransport, RadiometricTransport
 from evnlos.types import Events
 
 
@@ -52,7 +52,7 @@ class Simulation:
     """Length of a pass, seconds."""
     positions: int = 40
     """Equidistant positions of an object, one sample each."""
-    transport: PaperTransport | RadiometricTransport = field(default_factory=PaperTransport)
+    transport: PaperTransport | RadiometricTransport | MeasuredTransport = field(default_factory=PaperTransport)
     """How its light reaches the wall and the camera."""
     sensor: SensorSize = field(default_factory=SensorSize)
     """Size of the sensor."""

@@ -17,10 +17,11 @@ from evnlos.evaluation.identify_rig import (
     carried_on,
     seen_rig,
 )
+from evnlos.evaluation.identify_scan import scan_notes
 from evnlos.evaluation.identify_words import truncation_note, verdict
 from evnlos.seeds import derive_seed
 from evnlos.sensor import FrameCamera
-from evnlos.transport import PaperTransport
+from evnlos.transport import MeasuredTransport, PaperTransport
 
 MODE_LEVEL = 1e-2
 """Singular values above this share of the largest count as usable modes."""
@@ -168,6 +169,8 @@ def identify(
         wide = singular_values(seen_rig(carried_on(transport), bench).matrix)
         note = truncation_note(transport, counted(singular, KINK_LEVEL), counted(wide, KINK_LEVEL), KINK_LEVEL)
         warnings += [note] if note else []
+    if isinstance(transport, MeasuredTransport):
+        warnings += scan_notes(transport, bench, rig, singular, MODE_LEVEL)
     zero_db, mean_db = (
         _psnr((plates.test - blank).square().mean(dim=-1))
         for blank in (torch.zeros_like(plates.mean), plates.mean)

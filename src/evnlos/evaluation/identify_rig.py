@@ -12,6 +12,7 @@ from evnlos.sensor import FrameCamera
 from evnlos.transport import (
     DiffuseReflection,
     LinearTransport,
+    MeasuredTransport,
     PaperTransport,
     RadiometricTransport,
     Viewing,
@@ -20,7 +21,7 @@ from evnlos.transport import (
 from evnlos.transport.wall import ambient_plane
 from evnlos.types import Plane
 
-AnyTransport = PaperTransport | RadiometricTransport
+AnyTransport = PaperTransport | RadiometricTransport | MeasuredTransport
 _SAMPLES_A_RHO = 4  # samples of the plate to one unit of the tPSF's rho
 _FINEST = 16  # samples a side of a cell, at most
 
@@ -109,13 +110,25 @@ def seen_rig(transport: AnyTransport, bench: Bench = Bench()) -> SeenRig:
     """
     if isinstance(transport, PaperTransport):
         matrix = _paper_matrix(transport, bench) * transport.gain
+    elif isinstance(transport, MeasuredTransport):
+        bench = within_scan(transport, bench)
+        matrix = transport.matrix(bench.shape, bench.plate) * transport.gain
     else:
         matrix = transport.matrix(bench.shape, bench.plate)
         matrix = matrix * (transport.gain / _full_light(transport, bench, matrix))
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera gets no light from the plate; move the target or the camera")
-    ambient = ambient_plane(transport.ambient, transport.ambient_gradient, bench.shape)
+    if isinstance(transport, MeasuredTransport):
+        ambient = transport.ambient_light(bench.shape)
+    else:
+        ambient = ambient_plane(transport.ambient, transport.ambient_gradient, bench.shape)
     return SeenRig(matrix, ambient.double().flatten(), bench.plate, bench.shape)
+
+
+def within_scan(transport: MeasuredTransport, bench: Bench) -> Bench:
+    """Return the bench with no more pixels than the scan has."""
+    height, width = transport.measurement().shape
+    return replace(bench, height=min(height, bench.height), width=min(width, bench.width))
 
 
 def _full_light(rig: RadiometricTransport, bench: Bench, matrix: torch.Tensor) -> float:

@@ -14,7 +14,8 @@ from evnlos.dataset.presets import PRESETS
 from evnlos.errors import ConfigError
 from evnlos.evaluation.identify_rig import AnyTransport
 from evnlos.sensor import FrameCamera
-from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
+from evnlos.transport import MeasuredTransport, PaperTransport, RadiometricTransport, rig_preset
+from evnlos.transport.measured_file import SUFFIX
 from evnlos.transport.rig import rig_names
 
 
@@ -38,7 +39,7 @@ def described_rig(text: str | Path) -> Described:
 
     A file holds the settings of `evnlos simulate` or `evnlos lab` (of which `transport` and `frame_camera` are
     taken; what `vary` would draw stays as written), a dataset's `dataset.yaml`, a lab's `lab.yaml`, or the
-    settings of a transport alone.
+    settings of a transport alone; or it is a measured transport (.safetensors).
 
     Raises:
         ConfigError: There is no such name and no such file, or the file holds something else.
@@ -48,6 +49,8 @@ def described_rig(text: str | Path) -> Described:
         0.1
     """
     path = Path(text)
+    if path.suffix == SUFFIX:
+        return Described(path.stem, MeasuredTransport(file=str(path)), FrameCamera())
     if not path.is_file():
         if path.suffix in (".yaml", ".yml"):
             raise ConfigError(f"{path} does not exist; give a rig file or one of {', '.join(rig_names())}")
@@ -64,7 +67,7 @@ def described_rig(text: str | Path) -> Described:
     elif isinstance(values.get("config"), dict):
         values = values["config"]
     if "kind" in values:
-        either: Any = PaperTransport | RadiometricTransport
+        either: Any = PaperTransport | RadiometricTransport | MeasuredTransport
         return Described(path.stem, from_dict(either, values, source=str(path)), FrameCamera())
     if "transport" not in values:
         near = difflib.get_close_matches("transport", [str(key) for key in values], n=1)

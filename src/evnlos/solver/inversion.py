@@ -100,9 +100,22 @@ def prepare_inversion(
     if degree is not None:
         return Inversion(operator, measurement, degree)
     errors = background_errors(operator, measurement)
+    return Inversion(operator, measurement, _smallest_alike(errors), errors)
+
+
+def chosen_degree(operator: MatrixTransport, measurement: torch.Tensor) -> int:
+    """Return the smallest degree of the background whose cross-validation error is within 5 % of the least.
+
+    Args:
+        operator: From the hidden cells to the wall.
+        measurement: The wall, [channels, H, W].
+    """
+    return _smallest_alike(background_errors(operator, measurement))
+
+
+def _smallest_alike(errors: tuple[float, ...]) -> int:
     # Where errors are alike the smaller background is the better guess: it takes less from the scene.
-    chosen = next(d for d, error in zip(DEGREES, errors, strict=True) if error <= _ALIKE * min(errors))
-    return Inversion(operator, measurement, chosen, errors)
+    return next(d for d, error in zip(DEGREES, errors, strict=True) if error <= _ALIKE * min(errors))
 
 
 def background_errors(operator: MatrixTransport, measurement: torch.Tensor) -> tuple[float, ...]:

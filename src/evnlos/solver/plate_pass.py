@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.transport import MatrixTransport, MeasuredTransport, RadiometricTransport
 from evnlos.types import Plane
 
 
@@ -139,7 +139,10 @@ def strip_of(positions_m: ArrayLike, plate: Plane) -> Plane:
 
 
 def strip_transport(
-    rig: RadiometricTransport, sensor: tuple[int, int], shape: tuple[int, int], strip: Plane
+    rig: RadiometricTransport | MeasuredTransport,
+    sensor: tuple[int, int],
+    shape: tuple[int, int],
+    strip: Plane,
 ) -> MatrixTransport:
     """Return a rig's matrix from other cells to a smaller picture, in the same white levels, gain included.
 

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from evnlos.dataset.fixed_pattern import FixedPattern
 from evnlos.dataset.sampling import reduce_by_area
 from evnlos.errors import ConfigError
-from evnlos.transport import RadiometricTransport
+from evnlos.transport import MeasuredTransport, RadiometricTransport
 from evnlos.transport.wall import ambient_plane
 
 
 def object_light(
     frames: NDArray,
     peak: int,
-    rig: RadiometricTransport,
+    rig: RadiometricTransport | MeasuredTransport,
     shape: tuple[int, int],
     pattern: FixedPattern | None = None,
 ) -> torch.Tensor:
@@ -33,7 +33,11 @@ def object_light(
         White levels, float32 [N, h, w]; noise makes some of them negative.
     """
     levels = frames / np.float32(peak) if pattern is None else pattern.correct(frames, peak)
-    ambient = ambient_plane(rig.ambient, rig.ambient_gradient, (frames.shape[-2], frames.shape[-1]))
+    size = (frames.shape[-2], frames.shape[-1])
+    if isinstance(rig, MeasuredTransport):
+        ambient = rig.ambient_light(size)
+    else:
+        ambient = ambient_plane(rig.ambient, rig.ambient_gradient, size)
     return torch.from_numpy(reduce_by_area(levels - ambient.numpy(), shape))
 
 

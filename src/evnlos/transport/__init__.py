@@ -12,6 +12,7 @@ from evnlos.transport.diffraction import Diffraction
 from evnlos.transport.lamp import lamp_radiance
 from evnlos.transport.light_transport import LightTransport
 from evnlos.transport.matrix_wall import MatrixWall
+from evnlos.transport.measured import MeasuredTransport
 from evnlos.transport.occluder import Occluder
 from evnlos.transport.operator import LinearTransport, MatrixTransport, Transport, compose
 from evnlos.transport.paper import PaperTransport
@@ -34,6 +35,7 @@ __all__ = [
     "LinearTransport",
     "MatrixTransport",
     "MatrixWall",
+    "MeasuredTransport",
     "Occluder",
     "PaperTransport",
     "Patches",

@@ -1,0 +1,213 @@
+"""A scan's folder: `scan.yaml` says what was shown, `frames.csv` which picture shows what."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from evnlos.calibration.scan.patterns import Pattern, Patterns
+from evnlos.config import load_yaml
+from evnlos.dataset.frame_sources import inside, read_image
+from evnlos.errors import ConfigError, DataError
+from evnlos.types import Plane
+
+SCAN_FILE = "scan.yaml"
+DARK = "dark"
+_HEADER = ("pattern", "repeat", "exposure_s", "file")
+_MOST_SHOTS = 1_000_000
+
+
+@dataclass(frozen=True)
+class ScanInfo:
+    """What `scan.yaml` holds."""
+
+    plane: Plane
+    """Cells of the target's plane that light up: height, width, pitch_m, center_m (x to the right, y down)."""
+    pattern: Pattern = "raster"
+    """raster: every cell alone, row by row; hadamard: half of the cells at a time; points: the cells listed."""
+    cells: tuple[tuple[int, int], ...] = ()
+    """points: (row, column) of each lit cell, in the order of the patterns; one is a point-spread function."""
+    repeats: int = 2
+    """How often every pattern was recorded; two or more tell the noise and let the import remove some of it."""
+    exposure_s: float = 0.05
+    """Exposure of a frame, seconds, where frames.csv states none."""
+    white_dn: int | None = None
+    """Digital number at which the camera saturates, e.g. 4095; none = the largest of the picture's type."""
+    frames: str = "frames.csv"
+    """Table pattern,repeat,exposure_s,file: one line a picture."""
+    image_px_per_m: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """points: how far the image moves, pixels, when the light moves a metre: ((column by x, column by y),
+    (row by x, row by y)); found from the points where three or more do not lie on a line."""
+    notes: dict[str, Any] = field(default_factory=dict)
+    """Your notes: display, camera, lens, date."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.repeats <= 1000:
+            raise ConfigError(f"repeats is {self.repeats}; give 1 to 1000")
+        if not 0 < self.exposure_s <= 3600:
+            raise ConfigError(f"exposure_s is {self.exposure_s}; give more than 0 and at most 3600 s")
+        if self.white_dn is not None and not 1 <= self.white_dn <= 65_535:
+            raise ConfigError(f"white_dn is {self.white_dn}; give 1 to 65535")
+        if (self.pattern == "points") != bool(self.cells):
+            raise ConfigError(
+                f"pattern is {self.pattern} with {len(self.cells)} cells; list cells for points, and only there"
+            )
+        for row, column in self.cells:
+            if not (0 <= row < self.plane.height and 0 <= column < self.plane.width):
+                raise ConfigError(
+                    f"cells holds ({row}, {column}); the plane has {self.plane.height} x {self.plane.width} "
+                    "cells"
+                )
+        if len(set(self.cells)) != len(self.cells):
+            raise ConfigError("cells holds a cell twice; list each once, and use repeats")
+
+    @property
+    def patterns(self) -> Patterns:
+        """What was shown."""
+        count = len(self.cells) if self.pattern == "points" else self.plane.height * self.plane.width
+        return Patterns(self.pattern, count)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture of a scan.
+
+    Args:
+        pattern: Number of the pattern, or None for a dark frame.
+        repeat: Number of the pass, from 0.
+        exposure_s: Exposure, seconds.
+        file: Name of the picture in the folder.
+    """
+
+    pattern: int | None
+    repeat: int
+    exposure_s: float
+    file: str
+
+
+def read_scan_info(folder: str | Path) -> ScanInfo:
+    """Read the `scan.yaml` of a folder.
+
+    Raises:
+        ConfigError: It is missing, or has an unknown key, a wrong type or a value out of range.
+    """
+    return load_yaml(ScanInfo, Path(folder) / SCAN_FILE)
+
+
+def write_shots(path: Path, shots: list[Shot]) -> None:
+    """Write the table of pictures."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(_HEADER)
+        for shot in shots:
+            name = DARK if shot.pattern is None else shot.pattern
+            table.writerow((name, shot.repeat, f"{shot.exposure_s:g}", shot.file))
+
+
+def read_shots(folder: str | Path, info: ScanInfo) -> list[Shot]:
+    """Read and check the table of pictures: every pattern in every repeat, once, and dark frames.
+
+    Raises:
+        DataError: The table is missing or garbled, or a pattern or the dark frames are missing.
+    """
+    folder = Path(folder)
+    path = inside(folder, info.frames)
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(_bounded(csv.DictReader(file), path))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path} can't be read as a table: {error}") from None
+    if not rows or not {"pattern", "file"} <= rows[0].keys():
+        raise DataError(f"{path} holds no pictures; give a header {','.join(_HEADER)} and one line a picture")
+    shots = [_shot(path, number, row, info) for number, row in enumerate(rows, start=2)]
+    _check_complete(path, shots, info)
+    return shots
+
+
+def is_main(shot: Shot, info: ScanInfo) -> bool:
+    """Return whether a picture has the scan's own exposure; the others serve the check of linearity."""
+    return abs(shot.exposure_s - info.exposure_s) <= 1e-6 * info.exposure_s
+
+
+Reader = Callable[[Shot], NDArray]
+"""From a shot to its picture, digital numbers [H, W]."""
+
+
+def frame_reader(folder: str | Path) -> Reader:
+    """Return what reads the pictures of a folder, all of one size and type.
+
+    Raises (when it reads):
+        DataError: A picture is missing, unreadable, outside the folder, or unlike the first one.
+    """
+    folder, first = Path(folder), {}
+
+    def read(shot: Shot) -> NDArray:
+        path = inside(folder, shot.file)
+        image = read_image(path)
+        shape, kind = first.setdefault("like", (image.shape, image.dtype))
+        if image.shape != shape or image.dtype != kind:
+            raise DataError(
+                f"{path} is {image.dtype} {image.shape}, the first picture {kind} {shape}; give pictures of "
+                "one "
+                "camera and one format"
+            )
+        return image
+
+    return read
+
+
+def _bounded(rows: Iterator[dict[str, str]], path: Path) -> Iterator[dict[str, str]]:
+    for number, row in enumerate(rows):
+        if number >= _MOST_SHOTS:
+            raise DataError(f"{path} has more than {_MOST_SHOTS} lines; split the scan")
+        yield row
+
+
+def _shot(path: Path, line: int, row: dict[str, Any], info: ScanInfo) -> Shot:
+    text = str(row.get("pattern") or "").strip()
+    try:
+        pattern = None if text == DARK else int(text)
+        repeat = int(row.get("repeat") or 0)
+        exposure = float(row.get("exposure_s") or info.exposure_s)
+    except ValueError:
+        raise DataError(
+            f"{path} line {line}: pattern {text[:40]!r}, repeat {row.get('repeat')!r} or exposure_s "
+            f"{row.get('exposure_s')!r} is no number; write a number, or {DARK!r} for a dark frame"
+        ) from None
+    count = info.patterns.count
+    if pattern is not None and not 0 <= pattern < count:
+        raise DataError(f"{path} line {line}: pattern {pattern}; the scan has patterns 0 to {count - 1}")
+    if not 0 <= repeat < info.repeats:
+        raise DataError(
+            f"{path} line {line}: repeat {repeat}; scan.yaml states repeats 0 to {info.repeats - 1}"
+        )
+    if not 0 < exposure <= 3600:
+        raise DataError(f"{path} line {line}: exposure_s is {exposure}; give more than 0 and at most 3600 s")
+    return Shot(pattern, repeat, exposure, str(row.get("file") or ""))
+
+
+def _check_complete(path: Path, shots: list[Shot], info: ScanInfo) -> None:
+    main = [shot for shot in shots if is_main(shot, info)]
+    found = {(s.pattern, s.repeat) for s in main if s.pattern is not None}
+    lit = sum(s.pattern is not None for s in main)
+    count = info.patterns.count
+    wanted = count * info.repeats
+    if lit != len(found):
+        raise DataError(f"{path} lists {lit - len(found)} pictures twice; one line a pattern and repeat")
+    if len(found) != wanted:
+        every = ((k, r) for r in range(info.repeats) for k in range(count))
+        pattern, repeat = next(pair for pair in every if pair not in found)
+        raise DataError(
+            f"{path} lists {len(found)} pictures of patterns, {info.pattern} on {info.plane.height} x "
+            f"{info.plane.width} cells needs {count} x {info.repeats} repeats = {wanted}; the first missing is "
+            f"pattern {pattern} of repeat {repeat}: record it, or correct scan.yaml"
+        )
+    dark = {s.repeat for s in main if s.pattern is None}
+    if len(dark) != info.repeats:
+        missing = min(set(range(info.repeats)) - dark)
+        raise DataError(f"{path} lists no dark frame of repeat {missing}; record one with the display black")

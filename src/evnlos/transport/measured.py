@@ -1,0 +1,230 @@
+"""A transport that was measured on the rig itself, cell by cell, instead of computed from its geometry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import Scene
+from evnlos.transport.matrix_wall import MatrixWall
+from evnlos.transport.measured_file import Measurement, file_checksum, read_measurement
+from evnlos.transport.operator import MatrixTransport
+from evnlos.transport.wall import ambient_plane
+from evnlos.types import Plane
+
+
+@dataclass(frozen=True)
+class MeasuredTransport:
+    """The light-transport matrix of a scan (`evnlos scan import`), as a wall like any other."""
+
+    kind: Literal["measured"] = "measured"
+    """Tag of this transport."""
+    file: str = ""
+    """The measured matrix, a .safetensors file of `evnlos scan import`."""
+    checksum: str = ""
+    """First 16 digits of the file's SHA-256, as the import prints them; empty = not checked."""
+    gain: float = 1.0
+    """Brightness and exposure of the hidden object over those of the scan's light; 1 = the same."""
+    dark_frames: bool = True
+    """Whether the light of the scan's dark frames (black level, ambient light) is part of the wall."""
+    ambient: float = 0.0
+    """Ambient light on top of that in the middle of the image, white levels."""
+    ambient_gradient: tuple[float, float] = (0.0, 0.0)
+    """Relative growth of the ambient light from the middle to the right and the lower border."""
+
+    def measurement(self) -> Measurement:
+        """Return what was measured; the file is read once.
+
+        Raises:
+            ConfigError: No file is named, or it is another one than the checksum says.
+            DataError: The file is missing or damaged.
+        """
+        if not self.file:
+            raise ConfigError("transport.file is empty; give the .safetensors file of `evnlos scan import`")
+        path = Path(self.file)
+        if not path.is_file():
+            raise DataError(f"{path} does not exist; give the file that `evnlos scan import` wrote")
+        state = path.stat()
+        return _measurement(str(path.resolve()), state.st_mtime_ns, state.st_size, self.checksum)
+
+    def source(self) -> Plane:
+        """Return the scanned cells, in the coordinates of the target's motion."""
+        return self.measurement().about.plane
+
+    def transport(self, shape: tuple[int, int]) -> MatrixTransport:
+        """Return the matrix from the scanned cells to a camera image of `shape` (H, W), without `gain`.
+
+        Raises:
+            ConfigError: The scan has fewer pixels than that.
+        """
+        measured = self.measurement()
+        return MatrixTransport(averaged(measured.matrix, measured.shape, shape), measured.about.plane, shape)
+
+    def matrix(self, shape: tuple[int, int], source: Plane, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+        """Return the matrix from other cells of the same plane to the camera, without `gain`, [H W, h w].
+
+        A cell gets from each scanned cell the share of it that it covers: what lies within one scanned cell
+        can't be told apart.
+
+        Args:
+            shape: Size (H, W) of the camera image, pixels; at most those of the scan.
+            source: Cells, in the coordinates of the target's motion.
+            dtype: Floating-point type of the result.
+
+        Raises:
+            ConfigError: The cells reach beyond the scanned plane, or the scan has fewer pixels.
+        """
+        return self._resampled(self.measurement().matrix, shape, source).to(dtype)
+
+    def noise_matrix(self, shape: tuple[int, int], source: Plane, seed: int = 0) -> torch.Tensor:
+        """Return one draw of the noise of `matrix`, float64 [H W, h w], as if cells had independent noise.
+
+        Args:
+            shape: Size (H, W) of the camera image, pixels.
+            source: Cells, in the coordinates of the target's motion.
+            seed: Seed of the draw.
+        """
+        measured = self.measurement()
+        sigma = torch.where(measured.bad, 0.0, measured.noise).flatten()
+        draw = torch.Generator().manual_seed(seed)
+        noise = torch.randn(measured.matrix.shape, generator=draw) * sigma[:, None]
+        return self._resampled(noise, shape, source).double()
+
+    def ambient_light(self, shape: tuple[int, int]) -> torch.Tensor:
+        """Return the light that is there without the hidden object, white levels, float32 [H, W]."""
+        light = ambient_plane(self.ambient, self.ambient_gradient, shape)
+        if not self.dark_frames:
+            return light
+        measured = self.measurement()
+        return light + averaged(measured.dark.reshape(-1, 1), measured.shape, shape).reshape(shape).clamp(min=0)
+
+    def wall(self, scene: Scene, shape: tuple[int, int]) -> MatrixWall:
+        """Return the wall that a camera of `shape` (H, W) sees while the scene's plate moves.
+
+        Raises:
+            ConfigError: The plate leaves the scanned plane, or a setting is out of range.
+        """
+        about = self.measurement().about
+        self._check_travel(scene, about.plane)
+        return MatrixWall(
+            self.transport(shape),
+            scene.target,
+            scene.motion,
+            magnification_px_m=about.magnification_px_m * max(shape[0] / about.height, shape[1] / about.width),
+            gain=self.gain,
+            ambient=self.ambient_light(shape),
+        )
+
+    def _resampled(self, matrix: torch.Tensor, shape: tuple[int, int], source: Plane) -> torch.Tensor:
+        measured = self.measurement()
+        plane = measured.about.plane
+        for axis, have, want in (("x", plane.x_m, source.x_m), ("y", plane.y_m, source.y_m)):
+            low, high = (float(have[k] + s * plane.pitch_m / 2) for k, s in ((0, -1), (-1, 1)))
+            first, last = (float(want[k] + s * source.pitch_m / 2) for k, s in ((0, -1), (-1, 1)))
+            if first < low - plane.pitch_m or last > high + plane.pitch_m:
+                raise ConfigError(
+                    f"the scan covers {axis} = {low:.3f} to {high:.3f} m, {first:.3f} to {last:.3f} m are "
+                    "needed; "
+                    "scan a larger plane, or ask for less"
+                )
+        rows = averaged(matrix, measured.shape, shape).double()
+        y = covered(plane.y_m, plane.pitch_m, source.y_m, source.pitch_m)  # [h scan, h]
+        x = covered(plane.x_m, plane.pitch_m, source.x_m, source.pitch_m)  # [w scan, w]
+        cells = rows.unflatten(1, plane.shape)  # [H W, h scan, w scan]
+        return torch.einsum("pij,ik,jl->pkl", cells, y, x).flatten(1)
+
+    def _check_travel(self, scene: Scene, plane: Plane) -> None:
+        positions = scene.motion.position_m(np.linspace(0.0, scene.duration_s, 65))
+        half = scene.target.size_m / 2
+        for k, axis in enumerate(("width", "height")):
+            reach = np.abs(positions[:, k] - plane.center_m[k]).max() + half
+            side = plane.extent_m[1 - k]
+            if reach > side / 2 + plane.pitch_m:
+                raise ConfigError(
+                    f"the plate reaches {reach:.3f} m from the middle of a scanned plane of {axis} {side:.3f} "
+                    "m; "
+                    f"scan at least {2 * reach:.3f} m there, or shorten the travel"
+                )
+
+
+@lru_cache(maxsize=2)
+def _measurement(path: str, changed_ns: int, size: int, checksum: str) -> Measurement:
+    if checksum and (found := file_checksum(path)) != checksum:
+        raise ConfigError(f"{path} has the checksum {found}, the settings say {checksum}; name the file meant")
+    return read_measurement(path)
+
+
+def averaged(matrix: torch.Tensor, have: tuple[int, int], want: tuple[int, int]) -> torch.Tensor:
+    """Return the rows of a matrix [H W, n] averaged over the area of fewer pixels, [h w, n].
+
+    Raises:
+        ConfigError: More pixels are wanted than there are.
+    """
+    if tuple(have) == tuple(want):
+        return matrix
+    if want[0] > have[0] or want[1] > have[1] or min(want) < 1:
+        raise ConfigError(
+            f"the scan has {have[0]} x {have[1]} pixels, {want[0]} x {want[1]} are asked for; ask for at most "
+            "those"
+        )
+    y, x = (_area_share(a, b).to(matrix) for a, b in zip(have, want, strict=True))
+    image = matrix.reshape(have[0], -1)
+    image = (y @ image).reshape(want[0], have[1], -1)  # [h, W, n]
+    return torch.einsum("hwn,vw->hvn", image, x).flatten(0, 1)
+
+
+def covered(
+    have_m: NDArray[np.float64], have_pitch: float, want_m: NDArray[np.float64], want_pitch: float
+) -> torch.Tensor:
+    """Return the share of each of some cells that each of other cells covers, float64 [have, want].
+
+    Example:
+        >>> covered(np.array([0.0, 1.0]), 1.0, np.array([0.25]), 1.0)
+        tensor([[0.7500],
+                [0.2500]], dtype=torch.float64)
+    """
+    low = np.maximum(have_m[:, None] - have_pitch / 2, want_m - want_pitch / 2)
+    high = np.minimum(have_m[:, None] + have_pitch / 2, want_m + want_pitch / 2)
+    return torch.from_numpy(np.maximum(high - low, 0.0) / have_pitch)
+
+
+def image_motion_px_m(matrix: torch.Tensor, plane: Plane, shape: tuple[int, int]) -> float:
+    """Return a bound of how far the image moves when a light on the plane does, pixels a metre.
+
+    The middle of the light of each row and column of cells is followed; twice the largest steady motion is
+    taken, and never less than a pixel a cell, so that no cell is stepped over.
+
+    Args:
+        matrix: The measured matrix, [H W, h w].
+        plane: Its cells.
+        shape: Its camera image (H, W), pixels.
+    """
+    light = matrix.double().clamp(min=0).reshape(*shape, *plane.shape)
+    v, u = (torch.arange(n, dtype=torch.float64) for n in shape)
+    steps = [1.0]
+    for axis in (2, 3):  # along y, along x
+        lines = light.sum(dim=5 - axis)  # [H, W, cells]
+        cells = lines.shape[2]
+        total = lines.sum(dim=(0, 1))
+        if cells < 2 or not bool((total > 0).all()):
+            continue
+        middle = [torch.einsum("hwc,h->c", lines, v) / total, torch.einsum("hwc,w->c", lines, u) / total]
+        reach = math.hypot(*(float(m.max() - m.min()) for m in middle))
+        steps.append(2 * reach / (cells - 1))
+    return max(steps) / plane.pitch_m
+
+
+def _area_share(inside: int, outside: int) -> torch.Tensor:
+    """Return the fraction of each of `outside` equal cells that each of `inside` equal cells covers."""
+    cell = inside / outside
+    low = np.maximum(np.arange(outside)[:, None] * cell, np.arange(inside))
+    high = np.minimum(np.arange(1, outside + 1)[:, None] * cell, np.arange(1, inside + 1))
+    return torch.from_numpy(np.maximum(high - low, 0.0) / cell)
