@@ -1,0 +1,172 @@
+"""How long from an event to its picture, live, at 160 x 100 and a million events a second; where does it go?
+
+    python benchmarks/live.py                              # replay and UDP, event and fusion, two threads
+    python benchmarks/live.py --threads 1 --sources replay --seconds 20
+    python benchmarks/live.py --paradigms event --weights RUN
+    python benchmarks/live.py --write benchmarks/results/live.md
+
+Random events, the worst case for the surface, in true time: from memory, an event being due at its own
+instant, or from another process by UDP in packets of 180 events. Latency is wall time to the picture as an
+array, from the instant of the first event that is new in it (the one that waited longest) and from that of the
+last one; the parts are those of the first. Compilation and the first runs of the network are left out.
+
+Other work on the machine is most of what is measured, unless it is kept away: as root,
+`setsid -w nice -n -20 bash -c 'echo -20 > /proc/self/autogroup; exec python benchmarks/live.py'` (Linux).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from event_pixel import machine
+from evnlos.config import to_dict
+from evnlos.dataset import CHANNELS, Sampling
+from evnlos.live.chunk import Source
+from evnlos.live.engine import Engine
+from evnlos.live.replay import Replay, TimedFrame
+from evnlos.live.run import Pace, Run
+from evnlos.live.udp import UdpSender, UdpSource, send_timed
+from evnlos.model import ResidualUNet, UNetConfig, Weights, load_weights
+from evnlos.types import Events
+
+WIDTH, HEIGHT = 160, 100
+PIECE_US = 20_000
+FRAME_US = 200_000
+COLUMNS = (
+    "source", "paradigm", "pictures/s", "M events/s", "oldest p50, ms", "p90", "p99", "max", "newest p50, ms",
+    "p99", "surface p50, ms", "network p50, ms", "surface / network / rest, %", "events dropped / lost",
+    "cores used",
+)  # fmt: skip
+
+
+def pieces(rate_hz: float, seconds: float, seed: int = 0) -> Iterator[Events]:
+    """Yield random events as pieces of 20 ms: one second of them again and again."""
+    draw = np.random.default_rng(seed)
+    count = round(rate_hz * PIECE_US / 1e6)
+    second = []
+    for _ in range(1_000_000 // PIECE_US):
+        places = (draw.integers(0, side, count).astype(np.uint16) for side in (WIDTH, HEIGHT))
+        t_us = np.sort(draw.integers(0, PIECE_US, count))
+        second.append(Events(t_us, *places, draw.random(count) < 0.5, WIDTH, HEIGHT))
+    for number in range(round(seconds * 1e6 / PIECE_US)):
+        part = second[number % len(second)]
+        yield Events(part.t_us + number * PIECE_US, part.x, part.y, part.p, WIDTH, HEIGHT)
+
+
+def replay(rate_hz: float, seconds: float, with_frames: bool) -> Replay:
+    """Return a source in this process; a thread makes the chunks."""
+    draw = np.random.default_rng(1)
+    times = range(0, round(seconds * 1e6), FRAME_US) if with_frames else ()
+    frames = [TimedFrame(t, draw.random((HEIGHT, WIDTH), np.float32)) for t in times]
+    return Replay(list(pieces(rate_hz, seconds)), frames)
+
+
+def send(port: int, rate_hz: float, seconds: float) -> None:
+    """Send the events by UDP in true time; what the other process does."""
+    parts = list(pieces(rate_hz, seconds))
+    columns = (np.concatenate([part.columns()[name] for part in parts]) for name in ("t_us", "x", "y", "p"))
+    with UdpSender("127.0.0.1", port) as sender:
+        send_timed(sender, Events(*columns, WIDTH, HEIGHT))
+
+
+def network_of(paradigm: str, path: str | None) -> Weights:
+    """Return the weights given, else an untrained network of the default size."""
+    if path:
+        return load_weights(path)
+    sampling = Sampling()
+    torch.manual_seed(0)
+    network = ResidualUNet(CHANNELS[paradigm], UNetConfig(), (sampling.height, sampling.width))  # type: ignore[index]
+    return Weights(network.eval(), paradigm, to_dict(sampling), [])
+
+
+def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
+    """Run once and return a line of the table."""
+    rate_hz, seconds, other = arguments.rate_hz, arguments.seconds, None
+    engine = Engine(weights)
+    if name == "udp":
+        source: Source = UdpSource(idle_s=30)
+        engine.begin()
+        call = [sys.executable, __file__, "--send", str(source.port), "--rate-hz", str(rate_hz)]
+        other = subprocess.Popen([*call, "--seconds", str(seconds)])
+    else:
+        source = replay(rate_hz, seconds, weights.paradigm != "event")
+        engine.begin()
+    run = Run(source, engine, Pace(rate=arguments.pictures_hz))
+    before = time.process_time()
+    done = run.go().summary()
+    cpu = (time.process_time() - before) / max(done["seconds"], 1e-9)
+    if other is not None:
+        other.wait()
+    spread = done["latency_ms"]
+    oldest, newest = spread["oldest_event"], spread["newest_event"]
+    if oldest is None:
+        return f"| {name} | {weights.paradigm} | no picture with an event |"
+    parts = [spread[part]["mean"] for part in ("surface", "network", "wait")]
+    shares = " / ".join(f"{100 * part / sum(parts):.0f}" for part in parts)
+    lost = done["dropped"]["events"], done["faults"].get("lost packets", 0) * 180
+    cells = [name, weights.paradigm, f"{done['pictures_hz']:.0f}", f"{done['events_hz'] / 1e6:.2f}"]
+    cells += [f"{oldest[q]:.1f}" for q in ("p50", "p90", "p99", "max")]
+    cells += [f"{newest[q]:.1f}" for q in ("p50", "p99")]
+    cells += [f"{spread['surface']['p50']:.1f}", f"{spread['network']['p50']:.1f}", shares]
+    return "| " + " | ".join([*cells, f"{lost[0]:,} / {lost[1]:,}", f"{cpu:.2f}"]) + " |"
+
+
+def nice() -> str:
+    """Return the process's priority, with that of its group where the system schedules groups."""
+    group = Path("/proc/self/autogroup")
+    words = group.read_text().split()[-1:] if group.is_file() else []
+    return " and of its group ".join([str(os.nice(0)) if hasattr(os, "nice") else "usual", *words])
+
+
+def main() -> None:
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sources", nargs="+", choices=("replay", "udp"), default=["replay", "udp"])
+    parser.add_argument("--paradigms", nargs="+", choices=tuple(CHANNELS), default=["event", "fusion"])
+    parser.add_argument("--rate-hz", type=float, default=1e6, help="events a second")
+    parser.add_argument("--pictures-hz", type=float, default=Pace.rate, help="most pictures a second")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--threads", type=int, default=2, help="threads of the network")
+    parser.add_argument("--weights", help="weights or run, of the paradigm asked for")
+    parser.add_argument("--write", help="file for the table")
+    parser.add_argument("--send", type=int, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.send is not None:
+        return send(arguments.send, arguments.rate_hz, arguments.seconds)
+    torch.set_num_threads(arguments.threads)
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    lines = [
+        "# Live latency",
+        "",
+        f"{WIDTH} x {HEIGHT} pixels, {arguments.rate_hz:,.0f} events a second for {arguments.seconds:.0f} s; "
+        f"at most {arguments.pictures_hz:.0f} pictures a second of {Sampling.width} x {Sampling.height}; "
+        f"{arguments.threads} threads; niceness {nice()}, load before: {load:.1f}.",
+        "",
+        machine(),
+        "",
+        f"| {' | '.join(COLUMNS)} |",
+        f"|{'---|' * len(COLUMNS)}",
+    ]
+    print("\n".join(lines), flush=True)
+    for name in arguments.sources:
+        for paradigm in arguments.paradigms:
+            if name == "udp" and paradigm != "event":
+                continue  # packets carry no frames
+            lines.append(row(name, network_of(paradigm, arguments.weights), arguments))
+            print(lines[-1], flush=True)
+    if arguments.write:
+        Path(arguments.write).write_text("\n".join(lines) + "\n")
+    return None
+
+
+if __name__ == "__main__":
+    main()
