@@ -1,0 +1,174 @@
+"""Starting the page: on this machine alone unless told otherwise, asking nobody, leaving nothing behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evnlos.errors import ConfigError, MissingDependencyError
+
+_HERE = Path(__file__).parent
+# Every switch that Gradio and what it brings have for talking to somebody else.
+_QUIET = {
+    "GRADIO_ANALYTICS_ENABLED": "False",
+    "GRADIO_SHARE": "False",
+    "GRADIO_MCP_SERVER": "False",
+    "GRADIO_SSR_MODE": "False",
+    "GRADIO_RUN_HISTORY": "False",
+    "HF_HUB_DISABLE_TELEMETRY": "1",
+    "HF_HUB_OFFLINE": "1",
+    "DO_NOT_TRACK": "1",
+}
+# The browser itself refuses what would leave this server.
+_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; worker-src 'self' blob:; "
+    "form-action 'self'; base-uri 'self'; object-src 'none'"
+)
+
+
+@dataclass(frozen=True)
+class Server:
+    """Where and with what the page runs.
+
+    Raises:
+        ConfigError: The port or the limit is out of range.
+    """
+
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets every machine of the network in."""
+    port: int = 7860
+    """Port to listen on; 0 takes a free one."""
+    upload_mb: float = 200.0
+    """Largest upload, and largest content of an uploaded zip, MB."""
+    columns: int = 48
+    """Columns of the simulated camera, pixels; time and memory grow with its square."""
+    open: bool = False
+    """Open the page in the browser."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65_535:
+            raise ConfigError(f"port is {self.port}; give 0 (a free one) to 65535")
+        if not 0 < self.upload_mb <= 100_000:
+            raise ConfigError(f"upload_mb is {self.upload_mb}; give more than 0 and at most 100000 MB")
+
+
+def serve(server: Server, weights: tuple[Path, ...] = (), ready: Callable[[str], None] | None = None) -> None:
+    """Run the page until it is interrupted; uploads live in a folder that is deleted then.
+
+    Args:
+        server: Where.
+        weights: Weights files, or folders of runs.
+        ready: Called with the page's address once it can be opened.
+
+    Raises:
+        MissingDependencyError: Gradio is not installed.
+        ConfigError: Address or port cannot be had.
+        DataError: Weights are missing or damaged.
+    """
+    with running(server, weights) as address:
+        if ready is not None:
+            ready(address)
+        waiting = threading.Event()
+        previous = signal.signal(signal.SIGTERM, lambda *_: waiting.set())
+        try:
+            waiting.wait()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            signal.signal(signal.SIGTERM, previous)
+
+
+@contextmanager
+def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
+    """Yield the address of the running page, and stop it afterwards. Arguments and errors as in `serve`."""
+    os.environ.update(_QUIET)
+    try:
+        import gradio
+        import torch
+    except ImportError:
+        raise MissingDependencyError("the page needs Gradio: pip install 'evnlos[app]'") from None
+    from evnlos.app.hidden import picked
+    from evnlos.app.page import build_page, theme
+    from evnlos.app.setup import Setup
+    from evnlos.app.solving import named_weights
+    from evnlos.app.work import simulated
+
+    # Everything on the page is small: threads that wait for each other cost more than they save, above all
+    # where other programs keep the cores busy.
+    torch.set_num_threads(1)
+    named = named_weights(weights)
+    setup = Setup(columns=server.columns)
+    pieces = simulated(setup, picked("R"), {})
+    first = next(pieces)
+    # The verdict on the first rig takes seconds where nothing is compiled yet: it is made while the page loads.
+    threading.Thread(target=lambda: list(pieces), daemon=True).start()
+    limit = round(1e6 * server.upload_mb)
+    with tempfile.TemporaryDirectory(prefix="evnlos-app-", ignore_cleanup_errors=True) as scratch:
+        os.environ["GRADIO_TEMP_DIR"] = scratch
+        page = build_page(gradio, first, setup, named, Path(scratch), limit)
+        try:
+            _, address, _ = page.queue(api_open=False).launch(
+                server_name=server.host,
+                server_port=server.port or None,
+                share=False,
+                inbrowser=server.open,
+                prevent_thread_lock=True,
+                show_error=False,
+                quiet=True,
+                max_file_size=limit,
+                footer_links=[],
+                run_history=False,
+                enable_monitoring=False,
+                ssr_mode=False,
+                pwa=False,
+                mcp_server=False,
+                theme=theme(gradio),
+                css=(_HERE / "page.css").read_text(encoding="utf-8"),
+                head=f"<script>{(_HERE / 'page.js').read_text(encoding='utf-8')}</script>",
+                app_kwargs={
+                    "middleware": [_policy()],
+                    "docs_url": None,
+                    "redoc_url": None,
+                    "openapi_url": None,
+                },
+            )
+        except OSError as error:
+            raise ConfigError(
+                f"cannot listen on {server.host} port {server.port} ({' '.join(str(error).split())[:100]}); "
+                "give another --port, or 0 for a free one"
+            ) from None
+        try:
+            yield address
+        finally:
+            page.close(verbose=False)
+
+
+def _policy() -> Any:
+    """Return the middleware that tells browsers to fetch nothing from anywhere else."""
+    from starlette.middleware import Middleware
+
+    class Policy:
+        def __init__(self, app: Any) -> None:
+            self.app = app
+
+        async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+            async def send_with_policy(message: Any) -> None:
+                if message["type"] == "http.response.start":
+                    extra = [
+                        (b"content-security-policy", _POLICY.encode()),
+                        (b"referrer-policy", b"no-referrer"),
+                    ]
+                    message = {**message, "headers": [*message.get("headers", []), *extra]}
+                await send(message)
+
+            await self.app(scope, receive, send_with_policy if scope["type"] == "http" else send)
+
+    return Middleware(Policy)

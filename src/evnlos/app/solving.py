@@ -1,0 +1,143 @@
+"""What can be made of a pass: two classical pictures where the rig is known, and one of each network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.app.recorded import Recorded
+from evnlos.app.setup import COARSE
+from evnlos.config import from_dict
+from evnlos.dataset import Sampling, Simulation
+from evnlos.errors import DataError
+from evnlos.evaluation import reconstruct
+from evnlos.evaluation.consistency import FrameOperator, consistent
+from evnlos.evaluation.identify_rig import camera_variance
+from evnlos.metrics import psnr
+from evnlos.model import Weights, load_weights
+from evnlos.scene import Target
+from evnlos.solver import JointProblem, PlatePass
+from evnlos.solver.recording import object_light
+from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.types import Plane
+
+_DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far a picture may go from it
+_CELLS = 16  # a side of the plate of the whole pass
+_SMOOTH = 3.0  # weight of the gradient in units of the noise's variance
+_STATIC = 1.0  # the camera's fixed pattern is about as strong as its noise
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """The pictures that one method made of a pass.
+
+    Args:
+        name: The method.
+        note: What it uses.
+        images: The scored rows of the canvas, float32 [N, h, w], 0..1.
+        psnr_db: PSNR of each picture, [N]; None where the truth is unknown.
+        black_db: PSNR of an all-black picture, [N].
+    """
+
+    name: str
+    note: str
+    images: NDArray[np.float32]
+    psnr_db: NDArray[np.float64] | None = None
+    black_db: NDArray[np.float64] | None = None
+
+
+def from_each_frame(recorded: Recorded) -> Reconstruction:
+    """Return the regularised least squares picture of each frame alone, the rig and its noise being known.
+
+    Raises:
+        DataError: The pass has no frames, or its rig is unknown.
+    """
+    simulation, _, frames = _known(recorded)
+    operator = FrameOperator(simulation, COARSE)
+    seen = torch.from_numpy(recorded.samples(COARSE).frame)
+    flat = torch.full((len(frames), COARSE.height, COARSE.width), _DIM)
+    images = consistent(flat, seen, operator, trust=_TRUST)[:, COARSE.scored].numpy()
+    return _scored("least squares", "one frame, rig known, nothing learned", images, recorded, COARSE)
+
+
+def from_whole_pass(recorded: Recorded) -> Reconstruction:
+    """Return one picture from all frames at once, rig and motion being known, drawn where the object was.
+
+    Raises:
+        DataError: The pass has no frames, or its rig or its motion is unknown.
+    """
+    simulation, rig, frames = _known(recorded)
+    if recorded.scene is None:
+        raise DataError("the motion is unknown; the whole pass needs it")
+    size_m, shape = recorded.scene.target.size_m, frames.shape[1:]
+    light = object_light(frames, recorded.peak, rig, shape)
+    made = rig.transport(shape)
+    strip = made.source
+    assert isinstance(strip, Plane)  # a rig's cells
+    places = recorded.scene.motion.position_m(recorded.times_s)
+    plate = Plane(_CELLS, _CELLS, size_m / _CELLS)
+    problem = JointProblem(
+        PlatePass(MatrixTransport(made.matrix * rig.gain, strip, shape), plate, places), _STATIC
+    )
+    variance = camera_variance(light.mean() + rig.ambient, simulation.frame_camera)
+    image = problem.tikhonov(light, _SMOOTH * float(variance)).image
+    found = Target("found", image.clamp(0, 1).float().numpy(), size_m)
+    fine = Sampling()
+    images = found.rasterise(fine.canvas, places)[:, fine.scored]
+    return _scored("whole pass", "all frames, rig and motion known, nothing learned", images, recorded, fine)
+
+
+def from_weights(recorded: Recorded, name: str, weights: Weights) -> Reconstruction:
+    """Return the pictures of a network.
+
+    Raises:
+        DataError: The pass has no frames, and the network needs them.
+    """
+    if recorded.frames is None and weights.paradigm != "event":
+        raise DataError(
+            f"{name} looks at frames ({weights.paradigm}), and the recording has none; "
+            "give weights of the paradigm event, or upload a capture folder"
+        )
+    sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
+    samples = recorded.samples(sampling)
+    images = reconstruct(weights, samples.frame, samples.surface)[:, sampling.scored].numpy()
+    saw = {"frame": "one frame", "event": "events alone", "fusion": "frame and events"}[weights.paradigm]
+    return _scored(name, f"network: {saw}", images, recorded, sampling)
+
+
+def named_weights(paths: tuple[Path, ...]) -> dict[str, Weights]:
+    """Return weights by a short name each: that of the run's folder or of the file.
+
+    Raises:
+        DataError: One of them is missing or is no weights file.
+    """
+    found: dict[str, Weights] = {}
+    for path in paths:
+        name = path.resolve().name if path.is_dir() or path.stem != "weights" else path.resolve().parent.name
+        name = name.removesuffix(".safetensors")
+        found[name if name not in found else f"{name} ({len(found) + 1})"] = load_weights(path)
+    return found
+
+
+def _known(recorded: Recorded) -> tuple[Simulation, RadiometricTransport, NDArray]:
+    simulation, frames = recorded.simulation, recorded.frames
+    if simulation is None or frames is None or not isinstance(simulation.transport, RadiometricTransport):
+        raise DataError("the rig or the frames are unknown; a classical picture needs both")
+    return simulation, simulation.transport, frames
+
+
+def _scored(
+    name: str, note: str, images: NDArray[np.float32], recorded: Recorded, sampling: Sampling
+) -> Reconstruction:
+    truth = recorded.truth(sampling)
+    if truth is None:
+        return Reconstruction(name, note, images)
+    true = torch.from_numpy(truth)
+    own, black = (
+        psnr(one, true).double().numpy() for one in (torch.from_numpy(images), torch.zeros_like(true))
+    )
+    return Reconstruction(name, note, images, own, black)

@@ -1,0 +1,125 @@
+"""A visitor's file: an event recording, or a capture folder as a zip, checked and read into one pass."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.app.recorded import Recorded
+from evnlos.app.setup import POSITIONS
+from evnlos.app.unpack import unpack_zip
+from evnlos.dataset import read_capture
+from evnlos.dataset.capture_info import read_capture_info
+from evnlos.dataset.frame_sources import inside
+from evnlos.errors import DataError
+from evnlos.events.recording import Recording
+from evnlos.types import Events
+
+MOST_EVENTS = 20_000_000
+"""Events that are read, at most: 260 MB."""
+_MOST_PIXELS = 2_100_000  # of a sensor whose pixels all get maps
+_MOST_MAP_BYTES = 1 << 30  # of all maps of a pass
+_ZIP = b"PK\x03\x04"
+
+
+def read_upload(path: str | Path, scratch: str | Path, limit_bytes: int) -> Recorded:
+    """Read an uploaded file; what is unpacked is deleted again before this returns.
+
+    A zip with a capture.yaml is a capture; anything else has to be an event file, in any format that
+    `read_events` knows.
+
+    Args:
+        path: The file.
+        scratch: Folder to unpack in.
+        limit_bytes: Largest file, and largest content of a zip, bytes.
+
+    Raises:
+        EvnlosError: The file is too large, damaged, or not what it should be; the text is one line.
+    """
+    path = Path(path)
+    size = path.stat().st_size
+    if size > limit_bytes:
+        raise DataError(
+            f"{path.name} has {size / 1e6:.0f} MB; at most {limit_bytes / 1e6:g} MB are taken: "
+            "cut it with evnlos convert, or start the page with a larger --upload-mb"
+        )
+    with path.open("rb") as file:
+        zipped = file.read(4) == _ZIP
+    if not zipped or path.suffix.lower() == ".npz":
+        return _read_recording(path)
+    with tempfile.TemporaryDirectory(prefix="unpacked-", dir=scratch) as folder:
+        files = unpack_zip(path, Path(folder) / path.stem, limit_bytes)
+        found = [one for one in files if one.name == "capture.yaml"]
+        if len(found) != 1:
+            raise DataError(
+                f"{path.name} holds {len(found)} files capture.yaml; "
+                "zip one capture folder (see docs/own_camera.md)"
+            )
+        return _read_capture(found[0].parent)
+
+
+def _read_recording(path: Path) -> Recorded:
+    events, complete = _first_events(Recording(path))
+    if not len(events):
+        raise DataError(f"{path.name} holds no event; check it with evnlos info")
+    first, last = int(events.t_us[0]), int(events.t_us[-1])
+    edges = np.round(np.linspace(first - 1, max(last, first + POSITIONS), POSITIONS + 1)).astype(np.int64)
+    notes = [f"{len(events):,} events of a sensor of {events.width} x {events.height} pixels"]
+    if not complete:
+        notes.append(f"only the first {MOST_EVENTS:,} events are shown")
+    return Recorded(path.stem, events, edges, notes=tuple(notes))
+
+
+def _first_events(recording: Recording) -> tuple[Events, bool]:
+    """Return the first events of a recording, and whether these are all."""
+    pieces, count, complete = [], 0, True
+    for piece in recording.pieces():
+        pieces.append(piece[: MOST_EVENTS - count])
+        count += len(pieces[-1])
+        if count >= MOST_EVENTS:
+            complete = False
+            break
+    height, width = recording.shape
+    if not pieces:
+        return Events.empty(max(width, 1), max(height, 1)), True
+    columns = {name: np.concatenate([getattr(one, name) for one in pieces]) for name in ("t_us", "x", "y", "p")}
+    return Events(**columns, width=pieces[0].width, height=pieces[0].height), complete
+
+
+def _read_capture(folder: Path) -> Recorded:
+    info = read_capture_info(folder)
+    width, height = info.camera.width, info.camera.height
+    if width * height > _MOST_PIXELS:
+        raise DataError(f"the camera has {width} x {height} pixels; at most {_MOST_PIXELS:,} are shown")
+    recording = Recording(inside(folder, info.events), width=width, height=height)
+    if not _first_events(recording)[1]:
+        raise DataError(
+            f"{info.events} holds {MOST_EVENTS:,} events or more; cut it with evnlos convert before you zip it"
+        )
+    capture = read_capture(folder)
+    frames, edges = capture.frames[1:], capture.frame_times_us
+    if not len(frames):
+        raise DataError("the capture has one frame; a position needs two, with events between")
+    most = max(1, _MOST_MAP_BYTES // (8 * frames.shape[1] * frames.shape[2]))
+    notes = list(capture.notes)
+    if len(frames) > most:
+        frames, edges = frames[:most], edges[: most + 1]
+        notes.append(f"only the first {most} positions are shown")
+    return Recorded(
+        capture.name,
+        capture.events,
+        np.asarray(edges),
+        _own(frames),
+        capture.peak,
+        capture.scene,
+        None,
+        tuple(notes),
+    )
+
+
+def _own(frames: NDArray) -> NDArray:
+    """Return frames that no longer lean on a file."""
+    return np.array(frames)

@@ -1,0 +1,88 @@
+"""What happens when a control moves or a file arrives: pictures and words as HTML, piece by piece."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from evnlos.app.recorded import Recorded, simulate_pass
+from evnlos.app.setup import Setup
+from evnlos.app.sheet import message_box, sheet, verdict_box, waiting_box
+from evnlos.app.solving import Reconstruction, from_each_frame, from_weights, from_whole_pass
+from evnlos.app.upload import read_upload
+from evnlos.app.verdict import verdict_on
+from evnlos.app.views import View, event_views, found_views, seen_views
+from evnlos.errors import EvnlosError
+from evnlos.model import Weights
+from evnlos.scene import Target
+
+
+def simulated(setup: Setup, target: Target, weights: Mapping[str, Weights]) -> Iterator[tuple[str, str]]:
+    """Yield (sheet, verdict) of a simulated pass: first without networks and verdict, which take longer.
+
+    Args:
+        setup: Rig and camera.
+        target: What is hidden.
+        weights: Networks by name.
+
+    Raises:
+        EvnlosError: The settings can't be.
+    """
+    recorded = simulate_pass(setup, target)
+    before, after = seen_views(recorded), event_views(recorded)
+    found = [from_whole_pass(recorded), from_each_frame(recorded)]
+    assert recorded.simulation is not None  # it was simulated
+    pictures = _sheet(recorded, before, found, after)
+    yield pictures, waiting_box()
+    if weights:
+        found += [from_weights(recorded, name, one) for name, one in weights.items()]
+        pictures = _sheet(recorded, before, found, after)
+    yield pictures, verdict_box(verdict_on(recorded.simulation))
+
+
+def opening_verdict(setup: Setup) -> str:
+    """Return the verdict on the rig that the page opens with."""
+    return verdict_box(verdict_on(setup.simulation()))
+
+
+def uploaded(
+    path: str | None, scratch: Path, limit_bytes: int, weights: Mapping[str, Weights]
+) -> tuple[str, str]:
+    """Return (sheet, message) of an uploaded file; whatever is wrong with it is a message of one line.
+
+    Args:
+        path: The file, or None where there is none.
+        scratch: Folder to unpack in.
+        limit_bytes: Largest file, bytes.
+        weights: Networks by name.
+    """
+    if not path:
+        return "", message_box("no file yet: choose a recording, or a capture folder as a zip", wrong=False)
+    try:
+        recorded = read_upload(path, scratch, limit_bytes)
+        found, refused = [], []
+        for name, one in weights.items():
+            try:
+                found.append(from_weights(recorded, name, one))
+            except EvnlosError as error:
+                refused.append(str(error))
+        pictures = _sheet(recorded, seen_views(recorded), found, event_views(recorded))
+    except (EvnlosError, OSError, MemoryError) as error:
+        return "", message_box(_without_folder(str(error) or "the file needs too much memory", path, scratch))
+    notes = [*recorded.notes, *refused]
+    if not weights:
+        notes.append("no network to reconstruct with: start the page with --weights")
+    return pictures, message_box("; ".join(notes), wrong=False)
+
+
+def _sheet(recorded: Recorded, before: list[View], found: list[Reconstruction], after: list[View]) -> str:
+    views = [*before, *found_views(found), *after]
+    return sheet(views, recorded.times_s - recorded.edges_us[0] * 1e-6, recorded.name)
+
+
+def _without_folder(text: str, path: str, scratch: Path) -> str:
+    """Return a message without the folders of this machine."""
+    for folder in {scratch, scratch.resolve(), Path(path).parent, Path(path).resolve().parent}:
+        text = re.sub(re.escape(str(folder)) + r"/(unpacked-[^/]*/)?", "", text)
+    return text

@@ -1,0 +1,284 @@
+"""The page: what it shows, what it refuses, and the page itself in a real browser."""
+
+import importlib.util
+import json
+import re
+import tempfile
+import time
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+import torch
+
+import chromium
+from evnlos import Events, ResidualUNet, UNetConfig
+from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
+from evnlos.app.recorded import Recorded, simulate_pass
+from evnlos.app.serve import Server, running
+from evnlos.app.setup import Setup
+from evnlos.app.sheet import message_box
+from evnlos.app.solving import from_each_frame, from_weights, from_whole_pass, named_weights
+from evnlos.app.verdict import verdict_on
+from evnlos.app.views import event_views, found_views, seen_views
+from evnlos.app.work import simulated
+from evnlos.config import to_dict
+from evnlos.dataset import Sampling
+from evnlos.errors import ConfigError, DataError, MissingDependencyError
+from evnlos.model import Weights, load_weights, save_weights
+from evnlos.plot.event_views import CloudSize, cloud_pictures, signed_pictures, smaller, time_slices
+
+SMALL = Setup(columns=24)
+MB = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recorded:
+    return simulate_pass(SMALL, picked("R"))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> dict[str, Path]:
+    """Untrained weights of two paradigms."""
+    folder = tmp_path_factory.mktemp("weights")
+    sampling, found = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12), {}
+    for paradigm, channels in (("fusion", 3), ("event", 2)):
+        torch.manual_seed(0)
+        network = ResidualUNet(channels, UNetConfig(width=4, depth=1, rank=0)).eval()
+        found[paradigm] = folder / f"{paradigm}-run" / "weights.safetensors"
+        found[paradigm].parent.mkdir()
+        save_weights(found[paradigm], Weights(network, paradigm, to_dict(sampling), []))
+    return found
+
+
+@pytest.fixture(scope="module")
+def zipped(tiny_captures, tmp_path_factory) -> Path:
+    """A capture folder as people zip it."""
+    path = tmp_path_factory.mktemp("zip") / "shot.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for one in sorted(tiny_captures[0].rglob("*")):
+            archive.write(one, one.relative_to(tiny_captures[0].parent))
+    return path
+
+
+def test_a_pass_is_the_same_bytes_for_the_same_settings(recorded) -> None:
+    again = simulate_pass(SMALL, picked("R"))
+    assert again.events == recorded.events and len(recorded.events) > 300
+    np.testing.assert_array_equal(again.frames, recorded.frames)
+    assert simulate_pass(replace(SMALL, seed=2), picked("R")).events != recorded.events
+
+
+def test_settings_do_what_they_say(recorded) -> None:
+    faster = simulate_pass(replace(SMALL, speed_m_s=0.04), picked("R"))
+    assert faster.times_s[-1] == pytest.approx(recorded.times_s[-1] / 2)
+    higher = simulate_pass(replace(SMALL, threshold_on=0.3, threshold_off=0.3), picked("R"))
+    assert len(higher.events) < 0.7 * len(recorded.events)
+    assert simulate_pass(replace(SMALL, ambient=0.4), picked("R")).frames.min() > recorded.frames.max() / 2
+    usual, noisy = (Setup(frame_noise=n).simulation().frame_camera for n in (1.0, 3.0))
+    for level in (0.0, 0.3):
+        # Shot and read noise in white levels, both three times as strong.
+        own, more = ((c.full_well_e * level + c.read_noise_e**2) ** 0.5 / c.full_well_e for c in (usual, noisy))
+        assert more == pytest.approx(3 * own)
+
+
+@pytest.mark.parametrize("name", ["roughness", "distance_m", "speed_m_s", "ambient", "threshold_on", "columns"])
+def test_settings_out_of_range_are_one_line(name: str) -> None:
+    for wrong in (-1.0, 1e9, float("nan"), None):
+        with pytest.raises(ConfigError, match=name):
+            replace(SMALL, **{name: wrong})
+
+
+def test_a_drawing_is_a_plate() -> None:
+    ink = np.zeros((INK_SIDE, INK_SIDE), np.uint8)
+    ink[4:9, 10:] = 255
+    target = drawn(ink.tobytes().hex())
+    np.testing.assert_array_equal(target.mask, ink / np.float32(255))
+    assert simulate_pass(SMALL, target).truth(Sampling()).max() > 0.9
+    for wrong in ("", "00" * INK_SIDE**2, "ff", "zz" * INK_SIDE**2, "FF" * INK_SIDE**2, "f" * 10**6):
+        with pytest.raises(DataError):
+            drawn(wrong)
+    with pytest.raises(ConfigError, match="hidden character"):
+        picked("RR")
+    assert picked(CHARACTERS[0]).mask.any()
+
+
+def test_classical_pictures_beat_black_and_the_whole_pass_beats_one_frame(recorded) -> None:
+    whole, single = from_whole_pass(recorded), from_each_frame(recorded)
+    middle = slice(10, 30)
+    assert whole.psnr_db[middle].mean() > single.psnr_db[middle].mean() + 0.5
+    assert single.psnr_db[middle].mean() > single.black_db[middle].mean() + 1.5
+    matte = simulate_pass(replace(SMALL, wall="matte"), picked("R"))
+    assert from_whole_pass(matte).psnr_db[middle].mean() < whole.psnr_db[middle].mean() - 1.0
+    with pytest.raises(DataError, match="rig"):
+        from_each_frame(replace(recorded, simulation=None))
+
+
+def test_networks_see_what_they_were_trained_on(recorded, weights) -> None:
+    named = named_weights((weights["fusion"].parent, weights["event"]))
+    assert list(named) == ["fusion-run", "event-run"]
+    found = from_weights(recorded, "fusion-run", named["fusion-run"])
+    assert found.images.shape == (40, 12, 24) and found.psnr_db.shape == (40,)
+    blind = replace(recorded, frames=None)
+    assert from_weights(blind, "event-run", named["event-run"]).images.shape == (40, 12, 24)
+    with pytest.raises(DataError, match="has none"):
+        from_weights(blind, "fusion-run", named["fusion-run"])
+    with pytest.raises(DataError):
+        named_weights((Path("nowhere"),))
+
+
+def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
+    shown = [verdict_on(replace(SMALL, **one).simulation()) for one in ({"roughness": 0.02}, {"wall": "matte"})]
+    assert "measured" in shown[0].meaning and "memory, not a measurement" not in shown[0].meaning
+    assert "memory, not a measurement" in shown[1].meaning
+    assert all(one.reason.endswith(".") and "dB" in one.figures for one in shown)
+
+
+def test_a_sheet_holds_every_position_and_asks_nobody(recorded, weights) -> None:
+    first, second = simulated(SMALL, picked("R"), {"net": load_weights(weights["event"])})
+    assert "Looking at it" in first[1] and "Looking at it" not in second[1]
+    assert ">Net<" in second[0] and ">Net<" not in first[0]
+    for text in (*first, *second):
+        assert not re.findall(r"(?:src|href|url)\s*[=(]\s*['\"]?(?!data:)[a-z]", text)
+        assert "http" not in re.sub(r"base64,[^)]*", "", text)
+    assert first[0] == next(simulated(SMALL, picked("R"), {}))[0]
+    views = seen_views(recorded) + found_views([from_each_frame(recorded)]) + event_views(recorded)
+    for view in views:
+        assert len(view.pictures) == (1 if view.cursor else 40)
+        assert view.pictures.dtype == np.uint8 and view.pictures.any()
+        assert len(view.captions) in (0, 40)
+
+
+def test_a_message_is_text() -> None:
+    box = message_box("<script>alert(1)</script>\nsecond line")
+    assert "<script>" not in box and "\n" not in box and "&lt;script&gt;" in box
+
+
+def test_the_cloud_shows_each_event_once_as_present() -> None:
+    events = Events([5, 15, 25], [0, 3, 1], [0, 1, 1], [1, 0, 1], width=4, height=2)
+    pictures, colours = cloud_pictures(events, np.array([0, 10, 20, 30]), CloudSize(160, 96))
+    for k, now in enumerate((6, 7, 6)):
+        assert (pictures[k] == now).any() and not (pictures[k] == 13 - now).any()
+    assert not (pictures[2] == 3).any() and (pictures[0] == 3).any()
+    assert colours.shape == (8, 4)
+    blank, _ = cloud_pictures(Events.empty(4, 2), np.array([0, 10]))
+    assert not (blank >= 3).any()
+    with pytest.raises(DataError, match="64"):
+        CloudSize(10, 10)
+
+
+def test_slices_count_the_events_of_the_middle() -> None:
+    events = Events([1, 5, 9], [8, 8, 0], [8, 0, 8], [1, 1, 0], width=16, height=16)
+    over_x, over_y = time_slices(events, np.array([0, 10]), bins=10)
+    assert over_x.sum() == 2 and over_x[0, 8, 1] == 1 and over_x[1, 0, 9] == 1
+    assert over_y.sum() == 2 and over_y[0, 8, 1] == 1 and over_y[0, 0, 5] == 1
+    with pytest.raises(DataError, match="bins"):
+        time_slices(events, np.array([0, 10]), bins=0)
+    assert not signed_pictures(np.zeros((2, 3, 3))).any()
+
+
+def test_a_large_sensor_is_made_small_without_losing_events() -> None:
+    draw = np.random.default_rng(0)
+    x, y = draw.integers(0, 1281, 100), draw.integers(0, 720, 100)
+    events = Events(np.arange(100), x, y, draw.integers(0, 2, 100), width=1281, height=720)
+    small = smaller(events, 320)
+    assert (small.width, small.height) == (257, 144) and len(small) == 100
+    np.testing.assert_array_equal(small.x, x // 5)
+    assert smaller(small, 320) is small
+
+
+def test_a_server_refuses_what_cannot_be() -> None:
+    for wrong in ({"port": 70_000}, {"upload_mb": 0}, {"upload_mb": float("nan")}):
+        with pytest.raises(ConfigError):
+            Server(**wrong)
+    assert Server().host == "127.0.0.1"
+
+
+def test_without_gradio_the_page_says_what_to_install(monkeypatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "gradio", None)
+    with pytest.raises(MissingDependencyError, match=r"evnlos\[app\]"), running(Server()):
+        pass
+
+
+def strangers(addresses: list[str], home: str) -> list[str]:
+    """Return the addresses that lead to another host."""
+    own = {urlsplit(home).netloc}
+    return [
+        a[:200]
+        for a in addresses
+        if urlsplit(a).scheme not in ("data", "blob", "chrome") and urlsplit(a).netloc not in own
+    ]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::ResourceWarning")
+def test_the_page_in_a_real_browser(zipped, tmp_path, monkeypatch) -> None:
+    if importlib.util.find_spec("gradio") is None:
+        pytest.skip("gradio is not installed: pip install 'evnlos[app]'")
+    if chromium.missing():
+        pytest.skip(f"{chromium.missing()}: apt-get install chromium chromium-driver")
+    monkeypatch.setenv("GRADIO_TEMP_DIR", "")  # what the page sets goes back with the test
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    asked: list[str] = []
+    opening = Server(port=0, columns=24)
+    with running(opening) as home, chromium.Chromium(tmp_path / "profile") as browser:
+        assert urlsplit(home).hostname == "127.0.0.1"
+        browser.open(home)
+        width = browser.wait("const p = document.querySelector('.ev-picture'); return p && p.offsetWidth")
+        assert width > 100
+        # The slider answers in the page itself, by mouse and by key.
+        browser.run("const s = document.querySelector('.ev-position'); s.value = 30; s.oninput()")
+        assert browser.run("return document.querySelector('.ev-now').textContent").startswith(
+            "position 31 of 40"
+        )
+        assert browser.run("return document.querySelector('.ev-sheet').style.getPropertyValue('--k')") == "30"
+        browser.run("document.querySelector('.ev-position').focus()")
+        browser.press("\ue012")  # left
+        assert browser.run("return document.querySelector('.ev-now').textContent").startswith(
+            "position 30 of 40"
+        )
+        browser.wait("return !document.querySelector('.ev-verdict').textContent.includes('Looking at it')")
+        # A control simulates another pass, looked at where the last one was.
+        pass_of = "document.querySelector('.ev-sheet').dataset.pass"
+        label = "Ambient light"
+        before = browser.run(f"return {pass_of}")
+        browser.run(f"document.querySelector('input[type=range][aria-label*=\"{label}\"]').focus()")
+        browser.press("\ue014\ue014")  # right
+        browser.wait(f"return {pass_of} !== {json.dumps(before)}")
+        assert browser.run("return document.querySelector('.ev-now').textContent").startswith(
+            "position 30 of 40"
+        )
+        assert browser.run("return document.querySelector('.ev-position').value") == "29"
+        # Playing moves by itself.
+        browser.run("document.querySelector('.ev-play').click()")
+        browser.wait("return !document.querySelector('.ev-now').textContent.startsWith('position 30 ')")
+        browser.run("document.querySelector('.ev-play').click()")
+        # A drawing becomes the hidden object.
+        browser.run("document.querySelector('input[type=radio][value=\"Draw one\"]').click()")
+        browser.wait("return document.querySelector('.ev-message')?.textContent.includes('drawing is empty')")
+        x, y = browser.wait(
+            "const b = document.querySelector('.ev-pen').getBoundingClientRect();"
+            " return b.width && [b.left, b.top]"
+        )
+        before = browser.run(f"return {pass_of}")
+        browser.drag([(int(x) + 40, int(y) + 40), (int(x) + 150, int(y) + 150)])
+        browser.wait(f"return {pass_of} !== {json.dumps(before)}")
+        # An upload is shown; one that is too large is refused.
+        asked += browser.requests()
+        browser.run(
+            "[...document.querySelectorAll('[role=tab]')]"
+            ".find(tab => tab.textContent.includes('recording')).click()"
+        )
+        browser.wait("return [...document.querySelectorAll('input[type=file]')].length")
+        browser.give_file("input[type=file]", zipped)
+        browser.wait("return document.querySelectorAll('.ev-sheet').length === 2")
+        assert not browser.run("return document.body.innerHTML.includes('ev-wrong')")
+        time.sleep(0.2)
+        asked += browser.requests()
+        complaints = [one for one in browser.complaints() if "SEVERE" in one]
+        folders = [one for one in tmp_path.iterdir() if one.name.startswith("evnlos-app-")]
+        assert any(one.name == zipped.name for folder in folders for one in folder.rglob("*"))
+    assert len(asked) > 20 and strangers(asked, home) == []
+    assert complaints == []
+    assert not [one for one in tmp_path.iterdir() if one.name.startswith("evnlos-app-")]

@@ -1,0 +1,191 @@
+"""Files of strangers on the page: shown, or refused in one line, and nothing of them stays."""
+
+import stat
+import warnings
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from evnlos import ResidualUNet, UNetConfig
+from evnlos.app.hidden import picked
+from evnlos.app.recorded import Recorded, simulate_pass
+from evnlos.app.setup import Setup
+from evnlos.app.unpack import MOST_FILES, unpack_zip
+from evnlos.app.upload import read_upload
+from evnlos.app.work import uploaded
+from evnlos.config import to_dict
+from evnlos.dataset import Sampling
+from evnlos.errors import DataError
+from evnlos.events import write_events
+from evnlos.model import Weights, load_weights, save_weights
+
+SMALL = Setup(columns=24)
+MB = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recorded:
+    return simulate_pass(SMALL, picked("R"))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> dict[str, Path]:
+    """Untrained weights of two paradigms."""
+    folder = tmp_path_factory.mktemp("weights")
+    sampling, found = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12), {}
+    for paradigm, channels in (("fusion", 3), ("event", 2)):
+        torch.manual_seed(0)
+        network = ResidualUNet(channels, UNetConfig(width=4, depth=1, rank=0)).eval()
+        found[paradigm] = folder / f"{paradigm}-run" / "weights.safetensors"
+        found[paradigm].parent.mkdir()
+        save_weights(found[paradigm], Weights(network, paradigm, to_dict(sampling), []))
+    return found
+
+
+@pytest.fixture(scope="module")
+def zipped(tiny_captures, tmp_path_factory) -> Path:
+    """A capture folder as people zip it."""
+    path = tmp_path_factory.mktemp("zip") / "shot.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for one in sorted(tiny_captures[0].rglob("*")):
+            archive.write(one, one.relative_to(tiny_captures[0].parent))
+    return path
+
+
+def archive(path: Path, *names: str, content: bytes = b"x", mode: int = 0) -> Path:
+    with warnings.catch_warnings(), zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as made:
+        warnings.simplefilter("ignore")  # of names that are there twice
+        for name in names:
+            entry = zipfile.ZipInfo(name)
+            entry.external_attr, entry.compress_type = mode << 16, zipfile.ZIP_DEFLATED
+            made.writestr(entry, content)
+    return path
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../evil", "a/../../evil", "/evil", "a/../evil", "..\\evil", "C:\\evil", "C:evil", "\\\\host\\evil"],
+)
+def test_no_name_in_a_zip_leads_out(name: str, tmp_path) -> None:
+    with pytest.raises(DataError, match="leads out"):
+        unpack_zip(archive(tmp_path / "z.zip", "good", name), tmp_path / "in" / "side", MB)
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["z.zip"]
+
+
+@pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFIFO, stat.S_IFCHR, stat.S_IFSOCK])
+def test_links_and_devices_are_refused(kind: int, tmp_path) -> None:
+    path = archive(tmp_path / "z.zip", "link", content=b"/etc/passwd", mode=kind | 0o777)
+    with pytest.raises(DataError, match="link or a device"):
+        unpack_zip(path, tmp_path / "out", MB)
+
+
+def test_sizes_in_a_zip_are_not_believed(tmp_path) -> None:
+    path = archive(tmp_path / "bomb.zip", "zeros", content=bytes(20 * MB))
+    assert path.stat().st_size < MB / 10
+    with pytest.raises(DataError, match="unpacks to more than 1 MB"):
+        unpack_zip(path, tmp_path / "a", MB)
+    assert sum(p.stat().st_size for p in (tmp_path / "a").rglob("*")) <= MB
+    # The same with headers that claim a single byte.
+    lying = bytearray(path.read_bytes())
+    for mark, offset in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):
+        at = lying.index(mark) + offset
+        lying[at : at + 4] = (1).to_bytes(4, "little")
+    path.write_bytes(lying)
+    with pytest.raises(DataError):
+        unpack_zip(path, tmp_path / "b", MB)
+    assert sum(p.stat().st_size for p in (tmp_path / "b").rglob("*")) <= MB
+    # Many small files add up.
+    path = archive(tmp_path / "many.zip", *(f"{k}" for k in range(12)), content=bytes(100_000))
+    with pytest.raises(DataError, match="more than 1 MB"):
+        unpack_zip(path, tmp_path / "c", MB)
+
+
+def test_other_strange_zips_are_one_line(tmp_path) -> None:
+    whole = archive(tmp_path / "good.zip", "a/b", "c", content=bytes(range(256)) * 9).read_bytes()
+    assert [p.name for p in unpack_zip(tmp_path / "good.zip", tmp_path / "good", MB)] == ["b", "c"]
+    for k, content in enumerate(
+        (whole[:-30], whole[: len(whole) // 2], b"PK\x03\x04", b"", whole[:40] + bytes(20) + whole[60:])
+    ):
+        path = tmp_path / f"{k}.zip"
+        path.write_bytes(content)
+        with pytest.raises(DataError):
+            unpack_zip(path, tmp_path / f"out{k}", MB)
+    for name, names, message in (
+        ("twice", ("a", "a"), "twice"),
+        ("both", ("a", "a/b"), "twice|cannot be unpacked"),
+        ("many", tuple(str(k) for k in range(MOST_FILES + 1)), "at most 5000"),
+        ("long", ("n" * 5000,), "cannot be unpacked"),
+    ):
+        with pytest.raises(DataError, match=message):
+            unpack_zip(archive(tmp_path / f"{name}.zip", *names), tmp_path / name, MB)
+    # A list of files that would fill the memory before it could be counted.
+    huge = bytearray(whole)
+    huge[-10:-6] = (1 << 30).to_bytes(4, "little")
+    (tmp_path / "huge.zip").write_bytes(huge)
+    with pytest.raises(DataError, match="too many files"):
+        unpack_zip(tmp_path / "huge.zip", tmp_path / "huge", MB)
+    locked = bytearray(whole)
+    for mark, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        locked[locked.index(mark) + offset] |= 1
+    (tmp_path / "locked.zip").write_bytes(locked)
+    with pytest.raises(DataError, match="encrypted"):
+        unpack_zip(tmp_path / "locked.zip", tmp_path / "locked", MB)
+
+
+def test_a_capture_is_shown_and_reconstructed_and_nothing_stays(zipped, weights, tmp_path) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    found = read_upload(zipped, scratch, 10 * MB)
+    assert len(found) == 8 and found.scene is not None and found.frames.shape == (8, 48, 72)
+    pictures, message = uploaded(str(zipped), scratch, 10 * MB, {"net": load_weights(weights["fusion"])})
+    for title in (">Hidden object<", ">Wall<", ">Events<", ">Net<", ">Space-time cloud<"):
+        assert title in pictures
+    assert "ev-note" in message and "events from" in message
+    assert "start the page with --weights" in uploaded(str(zipped), scratch, 10 * MB, {})[1]
+    assert list(scratch.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".raw", ".npz", ".csv", ".h5"])
+def test_a_recording_is_shown(suffix: str, recorded, weights, tmp_path) -> None:
+    path = tmp_path / f"walk{suffix}"
+    write_events(path, recorded.events)
+    found = read_upload(path, tmp_path, 10 * MB)
+    assert found.events == recorded.events and len(found) == 40 and found.frames is None
+    networks = {name: load_weights(one) for name, one in weights.items()}
+    pictures, message = uploaded(str(path), tmp_path, 10 * MB, networks)
+    assert ">Event<" in pictures and ">Fusion<" not in pictures and ">Wall<" not in pictures
+    assert "fusion looks at frames" in message
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]
+
+
+def test_bad_uploads_are_one_line_without_this_machines_folders(
+    recorded, zipped, tmp_path, monkeypatch
+) -> None:
+    def said(name: str, content: bytes, limit: int = MB) -> str:
+        path = tmp_path / name
+        path.write_bytes(content)
+        pictures, message = uploaded(str(path), tmp_path, limit, {})
+        assert pictures == "" and 'role="alert"' in message and str(tmp_path) not in message
+        return message
+
+    assert "--upload-mb" in said("large.raw", bytes(2 * MB))
+    assert "unpacks to more" in said(
+        "bomb.zip", archive(tmp_path / "b", "capture.yaml", content=bytes(9 * MB)).read_bytes()
+    )
+    assert "capture.yaml" in said("none.zip", archive(tmp_path / "n", "a.txt").read_bytes())
+    assert "leads out" in said("slip.zip", archive(tmp_path / "s", "../capture.yaml").read_bytes())
+    assert "no known event format" in said("noise.bin", bytes(range(256)) * 40)
+    said("empty.raw", b"")
+    outside = b"camera: {width: 8, height: 8}\nevents: ../../../etc/passwd\nframes: frames.csv\n"
+    assert "outside" in said("out.zip", archive(tmp_path / "o", "c/capture.yaml", content=outside).read_bytes())
+    vast = outside.replace(b"8", b"60000")
+    assert "at most" in said("vast.zip", archive(tmp_path / "v", "c/capture.yaml", content=vast).read_bytes())
+    assert "no file yet" in uploaded(None, tmp_path, MB, {})[1]
+    monkeypatch.setattr("evnlos.app.upload.MOST_EVENTS", 100)
+    with pytest.raises(DataError, match="100 events or more"):
+        read_upload(zipped, tmp_path, 10 * MB)
+    write_events(tmp_path / "long.npz", recorded.events)
+    cut = read_upload(tmp_path / "long.npz", tmp_path, 10 * MB)
+    assert len(cut.events) == 100 and "only the first 100" in cut.notes[-1]
