@@ -39,6 +39,7 @@ _EXTRAS = {
     "av": ("video", "reads and writes videos"),
     "matplotlib": ("plot", "draws figures"),
     "mitsuba": ("lab", "checks the optics against a path tracer"),
+    "gradio": ("app", "opens the page to play with"),
     "distributed": ("cluster", "simulates on a Dask cluster"),
 }
 
