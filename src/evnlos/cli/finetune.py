@@ -8,14 +8,18 @@ from pathlib import Path
 from evnlos.cli.console import Flat
 from evnlos.cli.train import fit
 from evnlos.dataset import open_dataset
-from evnlos.training import Training, paper_finetuning
+from evnlos.training import Training, finetuning, paper_finetuning
 
-PRESETS = {"default": Training, "paper": paper_finetuning}
+PRESETS = {"default": finetuning, "paper": paper_finetuning}
 
 
 @dataclass(frozen=True)
 class Command:
-    """Fine-tune weights on few captures (EPNP): paradigm and network are those of the weights."""
+    """Fine-tune weights on few captures (EPNP): paradigm and network are those of the weights.
+
+    After a simulation that was fitted to the rig, less is better: --epochs 3 --learning-rate 2e-4
+    --no-restandardise.
+    """
 
     weights: Path
     """Weights file, or the run to start from."""
@@ -27,7 +31,7 @@ class Command:
     """`default`, or `paper` for the paper's 100 epochs at 1e-5 with its loss."""
     config: Path | None = None
     """YAML file with settings."""
-    settings: Flat[Training] = field(default_factory=Training)
+    settings: Flat[Training] = field(default_factory=finetuning)
 
     def run(self) -> None:
         """Train, with a progress bar over the epochs."""

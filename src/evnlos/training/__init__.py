@@ -1,7 +1,7 @@
 """Learning to reconstruct: pre-training on simulation, fine-tuning on captures, end-to-end training."""
 
 from evnlos.training.loss import LOSSES, balanced_loss, paper_loss
-from evnlos.training.presets import paper_finetuning, paper_pretraining
+from evnlos.training.presets import finetuning, paper_finetuning, paper_pretraining
 from evnlos.training.settings import Training, step_size
 from evnlos.training.train import train
 
@@ -9,6 +9,7 @@ __all__ = [
     "LOSSES",
     "Training",
     "balanced_loss",
+    "finetuning",
     "paper_finetuning",
     "paper_loss",
     "paper_pretraining",

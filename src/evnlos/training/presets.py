@@ -1,4 +1,4 @@
-"""The paper's training settings (Wang et al., EPNP, section on training), as functions."""
+"""Training settings by name: our fine-tuning, and the paper's (Wang et al., EPNP, section on training)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from evnlos.training.settings import Training
 
 PLAIN_NETWORK = UNetConfig(width=24, depth=4, shuffle=2, scaling="picture", rank=0)
 """A U-Net as the paper has it: it sees the maps, each picture standardised by itself, and no embedding."""
+
+
+def finetuning(paradigm: Paradigm = "frame") -> Training:
+    """Return our fine-tuning where the simulation was not fitted to the rig: smaller steps than a training's."""
+    return Training(paradigm=paradigm, epochs=10, learning_rate=1e-3)
 
 
 def paper_pretraining(paradigm: Paradigm = "fusion") -> Training:
