@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 CAPTURES ?=
 DEMO ?= demo
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check bench dist clean
 
 demo: $(READY)
 	$(BIN)/evnlos demo --out $(DEMO) $(if $(strip $(CAPTURES)),--captures $(CAPTURES))
@@ -23,6 +23,15 @@ check: $(READY)
 
 bench: $(READY)
 	for question in benchmarks/*.py; do $(BIN)/python $$question || exit 1; done
+
+# A wheel, with what is not Python in it.
+dist: $(READY)
+	rm -rf dist build
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+	$(BIN)/python -c "import glob, zipfile; names = set(zipfile.ZipFile(glob.glob('dist/*.whl')[0]).namelist()); \
+	  lost = [n for n in ('evnlos/py.typed', 'evnlos/live/page.html', 'evnlos/app/page.css', \
+	  'evnlos/report/style.css', 'evnlos/evaluation/classifier.safetensors') if n not in names]; assert not lost, lost"
+	ls -l dist
 
 clean:
 	rm -rf $(DEMO) build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis
