@@ -29,7 +29,7 @@ SETTINGS = Training(
     precision="float32",
 )
 FLAGS = ["--batch-size", "103", "--precision", "float32"]
-FLAGS += ["--network.width", "8", "--network.depth", "2", "--network.shuffle", "1"]
+FLAGS += ["--network.width", "8", "--network.depth", "2", "--network.shuffle", "1", "--network.rank", "8"]
 
 
 @pytest.mark.parametrize("name", LOSSES)

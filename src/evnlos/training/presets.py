@@ -11,7 +11,7 @@ PLAIN_NETWORK = UNetConfig(width=24, depth=4, shuffle=2, scaling="picture", rank
 
 
 def finetuning(paradigm: Paradigm = "frame") -> Training:
-    """Return our fine-tuning where the simulation was not fitted to the rig: smaller steps than a training's."""
+    """Return our fine-tuning after a simulation of any rig: smaller steps than those of a training."""
     return Training(paradigm=paradigm, epochs=10, learning_rate=1e-3)
 
 

@@ -88,9 +88,9 @@ def estimate_scan(
 
     Example:
         >>> camera = ScanCamera(full_level=0.8, full_well_e=1e9, read_noise_e=1e6, bit_depth=16)
-        >>> found = estimate_scan(Patterns("hadamard", 787), camera, 0.01, 2, 1600, 26, 0.1)
-        >>> round(found.other_noise / found.noise, 1)  # (q + 1) / (2 sqrt q) = 14.04
-        14.0
+        >>> found = estimate_scan(Patterns("hadamard", 787), camera, 0.01, 2, 3200, 1600, 0.1)
+        >>> round(found.other_noise / found.noise, 1)  # dark frames known, (q + 1) / (2 sqrt q) = 14.05
+        14.1
     """
     cell = camera.full_level / effective_cells(patterns.cells, camera.lobe_m, pitch_m)
     kinds: dict[str, tuple[Patterns, float]] = {
