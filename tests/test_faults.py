@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -192,7 +193,11 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(settings, tiny_dataset, tmp
 def test_ctrl_c_ends_all_processes_within_seconds(settings, tmp_path) -> None:
     folder = tmp_path / "d"
     command = [*COMMAND, "simulate", "--config", str(settings), "--workers", "2", "--out", str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    # a suite that runs in the background of a shell ignores the signal, and so would its children
+    listens = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=listens
+    )
     deadline = time.monotonic() + 90
     while not list(folder.glob("*.h5")) and time.monotonic() < deadline:
         time.sleep(0.02)
