@@ -1,6 +1,7 @@
 """Fixtures that several test files use."""
 
 import os
+import zipfile
 from pathlib import Path
 
 # One thread a process, here and in the programs that tests start: several processes test at once, and
@@ -66,3 +67,43 @@ def tiny_captures(tmp_path_factory) -> list[Path]:
         frame_rate_hz=1.0,
     )
     return list(render_captures(lab, tmp_path_factory.mktemp("lab")))
+
+
+@pytest.fixture(scope="session")
+def app_pass():
+    """A pass that the page simulates, at the smallest size."""
+    from evnlos.app.hidden import picked
+    from evnlos.app.recorded import simulate_pass
+    from evnlos.app.setup import Setup
+
+    return simulate_pass(Setup(columns=24), picked("R"))
+
+
+@pytest.fixture(scope="session")
+def app_weights(tmp_path_factory) -> dict[str, Path]:
+    """Untrained weights of two paradigms, for maps of the page's smallest size."""
+    import torch
+
+    from evnlos.config import to_dict
+    from evnlos.dataset import Sampling
+    from evnlos.model import ResidualUNet, UNetConfig, Weights, save_weights
+
+    folder = tmp_path_factory.mktemp("weights")
+    sampling, found = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12), {}
+    for paradigm, channels in (("fusion", 3), ("event", 2)):
+        torch.manual_seed(0)
+        network = ResidualUNet(channels, UNetConfig(width=4, depth=1, rank=0)).eval()
+        found[paradigm] = folder / f"{paradigm}-run" / "weights.safetensors"
+        found[paradigm].parent.mkdir()
+        save_weights(found[paradigm], Weights(network, paradigm, to_dict(sampling), []))
+    return found
+
+
+@pytest.fixture(scope="session")
+def zipped_capture(tiny_captures, tmp_path_factory) -> Path:
+    """A capture folder as people zip it."""
+    path = tmp_path_factory.mktemp("zip") / "shot.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for one in sorted(tiny_captures[0].rglob("*")):
+            archive.write(one, one.relative_to(tiny_captures[0].parent))
+    return path

@@ -5,19 +5,17 @@ import json
 import re
 import tempfile
 import time
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-import torch
 
 import chromium
-from evnlos import Events, ResidualUNet, UNetConfig
+from evnlos import Events
 from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
-from evnlos.app.recorded import Recorded, simulate_pass
+from evnlos.app.recorded import simulate_pass
 from evnlos.app.serve import Server, running
 from evnlos.app.setup import Setup
 from evnlos.app.sheet import message_box
@@ -25,58 +23,27 @@ from evnlos.app.solving import from_each_frame, from_weights, from_whole_pass, n
 from evnlos.app.verdict import verdict_on
 from evnlos.app.views import event_views, found_views, seen_views
 from evnlos.app.work import simulated
-from evnlos.config import to_dict
 from evnlos.dataset import Sampling
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
-from evnlos.model import Weights, load_weights, save_weights
+from evnlos.model import load_weights
 from evnlos.plot.event_views import CloudSize, cloud_pictures, signed_pictures, smaller, time_slices
 
 SMALL = Setup(columns=24)
-MB = 1_000_000
 
 
-@pytest.fixture(scope="module")
-def recorded() -> Recorded:
-    return simulate_pass(SMALL, picked("R"))
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory) -> dict[str, Path]:
-    """Untrained weights of two paradigms."""
-    folder = tmp_path_factory.mktemp("weights")
-    sampling, found = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12), {}
-    for paradigm, channels in (("fusion", 3), ("event", 2)):
-        torch.manual_seed(0)
-        network = ResidualUNet(channels, UNetConfig(width=4, depth=1, rank=0)).eval()
-        found[paradigm] = folder / f"{paradigm}-run" / "weights.safetensors"
-        found[paradigm].parent.mkdir()
-        save_weights(found[paradigm], Weights(network, paradigm, to_dict(sampling), []))
-    return found
-
-
-@pytest.fixture(scope="module")
-def zipped(tiny_captures, tmp_path_factory) -> Path:
-    """A capture folder as people zip it."""
-    path = tmp_path_factory.mktemp("zip") / "shot.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for one in sorted(tiny_captures[0].rglob("*")):
-            archive.write(one, one.relative_to(tiny_captures[0].parent))
-    return path
-
-
-def test_a_pass_is_the_same_bytes_for_the_same_settings(recorded) -> None:
+def test_a_pass_is_the_same_bytes_for_the_same_settings(app_pass) -> None:
     again = simulate_pass(SMALL, picked("R"))
-    assert again.events == recorded.events and len(recorded.events) > 300
-    np.testing.assert_array_equal(again.frames, recorded.frames)
-    assert simulate_pass(replace(SMALL, seed=2), picked("R")).events != recorded.events
+    assert again.events == app_pass.events and len(app_pass.events) > 300
+    np.testing.assert_array_equal(again.frames, app_pass.frames)
+    assert simulate_pass(replace(SMALL, seed=2), picked("R")).events != app_pass.events
 
 
-def test_settings_do_what_they_say(recorded) -> None:
+def test_settings_do_what_they_say(app_pass) -> None:
     faster = simulate_pass(replace(SMALL, speed_m_s=0.04), picked("R"))
-    assert faster.times_s[-1] == pytest.approx(recorded.times_s[-1] / 2)
+    assert faster.times_s[-1] == pytest.approx(app_pass.times_s[-1] / 2)
     higher = simulate_pass(replace(SMALL, threshold_on=0.3, threshold_off=0.3), picked("R"))
-    assert len(higher.events) < 0.7 * len(recorded.events)
-    assert simulate_pass(replace(SMALL, ambient=0.4), picked("R")).frames.min() > recorded.frames.max() / 2
+    assert len(higher.events) < 0.7 * len(app_pass.events)
+    assert simulate_pass(replace(SMALL, ambient=0.4), picked("R")).frames.min() > app_pass.frames.max() / 2
     usual, noisy = (Setup(frame_noise=n).simulation().frame_camera for n in (1.0, 3.0))
     for level in (0.0, 0.3):
         # Shot and read noise in white levels, both three times as strong.
@@ -105,23 +72,23 @@ def test_a_drawing_is_a_plate() -> None:
     assert picked(CHARACTERS[0]).mask.any()
 
 
-def test_classical_pictures_beat_black_and_the_whole_pass_beats_one_frame(recorded) -> None:
-    whole, single = from_whole_pass(recorded), from_each_frame(recorded)
+def test_classical_pictures_beat_black_and_the_whole_pass_beats_one_frame(app_pass) -> None:
+    whole, single = from_whole_pass(app_pass), from_each_frame(app_pass)
     middle = slice(10, 30)
     assert whole.psnr_db[middle].mean() > single.psnr_db[middle].mean() + 0.5
     assert single.psnr_db[middle].mean() > single.black_db[middle].mean() + 1.5
     matte = simulate_pass(replace(SMALL, wall="matte"), picked("R"))
     assert from_whole_pass(matte).psnr_db[middle].mean() < whole.psnr_db[middle].mean() - 1.0
     with pytest.raises(DataError, match="rig"):
-        from_each_frame(replace(recorded, simulation=None))
+        from_each_frame(replace(app_pass, simulation=None))
 
 
-def test_networks_see_what_they_were_trained_on(recorded, weights) -> None:
-    named = named_weights((weights["fusion"].parent, weights["event"]))
+def test_networks_see_what_they_were_trained_on(app_pass, app_weights) -> None:
+    named = named_weights((app_weights["fusion"].parent, app_weights["event"]))
     assert list(named) == ["fusion-run", "event-run"]
-    found = from_weights(recorded, "fusion-run", named["fusion-run"])
+    found = from_weights(app_pass, "fusion-run", named["fusion-run"])
     assert found.images.shape == (40, 12, 24) and found.psnr_db.shape == (40,)
-    blind = replace(recorded, frames=None)
+    blind = replace(app_pass, frames=None)
     assert from_weights(blind, "event-run", named["event-run"]).images.shape == (40, 12, 24)
     with pytest.raises(DataError, match="has none"):
         from_weights(blind, "fusion-run", named["fusion-run"])
@@ -136,15 +103,15 @@ def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
     assert all(one.reason.endswith(".") and "dB" in one.figures for one in shown)
 
 
-def test_a_sheet_holds_every_position_and_asks_nobody(recorded, weights) -> None:
-    first, second = simulated(SMALL, picked("R"), {"net": load_weights(weights["event"])})
+def test_a_sheet_holds_every_position_and_asks_nobody(app_pass, app_weights) -> None:
+    first, second = simulated(SMALL, picked("R"), {"net": load_weights(app_weights["event"])})
     assert "Looking at it" in first[1] and "Looking at it" not in second[1]
     assert ">Net<" in second[0] and ">Net<" not in first[0]
     for text in (*first, *second):
         assert not re.findall(r"(?:src|href|url)\s*[=(]\s*['\"]?(?!data:)[a-z]", text)
         assert "http" not in re.sub(r"base64,[^)]*", "", text)
     assert first[0] == next(simulated(SMALL, picked("R"), {}))[0]
-    views = seen_views(recorded) + found_views([from_each_frame(recorded)]) + event_views(recorded)
+    views = seen_views(app_pass) + found_views([from_each_frame(app_pass)]) + event_views(app_pass)
     for view in views:
         assert len(view.pictures) == (1 if view.cursor else 40)
         assert view.pictures.dtype == np.uint8 and view.pictures.any()
@@ -213,7 +180,7 @@ def strangers(addresses: list[str], home: str) -> list[str]:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::ResourceWarning")
-def test_the_page_in_a_real_browser(zipped, tmp_path, monkeypatch) -> None:
+def test_the_page_in_a_real_browser(zipped_capture, tmp_path, monkeypatch) -> None:
     if importlib.util.find_spec("gradio") is None:
         pytest.skip("gradio is not installed: pip install 'evnlos[app]'")
     if chromium.missing():
@@ -271,14 +238,14 @@ def test_the_page_in_a_real_browser(zipped, tmp_path, monkeypatch) -> None:
             ".find(tab => tab.textContent.includes('recording')).click()"
         )
         browser.wait("return [...document.querySelectorAll('input[type=file]')].length")
-        browser.give_file("input[type=file]", zipped)
+        browser.give_file("input[type=file]", zipped_capture)
         browser.wait("return document.querySelectorAll('.ev-sheet').length === 2")
         assert not browser.run("return document.body.innerHTML.includes('ev-wrong')")
         time.sleep(0.2)
         asked += browser.requests()
         complaints = [one for one in browser.complaints() if "SEVERE" in one]
         folders = [one for one in tmp_path.iterdir() if one.name.startswith("evnlos-app-")]
-        assert any(one.name == zipped.name for folder in folders for one in folder.rglob("*"))
+        assert any(one.name == zipped_capture.name for folder in folders for one in folder.rglob("*"))
     assert len(asked) > 20 and strangers(asked, home) == []
     assert complaints == []
     assert not [one for one in tmp_path.iterdir() if one.name.startswith("evnlos-app-")]

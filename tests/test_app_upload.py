@@ -6,52 +6,15 @@ import zipfile
 from pathlib import Path
 
 import pytest
-import torch
 
-from evnlos import ResidualUNet, UNetConfig
-from evnlos.app.hidden import picked
-from evnlos.app.recorded import Recorded, simulate_pass
-from evnlos.app.setup import Setup
 from evnlos.app.unpack import MOST_FILES, unpack_zip
 from evnlos.app.upload import read_upload
 from evnlos.app.work import uploaded
-from evnlos.config import to_dict
-from evnlos.dataset import Sampling
 from evnlos.errors import DataError
 from evnlos.events import write_events
-from evnlos.model import Weights, load_weights, save_weights
+from evnlos.model import load_weights
 
-SMALL = Setup(columns=24)
 MB = 1_000_000
-
-
-@pytest.fixture(scope="module")
-def recorded() -> Recorded:
-    return simulate_pass(SMALL, picked("R"))
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory) -> dict[str, Path]:
-    """Untrained weights of two paradigms."""
-    folder = tmp_path_factory.mktemp("weights")
-    sampling, found = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12), {}
-    for paradigm, channels in (("fusion", 3), ("event", 2)):
-        torch.manual_seed(0)
-        network = ResidualUNet(channels, UNetConfig(width=4, depth=1, rank=0)).eval()
-        found[paradigm] = folder / f"{paradigm}-run" / "weights.safetensors"
-        found[paradigm].parent.mkdir()
-        save_weights(found[paradigm], Weights(network, paradigm, to_dict(sampling), []))
-    return found
-
-
-@pytest.fixture(scope="module")
-def zipped(tiny_captures, tmp_path_factory) -> Path:
-    """A capture folder as people zip it."""
-    path = tmp_path_factory.mktemp("zip") / "shot.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for one in sorted(tiny_captures[0].rglob("*")):
-            archive.write(one, one.relative_to(tiny_captures[0].parent))
-    return path
 
 
 def archive(path: Path, *names: str, content: bytes = b"x", mode: int = 0) -> Path:
@@ -134,26 +97,28 @@ def test_other_strange_zips_are_one_line(tmp_path) -> None:
         unpack_zip(tmp_path / "locked.zip", tmp_path / "locked", MB)
 
 
-def test_a_capture_is_shown_and_reconstructed_and_nothing_stays(zipped, weights, tmp_path) -> None:
+def test_a_capture_is_shown_and_reconstructed_and_nothing_stays(zipped_capture, app_weights, tmp_path) -> None:
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    found = read_upload(zipped, scratch, 10 * MB)
+    found = read_upload(zipped_capture, scratch, 10 * MB)
     assert len(found) == 8 and found.scene is not None and found.frames.shape == (8, 48, 72)
-    pictures, message = uploaded(str(zipped), scratch, 10 * MB, {"net": load_weights(weights["fusion"])})
+    pictures, message = uploaded(
+        str(zipped_capture), scratch, 10 * MB, {"net": load_weights(app_weights["fusion"])}
+    )
     for title in (">Hidden object<", ">Wall<", ">Events<", ">Net<", ">Space-time cloud<"):
         assert title in pictures
     assert "ev-note" in message and "events from" in message
-    assert "start the page with --weights" in uploaded(str(zipped), scratch, 10 * MB, {})[1]
+    assert "start the page with --weights" in uploaded(str(zipped_capture), scratch, 10 * MB, {})[1]
     assert list(scratch.iterdir()) == []
 
 
 @pytest.mark.parametrize("suffix", [".raw", ".npz", ".csv", ".h5"])
-def test_a_recording_is_shown(suffix: str, recorded, weights, tmp_path) -> None:
+def test_a_recording_is_shown(suffix: str, app_pass, app_weights, tmp_path) -> None:
     path = tmp_path / f"walk{suffix}"
-    write_events(path, recorded.events)
+    write_events(path, app_pass.events)
     found = read_upload(path, tmp_path, 10 * MB)
-    assert found.events == recorded.events and len(found) == 40 and found.frames is None
-    networks = {name: load_weights(one) for name, one in weights.items()}
+    assert found.events == app_pass.events and len(found) == 40 and found.frames is None
+    networks = {name: load_weights(one) for name, one in app_weights.items()}
     pictures, message = uploaded(str(path), tmp_path, 10 * MB, networks)
     assert ">Event<" in pictures and ">Fusion<" not in pictures and ">Wall<" not in pictures
     assert "fusion looks at frames" in message
@@ -161,7 +126,7 @@ def test_a_recording_is_shown(suffix: str, recorded, weights, tmp_path) -> None:
 
 
 def test_bad_uploads_are_one_line_without_this_machines_folders(
-    recorded, zipped, tmp_path, monkeypatch
+    app_pass, zipped_capture, tmp_path, monkeypatch
 ) -> None:
     def said(name: str, content: bytes, limit: int = MB) -> str:
         path = tmp_path / name
@@ -185,7 +150,7 @@ def test_bad_uploads_are_one_line_without_this_machines_folders(
     assert "no file yet" in uploaded(None, tmp_path, MB, {})[1]
     monkeypatch.setattr("evnlos.app.upload.MOST_EVENTS", 100)
     with pytest.raises(DataError, match="100 events or more"):
-        read_upload(zipped, tmp_path, 10 * MB)
-    write_events(tmp_path / "long.npz", recorded.events)
+        read_upload(zipped_capture, tmp_path, 10 * MB)
+    write_events(tmp_path / "long.npz", app_pass.events)
     cut = read_upload(tmp_path / "long.npz", tmp_path, 10 * MB)
     assert len(cut.events) == 100 and "only the first 100" in cut.notes[-1]

@@ -45,6 +45,17 @@ def is_empty(folder: str | Path) -> bool:
     return not folder.is_dir() or all(path.name.startswith(LOCK) for path in folder.iterdir())
 
 
+def check_folder(folder: str | Path) -> None:
+    """Refuse a folder for results that is not new or empty.
+
+    Raises:
+        DataError: It holds something, or is a file.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(f"{folder} is not an empty folder; give a new one with --out")
+
+
 def _sweep(folder: Path) -> None:
     """Remove half-written files of a process that was killed: whoever holds the whole folder may."""
     for path in folder.glob(".*.tmp"):

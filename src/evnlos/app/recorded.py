@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from evnlos.app.setup import Setup
 from evnlos.dataset import Samples, Sampling, Simulation, make_samples
+from evnlos.dataset.sampling import edges_from
 from evnlos.scene import Scene, Target
 from evnlos.seeds import derive_seed
 from evnlos.sensor import EventCamera, FrameCamera
@@ -81,5 +82,4 @@ def simulate_pass(setup: Setup, target: Target) -> Recorded:
         wall, 0.0, simulation.duration_s, seed=derive_seed(setup.seed, "events")
     )
     frames = camera.capture(wall, times_s, seed=derive_seed(setup.seed, "frames"))
-    edges_us = np.concatenate([[0], np.round(times_s * 1e6)]).astype(np.int64)
-    return Recorded(target.name, events, edges_us, frames, camera.white, scene, simulation)
+    return Recorded(target.name, events, edges_from(times_s), frames, camera.white, scene, simulation)

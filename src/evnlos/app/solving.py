@@ -104,7 +104,8 @@ def from_weights(recorded: Recorded, name: str, weights: Weights) -> Reconstruct
         )
     sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
     samples = recorded.samples(sampling)
-    images = reconstruct(weights, samples.frame, samples.surface)[:, sampling.scored].numpy()
+    pictures = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
+    images = pictures[:, sampling.scored].numpy()
     saw = {"frame": "one frame", "event": "events alone", "fusion": "frame and events"}[weights.paradigm]
     return _scored(name, f"network: {saw}", images, recorded, sampling)
 

@@ -20,6 +20,7 @@ from evnlos.plot.event_views import (
     smaller,
     time_slices,
 )
+from evnlos.report.pictures import grey
 
 _LONGEST_SIDE = 320  # of a picture of the wall or of events: a page shows no more
 
@@ -54,9 +55,7 @@ def seen_views(recorded: Recorded) -> list[View]:
     views = []
     truth = recorded.truth(Sampling())
     if truth is not None:
-        views.append(
-            View("Hidden object", "24 cm x 12 cm around the corner; nobody sees this", _grey(truth, 1.0))
-        )
+        views.append(View("Hidden object", "24 cm x 12 cm around the corner; nobody sees this", grey(truth)))
     if recorded.frames is not None:
         views.append(_wall_view(recorded))
     events, edges = smaller(recorded.events, _LONGEST_SIDE), recorded.edges_us
@@ -92,7 +91,7 @@ def found_views(found: Sequence[Reconstruction]) -> list[View]:
                 f"{own:.1f} dB, black {black:.1f}" for own, black in zip(one.psnr_db, one.black_db, strict=True)
             )
         views.append(
-            View(one.name[:1].upper() + one.name[1:], one.note, _grey(one.images, 1.0), captions, group="found")
+            View(one.name[:1].upper() + one.name[1:], one.note, grey(one.images), captions, group="found")
         )
     return views
 
@@ -130,10 +129,6 @@ def _wall_view(recorded: Recorded) -> View:
     return View(
         "Wall",
         f"what the frame camera sees; black {low:.2f}, white {high:.2f} of full scale",
-        _grey((levels - low) / max(high - low, 1e-6), 1.0),
+        grey(levels, low, high),
         tuple(f"brightest pixel {value:.2f}" for value in brightest),
     )
-
-
-def _grey(images: NDArray, white: float) -> NDArray[np.uint8]:
-    return np.round(255 * np.clip(images / white, 0, 1)).astype(np.uint8)

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 import tyro
 
-from evnlos.cli.console import say
 from evnlos.errors import ConfigError
 
 LAM_TIKHONOV, LAM_TV = 4.0, 0.3  # best on eight characters of one rig, docs/inversion.md
@@ -73,6 +72,7 @@ class Command:
             raise ConfigError(
                 f"{len(self.files)} paths without --rig; give one NPZ file, or capture folders and their --rig"
             )
+        from evnlos.cli.invert_still import figures_of
         from evnlos.plot.inversion import draw_inversion
         from evnlos.solver import prepare_inversion, read_photograph
 
@@ -100,9 +100,7 @@ class Command:
             "solutions": {},
         }
         for name, solution in solved.items():
-            if not solution.converged:
-                say(f"warning: {name} stopped after {solution.iterations} iterations before it had converged")
-            row = {"lam": solution.lam, "misfit": solution.noise_sigma, "iterations": solution.iterations}
+            row = figures_of(name, solution)
             if photograph.truth is not None:
                 row["r"] = correlation(solution.image, photograph.truth)
             found["solutions"][name] = row

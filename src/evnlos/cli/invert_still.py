@@ -15,8 +15,8 @@ from evnlos.calibration.scan.importer import fill_bad
 from evnlos.cli.console import say
 from evnlos.dataset.frame_sources import read_image
 from evnlos.errors import ConfigError
-from evnlos.solver import Background, Gradient, tikhonov, total_variation
-from evnlos.solver.inversion import chosen_degree
+from evnlos.solver.inversion import Inversion, chosen_degree
+from evnlos.solver.solution import Solution
 from evnlos.solver.tikhonov import Rule
 from evnlos.transport import MatrixTransport, MeasuredTransport
 from evnlos.transport.measured import averaged
@@ -79,30 +79,20 @@ def invert_stills(
         "solutions": {},
     }
     images: dict[str, torch.Tensor] = {}
+    inversion = Inversion(operator, image, degree)
     for name in options.solvers:
-        nuisance, lam, sigma = Background(degree), options.lam, options.noise_sigma
-        if lam is None and options.rule == "discrepancy" and sigma is None:
-            sigma = tikhonov(operator, image, prior=Gradient("dark"), nuisance=nuisance).noise_sigma
-        if name == "tikhonov":
-            solution = tikhonov(
-                operator,
-                image,
-                lam,
-                rule=options.rule,
-                noise_sigma=sigma,
-                prior=Gradient("dark"),
-                nuisance=nuisance,
-            )
-        else:
-            rule = "discrepancy" if options.rule == "discrepancy" else "cv"
-            solution = total_variation(operator, image, lam, rule=rule, noise_sigma=sigma, nuisance=nuisance)
-        if not solution.converged:
-            say(f"warning: {name} stopped after {solution.iterations} iterations before it had converged")
-        row = {"lam": solution.lam, "misfit": solution.noise_sigma, "iterations": solution.iterations}
-        found["solutions"][name] = row
+        solution = inversion.solve(name, options.lam, options.rule, options.noise_sigma)
+        found["solutions"][name] = figures_of(name, solution)
         images[name] = solution.image
     found["seconds"] = round(time.perf_counter() - clock, 1)
     return found, images
+
+
+def figures_of(name: str, solution: Solution) -> dict[str, Any]:
+    """Return the figures of a solution, with a warning where the solver gave up."""
+    if not solution.converged:
+        say(f"warning: {name} stopped after {solution.iterations} iterations before it had converged")
+    return {"lam": solution.lam, "misfit": solution.noise_sigma, "iterations": solution.iterations}
 
 
 def reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from evnlos.dataset.check_picture import check_picture
 from evnlos.dataset.fixed_pattern import PATTERN_FILE, FixedPattern, load_pattern, save_pattern
 from evnlos.dataset.importer import capture_samples, character_of, import_captures
 from evnlos.dataset.live import LiveDataset, live_dataset
-from evnlos.dataset.loader import CHANNELS, PARADIGMS, NlosDataset, Paradigm, network_input
+from evnlos.dataset.loader import CHANNELS, PARADIGMS, HeldSamples, NlosDataset, Paradigm, network_input
 from evnlos.dataset.sampling import Samples, Sampling, make_samples, reduce_by_area
 from evnlos.dataset.shard import read_shard, write_shard
 from evnlos.dataset.simulate import SensorSize, Simulation, simulate, simulate_object
@@ -20,6 +20,7 @@ __all__ = [
     "CaptureInfo",
     "Dataset",
     "FixedPattern",
+    "HeldSamples",
     "LiveDataset",
     "NlosDataset",
     "Paradigm",

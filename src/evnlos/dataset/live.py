@@ -14,7 +14,7 @@ from torch import Tensor
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.loader import Paradigm, network_input
 from evnlos.dataset.pool import run_in_order
-from evnlos.dataset.sampling import Samples, make_samples
+from evnlos.dataset.sampling import Samples, edges_from, make_samples
 from evnlos.dataset.simulate import Simulation, drawn_for, simulate_object, split_of
 from evnlos.dataset.store import Dataset
 from evnlos.errors import ConfigError
@@ -135,7 +135,7 @@ def simulate_object_on(config: Simulation, name: str, device: torch.device, step
         light = wall.irradiance(instants).to(device).mul_(WHITE_DN)  # [T, H, W]
     seed = derive_seed(config.seed, name, "events")
     (events,) = simulate_batch(light[None], instants, drawn.pixel, [seed], dtype=torch.float32)
-    edges_us = np.concatenate([[0], np.round(times_s * 1e6)]).astype(np.int64)
+    edges_us = edges_from(times_s)
     peak = 2**drawn.frame_camera.bit_depth - 1
     return make_samples(frames, peak, events, edges_us, scene, config.sampling)
 

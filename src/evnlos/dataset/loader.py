@@ -37,7 +37,35 @@ def network_input(frame: NDArray | Tensor, surface: NDArray | Tensor, paradigm: 
     return torch.cat(parts, dim=1)
 
 
-class NlosDataset(torch.utils.data.Dataset):
+class HeldSamples(torch.utils.data.Dataset):
+    """Samples in memory: item i is (input [C, h, w], picture [1, h, w]), float32.
+
+    Args:
+        inputs: What the network sees, float16 [N, C, h, w].
+        truth: True pictures, float16 [N, h, w].
+        names: The object of each sample, [N].
+    """
+
+    def __init__(self, inputs: Tensor, truth: Tensor, names: NDArray[np.str_]) -> None:
+        self.inputs, self.truth, self.names = inputs, truth, names
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def bytes(self) -> int:
+        """Return the size of inputs and truth, bytes."""
+        return self.inputs.nbytes + self.truth.nbytes
+
+    def to(self, device: torch.device) -> None:
+        """Move inputs and truth to a device, where batches are then cut without a copy from main memory."""
+        self.inputs, self.truth = self.inputs.to(device), self.truth.to(device)
+
+    def __getitem__(self, index: int | Tensor | slice) -> tuple[Tensor, Tensor]:
+        """Return one sample, or a batch for a tensor of indices."""
+        return self.inputs[index].float(), self.truth[index].unsqueeze(-3).float()
+
+
+class NlosDataset(HeldSamples):
     """The samples of a split in memory: item i is (input [C, H, W], truth [1, H, W]), float32.
 
     Args:
@@ -68,21 +96,5 @@ class NlosDataset(torch.utils.data.Dataset):
             names += [name] * len(samples)
             unknown = np.full((len(samples), 2), np.nan, dtype=np.float32)
             places.append(unknown if samples.position_m is None else samples.position_m.astype(np.float32))
-        self.inputs, self.truth = torch.cat(inputs), torch.cat(truth)
-        self.names = np.array(names)
+        super().__init__(torch.cat(inputs), torch.cat(truth), np.array(names))
         self.position_m = np.concatenate(places)
-
-    def __len__(self) -> int:
-        return len(self.inputs)
-
-    def bytes(self) -> int:
-        """Return the size of inputs and truth, bytes."""
-        return self.inputs.nbytes + self.truth.nbytes
-
-    def to(self, device: torch.device) -> None:
-        """Move inputs and truth to a device, where batches are then cut without a copy from main memory."""
-        self.inputs, self.truth = self.inputs.to(device), self.truth.to(device)
-
-    def __getitem__(self, index: int | Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Return one sample, or a batch for a tensor of indices."""
-        return self.inputs[index].float(), self.truth[index].unsqueeze(-3).float()

@@ -79,6 +79,11 @@ class Samples:
         return len(self.frame)
 
 
+def edges_from(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the instants between positions, int64 [N + 1], microseconds: 0, then those of the positions."""
+    return np.concatenate([[0], np.round(times_s * 1e6)]).astype(np.int64)
+
+
 def make_samples(
     frames: NDArray,
     peak: float,

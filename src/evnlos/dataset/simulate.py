@@ -11,7 +11,7 @@ import numpy as np
 from evnlos.claim import claim
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.pool import Engine, run_tasks
-from evnlos.dataset.sampling import Samples, Sampling, make_samples
+from evnlos.dataset.sampling import Samples, Sampling, edges_from, make_samples
 from evnlos.dataset.shard import write_shard
 from evnlos.dataset.store import Dataset, create_dataset
 from evnlos.dataset.variation import check_ranges, varied
@@ -140,7 +140,7 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
         wall, 0.0, drawn.duration_s, seed=derive_seed(config.seed, name, "events")
     )
     frames = drawn.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
-    edges_us = np.concatenate([[0], np.round(times_s * 1e6)]).astype(np.int64)
+    edges_us = edges_from(times_s)
     peak = 2**drawn.frame_camera.bit_depth - 1
     return make_samples(frames, peak, events, edges_us, scene, config.sampling), events
 

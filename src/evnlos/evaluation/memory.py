@@ -75,8 +75,9 @@ def nearest_answer(memory: Memory, inputs: Tensor) -> Tensor:
     """
     scale = Standardise(inputs.shape[1], "dataset")  # frames and events in units that can be compared
     scale.fit(memory.inputs.flatten(0, 1))
+    seen = scale(inputs.float())
     distance = torch.stack(
-        [(scale(known) - scale(inputs.float())).square().flatten(1).mean(dim=1) for known in memory.inputs]
+        [(scale(known) - seen).square().flatten(1).mean(dim=1) for known in memory.inputs]
     )  # [G, N]
     return memory.truth[distance.argmin(dim=0), torch.arange(len(inputs))]
 

@@ -19,6 +19,7 @@ UNCALIBRATED = replace(FINETUNING, epochs=10, learning_rate=1e-3, restandardise=
 END_TO_END = Training(epochs=12)
 """End-to-end training; validation characters gain nothing after half of it."""
 
+_PLAIN = UNetConfig(rank=0, scaling="picture")  # a U-Net as the paper has it: it sees the maps
 _E2E = Arm("E2E", "none", None, END_TO_END)
 _EPNP = Arm("EPNP", "calibrated", PRETRAINING, FINETUNING)
 
@@ -29,7 +30,7 @@ def captures(rig: str) -> Study:
     E2E is there twice: with our network, whose linear embedding it learns from the captures, and as the paper
     has it, with a U-Net that sees the maps.
     """
-    plain = replace(END_TO_END, network=replace(UNetConfig(), rank=0, scaling="picture"))
+    plain = replace(END_TO_END, network=_PLAIN)
     return Study(
         "captures",
         rig,
@@ -119,7 +120,7 @@ def width(rig: str) -> Study:
     """Return the ablation of the network's width."""
     arms = []
     for channels in (16, 32, 48, 64):
-        net = replace(UNetConfig(), width=channels)
+        net = UNetConfig(width=channels)
         arms.append(replace(_E2E, name=f"E2E width {channels}", finetuning=replace(END_TO_END, network=net)))
         pre = replace(PRETRAINING, network=net)
         arms.append(replace(_EPNP, name=f"EPNP width {channels}", pretraining=pre))
@@ -129,9 +130,9 @@ def width(rig: str) -> Study:
 def embedding(rig: str) -> Study:
     """Return the ablation of what the network knows before its first step: scale and linear embedding."""
     kinds = {
-        "plain, each picture scaled": replace(UNetConfig(), rank=0, scaling="picture"),
-        "plain": replace(UNetConfig(), rank=0),
-        "one ridge": replace(UNetConfig(), strengths=(1.0,)),
+        "plain, each picture scaled": _PLAIN,
+        "plain": UNetConfig(rank=0),
+        "one ridge": UNetConfig(strengths=(1.0,)),
         "three ridges": UNetConfig(),
     }
     arms = []
@@ -143,7 +144,7 @@ def embedding(rig: str) -> Study:
 
 def joint(rig: str) -> Study:
     """Return the comparison of E2E and EPNP where all positions of a pass are seen together."""
-    net = replace(UNetConfig(), rank=512, strengths=(0.001, 0.01, 0.1, 1.0))
+    net = UNetConfig(rank=512, strengths=(0.001, 0.01, 0.1, 1.0))
     before = Training(joint=True, epochs=12, batch_size=16, network=net)
     arms = (
         Arm("E2E joint", "none", None, replace(before, epochs=60)),

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from evnlos.claim import check_folder
 from evnlos.errors import DataError
 from evnlos.live.engine import Picture
 from evnlos.live.panels import side_by_side
@@ -98,12 +99,6 @@ class Recorder:
             self._encoder.finish()
         except Exception as error:
             self._error = self._error or error
-
-
-def check_folder(folder: Path) -> None:
-    """Raise unless a folder is new or empty."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DataError(f"{folder} is not an empty folder; give a new one with --out")
 
 
 def _pyav() -> Any:

@@ -120,3 +120,18 @@ class JointNetwork(nn.Module):
         inside = (grid.abs() <= 1).all(dim=-1)  # [N, P, P]
         moved = F.grid_sample(pictures, grid, padding_mode="border", align_corners=False)
         return (moved * inside[:, None]).sum(dim=0), inside.sum(dim=0)
+
+
+def new_network(
+    channels: int, config: UNetConfig, size: tuple[int, int], pitch_m: float, *, joint: bool
+) -> ResidualUNet | JointNetwork:
+    """Return a network with random weights: of single positions, or a joint one of whole passes.
+
+    Args:
+        channels: Channels of the maps: frame 1, event 2, fusion 3.
+        config: The U-Net and the embedding.
+        size: Height and width of the maps, pixels.
+        pitch_m: Pixel of the maps on the target's canvas, metres; only a joint network needs it.
+        joint: Which of the two.
+    """
+    return JointNetwork(channels, config, size, pitch_m) if joint else ResidualUNet(channels, config, size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from safetensors.torch import save
 from evnlos.config import from_dict, to_dict, write_atomically
 from evnlos.dataset import CHANNELS
 from evnlos.errors import ConfigError, DataError
-from evnlos.model.joint import JointNetwork
+from evnlos.model.joint import JointNetwork, new_network
 from evnlos.model.unet import ResidualUNet, UNetConfig
 
 _FORMAT = "evnlos-weights-2"
@@ -99,12 +100,9 @@ def load_weights(path: str | Path) -> Weights:
     ):
         raise DataError(f"{path} garbles its sampling, its history or its mean picture; the file is damaged")
     config = from_dict(UNetConfig, about.get("network"), source=str(path))  # type: ignore[arg-type]
-    make: Callable[[], ResidualUNet | JointNetwork]
     size: Any = (sampling.get("height"), sampling.get("width"))
-    if about.get("joint"):
-        make = lambda: JointNetwork(CHANNELS[paradigm], config, size, sampling["pitch_m"])  # noqa: E731
-    else:
-        make = lambda: ResidualUNet(CHANNELS[paradigm], config, size)  # noqa: E731
+    pitch_m: Any = sampling.get("pitch_m")
+    make = partial(new_network, CHANNELS[paradigm], config, size, pitch_m, joint=bool(about.get("joint")))
     network = _matching_network(make, config, tensors, path)
     network.load_state_dict({name: value.float() for name, value in tensors.items()})
     return Weights(network.eval(), paradigm, sampling, history, mean_image)

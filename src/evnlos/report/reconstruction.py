@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from evnlos.claim import check_folder
 from evnlos.config import from_dict, write_atomically
 from evnlos.dataset import FixedPattern, Sampling, capture_samples, read_capture
-from evnlos.errors import DataError
 from evnlos.evaluation import reconstruct, score
 from evnlos.model import load_weights
 from evnlos.report.pictures import grey, polarity, save_animation, save_png, stretched, strip
@@ -47,8 +47,7 @@ def reconstruct_capture(
     loaded, shot = load_weights(weights), read_capture(capture)
     sampling = from_dict(Sampling, loaded.sampling, source="the weights' sampling")
     samples = capture_samples(shot, sampling, pattern)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DataError(f"{out} is not an empty folder; give a new one")
+    check_folder(out)
     images = reconstruct(loaded, samples.frame, samples.surface, samples.position_m)
     pictures = [grey(image) for image in images]
     out.mkdir(parents=True, exist_ok=True)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from evnlos.dataset import NlosDataset
+from evnlos.dataset import HeldSamples, NlosDataset
 from evnlos.errors import DataError
 from evnlos.model import JointNetwork
 from evnlos.seeds import derive_seed
 
 
-class PooledSamples:
+class PooledSamples(HeldSamples):
     """Some views of each object's pass: all positions, every other one, then random subsets.
 
     Subsets have other noise and fewer angles on the same plate, so that the network meets short passes too.
@@ -52,22 +51,7 @@ class PooledSamples:
                 inputs.append(network.pooled(seen, places[kept]).half().cpu())
                 truth.append(plate)
                 names.append(name)
-        self.inputs, self.truth, self.names = torch.stack(inputs), torch.stack(truth), np.array(names)
-
-    def __len__(self) -> int:
-        return len(self.inputs)
-
-    def bytes(self) -> int:
-        """Return the size of inputs and truth, bytes."""
-        return self.inputs.nbytes + self.truth.nbytes
-
-    def to(self, device: torch.device) -> None:
-        """Move inputs and truth to a device."""
-        self.inputs, self.truth = self.inputs.to(device), self.truth.to(device)
-
-    def __getitem__(self, index: int | Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Return one sample, or a batch for a tensor of indices: maps [.., S, P, P], plates [.., 1, P, P]."""
-        return self.inputs[index].float(), self.truth[index].unsqueeze(-3).float()
+        super().__init__(torch.stack(inputs), torch.stack(truth), np.array(names))
 
 
 def _view(number: int, positions: int, draw: np.random.Generator) -> NDArray[np.int64]:

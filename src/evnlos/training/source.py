@@ -10,10 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.dataset import LiveDataset, NlosDataset, Paradigm
+from evnlos.dataset import HeldSamples, LiveDataset, Paradigm
 from evnlos.errors import ConfigError
 from evnlos.seeds import derive_seed
-from evnlos.training.pooled import PooledSamples
 from evnlos.training.team import Team
 
 
@@ -66,8 +65,8 @@ class Stored:
         team: The processes.
     """
 
-    def __init__(self, samples: NlosDataset | PooledSamples, batch_size: int, seed: int, team: Team) -> None:
-        self._samples, self._batch_size, self._seed, self._team = samples, batch_size, seed, team
+    def __init__(self, samples: HeldSamples, batch_size: int, seed: int, team: Team) -> None:
+        self.samples, self._batch_size, self._seed, self._team = samples, batch_size, seed, team
         self.steps = -(-len(samples) // batch_size)
         if team.device.type == "cuda" and samples.bytes() < torch.cuda.mem_get_info(team.device)[0] // 2:
             samples.to(team.device)
@@ -75,23 +74,23 @@ class Stored:
     def batches(self, epoch: int) -> Iterator[Batch]:
         """Yield this process's part of each batch; a process that has none is given a sample of share 0."""
         order = torch.Generator().manual_seed(derive_seed(self._seed, "order", epoch))
-        for batch in torch.randperm(len(self._samples), generator=order).split(self._batch_size):
+        for batch in torch.randperm(len(self.samples), generator=order).split(self._batch_size):
             mine = batch[self._team.rank :: self._team.size]
-            seen, truth = self._samples[mine if len(mine) else batch[:1]]
-            yield Batch(seen, truth, len(mine) / len(batch), len(batch) / len(self._samples))
+            seen, truth = self.samples[mine if len(mine) else batch[:1]]
+            yield Batch(seen, truth, len(mine) / len(batch), len(batch) / len(self.samples))
 
     def mean_image(self) -> Tensor:
         """Return the mean of the true pictures, float32 [H, W]."""
-        return self._samples.truth.float().mean(dim=0).cpu()
+        return self.samples.truth.float().mean(dim=0).cpu()
 
     def some(self, count: int) -> Samples:
         """Return at most `count` samples, chosen by the seed, on the CPU."""
         draw = torch.Generator().manual_seed(derive_seed(self._seed, "some"))
-        chosen = torch.randperm(len(self._samples), generator=draw)[:count].sort().values
+        chosen = torch.randperm(len(self.samples), generator=draw)[:count].sort().values
         inputs, truth = (
-            part[chosen.to(part.device)].cpu() for part in (self._samples.inputs, self._samples.truth)
+            part[chosen.to(part.device)].cpu() for part in (self.samples.inputs, self.samples.truth)
         )
-        return inputs, truth, self._samples.names[chosen.numpy()]
+        return inputs, truth, self.samples.names[chosen.numpy()]
 
 
 class Live:

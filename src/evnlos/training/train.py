@@ -19,7 +19,7 @@ from evnlos.config import config_hash, differing_keys, read_yaml, save_yaml, to_
 from evnlos.dataset import CHANNELS, Dataset, LiveDataset, NlosDataset, Sampling
 from evnlos.errors import ConfigError, DataError
 from evnlos.metrics import psnr
-from evnlos.model import JointNetwork, ResidualUNet, Weights, infer, load_weights, save_weights
+from evnlos.model import JointNetwork, ResidualUNet, Weights, infer, load_weights, new_network, save_weights
 from evnlos.seeds import derive_seed
 from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
 from evnlos.training.loss import LOSSES, light_of
@@ -112,9 +112,8 @@ def _epochs(
     else:
         prepare(network, positions, settings.seed, is_new=is_new, restandardise=settings.restandardise)
     if isinstance(network, JointNetwork):
-        passes = PooledSamples(
-            NlosDataset(dataset, "train", settings.paradigm), network, settings.views, settings.seed
-        )
+        assert isinstance(positions, Stored) and isinstance(positions.samples, NlosDataset)  # see _source
+        passes = PooledSamples(positions.samples, network, settings.views, settings.seed)
         if is_new and not done:
             network.fit_scale(passes.inputs)
         source = Stored(passes, settings.batch_size, settings.seed, processes)
@@ -172,9 +171,8 @@ def _network(
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(settings.seed, "weights"))
             channels, size = CHANNELS[settings.paradigm], (sampling.height, sampling.width)
-            if settings.joint:
-                return JointNetwork(channels, settings.network, size, sampling.pitch_m), settings
-            return ResidualUNet(channels, settings.network, size), settings
+            made = new_network(channels, settings.network, size, sampling.pitch_m, joint=settings.joint)
+            return made, settings
     known = {"paradigm": start.paradigm, "joint": isinstance(start.network, JointNetwork)}
     return start.network, replace(settings, network=start.network.config, **known)  # type: ignore[arg-type]
 
