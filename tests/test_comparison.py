@@ -6,10 +6,11 @@ import torch
 
 from evnlos import EvnlosError
 from evnlos.dataset import NlosDataset, Sampling, import_captures, open_dataset
-from evnlos.evaluation.classifier import CHARACTERS, load_reader, plates, read_characters
+from evnlos.evaluation.classifier import CHARACTERS, load_reader, read_characters
 from evnlos.evaluation.classifier_training import train_reader
 from evnlos.evaluation.intervals import paired_difference
 from evnlos.evaluation.memory import Memory, nearer_to_truth, nearest_answer, recall
+from evnlos.model import plates
 from evnlos.scene import FontGlyphs, find_font
 from evnlos.types import Plane
 

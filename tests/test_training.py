@@ -1,10 +1,5 @@
 """Learning: a tiny run must see, a killed run must go on bit for bit, a collapse must be noticed."""
 
-import json
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -97,26 +92,6 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tiny_dataset
     a, b, c = ((tmp_path / n / "weights.safetensors").read_bytes() for n in "abc")
     assert a == b
     assert a != c
-
-
-def test_a_killed_training_ends_with_the_same_bytes(tiny_dataset, tmp_path) -> None:
-    command = [sys.executable, "-m", "evnlos", "train", "--data", str(tiny_dataset.folder), "--epochs", "6"]
-    command += ["--network.width", "8", "--network.depth", "2", "--network.shuffle", "1", "--out"]
-    quiet = {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    subprocess.run([*command, "whole"], check=True, **quiet)
-    process = subprocess.Popen([*command, "killed"], **quiet)
-    checkpoint = tmp_path / "killed" / "checkpoint.safetensors"
-    deadline = time.monotonic() + 120
-    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.005)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert checkpoint.exists() and not (tmp_path / "killed" / "weights.safetensors").exists()
-    subprocess.run([*command, "killed"], check=True, **quiet)
-    whole, killed = ((tmp_path / name / "weights.safetensors").read_bytes() for name in ("whole", "killed"))
-    assert whole == killed
-    lines = (tmp_path / "killed" / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line)["epoch"] for line in lines] == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_run_that_has_ended_is_not_trained_again(trained, tiny_dataset) -> None:

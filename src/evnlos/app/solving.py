@@ -17,6 +17,7 @@ from evnlos.errors import DataError
 from evnlos.evaluation import reconstruct
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.identify_rig import camera_variance
+from evnlos.evaluation.worth import judgement_of
 from evnlos.metrics import psnr
 from evnlos.model import Weights, load_weights
 from evnlos.scene import Target
@@ -107,7 +108,9 @@ def from_weights(recorded: Recorded, name: str, weights: Weights) -> Reconstruct
     pictures = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
     images = pictures[:, sampling.scored].numpy()
     saw = {"frame": "one frame", "event": "events alone", "fusion": "frame and events"}[weights.paradigm]
-    return _scored(name, f"network: {saw}", images, recorded, sampling)
+    worth = judgement_of(weights, samples, pictures)
+    note = f"network: {saw}" + (f"; {worth.verdict}" if worth else "")
+    return _scored(name, note, images, recorded, sampling)
 
 
 def named_weights(paths: tuple[Path, ...]) -> dict[str, Weights]:

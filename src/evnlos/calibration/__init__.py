@@ -7,10 +7,11 @@ from evnlos.calibration.frame_model import FrameModel, Light
 from evnlos.calibration.frame_noise import FrameNoise, fit_frame_noise
 from evnlos.calibration.residual import Residual
 from evnlos.calibration.settings import Calibration
-from evnlos.calibration.summary import figures, residual_table, rows_of, table, write_rig
+from evnlos.calibration.summary import RIG_FILE, figures, residual_table, rows_of, table, write_rig
 from evnlos.calibration.transport_fit import TransportFit, fit_transport
 
 __all__ = [
+    "RIG_FILE",
     "Calibration",
     "Example",
     "FrameModel",

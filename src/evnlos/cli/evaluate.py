@@ -10,6 +10,7 @@ from typing import Any
 from evnlos.cli.console import say
 from evnlos.dataset import open_dataset
 from evnlos.evaluation import BASELINES, CHECKS
+from evnlos.model.confidence import COVERAGE
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,13 @@ def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
     print("\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows))
     for name, share in found["checks"].items():
         print(f"{CHECKS[name]}: {share:.0%}")
+    if worth := found["confidence"]:
+        mean = {key: sum(one[key] for one in worth) / len(worth) for key in worth[0] if key != "name"}
+        print(
+            f"confidence: support {mean['support']:.0%} said, {mean['skill']:.0%} found; "
+            f"{mean['measured']:.0%} of {len(worth)} passes said to be measured; intervals of "
+            f"{COVERAGE:.0%} hold {mean['coverage']:.0%} of the pixels, mean length {mean['width']:.2f}"
+        )
 
 
 def _cell(value: float | None) -> str:

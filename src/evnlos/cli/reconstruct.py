@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -22,19 +22,37 @@ class Command:
     """Folder for the pictures; new or empty."""
     pattern: Path | None = None
     """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
+    rig: Path | None = None
+    """Folder that `calibrate` wrote: its fixed pattern is taken from the frames, the pictures are moved to
+    where its wall agrees with the frames, and it is printed how much of the frames they explain."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> None:
         """Reconstruct and print where the pictures are."""
-        from evnlos.dataset import load_pattern
+        from evnlos.calibration import RIG_FILE
+        from evnlos.config import load_yaml
+        from evnlos.dataset import Simulation, load_pattern
         from evnlos.report import reconstruct_capture
 
-        pattern = load_pattern(self.pattern) if self.pattern else None
-        found = reconstruct_capture(self.capture, self.weights, self.out, pattern=pattern)
+        source = self.pattern or self.rig
+        pattern = load_pattern(source) if source else None
+        rig = load_yaml(Simulation, self.rig / RIG_FILE) if self.rig else None
+        found = reconstruct_capture(self.capture, self.weights, self.out, pattern=pattern, rig=rig)
         if self.json:
             print(json.dumps(found | {"out": str(self.out)}))
             return
         print(f"{self.out}: {found['positions']} positions of {found['capture']} ({found['paradigm']})")
+        if "confidence" in found:
+            print(_said(found["confidence"]))
         if "scores" in found:
             print("  ".join(f"{name} {value}" for name, value in found["scores"].items() if value is not None))
+
+
+def _said(confidence: dict[str, Any]) -> str:
+    """Return what there is to say of the pictures' worth, in one line."""
+    words = [confidence["verdict"]] if "verdict" in confidence else []
+    if "explained" in confidence:
+        share = 100 * confidence["explained"]
+        words.append(f"of what the average object leaves unexplained in the frames they explain {share:.0f} %")
+    return "; ".join(words)

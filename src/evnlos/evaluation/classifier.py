@@ -7,20 +7,15 @@ from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import ArrayLike
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from evnlos.errors import DataError
-from evnlos.types import Plane
 
 CHARACTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
 """What the reader knows; it always answers with one of these."""
-SIDE = 32
-"""Side of the pictures that it reads, pixels."""
 _FILE = Path(__file__).parent / "classifier.safetensors"
 
 
@@ -62,27 +57,6 @@ def load_reader(path: str | Path = _FILE) -> CharacterReader:
     if about.get("characters") != CHARACTERS:
         raise DataError(f"{path} knows {about.get('characters')!r}; this version reads {CHARACTERS!r}")
     return reader.eval()
-
-
-def plates(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
-    """Return the part of each picture that shows the plate, resampled to 32 x 32.
-
-    Args:
-        images: Pictures of the canvas, float [N, H, W].
-        canvas: Their geometry.
-        position_m: Centre (x, y) of the plate in each picture, [N, 2], metres.
-        size_m: Side of the plate, metres.
-
-    Returns:
-        float32 [N, 1, 32, 32]; zero outside the canvas.
-    """
-    centre = torch.as_tensor(np.asarray(position_m), dtype=torch.float32)  # [N, 2]
-    span = torch.tensor([canvas.width, canvas.height]) * (canvas.pitch_m / 2)
-    ticks = (torch.arange(SIDE) + 0.5) / SIDE * size_m - size_m / 2
-    y, x = torch.meshgrid(ticks, ticks, indexing="ij")
-    middle = torch.tensor(canvas.center_m, dtype=torch.float32)
-    points = torch.stack([x, y], dim=-1) + (centre - middle)[:, None, None]  # [N, 32, 32, 2]
-    return F.grid_sample(images[:, None].float(), points / span, align_corners=False)
 
 
 @torch.inference_mode()

@@ -20,7 +20,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from evnlos.config import write_atomically
-from evnlos.evaluation.classifier import CHARACTERS, SIDE, CharacterReader
+from evnlos.evaluation.classifier import CHARACTERS, CharacterReader
+from evnlos.model.plates import SIDE
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.seeds import derive_seed
 from evnlos.types import Plane
@@ -33,7 +34,14 @@ FAMILIES = (
     "Indie Flower",
     "Permanent Marker",
     "Shadows Into Light",
+    "Fredoka",
+    "Nunito",
+    "Nunito Bold",
+    "Quicksand",
+    "Quicksand Bold",
+    "Varela Round",
 )
+_REPEATS = 4  # a typeface counts as much as so many writers
 _DRAWN = 2 * SIDE  # glyphs are drawn at twice the size, so that turning them keeps their edges
 
 
@@ -97,12 +105,18 @@ def train_reader(writers: int = 36, epochs: int = 40, seed: int = 0) -> tuple[Ch
         network = CharacterReader()
     generator = torch.Generator().manual_seed(derive_seed(seed, "degrade"))
     pictures, labels = clean_glyphs(writers)
+    drawn = torch.cat(
+        [
+            torch.arange(len(pictures)),
+            torch.arange(len(CHARACTERS) * writers, len(pictures)).repeat(_REPEATS - 1),
+        ]
+    )
     held, answers = clean_glyphs(2, writers, ())
     optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-2)
-    steps = epochs * -(-len(pictures) // 64)
+    steps = epochs * -(-len(drawn) // 64)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, total_steps=steps)
     for _ in tqdm(range(epochs), unit="epoch", desc="reader"):
-        for batch in torch.randperm(len(pictures), generator=generator).split(64):
+        for batch in drawn[torch.randperm(len(drawn), generator=generator)].split(64):
             loss = F.cross_entropy(network(degrade(pictures[batch], generator)), labels[batch])
             optimiser.zero_grad(set_to_none=True)
             loss.backward()

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from evnlos.config import from_dict
+from evnlos.config import from_dict, to_dict
 from evnlos.dataset import Dataset, NlosDataset, Sampling, character_of, network_input, read_shard
 from evnlos.errors import DataError
-from evnlos.evaluation.classifier import CHARACTERS, plates, read_characters
+from evnlos.evaluation.classifier import CHARACTERS, read_characters
 from evnlos.evaluation.memory import nearer_to_truth, nearest_answer, recall
 from evnlos.evaluation.score import Perceptual, Scores, score
-from evnlos.model import Weights, infer
+from evnlos.evaluation.worth import PassWorth, worth_of
+from evnlos.model import Weights, infer, plates
 from evnlos.types import Plane
 
 BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest shot"}
@@ -43,6 +44,8 @@ class Evaluation:
         checks: Shares of the pictures: "read", whose character the independent reader names rightly;
             "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
             the truth than to any training picture. Only what could be found out.
+        worth: What the network's confidence said of each pass, beside what was true; empty where it has none,
+            or a motion is unknown.
     """
 
     images: Tensor
@@ -51,6 +54,7 @@ class Evaluation:
     scores: Scores
     baselines: dict[str, Scores]
     checks: dict[str, float] = field(default_factory=dict)
+    worth: list[PassWorth] = field(default_factory=list)
 
     def characters(self) -> list[str]:
         """Return the objects in the order of the dataset."""
@@ -71,6 +75,7 @@ class Evaluation:
             **table(self.scores),
             "baselines": {name: table(scores) for name, scores in self.baselines.items()},
             "checks": self.checks,
+            "confidence": [to_dict(one) for one in self.worth],
         }
 
 
@@ -93,7 +98,11 @@ def evaluate(
     check_sampling(weights, dataset.sampling)
     samples = NlosDataset(dataset, split, weights.paradigm)  # type: ignore[arg-type]
     images = infer(weights.network, samples.inputs, samples.position_m, samples.names)
-    return assess(images, samples, dataset, split, weights.paradigm, weights.mean_image, perceptual)
+    found = assess(images, samples, dataset, split, weights.paradigm, weights.mean_image, perceptual)
+    if weights.confidence is None or np.isnan(samples.position_m).any():
+        return found
+    canvas = dataset.sampling.canvas
+    return replace(found, worth=worth_of(weights.network, weights.confidence, samples, images, canvas))
 
 
 def assess(

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from evnlos.calibration import RIG_FILE
 from evnlos.config import load_yaml
 from evnlos.dataset import Dataset, NlosDataset, Paradigm, Sampling, Simulation, read_shard
 from evnlos.evaluation import assess, available_lpips, check_sampling
@@ -112,7 +113,7 @@ def _linear(data: Dataset, paradigm: Paradigm, samples: NlosDataset) -> Tensor:
 
 def _consistent(study: Study, arm: Arm, shots: Dataset, place: Place, images: Tensor) -> Tensor:
     """Return pictures of the scored split after data consistency with the calibrated rig."""
-    operator = _operator(place.out / "rigs" / study.rig / "rig.yaml", arm.sampling)
+    operator = _operator(place.out / "rigs" / study.rig / RIG_FILE, arm.sampling)
     names = shots.objects(study.split)
     frames = torch.cat([torch.from_numpy(read_shard(shots.shard(name))[0].frame) for name in names])
     return consistent(images, frames, operator, TRUST)

@@ -16,11 +16,13 @@ from safetensors.torch import save
 from evnlos.config import from_dict, to_dict, write_atomically
 from evnlos.dataset import CHANNELS
 from evnlos.errors import ConfigError, DataError
+from evnlos.model.confidence import Confidence
 from evnlos.model.joint import JointNetwork, new_network
 from evnlos.model.unet import ResidualUNet, UNetConfig
 
 _FORMAT = "evnlos-weights-2"
 _MEAN = "baseline.mean_image"
+_CONFIDENCE = "confidence."
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class Weights:
         sampling: Resolution and representation of the samples that it was trained on.
         history: The trainings behind it, oldest first: settings, data, version.
         mean_image: Mean of the true pictures of the last training, float32 [H, W]: the baseline to beat.
+        confidence: What its pictures are worth, learned from passes that no training saw; None where there
+            were none.
     """
 
     network: ResidualUNet | JointNetwork
@@ -40,6 +44,7 @@ class Weights:
     sampling: dict[str, Any]
     history: list[dict[str, Any]]
     mean_image: torch.Tensor | None = None
+    confidence: Confidence | None = None
 
 
 def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.float32) -> None:
@@ -54,6 +59,8 @@ def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.
     tensors = {name: value.detach().cpu().to(dtype).contiguous() for name, value in state.items()}
     if weights.mean_image is not None:
         tensors[_MEAN] = weights.mean_image.contiguous()
+    if weights.confidence is not None:
+        tensors |= {f"{_CONFIDENCE}{name}": one for name, one in weights.confidence.tensors().items()}
     about = {
         "format": _FORMAT,
         "paradigm": weights.paradigm,
@@ -92,6 +99,8 @@ def load_weights(path: str | Path) -> Weights:
     if not isinstance(paradigm, str) or paradigm not in CHANNELS:
         raise DataError(f"{path} names the paradigm {str(paradigm)[:40]!r}; give one of {', '.join(CHANNELS)}")
     mean_image = tensors.pop(_MEAN, None)
+    learned = [name for name in tensors if name.startswith(_CONFIDENCE)]
+    confidence = _confidence({name.removeprefix(_CONFIDENCE): tensors.pop(name) for name in learned}, path)
     if not (
         isinstance(sampling, dict)
         and isinstance(history, list)
@@ -105,7 +114,21 @@ def load_weights(path: str | Path) -> Weights:
     make = partial(new_network, CHANNELS[paradigm], config, size, pitch_m, joint=bool(about.get("joint")))
     network = _matching_network(make, config, tensors, path)
     network.load_state_dict({name: value.float() for name, value in tensors.items()})
-    return Weights(network.eval(), paradigm, sampling, history, mean_image)
+    return Weights(network.eval(), paradigm, sampling, history, mean_image, confidence)
+
+
+def _confidence(tensors: dict[str, torch.Tensor], path: Path) -> Confidence | None:
+    """Return what a file says of confidence, where it says anything.
+
+    Raises:
+        DataError: It is not whole.
+    """
+    if not tensors:
+        return None
+    try:
+        return Confidence(**tensors).checked()
+    except (TypeError, DataError) as error:
+        raise DataError(f"{path} garbles its confidence ({error}); the file is damaged") from None
 
 
 def _matching_network(

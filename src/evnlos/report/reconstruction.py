@@ -11,8 +11,17 @@ import torch
 
 from evnlos.claim import check_folder
 from evnlos.config import from_dict, write_atomically
-from evnlos.dataset import FixedPattern, Sampling, capture_samples, read_capture
+from evnlos.dataset import (
+    FixedPattern,
+    Sampling,
+    Simulation,
+    capture_samples,
+    read_capture,
+)
 from evnlos.evaluation import reconstruct, score
+from evnlos.evaluation.consistency import FrameOperator, consistent
+from evnlos.evaluation.explained import explained
+from evnlos.evaluation.worth import judgement_of, said
 from evnlos.model import load_weights
 from evnlos.report.pictures import grey, polarity, save_animation, save_png, stretched, strip
 
@@ -23,12 +32,15 @@ def reconstruct_capture(
     out: str | Path,
     zoom: int = 4,
     pattern: FixedPattern | None = None,
+    rig: Simulation | None = None,
 ) -> dict[str, Any]:
     """Reconstruct all positions of a capture and write them as pictures.
 
     Writes `position_00.png` and on, `strip.png` (rows of positions), `animation.gif` (wall frame,
     surface, reconstruction and, where known, truth, side by side) and `reconstruction.npy` (float32
-    [N, H, W], 0..1).
+    [N, H, W], 0..1). Where the weights know what their pictures are worth and the motion is known, also
+    `interval.npy` (the ends of each pixel's interval, float32 [2, N, H, W]) and `unsure.png`, a strip of the
+    intervals' lengths (black is sure, white is anything).
 
     Args:
         capture: A capture folder; its target may be unknown.
@@ -36,9 +48,12 @@ def reconstruct_capture(
         out: The folder for the pictures; must not exist or be empty.
         zoom: Size of a pixel in the pictures.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
+        rig: The calibrated rig; the pictures are then moved to where the wall agrees with the frames, and the
+            confidence says how much of the frames they explain.
 
     Returns:
-        Number of positions, the files, and, where the truth is known, the mean scores.
+        Number of positions; where the truth is known, the mean scores; where it can be told, the confidence:
+        support, threshold, measured, verdict and, with a rig, explained.
 
     Raises:
         DataError: The capture or the weights can't be used, or `out` holds other files.
@@ -49,6 +64,14 @@ def reconstruct_capture(
     samples = capture_samples(shot, sampling, pattern)
     check_folder(out)
     images = reconstruct(loaded, samples.frame, samples.surface, samples.position_m)
+    worth = judgement_of(loaded, samples, images)
+    confidence = said(worth) if worth else {}
+    if rig is not None:
+        frames, operator = torch.from_numpy(samples.frame), FrameOperator(rig, sampling)
+        images = consistent(images, frames, operator)
+        if loaded.confidence is not None and samples.position_m is not None:
+            known = (samples.position_m, loaded.confidence.mean, operator, sampling)
+            confidence["explained"] = round(explained(images, frames, *known), 4)
     pictures = [grey(image) for image in images]
     out.mkdir(parents=True, exist_ok=True)
     for k, picture in enumerate(pictures):
@@ -64,6 +87,11 @@ def reconstruct_capture(
     save_animation(out / "animation.gif", shown, rate_hz, 2)
     write_atomically(out / "reconstruction.npy", _npy(images.numpy()))
     found: dict[str, Any] = {"capture": shot.name, "positions": len(pictures), "paradigm": loaded.paradigm}
+    if worth is not None:
+        save_png(out / "unsure.png", strip([grey(one) for one in worth.high - worth.low]), 2)
+        write_atomically(out / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))
+    if confidence:
+        found["confidence"] = confidence
     if samples.truth is not None:
         truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
         found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()

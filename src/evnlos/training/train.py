@@ -12,16 +12,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.data import TensorDataset
 
 from evnlos.claim import claim, is_empty
 from evnlos.config import config_hash, differing_keys, read_yaml, save_yaml, to_dict, write_atomically
 from evnlos.dataset import CHANNELS, Dataset, LiveDataset, NlosDataset, Sampling
 from evnlos.errors import ConfigError, DataError
-from evnlos.metrics import psnr
-from evnlos.model import JointNetwork, ResidualUNet, Weights, infer, load_weights, new_network, save_weights
+from evnlos.model import (
+    JointNetwork,
+    ResidualUNet,
+    Weights,
+    load_weights,
+    new_network,
+    save_weights,
+)
 from evnlos.seeds import derive_seed
 from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
+from evnlos.training.held_out import confidence_of, held_out_samples, validate
 from evnlos.training.loss import LOSSES, light_of
 from evnlos.training.pooled import PooledSamples
 from evnlos.training.prepare import prepare
@@ -30,7 +36,6 @@ from evnlos.training.source import Live, Source, Stored
 from evnlos.training.team import Team, team
 from evnlos.version import __version__
 
-HeldOut = NlosDataset | TensorDataset
 _PARTS = {"encoder": ("stem", "encoder", "down"), "latent": ("latent",), "decoder": ("up", "decoder", "head")}
 
 
@@ -69,7 +74,7 @@ def train(
             _take_up(out, about)
         processes.wait()
         history = [*(start.history if start else []), about]
-        yield from _epochs(network, dataset, settings, out, history, processes, is_new=start is None)
+        yield from _epochs(network, dataset, settings, out, history, processes, start)
 
 
 def _epochs(
@@ -79,8 +84,7 @@ def _epochs(
     out: Path,
     history: list[dict[str, Any]],
     processes: Team,
-    *,
-    is_new: bool,
+    start: Weights | None,
 ) -> Iterator[dict[str, Any]]:
     """Run the epochs that are left, and write the weights after the last."""
     checkpoint, metrics = out / "checkpoint.safetensors", out / "metrics.jsonl"
@@ -100,7 +104,7 @@ def _epochs(
     optimiser = torch.optim.Adam(trained, lr=settings.learning_rate)
     loss_of, half = LOSSES[settings.loss], _half(settings, device)
     positions = source = _source(dataset, settings, processes)
-    held_out = _held_out(dataset, settings, device) if leads else None
+    held_out = held_out_samples(dataset, settings.paradigm, device) if leads else None
 
     done, log = 0, []
     key = config_hash(settings)
@@ -110,11 +114,11 @@ def _epochs(
             _write_log(metrics, log)
         yield from log
     else:
-        prepare(network, positions, settings.seed, is_new=is_new, restandardise=settings.restandardise)
+        prepare(network, positions, settings.seed, is_new=start is None, restandardise=settings.restandardise)
     if isinstance(network, JointNetwork):
         assert isinstance(positions, Stored) and isinstance(positions.samples, NlosDataset)  # see _source
         passes = PooledSamples(positions.samples, network, settings.views, settings.seed)
-        if is_new and not done:
+        if start is None and not done:
             network.fit_scale(passes.inputs)
         source = Stored(passes, settings.batch_size, settings.seed, processes)
     processes.wait()  # nobody writes before all have read
@@ -143,7 +147,7 @@ def _epochs(
             "learning_rate": rate,
         }
         if held_out is not None:
-            record |= _validate(network, held_out, dataset, device, half)
+            record |= validate(network, held_out, dataset, device, half)
         record["seconds"] = round(time.perf_counter() - began, 2)
         log.append(record)
         if leads:
@@ -151,12 +155,14 @@ def _epochs(
             _write_log(metrics, log)
         yield record
     if leads:
+        network = network.cpu().eval()
         done_weights = Weights(
-            network.cpu().eval(),
+            network,
             settings.paradigm,
             to_dict(dataset.sampling),
             history,
             positions.mean_image(),
+            confidence_of(network, held_out, dataset, start),
         )
         save_weights(out / "weights.safetensors", done_weights)
         checkpoint.unlink(missing_ok=True)
@@ -189,16 +195,6 @@ def _source(dataset: Dataset, settings: Training, processes: Team) -> Source:
         return Live(dataset, settings.paradigm, settings.batch_size, settings.seed, processes)
     samples = NlosDataset(dataset, "train", settings.paradigm)
     return Stored(samples, settings.batch_size, settings.seed, processes)
-
-
-def _held_out(dataset: Dataset, settings: Training, device: torch.device) -> HeldOut | None:
-    """Return the samples to validate on, or None where the dataset holds none out."""
-    if not dataset.split.get("validation"):
-        return None
-    if isinstance(dataset, LiveDataset):
-        made = dataset.stream(dataset.objects("validation"), 0, settings.paradigm, device)
-        return TensorDataset(*(torch.cat(parts) for parts in zip(*made, strict=True)))
-    return NlosDataset(dataset, "validation", settings.paradigm)
 
 
 def _write_log(path: Path, log: list[dict[str, Any]]) -> None:
@@ -250,26 +246,3 @@ def _take_up(out: Path, about: dict[str, Any]) -> None:
     if not is_empty(out):
         raise DataError(f"{out} is not empty and holds no run; give a new folder")
     save_yaml(about, path)
-
-
-@torch.inference_mode()
-def _validate(
-    network: ResidualUNet | JointNetwork,
-    held_out: HeldOut,
-    dataset: Dataset,
-    device: torch.device,
-    half: bool,
-) -> dict[str, Any]:
-    if isinstance(held_out, NlosDataset):
-        inputs, truth = held_out.inputs, held_out.truth.float().cpu()
-        places, names = held_out.position_m, held_out.names
-    else:
-        inputs, truth = held_out.tensors[0], held_out.tensors[1][:, 0].cpu()
-        places = names = None
-    with torch.autocast(device.type, torch.bfloat16, enabled=half):
-        images = infer(network, inputs.to(device), places, names).float().cpu()
-    images, truth = (part[:, dataset.sampling.scored] for part in (images, truth))
-    score, blank = psnr(images, truth).mean().item(), psnr(torch.zeros_like(truth), truth).mean().item()
-    # A network that has collapsed answers the same to every input.
-    collapsed = bool(images.flatten(1).std(dim=0).mean() < 1e-3) if len(images) > 1 else False
-    return {"psnr_db": round(score, 3), "zero_db": round(blank, 3), "collapsed": collapsed}

@@ -1,0 +1,124 @@
+"""Is the confidence right? Support against skill, and coverage of the intervals, pass by pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from evnlos.config import from_dict
+from evnlos.dataset import NlosDataset, Samples, Sampling, network_input
+from evnlos.model import Confidence, JointNetwork, Judgement, ResidualUNet, Weights, halves_of, plates
+from evnlos.model.plates import on_canvas
+from evnlos.types import Plane
+
+
+@torch.inference_mode()
+def judgement_of(weights: Weights, samples: Samples, images: Tensor) -> Judgement | None:
+    """Return what the pictures of one pass are worth; None where the weights or the motion do not tell.
+
+    Args:
+        weights: The network, and what it learned of its pictures' worth.
+        samples: The pass.
+        images: The network's pictures, float32 [N, H, W].
+    """
+    if weights.confidence is None or samples.position_m is None or len(samples) < 2:
+        return None
+    sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
+    seen = network_input(samples.frame, samples.surface, weights.paradigm)  # type: ignore[arg-type]
+    halves = halves_of(weights.network, seen, samples.position_m, sampling.canvas)
+    return weights.confidence.judge(images, halves)
+
+
+def said(worth: Judgement) -> dict[str, Any]:
+    """Return a judgement as plain values: support, threshold, measured, verdict."""
+    numbers = {"support": round(worth.support, 4), "threshold": round(worth.threshold, 4)}
+    return numbers | {"measured": worth.measured, "verdict": worth.verdict}
+
+
+@dataclass(frozen=True)
+class PassWorth:
+    """What the confidence said of one pass, and what was true.
+
+    Args:
+        name: Object of the pass.
+        support: What it said: share of what tells this object from others that was measured.
+        measured: Whether it said that anything was.
+        skill: 1 - |x - t|^2 / |x0 - t|^2 over the plates, with x the pictures, t the truth, and x0 the average
+            plate: 1 is perfect, 0 is no better than the average object, below 0 is worse.
+        coverage: Share of the plates' pixels whose true level lies in its interval.
+        width: Mean length of these intervals, 0..1.
+    """
+
+    name: str
+    support: float
+    measured: bool
+    skill: float
+    coverage: float
+    width: float
+
+
+@torch.inference_mode()
+def worth_of(
+    network: ResidualUNet | JointNetwork,
+    confidence: Confidence,
+    samples: NlosDataset,
+    images: Tensor,
+    canvas: Plane,
+) -> list[PassWorth]:
+    """Compare what the confidence says of pictures with their truth, for each pass.
+
+    Args:
+        network: The network.
+        confidence: What it learned of its pictures' worth.
+        samples: The passes, all of known motion.
+        images: The network's pictures of all samples, float32 [N, H, W].
+        canvas: Their geometry.
+
+    Raises:
+        DataError: The motion of a pass is unknown.
+    """
+    found = []
+    for name in dict.fromkeys(samples.names.tolist()):
+        mine = np.flatnonzero(samples.names == name)
+        rows, at = torch.from_numpy(mine), samples.position_m[mine]
+        said = confidence.judge(images[rows], halves_of(network, samples.inputs[rows], at, canvas))
+        true, shown = samples.truth[rows].float(), images[rows]
+        average = on_canvas(confidence.mean, canvas, at)
+        missed, blank = (plates((one - true).square(), canvas, at).sum() for one in (shown, average))
+        # Where the resampled truth is a rounding error beyond 0 or 1, it still is 0 or 1.
+        held = ((true >= said.low - 1e-3) & (true <= said.high + 1e-3)).float()
+        found.append(
+            PassWorth(
+                name,
+                said.support,
+                said.measured,
+                float(1 - missed / blank),
+                float(plates(held, canvas, at).mean()),
+                float(plates(said.high - said.low, canvas, at).mean()),
+            )
+        )
+    return found
+
+
+def risk_coverage(support: ArrayLike, risk: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean risk of what is kept when only the most supported passes are, for each share kept.
+
+    Args:
+        support: What the confidence said of each pass, [N].
+        risk: What was wrong with it, such as 1 - skill, [N].
+
+    Returns:
+        Shares kept, ascending to 1, and the mean risk of each, [N] both (El-Yaniv and Wiener, JMLR 2010).
+
+    Example:
+        >>> risk_coverage([0.9, 0.1, 0.5], [0.0, 0.6, 0.3])[1].round(2).tolist()
+        [0.0, 0.15, 0.3]
+    """
+    order = np.argsort(-np.asarray(support, np.float64), kind="stable")
+    ranks = np.arange(1, len(order) + 1)
+    return ranks / len(order), np.cumsum(np.asarray(risk, np.float64)[order]) / ranks

@@ -1,0 +1,169 @@
+"""What a picture is worth: how much of it the measurement supports, and where each pixel's level lies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evnlos.errors import DataError
+from evnlos.model.infer import infer
+from evnlos.model.joint import JointNetwork
+from evnlos.model.plates import SIDE, plates
+from evnlos.model.unet import ResidualUNet
+from evnlos.types import Plane
+
+COVERAGE = 0.9
+"""Share of a plate's pixels whose true level the intervals are to hold."""
+LEVELS = 16
+"""Bins of a pixel's reconstructed level."""
+GROUPS = 3
+"""Groups of passes, by support, with intervals of their own."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What one pass of pictures is worth.
+
+    Args:
+        support: Share of what tells this object from the average one that both halves of the pass agree on:
+            1 = all that objects differ by, 0 = nothing.
+        threshold: Support that one in 20 passes shows in which each position saw another object, so that
+            nothing of any one object was measured.
+        low: Lower end of each pixel's interval, float32 [N, H, W], 0..1.
+        high: Upper end.
+    """
+
+    support: float
+    threshold: float
+    low: Tensor
+    high: Tensor
+
+    @property
+    def measured(self) -> bool:
+        """Whether the measurement tells this object from others at all."""
+        return self.support > self.threshold
+
+    @property
+    def verdict(self) -> str:
+        """One sentence for a reader."""
+        if not self.measured:
+            return (
+                "nothing measured: both halves of the pass share "
+                f"{100 * max(self.support, 0):.0f} % of what tells objects apart; passes without any object "
+                f"share up to {100 * self.threshold:.0f} %"
+            )
+        return f"the measurement supports {100 * min(self.support, 1):.0f} % of the picture"
+
+
+@dataclass(frozen=True, eq=False)
+class Confidence:
+    """What `fit_confidence` learned from passes that the network was not trained on.
+
+    Args:
+        mean: Mean of the true plates, float32 [32, 32].
+        power: Mean of |d|^2 over true plates, d what tells a plate from the mean one (see `telling`), [].
+        threshold: See `Judgement.threshold`, [].
+        edges: Supports that separate the groups of passes, ascending, [G - 1].
+        low: Lower end of the interval for each group and level, [G, L].
+        high: Upper end.
+    """
+
+    mean: Tensor
+    power: Tensor
+    threshold: Tensor
+    edges: Tensor
+    low: Tensor
+    high: Tensor
+
+    def judge(self, pictures: Tensor, halves: Tensor) -> Judgement:
+        """Return what the pictures of a pass are worth.
+
+        Args:
+            pictures: Pictures of all positions, float [N, H, W], 0..1.
+            halves: What the two halves of the pass show of the plate, [2, 32, 32]: see `halves_of`.
+        """
+        support, threshold = float(self.support(halves)), float(self.threshold)
+        if support <= threshold:
+            return Judgement(support, threshold, torch.zeros_like(pictures), torch.ones_like(pictures))
+        group = int(torch.searchsorted(self.edges, torch.tensor(support)))
+        # Halfway between the middles of two bins lies halfway between their intervals.
+        at = (pictures * LEVELS - 0.5).clamp(0, LEVELS - 1)
+        below = at.floor().long().clamp(max=LEVELS - 2)
+        part = at - below
+        low, high = (
+            torch.lerp(ends[group][below], ends[group][below + 1], part) for ends in (self.low, self.high)
+        )
+        return Judgement(support, threshold, low, high)
+
+    def support(self, halves: Tensor) -> Tensor:
+        """Return the support of a pass, [], from its halves [2, 32, 32]."""
+        first, second = self.telling(halves)
+        return first @ second / self.power
+
+    def telling(self, shown: Tensor) -> Tensor:
+        """Return what tells plates [N, 32, 32] from the average one, [N, P]: their difference from it, without
+        its own direction, so that neither a black plate nor a paler one tells anything.
+        """
+        mean = F.normalize(self.mean.flatten(), dim=0)
+        away = (shown - self.mean).flatten(1)
+        return away - (away @ mean)[:, None] * mean
+
+    def checked(self) -> Confidence:
+        """Return this, whose tensors may be a stranger's.
+
+        Raises:
+            DataError: Their shapes do not belong together, or a number is none.
+        """
+        shapes = {item.name: tuple(getattr(self, item.name).shape) for item in fields(self)}
+        table = (GROUPS, LEVELS)
+        wanted = {"mean": (SIDE, SIDE), "power": (), "threshold": (), "edges": (GROUPS - 1,), "low": table}
+        if shapes != wanted | {"high": table}:
+            raise DataError(f"its tensors have the shapes {shapes}")
+        if not all(bool(torch.isfinite(one).all()) for one in self.tensors().values()) or self.power <= 0:
+            raise DataError("its numbers are not finite, or its power is not positive")
+        return self
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return all fields by name, for a file."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+
+@torch.inference_mode()
+def halves_of(
+    network: ResidualUNet | JointNetwork, inputs: Tensor, position_m: NDArray, canvas: Plane
+) -> Tensor:
+    """Return what the first and the second half of a pass show of the plate, each on its own, [2, 32, 32].
+
+    The object is the same in both halves and everything else is not: the noise, and where plate, wall and
+    camera are to one another. A pattern that stays where it is, or comes from nowhere, is not in both.
+
+    Args:
+        network: The network.
+        inputs: What was measured, [N, C, H, W], in the order of time, N at least 2.
+        position_m: The plate's centre at each, (x, y) in metres, [N, 2].
+        canvas: Geometry of the pictures.
+
+    Raises:
+        DataError: The motion is unknown, or there are fewer than two positions.
+    """
+    position_m = np.asarray(position_m)
+    if len(inputs) < 2 or np.isnan(position_m).any():
+        motion = "unknown" if np.isnan(position_m).any() else "known"
+        raise DataError(
+            f"{len(inputs)} positions, motion {motion}: confidence takes two positions and the motion; give it "
+            "in capture.yaml (`evnlos track` finds it)"
+        )
+    parts = np.array_split(np.arange(len(inputs)), 2)
+    return torch.stack(
+        [
+            plates(infer(network, inputs[torch.from_numpy(part)], position_m[part]), canvas, position_m[part])
+            .mean(dim=0)[0]
+            .cpu()
+            for part in parts
+        ]
+    )

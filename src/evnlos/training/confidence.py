@@ -1,0 +1,102 @@
+"""Learn what a network's pictures are worth, from passes that it was not trained on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evnlos.dataset import NlosDataset
+from evnlos.errors import DataError
+from evnlos.model import Confidence, JointNetwork, ResidualUNet, halves_of, infer, plates
+from evnlos.model.confidence import COVERAGE, GROUPS, LEVELS
+from evnlos.seeds import derive_seed
+from evnlos.types import Plane
+
+FALSE_ALARM = 0.05
+"""Share of passes of which nothing was measured that are taken for measured."""
+FEWEST = 8
+"""Passes that confidence can be learned from, at least."""
+_MIXED = 60  # passes without an object
+
+
+@torch.inference_mode()
+def fit_confidence(network: ResidualUNet | JointNetwork, samples: NlosDataset, canvas: Plane) -> Confidence:
+    """Learn what pictures of a network are worth from passes that it was not trained on.
+
+    Support. With d what tells a plate from the mean one (`Confidence.telling`), the support is
+    <d1, d2> / E|t|^2: d1 and d2 from the two halves of a pass, t the same of true plates. For a network that
+    answers with the expectation of the truth, the law of total variance makes it the share of the objects'
+    variance that the measurement explains; noise that the halves do not share cancels. The threshold comes
+    from passes in which each position saw another object.
+
+    Intervals. The central 90 % of the true levels of a plate's pixels for each level that the network gave
+    (split conformal, Mondrian by level and by support: Vovk et al., Algorithmic Learning in a Random World,
+    2005), so that the coverage holds for passes like these whatever the network is.
+
+    Args:
+        network: The network.
+        samples: The passes, each object's positions in the order of time.
+        canvas: Geometry of the pictures.
+
+    Raises:
+        DataError: There are fewer than 8 passes, or a motion is unknown.
+    """
+    names, position_m = samples.names, samples.position_m
+    objects = list(dict.fromkeys(names.tolist()))
+    if len(objects) < FEWEST:
+        raise DataError(f"{len(objects)} passes to learn confidence from; give at least {FEWEST}")
+    halves, shown, true = [], [], []
+    for name in objects:
+        mine = np.flatnonzero(names == name)
+        rows, at = torch.from_numpy(mine), position_m[mine]
+        halves.append(halves_of(network, samples.inputs[rows], at, canvas))
+        shown.append(plates(infer(network, samples.inputs[rows], at), canvas, at)[:, 0])
+        true.append(plates(samples.truth[rows].float(), canvas, at)[:, 0])
+    mean = torch.stack([one.mean(dim=0) for one in true]).mean(dim=0)
+    blank = Confidence(mean, *(torch.ones(()) for _ in range(5)))
+    power = blank.telling(torch.stack([one.mean(dim=0) for one in true])).square().sum(dim=1).mean()
+    blank = replace(blank, power=power)
+    strange = torch.stack(
+        [
+            blank.support(halves_of(network, samples.inputs[rows], position_m[rows], canvas))
+            for rows in _mixed(names)
+        ]
+    )
+    support = torch.stack([blank.support(one) for one in halves])
+    edges = torch.quantile(support, torch.arange(1, GROUPS) / GROUPS)
+    group = torch.searchsorted(edges, support)
+    ends = [_ends([(shown[k], true[k]) for k in torch.nonzero(group == g)[:, 0]]) for g in range(GROUPS)]
+    low, high = (torch.stack([pair[k] for pair in ends]) for k in (0, 1))
+    threshold = torch.quantile(strange, 1 - FALSE_ALARM)
+    return replace(blank, threshold=threshold, edges=edges, low=low, high=high)
+
+
+def _mixed(names: NDArray, count: int = _MIXED) -> list[NDArray[np.int64]]:
+    """Return the rows of passes in which each position is of another object; always the same."""
+    passes = [np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())]
+    draw = np.random.default_rng(derive_seed(0, "mixed passes"))
+    length = min(len(one) for one in passes)
+    return [
+        np.array([passes[i][k] for k, i in enumerate(draw.integers(0, len(passes), length))])
+        for _ in range(count)
+    ]
+
+
+def _ends(passes: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Return the ends of the intervals for each level, [L] and [L], from pairs of plates shown and true."""
+    shown = torch.cat([one.flatten() for one, _ in passes])
+    true = torch.cat([one.flatten() for _, one in passes])
+    bins = (shown * LEVELS).long().clamp(0, LEVELS - 1)
+    low, high = torch.zeros(LEVELS), torch.ones(LEVELS)
+    for level in range(LEVELS):
+        here = true[bins == level].sort().values
+        if len(here) < 1 / (1 - COVERAGE):
+            continue  # too few to tell: from black to white
+        # The finite-sample rank of split conformal prediction, on either side.
+        rank = int(np.floor((len(here) + 1) * (1 - COVERAGE) / 2))
+        low[level], high[level] = here[max(rank - 1, 0)], here[min(len(here) - rank, len(here) - 1)]
+    return low, high

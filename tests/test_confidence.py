@@ -1,0 +1,199 @@
+"""What pictures are worth: support, intervals, and the verdict where nothing was measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos.config import to_dict
+from evnlos.dataset import NlosDataset, Sampling, SensorSize, Simulation
+from evnlos.errors import DataError
+from evnlos.evaluation import evaluate
+from evnlos.evaluation.consistency import FrameOperator
+from evnlos.evaluation.explained import explained
+from evnlos.evaluation.worth import risk_coverage
+from evnlos.model import ResidualUNet, UNetConfig, Weights, halves_of, load_weights, plates, save_weights
+from evnlos.model.confidence import COVERAGE
+from evnlos.model.plates import on_canvas
+from evnlos.report import reconstruct_capture
+from evnlos.training.confidence import fit_confidence
+from evnlos.transport import RadiometricTransport
+from evnlos.types import Plane
+
+CANVAS = Plane(48, 96, 0.0025)
+SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
+
+
+class Given(ResidualUNet):
+    """A network whose picture is its input: what is measured can be chosen."""
+
+    def __init__(self) -> None:
+        super().__init__(1, UNetConfig(width=4, depth=1, rank=0))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x
+
+
+def passes(
+    noise: float, count: int = 24, positions: int = 10, seed: int = 0, share: float = 1.0
+) -> NlosDataset:
+    """Return passes of objects of 4 x 4 random squares, seen with noise of their own at each position.
+
+    `share` of what tells objects apart is seen; the rest is the average object.
+    """
+    draw = torch.Generator().manual_seed(seed)
+    x = np.linspace(-0.07, 0.07, positions)
+    at = np.stack([x, np.zeros(positions)], axis=1)
+    inputs, truth, names = [], [], []
+    for k in range(count):
+        squares = (torch.rand(4, 4, generator=draw) > 0.5).float()
+        plate = squares.repeat_interleave(8, 0).repeat_interleave(8, 1)
+        true = on_canvas(plate, CANVAS, at)
+        seen = share * true + (1 - share) * on_canvas(torch.full((32, 32), 0.5), CANVAS, at)
+        inputs.append((seen + noise * torch.randn(true.shape, generator=draw)).clamp(0, 1)[:, None])
+        truth.append(true)
+        names += [f"o{k}"] * positions
+    made = NlosDataset.__new__(NlosDataset)
+    made.inputs, made.truth, made.names = torch.cat(inputs), torch.cat(truth), np.array(names)
+    made.position_m = np.tile(at, (count, 1))
+    return made
+
+
+def judged(confidence, samples: NlosDataset, name: str):
+    rows = np.flatnonzero(samples.names == name)
+    inputs, at = samples.inputs[torch.from_numpy(rows)], samples.position_m[rows]
+    halves = halves_of(Given(), inputs, at, CANVAS)
+    return confidence.judge(inputs[:, 0], halves)
+
+
+def test_a_plate_put_on_the_canvas_is_taken_out_again() -> None:
+    plate = torch.rand(32, 32, generator=torch.Generator().manual_seed(1))
+    at = np.array([[0.0, 0.0], [0.025, -0.01]])  # whole pixels
+    back = plates(on_canvas(plate, CANVAS, at), CANVAS, at)[:, 0]
+    torch.testing.assert_close(back[0], plate, atol=1e-4, rtol=0)
+    torch.testing.assert_close(back[1], plate, atol=1e-4, rtol=0)
+
+
+def test_support_is_the_share_of_the_variance_that_is_seen() -> None:
+    for share in (1.0, 0.7, 0.3):
+        samples = passes(0.0, share=share)
+        confidence = fit_confidence(Given(), samples, CANVAS)
+        found = np.mean([judged(confidence, samples, f"o{k}").support for k in range(24)])
+        # What is seen is `share` of the difference from the mean, so its square of the power.
+        assert found == pytest.approx(share**2, abs=0.03)
+
+
+def test_noise_that_the_halves_do_not_share_is_no_support() -> None:
+    confidence = fit_confidence(Given(), passes(0.3), CANVAS)
+    blind = passes(0.3, share=0.0, seed=5)
+    supports = [judged(confidence, blind, f"o{k}") for k in range(24)]
+    assert np.mean([one.support for one in supports]) == pytest.approx(0, abs=0.05)
+    assert sum(one.measured for one in supports) <= 4
+    said = next(one for one in supports if not one.measured)
+    assert said.verdict.startswith("nothing measured")
+    assert float(said.low.max()) == 0 and float(said.high.min()) == 1
+    seen = judged(confidence, passes(0.3, seed=6), "o0")
+    assert seen.measured and "supports" in seen.verdict
+
+
+def test_a_pattern_that_does_not_move_with_the_object_is_no_support() -> None:
+    samples = passes(0.0)
+    confidence = fit_confidence(Given(), samples, CANVAS)
+    still = passes(0.0, count=1, seed=7)
+    still.inputs = still.inputs[:1].expand(10, -1, -1, -1)  # the same picture, wherever the object is
+    assert not judged(confidence, still, "o0").measured
+
+
+def test_intervals_cover_unseen_passes_as_often_as_they_say() -> None:
+    confidence = fit_confidence(Given(), passes(0.25, count=40), CANVAS)
+    fresh = passes(0.25, count=20, seed=9)
+    inside, width = [], []
+    for k in range(20):
+        found = judged(confidence, fresh, f"o{k}")
+        rows = torch.from_numpy(np.flatnonzero(fresh.names == f"o{k}"))
+        truth, at = fresh.truth[rows], fresh.position_m[rows.numpy()]
+        held = ((truth >= found.low - 1e-6) & (truth <= found.high + 1e-6)).float()
+        inside.append(plates(held, CANVAS, at).mean())
+        width.append(plates(found.high - found.low, CANVAS, at).mean())
+    assert float(torch.stack(inside).mean()) >= COVERAGE - 0.02
+    assert float(torch.stack(width).mean()) < 0.8  # tells something
+
+
+def test_confidence_travels_with_the_weights(tmp_path) -> None:
+    confidence = fit_confidence(Given(), passes(0.2), CANVAS)
+    torch.manual_seed(0)
+    network = ResidualUNet(1, UNetConfig(width=4, depth=1, rank=0)).eval()
+    about = {"height": 48, "width": 96, "pitch_m": 0.0025, "scored_rows": 48}
+    save_weights(tmp_path / "w.safetensors", Weights(network, "frame", about, [], None, confidence))
+    back = load_weights(tmp_path / "w.safetensors").confidence
+    assert back is not None
+    for name, one in confidence.tensors().items():
+        torch.testing.assert_close(back.tensors()[name], one)
+    for wrong in (
+        replace(confidence, low=torch.zeros(2, 2)),
+        replace(confidence, power=torch.tensor(float("nan"))),
+        replace(confidence, power=torch.tensor(0.0)),
+    ):
+        save_weights(tmp_path / "bad.safetensors", Weights(network, "frame", about, [], None, wrong))
+        with pytest.raises(DataError, match="garbles its confidence"):
+            load_weights(tmp_path / "bad.safetensors")
+
+
+def test_confidence_needs_motion_and_passes() -> None:
+    samples = passes(0.1, count=4)
+    with pytest.raises(DataError, match="4 passes"):
+        fit_confidence(Given(), samples, CANVAS)
+    with pytest.raises(DataError, match="motion unknown"):
+        halves_of(Given(), samples.inputs[:10], np.full((10, 2), np.nan), CANVAS)
+    with pytest.raises(DataError, match="1 positions"):
+        halves_of(Given(), samples.inputs[:1], samples.position_m[:1], CANVAS)
+
+
+def lab_rig() -> Simulation:
+    """The rig of the rendered captures."""
+    transport = RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06)
+    return Simulation(transport=transport, sensor=SensorSize(48, 72), sampling=SAMPLING)
+
+
+def test_the_truth_explains_the_frames_and_another_object_does_not() -> None:
+    operator = FrameOperator(lab_rig(), SAMPLING)
+    at = np.stack([np.linspace(-0.06, 0.06, 6), np.zeros(6)], axis=1)
+    draw = torch.Generator().manual_seed(3)
+    average = torch.full((32, 32), 0.5)
+    own, other = ((torch.rand(4, 4, generator=draw) > 0.5).float() for _ in range(2))
+    true, wrong = (
+        on_canvas(one.repeat_interleave(8, 0).repeat_interleave(8, 1), SAMPLING.canvas, at)
+        for one in (own, other)
+    )
+    frames = operator(true)
+    known = (at, average, operator, SAMPLING)
+    assert explained(true, frames, *known) == pytest.approx(1, abs=1e-6)
+    assert explained(on_canvas(average, SAMPLING.canvas, at), frames, *known) == pytest.approx(0, abs=1e-6)
+    assert explained(wrong, frames, *known) < 0.5
+    with pytest.raises(DataError, match="do not fit a rig"):
+        explained(true[:2], frames, *known)
+
+
+def test_reconstruct_and_evaluate_say_what_the_pictures_are_worth(
+    tiny_dataset, tiny_captures, tmp_path
+) -> None:
+    torch.manual_seed(0)
+    network = ResidualUNet(1, UNetConfig(width=4, depth=1, rank=0)).eval()
+    samples = NlosDataset(tiny_dataset, "train", "frame")
+    confidence = fit_confidence(network, samples, SAMPLING.canvas)
+    weights = Weights(network, "frame", to_dict(SAMPLING), [], None, confidence)
+    (passed,) = [one for one in evaluate(weights, tiny_dataset, "train").worth if one.name == samples.names[0]]
+    assert passed.skill < 1 and 0 <= passed.width <= 1 and 0 <= passed.coverage <= 1
+    save_weights(tmp_path / "w.safetensors", weights)
+    out = tmp_path / "out"
+    found = reconstruct_capture(tiny_captures[0], tmp_path / "w.safetensors", out, rig=lab_rig())
+    assert set(found["confidence"]) == {"support", "threshold", "measured", "verdict", "explained"}
+    assert np.load(out / "interval.npy").shape == (2, 8, 32, 48)
+    assert (out / "unsure.png").is_file()
+
+
+def test_keeping_the_most_supported_first() -> None:
+    kept, risk = risk_coverage([0.2, 0.9, 0.5, 0.7], [0.8, 0.1, 0.5, 0.2])
+    np.testing.assert_allclose(kept, [0.25, 0.5, 0.75, 1])
+    np.testing.assert_allclose(risk, [0.1, 0.15, 0.8 / 3, 0.4])
