@@ -11,6 +11,7 @@ from evnlos.dataset import NlosDataset
 from evnlos.errors import DataError
 from evnlos.model import save_weights
 from evnlos.training import LOSSES, balanced_loss, paper_loss, step_size
+from evnlos.training.held_out import validate
 
 SMALL = UNetConfig(width=8, depth=2, shuffle=1, rank=0)
 QUICK = Training(
@@ -128,10 +129,8 @@ def test_a_collapsed_network_is_recognised(tiny_dataset, tmp_path) -> None:
     net = ResidualUNet(1, SMALL)
     for p in net.parameters():
         torch.nn.init.zeros_(p)
-    from evnlos.training.train import _validate
-
     held_out = NlosDataset(tiny_dataset, "validation", "frame")
-    assert _validate(net, held_out, tiny_dataset, torch.device("cpu"), False)["collapsed"]
+    assert validate(net, held_out, tiny_dataset, torch.device("cpu"), False)["collapsed"]
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "other", "missing", "huge"])
