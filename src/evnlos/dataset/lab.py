@@ -19,7 +19,15 @@ from evnlos.dataset.simulate import SensorSize
 from evnlos.dataset.variation import check_ranges, varied
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
-from evnlos.scene import EmnistGlyphs, FontGlyphs, HandwritingGlyphs, LineMotion, NistGlyphs, Scene
+from evnlos.scene import (
+    DrawingGlyphs,
+    EmnistGlyphs,
+    FontGlyphs,
+    HandwritingGlyphs,
+    LineMotion,
+    NistGlyphs,
+    Scene,
+)
 from evnlos.seeds import derive_seed
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
 from evnlos.transport import RadiometricTransport, rig_preset
@@ -37,7 +45,9 @@ class Lab:
 
     name: str = "lab"
     """Name of the rig; captures are called NAME_A, NAME_B, ..."""
-    glyphs: FontGlyphs | HandwritingGlyphs | NistGlyphs | EmnistGlyphs = field(default_factory=FontGlyphs)
+    glyphs: FontGlyphs | HandwritingGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs = field(
+        default_factory=FontGlyphs
+    )
     """What is hidden."""
     motion: LineMotion = field(default_factory=LineMotion)
     """How it moves."""

@@ -16,7 +16,15 @@ from evnlos.dataset.shard import write_shard
 from evnlos.dataset.store import Dataset, create_dataset
 from evnlos.dataset.variation import check_ranges, varied
 from evnlos.errors import ConfigError
-from evnlos.scene import EmnistGlyphs, FontGlyphs, HandwritingGlyphs, LineMotion, NistGlyphs, Scene
+from evnlos.scene import (
+    DrawingGlyphs,
+    EmnistGlyphs,
+    FontGlyphs,
+    HandwritingGlyphs,
+    LineMotion,
+    NistGlyphs,
+    Scene,
+)
 from evnlos.seeds import derive_seed
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
 from evnlos.transport import MeasuredTransport, PaperTransport, RadiometricTransport
@@ -42,7 +50,7 @@ class SensorSize:
 class Simulation:
     """Everything that decides a simulated dataset."""
 
-    glyphs: HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs = field(
+    glyphs: HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs = field(
         default_factory=HandwritingGlyphs
     )
     """What is hidden."""

@@ -1,5 +1,7 @@
 """What is hidden and how it moves."""
 
+from evnlos.scene.drawing_set import DrawingGlyphs
+from evnlos.scene.drawings import drawing
 from evnlos.scene.emnist import list_emnist, read_emnist
 from evnlos.scene.fonts import Font, find_font
 from evnlos.scene.glyph_sets import (
@@ -24,6 +26,7 @@ __all__ = [
     "DIGITS",
     "TRAIN_WRITERS",
     "UPPER_CASE",
+    "DrawingGlyphs",
     "EmnistGlyphs",
     "Font",
     "FontGlyphs",
@@ -41,6 +44,7 @@ __all__ = [
     "Scene",
     "Strokes",
     "Target",
+    "drawing",
     "find_font",
     "fit_to_plate",
     "hand",

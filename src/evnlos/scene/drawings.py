@@ -1,0 +1,218 @@
+"""Things to hide that are no characters: icons, people, vehicles, doodles, several at once, in grey levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.errors import ConfigError
+from evnlos.scene.canvas import Canvas
+from evnlos.seeds import derive_seed
+
+Drawing = Callable[[Canvas], None]
+
+
+def drawing(kind: str, number: int, seed: int = 0, size_px: int = 256) -> NDArray[np.float32]:
+    """Draw one object of a kind; every number is another one.
+
+    Args:
+        kind: "icon", "person", "vehicle", "doodle", "several" (two or three smaller ones beside one another) or
+            "grey" (any of the first three, its parts of different brightness).
+        number: Number of the object, from 0 on.
+        seed: Fixes the whole population.
+        size_px: Side of the picture, pixels.
+
+    Returns:
+        float32 [size_px, size_px], 0..1.
+
+    Raises:
+        ConfigError: The kind is unknown.
+    """
+    if kind not in KINDS:
+        raise ConfigError(f"kind of drawing {kind!r} is unknown; give one of {', '.join(KINDS)}")
+    draw = np.random.default_rng(derive_seed(seed, "drawing", kind, number))
+    canvas = Canvas(size_px, draw, levels=(0.25, 1.0) if kind == "grey" else (1.0, 1.0))
+    if kind == "several":
+        _several(canvas, number)
+    else:
+        shapes = [*_ICONS, _person, *_VEHICLES] if kind == "grey" else _SHAPES[kind]
+        canvas.place(draw.uniform(-0.2, 0.2), draw.uniform(0.75, 0.9), (0, 0))
+        shapes[number % len(shapes)](canvas)
+    return canvas.picture()
+
+
+def _several(canvas: Canvas, number: int) -> None:
+    draw, count = canvas.draw, 2 + number % 2
+    start = draw.uniform(0, 2 * np.pi)
+    for k in range(count):
+        angle = start + 2 * np.pi * k / count
+        canvas.place(draw.uniform(-0.3, 0.3), 0.42, (0.5 * np.cos(angle), 0.5 * np.sin(angle)))
+        _ICONS[int(draw.integers(len(_ICONS)))](canvas)
+
+
+def _house(c: Canvas) -> None:
+    wide = c.draw.uniform(0.6, 0.85)
+    c.box(-wide, -0.1, wide, 0.9)
+    c.polygon([(-wide - 0.12, -0.1), (0, -0.9), (wide + 0.12, -0.1)])
+    c.box(-0.15, 0.4, 0.2, 0.9, 0)
+    if c.draw.random() < 0.5:
+        c.box(0.3, 0.1, 0.55, 0.35, 0)
+
+
+def _tree(c: Canvas) -> None:
+    c.box(-0.1, 0.4, 0.1, 0.95)
+    if c.draw.random() < 0.5:
+        for top in (-0.95, -0.55, -0.15):
+            wide = 0.45 + 0.15 * (top + 0.95)
+            c.polygon([(-wide, top + 0.65), (0, top), (wide, top + 0.65)])
+    else:
+        for _ in range(5):
+            x, y = c.draw.uniform(-0.35, 0.35, 2)
+            c.disc(x, y - 0.25, c.draw.uniform(0.25, 0.45))
+
+
+def _heart(c: Canvas) -> None:
+    t = np.linspace(0, 2 * np.pi, 60)
+    x, y = 16 * np.sin(t) ** 3, -(13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t))
+    c.polygon(np.stack([x, y], axis=1) / 17)
+
+
+def _star(c: Canvas) -> None:
+    points, inner = int(c.draw.integers(4, 8)), c.draw.uniform(0.35, 0.5)
+    t = np.arange(2 * points) * np.pi / points - np.pi / 2
+    r = np.where(np.arange(2 * points) % 2, inner, 0.95)
+    c.polygon(np.stack([r * np.cos(t), r * np.sin(t)], axis=1))
+
+
+def _arrow(c: Canvas) -> None:
+    half, neck = c.draw.uniform(0.12, 0.25), c.draw.uniform(-0.1, 0.3)
+    c.box(-0.95, -half, neck, half)
+    c.polygon([(neck, -0.6), (0.95, 0), (neck, 0.6)])
+
+
+def _cup(c: Canvas) -> None:
+    c.polygon([(-0.7, -0.6), (0.4, -0.6), (0.3, 0.75), (-0.6, 0.75)])
+    c.arc(0.4, 0.0, 0.35, -1.4, 1.5, 0.17)
+
+
+def _key(c: Canvas) -> None:
+    c.arc(-0.5, 0.0, 0.33, 0, 2 * np.pi, 0.2)
+    c.box(-0.2, -0.1, 0.95, 0.1)
+    for x in (0.55, 0.8):
+        c.box(x, 0.0, x + 0.13, c.draw.uniform(0.3, 0.45))
+
+
+def _umbrella(c: Canvas) -> None:
+    t = np.linspace(np.pi, 2 * np.pi, 30)
+    c.polygon(np.stack([0.95 * np.cos(t), 0.9 * np.sin(t)], axis=1))
+    c.line([(0, 0), (0, 0.7)], 0.14)
+    c.arc(0.15, 0.72, 0.15, np.pi, 0, 0.14)
+
+
+def _moon(c: Canvas) -> None:
+    c.disc(0, 0, 0.9)
+    c.disc(c.draw.uniform(0.3, 0.5), -0.1, c.draw.uniform(0.65, 0.8), level=0)
+
+
+def _bolt(c: Canvas) -> None:
+    c.polygon([(0.1, -0.95), (-0.55, 0.15), (-0.08, 0.15), (-0.2, 0.95), (0.55, -0.25), (0.05, -0.25)])
+
+
+def _fish(c: Canvas) -> None:
+    c.disc(-0.15, 0, 0.65, c.draw.uniform(0.3, 0.45))
+    c.polygon([(0.35, 0), (0.95, -0.45), (0.8, 0), (0.95, 0.45)])
+    c.disc(-0.5, -0.08, 0.08, level=0)
+
+
+def _scissors(c: Canvas) -> None:
+    for side in (-1, 1):
+        c.arc(-0.55, 0.45 * side, 0.25, 0, 2 * np.pi, 0.14)
+        c.line([(-0.35, 0.3 * side), (0.9, -0.35 * side)], 0.15)
+
+
+def _person(c: Canvas) -> None:
+    """A standing, walking or waving person: head, trunk, two arms and two legs with a joint each."""
+    draw, lean = c.draw, c.draw.uniform(-0.15, 0.15)
+    hip, neck = np.array([0.0, 0.15]), np.array([lean, -0.45])
+    c.disc(neck[0] + lean / 2, neck[1] - 0.27, 0.19)
+    c.line([tuple(neck), tuple(hip)], draw.uniform(0.26, 0.36))
+    stride, swing = draw.uniform(0.05, 0.6), draw.uniform(-0.4, 0.9)
+    waves = draw.random() < 0.3
+    for side in (-1, 1):
+        thigh = side * stride
+        knee = hip + 0.4 * np.array([np.sin(thigh), np.cos(thigh)])
+        shin = thigh - (draw.uniform(0, 0.5) if side < 0 else draw.uniform(0, 0.2))
+        c.line([tuple(hip), tuple(knee), tuple(knee + 0.4 * np.array([np.sin(shin), np.cos(shin)]))], 0.17)
+        upper = -side * swing if not (waves and side > 0) else draw.uniform(2.0, 2.7)
+        shoulder = neck + np.array([0.05 * side, 0.06])
+        elbow = shoulder + 0.3 * np.array([np.sin(upper), np.cos(upper)])
+        lower = upper + draw.uniform(0.0, 0.8) * (1 if side > 0 else -1)
+        hand = elbow + 0.3 * np.array([np.sin(lower), np.cos(lower)])
+        c.line([tuple(shoulder), tuple(elbow), tuple(hand)], 0.12)
+
+
+def _car(c: Canvas) -> None:
+    c.box(-0.95, -0.05, 0.95, 0.35)
+    roof = c.draw.uniform(-0.55, -0.4)
+    c.polygon([(-0.65, -0.05), (-0.4, roof), (0.3, roof), (0.6, -0.05)])
+    c.polygon([(-0.45, -0.08), (-0.3, roof + 0.1), (-0.08, roof + 0.1), (-0.08, -0.08)], 0)
+    c.polygon([(0.05, -0.08), (0.05, roof + 0.1), (0.25, roof + 0.1), (0.43, -0.08)], 0)
+    _wheels(c, (-0.55, 0.55), 0.35, c.draw.uniform(0.2, 0.26))
+
+
+def _lorry(c: Canvas) -> None:
+    c.box(-0.95, -0.6, 0.35, 0.35)
+    c.polygon([(0.42, 0.35), (0.42, -0.3), (0.75, -0.3), (0.95, 0.0), (0.95, 0.35)])
+    c.polygon([(0.55, 0.0), (0.55, -0.2), (0.72, -0.2), (0.83, 0.0)], 0)
+    _wheels(c, (-0.65, -0.25, 0.68), 0.4, 0.2)
+
+
+def _bus(c: Canvas) -> None:
+    c.box(-0.95, -0.5, 0.95, 0.4)
+    for x in np.linspace(-0.8, 0.5, int(c.draw.integers(3, 5))):
+        c.box(x, -0.35, x + 0.26, 0.0, 0)
+    _wheels(c, (-0.55, 0.55), 0.42, 0.19)
+
+
+def _bicycle(c: Canvas) -> None:
+    for x in (-0.55, 0.55):
+        c.arc(x, 0.3, 0.36, 0, 2 * np.pi, 0.1)
+    c.line([(-0.55, 0.3), (-0.2, -0.3), (0.35, -0.3), (0.0, 0.3), (-0.55, 0.3)], 0.09)
+    c.line([(0.0, 0.3), (-0.2, -0.3), (-0.25, -0.45)], 0.09)
+    c.line([(0.55, 0.3), (0.35, -0.3), (0.3, -0.5), (0.5, -0.55)], 0.09)
+
+
+def _wheels(c: Canvas, places: tuple[float, ...], y: float, radius: float) -> None:
+    for x in places:
+        c.disc(x, y, radius)
+        c.disc(x, y, radius / 3, level=0)
+
+
+def _doodle(c: Canvas) -> None:
+    """Two or three smooth strokes of a pen, sums of a few slow waves, that fill the plate."""
+    t, waves, width = np.linspace(0, 1, 40), np.arange(3), c.draw.uniform(0.1, 0.18)
+    count = int(c.draw.integers(2, 4))
+    sizes = c.draw.normal(size=(count, 2, 3)) / (1 + waves)
+    phases = c.draw.uniform(0, np.pi, (count, 2, 3))
+    at = (sizes[:, None] * np.cos(np.pi * t[:, None, None] * waves + phases[:, None])).sum(
+        axis=-1
+    )  # [K, 40, 2]
+    low, high = at.min(axis=(0, 1)), at.max(axis=(0, 1))
+    for stroke in (at - (low + high) / 2) * (1.8 / (high - low).max()):
+        c.line(stroke, width)
+
+
+_ICONS: list[Drawing] = [
+    _house, _tree, _heart, _star, _arrow, _cup, _key, _umbrella, _moon, _bolt, _fish, _scissors,
+]  # fmt: skip
+_VEHICLES: list[Drawing] = [_car, _lorry, _bus, _bicycle]
+_SHAPES: dict[str, list[Drawing]] = {
+    "icon": _ICONS,
+    "person": [_person],
+    "vehicle": _VEHICLES,
+    "doodle": [_doodle],
+}
+KINDS = (*_SHAPES, "several", "grey")
+"""Kinds of drawings."""
