@@ -23,10 +23,13 @@ class Command:
 
     name: Annotated[str, tyro.conf.Positional]
     """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss or width;
-    without captures: simulation (handwriting, transfer to Comic) and conditions (frames against events over
-    light, noise, exposure and speed)."""
+    without captures: simulation (handwriting, transfer to Comic), conditions (frames against events over
+    light, noise, exposure and speed), and carry-over (given weights on unseen hands, other things than
+    characters, and other walls, with what their confidence says)."""
     captures: Path | None = None
     """Folder of the capture folders."""
+    weights: Path | None = None
+    """Weights for carry-over, which were trained for the rig OUT/rigs/RIG."""
     out: Path = Path("experiments")
     """Folder for rigs, datasets, runs, records and tables; experiments in one folder share what they can."""
     rig: str = "near"
@@ -64,9 +67,13 @@ class Command:
         if self.name == "simulation":
             self._simulation()
             return
+        if self.name == "carry-over":
+            self._carry_over()
+            return
         if self.name not in STUDIES:
             raise ConfigError(
-                f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}, conditions"
+                f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}, simulation, "
+                "conditions, carry-over"
             )
         if self.captures is None:
             raise ConfigError(f"the experiment {self.name} needs --captures, the folder of the capture folders")
@@ -137,6 +144,27 @@ class Command:
         show(steps())
         text = conditions_table(findings) + "\n"
         write_atomically(self.out / "conditions.md", text.encode())
+        print(text)
+
+    def _carry_over(self) -> None:
+        from evnlos.experiment import carried_table, carry_over, show, write_carried
+
+        weights = self.weights
+        if weights is None:
+            raise ConfigError("carry-over needs --weights, a weights file or a run's folder")
+        found = []
+
+        def steps() -> Iterator[Step]:
+            for step, one in carry_over(weights, self.out / "rigs" / self.rig, self.out, self.workers):
+                if one is not None:
+                    found.append(one)
+                yield step
+
+        show(steps())
+        name = f"carry-over-{self.rig}-{weights.stem}"
+        write_carried(found, self.out / f"{name}.json")
+        text = carried_table(found) + "\n"
+        write_atomically(self.out / f"{name}.md", text.encode())
         print(text)
 
 

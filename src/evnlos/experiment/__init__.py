@@ -1,5 +1,6 @@
 """Experiments: what is compared, run so that it can go on after any interruption, and put into tables."""
 
+from evnlos.experiment.carry_over import CarriedOver, carried_table, carry_over, write_carried
 from evnlos.experiment.conditions import (
     Condition,
     Finding,
@@ -19,6 +20,7 @@ from evnlos.experiment.table import character_table, checks_table, difference, g
 __all__ = [
     "STUDIES",
     "Arm",
+    "CarriedOver",
     "Condition",
     "Finding",
     "Place",
@@ -28,6 +30,8 @@ __all__ = [
     "Study",
     "base_simulation",
     "captures_of",
+    "carried_table",
+    "carry_over",
     "character_table",
     "checks_table",
     "conditions",
@@ -40,5 +44,6 @@ __all__ = [
     "run_study",
     "show",
     "summary_table",
+    "write_carried",
     "write_record",
 ]

@@ -1,0 +1,162 @@
+"""What carries over: one network on other hands, other things than characters, and other walls than its own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from evnlos.calibration import RIG_FILE
+from evnlos.config import config_hash, from_dict, load_yaml, to_dict, write_atomically
+from evnlos.dataset import NlosDataset, Sampling, Simulation, open_dataset, simulate
+from evnlos.errors import DataError
+from evnlos.evaluation.worth import PassWorth, risk_coverage, worth_of
+from evnlos.experiment.study import Step
+from evnlos.metrics import psnr
+from evnlos.model import Weights, infer, load_weights
+from evnlos.model.plates import on_canvas
+from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, DrawingGlyphs, HandwritingGlyphs
+from evnlos.scene.drawings import KINDS
+from evnlos.transport import RadiometricTransport
+
+
+@dataclass(frozen=True)
+class CarriedOver:
+    """What one network made of one set of objects and walls.
+
+    Args:
+        name: What the set is.
+        psnr_db: Mean PSNR of the network's pictures on the scored canvas, dB.
+        average_db: The same of the average plate, drawn where the plate is, dB.
+        worth: What the confidence said of each pass, and what was true.
+    """
+
+    name: str
+    psnr_db: float
+    average_db: float
+    worth: list[PassWorth]
+
+    def mean(self, key: str) -> float:
+        """Return the mean of one number of the passes."""
+        return float(np.mean([getattr(one, key) for one in self.worth]))
+
+
+def sets(rig: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation]:
+    """Return the sets: unseen hands, each kind of drawings, and the same hands in front of other walls.
+
+    Args:
+        rig: The calibrated rig.
+        sampling: Resolution and representation of the network's samples.
+        each: Objects of a set; of the unseen hand all 36 characters.
+
+    Raises:
+        DataError: The rig's wall is not radiometric.
+    """
+    wall = rig.transport
+    if not isinstance(wall, RadiometricTransport):
+        raise DataError(f"the rig's transport is {wall.kind!r}; give a calibrated rig (radiometric)")
+    base = replace(rig, sampling=sampling, vary={}, rigs=0, validation=0.0, held_out="", keep_events=False)
+    hand = HandwritingGlyphs(characters=UPPER_CASE + DIGITS, writers=1, first_writer=TRAIN_WRITERS)
+    some = replace(hand, characters="".join((UPPER_CASE + DIGITS)[:: max(1, 36 // each)][:each]))
+    offset = wall.target_offset_m  # None: in the mirror direction, at any distance
+    beyond = None if offset is None else (1.5 * offset[0], 1.5 * offset[1])
+    farther = replace(wall, distance_m=1.5 * wall.distance_m, target_offset_m=beyond)
+    walls = {
+        "wall 1.5 x as rough": replace(wall, roughness=wall.roughness * 1.5),
+        "wall 3 x as rough": replace(wall, roughness=min(1.0, wall.roughness * 3)),
+        "1.5 x as far": farther,
+        "a third of the light": replace(wall, gain=wall.gain / 3, ambient=wall.ambient / 3),
+        "matte wall": replace(wall, wall_material="lambert"),
+    }
+    found = {"characters of an unseen hand": replace(base, glyphs=hand)}
+    found |= {kind: replace(base, glyphs=DrawingGlyphs(kinds=(kind,), each=each)) for kind in KINDS}
+    return found | {name: replace(base, glyphs=some, transport=other) for name, other in walls.items()}
+
+
+def carry_over(
+    weights: Path, rig: Path, out: Path, workers: int = 0, each: int = 12
+) -> Iterator[tuple[Step, CarriedOver | None]]:
+    """Run one network on all sets, yielding each step and, with the last of a set, what came of it.
+
+    Args:
+        weights: Weights file, or a run's folder.
+        rig: Folder of the calibrated rig.
+        out: Folder for datasets and results.
+        workers: Processes that simulate; 0 = one for each core.
+        each: Objects of a set.
+
+    Raises:
+        DataError: The weights do not know what their pictures are worth, or the rig can't be used.
+    """
+    loaded = load_weights(weights)
+    if loaded.confidence is None:
+        raise DataError(
+            f"{weights} does not know what its pictures are worth; train on a dataset with a validation split"
+        )
+    sampling = from_dict(Sampling, loaded.sampling, source="the weights' sampling")
+    for name, config in sets(load_yaml(Simulation, rig / RIG_FILE), sampling, each).items():
+        key = config_hash(config)[:8]
+        folder = out / "simulations" / f"{rig.name}-{name.replace(' ', '-')}-{key}"
+        total = len(config.glyphs.objects())
+        for k, _ in enumerate(simulate(config, folder, workers)):
+            yield Step(f"simulate {folder.name}", k + 1, total), None
+        yield Step(f"score {folder.name}", 1, 1), _score(name, loaded, folder)
+
+
+def _score(name: str, weights: Weights, folder: Path) -> CarriedOver:
+    assert weights.confidence is not None
+    dataset = open_dataset(folder)
+    samples = NlosDataset(dataset, "all", weights.paradigm)  # type: ignore[arg-type]
+    images = infer(weights.network, samples.inputs, samples.position_m, samples.names)
+    canvas, rows = dataset.sampling.canvas, dataset.sampling.scored
+    truth = samples.truth.float()[:, rows]
+    average = on_canvas(weights.confidence.mean, canvas, samples.position_m)
+    seen_db, average_db = (float(psnr(one[:, rows].contiguous(), truth).mean()) for one in (images, average))
+    worth = worth_of(weights.network, weights.confidence, samples, images, canvas)
+    return CarriedOver(name, seen_db, average_db, worth)
+
+
+def write_carried(found: list[CarriedOver], path: Path) -> None:
+    """Write the findings, pass by pass, as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps([to_dict(one) for one in found], indent=1).encode())
+
+
+def carried_table(found: list[CarriedOver]) -> str:
+    """Return the findings as a table, and how well the support orders all passes by their skill."""
+    head = (
+        "set",
+        "passes",
+        "PSNR, dB",
+        "average plate, dB",
+        "skill",
+        "support",
+        "measured",
+        "coverage",
+        "width",
+    )
+    lines = [" | ".join(("", *head, "")).strip(), "|" + "---|" * len(head)]
+    for one in found:
+        row = [one.name, str(len(one.worth)), f"{one.psnr_db:.2f}", f"{one.average_db:.2f}"]
+        row += [f"{one.mean(key):.2f}" for key in ("skill", "support")]
+        row += [f"{one.mean(key):.0%}" for key in ("measured", "coverage")]
+        lines.append(f"| {' | '.join(row)} | {one.mean('width'):.2f} |")
+    return "\n".join([*lines, "", _order([pass_ for one in found for pass_ in one.worth])])
+
+
+def _order(passes: list[PassWorth]) -> str:
+    support, skill = (np.array([getattr(one, key) for one in passes]) for key in ("support", "skill"))
+    risk = 1 - skill
+    parts = []
+    for order, name in (
+        (support, "by support"),
+        (skill, "by skill itself"),
+        (np.zeros(len(risk)), "as they come"),
+    ):
+        shares, kept = risk_coverage(order, risk)
+        at = [float(kept[np.searchsorted(shares, share)]) for share in (0.25, 0.5, 0.75, 1.0)]
+        parts.append(f"{name} " + " / ".join(f"{1 - value:.2f}" for value in at))
+    return "Mean skill of the best 25 / 50 / 75 / 100 % of all passes: " + "; ".join(parts) + "."
