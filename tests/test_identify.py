@@ -15,7 +15,6 @@ from evnlos.dataset import Simulation
 from evnlos.dataset.lab import Lab
 from evnlos.errors import ConfigError, DataError
 from evnlos.evaluation.identify import counted, identify, singular_values
-from evnlos.evaluation.identify_glyphs import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_plates
 from evnlos.evaluation.identify_linear import LinearEstimator, bars, finest_bars
 from evnlos.evaluation.identify_rig import Bench, camera_variance, carried_on, seen_rig
 from evnlos.evaluation.identify_source import described_rig
@@ -23,6 +22,7 @@ from evnlos.evaluation.identify_table import rig_table
 from evnlos.evaluation.identify_words import verdict
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.sensor import FrameCamera
+from evnlos.solver.glyph_prior import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_plates
 from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
 from evnlos.transport.rig import rig_names
 

@@ -1,9 +1,9 @@
-"""The captures that a calibration works on: one rig, one camera, known targets, some of them held out."""
+"""The captures that a calibration works on: one rig, one camera, known motions, some of them held out."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from evnlos.dataset.capture import Capture, read_capture
 from evnlos.dataset.importer import character_of
 from evnlos.errors import DataError
-from evnlos.scene import Scene
+from evnlos.scene import LineMotion, Scene
 from evnlos.seeds import derive_seed
 
 FEWEST = 3
@@ -24,15 +24,22 @@ class Shots:
     """Captures of one rig, in the order of their names.
 
     Args:
-        captures: The captures; target and motion of each are known.
+        captures: The captures; the motion of each is known, and, where they are `labelled`, the target.
+        plate_m: Side of the plates, metres.
     """
 
     captures: tuple[Capture, ...]
+    plate_m: float = 0.08
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the captures."""
         return tuple(capture.name for capture in self.captures)
+
+    @property
+    def motions(self) -> tuple[LineMotion, ...]:
+        """Motion of each capture's target."""
+        return tuple(_motion(capture) for capture in self.captures)
 
     @property
     def scenes(self) -> tuple[Scene, ...]:
@@ -70,6 +77,7 @@ def read_shots(
     holdout: Sequence[str] = (),
     share: float = 0.25,
     seed: int = 0,
+    plate_m: float | None = None,
 ) -> tuple[Shots, Shots]:
     """Read the captures of one rig and split them into those to fit and those to check the fit on.
 
@@ -79,6 +87,8 @@ def read_shots(
         holdout: Names, or characters, to check on; empty draws a share of the captures.
         share: Share of the captures that is drawn, 0..1.
         seed: Seed of the draw.
+        plate_m: Side of the plates where the targets are unknown, metres: what the captures say of their
+            targets is then dropped. None takes the targets as known.
 
     Returns:
         The captures to fit, and those held out.
@@ -95,17 +105,20 @@ def read_shots(
             f"{len(chosen)} capture(s) are left to calibrate on; give {FEWEST} or more, best 20, of one rig"
         )
     captures = [read_capture(paths[name]) for name in chosen]
+    if plate_m is not None:
+        captures = [replace(capture, target=None) for capture in captures]
     for capture in captures:
-        _scene(capture)
+        _motion(capture) if plate_m is not None else _scene(capture)
         _check_same_rig(captures[0], capture)
+    side = _scene(captures[0]).target.size_m if plate_m is None else plate_m
     held = {name for name in chosen if _named(name, holdout)} or _drawn(chosen, share, seed)
     if len(chosen) - len(held) < FEWEST - 1:
         raise DataError(
             f"{len(held)} of {len(chosen)} captures are held out; leave {FEWEST - 1} or more to fit"
         )
     return (
-        Shots(tuple(capture for capture in captures if capture.name not in held)),
-        Shots(tuple(capture for capture in captures if capture.name in held)),
+        Shots(tuple(capture for capture in captures if capture.name not in held), side),
+        Shots(tuple(capture for capture in captures if capture.name in held), side),
     )
 
 
@@ -138,12 +151,21 @@ def _scene(capture: Capture) -> Scene:
     return scene
 
 
+def _motion(capture: Capture) -> LineMotion:
+    if capture.motion is None:
+        raise DataError(
+            f"{capture.name} has no known motion; add `motion` to its capture.yaml (`evnlos track` finds it), "
+            "or leave the capture out"
+        )
+    return capture.motion
+
+
 def _check_same_rig(first: Capture, other: Capture) -> None:
     """Refuse captures of another camera, rig or plate than the first one's."""
     pairs = {
         "camera": (first.info.camera, other.info.camera),
         "rig": (first.info.rig, other.info.rig),
-        "plate_m": (_scene(first).target.size_m, _scene(other).target.size_m),
+        "plate_m": tuple(one.target.size_m if one.target else None for one in (first, other)),
         "size": (first.frames.shape[1:], other.frames.shape[1:]),
         "bit depth": (str(first.frames.dtype), str(other.frames.dtype)),
     }

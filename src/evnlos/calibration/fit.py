@@ -20,11 +20,12 @@ from evnlos.calibration.residual import Residual
 from evnlos.calibration.settings import Calibration
 from evnlos.calibration.training_set import pens_of, training_simulation
 from evnlos.calibration.transport_fit import TransportFit, fit_transport
+from evnlos.calibration.unlabelled import fit_unlabelled
 from evnlos.dataset.simulate import SensorSize, Simulation
 from evnlos.errors import DataError
-from evnlos.scene import LineMotion
+from evnlos.scene import LineMotion, Strokes
 from evnlos.sensor import EventPixel
-from evnlos.transport import MeasuredTransport
+from evnlos.transport import MeasuredTransport, RadiometricTransport
 
 _EXAMPLES = 3
 
@@ -87,7 +88,10 @@ class RigFit:
 
 
 def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) -> RigFit:
-    """Fit the simulator to captures of a rig with known targets.
+    """Fit the simulator to captures of a rig whose targets are known, or, with `targets="unknown"`, are not.
+
+    Where they are not, everything behind the optics (noise, event pixel) is fitted with the plates that are
+    expected; they show what reaches the wall, which is all that counts for it.
 
     Args:
         folders: Capture folders of one rig and one camera.
@@ -108,10 +112,17 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
         holdout=settings.holdout,
         share=settings.holdout_share,
         seed=settings.seed,
+        plate_m=settings.start.glyphs.plate.size_m if settings.targets == "unknown" else None,
     )
     start, fixed = _at_known_distance(settings, fit)
-    optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
     residuals: dict[str, Residual] = {}
+    if settings.targets == "known":
+        optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
+    else:
+        assert isinstance(start, RadiometricTransport)  # `Calibration` refuses any other
+        found = fit_unlabelled(fit, held, start, fixed=fixed)
+        optics, fit, held = found.optics, found.fitted, found.held_out
+        residuals["every other frame held out"] = found.check
     models = {"fit": FrameModel(fit, fit.shape), "held out": FrameModel(held, held.shape)}
     predicted = {name: model.predict(optics.transport) for name, model in models.items()}
     noise = fit_frame_noise(fit, predicted["fit"].numpy(), settings.start.frame_camera)
@@ -141,7 +152,9 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
             )
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
-    strokes = pens_of([scene.target.mask for scene in fit.scenes])
+    strokes = Strokes().pen
+    if settings.targets == "known":
+        strokes = pens_of([scene.target.mask for scene in fit.scenes])
     training = training_simulation(simulation, noise, pixel, strokes)
     return RigFit(simulation, training, fit.names, held.names, optics, noise, pixel, residuals, examples)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 from evnlos.dataset.simulate import Simulation
 from evnlos.errors import ConfigError
@@ -28,6 +29,9 @@ class Calibration:
     """Names of captures, or characters, to check the fit on; none draws `holdout_share` of the captures."""
     holdout_share: float = 0.25
     """Share of the captures that is drawn for the check, between 0 and 1."""
+    targets: Literal["known", "unknown"] = "known"
+    """Whether the captures' targets are known; where not, any handwriting is as likely, and what the files say
+    of targets is not looked at."""
     fit_distance: bool = False
     """Fit the distance of target and wall too; else that of the capture's notes is taken as measured."""
     events: bool = True
@@ -49,6 +53,10 @@ class Calibration:
         if isinstance(self.start.transport, MeasuredTransport):
             raise ConfigError(
                 "start.transport is measured, which leaves no optics to fit; give paper or radiometric"
+            )
+        if self.targets == "unknown" and not isinstance(self.start.transport, RadiometricTransport):
+            raise ConfigError(
+                f"start.transport is {self.start.transport.kind}; a fit to unknown targets needs radiometric"
             )
         if self.columns < 16:
             raise ConfigError(f"Calibration.columns is {self.columns}; give 16 pixels or more")

@@ -161,7 +161,7 @@ def _search(
 ) -> tuple[AnyTransport, NDArray[np.float64]]:
     def residual(values: NDArray[np.float64]) -> torch.Tensor:
         try:
-            light = model.light(_with(start, parameters, values))
+            light = model.light(moved(start, parameters, values))
         except ConfigError:  # a camera that can't be, e.g. one that sees past the wall: the search turns back
             return model.frames * model.weight
         return model.fit(light)[1]
@@ -173,7 +173,7 @@ def _search(
         [(p.encode(p.low), p.encode(p.high)) for p in parameters],
         iterations=iterations,
     )
-    result = _with(start, parameters, found.values)
+    result = moved(start, parameters, found.values)
     scale = [p.read(result) if p.log else 1.0 for p in parameters]
     return result, found.error * np.array(scale)
 
@@ -217,10 +217,10 @@ def _rms(residual: torch.Tensor) -> float:
     return float(residual.square().mean().sqrt())
 
 
-def _with(
+def moved(
     transport: AnyTransport, parameters: tuple[Parameter, ...], values: NDArray[np.float64]
 ) -> AnyTransport:
-    """Return the transport with the search's values."""
+    """Return the transport with the search's values, [len(parameters)], each as `Parameter.encode` gives it."""
     chosen = {p.name: p.decode(float(v)) for p, v in zip(parameters, values, strict=True)}
     return varied(transport, {name: (v, v) for name, v in chosen.items()}, 0, "")  # a range without width
 

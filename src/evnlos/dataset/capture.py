@@ -55,18 +55,25 @@ class Capture:
         return int(np.iinfo(self.frames.dtype).max)
 
     @property
-    def scene(self) -> Scene | None:
-        """The target and its motion on the events' clock; None where either is unknown."""
+    def motion(self) -> LineMotion | None:
+        """The target's motion on the events' clock; None where it is unknown."""
         motion = self.info.motion
-        if self.target is None or motion is None:
+        if motion is None:
             return None
         direction = np.asarray(motion.direction, dtype=float)
         start = motion.start_m
         if not isinstance(start, tuple):
             along = start * direction / np.hypot(*direction)
             start = (float(along[0]), float(along[1]))
-        line = LineMotion(start, motion.speed_m_s, motion.direction, motion.start_us * 1e-6)
-        return Scene(self.target, line, duration_s=max(float(self.frame_times_us[-1]) * 1e-6, 1e-6))
+        return LineMotion(start, motion.speed_m_s, motion.direction, motion.start_us * 1e-6)
+
+    @property
+    def scene(self) -> Scene | None:
+        """The target and its motion on the events' clock; None where either is unknown."""
+        motion = self.motion
+        if self.target is None or motion is None:
+            return None
+        return Scene(self.target, motion, duration_s=max(float(self.frame_times_us[-1]) * 1e-6, 1e-6))
 
 
 def read_capture(folder: str | Path) -> Capture:

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from evnlos.evaluation.identify_glyphs import Plates, handwritten_plates
 from evnlos.evaluation.identify_linear import LinearEstimator, finest_bars
 from evnlos.evaluation.identify_rig import (
     AnyTransport,
@@ -21,6 +20,7 @@ from evnlos.evaluation.identify_scan import scan_notes
 from evnlos.evaluation.identify_words import truncation_note, verdict
 from evnlos.seeds import derive_seed
 from evnlos.sensor import FrameCamera
+from evnlos.solver.glyph_prior import Plates, handwritten_plates
 from evnlos.transport import MeasuredTransport, PaperTransport
 
 MODE_LEVEL = 1e-2

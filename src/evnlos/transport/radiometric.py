@@ -247,7 +247,7 @@ def _fill(
     occluders: Sequence[Occluder],
 ) -> None:
     """Fill `matrix` by the compiled loop."""
-    from evnlos.transport.radiometric_kernel import fill_matrix  # numba loads slowly
+    from evnlos.transport.radiometric_kernel import fill_matrix, torchs_threads  # numba loads slowly
 
     metal, albedo = np.zeros(4), 0.0
     if isinstance(brdf, GGX):
@@ -258,19 +258,20 @@ def _fill(
     patches = as_patches(source)
     sub, weight = (np.array(values) for values in gauss_points(over_cell))
     width, height = patches.size_m
-    fill_matrix(
-        matrix.numpy(),
-        wall.contiguous().numpy(),
-        wall_weight.numpy(),
-        patches.x_m + _number(offset_m[0]) + sub[:, None] * width,
-        patches.y_m + _number(offset_m[1]) + sub[:, None] * height,
-        weight,
-        emission.detach().flatten().double().numpy() * (width * height),
-        distance_m,
-        np.array(eye_m),
-        metal,
-        albedo,
-        np.array(exponent, dtype=np.float64),
-        np.array([corner for one in occluders for corner in one.vertices_m], np.float64).reshape(-1, 3),
-        np.cumsum([len(one.vertices_m) for one in occluders], dtype=np.int64),
-    )
+    with torchs_threads():
+        fill_matrix(
+            matrix.numpy(),
+            wall.contiguous().numpy(),
+            wall_weight.numpy(),
+            patches.x_m + _number(offset_m[0]) + sub[:, None] * width,
+            patches.y_m + _number(offset_m[1]) + sub[:, None] * height,
+            weight,
+            emission.detach().flatten().double().numpy() * (width * height),
+            distance_m,
+            np.array(eye_m),
+            metal,
+            albedo,
+            np.array(exponent, dtype=np.float64),
+            np.array([corner for one in occluders for corner in one.vertices_m], np.float64).reshape(-1, 3),
+            np.cumsum([len(one.vertices_m) for one in occluders], dtype=np.int64),
+        )

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
-from numba import njit, prange
+import torch
+from numba import config, njit, prange, set_num_threads
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -87,6 +90,22 @@ def _hide_row(value: Array, x: Array, y: float, shadow: Array, ends: Ends) -> No
                 if inside[c]:
                     value[c] = 0.0
         first = end
+
+
+@contextmanager
+def torchs_threads() -> Iterator[None]:
+    """Let numba use as many threads as torch does, and leave torch as many as it had.
+
+    Both share OpenMP's pool. Numba starts it with a thread for each core and makes that the number of the whole
+    process; where torch was told to use fewer, because other processes keep the cores busy, its threads would
+    then wait for each other at every operation: a hundred times slower for small matrices.
+    """
+    threads = torch.get_num_threads()
+    set_num_threads(min(threads, config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @njit(cache=True, parallel=True)

@@ -1,4 +1,4 @@
-"""What the hidden plates look like: a prior from some characters, tested on others."""
+"""What hidden plates look like: a Gaussian prior from some characters, and others to test it on."""
 
 from __future__ import annotations
 
