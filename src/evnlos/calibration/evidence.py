@@ -16,6 +16,8 @@ from evnlos.solver.plate_pass import strip_gram_of, strip_of
 from evnlos.transport import MatrixTransport, RadiometricTransport
 from evnlos.types import Plane
 
+WRITERS = 3
+"""Writers of the prior's handwriting."""
 _SHARE = 0.1  # of what moves that is noise, at the start of the search
 _REACH = 12.0  # of the search for gain and noise, in units of their logarithms
 
@@ -102,7 +104,7 @@ class MovingLight:
         self.position_m = np.asarray(position_m, dtype=np.float64)
         self.plate = Plane(cells, cells, size_m / cells)
         self._strip = strip_of(self.position_m, self.plate)
-        self._prior = handwritten_plates(self.plate)
+        self._prior = handwritten_plates(self.plate, WRITERS)
 
     @property
     def spread(self) -> float:
