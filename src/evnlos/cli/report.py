@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from evnlos.cli.console import Folders
+from evnlos.cli.console import Folders, result
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,17 @@ class Command:
     """Split to score."""
     out: Path = Path("report.html")
     """The page."""
+    json: bool = False
+    """Print one JSON object: mean scores of each run and baseline."""
 
     def run(self) -> None:
         """Evaluate the runs and write the page."""
         from evnlos.report import gather, to_text, write_report
+        from evnlos.report.tables import baselines_of
 
         dataset, results = gather(list(self.runs), self.data, self.split)
         path = write_report(self.out, dataset, results, [], self.split)
-        print(to_text(results))
-        print(f"report: {path}")
+        about = {"report": str(path), "csv": str(path.with_suffix(".csv"))}
+        about["runs"] = {r.name: r.evaluation.scores.mean() for r in results}
+        about["baselines"] = {name: scores.mean() for name, scores in baselines_of(results).items()}
+        result(self.json, about, f"{to_text(results)}\nreport: {path}")
