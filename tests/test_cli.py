@@ -65,7 +65,18 @@ def runs(shots, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
     return found
 
 
-WITHOUT_OUT = ("evaluate", "weights", "verify", "info", "convert", "capture", "app", "cite", "doctor")
+WITHOUT_OUT = (
+    "evaluate",
+    "weights",
+    "verify",
+    "info",
+    "convert",
+    "capture",
+    "app",
+    "cite",
+    "doctor",
+    "completion",
+)
 """Commands that write nothing, or name what they write in another way."""
 
 

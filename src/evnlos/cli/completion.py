@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-Shell = Literal["bash", "zsh", "tcsh"]
+Shell = Literal["bash", "zsh", "fish"]
 
 
 @dataclass(frozen=True)

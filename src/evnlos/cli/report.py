@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from evnlos.cli.console import Folders, result
 
@@ -30,7 +31,7 @@ class Command:
 
         dataset, results = gather(list(self.runs), self.data, self.split)
         path = write_report(self.out, dataset, results, [], self.split)
-        about = {"report": str(path), "csv": str(path.with_suffix(".csv"))}
+        about: dict[str, Any] = {"report": str(path), "csv": str(path.with_suffix(".csv"))}
         about["runs"] = {r.name: r.evaluation.scores.mean() for r in results}
         about["baselines"] = {name: scores.mean() for name, scores in baselines_of(results).items()}
         result(self.json, about, f"{to_text(results)}\nreport: {path}")
