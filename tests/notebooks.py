@@ -1,6 +1,6 @@
 """Run notebooks without Jupyter: cells in order, what they print and show kept as their outputs.
 
-    python tests/notebooks.py notebooks/*.ipynb    # run them and write their outputs into the files
+python tests/notebooks.py notebooks/*.ipynb    # run them and write their outputs into the files
 """
 
 from __future__ import annotations
@@ -34,7 +34,12 @@ def run(path: Path) -> dict[str, Any]:
             text = printed.getvalue().splitlines(keepends=True)
             cell["outputs"].append({"name": "stdout", "output_type": "stream", "text": text})
         if shown is not None:
-            output = {"data": _data(shown), "execution_count": count, "metadata": {}, "output_type": "execute_result"}
+            output = {
+                "data": _data(shown),
+                "execution_count": count,
+                "metadata": {},
+                "output_type": "execute_result",
+            }
             cell["outputs"].append(output)
     return notebook
 
