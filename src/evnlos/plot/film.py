@@ -52,7 +52,7 @@ def film(
         >>> hidden, wall = np.zeros((3, 12, 24), np.uint8), np.zeros((3, 10, 16, 4), np.uint8)
         >>> pictures = film([Column("hidden", "24 cm wide", hidden), Column("wall", "16 px", wall)], 96)
         >>> len(pictures), pictures[0].shape
-        (3, (97, 216, 3))
+        (3, (109, 216, 3))
     """
     lengths = sorted({len(column.pictures) for column in columns} | ({len(captions)} if captions else set()))
     if len(lengths) != 1:
