@@ -26,6 +26,7 @@ STAGES = [
     "calibration",
     "training",
     "evaluation",
+    "plot",
     "report",
     "experiment",
 ]

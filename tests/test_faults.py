@@ -89,6 +89,9 @@ def test_damage_is_found_named_and_repaired(copy, tiny_dataset, capsys) -> None:
     ):
         assert any(str(path) in line and reason in line for line in out.splitlines()), out
     assert f"4 of {len(names)} shards are faulty" in err
+    with pytest.raises(SystemExit):
+        main(["verify", str(copy.folder), "--json"])
+    assert set(json.loads(capsys.readouterr().out)["faults"]) == set(names[:4])
     main(["verify", str(copy.folder), "--repair", "--workers", "1"])
     assert "4 of 4" in capsys.readouterr().out
     assert bytes_of(copy.folder) == bytes_of(tiny_dataset.folder)

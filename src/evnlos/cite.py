@@ -75,6 +75,40 @@ ENTRIES = {
   volume = {13}, number = {4}, pages = {600--612},
   year = {2004}
 }""",
+    "haarpsi": """@article{reisenhofer2018haarpsi,
+  title = {A {Haar} Wavelet-Based Perceptual Similarity Index for Image Quality Assessment},
+  author = {Reisenhofer, Rafael and Bosse, Sebastian and Kutyniok, Gitta and Wiegand, Thomas},
+  journal = {Signal Processing: Image Communication},
+  volume = {61}, pages = {33--43},
+  year = {2018}
+}""",
+    "gmsd": """@article{xue2014gmsd,
+  title = {Gradient Magnitude Similarity Deviation: A Highly Efficient Perceptual Image Quality Index},
+  author = {Xue, Wufeng and Zhang, Lei and Mou, Xuanqin and Bovik, Alan C.},
+  journal = {IEEE Transactions on Image Processing},
+  volume = {23}, number = {2}, pages = {684--695},
+  year = {2014}
+}""",
+    "lpips": """@inproceedings{zhang2018lpips,
+  title = {The Unreasonable Effectiveness of Deep Features as a Perceptual Metric},
+  author = {Zhang, Richard and Isola, Phillip and Efros, Alexei A. and Shechtman, Eli and Wang, Oliver},
+  booktitle = {CVPR},
+  year = {2018}
+}""",
+    "total variation": """@article{chambolle2011primaldual,
+  title = {A First-Order Primal-Dual Algorithm for Convex Problems with Applications to Imaging},
+  author = {Chambolle, Antonin and Pock, Thomas},
+  journal = {Journal of Mathematical Imaging and Vision},
+  volume = {40}, number = {1}, pages = {120--145},
+  year = {2011}
+}""",
+    "photograph": """@article{saunders2019periscopy,
+  title = {Computational Periscopy with an Ordinary Digital Camera},
+  author = {Saunders, Charles and Murray-Bruce, John and Goyal, Vivek K.},
+  journal = {Nature},
+  volume = {565}, pages = {472--475},
+  year = {2019}
+}""",
 }  # fmt: skip
 """BibTeX entries by what they are for."""
 
@@ -97,7 +131,7 @@ def entries_for(path: str | Path | None = None) -> dict[str, str]:
     values = read_yaml(found)
     wanted = {"evnlos", "epnp"}
     if found.name == "run.yaml":
-        wanted |= {"network", "optimiser", "time surface", "ssim"}
+        wanted |= {"network", "optimiser", "time surface", "ssim", "haarpsi", "gmsd", "lpips"}
     simulation = values.get("config", values) if isinstance(values.get("config", values), dict) else values
     wanted |= _of_simulation(simulation)
     return {name: text for name, text in ENTRIES.items() if name in wanted}

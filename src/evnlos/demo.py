@@ -13,6 +13,7 @@ from evnlos.dataset.importer import character_of
 from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.presets import default
 from evnlos.errors import CalibrationError
+from evnlos.evaluation.identify_source import described_rig
 from evnlos.experiment import Arm, Place, Step, Study, gain_table, read_records, run_study, show
 from evnlos.model import UNetConfig
 from evnlos.report import gather, to_text, write_report
@@ -86,7 +87,8 @@ def run_demo(settings: Demo) -> Path:
     single = [record for record in records if record.arm in [arm.name for arm in study.arms]]
     runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
     dataset, results = gather(runs, out / "shots" / single[0].settings["captures"])
-    path = write_report(out / "report.html", dataset, results, notes)
+    rig = described_rig(out / "rigs" / study.rig / "rig.yaml") if settings.calibrate else None
+    path = write_report(out / "report.html", dataset, results, notes, rig=rig)
     for note in notes:
         print(note)
     print(to_text(results))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
+import os
 import platform
 import shutil
 import sys
@@ -46,8 +48,18 @@ _EXTRAS = {
 
 def examine() -> list[Part]:
     """Return all parts, needed ones first."""
-    checks: list[Callable[[], Part]] = [_python, _torch, _numba, _hdf5, _fonts, _comic, _disk]
-    return [*(check() for check in checks), *(_extra(module) for module in _EXTRAS)]
+    checks = {"python": _python, "torch": _torch, "numba": _numba, "hdf5": _hdf5, "fonts": _fonts}
+    checks |= {"reader": _reader, "GPU": _gpu, "LPIPS": _lpips, "comic face": _comic, "disk": _disk}
+    return [*(_tried(*check) for check in checks.items()), *(_extra(module) for module in _EXTRAS)]
+
+
+def _tried(name: str, check: Callable[[], Part]) -> Part:
+    """Return what a check finds; one that fails itself is a part that is broken."""
+    try:
+        return check()
+    except Exception as error:
+        cure = "reinstall evnlos and what it needs: pip install --force-reinstall evnlos"
+        return Part(name, False, f"{type(error).__name__}: {error}", cure, needed=True)
 
 
 def _python() -> Part:
@@ -59,20 +71,22 @@ def _python() -> Part:
 def _torch() -> Part:
     import torch
 
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
     capability = torch.backends.cpu.get_cpu_capability()
     value = float(torch.ones(3, 3).matmul(torch.ones(3, 3)).sum())
-    found = f"torch {torch.__version__}, {device}, CPU {capability}, {torch.get_num_threads()} threads"
+    found = f"torch {torch.__version__}, CPU {capability}, {torch.get_num_threads()} threads"
     return Part("torch", value == 27.0, found, "" if value == 27.0 else "reinstall torch", needed=True)
 
 
 def _numba() -> Part:
-    """Compile a small kernel and see that the cache beside the package can be written."""
+    """Compile a small kernel and see that the folder where numba keeps those of the package can be written."""
     import numba
 
+    from evnlos.sensor import _order
+
     compiled = numba.njit(lambda x: x + 1)(1) == 2
-    cache = Path(__file__).parent / "sensor" / "__pycache__"
-    writable = _can_write(cache if cache.is_dir() else cache.parent)
+    cache = Path(next(kernel.stats.cache_path for kernel in vars(_order).values() if hasattr(kernel, "stats")))
+    cache.mkdir(parents=True, exist_ok=True)
+    writable = _can_write(cache)
     cure = (
         "" if writable else "set NUMBA_CACHE_DIR to a folder that you may write: kernels compile anew each run"
     )
@@ -105,6 +119,44 @@ def _fonts() -> Part:
     return Part("fonts", not missing, found, cure, needed=True)
 
 
+def _reader() -> Part:
+    """Load the weights that the package brings: those of the reader of characters."""
+    from evnlos.evaluation.classifier import load_reader
+
+    try:
+        size = sum(values.numel() for values in load_reader().parameters())
+    except EvnlosError as error:
+        return Part("reader", False, str(error), "reinstall evnlos: its weights are damaged", needed=True)
+    return Part("reader", True, f"{size:,} weights that tell whether a picture can be read")
+
+
+def _gpu() -> Part:
+    import torch
+
+    if not torch.cuda.is_available():
+        cure = "needed for long trainings only: install a driver, and torch's build for it"
+        return Part("GPU", False, "none that torch can use; the CPU does everything", cure)
+    name = torch.cuda.get_device_name()
+    try:
+        value = float(torch.ones(3, 3, device="cuda").matmul(torch.ones(3, 3, device="cuda")).sum())
+    except RuntimeError as error:
+        value, name = 0.0, f"{name}: {str(error).splitlines()[0]}"
+    good = value == 27.0
+    cure = "" if good else "install torch's build for this GPU and driver, or hide it: CUDA_VISIBLE_DEVICES=''"
+    return Part("GPU", good, name, cure)
+
+
+def _lpips() -> Part:
+    from evnlos.evaluation import load_lpips
+
+    try:
+        load_lpips(os.environ.get("EVNLOS_VGG16"))
+    except EvnlosError as error:
+        cure = "put the trunk into torch's hub cache or name it in EVNLOS_VGG16; pip install lpips"
+        return Part("LPIPS", False, str(error).split("; give")[0].removeprefix("LPIPS: "), cure)
+    return Part("LPIPS", True, "trunk and heads are there")
+
+
 def _comic() -> Part:
     from evnlos.scene.fonts import find_font
 
@@ -126,13 +178,14 @@ def _disk() -> Part:
 
 def _extra(module: str) -> Part:
     extra, use = _EXTRAS[module]
-    there = importlib.util.find_spec(module) is not None
-    return Part(
-        f"[{extra}]",
-        there,
-        use if there else f"not installed; {use}",
-        "" if there else f"pip install evnlos[{extra}]",
-    )
+    if importlib.util.find_spec(module) is None:
+        return Part(f"[{extra}]", False, f"not installed; {use}", f"pip install evnlos[{extra}]")
+    try:
+        version = importlib.metadata.version(module)
+    except importlib.metadata.PackageNotFoundError:
+        cure = f"pip install --force-reinstall evnlos[{extra}]"
+        return Part(f"[{extra}]", False, f"{module} is there without its metadata; {use}", cure)
+    return Part(f"[{extra}]", True, f"{use} ({module} {version})")
 
 
 def _can_write(folder: Path) -> bool:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from evnlos.calibration.settings import PRESETS, Calibration
-from evnlos.cli.console import Flat, Folders, say
+from evnlos.cli.console import Flat, Folders
+from evnlos.cli.notes import say
 
 __all__ = ["PRESETS", "Command"]
 

@@ -1,11 +1,11 @@
-"""What the commands share: flat settings, progress bars, notes on stderr."""
+"""What the commands share: flat settings, progress bars, results as JSON."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Iterator
+import json
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from tqdm import tqdm
@@ -19,9 +19,9 @@ Flat = Annotated[T, tyro.conf.arg(name="")]
 """Settings whose flags carry no prefix."""
 
 
-def say(text: str) -> None:
-    """Print a note on stderr, so that stdout stays for results."""
-    print(text, file=sys.stderr)
+def result(as_json: bool, values: Mapping[str, Any], text: str) -> None:
+    """Print a command's result on stdout: its values as one JSON object, or a line for people."""
+    print(json.dumps(values, default=str) if as_json else text)
 
 
 def progress(steps: Iterable[T], total: int, unit: str, out: Path) -> Iterator[T]:

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from evnlos.cli.console import Flat, say
+from evnlos.cli.console import Flat, result
 from evnlos.cli.event_files import EventFile, Reading, Taking, amount, counted, refuse_existing
+from evnlos.cli.notes import say
 from evnlos.errors import ConfigError
 from evnlos.events import EventWriter
 from evnlos.events.io.report import OnError
@@ -33,6 +34,8 @@ class Command:
     """Leave out events whose polarity the camera did not give; RAW formats cannot hold them."""
     force: bool = False
     """Replace the file where it exists."""
+    json: bool = False
+    """Print one JSON object."""
 
     def run(self) -> None:
         """Convert, with a progress bar over the events."""
@@ -51,4 +54,7 @@ class Command:
             say(f"note: {report}")
         if report.geometry_from in ("assumed", "events"):
             say(f"note: the sensor size {report.width} x {report.height} is a guess; give --width and --height")
-        print(f"{self.out}: {writer.events:,} events, {amount(self.out.stat().st_size, 'B')}")
+        size = self.out.stat().st_size
+        about = {"out": str(self.out), "events": writer.events, "bytes": size, "faults": dict(report.faults)}
+        about |= {"width": report.width, "height": report.height, "geometry_from": report.geometry_from}
+        result(self.json, about, f"{self.out}: {writer.events:,} events, {amount(size, 'B')}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evnlos.cli.console import say
+from evnlos.cli.notes import say
 from evnlos.dataset import open_dataset
 from evnlos.evaluation import BASELINES, CHECKS
 from evnlos.model.confidence import COVERAGE

@@ -12,8 +12,8 @@ import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from evnlos.cli.console import say
 from evnlos.cli.event_files import amount, refuse_existing
+from evnlos.cli.notes import say
 from evnlos.cli.preview import look_of, write_preview
 from evnlos.config import load_yaml
 from evnlos.events import EventWriter

@@ -31,8 +31,10 @@ class Command:
     """`default`, or `paper` for the paper's 100 epochs at 1e-5 with its loss."""
     config: Path | None = None
     """YAML file with settings."""
+    json: bool = False
+    """Print one JSON object."""
     settings: Flat[Training] = field(default_factory=finetuning)
 
     def run(self) -> None:
         """Train, with a progress bar over the epochs."""
-        fit(open_dataset(self.data), self.settings, self.out, self.weights)
+        fit(open_dataset(self.data), self.settings, self.out, self.weights, self.json)

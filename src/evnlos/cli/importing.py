@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from evnlos.cli.console import Folders, progress
+from evnlos.cli.console import Folders, progress, result
 from evnlos.dataset import Capture, Sampling, check_picture, import_captures, load_pattern, open_dataset
 
 
@@ -29,6 +29,8 @@ class Command:
     check_pictures: bool = True
     """Draw one picture a capture (frame, events, both, curves over time) into the folder checks of the
     dataset."""
+    json: bool = False
+    """Print one JSON object."""
     sampling: Sampling = field(default_factory=Sampling)
     """Resolution and representation."""
 
@@ -47,8 +49,9 @@ class Command:
             pass
         dataset = open_dataset(self.out)
         counts = ", ".join(f"{len(names)} {split}" for split, names in dataset.split.items())
-        print(f"{self.out}: {len(dataset.objects())} captures ({counts})")
-        if self.check_pictures:
+        text = f"{self.out}: {len(dataset.objects())} captures ({counts})"
+        result(self.json, {"out": str(self.out), "split": dataset.split}, text)
+        if self.check_pictures and not self.json:
             print(f"check pictures: {self.out / 'checks'}")
 
     def _look(self, capture: Capture) -> None:

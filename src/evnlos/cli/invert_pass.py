@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.cli.console import say
+from evnlos.cli.notes import say
 from evnlos.config import load_yaml
 from evnlos.dataset import Capture, Simulation, load_pattern, read_capture
 from evnlos.dataset.sampling import Sampling

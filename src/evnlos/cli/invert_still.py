@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from evnlos.calibration.scan.importer import fill_bad
-from evnlos.cli.console import say
+from evnlos.cli.notes import say
 from evnlos.dataset.frame_sources import read_image
 from evnlos.errors import ConfigError
 from evnlos.solver.inversion import Inversion, chosen_degree

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from evnlos.cli.console import Flat, progress, say
+from evnlos.cli.console import Flat, progress
+from evnlos.cli.notes import say
 from evnlos.dataset.lab import Lab, lab_preset, render_captures
 from evnlos.transport.rig import rig_names
 

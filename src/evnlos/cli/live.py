@@ -10,7 +10,8 @@ from typing import Annotated
 
 import tyro
 
-from evnlos.cli.console import Flat, say
+from evnlos.cli.console import Flat
+from evnlos.cli.notes import say
 from evnlos.config import write_atomically
 from evnlos.errors import ConfigError
 from evnlos.live.run import Pace, Run

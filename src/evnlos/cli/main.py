@@ -9,6 +9,7 @@ from typing import Any
 
 import tyro
 
+from evnlos.cli.notes import FLAG, LEVELS, LOG, VARIABLE, listen
 from evnlos.cli.verbs import VERBS, module_of
 from evnlos.config import load_yaml
 from evnlos.errors import ConfigError, EvnlosError
@@ -17,7 +18,11 @@ from evnlos.version import __version__
 
 def main(argv: list[str] | None = None) -> None:
     """Run a command; bad input ends with one line on stderr and exit code 2."""
-    arguments = sys.argv[1:] if argv is None else argv
+    try:
+        arguments = listen(sys.argv[1:] if argv is None else argv)
+    except ConfigError as error:
+        print(f"evnlos: error: {error}", file=sys.stderr)
+        sys.exit(2)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return
@@ -33,13 +38,16 @@ def main(argv: list[str] | None = None) -> None:
         # The kinds of glyphs and transport come from preset or file; flags change the numbers of that kind.
         quiet = (tyro.conf.AvoidSubcommands,)
         command = tyro.cli(module.Command, args=rest, prog=f"evnlos {verb}", default=default, config=quiet)
+        LOG.debug("%s", command)
         command.run()
     except EvnlosError as error:
+        LOG.debug("where the error came from", exc_info=True)
         print(f"evnlos {verb}: error: {error}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:
         sys.exit(1)
     except OSError as error:
+        LOG.debug("where the error came from", exc_info=True)
         print(f"evnlos {verb}: error: {error}; nothing half-written was left", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
@@ -81,4 +89,6 @@ def _overview() -> str:
     lines.append("usage: evnlos COMMAND [options]; evnlos COMMAND --help shows units and defaults")
     lines.append("")
     lines += [f"  {verb:<12} {module_of(verb).Command.__doc__.splitlines()[0]}" for verb in VERBS]
+    lines.append("")
+    lines.append(f"with every command: {FLAG} {{{','.join(LEVELS)}}}, or the variable {VARIABLE}; --version")
     return "\n".join(lines)

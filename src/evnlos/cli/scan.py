@@ -11,7 +11,8 @@ import tyro
 
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
-from evnlos.cli.console import Flat, say
+from evnlos.cli.console import Flat
+from evnlos.cli.notes import say
 from evnlos.config import to_dict
 
 if TYPE_CHECKING:

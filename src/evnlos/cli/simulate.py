@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from evnlos.cli.console import Flat, progress, say
+from evnlos.cli.console import Flat, progress, result
+from evnlos.cli.notes import say
 from evnlos.dataset import Simulation, open_dataset, simulate
 from evnlos.dataset.cluster import run_on_dask
 from evnlos.dataset.estimate import estimate
@@ -39,6 +40,8 @@ class Command:
     """Address of a running Dask scheduler, e.g. tcp://node1:8786; by default a cluster on this machine."""
     dry_run: bool = False
     """Only simulate one object and print what the whole would take: time, disk, memory."""
+    json: bool = False
+    """Print one JSON object."""
     settings: Flat[Simulation] = field(default_factory=Simulation)
 
     def run(self) -> None:
@@ -60,10 +63,10 @@ class Command:
         made = simulate(config, self.out, self.workers, share, engine)
         for _ in progress(made, len(range(share[0] - 1, total, share[1])), "objects", self.out):
             pass
-        dataset = open_dataset(self.out)
-        print(
-            f"{self.out}: {total} objects, {total * config.positions} samples, {len(dataset.missing())} missing"
-        )
+        missing = open_dataset(self.out).missing()
+        about = {"out": str(self.out), "objects": total, "samples": total * config.positions}
+        text = f"{self.out}: {total} objects, {total * config.positions} samples, {len(missing)} missing"
+        result(self.json, about | {"missing": missing}, text)
 
 
 def _share(text: str) -> tuple[int, int]:

@@ -9,7 +9,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from evnlos.cli.console import Flat, say
+from evnlos.cli.console import Flat, result
+from evnlos.cli.notes import say
 from evnlos.config import load_yaml
 from evnlos.dataset import Dataset, Simulation, live_dataset, open_dataset
 from evnlos.errors import ConfigError
@@ -35,6 +36,8 @@ class Command:
     """`default`, or `paper` for the paper's 200 epochs, step sizes and loss."""
     config: Path | None = None
     """YAML file with settings."""
+    json: bool = False
+    """Print one JSON object."""
     settings: Flat[Training] = field(default_factory=Training)
 
     def run(self) -> None:
@@ -42,14 +45,14 @@ class Command:
         if (self.data is None) == (self.simulate is None):
             raise ConfigError("give --data DATASET or --simulate SETTINGS.yaml, one of the two")
         if self.data is not None:
-            fit(open_dataset(self.data), self.settings, self.out, None)
+            fit(open_dataset(self.data), self.settings, self.out, None, self.json)
         else:
             assert self.simulate is not None
             config = load_yaml(Simulation, self.simulate)
-            fit(live_dataset(config, self.workers), self.settings, self.out, None)
+            fit(live_dataset(config, self.workers), self.settings, self.out, None, self.json)
 
 
-def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None) -> None:
+def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, as_json: bool) -> None:
     """Train with a progress bar over the epochs, and warn of a network that ignores its input.
 
     Of several processes that `torchrun` started, only the first speaks.
@@ -67,4 +70,6 @@ def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None) -
             f"warning: the network answers the same to every input ({record['psnr_db']} dB; all-black has "
             f"{record['zero_db']} dB): it has collapsed; use --loss balanced, or train for more epochs"
         )
-    print(f"{out}: {record['epoch']} epochs, loss {record['loss']}, weights in {out / 'weights.safetensors'}")
+    file = out / "weights.safetensors"
+    text = f"{out}: {record['epoch']} epochs, loss {record['loss']}, weights in {file}"
+    result(as_json, {"run": str(out), "weights": str(file), **record}, text)

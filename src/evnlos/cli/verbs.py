@@ -32,6 +32,7 @@ VERBS: dict[str, str] = {
     "app": "app",
     "cite": "cite",
     "doctor": "doctor",
+    "completion": "completion",
 }
 """The module of each verb in `evnlos.cli`; it holds `Command`, and `PRESETS` where settings have presets."""
 

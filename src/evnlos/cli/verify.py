@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,7 @@ from typing import Annotated
 import tyro
 from tqdm import tqdm
 
+from evnlos.cli.console import result
 from evnlos.dataset import open_dataset
 from evnlos.dataset.verify import find_faults, repair
 from evnlos.errors import DataError
@@ -24,6 +26,8 @@ class Command:
     """Simulate faulty and missing objects again."""
     workers: int = 0
     """Processes for the repair; 0 = one for each core."""
+    json: bool = False
+    """Print one JSON object."""
 
     def run(self) -> None:
         """Check, report, and repair where asked."""
@@ -31,15 +35,20 @@ class Command:
         total = len(dataset.objects())
         found = tqdm(find_faults(dataset), total=total, unit=" objects", desc=self.dataset.name)
         faults = [fault for fault in found if fault is not None]
-        for fault in faults:
-            print(f"{dataset.shard(fault.name)}: {fault.reason}")
+        about = {"dataset": str(self.dataset), "objects": total, "faults": {f.name: f.reason for f in faults}}
+        if not self.json:
+            for fault in faults:
+                print(f"{dataset.shard(fault.name)}: {fault.reason}")
         if not faults:
-            print(f"{self.dataset}: {total} objects, all whole")
+            result(self.json, about | {"repaired": 0}, f"{self.dataset}: {total} objects, all whole")
         elif not self.repair:
+            if self.json:
+                print(json.dumps(about | {"repaired": 0}))
             raise DataError(
                 f"{self.dataset}: {len(faults)} of {total} shards are faulty; --repair makes them again"
             )
         else:
             made = repair(dataset, faults, self.workers)
             count = sum(1 for _ in tqdm(made, total=len(faults), unit=" objects", desc="repair"))
-            print(f"{self.dataset}: {count} of {len(faults)} faulty shards made again")
+            text = f"{self.dataset}: {count} of {len(faults)} faulty shards made again"
+            result(self.json, about | {"repaired": count}, text)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from evnlos.errors import MissingDependencyError
 
@@ -18,3 +18,20 @@ def new_figure(size: tuple[float, float]) -> Any:
     except ImportError:
         raise MissingDependencyError("figures need matplotlib: pip install 'evnlos[plot]'") from None
     return Figure(size, layout="constrained")
+
+
+def themed(theme: Literal["light", "dark"]) -> Any:
+    """Return a context in which figures are made and saved on a light or a dark ground.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    new_figure((1.0, 1.0))  # or the line that says what to install
+    from matplotlib import rc_context
+
+    ink, ground = ("#e2e5eb", "#0e1014") if theme == "dark" else ("#1d2126", "#ffffff")
+    keys = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
+    return rc_context(
+        dict.fromkeys(keys, ink)
+        | dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), ground)
+    )

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import html
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 
 from evnlos.config import write_atomically
 from evnlos.dataset import Dataset, character_of, read_shard
 from evnlos.evaluation import CHECKS
+from evnlos.evaluation.identify import Identification
+from evnlos.evaluation.identify_source import Described
 from evnlos.report.curves import curves_svg
+from evnlos.report.films import animations_section, failures_section, strips_section
 from evnlos.report.gather import RunResult
 from evnlos.report.lead import lead
+from evnlos.report.origin import origin_section
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
+from evnlos.report.setup import limits_section, setup_section
 from evnlos.report.tables import (
     available_metrics,
     baselines_of,
@@ -32,7 +35,13 @@ _STYLE = Path(__file__).parent / "style.css"
 
 
 def write_report(
-    path: str | Path, dataset: Dataset, results: list[RunResult], notes: list[str], split: str = "test"
+    path: str | Path,
+    dataset: Dataset,
+    results: list[RunResult],
+    notes: list[str],
+    split: str = "test",
+    rig: Described | None = None,
+    limits: Identification | None = None,
 ) -> Path:
     """Write the report and, beside it, its numbers as CSV.
 
@@ -42,6 +51,8 @@ def write_report(
         results: Evaluated runs; all on the same split.
         notes: Sentences that a reader must know, e.g. that the captures are rendered.
         split: Name of the split.
+        rig: The rig of the recordings, to be drawn; None where it is unknown.
+        limits: What `identify` found on the rig.
 
     Returns:
         The path of the page.
@@ -54,13 +65,18 @@ def write_report(
             "<meta name=viewport content='width=device-width,initial-scale=1'>",
             f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
             _head(dataset, results, notes, split),
+            setup_section(rig.name if rig else "", rig.transport if rig else None),
             lead(results),
             *(_table(results, metric, *about) for metric, about in available_metrics(results).items()),
             _checks(results),
             _pictures(dataset, results),
+            animations_section(dataset, results),
+            strips_section(results),
+            failures_section(results),
+            limits_section(limits),
             _curves(results),
             _optics(dataset, results),
-            _provenance(dataset, results),
+            origin_section(dataset, results, split),
             "</html>",
         ]
     )
@@ -186,11 +202,3 @@ def _optics(dataset: Dataset, results: list[RunResult]) -> str:
         "radius of the tPSF in camera pixels; distance up to which the sampled wave is true, in metres.</p>"
         f"<table><tr><th>dataset</th><th></th><th></th></tr>{''.join(lines)}</table>"
     )
-
-
-def _provenance(dataset: Dataset, results: list[RunResult]) -> str:
-    about: dict[str, Any] = {"dataset": {"name": dataset.folder.resolve().name, "settings": dataset.config}}
-    about["runs"] = {label(r): r.history for r in results}
-    text = yaml.safe_dump(about, sort_keys=False, allow_unicode=True)
-    summary = "<details><summary>Settings and versions</summary>"
-    return f"<h2>How it was made</h2>{summary}<pre>{html.escape(text)}</pre></details>"

@@ -65,9 +65,21 @@ def save_png(path: str | Path, picture: NDArray[np.uint8], zoom: int = 1) -> Non
 def save_animation(
     path: str | Path, pictures: Sequence[NDArray[np.uint8]], rate_hz: float, zoom: int = 1
 ) -> None:
-    """Write pictures as an animated GIF that repeats, at most 50 pictures a second, atomically."""
+    """Write pictures as an animation that repeats, at most 50 pictures a second, atomically.
+
+    A file that ends in .webp is a WebP, a few times smaller and not exact; any other a GIF.
+    """
+    write_atomically(path, animation(pictures, rate_hz, zoom, webp=Path(path).suffix.lower() == ".webp"))
+
+
+def animation(
+    pictures: Sequence[NDArray[np.uint8]], rate_hz: float, zoom: int = 1, webp: bool = False
+) -> bytes:
+    """Return pictures as the bytes of an animated GIF or WebP that repeats."""
     pause_ms = max(round(1000 / rate_hz), 20)
-    write_atomically(path, _encoded(pictures, "GIF", zoom, duration=pause_ms, loop=0))
+    if webp:
+        return _encoded(pictures, "WEBP", zoom, duration=pause_ms, loop=0, quality=70, method=4)
+    return _encoded(pictures, "GIF", zoom, duration=pause_ms, loop=0)
 
 
 def data_uri(content: bytes, kind: str = "image/png") -> str:
@@ -87,5 +99,5 @@ def _encoded(pictures: Sequence[NDArray[np.uint8]], kind: str, zoom: int, **opti
         options["save_all"] = True
         images[0].save(buffer, kind, append_images=images[1:], **options)
     else:
-        images[0].save(buffer, kind)
+        images[0].save(buffer, kind, **options)
     return buffer.getvalue()

@@ -1,0 +1,41 @@
+"""`evnlos completion`: a script that completes commands and flags."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+Shell = Literal["bash", "zsh", "fish"]
+
+
+@dataclass(frozen=True)
+class Command:
+    """Print a script that completes commands, flags and choices: evnlos completion bash >> ~/.bashrc."""
+
+    shell: Annotated[Shell, tyro.conf.Positional] = "bash"
+    """Shell that the script is for."""
+
+    def run(self) -> None:
+        """Print the script."""
+        print(script(self.shell))
+
+
+def script(shell: Shell) -> str:
+    """Return the completion script of all commands for a shell."""
+    from evnlos.cli.verbs import VERBS, module_of
+
+    commands = {verb: module_of(verb).Command for verb in VERBS}
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        tyro.extras.subcommand_cli_from_dict(
+            commands,
+            prog="evnlos",
+            args=["--tyro-print-completion", shell],
+            config=(tyro.conf.AvoidSubcommands,),
+        )
+    # Where nothing of ours fits, bash offers files.
+    return printed.getvalue().replace("complete -F ", "complete -o default -F ")

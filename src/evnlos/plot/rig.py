@@ -1,0 +1,150 @@
+"""The set-up of a rig, to scale, seen from above; SVG in the colours of the page that it stands on."""
+
+from __future__ import annotations
+
+import html
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.transport import PaperTransport, RadiometricTransport
+
+_WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
+_LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # told apart with every common kind of colour blindness
+_STEPS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """An SVG drawing; a notebook shows it as a picture.
+
+    Args:
+        svg: The drawing.
+    """
+
+    svg: str
+
+    def _repr_svg_(self) -> str:
+        return self.svg
+
+
+def rig_drawing(
+    rig: RadiometricTransport | PaperTransport, travel_m: float = 0.16, plate_m: float = 0.08
+) -> Drawing:
+    """Return the rig from above, to scale: wall, object and its way, cameras and their view, what is between.
+
+    Where the paper's transport has no place of the camera, none is drawn.
+
+    Args:
+        rig: The rig.
+        travel_m: Way of the object's middle, metres.
+        plate_m: Side of the object's plate, metres.
+
+    Example:
+        >>> rig_drawing(RadiometricTransport()).svg[:4]
+        '<svg'
+    """
+    parts, around = [], []  # drawn in metres first: (kind, points, style or words)
+    middle, deep = _object(rig)
+    half = (travel_m + plate_m) / 2
+    parts.append(
+        ("line", [(middle - half, deep), (middle + half, deep)], f"stroke='{_LIGHT}' stroke-dasharray='2 3'")
+    )
+    parts.append(
+        (
+            "line",
+            [(middle - plate_m / 2, deep), (middle + plate_m / 2, deep)],
+            f"stroke='{_LIGHT}' stroke-width='4'",
+        )
+    )
+    parts.append(("text", [(middle, deep)], f"object {100 * plate_m:g} cm, way {100 * travel_m:g} cm"))
+    reach = max(half + abs(middle) + 0.04, 0.2)
+    around += [(middle - half, deep), (middle + half, deep)]
+    if isinstance(rig, RadiometricTransport):
+        angle, fov = math.radians(rig.camera_angle_deg), math.radians(rig.field_of_view_deg)
+        eye = (rig.camera_distance_m * math.sin(angle), rig.camera_distance_m * math.cos(angle))
+        seen = [(eye[0] - eye[1] * math.tan(angle + side * fov / 2), 0.0) for side in (1, -1)]
+        reach = max(reach, *(abs(x) + 0.02 for x, _ in seen))
+        parts += [("line", [eye, one], f"stroke='{_SIGHT}' stroke-width='1'") for one in seen]
+        parts.append(("disc", [eye], f"fill='{_SIGHT}'"))
+        parts.append(
+            ("text", [eye], f"cameras, {100 * rig.camera_distance_m:g} cm, {rig.camera_angle_deg:g} deg")
+        )
+        for occluder in rig.occluders():
+            corners = np.asarray(occluder.vertices_m)[:, [0, 2]]
+            parts.append(
+                ("line", [tuple(c) for c in (*corners, corners[0])], "stroke='currentColor' stroke-width='3'")
+            )
+        if rig.lamp_m is not None:
+            lamp = (rig.lamp_m[0], rig.lamp_m[2])
+            parts += [("disc", [lamp], f"fill='{_LIGHT}'"), ("text", [lamp], "lamp")]
+            around.append(lamp)
+        parts.append(
+            (
+                "line",
+                [(middle, deep), (0.0, 0.0), eye],
+                f"stroke='{_LIGHT}' stroke-width='.8' stroke-dasharray='6 4'",
+            )
+        )
+        around += [eye, *seen]
+    parts.append(("line", [(-reach, 0.0), (reach, 0.0)], "stroke='currentColor' stroke-width='5'"))
+    around += [(-reach, 0.0), (reach, 0.0)]
+    return Drawing(_svg(parts, np.array(around), _words(rig), deep))
+
+
+def _object(rig: RadiometricTransport | PaperTransport) -> tuple[float, float]:
+    """Return where the middle of the object's way is, x and z, metres."""
+    return (rig.offset_m()[0] if isinstance(rig, RadiometricTransport) else 0.0), rig.distance_m
+
+
+def _words(rig: RadiometricTransport | PaperTransport) -> str:
+    if isinstance(rig, PaperTransport):
+        return f"relay wall (the paper's kernel, {1e3 * rig.tpsf_length_m:g} mm a unit of rho)"
+    return (
+        "relay wall, matte"
+        if rig.wall_material == "lambert"
+        else f"relay wall, metal of roughness {rig.roughness:g}"
+    )
+
+
+def _svg(parts: list, around: NDArray[np.float64], wall: str, deep: float) -> str:
+    low, high = around.min(axis=0), around.max(axis=0)
+    scale = min(
+        (_WIDTH - 2 * _MARGIN) / (high[0] - low[0]), (_HEIGHT - 2 * _MARGIN - 26) / max(high[1] - low[1], 1e-9)
+    )
+
+    def place(point: tuple[float, float]) -> tuple[float, float]:
+        return _MARGIN + (point[0] - low[0]) * scale, _MARGIN + (point[1] - low[1]) * scale
+
+    drawn = []
+    for kind, points, style in parts:
+        at = [place(point) for point in points]
+        if kind == "line":
+            drawn.append(
+                f"<polyline points='{' '.join(f'{x:.1f},{y:.1f}' for x, y in at)}' fill='none' {style}/>"
+            )
+        elif kind == "disc":
+            drawn.append(f"<circle cx='{at[0][0]:.1f}' cy='{at[0][1]:.1f}' r='6' {style}/>")
+        else:
+            x = min(max(at[0][0], 90), _WIDTH - 110)
+            drawn.append(_text(x, at[0][1] + 20, style))
+    drawn.append(_text(place((0.0, 0.0))[0], _MARGIN - 16, wall))
+    x, top, bottom = place((low[0], 0.0))[0] + 12, place((0.0, 0.0))[1] + 4, place((0.0, deep))[1]
+    drawn.append(f"<path d='M{x:.1f} {top:.1f}V{bottom:.1f}' stroke='currentColor' stroke-width='.8' />")
+    drawn.append(_text(x + 5, (top + bottom) / 2, f"{100 * deep:g} cm", "start"))
+    step = max((one for one in _STEPS_M if one * scale <= 150), default=_STEPS_M[0])
+    left, foot = _MARGIN, _HEIGHT - 14
+    drawn.append(f"<path d='M{left} {foot - 4}v4h{step * scale:.1f}v-4' fill='none' stroke='currentColor' />")
+    drawn.append(_text(left + step * scale + 8, foot, f"{100 * step:g} cm; seen from above, to scale", "start"))
+    return (
+        f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {_WIDTH} {_HEIGHT}' width='{_WIDTH}' role='img' "
+        f"aria-label='set-up, to scale' font-family='sans-serif' font-size='12'>{''.join(drawn)}</svg>"
+    )
+
+
+def _text(x: float, y: float, words: str, anchor: str = "middle") -> str:
+    return (
+        f"<text x='{x:.1f}' y='{y:.1f}' text-anchor='{anchor}' fill='currentColor'>{html.escape(words)}</text>"
+    )

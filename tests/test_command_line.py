@@ -1,0 +1,121 @@
+"""The habits of the command line: completion, log levels, JSON on stdout, documented variables."""
+
+import json
+import logging
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import evnlos
+from evnlos import Events, doctor, write_events
+from evnlos.cli import VERBS, main
+from evnlos.cli.completion import script
+from evnlos.cli.notes import say
+from evnlos.cli.verbs import module_of
+
+SOURCE = Path(evnlos.__file__).parent
+PAGE = (SOURCE.parent.parent / "docs" / "command_line.md").read_text()
+
+
+@pytest.fixture
+def recording(tmp_path) -> Path:
+    path = tmp_path / "events.npz"
+    write_events(path, Events([1, 2, 9], [0, 1, 2], [0, 1, 1], [1, 0, 1], width=4, height=3))
+    return path
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_commands_flags_and_choices(tmp_path) -> None:
+    (tmp_path / "completion").write_text(script("bash"))
+    (tmp_path / "some_file").touch()
+    cases = {
+        "evnlos tra": "train",
+        "evnlos train --netw": "--network.width",
+        "evnlos train --paradigm ": "fusion",
+    }
+    ask = '. ./completion; read -ra COMP_WORDS <<< "$0"; [[ "$0" = *" " ]] && COMP_WORDS+=(""); '
+    ask += 'COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); _tyro_evnlos; printf "%s\\n" "${COMPREPLY[@]}"'
+    for typed, offered in cases.items():
+        done = subprocess.run(["bash", "-c", ask, typed], capture_output=True, text=True, cwd=tmp_path)
+        assert offered in done.stdout.split(), (typed, done)
+    shown = subprocess.run(
+        ["bash", "-c", ". ./completion; complete -p evnlos"], capture_output=True, cwd=tmp_path
+    )
+    assert b"-o default" in shown.stdout  # files, where nothing else fits
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_the_completion_of_other_shells_knows_every_command(shell: str, capsys) -> None:
+    main(["completion", shell])
+    text = capsys.readouterr().out
+    assert not [verb for verb in VERBS if verb not in text]
+
+
+def test_log_levels(recording, monkeypatch, capsys) -> None:
+    def notes() -> str:
+        say("a note")
+        say("warning: a warning")
+        return capsys.readouterr().err
+
+    main(["cite"])
+    assert notes() == "a note\nwarning: a warning\n"
+    main(["cite", "--log-level", "warning"])
+    assert notes() == "warning: a warning\n"
+    monkeypatch.setenv("EVNLOS_LOG", "error")
+    main(["cite"])
+    assert notes() == ""
+    main(["--log-level=info", "cite"])
+    assert "a note" in notes()
+    monkeypatch.setenv("EVNLOS_LOG", "loud")
+    with pytest.raises(SystemExit) as stop:
+        main(["cite"])
+    assert stop.value.code == 2
+    assert "EVNLOS_LOG is 'loud'; give one of debug, info, warning, error" in capsys.readouterr().err
+    monkeypatch.delenv("EVNLOS_LOG")
+    with pytest.raises(SystemExit):
+        main(["info", "nowhere.raw", "--log-level", "debug"])
+    shown = capsys.readouterr().err
+    assert "Traceback" in shown and shown.splitlines()[-1].startswith("evnlos info: error: nowhere.raw")
+    main(["info", str(recording)])
+    assert len(logging.getLogger("evnlos").handlers) == 1
+
+
+def test_json_is_one_object(recording, tmp_path, capsys) -> None:
+    def printed(*words: object) -> dict:
+        capsys.readouterr()
+        main([*map(str, words), "--json"])
+        return json.loads(capsys.readouterr().out)
+
+    made = printed("convert", recording, tmp_path / "same.h5")
+    assert made["events"] == 3 and made["bytes"] == (tmp_path / "same.h5").stat().st_size
+    assert printed("cite")["evnlos"].startswith("@software{evnlos")
+
+
+def test_the_page_lists_the_commands_with_json() -> None:
+    with_json = {verb for verb in VERBS if "json" in module_of(verb).Command.__dataclass_fields__}
+    sentence = re.search(r"`--json` is there(.*?)`experiment`", PAGE, re.DOTALL)
+    assert sentence and set(re.findall(r"`(\w+)`", sentence[1])) == with_json
+
+
+def test_every_variable_that_is_read_is_documented() -> None:
+    used: set[str] = set()
+    for path in SOURCE.rglob("*.py"):
+        text = path.read_text()
+        used |= set(re.findall(r'environ(?:\.get\(|\[)"(\w+)"', text)) | set(
+            re.findall(r'"(EVNLOS_\w+)"', text)
+        )
+    assert {"EVNLOS_LOG", "EVNLOS_VGG16", "RANK"} <= used
+    assert not {name for name in used if f"`{name}`" not in PAGE}
+
+
+def test_the_doctor_survives_a_part_that_raises(monkeypatch) -> None:
+    def fails() -> doctor.Part:
+        raise ImportError("libcudart.so: cannot open shared object file")
+
+    monkeypatch.setattr(doctor, "_gpu", fails)
+    parts = {part.name: part for part in doctor.examine()}
+    assert parts["GPU"].needed and "ImportError: libcudart.so" in parts["GPU"].found and parts["GPU"].cure
+    assert parts["reader"].there and parts["numba"].there

@@ -1,0 +1,102 @@
+"""The pages are true: their Python prints what they say, their flags and error messages are the code's."""
+
+import ast
+import contextlib
+import io
+import re
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+import evnlos
+from evnlos.cli import VERBS
+from evnlos.cli.completion import script
+
+SOURCE = Path(evnlos.__file__).parent
+ROOT = SOURCE.parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", *DOCS.glob("*.md")])
+
+
+@pytest.mark.parametrize("name", ["quickstart", "units", "extending"])
+def test_python_on_a_page_prints_what_it_says(name: str, monkeypatch) -> None:
+    blocks = re.findall(r"```(\w*)\n(.*?)```", (DOCS / f"{name}.md").read_text(), flags=re.DOTALL)
+    names: dict = {"__name__": "page"}
+    monkeypatch.setitem(sys.modules, "page", type(sys)("page"))
+    pairs = [(code, printed) for (kind, code), (_, printed) in pairwise(blocks) if kind == "python"]
+    assert pairs
+    for code, printed in pairs:
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            exec(code, names)
+        assert out.getvalue() == printed
+
+
+def test_the_index_lists_every_page() -> None:
+    listed = set(re.findall(r"\]\(([\w.]+\.md)\)", (DOCS / "README.md").read_text()))
+    assert listed == {page.name for page in DOCS.glob("*.md")} - {"README.md"}
+    examples = set(
+        re.findall(r"\(\.\./(examples/\w+\.py|notebooks/\w+\.ipynb)\)", (DOCS / "README.md").read_text())
+    )
+    there = {*ROOT.glob("examples/[0-9]*.py"), *ROOT.glob("notebooks/*.ipynb")}
+    assert examples == {str(path.relative_to(ROOT)) for path in there}
+
+
+def test_headings_that_links_name_exist() -> None:
+    for page in PAGES:
+        for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", page.read_text()):
+            other = (page.parent / target) if target else page
+            heads = re.findall(r"^#+ (.*)$", other.read_text(), flags=re.MULTILINE)
+            slugs = {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+            assert anchor in slugs, f"{page.name} links to {target}#{anchor}"
+
+
+def commands_on(page: Path) -> list[str]:
+    """Return the commands that a page shows, in code set apart or in a line; continued lines joined."""
+    text = re.sub(r"\\\n\s*", " ", page.read_text())
+    shown = re.findall(r"^(?:    |> )?(evnlos [a-z].*)$", text, flags=re.MULTILINE)
+    shown += re.findall(r"`(evnlos [^`]*)`", text)
+    return [part.strip() for line in shown for part in re.split(r"&&|\||;|#", line) if "evnlos" in part]
+
+
+def test_every_flag_that_a_page_shows_exists() -> None:
+    spec = script("bash")
+    starts = {verb: spec.find(f"'{verb}': {{'description': ") for verb in VERBS}
+    order = sorted(starts.values())
+    flags = {}
+    for verb, start in starts.items():
+        assert start >= 0, verb
+        part = spec[start : next((other for other in order if other > start), len(spec))]
+        flags[verb] = set(re.findall(r"--[a-z][\w.-]*", " ".join(re.findall(r"'flags': \[(.*?)\]", part))))
+    assert "--network.rank" in flags["train"] and "--no-restandardise" in flags["finetune"]
+    checked, wrong = 0, []
+    for page in PAGES:
+        for command in commands_on(page):
+            verb = command.split()[1] if len(command.split()) > 1 else ""
+            for flag in re.findall(r"(?<=\s)--[a-z][\w.-]*", command):
+                checked += 1
+                if flag not in flags.get(verb, set()) | {"--help", "--version", "--log-level"}:
+                    wrong.append(f"{page.name}: {command}: {flag}")
+    assert checked > 150
+    assert not wrong
+
+
+def messages() -> list[str]:
+    """Return all texts in the code; what an f-string fills in is '...'."""
+    found = []
+    for path in SOURCE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                found.append("".join(v.value if isinstance(v, ast.Constant) else "..." for v in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
+
+
+def test_the_messages_of_the_questions_are_those_of_the_code() -> None:
+    known = set(messages())
+    quoted = re.findall(r"^> (.*)$", (DOCS / "faq.md").read_text(), flags=re.MULTILINE)
+    assert len(quoted) >= 15
+    assert not [line for line in quoted if line not in known]

@@ -1,0 +1,102 @@
+"""The page to mail: set-up, films, failures, limits and origin, small and without requests."""
+
+import html
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos.dataset import Sampling
+from evnlos.dataset.sampling import Samples
+from evnlos.dataset.shard import write_shard
+from evnlos.dataset.store import Dataset, create_dataset
+from evnlos.evaluation import Evaluation
+from evnlos.evaluation.identify import identify
+from evnlos.evaluation.identify_rig import Bench
+from evnlos.evaluation.identify_source import described_rig
+from evnlos.evaluation.score import score
+from evnlos.plot.rig import rig_drawing
+from evnlos.report import RunResult, write_report
+from evnlos.transport import PaperTransport, RadiometricTransport
+
+POSITIONS = 12
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Two objects, two runs: one adds noise to the truth, the other answers the same to everything."""
+    draw = np.random.default_rng(0)
+    sampling = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
+    names, truths = ["near_G", "near_K"], []
+    folder = tmp_path_factory.mktemp("shots") / "near"
+    data = Dataset(folder, "captures", sampling, {"train": [], "validation": [], "test": names})
+    create_dataset(data)
+    for name in names:
+        truth = (draw.random((POSITIONS, 32, 48)) > 0.8).astype(np.float32)
+        frame, surface = (
+            draw.random((POSITIONS, 32, 48), np.float32),
+            draw.random((POSITIONS, 2, 32, 48), np.float32),
+        )
+        times = np.arange(1.0, POSITIONS + 1)
+        samples = Samples(frame, surface, truth, times, np.zeros((POSITIONS, 2)), np.ones(POSITIONS, np.int64))
+        write_shard(data.shard(name), samples, {"object": name, "config_hash": ""})
+        truths.append(truth[:, sampling.scored])
+    truth = torch.from_numpy(np.concatenate(truths))
+    of = np.repeat(names, POSITIONS)
+    blank = {"zero": score(torch.zeros_like(truth), truth), "mean": score(truth.mean() + 0 * truth, truth)}
+    runs = []
+    for method, image in (("EPNP", (0.9 * truth)), ("E2E", torch.full_like(truth, 0.9))):
+        steps = [{"settings": {"epochs": 2}, "data": {"name": "sim", "origin": "simulation"}}] * (
+            method == "EPNP"
+        )
+        steps += [{"settings": {"epochs": 3}, "data": {"name": "near", "origin": "captures"}}]
+        found = Evaluation(image, truth, of, score(image, truth), blank)
+        runs.append(RunResult(method.lower(), "frame", method, found, [], steps))
+    return data, runs
+
+
+def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None:
+    data, runs = made
+    rig = described_rig("main-near")
+    limits = identify(rig.transport, rig.camera, Bench(cells=8, height=12, width=20, writers=1), "main-near")
+    path = write_report(tmp_path / "report.html", data, runs, [], rig=rig, limits=limits)
+    page = path.read_text()
+    assert path.stat().st_size < 5e6
+    assert not re.findall(r"(?:src|href)=['\"](?!data:)", page)
+    assert not re.findall(r"https?:", page.replace("http://www.w3.org/2000/svg", ""))
+    for heading in ("The set-up", "Moving", "Position by position", "Where it fails", "How it was made"):
+        assert f"<h2>{heading}</h2>" in page
+    assert "What this rig can show at all" in page and html.escape(limits.verdict) in page
+    assert "metal of roughness 0.05" in page
+    assert page.count("data:image/webp") == 2  # an animation an object
+    assert page.count("near_G: ") >= 3  # truth and both runs over positions
+    # The run that answers the same fails everywhere, and the page says so.
+    assert "E2E frame: 100% of its pictures are worse than the mean picture" in page
+    assert "EPNP frame: 0% of its pictures are worse than the mean picture" in page
+    worst = runs[1].evaluation.scores.psnr_db.min()
+    assert f"{worst:.1f} dB (" in page.split("Where it fails")[1]
+    shown = page.split("How it was made")[1]
+    assert "evnlos import near_G near_K --out near --test near_G near_K" in shown
+    assert "evnlos train --data sim --config epnp-1.yaml --out epnp-1" in shown
+    assert "evnlos finetune --data near --weights epnp-1 --config epnp.yaml --out epnp" in shown
+    assert "evnlos report epnp e2e --data near --split test --out report.html" in shown
+    assert "torch " in shown and "/tmp/" not in page.replace(str(tmp_path), "")
+
+
+def test_without_a_rig_the_page_says_how_to_name_it(made, tmp_path) -> None:
+    page = write_report(tmp_path / "report.html", *made, []).read_text()
+    assert "evnlos report --rig RIG.yaml" in page and "What this rig can show" not in page
+
+
+def test_the_drawing_of_a_rig_is_to_scale() -> None:
+    from xml.dom.minidom import parseString
+
+    for rig in (RadiometricTransport(distance_m=0.3), PaperTransport(distance_m=0.5)):
+        drawing = parseString(rig_drawing(rig, travel_m=0.16, plate_m=0.08).svg)
+        lines = [one.getAttribute("points") for one in drawing.getElementsByTagName("polyline")]
+        way, plate = (np.array([[float(v) for v in p.split(",")] for p in line.split()]) for line in lines[:2])
+        wall = np.array([[float(v) for v in p.split(",")] for p in lines[-1].split()])
+        length = float(np.ptp(plate[:, 0]))
+        assert np.ptp(way[:, 0]) == pytest.approx(3 * length, abs=0.3)  # 24 cm beside 8 cm
+        assert plate[0, 1] - wall[0, 1] == pytest.approx(length * rig.distance_m / 0.08, rel=0.01)
