@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from evnlos.solver import PlatePass
 from evnlos.solver.glyph_prior import handwritten_plates
@@ -113,6 +112,8 @@ class MovingLight:
 
     def explained(self, rig: RadiometricTransport) -> Explained:
         """Return how a rig explains the frames at its best gain and noise."""
+        from scipy.optimize import minimize  # scipy loads slowly
+
         terms = self.terms(rig)
         # The gain at which the mean plate alone moves as much as the frames, and a tenth of that as noise.
         power = float(terms.power.mean())
@@ -125,8 +126,17 @@ class MovingLight:
             options={"xatol": 1e-3, "fatol": 1e-9, "initial_simplex": start - np.eye(3, 2)},
         )
         gain, variance = math.exp(found.x[0]), math.exp(found.x[1])
+        plates = self._plates(terms, gain, variance)
+        return Explained(float(found.fun), gain, math.sqrt(variance), plates)
+
+    def explained_at(self, rig: RadiometricTransport, gain: float, noise: float) -> Explained:
+        """Return how a rig explains the frames at a gain and a noise that other passes told."""
+        terms, variance = self.terms(rig), noise**2
+        return Explained(terms.cost(gain, variance), gain, noise, self._plates(terms, gain, variance))
+
+    def _plates(self, terms: EvidenceTerms, gain: float, variance: float) -> torch.Tensor:
         plates = self._prior.mean + terms.code(gain, variance) @ terms.turn.mT @ self._prior.root.mT
-        return Explained(float(found.fun), gain, math.sqrt(variance), plates.unflatten(1, self.plate.shape))
+        return plates.unflatten(1, self.plate.shape)
 
     def terms(self, rig: RadiometricTransport) -> EvidenceTerms:
         """Return what the evidence of a rig is made of, all but gain and noise."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from evnlos.calibration.captures import Shots
 from evnlos.calibration.evidence import Explained, MovingLight
@@ -69,12 +68,13 @@ def fit_unlabelled(
     parameters = parameters_of(start, fixed)
     found = _search(light, _scanned(light, start), parameters, iterations)
     before, after = (_check(held, rig) for rig in (start, found))
-    noise = light.explained(found).noise / light.spread
-    seen, other = (_with_plates(part, _moving(part, slice(None)).explained(found)) for part in (fit, held))
+    known = light.explained(found)
+    unseen = _moving(held, slice(None)).explained_at(found, known.gain, known.noise)
+    seen, other = _with_plates(fit, known), _with_plates(held, unseen)
     full = FrameModel(seen, fit.shape, max(1, len(fit.frames()) // 200))
     lit = [full.fit(full.light(sampled(rig)))[0].into(sampled(rig)) for rig in (start, found)]
     optics = TransportFit(lit[0], lit[1], parameters, _errors(light, found, parameters))
-    return UnlabelledFit(optics, seen, other, Residual(before, after, noise))
+    return UnlabelledFit(optics, seen, other, Residual(before, after, known.noise / light.spread))
 
 
 def _moving(shots: Shots, frames: slice) -> MovingLight:
@@ -108,6 +108,8 @@ def _scanned(light: MovingLight, start: RadiometricTransport) -> RadiometricTran
 def _search(
     light: MovingLight, start: RadiometricTransport, parameters: tuple[Parameter, ...], iterations: int
 ) -> RadiometricTransport:
+    from scipy.optimize import minimize  # scipy loads slowly
+
     middle = np.array([p.encode(p.read(start)) for p in parameters])
     scale = np.array([_SCALE * p.step for p in parameters])
 
