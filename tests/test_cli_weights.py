@@ -1,12 +1,14 @@
 """`evnlos weights`: what they are, and a copy of half the size that sees the same."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
 from evnlos import Training, UNetConfig, load_weights, train
 from evnlos.cli import main
+from evnlos.model import published, save_weights
 
 
 @pytest.fixture(scope="module")
@@ -45,3 +47,53 @@ def test_no_weights_are_named_in_one_line(tmp_path, capsys) -> None:
     with pytest.raises(SystemExit):
         main(["weights", str(tmp_path / "none")])
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_scores_go_with_a_copy(run, tiny_dataset, tmp_path, capsys) -> None:
+    main(
+        [
+            "evaluate",
+            "--weights",
+            str(run),
+            "--data",
+            str(tiny_dataset.folder),
+            "--split",
+            "validation",
+            "--json",
+        ]
+    )
+    scores = tmp_path / "scores.json"
+    scores.write_text(capsys.readouterr().out)
+    copy = tmp_path / "scored.safetensors"
+    main(["weights", str(run), "--half", str(copy), "--scores", str(scores)])
+    kept = load_weights(copy).scores
+    assert kept["images"] == 8 * len(tiny_dataset.objects("validation")) and "mean" in kept["baselines"]
+    main(["weights", str(copy)])
+    assert f"{kept['overall']['psnr_db']:.2f} dB on simulation, validation" in capsys.readouterr().out
+    scores.write_text('{"overall": 1}')
+    with pytest.raises(SystemExit):
+        main(["weights", str(run), "--half", str(tmp_path / "no.safetensors"), "--scores", str(scores)])
+    assert "is not what `evnlos evaluate --json` prints" in capsys.readouterr().err
+
+
+def test_a_stranger_s_scores_do_no_harm(run, tmp_path, capsys) -> None:
+    loaded = replace(load_weights(run), scores={"psnr_db": [1], "overall": "good"})
+    save_weights(tmp_path / "w.safetensors", loaded)
+    main(["weights", str(tmp_path / "w.safetensors")])
+    assert "not what this version writes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", published())
+def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys) -> None:
+    path = published()[name]
+    assert path.stat().st_size <= 16_000_000
+    loaded = load_weights(name)
+    assert loaded.paradigm == name.split("-")[1]
+    assert loaded.confidence is not None and loaded.scores["images"] >= 160
+    better = loaded.scores["overall"]["psnr_db"] - loaded.scores["baselines"]["mean"]["psnr_db"]
+    assert better > 1
+    # What they were trained on is not what they were scored on.
+    captures = [step["data"] for step in loaded.history if step["data"]["origin"] == "captures"]
+    assert captures and not {name[-1] for data in captures for name in data["train"]} & set("GK49")
+    main(["weights"])
+    assert f"{name}: {loaded.paradigm}" in capsys.readouterr().out

@@ -16,8 +16,8 @@ class Command:
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder; its target may be unknown."""
-    weights: Path
-    """Weights file, or a run's folder."""
+    weights: Path = Path("near-fusion")
+    """Weights file, run's folder, or name of published weights (`evnlos weights` lists them)."""
     out: Path = Path("reconstruction")
     """Folder for the pictures; new or empty."""
     pattern: Path | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,32 +11,59 @@ import torch
 import tyro
 
 from evnlos.config import to_dict
-from evnlos.errors import DataError
-from evnlos.model import JointNetwork, Weights, load_weights, save_weights
+from evnlos.errors import ConfigError, DataError
+from evnlos.model import JointNetwork, Weights, load_weights, published, save_weights
 
 
 @dataclass(frozen=True)
 class Command:
-    """Show what weights see, how they were trained and on what; write a copy in half precision to share."""
+    """Show what weights see, how they were trained and on what, or list those that come with the package."""
 
-    weights: Annotated[Path, tyro.conf.Positional]
-    """Weights file, or a run's folder."""
+    weights: Annotated[Path | None, tyro.conf.Positional] = None
+    """Weights file, run's folder, or name of published weights; none lists the published ones."""
     half: Path | None = None
     """File for a copy in half precision, half as large; it must not exist."""
+    scores: Path | None = None
+    """What `evnlos evaluate --json` printed of these weights, to be kept in the copy."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> None:
         """Read the weights, print, and write the copy where one is asked for."""
+        if self.weights is None:
+            if self.half is not None or self.scores is not None:
+                raise ConfigError("--half and --scores copy one file of weights; say which")
+            self._list()
+            return
         loaded = load_weights(self.weights)
         if self.half is not None:
             if self.half.exists():
                 raise DataError(f"{self.half} exists; give --half another name")
+            loaded = replace(loaded, scores=_scores(self.scores) if self.scores else loaded.scores)
             save_weights(self.half, loaded, torch.float16)
         found = describe(loaded)
         print(json.dumps(found) if self.json else to_text(str(self.weights), found))
         if self.half is not None and not self.json:
             print(f"{self.half}: half precision, {self.half.stat().st_size / 1e6:.1f} MB")
+
+    def _list(self) -> None:
+        found = {name: describe(load_weights(path)) for name, path in published().items()}
+        if self.json:
+            print(json.dumps(found))
+            return
+        print("\n".join(to_text(name, about) for name, about in found.items()) or "no weights are published")
+
+
+def _scores(path: Path) -> dict[str, Any]:
+    """Return what a reader of weights wants of an evaluation: on what, how good, and the baselines."""
+    try:
+        found = json.loads(path.read_text())
+        baselines = {name: one["overall"] for name, one in found["baselines"].items()}
+        objects = {one["character"]: one["psnr_db"] for one in found["characters"].values()}
+        kept = {name: found[name] for name in ("data", "split", "images", "overall", "checks")}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path} is not what `evnlos evaluate --json` prints: {error!r}"[:300]) from None
+    return kept | {"data": Path(kept["data"]).name, "psnr_db": objects, "baselines": baselines}
 
 
 def describe(weights: Weights) -> dict[str, Any]:
@@ -50,6 +77,8 @@ def describe(weights: Weights) -> dict[str, Any]:
         "network": to_dict(weights.network.config),
         "sampling": weights.sampling,
         "history": weights.history,
+        "confidence": weights.confidence is not None,
+        "scores": weights.scores,
     }
 
 
@@ -69,4 +98,15 @@ def to_text(name: str, found: dict[str, Any]) -> str:
             f"  {number}. {data.get('origin')} {data.get('name')}: {len(data.get('train', []))} objects, "
             f"{plan.get('epochs')} epochs at {plan.get('learning_rate')}, seed {plan.get('seed')}"
         )
+    if found["scores"]:
+        lines.append(_score_line(found["scores"]))
     return "\n".join(lines)
+
+
+def _score_line(scores: dict[str, Any]) -> str:
+    """Return one line on how good the weights were found to be; a stranger's file may say anything there."""
+    try:
+        each = ", ".join(f"{name} {value:.2f}" for name, value in scores["psnr_db"].items())
+        return f"  {scores['overall']['psnr_db']:.2f} dB on {scores['data']}, {scores['split']}: {each}"
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return "  its scores are not what this version writes"

@@ -5,6 +5,7 @@ from evnlos.model.infer import infer
 from evnlos.model.joint import JointNetwork, new_network
 from evnlos.model.linear import LinearEstimate, fit_linear
 from evnlos.model.plates import plates
+from evnlos.model.published import published
 from evnlos.model.unet import ResidualUNet, UNetConfig
 from evnlos.model.weights import Weights, load_weights, save_weights
 
@@ -22,5 +23,6 @@ __all__ = [
     "load_weights",
     "new_network",
     "plates",
+    "published",
     "save_weights",
 ]

@@ -16,6 +16,7 @@ _LAMBDAS = tuple(10.0 ** (k / 2) for k in range(-12, 5))  # in units of the mean
 _FOLDS = 5
 _EXTRA = 20  # columns of the random probe beyond the rank
 _POWERS = 2
+_EVENT_SHARE = 0.375  # of the rank of frame and events together
 _TINY = 1e-30
 
 
@@ -25,7 +26,7 @@ class LinearEstimate:
 
     Args:
         mean_in: Mean input, [D], D = C H W.
-        basis: Main directions of the inputs, [D, R], orthonormal, their coefficients uncorrelated.
+        basis: Main directions of the inputs, [D, R], orthogonal, their coefficients uncorrelated.
         powers: Power of each coefficient, summed over the samples, [R].
         weights: From the coefficients to the picture, [R, H W].
         mean_out: Mean picture, [H, W].
@@ -60,7 +61,8 @@ def fit_linear(
     """Fit the linear estimate with the least mean squared error on unseen objects.
 
     The basis comes from a randomised singular value decomposition (Halko, Martinsson and Tropp, SIAM Review
-    53, 2011); the ridge is the best of a grid when one fold of the objects at a time is left out.
+    53, 2011); the ridge is the best of a grid when one fold of the objects at a time is left out. Frame and
+    events (three channels) have a basis each, in units of their own noise.
 
     Args:
         inputs: What the network would see, [N, C, H, W].
@@ -77,21 +79,57 @@ def fit_linear(
         raise DataError(f"{len(inputs)} inputs, {len(truth)} pictures and {len(objects)} names; give as many")
     if len(names) < 2:
         raise DataError(f"{len(names)} object(s); a ridge is chosen on objects left out: give at least two")
-    x, y = inputs.float().flatten(1), truth.float().flatten(1)  # [N, D], [N, H W]
-    mean_in, mean_out = x.mean(dim=0), y.mean(dim=0)
-    x, y = x - mean_in, y - mean_out
-    basis = _main_directions(x, min(rank, *x.shape), seed)
-    code = x @ basis  # [N, R]
-    powers, turn = torch.linalg.eigh((code.T @ code).double())
-    powers, turn = powers.clamp_min(0).float().flip(0), turn.float().flip(1)
-    basis, code = basis @ turn, code @ turn
     order = np.random.default_rng(derive_seed(seed, "folds")).permutation(len(names))
     fold_of = dict(zip(names[order], np.arange(len(names)) % min(_FOLDS, len(names)), strict=True))
     folds = torch.tensor([int(fold_of[name]) for name in objects])
+    y = truth.float().flatten(1)  # [N, H W]
+    mean_out = y.mean(dim=0)
+    parts = _parts(inputs.shape[1], rank)
+    found = [_fit(inputs[:, own].float().flatten(1), y - mean_out, folds, r, seed) for own, r in parts]
+    shape = tuple(truth.shape[1:])
+    if len(found) == 1:
+        return LinearEstimate(*found[0][:4], mean_out.unflatten(0, shape), found[0][4])
+    # Each part in units of its own noise, as its own best ridge tells it: else the noise of the events would
+    # hide the fine detail of the frames.
+    scales = torch.tensor(
+        [float(lam * powers.mean().clamp_min(_TINY)) ** -0.5 for _, _, powers, _, lam in found]
+    )
+    scales = scales / scales.log().mean().exp()
+    basis = torch.block_diag(*(one[1] * scale for one, scale in zip(found, scales, strict=True)))
+    mean_in = torch.cat([one[0] for one in found])
+    code = torch.cat([part.float().flatten(1) for part in (inputs[:, own] for own, _ in parts)], dim=1)
+    turned, powers, weights, lam = _regress((code - mean_in) @ basis, y - mean_out, folds)
+    return LinearEstimate(mean_in, basis @ turned, powers, weights, mean_out.unflatten(0, shape), lam)
+
+
+def _parts(channels: int, rank: int) -> list[tuple[slice, int]]:
+    """Return the channels of the frame and of the events, each with its share of the rank."""
+    if channels != 3:
+        return [(slice(0, channels), rank)]
+    events = round(_EVENT_SHARE * rank)
+    return [(slice(0, 1), rank - events), (slice(1, 3), events)]
+
+
+def _fit(
+    x: Tensor, y: Tensor, folds: Tensor, rank: int, seed: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, float]:
+    """Return mean input [D], basis [D, R], powers [R], weights [R, H W] and ridge of one part of the input."""
+    mean_in = x.mean(dim=0)
+    x = x - mean_in
+    basis = _main_directions(x, min(rank, *x.shape), seed)
+    turned, powers, weights, lam = _regress(x @ basis, y, folds)
+    return mean_in, basis @ turned, powers, weights, lam
+
+
+def _regress(code: Tensor, y: Tensor, folds: Tensor) -> tuple[Tensor, Tensor, Tensor, float]:
+    """Return what makes the code [N, R] uncorrelated [R, R], its powers [R], weights [R, H W] and ridge."""
+    powers, turn = torch.linalg.eigh((code.T @ code).double())
+    powers, turn = powers.clamp_min(0).float().flip(0), turn.float().flip(1)
+    code = code @ turn
     errors = sum(_left_out(code, y, folds == fold) for fold in folds.unique())
     lam = _LAMBDAS[int(torch.as_tensor(errors).argmin())]
     weights = (code.T @ y) / (powers + lam * powers.mean().clamp_min(_TINY))[:, None]
-    return LinearEstimate(mean_in, basis, powers, weights, mean_out.unflatten(0, tuple(truth.shape[1:])), lam)
+    return turn, powers, weights, lam
 
 
 def _left_out(code: Tensor, y: Tensor, left: Tensor) -> Tensor:

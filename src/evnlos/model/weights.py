@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from evnlos.dataset import CHANNELS
 from evnlos.errors import ConfigError, DataError
 from evnlos.model.confidence import Confidence
 from evnlos.model.joint import JointNetwork, new_network
+from evnlos.model.published import published
 from evnlos.model.unet import ResidualUNet, UNetConfig
 
 _FORMAT = "evnlos-weights-2"
@@ -37,6 +38,7 @@ class Weights:
         mean_image: Mean of the true pictures of the last training, float32 [H, W]: the baseline to beat.
         confidence: What its pictures are worth, learned from passes that no training saw; None where there
             were none.
+        scores: How good it was found to be, for published weights: data, metrics, baselines.
     """
 
     network: ResidualUNet | JointNetwork
@@ -45,6 +47,7 @@ class Weights:
     history: list[dict[str, Any]]
     mean_image: torch.Tensor | None = None
     confidence: Confidence | None = None
+    scores: dict[str, Any] = field(default_factory=dict)
 
 
 def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.float32) -> None:
@@ -68,6 +71,7 @@ def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.
         "network": to_dict(weights.network.config),
         "sampling": weights.sampling,
         "history": weights.history,
+        "scores": weights.scores,
     }
     write_atomically(path, save(tensors, metadata={"evnlos": json.dumps(about)}))
 
@@ -76,16 +80,18 @@ def load_weights(path: str | Path) -> Weights:
     """Read weights; a run's folder stands for the `weights.safetensors` in it.
 
     Args:
-        path: A safetensors file, or the folder of a run whose training has ended.
+        path: A safetensors file, the folder of a run whose training has ended, or a name of `published`.
 
     Raises:
         DataError: The file is missing, is not a weights file of this package, or does not fit its own config.
     """
-    path = Path(path)
+    known = published()
+    path = Path(path) if Path(path).exists() else known.get(str(path), Path(path))
     if path.is_dir():
         path = path / "weights.safetensors"
     if not path.is_file():
-        raise DataError(f"{path} does not exist; give a weights file, or a run whose training has ended")
+        names = f", or one of {', '.join(known)}" if known else ""
+        raise DataError(f"{path} does not exist; give a weights file, a run whose training has ended{names}")
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("evnlos", "{}"))
@@ -96,6 +102,7 @@ def load_weights(path: str | Path) -> Weights:
         found = about.get("format", "no format") if isinstance(about, dict) else about
         raise DataError(f"{path} holds {str(found)[:40]!r}; give weights of format {_FORMAT}")
     paradigm, sampling, history = about.get("paradigm"), about.get("sampling", {}), about.get("history", [])
+    scores = about.get("scores", {})
     if not isinstance(paradigm, str) or paradigm not in CHANNELS:
         raise DataError(f"{path} names the paradigm {str(paradigm)[:40]!r}; give one of {', '.join(CHANNELS)}")
     mean_image = tensors.pop(_MEAN, None)
@@ -105,16 +112,19 @@ def load_weights(path: str | Path) -> Weights:
         isinstance(sampling, dict)
         and isinstance(history, list)
         and all(isinstance(step, dict) for step in history)
+        and isinstance(scores, dict)
         and (mean_image is None or mean_image.ndim == 2)
     ):
-        raise DataError(f"{path} garbles its sampling, its history or its mean picture; the file is damaged")
+        raise DataError(
+            f"{path} garbles its sampling, its history, its scores or its mean picture; the file is damaged"
+        )
     config = from_dict(UNetConfig, about.get("network"), source=str(path))  # type: ignore[arg-type]
     size: Any = (sampling.get("height"), sampling.get("width"))
     pitch_m: Any = sampling.get("pitch_m")
     make = partial(new_network, CHANNELS[paradigm], config, size, pitch_m, joint=bool(about.get("joint")))
     network = _matching_network(make, config, tensors, path)
     network.load_state_dict({name: value.float() for name, value in tensors.items()})
-    return Weights(network.eval(), paradigm, sampling, history, mean_image, confidence)
+    return Weights(network.eval(), paradigm, sampling, history, mean_image, confidence, scores)
 
 
 def _confidence(tensors: dict[str, torch.Tensor], path: Path) -> Confidence | None:
