@@ -79,7 +79,7 @@ def test_support_is_the_share_of_the_variance_that_is_seen() -> None:
     for share in (1.0, 0.7, 0.3):
         samples = passes(0.0, share=share)
         confidence = fit_confidence(Given(), samples, CANVAS)
-        found = np.mean([judged(confidence, samples, f"o{k}").support for k in range(24)])
+        found = np.mean([judged(confidence, samples, f"o{k}").agreement for k in range(24)])
         # What is seen is `share` of the difference from the mean, so its square of the power.
         assert found == pytest.approx(share**2, abs=0.03)
 
@@ -88,7 +88,7 @@ def test_noise_that_the_halves_do_not_share_is_no_support() -> None:
     confidence = fit_confidence(Given(), passes(0.3), CANVAS)
     blind = passes(0.3, share=0.0, seed=5)
     supports = [judged(confidence, blind, f"o{k}") for k in range(24)]
-    assert np.mean([one.support for one in supports]) == pytest.approx(0, abs=0.05)
+    assert np.mean([one.agreement for one in supports]) == pytest.approx(0, abs=0.05)
     assert sum(one.measured for one in supports) <= 4
     said = next(one for one in supports if not one.measured)
     assert said.verdict.startswith("nothing measured")
@@ -103,6 +103,18 @@ def test_a_pattern_that_does_not_move_with_the_object_is_no_support() -> None:
     still = passes(0.0, count=1, seed=7)
     still.inputs = still.inputs[:1].expand(10, -1, -1, -1)  # the same picture, wherever the object is
     assert not judged(confidence, still, "o0").measured
+
+
+def test_pictures_that_do_not_explain_the_frames_are_not_measured() -> None:
+    samples = passes(0.2)
+    confidence = fit_confidence(Given(), samples, CANVAS)
+    inputs, at = samples.inputs[:10], samples.position_m[:10]
+    halves = halves_of(Given(), inputs, at, CANVAS)
+    good, poor, wrong = (confidence.judge(inputs[:, 0], halves, share) for share in (0.9, 0.3, -0.2))
+    assert good.measured and good.support == pytest.approx(min(good.agreement, 0.9, 1))
+    assert poor.measured and poor.support == 0.3
+    assert not wrong.measured and wrong.support == 0
+    assert "explain the frames no better" in wrong.verdict and float(wrong.high.min()) == 1
 
 
 def test_intervals_cover_unseen_passes_as_often_as_they_say() -> None:
@@ -167,7 +179,7 @@ def test_the_truth_explains_the_frames_and_another_object_does_not() -> None:
         for one in (own, other)
     )
     frames = operator(true)
-    known = (at, average, operator, SAMPLING)
+    known = (at, average, operator, SAMPLING.canvas)
     assert explained(true, frames, *known) == pytest.approx(1, abs=1e-6)
     assert explained(on_canvas(average, SAMPLING.canvas, at), frames, *known) == pytest.approx(0, abs=1e-6)
     assert explained(wrong, frames, *known) < 0.5
@@ -188,7 +200,7 @@ def test_reconstruct_and_evaluate_say_what_the_pictures_are_worth(
     save_weights(tmp_path / "w.safetensors", weights)
     out = tmp_path / "out"
     found = reconstruct_capture(tiny_captures[0], tmp_path / "w.safetensors", out, rig=lab_rig())
-    assert set(found["confidence"]) == {"support", "threshold", "measured", "verdict", "explained"}
+    assert set(found["confidence"]) == {"support", "agreement", "threshold", "measured", "verdict", "explained"}
     assert np.load(out / "interval.npy").shape == (2, 8, 32, 48)
     assert (out / "unsure.png").is_file()
 

@@ -51,7 +51,7 @@ class Command:
 
 def _said(confidence: dict[str, Any]) -> str:
     """Return what there is to say of the pictures' worth, in one line."""
-    words = [confidence["verdict"]] if "verdict" in confidence else []
+    words = [confidence["verdict"]]
     if "explained" in confidence:
         share = 100 * confidence["explained"]
         words.append(f"of what the average object leaves unexplained in the frames they explain {share:.0f} %")

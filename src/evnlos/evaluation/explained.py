@@ -6,10 +6,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.dataset import Sampling
 from evnlos.errors import DataError
 from evnlos.evaluation.consistency import FrameOperator
 from evnlos.model.plates import on_canvas
+from evnlos.types import Plane
 
 
 def explained(
@@ -18,7 +18,7 @@ def explained(
     position_m: NDArray,
     average: Tensor,
     operator: FrameOperator,
-    sampling: Sampling,
+    canvas: Plane,
 ) -> float:
     """Return the share of what the average object leaves unexplained in the frames that the pictures explain.
 
@@ -33,7 +33,7 @@ def explained(
         position_m: The plate's centre in each, (x, y) in metres, [N, 2].
         average: The average plate, [P, P].
         operator: The rig.
-        sampling: Geometry of the pictures.
+        canvas: Geometry of the pictures.
 
     Raises:
         DataError: Pictures and frames are not as many, or not of the operator's size.
@@ -43,6 +43,6 @@ def explained(
             f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a rig of "
             f"{operator.size[1]} x {operator.size[0]} samples"
         )
-    plain = on_canvas(average, sampling.canvas, position_m)
+    plain = on_canvas(average, canvas, position_m)
     left, before = ((frames - operator(shown)).square().sum() for shown in (pictures, plain))
     return float(1 - left / before.clamp_min(torch.finfo(torch.float32).tiny))

@@ -12,31 +12,42 @@ from torch import Tensor
 
 from evnlos.config import from_dict
 from evnlos.dataset import NlosDataset, Samples, Sampling, network_input
+from evnlos.evaluation.consistency import FrameOperator
+from evnlos.evaluation.explained import explained
 from evnlos.model import Confidence, JointNetwork, Judgement, ResidualUNet, Weights, halves_of, plates
 from evnlos.model.plates import on_canvas
 from evnlos.types import Plane
 
 
 @torch.inference_mode()
-def judgement_of(weights: Weights, samples: Samples, images: Tensor) -> Judgement | None:
+def judgement_of(
+    weights: Weights, samples: Samples, images: Tensor, operator: FrameOperator | None = None
+) -> Judgement | None:
     """Return what the pictures of one pass are worth; None where the weights or the motion do not tell.
 
     Args:
         weights: The network, and what it learned of its pictures' worth.
         samples: The pass.
         images: The network's pictures, float32 [N, H, W].
+        operator: The calibrated rig, where it is known.
     """
     if weights.confidence is None or samples.position_m is None or len(samples) < 2:
         return None
     sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
     seen = network_input(samples.frame, samples.surface, weights.paradigm)  # type: ignore[arg-type]
     halves = halves_of(weights.network, seen, samples.position_m, sampling.canvas)
-    return weights.confidence.judge(images, halves)
+    share = None
+    if operator is not None:
+        known = (samples.position_m, weights.confidence.mean, operator, sampling.canvas)
+        share = explained(images, torch.from_numpy(samples.frame), *known)
+    return weights.confidence.judge(images, halves, share)
 
 
 def said(worth: Judgement) -> dict[str, Any]:
-    """Return a judgement as plain values: support, threshold, measured, verdict."""
-    numbers = {"support": round(worth.support, 4), "threshold": round(worth.threshold, 4)}
+    """Return a judgement as plain values; `explained` is there only where the rig is known."""
+    numbers = {name: round(getattr(worth, name), 4) for name in ("support", "agreement", "threshold")}
+    if worth.explained is not None:
+        numbers["explained"] = round(worth.explained, 4)
     return numbers | {"measured": worth.measured, "verdict": worth.verdict}
 
 
@@ -46,7 +57,9 @@ class PassWorth:
 
     Args:
         name: Object of the pass.
-        support: What it said: share of what tells this object from others that was measured.
+        support: What it said, in one number: how much of the picture the measurement supports, 0..1.
+        agreement: Share of what tells this object from others that both halves of the pass agree on.
+        explained: Share of the frames that the pictures explain (see `explained`); None without a rig.
         measured: Whether it said that anything was.
         skill: 1 - |x - t|^2 / |x0 - t|^2 over the plates, with x the pictures, t the truth, and x0 the average
             plate: 1 is perfect, 0 is no better than the average object, below 0 is worse.
@@ -56,6 +69,8 @@ class PassWorth:
 
     name: str
     support: float
+    agreement: float
+    explained: float | None
     measured: bool
     skill: float
     coverage: float
@@ -69,6 +84,7 @@ def worth_of(
     samples: NlosDataset,
     images: Tensor,
     canvas: Plane,
+    operator: FrameOperator | None = None,
 ) -> list[PassWorth]:
     """Compare what the confidence says of pictures with their truth, for each pass.
 
@@ -78,6 +94,7 @@ def worth_of(
         samples: The passes, all of known motion.
         images: The network's pictures of all samples, float32 [N, H, W].
         canvas: Their geometry.
+        operator: The rig that the network was trained for; the inputs then begin with the frame.
 
     Raises:
         DataError: The motion of a pass is unknown.
@@ -86,7 +103,11 @@ def worth_of(
     for name in dict.fromkeys(samples.names.tolist()):
         mine = np.flatnonzero(samples.names == name)
         rows, at = torch.from_numpy(mine), samples.position_m[mine]
-        said = confidence.judge(images[rows], halves_of(network, samples.inputs[rows], at, canvas))
+        share = None
+        if operator is not None:
+            frames = samples.inputs[rows, 0].float()
+            share = explained(images[rows], frames, at, confidence.mean, operator, canvas)
+        said = confidence.judge(images[rows], halves_of(network, samples.inputs[rows], at, canvas), share)
         true, shown = samples.truth[rows].float(), images[rows]
         average = on_canvas(confidence.mean, canvas, at)
         missed, blank = (plates((one - true).square(), canvas, at).sum() for one in (shown, average))
@@ -96,6 +117,8 @@ def worth_of(
             PassWorth(
                 name,
                 said.support,
+                said.agreement,
+                said.explained,
                 said.measured,
                 float(1 - missed / blank),
                 float(plates(held, canvas, at).mean()),

@@ -13,6 +13,7 @@ from evnlos.calibration import RIG_FILE
 from evnlos.config import config_hash, from_dict, load_yaml, to_dict, write_atomically
 from evnlos.dataset import NlosDataset, Sampling, Simulation, open_dataset, simulate
 from evnlos.errors import DataError
+from evnlos.evaluation.consistency import FrameOperator
 from evnlos.evaluation.worth import PassWorth, risk_coverage, worth_of
 from evnlos.experiment.study import Step
 from evnlos.metrics import psnr
@@ -97,16 +98,18 @@ def carry_over(
             f"{weights} does not know what its pictures are worth; train on a dataset with a validation split"
         )
     sampling = from_dict(Sampling, loaded.sampling, source="the weights' sampling")
-    for name, config in sets(load_yaml(Simulation, rig / RIG_FILE), sampling, each).items():
+    own = load_yaml(Simulation, rig / RIG_FILE)
+    operator = FrameOperator(own, sampling) if loaded.paradigm != "event" else None
+    for name, config in sets(own, sampling, each).items():
         key = config_hash(config)[:8]
         folder = out / "simulations" / f"{rig.name}-{name.replace(' ', '-')}-{key}"
         total = len(config.glyphs.objects())
         for k, _ in enumerate(simulate(config, folder, workers)):
             yield Step(f"simulate {folder.name}", k + 1, total), None
-        yield Step(f"score {folder.name}", 1, 1), _score(name, loaded, folder)
+        yield Step(f"score {folder.name}", 1, 1), _score(name, loaded, folder, operator)
 
 
-def _score(name: str, weights: Weights, folder: Path) -> CarriedOver:
+def _score(name: str, weights: Weights, folder: Path, operator: FrameOperator | None) -> CarriedOver:
     assert weights.confidence is not None
     dataset = open_dataset(folder)
     samples = NlosDataset(dataset, "all", weights.paradigm)  # type: ignore[arg-type]
@@ -115,7 +118,7 @@ def _score(name: str, weights: Weights, folder: Path) -> CarriedOver:
     truth = samples.truth.float()[:, rows]
     average = on_canvas(weights.confidence.mean, canvas, samples.position_m)
     seen_db, average_db = (float(psnr(one[:, rows].contiguous(), truth).mean()) for one in (images, average))
-    worth = worth_of(weights.network, weights.confidence, samples, images, canvas)
+    worth = worth_of(weights.network, weights.confidence, samples, images, canvas, operator)
     return CarriedOver(name, seen_db, average_db, worth)
 
 
@@ -141,7 +144,8 @@ def carried_table(found: list[CarriedOver]) -> str:
     lines = [" | ".join(("", *head, "")).strip(), "|" + "---|" * len(head)]
     for one in found:
         row = [one.name, str(len(one.worth)), f"{one.psnr_db:.2f}", f"{one.average_db:.2f}"]
-        row += [f"{one.mean(key):.2f}" for key in ("skill", "support")]
+        row += [f"{one.mean(key):.2f}" for key in ("skill", "support", "agreement")]
+        row.append("-" if one.worth[0].explained is None else f"{one.mean('explained'):.2f}")
         row += [f"{one.mean(key):.0%}" for key in ("measured", "coverage")]
         lines.append(f"| {' | '.join(row)} | {one.mean('width'):.2f} |")
     return "\n".join([*lines, "", _order([pass_ for one in found for pass_ in one.worth])])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ COVERAGE = 0.9
 LEVELS = 16
 """Bins of a pixel's reconstructed level."""
 GROUPS = 3
-"""Groups of passes, by support, with intervals of their own."""
+"""Groups of passes, by agreement, with intervals of their own."""
 
 
 @dataclass(frozen=True)
@@ -30,34 +30,48 @@ class Judgement:
     """What one pass of pictures is worth.
 
     Args:
-        support: Share of what tells this object from the average one that both halves of the pass agree on:
+        agreement: Share of what tells this object from the average one that both halves of the pass agree on:
             1 = all that objects differ by, 0 = nothing.
-        threshold: Support that one in 20 passes shows in which each position saw another object, so that
+        threshold: Agreement that one in 20 passes shows in which each position saw another object, so that
             nothing of any one object was measured.
         low: Lower end of each pixel's interval, float32 [N, H, W], 0..1.
         high: Upper end.
+        explained: Share of what the average object leaves unexplained in the frames that the pictures explain,
+            where the rig is known; 0 or less is no better than the average object.
     """
 
-    support: float
+    agreement: float
     threshold: float
     low: Tensor
     high: Tensor
+    explained: float | None = None
+
+    @property
+    def support(self) -> float:
+        """How much of this picture the measurement supports, 0..1: the smaller of agreement and explained."""
+        known = self.agreement if self.explained is None else min(self.agreement, self.explained)
+        return min(max(known, 0.0), 1.0) if self.measured else 0.0
 
     @property
     def measured(self) -> bool:
         """Whether the measurement tells this object from others at all."""
-        return self.support > self.threshold
+        return self.agreement > self.threshold and (self.explained is None or self.explained > 0)
 
     @property
     def verdict(self) -> str:
         """One sentence for a reader."""
+        if self.agreement > self.threshold and not self.measured:
+            return (
+                "nothing measured: the pictures explain the frames no better than the average object would; "
+                "this is not what the weights know, or not the rig"
+            )
         if not self.measured:
             return (
                 "nothing measured: both halves of the pass share "
-                f"{100 * max(self.support, 0):.0f} % of what tells objects apart; passes without any object "
+                f"{100 * max(self.agreement, 0):.0f} % of what tells objects apart; passes without any object "
                 f"share up to {100 * self.threshold:.0f} %"
             )
-        return f"the measurement supports {100 * min(self.support, 1):.0f} % of the picture"
+        return f"the measurement supports {100 * self.support:.0f} % of the picture"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +82,7 @@ class Confidence:
         mean: Mean of the true plates, float32 [32, 32].
         power: Mean of |d|^2 over true plates, d what tells a plate from the mean one (see `telling`), [].
         threshold: See `Judgement.threshold`, [].
-        edges: Supports that separate the groups of passes, ascending, [G - 1].
+        edges: Agreements that separate the groups of passes, ascending, [G - 1].
         low: Lower end of the interval for each group and level, [G, L].
         high: Upper end.
     """
@@ -80,17 +94,21 @@ class Confidence:
     low: Tensor
     high: Tensor
 
-    def judge(self, pictures: Tensor, halves: Tensor) -> Judgement:
+    def judge(self, pictures: Tensor, halves: Tensor, explained: float | None = None) -> Judgement:
         """Return what the pictures of a pass are worth.
 
         Args:
             pictures: Pictures of all positions, float [N, H, W], 0..1.
             halves: What the two halves of the pass show of the plate, [2, 32, 32]: see `halves_of`.
+            explained: How much of the frames the pictures explain, where the rig is known.
         """
-        support, threshold = float(self.support(halves)), float(self.threshold)
-        if support <= threshold:
-            return Judgement(support, threshold, torch.zeros_like(pictures), torch.ones_like(pictures))
-        group = int(torch.searchsorted(self.edges, torch.tensor(support)))
+        agreement, threshold = float(self.agreement(halves)), float(self.threshold)
+        blank = Judgement(
+            agreement, threshold, torch.zeros_like(pictures), torch.ones_like(pictures), explained
+        )
+        if not blank.measured:
+            return blank
+        group = int(torch.searchsorted(self.edges, torch.tensor(agreement)))
         # Halfway between the middles of two bins lies halfway between their intervals.
         at = (pictures * LEVELS - 0.5).clamp(0, LEVELS - 1)
         below = at.floor().long().clamp(max=LEVELS - 2)
@@ -98,10 +116,10 @@ class Confidence:
         low, high = (
             torch.lerp(ends[group][below], ends[group][below + 1], part) for ends in (self.low, self.high)
         )
-        return Judgement(support, threshold, low, high)
+        return replace(blank, low=low, high=high)
 
-    def support(self, halves: Tensor) -> Tensor:
-        """Return the support of a pass, [], from its halves [2, 32, 32]."""
+    def agreement(self, halves: Tensor) -> Tensor:
+        """Return the agreement of a pass, [], from its halves [2, 32, 32]."""
         first, second = self.telling(halves)
         return first @ second / self.power
 

@@ -20,7 +20,6 @@ from evnlos.dataset import (
 )
 from evnlos.evaluation import reconstruct, score
 from evnlos.evaluation.consistency import FrameOperator, consistent
-from evnlos.evaluation.explained import explained
 from evnlos.evaluation.worth import judgement_of, said
 from evnlos.model import load_weights
 from evnlos.report.pictures import grey, polarity, save_animation, save_png, stretched, strip
@@ -64,14 +63,10 @@ def reconstruct_capture(
     samples = capture_samples(shot, sampling, pattern)
     check_folder(out)
     images = reconstruct(loaded, samples.frame, samples.surface, samples.position_m)
-    worth = judgement_of(loaded, samples, images)
-    confidence = said(worth) if worth else {}
-    if rig is not None:
-        frames, operator = torch.from_numpy(samples.frame), FrameOperator(rig, sampling)
-        images = consistent(images, frames, operator)
-        if loaded.confidence is not None and samples.position_m is not None:
-            known = (samples.position_m, loaded.confidence.mean, operator, sampling)
-            confidence["explained"] = round(explained(images, frames, *known), 4)
+    operator = None if rig is None else FrameOperator(rig, sampling)
+    worth = judgement_of(loaded, samples, images, operator)
+    if operator is not None:
+        images = consistent(images, torch.from_numpy(samples.frame), operator)
     pictures = [grey(image) for image in images]
     out.mkdir(parents=True, exist_ok=True)
     for k, picture in enumerate(pictures):
@@ -90,8 +85,7 @@ def reconstruct_capture(
     if worth is not None:
         save_png(out / "unsure.png", strip([grey(one) for one in worth.high - worth.low]), 2)
         write_atomically(out / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))
-    if confidence:
-        found["confidence"] = confidence
+        found["confidence"] = said(worth)
     if samples.truth is not None:
         truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
         found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()

@@ -27,14 +27,14 @@ _MIXED = 60  # passes without an object
 def fit_confidence(network: ResidualUNet | JointNetwork, samples: NlosDataset, canvas: Plane) -> Confidence:
     """Learn what pictures of a network are worth from passes that it was not trained on.
 
-    Support. With d what tells a plate from the mean one (`Confidence.telling`), the support is
+    Agreement. With d what tells a plate from the mean one (`Confidence.telling`), the agreement is
     <d1, d2> / E|t|^2: d1 and d2 from the two halves of a pass, t the same of true plates. For a network that
     answers with the expectation of the truth, the law of total variance makes it the share of the objects'
     variance that the measurement explains; noise that the halves do not share cancels. The threshold comes
     from passes in which each position saw another object.
 
     Intervals. The central 90 % of the true levels of a plate's pixels for each level that the network gave
-    (split conformal, Mondrian by level and by support: Vovk et al., Algorithmic Learning in a Random World,
+    (split conformal, Mondrian by level and by agreement: Vovk et al., Algorithmic Learning in a Random World,
     2005), so that the coverage holds for passes like these whatever the network is.
 
     Args:
@@ -62,13 +62,13 @@ def fit_confidence(network: ResidualUNet | JointNetwork, samples: NlosDataset, c
     blank = replace(blank, power=power)
     strange = torch.stack(
         [
-            blank.support(halves_of(network, samples.inputs[rows], position_m[rows], canvas))
+            blank.agreement(halves_of(network, samples.inputs[rows], position_m[rows], canvas))
             for rows in _mixed(names)
         ]
     )
-    support = torch.stack([blank.support(one) for one in halves])
-    edges = torch.quantile(support, torch.arange(1, GROUPS) / GROUPS)
-    group = torch.searchsorted(edges, support)
+    agreement = torch.stack([blank.agreement(one) for one in halves])
+    edges = torch.quantile(agreement, torch.arange(1, GROUPS) / GROUPS)
+    group = torch.searchsorted(edges, agreement)
     ends = [_ends([(shown[k], true[k]) for k in torch.nonzero(group == g)[:, 0]]) for g in range(GROUPS)]
     low, high = (torch.stack([pair[k] for pair in ends]) for k in (0, 1))
     threshold = torch.quantile(strange, 1 - FALSE_ALARM)
