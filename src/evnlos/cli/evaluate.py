@@ -73,7 +73,8 @@ def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
     for name, share in found["checks"].items():
         print(f"{CHECKS[name]}: {share:.0%}")
     if worth := found["confidence"]:
-        mean = {key: sum(one[key] for one in worth) / len(worth) for key in worth[0] if key != "name"}
+        said = ("support", "skill", "measured", "coverage", "width")
+        mean = {key: sum(one[key] for one in worth) / len(worth) for key in said}
         print(
             f"confidence: support {mean['support']:.0%} said, {mean['skill']:.0%} found; "
             f"{mean['measured']:.0%} of {len(worth)} passes said to be measured; intervals of "

@@ -64,7 +64,9 @@ def read_characters(pictures: Tensor) -> list[str]:
     """Name the character on each plate [N, 1, 32, 32].
 
     Example:
+        >>> import numpy as np
         >>> from evnlos.scene import FontGlyphs
+        >>> from evnlos.types import Plane
         >>> mask = FontGlyphs(characters="R").target("comic_neue_bold_R").rasterise(Plane(32, 32, 0.0025))
         >>> read_characters(torch.from_numpy(mask)[None, None])
         ['R']

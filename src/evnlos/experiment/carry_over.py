@@ -130,18 +130,9 @@ def write_carried(found: list[CarriedOver], path: Path) -> None:
 
 def carried_table(found: list[CarriedOver]) -> str:
     """Return the findings as a table, and how well the support orders all passes by their skill."""
-    head = (
-        "set",
-        "passes",
-        "PSNR, dB",
-        "average plate, dB",
-        "skill",
-        "support",
-        "measured",
-        "coverage",
-        "width",
-    )
-    lines = [" | ".join(("", *head, "")).strip(), "|" + "---|" * len(head)]
+    head = ["set", "passes", "PSNR, dB", "average plate, dB", "skill", "support", "agreement", "explained"]
+    head += ["measured", "coverage", "width"]
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in found:
         row = [one.name, str(len(one.worth)), f"{one.psnr_db:.2f}", f"{one.average_db:.2f}"]
         row += [f"{one.mean(key):.2f}" for key in ("skill", "support", "agreement")]

@@ -19,6 +19,8 @@ from evnlos.types import Plane
 
 COVERAGE = 0.9
 """Share of a plate's pixels whose true level the intervals are to hold."""
+CONFIRMED = 0.5
+"""Share of the frames that pictures have to explain where the rig is known (see `Judgement.explained`)."""
 LEVELS = 16
 """Bins of a pixel's reconstructed level."""
 GROUPS = 3
@@ -37,7 +39,8 @@ class Judgement:
         low: Lower end of each pixel's interval, float32 [N, H, W], 0..1.
         high: Upper end.
         explained: Share of what the average object leaves unexplained in the frames that the pictures explain,
-            where the rig is known; 0 or less is no better than the average object.
+            where the rig is known; 0 or less is no better than the average object, and a half is the least that
+            is believed.
     """
 
     agreement: float
@@ -55,15 +58,15 @@ class Judgement:
     @property
     def measured(self) -> bool:
         """Whether the measurement tells this object from others at all."""
-        return self.agreement > self.threshold and (self.explained is None or self.explained > 0)
+        return self.agreement > self.threshold and (self.explained is None or self.explained > CONFIRMED)
 
     @property
     def verdict(self) -> str:
         """One sentence for a reader."""
         if self.agreement > self.threshold and not self.measured:
             return (
-                "nothing measured: the pictures explain the frames no better than the average object would; "
-                "this is not what the weights know, or not the rig"
+                f"nothing measured: the pictures explain {100 * (self.explained or 0):.0f} % of what the "
+                "frames show of this object; this is not what the weights know, or not the rig"
             )
         if not self.measured:
             return (
