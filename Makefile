@@ -31,7 +31,7 @@ dist: $(READY)
 	$(BIN)/python -c "import glob, zipfile; names = set(zipfile.ZipFile(glob.glob('dist/*.whl')[0]).namelist()); \
 	  lost = [n for n in ('evnlos/py.typed', 'evnlos/live/page.html', 'evnlos/app/page.css', \
 	  'evnlos/report/style.css', 'evnlos/evaluation/classifier.safetensors', \
-	  'evnlos/model/published/near-fusion.safetensors') if n not in names]; assert not lost, lost"
+	  'evnlos/model/published/near-frame.safetensors') if n not in names]; assert not lost, lost"
 	ls -l dist
 
 clean:

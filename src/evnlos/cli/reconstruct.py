@@ -16,7 +16,7 @@ class Command:
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder; its target may be unknown."""
-    weights: Path = Path("near-fusion")
+    weights: Path = Path("near-frame")
     """Weights file, run's folder, or name of published weights (`evnlos weights` lists them)."""
     out: Path = Path("reconstruction")
     """Folder for the pictures; new or empty."""

@@ -11,10 +11,11 @@ import numpy as np
 
 from evnlos.calibration import RIG_FILE
 from evnlos.config import config_hash, from_dict, load_yaml, to_dict, write_atomically
-from evnlos.dataset import NlosDataset, Sampling, Simulation, open_dataset, simulate
+from evnlos.dataset import NlosDataset, Sampling, Simulation, open_dataset
 from evnlos.errors import DataError
 from evnlos.evaluation.consistency import FrameOperator
 from evnlos.evaluation.worth import PassWorth, risk_coverage, worth_of
+from evnlos.experiment.making import simulated_steps
 from evnlos.experiment.study import Step
 from evnlos.metrics import psnr
 from evnlos.model import Weights, infer, load_weights
@@ -103,9 +104,8 @@ def carry_over(
     for name, config in sets(own, sampling, each).items():
         key = config_hash(config)[:8]
         folder = out / "simulations" / f"{rig.name}-{name.replace(' ', '-')}-{key}"
-        total = len(config.glyphs.objects())
-        for k, _ in enumerate(simulate(config, folder, workers)):
-            yield Step(f"simulate {folder.name}", k + 1, total), None
+        for step in simulated_steps(config, folder, workers):
+            yield step, None
         yield Step(f"score {folder.name}", 1, 1), _score(name, loaded, folder, operator)
 
 

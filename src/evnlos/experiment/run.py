@@ -18,11 +18,11 @@ from evnlos.dataset import (
     import_captures,
     load_pattern,
     open_dataset,
-    simulate,
 )
 from evnlos.dataset.importer import character_of
 from evnlos.dataset.presets import default
 from evnlos.errors import CalibrationError, DataError
+from evnlos.experiment.making import simulated_steps
 from evnlos.experiment.scoring import score_arm
 from evnlos.experiment.study import Arm, Place, Step, Study, slug
 from evnlos.scene import HandwritingGlyphs
@@ -95,9 +95,7 @@ def _simulate(study: Study, arm: Arm, place: Place) -> Generator[Step, None, Dat
         return None
     config = simulation_of(study, arm, place)
     folder = place.out / "simulations" / f"{arm.source}-{study.rig}-{config_hash(config)[:8]}"
-    total = len(config.glyphs.objects())
-    for k, _ in enumerate(simulate(config, folder, place.workers)):
-        yield Step(f"simulate {folder.name}", k + 1, total)
+    yield from simulated_steps(config, folder, place.workers)
     return open_dataset(folder)
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from evnlos.config import config_hash, to_dict
-from evnlos.dataset import PARADIGMS, Dataset, Paradigm, SensorSize, Simulation, open_dataset, simulate
+from evnlos.dataset import PARADIGMS, Dataset, Paradigm, SensorSize, Simulation, open_dataset
 from evnlos.dataset.presets import paper
 from evnlos.evaluation import available_lpips, evaluate
+from evnlos.experiment.making import simulated_steps
 from evnlos.experiment.records import keep_scores, names_there
 from evnlos.experiment.study import Record, Step
 from evnlos.model import load_weights
@@ -71,9 +72,7 @@ def run_simulated(settings: Simulated) -> Iterator[Step]:
     data = {}
     for name, config in simulations(settings).items():
         folder = settings.out / "simulations" / f"paper-{name}-{config_hash(config)[:8]}"
-        total = len(config.glyphs.objects())
-        for k, _ in enumerate(simulate(config, folder, settings.workers)):
-            yield Step(f"simulate {folder.name}", k + 1, total)
+        yield from simulated_steps(config, folder, settings.workers)
         data[name] = open_dataset(folder)
     for paradigm in settings.paradigms:
         for seed in settings.seeds:

@@ -8,5 +8,5 @@ _FOLDER = Path(__file__).parent / "published"
 
 
 def published() -> dict[str, Path]:
-    """Return the weights that come with the package: name, such as "near-fusion", -> file."""
+    """Return the weights that come with the package: name, such as "near-frame", -> file."""
     return {path.stem: path for path in sorted(_FOLDER.glob("*.safetensors"))}
