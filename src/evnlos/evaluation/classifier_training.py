@@ -89,13 +89,16 @@ def degrade(pictures: Tensor, generator: torch.Generator) -> Tensor:
     return (blurred * uniform(0.5, 1.0).reshape(-1, 1, 1, 1) + noise).clamp(0, 1)
 
 
-def train_reader(writers: int = 36, epochs: int = 40, seed: int = 0) -> tuple[CharacterReader, dict]:
+def train_reader(
+    writers: int = 36, epochs: int = 40, seed: int = 0, families: tuple[str, ...] = FAMILIES
+) -> tuple[CharacterReader, dict]:
     """Train the reader; return it and what a user of the file must know.
 
     Args:
         writers: Writers of the simulated hand; the two behind them are for validation.
         epochs: Passes over the glyphs, each time degraded anew.
         seed: Seed of weights, order and degradation.
+        families: Typefaces beside the writers.
 
     Returns:
         The network, and a record with its accuracy on clean and degraded glyphs of writers that it never saw.
@@ -104,7 +107,7 @@ def train_reader(writers: int = 36, epochs: int = 40, seed: int = 0) -> tuple[Ch
         torch.manual_seed(derive_seed(seed, "reader"))
         network = CharacterReader()
     generator = torch.Generator().manual_seed(derive_seed(seed, "degrade"))
-    pictures, labels = clean_glyphs(writers)
+    pictures, labels = clean_glyphs(writers, families=families)
     drawn = torch.cat(
         [
             torch.arange(len(pictures)),
@@ -128,7 +131,7 @@ def train_reader(writers: int = 36, epochs: int = 40, seed: int = 0) -> tuple[Ch
         poor = torch.stack([network(degrade(held, generator)).argmax(dim=1) == answers for _ in range(10)])
     about = {
         "characters": CHARACTERS,
-        "trained_on": f"{writers} writers and {', '.join(FAMILIES)}",
+        "trained_on": f"{writers} writers and {', '.join(families)}",
         "epochs": epochs,
         "seed": seed,
         "accuracy_clean": round(clean, 4),
