@@ -194,7 +194,7 @@ def page(scratch: Path, *options: str) -> Iterator[str]:
             command, env={**os.environ, "TMPDIR": str(scratch)}, stdout=log, stderr=subprocess.STDOUT
         )
     try:
-        until = time.monotonic() + 60
+        until = time.monotonic() + 180  # a first start compiles the kernels
         while not (found := re.search(r"http://\S+", said.read_text())):
             assert process.poll() is None and time.monotonic() < until, said.read_text()
             time.sleep(0.1)
