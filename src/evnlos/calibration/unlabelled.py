@@ -67,7 +67,8 @@ def fit_unlabelled(
     light = _moving(fit, slice(None))
     parameters = parameters_of(start, fixed)
     found = _search(light, _scanned(light, start), parameters, iterations)
-    before, after = (_check(held, rig) for rig in (start, found))
+    given, asked = _moving(held, slice(0, None, 2)), _moving(held, slice(1, None, 2))
+    before, after = (_missed(given, asked, rig) for rig in (start, found))
     known = light.explained(found)
     unseen = _moving(held, slice(None)).explained_at(found, known.gain, known.noise)
     seen, other = _with_plates(fit, known), _with_plates(held, unseen)
@@ -153,10 +154,9 @@ def _cost(light: MovingLight, rig: RadiometricTransport) -> float:
         return _FAR
 
 
-def _check(shots: Shots, rig: RadiometricTransport) -> float:
-    """Return how far every other frame is from what the rest predicts, over the spread of what moves."""
-    known, asked = _moving(shots, slice(0, None, 2)), _moving(shots, slice(1, None, 2))
-    away = asked.moving - asked.predicted(rig, known.explained(rig))
+def _missed(given: MovingLight, asked: MovingLight, rig: RadiometricTransport) -> float:
+    """Return how far some frames are from what others predict of them, over the spread of what moves."""
+    away = asked.moving - asked.predicted(rig, given.explained(rig))
     return float(away.square().mean().sqrt()) / asked.spread
 
 

@@ -97,8 +97,12 @@ def fit_linear(
     scales = scales / scales.log().mean().exp()
     basis = torch.block_diag(*(one[1] * scale for one, scale in zip(found, scales, strict=True)))
     mean_in = torch.cat([one[0] for one in found])
-    code = torch.cat([part.float().flatten(1) for part in (inputs[:, own] for own, _ in parts)], dim=1)
-    turned, powers, weights, lam = _regress((code - mean_in) @ basis, y - mean_out, folds)
+    # One part at a time: frame and events side by side in float32 would fill the memory once more.
+    codes = [
+        (inputs[:, own].float().flatten(1) - one[0]) @ one[1] * scale
+        for (own, _), one, scale in zip(parts, found, scales, strict=True)
+    ]
+    turned, powers, weights, lam = _regress(torch.cat(codes, dim=1), y - mean_out, folds)
     return LinearEstimate(mean_in, basis @ turned, powers, weights, mean_out.unflatten(0, shape), lam)
 
 
