@@ -35,12 +35,25 @@ def judgement_of(
         return None
     sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
     seen = network_input(samples.frame, samples.surface, weights.paradigm)  # type: ignore[arg-type]
-    halves = halves_of(weights.network, seen, samples.position_m, sampling.canvas)
+    frames = torch.from_numpy(samples.frame)
+    pass_ = (seen, frames, images, samples.position_m)
+    return _judged(weights.network, weights.confidence, *pass_, sampling.canvas, operator)
+
+
+def _judged(
+    network: ResidualUNet | JointNetwork,
+    confidence: Confidence,
+    inputs: Tensor,
+    frames: Tensor,
+    images: Tensor,
+    position_m: NDArray,
+    canvas: Plane,
+    operator: FrameOperator | None,
+) -> Judgement:
     share = None
     if operator is not None:
-        known = (samples.position_m, weights.confidence.mean, operator, sampling.canvas)
-        share = explained(images, torch.from_numpy(samples.frame), *known)
-    return weights.confidence.judge(images, halves, share)
+        share = explained(images, frames, position_m, confidence.mean, operator, canvas)
+    return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
 
 
 def said(worth: Judgement) -> dict[str, Any]:
@@ -103,11 +116,9 @@ def worth_of(
     for name in dict.fromkeys(samples.names.tolist()):
         mine = np.flatnonzero(samples.names == name)
         rows, at = torch.from_numpy(mine), samples.position_m[mine]
-        share = None
-        if operator is not None:
-            frames = samples.inputs[rows, 0].float()
-            share = explained(images[rows], frames, at, confidence.mean, operator, canvas)
-        said = confidence.judge(images[rows], halves_of(network, samples.inputs[rows], at, canvas), share)
+        inputs = samples.inputs[rows]
+        pass_ = (inputs, inputs[:, 0].float(), images[rows], at)
+        said = _judged(network, confidence, *pass_, canvas, operator)
         true, shown = samples.truth[rows].float(), images[rows]
         average = on_canvas(confidence.mean, canvas, at)
         missed, blank = (plates((one - true).square(), canvas, at).sum() for one in (shown, average))
