@@ -67,29 +67,27 @@ def _decode_carefully(words, first, state, t_us, x, y, p, width, height):
 
 @njit(cache=True)
 def _unpack(words, base, t_us, x, y, p):
-    """Split words into columns, one loop a column so that each becomes vector code.
+    """Split words into columns, then look at the columns; every loop becomes vector code.
 
-    Returns the largest x, y and polarity, and whether the times ascend.
+    Returns the largest x and y, the bits that any polarity has, and whether the times ascend.
     """
-    largest_x, largest_y, largest_p = np.int64(0), np.int64(0), np.int64(0)
+    bits = np.int64(0)
     for index in range(len(words)):
-        t_us[index] = base + (words[index] & 0xFFFFFFFF)
+        word = words[index]
+        t_us[index] = base + (word & 0xFFFFFFFF)
+        x[index] = (word >> 32) & 0x3FFF
+        y[index] = (word >> 46) & 0x3FFF
+        p[index] = ((word >> 60) & 0xF) != 0
+        bits |= word
+    largest_x, largest_y = np.uint16(0), np.uint16(0)
     for index in range(len(words)):
-        column = (words[index] >> 32) & 0x3FFF
-        x[index] = column
-        largest_x = max(largest_x, column)
+        largest_x = max(largest_x, x[index])
     for index in range(len(words)):
-        row = (words[index] >> 46) & 0x3FFF
-        y[index] = row
-        largest_y = max(largest_y, row)
-    for index in range(len(words)):
-        sign = (words[index] >> 60) & 0xF
-        p[index] = sign != 0
-        largest_p = max(largest_p, sign)
-    backwards = 0
+        largest_y = max(largest_y, y[index])
+    backwards = False
     for index in range(1, len(words)):
-        backwards += t_us[index] < t_us[index - 1]
-    return largest_x, largest_y, largest_p, backwards == 0
+        backwards |= t_us[index] < t_us[index - 1]
+    return largest_x, largest_y, (bits >> 60) & 0xF, not backwards
 
 
 @njit(cache=True)
@@ -106,13 +104,13 @@ def decode_dat(words, state, t_us, x, y, p, width, height):
             p[count : count + size],
         )
         base = state[BASE]
-        largest_x, largest_y, largest_p, ascend = _unpack(chunk, base, *out)
+        largest_x, largest_y, signs, ascend = _unpack(chunk, base, *out)
         if (
             ascend
             and t_us[count] >= state[NEWEST]
             and largest_x < width
             and largest_y < height
-            and largest_p <= 1
+            and signs <= 1
         ):
             state[NEWEST] = t_us[count + size - 1]
             state[CLOCK] = state[NEWEST] - base
