@@ -105,13 +105,7 @@ def decode_dat(words, state, t_us, x, y, p, width, height):
         )
         base = state[BASE]
         largest_x, largest_y, signs, ascend = _unpack(chunk, base, *out)
-        if (
-            ascend
-            and t_us[count] >= state[NEWEST]
-            and largest_x < width
-            and largest_y < height
-            and signs <= 1
-        ):
+        if ascend and t_us[count] >= state[NEWEST] and largest_x < width and largest_y < height and signs <= 1:
             state[NEWEST] = t_us[count + size - 1]
             state[CLOCK] = state[NEWEST] - base
             count += size
