@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from evnlos import EvnlosError, FrameCamera
+from evnlos.sensor._photons import few_electrons, many_electrons
 
 QUIET = {"read_noise_e": 0.0, "prnu": 0.0, "dsnu_e": 0.0, "full_well_e": 1e10, "bit_depth": 16}
 
@@ -86,3 +88,30 @@ def test_bad_settings(settings: dict) -> None:
 def test_bad_light(light: np.ndarray) -> None:
     with pytest.raises(EvnlosError):
         FrameCamera().expose(light, seed=0)
+
+
+@pytest.mark.parametrize("mean", [64.0, 300.0, 15_000.0])
+def test_many_electrons_have_the_distribution_of_poisson(mean: float) -> None:
+    z = np.linspace(-7, 7, 400_001)
+    drawn = np.array([many_electrons(mean, value) for value in z])
+    edges = np.flatnonzero(np.diff(drawn) > 0)
+    assert (np.diff(drawn) >= 0).all()
+    np.testing.assert_allclose(stats.norm.cdf(z[edges]), stats.poisson.cdf(drawn[edges], mean), atol=2.1e-4)
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.3, 5.0, 63.0])
+def test_few_electrons_are_the_quantiles_of_poisson(mean: float) -> None:
+    uniform = np.linspace(1e-6, 1 - 1e-6, 999)
+    drawn = [few_electrons(mean, value) for value in uniform]
+    np.testing.assert_array_equal(drawn, stats.poisson.ppf(uniform, mean))
+
+
+@pytest.mark.parametrize("mean", [3.0, 200.0])
+def test_frames_of_any_light_have_shot_noise(mean: float) -> None:
+    camera = FrameCamera(full_well_e=65_535.0, bit_depth=16, prnu=0.0, dsnu_e=0.0, read_noise_e=0.0)
+    seen = camera.expose(np.full((20, 60, 60), mean / 65_535), seed=1).ravel()
+    values = np.arange(seen.max() + 2)
+    shares = np.bincount(seen, minlength=len(values)) / seen.size
+    np.testing.assert_allclose(shares, stats.poisson.pmf(values, mean), atol=0.006)
+    frames = seen.reshape(20, -1).astype(float)
+    assert abs(np.corrcoef(frames[0], frames[1])[0, 1]) < 0.05  # each frame has noise of its own

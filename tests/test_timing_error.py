@@ -1,4 +1,4 @@
-"""The steps that the camera chooses for the paper's scene time its events to better than a millisecond, rms."""
+"""The steps that the camera chooses for the paper's scene time its events to better than a quarter of a millisecond, rms."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def by_pixel(events: Events) -> tuple[np.ndarray, np.ndarray]:
     return key[order], events.t_us[order]
 
 
-def test_chosen_steps_time_events_to_a_millisecond_rms() -> None:
+def test_chosen_steps_time_events_to_a_quarter_of_a_millisecond_rms() -> None:
     config = paper()
     target = config.glyphs.target(config.glyphs.objects()[0], derive_seed(config.seed, "glyph"))
     wall = config.transport.wall(Scene(target, config.motion, config.duration_s), SHAPE)
@@ -33,10 +33,10 @@ def test_chosen_steps_time_events_to_a_millisecond_rms() -> None:
     assert counts[0].sum() > 30_000
     assert alike.mean() > 0.999
     error_ms = (found[1][alike[found[0]]] - fine[1][alike[fine[0]]]) / 1000
-    assert np.sqrt(np.mean(error_ms**2)) < 1.0, np.sqrt(np.mean(error_ms**2))
-    assert np.percentile(np.abs(error_ms), 99) < 0.3
-    # steps of 40 ms, three pixels, are told apart
-    coarse = by_pixel(EventCamera(pixel, time_step_s=40e-3).record(wall, *SPAN_S, seed=1))
+    assert np.sqrt(np.mean(error_ms**2)) < 0.25, np.sqrt(np.mean(error_ms**2))
+    assert np.percentile(np.abs(error_ms), 99) < 0.5
+    # steps of 50 ms, four pixels, are told apart
+    coarse = by_pixel(EventCamera(pixel, time_step_s=50e-3).record(wall, *SPAN_S, seed=1))
     same = np.bincount(coarse[0], minlength=len(alike)) == counts[0]
     coarse_ms = (coarse[1][same[coarse[0]]] - fine[1][same[fine[0]]]) / 1000
-    assert np.percentile(np.abs(coarse_ms), 99) > 0.3
+    assert np.percentile(np.abs(coarse_ms), 99) > 0.5

@@ -32,7 +32,7 @@ from evnlos.sensor._exact_pass import (
     log_row,
     respond,
 )
-from evnlos.sensor._fast_math import fast_exp
+from evnlos.sensor._fast_math import single_exp
 from evnlos.sensor._random import (
     STREAM_SHOT_CHOICE,
     STREAM_SHOT_GAP,
@@ -54,12 +54,13 @@ def _grown(column):
     return longer
 
 
-# The functions of single events own no array. Without `_nrt=False` numba would count references to those that
-# they are handed, by locked instructions that cost a sixth of all.
+# What sends events owns no array. Without `_nrt=False` numba would count references to those that it is handed,
+# by locked instructions that cost a sixth of all; a call for each event would cost as much again.
 _owns_nothing = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+_inlined = njit(cache=True, error_model="numpy", inline="always")
 
 
-@_owns_nothing
+@_inlined
 def _emit(out_time, out_pixel, out_on, count, time_s, pixel, on, jitter, window, seed, sent):
     """Append an event to the columns and return their fill; where they are full it is only counted."""
     if jitter > 0.0:
@@ -108,8 +109,9 @@ def _piece(
         kind, end = LOW_PASS, length * (speed + curve * length)
         per_tau = (log_b - log_a) / end
         a, b, c = log_a - per_tau, per_tau + leak * length / end, filtered - log_a + per_tau
-        decay = fast_exp(-end)
+        decay = single_exp(-end)
         arrival = a + per_tau * end + c * decay
+        slope_start, slope_end = b - c, b - c * decay
         arrival += bend_response(light_a, light_b, log_b - log_a, end, 1.0 / end, 1.0 - decay, rate * length)
     elif max(light_a, light_b) > KNEE:
         kind, end = LOG_LINE, length
@@ -117,39 +119,54 @@ def _piece(
     else:
         kind, end = LINE, length
         a, b, c = log_a, gradient * LOG_KNEE / KNEE + leak, 0.0
+    if kind != LOW_PASS:
+        slope_start, slope_end = response(kind, a, b, c, 0.0)[1], response(kind, a, b, c, end)[1]
+    monotone = slope_start * slope_end >= 0.0
     arrived = arrival + leak * length
-    now = 0.0
+    now, value, slope, stale = 0.0, filtered, slope_start, False
     while True:
         ready, candidate = state[1] + refractory - start, state[2] - start
         shot_due = candidate < length
+        above, below = max(value, arrived) - state[0], min(value, arrived) - state[0]
+        if monotone and not shot_due and above < on and below > -off:
+            break  # as most pieces end after their one event
         limit = end
         if shot_due:
             limit = max(now, candidate * (speed + curve * candidate) if kind == LOW_PASS else candidate)
         if ready >= length:
             now = end
         elif ready > 0.0:
-            now = max(now, ready * (speed + curve * ready) if kind == LOW_PASS else ready)
+            begin = ready * (speed + curve * ready) if kind == LOW_PASS else ready
+            if begin > now:
+                now, stale = begin, True
         x, sign = limit, 0
         if now < limit:
-            value = response(kind, a, b, c, now)[0] if now > 0.0 else filtered
+            if stale:
+                value, slope, _ = response(kind, a, b, c, now)
+                stale = False
             if value - state[0] >= on:
                 x, sign = now, 1
             elif value - state[0] <= -off:
                 x, sign = now, -1
             else:
-                final = arrived if limit == end else response(kind, a, b, c, limit)[0]
-                x, sign = first_crossing(kind, a, b, c, now, limit, value, final, state[0] + on, state[0] - off)
+                final = arrived, slope_end
+                if limit != end:
+                    final = response(kind, a, b, c, limit)[:2]
+                x, sign = first_crossing(
+                    kind, a, b, c, now, limit, (value, slope), final, state[0] + on, state[0] - off
+                )
         if sign != 0:
             moment = x
             if kind == LOW_PASS:
                 moment = 2.0 * x / (speed + math.sqrt(max(speed * speed + 4.0 * curve * x, 0.0)))
             moment = min(moment, length)
             state[0] += on if sign > 0 else -off
+            if x > now:
+                now, value, stale = x, state[0], True
             state[1] = start + moment
             count = _emit(
                 out_time, out_pixel, out_on, count, start + moment, pixel, sign > 0, jitter, window, seed, sent
             )
-            now = x
         elif shot_due:
             light = light_a + gradient * candidate
             choice = _shot(seed, pixel, drawn[pixel], light, rate_on, rate_off, rate_hot)
@@ -164,13 +181,14 @@ def _piece(
                     out_time, out_pixel, out_on, count, when, pixel, choice > 0, jitter, window, seed, sent
                 )
             now = max(now, limit)
+            value, stale = response(kind, a, b, c, now)[0], True
         else:
             break
     state[0] -= leak * length
     return count, arrival
 
 
-@_owns_nothing
+@_inlined
 def _step(
     out_time, out_pixel, out_on, count, pixel, start, stop, light_a, light_b, log_a, log_b, filtered,
     state, constants, jitter, window, drawn, sent,
@@ -200,6 +218,45 @@ def _step(
     return count, filtered
 
 
+@_owns_nothing
+def _send(
+    out_time, out_pixel, out_on, count, begin, flag_words, flags, now, then, start, stop, first, last_event,
+    candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
+    state,
+):  # fmt: skip
+    """Send the events of a tile's flagged pixels in one step, from pixel `begin` of the tile on.
+
+    Returns the fill of the columns, and the pixel that they had no room for (the tile's size: all had).
+    """
+    size, has_shot = now.shape[1], len(candidate) > 0
+    for w in range(begin // 8, len(flag_words)):
+        if flag_words[w] == 0:
+            continue
+        for i in range(max(8 * w, begin), min(8 * w + 8, size)):
+            if flags[i] == 0:
+                continue
+            pixel = first + i
+            constants = (
+                on[pixel], off[pixel], leak[pixel], rate_on[pixel], rate_off[pixel], rate_hot[pixel],
+                rate, refractory, seed,
+            )  # fmt: skip
+            drawn_0, sent_0 = drawn[pixel], sent[pixel]
+            state[0], state[1] = now[3, i], last_event[pixel]
+            state[2] = candidate[pixel] if has_shot else np.inf
+            filled, arrival = _step(
+                out_time, out_pixel, out_on, count, pixel, start, stop, now[0, i], then[0, i],
+                now[1, i], then[1, i], now[2, i], state, constants, jitter, window, drawn, sent,
+            )  # fmt: skip
+            if filled > len(out_time):
+                drawn[pixel], sent[pixel] = drawn_0, sent_0
+                return count, i
+            count, then[2, i], then[3, i] = filled, arrival, state[0]
+            last_event[pixel] = state[1]
+            if has_shot:
+                candidate[pixel] = state[2]
+    return count, size
+
+
 @njit(cache=True, error_model="numpy")
 def _run_tile(
     out, count, frames, times, first, last, light, filtered, base, last_event, candidate, drawn, sent,
@@ -208,8 +265,7 @@ def _run_tile(
     """Run the pixels first..last - 1 through all steps of a block; see `run_tiles`."""
     out_time, out_pixel, out_on = out
     size = last - first
-    words = (size + 7) // 8
-    flag_words = np.zeros(words, np.uint64)
+    flag_words = np.zeros((size + 7) // 8, np.uint64)
     flags = flag_words.view(np.uint8)
     now = np.empty((4, size))
     then = np.empty((4, size))
@@ -218,9 +274,8 @@ def _run_tile(
     gain = np.empty(size)
     my_on, my_off, my_leak = on[first:last], off[first:last], leak[first:last]
     state = np.empty(3)
-    has_shot = len(candidate) > 0
     soonest = np.inf
-    if has_shot:
+    if len(candidate) > 0:
         soonest = candidate[first:last].min()
     for k in range(len(frames)):
         start, stop = times[k], times[k + 1]
@@ -238,36 +293,15 @@ def _run_tile(
         if soonest < stop:
             for i in range(size):
                 flags[i] |= candidate[first + i] < stop
-        for w in range(words):
-            if flag_words[w] == 0:
-                continue
-            for i in range(8 * w, min(8 * w + 8, size)):
-                if flags[i] == 0:
-                    continue
-                pixel = first + i
-                constants = (
-                    on[pixel], off[pixel], leak[pixel], rate_on[pixel], rate_off[pixel], rate_hot[pixel],
-                    rate, refractory, seed,
-                )  # fmt: skip
-                drawn_0, sent_0 = drawn[pixel], sent[pixel]
-                while True:
-                    state[0], state[1] = now[3, i], last_event[pixel]
-                    state[2] = candidate[pixel] if has_shot else np.inf
-                    filled, arrival = _step(
-                        out_time, out_pixel, out_on, count, pixel, start, stop, now[0, i], then[0, i],
-                        now[1, i], then[1, i], now[2, i], state, constants, jitter, window, drawn, sent,
-                    )  # fmt: skip
-                    if filled <= len(out_time):
-                        break
-                    # Columns that grew deep inside would be handed up through every call, which costs more
-                    # than the events: the step is done again instead.
-                    out_time, out_pixel, out_on = _grown(out_time), _grown(out_pixel), _grown(out_on)
-                    drawn[pixel], sent[pixel] = drawn_0, sent_0
-                count, then[2, i] = filled, arrival
-                then[3, i] = state[0]
-                last_event[pixel] = state[1]
-                if has_shot:
-                    candidate[pixel] = state[2]
+        at = 0
+        while at < size:
+            count, at = _send(
+                out_time, out_pixel, out_on, count, at, flag_words, flags, now, then, start, stop, first,
+                last_event, candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate,
+                refractory, jitter, window, seed, state,
+            )  # fmt: skip
+            if at < size:
+                out_time, out_pixel, out_on = _grown(out_time), _grown(out_pixel), _grown(out_on)
         if soonest < stop:
             soonest = candidate[first:last].min()
         now, then = then, now

@@ -38,11 +38,18 @@ def fast_log(x):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def fast_exp(x):
-    """Return exp x for x <= 0 (clamped at -700), within 2 ulp, in a form that compilers vectorise."""
+def _split(x):
+    """Return n and r of x = n ln 2 + r, |r| <= ln 2 / 2, and 2^n; x is clamped at -700."""
     x = max(x, -700.0)
     n = np.rint(x * 1.4426950408889634)
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
+    return r, np.int64((np.int64(n) + 1023) << 52).view(np.float64)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def fast_exp(x):
+    """Return exp x for x <= 0 (clamped at -700), within 2 ulp, in a form that compilers vectorise."""
+    r, power = _split(x)
     p = 1.0 / 479001600.0
     p = p * r + 1.0 / 39916800.0
     p = p * r + 1.0 / 3628800.0
@@ -56,7 +63,22 @@ def fast_exp(x):
     p = p * r + 0.5
     p = p * r + 1.0
     p = p * r + 1.0
-    return p * np.int64((np.int64(n) + 1023) << 52).view(np.float64)
+    return p * power
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def single_exp(x):
+    """Return exp x for x <= 0 (clamped at -700), within 2 ulp, soon: for one number rather than a vector.
+
+    The same series as `fast_exp` in Estrin's order, a chain of five sums instead of twelve.
+    """
+    r, power = _split(x)
+    r2 = r * r
+    r4 = r2 * r2
+    low = (1.0 + r) + r2 * (0.5 + r * (1.0 / 6.0))
+    middle = (1.0 / 24.0 + r * (1.0 / 120.0)) + r2 * (1.0 / 720.0 + r * (1.0 / 5040.0))
+    high = (1.0 / 40320.0 + r * (1.0 / 362880.0)) + r2 * (1.0 / 3628800.0 + r * (1.0 / 39916800.0))
+    return (low + r4 * (middle + r4 * (high + r4 * (1.0 / 479001600.0)))) * power
 
 
 @njit(cache=True, error_model="numpy", inline="always")

@@ -76,13 +76,58 @@ def sort_events(bucket: NDArray, pixel: NDArray, on: NDArray, time_us: NDArray) 
     """Return (t_us, pixel, on) in order, given each event's bucket and each bucket's time stamp (ascending)."""
     count = len(bucket)
     if len(time_us) <= max(_DENSE_LIMIT, 4 * count):
-        columns = np.empty(count, np.int64), np.empty(count, np.int32), np.empty(count, np.bool_)
+        columns = _columns(count)
         _counting_sort(bucket, pixel, on, time_us, *columns)
     else:
         rank = np.argsort(bucket, kind="stable")
         columns = time_us[bucket[rank]], pixel[rank], on[rank]
     settle_ties(*columns)
     return columns
+
+
+@njit(cache=True, nogil=True)
+def _two_level_sort(time, pixel, on, first, shift, coarse, out):
+    """Sort stably by time stamp: all events into spans of 2^shift microseconds, then each span by itself.
+
+    Both steps stay in the cache, which one table of all microseconds does not. `coarse` and `out` are columns
+    for the result of each step.
+    """
+    coarse_time, coarse_pixel, coarse_on = coarse
+    out_time, out_pixel, out_on = out
+    spans = ((time.max() - first) >> shift) + 1
+    edges = np.zeros(spans + 1, np.int64)
+    for i in range(len(time)):
+        edges[((time[i] - first) >> shift) + 1] += 1
+    for span in range(spans):
+        edges[span + 1] += edges[span]
+    fill = edges.copy()
+    for i in range(len(time)):
+        span = (time[i] - first) >> shift
+        n = fill[span]
+        fill[span] = n + 1
+        coarse_time[n], coarse_pixel[n], coarse_on[n] = time[i], pixel[i], on[i]
+    width = 1 << shift
+    place = np.empty(width + 1, np.int64)
+    for span in range(spans):
+        start, stop = edges[span], edges[span + 1]
+        if start == stop:
+            continue
+        begin = first + (span << shift)
+        place[:] = 0
+        place[0] = start
+        for i in range(start, stop):
+            place[coarse_time[i] - begin + 1] += 1
+        for b in range(width):
+            place[b + 1] += place[b]
+        for i in range(start, stop):
+            b = coarse_time[i] - begin
+            n = place[b]
+            place[b] = n + 1
+            out_time[n], out_pixel[n], out_on[n] = coarse_time[i], coarse_pixel[i], coarse_on[i]
+
+
+def _columns(count: int) -> Columns:
+    return np.empty(count, np.int64), np.empty(count, np.int32), np.empty(count, np.bool_)
 
 
 def sort_times(time_us: NDArray, pixel: NDArray, on: NDArray) -> Columns:
@@ -92,9 +137,13 @@ def sort_times(time_us: NDArray, pixel: NDArray, on: NDArray) -> Columns:
     first = int(time_us.min())
     span = int(time_us.max()) - first + 1
     if span <= max(_DENSE_LIMIT, 4 * len(time_us)):
-        return sort_events(time_us - first, pixel, on, np.arange(first, first + span))
-    rank = np.argsort(time_us, kind="stable")
-    columns = time_us[rank], pixel[rank], on[rank]
+        columns = _columns(len(time_us))
+        _two_level_sort(
+            time_us, pixel, on, first, (span.bit_length() + 1) // 2, _columns(len(time_us)), columns
+        )
+    else:
+        rank = np.argsort(time_us, kind="stable")
+        columns = time_us[rank], pixel[rank], on[rank]
     settle_ties(*columns)
     return columns
 

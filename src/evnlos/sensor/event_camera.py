@@ -24,7 +24,7 @@ WHITE_DN = 255.0
 _CHUNK_BYTES = 64 << 20
 _CHUNK_STEPS = 32
 _RENDER_BYTES = 2 << 20  # of light at once: it is scaled while the cache still holds it
-_LONGEST_SHIFT_PX = 1.0
+_LONGEST_SHIFT_PX = 4.0
 _FEWEST_STEPS = 8
 _PROBES = 3
 _BLOCK = 512
@@ -56,7 +56,8 @@ class EventCamera:
     The wall is rendered in chunks; between two instants its light counts as a line. The camera renders probe
     instants in the middle of steps and shortens the steps until that line misses the true log light by no more
     than `tolerance` thresholds. An event is then early or late by at most that fraction of the time its pixel
-    takes from one event to the next. No step moves the image by more than a pixel.
+    takes from one event to the next. No step moves the image by more than four pixels, so that the probes see
+    what passes between two instants.
 
     Args:
         pixel: Parameters of the pixels.
@@ -70,7 +71,7 @@ class EventCamera:
 
     pixel: EventPixel = field(default_factory=EventPixel)
     """Parameters of the pixels."""
-    tolerance: float = 0.005
+    tolerance: float = 0.01
     """Largest error of the interpolated log light, in thresholds."""
     time_step_s: float | None = None
     """Fixed time step, seconds; None = chosen from the motion."""
@@ -159,7 +160,7 @@ class EventCamera:
 
 
 def _longest_step(wall: Wall, t0: float, t1: float) -> float:
-    """Return the step that moves the image by one pixel, at most an eighth of the recording."""
+    """Return the step that moves the image by four pixels, at most an eighth of the recording."""
     speed = float(wall.speed_px_s)
     if not (math.isfinite(speed) and speed >= 0):
         raise ConfigError(

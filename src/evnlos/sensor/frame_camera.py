@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.sensor._photons import fill_electrons
 from evnlos.sensor._random import check_seed
 from evnlos.sensor.event_camera import Wall
 
@@ -168,12 +169,19 @@ class FrameCamera:
     ) -> NDArray[np.float64]:
         """Return the digital numbers of one frame, light [H, W], as whole float64."""
         sensitivity, offset_e = pattern
-        draw = np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, 1, number])))
-        electrons = draw.poisson(np.maximum(self.full_well_e * sensitivity * image, 0.0)) + offset_e
-        if self.read_noise_e > 0:
-            electrons += self.read_noise_e * draw.standard_normal(image.shape)
-        span = (self.white - self.black_level) * self.gain / self.full_well_e
-        return np.clip(np.rint(self.black_level + span * electrons), 0, self.white)
+        mean = self.full_well_e * sensitivity * image
+        levels = np.empty_like(mean)
+        fill_electrons(
+            mean.ravel(),
+            offset_e.ravel(),
+            self.read_noise_e,
+            np.uint64(seed),
+            np.uint64(number),
+            levels.ravel(),
+        )
+        levels *= (self.white - self.black_level) * self.gain / self.full_well_e
+        levels += self.black_level
+        return np.clip(np.rint(levels, out=levels), 0, self.white, out=levels)
 
     def fixed_pattern(
         self, shape: tuple[int, int], seed: int = 0
