@@ -1,4 +1,4 @@
-"""The steps that the camera chooses for the paper's scene time its events to better than a quarter of a millisecond, rms."""
+"""The steps that the camera chooses time the events of the paper's scene to a quarter of a millisecond, rms."""
 
 from dataclasses import replace
 
