@@ -18,37 +18,21 @@ from evnlos import FrameCamera
 from evnlos.calibration.scan import ScanPlan, import_scan, rehearse_scan, write_plan
 from evnlos.solver import read_photograph
 from evnlos.solver.inversion import Inversion, chosen_degree
-from evnlos.transport import Lambert, MatrixTransport, light_transport_matrix
-from evnlos.types import Plane
+from evnlos.transport import MatrixTransport
 
 PITCH = 0.02
 torch.set_num_threads(1)
 photograph = read_photograph(sys.argv[1]).binned(6)
-screen, shape = photograph.screen, photograph.patches.shape
-sides = [round(float(np.ptp(middles)) / PITCH) + 1 for middles in (screen.y_m, screen.x_m)]
-center = tuple(float(m.min() + m.max()) / 2 for m in (screen.x_m, screen.y_m))
-plane = Plane(sides[0], sides[1], PITCH, center)
-nearest = [
-    np.abs(np.asarray(a)[:, None] - b).argmin(axis=1)
-    for a, b in ((screen.y_m, plane.y_m), (screen.x_m, plane.x_m))
-]
-truth = light_transport_matrix(
-    photograph.patches,
-    plane,
-    photograph.distance_m,
-    Lambert(1.0),
-    occluders=photograph.occluders,
-    emission_exponent=photograph.emission_exponent,
-    points=(3, 6),
-).numpy()
+shape, plane = photograph.patches.shape, photograph.plane_of_screen(PITCH)
+truth = photograph.matrix(plane).numpy()
 truth *= 0.8 / truth.sum(axis=1).max()
 
 
 def correlation(matrix: torch.Tensor) -> float:
     operator = MatrixTransport(matrix / torch.linalg.matrix_norm(matrix, 2), plane, shape)
     wall = photograph.measurement()
-    image = Inversion(operator, wall, chosen_degree(operator, wall)).solve("tikhonov").image.numpy()
-    seen = image[:, nearest[0]][:, :, nearest[1]]
+    image = Inversion(operator, wall, chosen_degree(operator, wall)).solve("tikhonov").image
+    seen = photograph.at_cells(image, plane).numpy()
     return float(np.corrcoef(seen.ravel(), photograph.truth.numpy().ravel())[0, 1])
 
 
@@ -57,7 +41,7 @@ print(f"modelled matrix: r = {correlation(torch.from_numpy(truth)):.3f}")
 for pattern, noise in (("hadamard", 2e-3), ("hadamard", 8e-3), ("raster", 2e-3), ("raster", 5e-4)):
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "scan"
-        plan = ScanPlan((plane.width * PITCH, plane.height * PITCH), PITCH, center, pattern)
+        plan = ScanPlan((plane.width * PITCH, plane.height * PITCH), PITCH, plane.center_m, pattern)
         list(write_plan(plan, folder))
         camera = FrameCamera(
             bit_depth=16, full_well_e=1e9, read_noise_e=noise * 1e9, prnu=0, dsnu_e=0, black_level=2000

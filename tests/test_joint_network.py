@@ -9,7 +9,8 @@ import torch
 from evnlos import EvnlosError, Training, UNetConfig, evaluate, load_weights, train
 from evnlos.dataset import NlosDataset
 from evnlos.errors import ConfigError, DataError
-from evnlos.evaluation import Reconstructor
+from evnlos.evaluation import Reconstructor, curve_over_positions
+from evnlos.evaluation.positions import choices
 from evnlos.model import JointNetwork, infer
 from evnlos.scene import FontGlyphs
 from evnlos.types import Plane
@@ -68,6 +69,28 @@ def test_a_joint_run_learns_scores_and_is_read_back(trained, tiny_dataset) -> No
     mine = samples.names == name
     alone = infer(weights.network, samples.inputs[torch.from_numpy(mine)], samples.position_m[mine])
     torch.testing.assert_close(both[torch.from_numpy(mine)], alone)
+
+
+def test_the_curve_over_positions_ends_at_the_whole_pass(trained, tiny_dataset) -> None:
+    weights = load_weights(trained[0])
+    whole = len(NlosDataset(tiny_dataset, "train", "frame")) // len(tiny_dataset.objects("train"))
+    points = curve_over_positions(weights, tiny_dataset, "train", (1, whole))
+    assert [point.positions for point in points] == [1, whole]
+    assert [point.subsets for point in points] == [min(whole, 8), 1]
+    every = evaluate(weights, tiny_dataset, "train").scores.mean()["psnr_db"]
+    assert points[-1].psnr_db == pytest.approx(every, abs=1e-4)
+    assert points[0].psnr_db != pytest.approx(every, abs=1e-2)
+    with pytest.raises(DataError, match=f"{whole + 1} positions"):
+        curve_over_positions(weights, tiny_dataset, "train", (whole + 1,))
+
+
+@pytest.mark.parametrize("count", [1, 3, 7, 20, 39, 40])
+def test_choices_are_equally_spaced_and_within_the_pass(count: int) -> None:
+    parts = choices(40, count)
+    assert 1 <= len(parts) <= 8
+    for part in parts:
+        assert len(part) == count and part.min() >= 0 and part.max() < 40
+        assert len(set(np.diff(part).tolist())) <= 1
 
 
 def test_a_killed_joint_run_goes_on_to_the_same_bytes(trained, tiny_dataset, tmp_path) -> None:

@@ -39,8 +39,7 @@ from evnlos.scene.glyph_sets import Plate
 from evnlos.sensor import FrameCamera
 from evnlos.solver import read_photograph
 from evnlos.solver.inversion import Inversion, chosen_degree
-from evnlos.transport import MatrixTransport, MeasuredTransport, RadiometricTransport, light_transport_matrix
-from evnlos.transport.brdf import Lambert
+from evnlos.transport import MatrixTransport, MeasuredTransport, RadiometricTransport
 from evnlos.transport.measured_file import About, Measurement, read_measurement, write_measurement
 from evnlos.types import Plane
 
@@ -534,22 +533,11 @@ def test_whole_passes_are_inverted_under_a_measured_rig(tiny_captures, tmp_path,
 def test_real_photograph_under_a_scanned_room(shared_data, tmp_path) -> None:
     """The published chair's room, scanned by our simulator with noise, inverts the real photograph."""
     photograph = read_photograph(shared_data / "periscopy" / "mushroom_chair.npz").binned(6)
-    shape, screen = photograph.patches.shape, photograph.screen
-    pitch = 0.02
-    width, height = (round(float(np.ptp(m)) / pitch) + 1 for m in (screen.x_m, screen.y_m))
-    middle = tuple(float(m.min() + m.max()) / 2 for m in (screen.x_m, screen.y_m))
-    plane = Plane(height, width, pitch, middle)
-    matrix = light_transport_matrix(
-        photograph.patches,
-        plane,
-        photograph.distance_m,
-        Lambert(1.0),
-        occluders=photograph.occluders,
-        emission_exponent=photograph.emission_exponent,
-        points=(2, 4),
-    ).numpy()
+    pitch, shape = 0.02, photograph.patches.shape
+    plane = photograph.plane_of_screen(pitch)
+    matrix = photograph.matrix(plane).numpy()
     matrix *= 0.8 / matrix.sum(axis=1).max()
-    plan = ScanPlan((width * pitch, height * pitch), pitch, middle, "hadamard")
+    plan = ScanPlan((plane.width * pitch, plane.height * pitch), pitch, plane.center_m, "hadamard")
     record(tmp_path / "room", plan, matrix, with_read_noise(2e-3), shape)
     found = import_scan(tmp_path / "room")
     assert found.denoising.applied
@@ -557,7 +545,5 @@ def test_real_photograph_under_a_scanned_room(shared_data, tmp_path) -> None:
     operator = MatrixTransport(measured / torch.linalg.matrix_norm(measured, 2), plane, shape)
     wall = photograph.measurement()
     image = Inversion(operator, wall, chosen_degree(operator, wall)).solve("tikhonov").image
-    columns = np.abs(np.asarray(screen.x_m)[:, None] - plane.x_m).argmin(axis=1)
-    rows = np.abs(np.asarray(screen.y_m)[:, None] - plane.y_m).argmin(axis=1)
-    seen = image.numpy()[:, rows][:, :, columns]
+    seen = photograph.at_cells(image, plane).numpy()
     assert np.corrcoef(seen.ravel(), photograph.truth.numpy().ravel())[0, 1] > 0.65

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from evnlos.cli.notes import say
+from evnlos.config import to_dict
 from evnlos.dataset import open_dataset
 from evnlos.evaluation import BASELINES, CHECKS
 from evnlos.model.confidence import COVERAGE
@@ -27,12 +28,14 @@ class Command:
     """torchvision's vgg16-397923af.pth for LPIPS; by default it is looked for in the torch hub cache."""
     lpips_heads: Path | None = None
     """The linear heads vgg.pth of LPIPS v0.1; by default those of an installed `lpips`."""
+    positions: tuple[int, ...] = ()
+    """Numbers of positions, e.g. 1 2 5 10 20 40: also how the picture of a joint network grows with them."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> None:
         """Evaluate and print."""
-        from evnlos.evaluation import available_lpips, evaluate, load_lpips
+        from evnlos.evaluation import available_lpips, curve_over_positions, evaluate, load_lpips
         from evnlos.model import load_weights
         from evnlos.report import refuse_seen, seen_in_training
 
@@ -48,10 +51,15 @@ class Command:
             "split": split,
         }
         seen = seen_in_training(weights.history, dataset, split)
+        curve = curve_over_positions(weights, dataset, split, self.positions) if self.positions else []
         if self.json:
-            print(json.dumps(about | {"seen_in_training": seen} | found))
+            points = {"positions": [to_dict(point) for point in curve]} if curve else {}
+            print(json.dumps(about | {"seen_in_training": seen} | found | points))
         else:
             _print_summary(about, found)
+            if curve:
+                print("| positions | choices of them | PSNR, dB |\n|---|---|---|")
+                print("\n".join(f"| {p.positions} | {p.subsets} | {p.psnr_db:.2f} |" for p in curve))
             if seen:
                 say(f"note: training saw {', '.join(seen)}; scores on them say nothing about unseen objects")
 

@@ -20,12 +20,9 @@ from evnlos.dataset.variation import check_ranges, varied
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.scene import (
-    DrawingGlyphs,
-    EmnistGlyphs,
     FontGlyphs,
-    HandwritingGlyphs,
+    Glyphs,
     LineMotion,
-    NistGlyphs,
     Scene,
 )
 from evnlos.seeds import derive_seed
@@ -45,9 +42,7 @@ class Lab:
 
     name: str = "lab"
     """Name of the rig; captures are called NAME_A, NAME_B, ..."""
-    glyphs: FontGlyphs | HandwritingGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs = field(
-        default_factory=FontGlyphs
-    )
+    glyphs: Glyphs = field(default_factory=FontGlyphs)
     """What is hidden."""
     motion: LineMotion = field(default_factory=LineMotion)
     """How it moves."""

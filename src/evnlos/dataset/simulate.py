@@ -17,12 +17,9 @@ from evnlos.dataset.store import Dataset, create_dataset
 from evnlos.dataset.variation import check_ranges, varied
 from evnlos.errors import ConfigError
 from evnlos.scene import (
-    DrawingGlyphs,
-    EmnistGlyphs,
-    FontGlyphs,
+    Glyphs,
     HandwritingGlyphs,
     LineMotion,
-    NistGlyphs,
     Scene,
 )
 from evnlos.seeds import derive_seed
@@ -50,9 +47,7 @@ class SensorSize:
 class Simulation:
     """Everything that decides a simulated dataset."""
 
-    glyphs: HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs = field(
-        default_factory=HandwritingGlyphs
-    )
+    glyphs: Glyphs = field(default_factory=HandwritingGlyphs)
     """What is hidden."""
     motion: LineMotion = field(default_factory=LineMotion)
     """How it moves."""

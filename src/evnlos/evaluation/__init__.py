@@ -12,6 +12,7 @@ from evnlos.evaluation.evaluate import (
 from evnlos.evaluation.identify import Identification, identify
 from evnlos.evaluation.identify_rig import Bench
 from evnlos.evaluation.lpips import available_lpips, load_lpips
+from evnlos.evaluation.positions import PositionsPoint, curve_over_positions
 from evnlos.evaluation.reconstructor import Reconstructor
 from evnlos.evaluation.score import Scores, score
 
@@ -21,11 +22,13 @@ __all__ = [
     "Bench",
     "Evaluation",
     "Identification",
+    "PositionsPoint",
     "Reconstructor",
     "Scores",
     "assess",
     "available_lpips",
     "check_sampling",
+    "curve_over_positions",
     "evaluate",
     "identify",
     "load_lpips",

@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.model.embedding import LinearEmbedding, Standardise
+from evnlos.model.plates import on_canvas
 from evnlos.model.unet import ResidualUNet, UNetConfig
+from evnlos.types import Plane
 
 PLATE_M = 0.1
 """Side of the square around the plate's centre that a joint network draws, metres: 8 cm and a margin."""
@@ -95,13 +97,8 @@ class JointNetwork(nn.Module):
             Pictures [N, H, W]; each pixel is the mean of `FINER` x `FINER` samples.
         """
         height, width = self.size
-        fine_m = self._pitch_m / FINER
-        x = (torch.arange(width * FINER) + 0.5 - width * FINER / 2) * fine_m
-        y = (torch.arange(height * FINER) + 0.5 - height * FINER / 2) * fine_m
-        place = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).to(plate)  # [H', W', 2]
-        grid = (place - position_m.to(plate)[:, None, None]) / (self._side_m / 2)
-        fine = F.grid_sample(plate.expand(len(grid), 1, *plate.shape), grid, align_corners=False)
-        return F.avg_pool2d(fine, FINER)[:, 0]
+        canvas = Plane(height * FINER, width * FINER, self._pitch_m / FINER)
+        return F.avg_pool2d(on_canvas(plate, canvas, position_m, self._side_m), FINER)
 
     def plate_of(self, pictures: Tensor, position_m: Tensor) -> Tensor:
         """Return the plate [P, P] that pictures [N, H, W] of all positions show, their mean: what to learn."""

@@ -47,8 +47,8 @@ def on_canvas(plate: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float
     Returns:
         float32 [N, H, W]; zero beside the plate.
     """
-    centre = torch.as_tensor(np.asarray(position_m), dtype=torch.float32)
-    y, x = (torch.from_numpy(at).float() for at in (canvas.y_m, canvas.x_m))
+    centre = torch.as_tensor(position_m, dtype=torch.float32, device=plate.device)
+    y, x = (torch.from_numpy(at).float().to(plate.device) for at in (canvas.y_m, canvas.x_m))
     place = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)  # [H, W, 2]
     grid = (place - centre[:, None, None]) / (size_m / 2)
     return F.grid_sample(plate.float().expand(len(grid), 1, -1, -1), grid, align_corners=False)[:, 0]

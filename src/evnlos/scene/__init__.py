@@ -1,13 +1,12 @@
 """What is hidden and how it moves."""
 
-from evnlos.scene.drawing_set import DrawingGlyphs
+from evnlos.scene.drawing_set import DrawingGlyphs, Glyphs
 from evnlos.scene.drawings import drawing
 from evnlos.scene.emnist import list_emnist, read_emnist
 from evnlos.scene.fonts import Font, find_font
 from evnlos.scene.glyph_sets import (
     EmnistGlyphs,
     FontGlyphs,
-    Glyphs,
     GlyphSet,
     HandwritingGlyphs,
     NistGlyphs,

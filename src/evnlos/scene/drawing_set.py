@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from evnlos.errors import ConfigError
 from evnlos.scene.drawings import KINDS, drawing
-from evnlos.scene.glyph_sets import ObjectId, Plate
+from evnlos.scene.glyph_sets import EmnistGlyphs, FontGlyphs, HandwritingGlyphs, NistGlyphs, ObjectId, Plate
 from evnlos.scene.target import Target
 
 
@@ -50,3 +50,7 @@ class DrawingGlyphs:
     def notes(self) -> list[str]:
         """Return nothing: no font stands in for another."""
         return []
+
+
+Glyphs: TypeAlias = HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs
+"""All kinds of sets, told apart by `kind` in a settings file."""

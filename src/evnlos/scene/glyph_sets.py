@@ -229,10 +229,6 @@ class EmnistGlyphs:
         return []
 
 
-Glyphs: TypeAlias = HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs
-"""All kinds of sets, told apart by `kind` in a settings file."""
-
-
 @lru_cache(maxsize=16)
 def _handwriting_index(glyphs: HandwritingGlyphs) -> dict[ObjectId, tuple[int, str]]:
     writers = range(glyphs.first_writer, glyphs.first_writer + glyphs.writers)

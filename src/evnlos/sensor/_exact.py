@@ -116,11 +116,11 @@ def _piece(
     elif max(light_a, light_b) > KNEE:
         kind, end = LOG_LINE, length
         a, b, c = light_a, gradient, leak
+        slope_start, slope_end = b / light_a + c, b / light_b + c
     else:
         kind, end = LINE, length
         a, b, c = log_a, gradient * LOG_KNEE / KNEE + leak, 0.0
-    if kind != LOW_PASS:
-        slope_start, slope_end = response(kind, a, b, c, 0.0)[1], response(kind, a, b, c, end)[1]
+        slope_start = slope_end = b
     monotone = slope_start * slope_end >= 0.0
     arrived = arrival + leak * length
     now, value, slope, stale = 0.0, filtered, slope_start, False

@@ -12,6 +12,7 @@ import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.transport import Lambert, MatrixTransport, Occluder, Patches, light_transport_matrix
+from evnlos.types import Plane
 
 _FINEST = 48  # wall patches a side that carry what a matte wall knows
 _NEEDED = ("wall_x_m", "wall_z_m", "cell_x_m", "cell_z_m", "cell_size_m", "distance_m")
@@ -56,11 +57,16 @@ class Photograph:
         size = (self.patches.size_m[0] * factor, self.patches.size_m[1] * factor)
         return replace(self, wall=wall, patches=Patches(x, y, size))
 
-    def transport(self, *, occluded: bool = True) -> MatrixTransport:
-        """Return the matrix from screen to wall, float64, of norm 1, with or without the occluders."""
-        matrix = light_transport_matrix(
+    def matrix(self, screen: Plane | Patches | None = None, *, occluded: bool = True) -> torch.Tensor:
+        """Return the light-transport matrix from a screen to the wall, float64 [wall patches, cells].
+
+        Args:
+            screen: Cells in the place of the photograph's own.
+            occluded: With the occluders, or without.
+        """
+        return light_transport_matrix(
             self.patches,
-            self.screen,
+            self.screen if screen is None else screen,
             self.distance_m,
             Lambert(1.0),
             occluders=self.occluders if occluded else (),
@@ -68,8 +74,25 @@ class Photograph:
             # Measured: r of the published photograph is 0.01 lower with the adapted (2, 4).
             points=(3, 6) if occluded and self.occluders else None,
         )
+
+    def transport(self, *, occluded: bool = True) -> MatrixTransport:
+        """Return the operator from screen to wall, of norm 1, with or without the occluders."""
+        matrix = self.matrix(occluded=occluded)
         norm = torch.linalg.eigvalsh(matrix.mT @ matrix)[-1].sqrt()
         return MatrixTransport(matrix / norm, self.screen, self.patches.shape)
+
+    def plane_of_screen(self, pitch_m: float) -> Plane:
+        """Return a plane of square cells whose outermost centres are those of the screen."""
+        x, y = np.asarray(self.screen.x_m), np.asarray(self.screen.y_m)
+        height, width = (round(float(np.ptp(middles)) / pitch_m) + 1 for middles in (y, x))
+        return Plane(height, width, pitch_m, (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2))
+
+    def at_cells(self, images: torch.Tensor, plane: Plane) -> torch.Tensor:
+        """Return pictures of a plane [..., H, W] at the samples nearest to the screen's cells, [..., h, w]."""
+        x, y = np.asarray(self.screen.x_m), np.asarray(self.screen.y_m)
+        rows = np.abs(y[:, None] - plane.y_m).argmin(axis=1)
+        columns = np.abs(x[:, None] - plane.x_m).argmin(axis=1)
+        return images[..., rows, :][..., columns]
 
     def measurement(self) -> torch.Tensor:
         """Return the wall over its largest value, float64 [channels, H, W]."""
