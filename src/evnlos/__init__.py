@@ -1,5 +1,6 @@
 """evnlos sees moving things around a corner with an event camera: simulate, learn, reconstruct, measure."""
 
+import evnlos.threads  # noqa: F401 - before PyTorch
 from evnlos.dataset import (
     NlosDataset,
     Sampling,

@@ -92,7 +92,6 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     os.environ.update(_QUIET)
     try:
         import gradio
-        import torch
     except ImportError:
         raise MissingDependencyError("the page needs Gradio: pip install 'evnlos[app]'") from None
     from evnlos.app.hidden import picked
@@ -101,9 +100,6 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     from evnlos.app.solving import named_weights
     from evnlos.app.work import simulated
 
-    # Everything on the page is small: threads that wait for each other cost more than they save, above all
-    # where other programs keep the cores busy.
-    torch.set_num_threads(1)
     named = named_weights(weights)
     setup = Setup(columns=server.columns)
     pieces = simulated(setup, picked("R"), {})
