@@ -67,7 +67,8 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, monkeypatch) -> 
     assert [one["name"] for one in found] == ["icon", "dim"]
     for one in found:
         assert [p["name"] for p in one["worth"]] == ["icon_000", "icon_001"]
+        assert one["consistent_db"] > 0
         assert all(p["explained"] is not None and p["skill"] < 1 for p in one["worth"])
     text = (tmp_path / "carry-over-lab-w.md").read_text()
     widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
-    assert widths == {12} and "Mean skill of the best" in text
+    assert widths == {13} and "Mean skill of the best" in text

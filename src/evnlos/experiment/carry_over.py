@@ -8,14 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from evnlos.calibration import RIG_FILE
 from evnlos.config import config_hash, from_dict, load_yaml, to_dict, write_atomically
-from evnlos.dataset import NlosDataset, Sampling, Simulation, open_dataset
+from evnlos.dataset import NlosDataset, Sampling, Simulation, open_dataset, read_shard
 from evnlos.errors import DataError
-from evnlos.evaluation.consistency import FrameOperator
+from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.worth import PassWorth, risk_coverage, worth_of
 from evnlos.experiment.making import simulated_steps
+from evnlos.experiment.scoring import TRUST
 from evnlos.experiment.study import Step
 from evnlos.metrics import psnr
 from evnlos.model import Weights, infer, load_weights
@@ -33,12 +36,15 @@ class CarriedOver:
         name: What the set is.
         psnr_db: Mean PSNR of the network's pictures on the scored canvas, dB.
         average_db: The same of the average plate, drawn where the plate is, dB.
+        consistent_db: The same of the network's pictures after data consistency with the set's own wall, dB;
+            None for events alone.
         worth: What the confidence said of each pass, and what was true.
     """
 
     name: str
     psnr_db: float
     average_db: float
+    consistent_db: float | None
     worth: list[PassWorth]
 
     def mean(self, key: str) -> float:
@@ -106,10 +112,14 @@ def carry_over(
         folder = out / "simulations" / f"{rig.name}-{name.replace(' ', '-')}-{key}"
         for step in simulated_steps(config, folder, workers):
             yield step, None
-        yield Step(f"score {folder.name}", 1, 1), _score(name, loaded, folder, operator)
+        own_wall = FrameOperator(config, sampling) if operator is not None else None
+        yield Step(f"score {folder.name}", 1, 1), _score(name, loaded, folder, operator, own_wall)
 
 
-def _score(name: str, weights: Weights, folder: Path, operator: FrameOperator | None) -> CarriedOver:
+def _score(
+    name: str, weights: Weights, folder: Path, operator: FrameOperator | None, own_wall: FrameOperator | None
+) -> CarriedOver:
+    """Score a set; `operator` is the rig that the network was trained for, `own_wall` that of the set."""
     assert weights.confidence is not None
     dataset = open_dataset(folder)
     samples = NlosDataset(dataset, "all", weights.paradigm)  # type: ignore[arg-type]
@@ -117,9 +127,16 @@ def _score(name: str, weights: Weights, folder: Path, operator: FrameOperator | 
     canvas, rows = dataset.sampling.canvas, dataset.sampling.scored
     truth = samples.truth.float()[:, rows]
     average = on_canvas(weights.confidence.mean, canvas, samples.position_m)
-    seen_db, average_db = (float(psnr(one[:, rows].contiguous(), truth).mean()) for one in (images, average))
+
+    def mean_db(pictures: Tensor) -> float:
+        return float(psnr(pictures[:, rows].contiguous(), truth).mean())
+
+    consistent_db = None
+    if own_wall is not None:
+        frames = [torch.from_numpy(read_shard(dataset.shard(one))[0].frame) for one in dataset.objects("all")]
+        consistent_db = mean_db(consistent(images, torch.cat(frames), own_wall, TRUST))
     worth = worth_of(weights.network, weights.confidence, samples, images, canvas, operator)
-    return CarriedOver(name, seen_db, average_db, worth)
+    return CarriedOver(name, mean_db(images), mean_db(average), consistent_db, worth)
 
 
 def write_carried(found: list[CarriedOver], path: Path) -> None:
@@ -130,11 +147,22 @@ def write_carried(found: list[CarriedOver], path: Path) -> None:
 
 def carried_table(found: list[CarriedOver]) -> str:
     """Return the findings as a table, and how well the support orders all passes by their skill."""
-    head = ["set", "passes", "PSNR, dB", "average plate, dB", "skill", "support", "agreement", "explained"]
+    head = [
+        "set",
+        "passes",
+        "PSNR, dB",
+        "+ consistency, dB",
+        "average plate, dB",
+        "skill",
+        "support",
+        "agreement",
+        "explained",
+    ]
     head += ["measured", "coverage", "width"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in found:
-        row = [one.name, str(len(one.worth)), f"{one.psnr_db:.2f}", f"{one.average_db:.2f}"]
+        moved = "-" if one.consistent_db is None else f"{one.consistent_db:.2f}"
+        row = [one.name, str(len(one.worth)), f"{one.psnr_db:.2f}", moved, f"{one.average_db:.2f}"]
         row += [f"{one.mean(key):.2f}" for key in ("skill", "support", "agreement")]
         row.append("-" if one.worth[0].explained is None else f"{one.mean('explained'):.2f}")
         row += [f"{one.mean(key):.0%}" for key in ("measured", "coverage")]
