@@ -22,7 +22,8 @@ class Command:
     """Run an experiment on captures: calibrate, simulate, pre-train, fine-tune, compare; resumable."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss or width;
+    """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss, width,
+    embedding, joint (whole passes) or objects (how many are simulated);
     without captures: simulation (handwriting, transfer to Comic), conditions (frames against events over
     light, noise, exposure and speed), and carry-over (given weights on unseen hands, other things than
     characters, and other walls, with what their confidence says)."""

@@ -30,6 +30,8 @@ class Arm:
     """Settings of the pre-training."""
     finetuning: Training | None = None
     """Settings of the fine-tuning, or of the end-to-end training where there is no pre-training."""
+    writers: int | None = None
+    """Writers of the simulated characters; None is as many as the study says."""
     shots: int | None = None
     """Captures to train on; None is all that are there, otherwise the first of a seeded order."""
     sampling: Sampling = field(default_factory=Sampling)
