@@ -55,12 +55,11 @@ def _grown(column):
 
 
 # What sends events owns no array. Without `_nrt=False` numba would count references to those that it is handed,
-# by locked instructions that cost a sixth of all; a call for each event would cost as much again.
+# by locked instructions that cost a sixth of all.
 _owns_nothing = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
-_inlined = njit(cache=True, error_model="numpy", inline="always")
 
 
-@_inlined
+@_owns_nothing
 def _emit(out_time, out_pixel, out_on, count, time_s, pixel, on, jitter, window, seed, sent):
     """Append an event to the columns and return their fill; where they are full it is only counted."""
     if jitter > 0.0:
@@ -188,7 +187,7 @@ def _piece(
     return count, arrival
 
 
-@_inlined
+@_owns_nothing
 def _step(
     out_time, out_pixel, out_on, count, pixel, start, stop, light_a, light_b, log_a, log_b, filtered,
     state, constants, jitter, window, drawn, sent,

@@ -28,7 +28,7 @@ def log_light(intensity):
     return intensity * KNEE_SLOPE if intensity <= KNEE else logarithm
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def light_of(log_value):
     """Return the light in DN whose `log_light` this is."""
     return log_value / KNEE_SLOPE if log_value <= LOG_KNEE else math.exp(log_value)
@@ -52,7 +52,7 @@ def bend_response(light_a, light_b, change, tau, inverse, gain, span):
     return 0.5 * (above if middle > KNEE else below) * min(max(share, 0.0), tau / 6.0)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def response(kind, a, b, c, x):
     """Return the response of a piece at its own time x, and its first two derivatives there.
 
@@ -68,7 +68,7 @@ def response(kind, a, b, c, x):
     return a + b * x, b, 0.0
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def _extremum(kind, a, b, c):
     """Return where the response of a piece turns; it does so once, where its slope has two signs."""
     return math.log(c / b) if kind == LOW_PASS else -1.0 / c - a / b

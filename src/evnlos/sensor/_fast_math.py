@@ -66,7 +66,7 @@ def fast_exp(x):
     return p * power
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy")
 def single_exp(x):
     """Return exp x for x <= 0 (clamped at -700), within 2 ulp, soon: for one number rather than a vector.
 
