@@ -12,9 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -31,27 +29,46 @@ CONTROLS = {
     "ambient light": "Ambient light",
     "speed": "Speed of",
 }
+LEFT, RIGHT = "\ue012", "\ue014"
 PASS = "document.querySelector('.ev-sheet').dataset.pass"
+
+
+FIRST = "first picture, from opening the address"
 
 
 def first_picture(home: str, browser: chromium.Chromium) -> float:
     start = time.perf_counter()
     browser.open(home)
-    browser.wait(
-        "const p = document.querySelector('.ev-picture'); return p && p.complete !== false && p.offsetWidth"
-    )
+    browser.wait("const p = document.querySelector('.ev-picture'); return p && p.offsetWidth")
     return time.perf_counter() - start
 
 
+def settle(browser: chromium.Chromium) -> None:
+    browser.wait("return !document.querySelector('.ev-verdict').textContent.includes('Looking at it')")
+
+
 def answer(browser: chromium.Chromium, label: str, key: str) -> float:
+    settle(browser)
     before = browser.run(f"return {PASS}")
     browser.run(f"document.querySelector('input[type=range][aria-label*=\"{label}\"]').focus()")
     start = time.perf_counter()
     browser.press(key)
     browser.wait(f"return {PASS} !== {json.dumps(before)}")
-    took = time.perf_counter() - start
-    browser.wait("return !document.querySelector('.ev-verdict').textContent.includes('Looking at it')")
-    return took
+    return time.perf_counter() - start
+
+
+def measure(folder: Path, rounds: int) -> dict[str, list[float]]:
+    rows: dict[str, list[float]] = {FIRST: []}
+    with chromium.page(folder) as home:
+        for k in range(2):
+            with chromium.Chromium(folder / f"profile{k}") as browser:
+                rows[FIRST].append(first_picture(home, browser))
+        with chromium.Chromium(folder / "profile") as browser:
+            rows[FIRST].append(first_picture(home, browser))
+            for control, label in CONTROLS.items():
+                answer(browser, label, RIGHT)
+                rows[control] = [answer(browser, label, (LEFT, RIGHT)[turn % 2]) for turn in range(rounds)]
+    return rows
 
 
 def main() -> None:
@@ -61,36 +78,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if lacking := chromium.missing():
         sys.exit(f"{lacking}: apt-get install chromium chromium-driver")
-    rows: dict[str, list[float]] = {"first picture, from opening the address": []}
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        said = folder / "said"
-        with said.open("w") as log:
-            page = subprocess.Popen(
-                [sys.executable, "-m", "evnlos", "app", "--port", "0"], stdout=log, stderr=subprocess.STDOUT
-            )
-        try:
-            while not (found := re.search(r"http://\S+", said.read_text())):
-                time.sleep(0.1)
-            for k in range(3):
-                with chromium.Chromium(folder / f"profile{k}") as browser:
-                    rows["first picture, from opening the address"].append(
-                        first_picture(found.group(), browser)
-                    )
-                    if k < 2:
-                        continue
-                    browser.wait(
-                        "return !document.querySelector('.ev-verdict').textContent.includes('Looking at it')"
-                    )
-                    for control, label in CONTROLS.items():
-                        answer(browser, label, "\ue014")
-                        rows[control] = [
-                            answer(browser, label, "\ue014" if turn % 2 else "\ue012")
-                            for turn in range(arguments.rounds)
-                        ]
-        finally:
-            page.terminate()
-            page.wait(20)
+        rows = measure(Path(name), arguments.rounds)
     lines = [
         "# How long the page lets a person wait",
         "",

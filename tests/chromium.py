@@ -1,13 +1,18 @@
-"""A real headless Chromium, driven over the WebDriver protocol with the standard library alone."""
+"""A real headless Chromium, driven over the WebDriver protocol with the standard library; and the page."""
 
 import base64
 import json
+import os
+import re
 import shutil
 import socket
 import subprocess
+import sys
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -153,3 +158,29 @@ class Chromium:
             text = json.load(error)["value"]["message"]
             error.close()
             raise AssertionError(text) from None
+
+
+@contextmanager
+def page(scratch: Path, *options: str) -> Iterator[str]:
+    """Yield the address of the page in a process of its own, which a SIGTERM ends cleanly."""
+    command = [sys.executable, "-m", "evnlos", "app", "--port", "0", *options]
+    # The output goes to a file: what Gradio says must not fill a pipe that nobody reads.
+    said = scratch / "said"
+    with said.open("w") as log:
+        process = subprocess.Popen(
+            command, env={**os.environ, "TMPDIR": str(scratch)}, stdout=log, stderr=subprocess.STDOUT
+        )
+    try:
+        until = time.monotonic() + 180  # a first start compiles the kernels
+        while not (found := re.search(r"http://\S+", said.read_text())):
+            assert process.poll() is None and time.monotonic() < until, said.read_text()
+            time.sleep(0.1)
+        yield found.group()
+    finally:
+        process.terminate()
+        try:
+            ended = process.wait(20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+    assert ended == 0, said.read_text()

@@ -2,13 +2,8 @@
 
 import importlib.util
 import json
-import os
 import re
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -183,39 +178,13 @@ def strangers(addresses: list[str], home: str) -> list[str]:
     ]
 
 
-@contextmanager
-def page(scratch: Path, *options: str) -> Iterator[str]:
-    """Yield the address of the page in a process of its own, which a SIGTERM ends cleanly."""
-    command = [sys.executable, "-m", "evnlos", "app", "--port", "0", *options]
-    # The output goes to a file: what Gradio says must not fill a pipe that nobody reads.
-    said = scratch / "said"
-    with said.open("w") as log:
-        process = subprocess.Popen(
-            command, env={**os.environ, "TMPDIR": str(scratch)}, stdout=log, stderr=subprocess.STDOUT
-        )
-    try:
-        until = time.monotonic() + 180  # a first start compiles the kernels
-        while not (found := re.search(r"http://\S+", said.read_text())):
-            assert process.poll() is None and time.monotonic() < until, said.read_text()
-            time.sleep(0.1)
-        yield found.group()
-    finally:
-        process.terminate()
-        try:
-            ended = process.wait(20)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            raise
-    assert ended == 0, said.read_text()
-
-
 def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
     if importlib.util.find_spec("gradio") is None:
         pytest.skip("gradio is not installed: pip install 'evnlos[app]'")
     if chromium.missing():
         pytest.skip(f"{chromium.missing()}: apt-get install chromium chromium-driver")
     asked: list[str] = []
-    with page(tmp_path, "--columns", "24") as home, chromium.Chromium(tmp_path / "profile") as browser:
+    with chromium.page(tmp_path, "--columns", "24") as home, chromium.Chromium(tmp_path / "profile") as browser:
         assert urlsplit(home).hostname == "127.0.0.1"
         browser.open(home)
         width = browser.wait("const p = document.querySelector('.ev-picture'); return p && p.offsetWidth")

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from evnlos.sensor import EventPixel, EventStream, simulate_events
 from evnlos.sensor._exact_math import LOG_LINE, LOW_PASS, first_crossing, response
 from evnlos.sensor._fast_math import cos_turns, fast_exp, fast_log, single_exp
+from evnlos.sensor._order import sort_times
 from evnlos.sensor._reference import reference_exact
 
 QUIET = {"threshold_sigma": 0.0, "leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0}
@@ -357,3 +358,13 @@ def test_single_and_double_precision_and_bytes_agree():
         simulate_events(bytes_in.astype(t), times, NOISY, seed=2) for t in (np.uint8, np.float32, np.float64)
     ]
     assert runs[0] == runs[1] == runs[2]
+
+
+@pytest.mark.parametrize(("count", "span"), [(1, 1), (5, 3), (20_000, 700), (20_000, 1 << 20), (300, 1 << 40)])
+def test_events_are_put_in_order_of_time_pixel_and_polarity(count: int, span: int) -> None:
+    draw = np.random.default_rng(count)
+    time = draw.integers(0, span, count) - 17
+    pixel, on = draw.integers(0, 900, count).astype(np.int32), draw.random(count) < 0.5
+    rank = np.lexsort((on, pixel, time))
+    for found, column in zip(sort_times(time, pixel, on), (time, pixel, on), strict=True):
+        np.testing.assert_array_equal(found, column[rank])

@@ -199,6 +199,7 @@ def test_the_command_names_what_is_wrong(tmp_path, capsys) -> None:
         (["capture"], "captures, paper"),
         (["captures", "--arms", "EPMP"], "EPNP"),
         (["captures"], "no captures near_"),
+        (["objects", "--writers", "5"], "--writers 5 would change nothing"),
     ):
         with pytest.raises(SystemExit) as stop:
             main(["experiment", *arguments, "--captures", str(tmp_path), "--out", str(tmp_path / "o")])

@@ -1,5 +1,6 @@
 """A whole pass as one measurement: aligned by the motion, pooled, and better than its best position."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from evnlos import EvnlosError, Training, UNetConfig, evaluate, load_weights, train
+from evnlos.cli import main
 from evnlos.dataset import NlosDataset
 from evnlos.errors import ConfigError, DataError
 from evnlos.evaluation import Reconstructor, curve_over_positions
@@ -81,7 +83,16 @@ def test_the_curve_over_positions_ends_at_the_whole_pass(trained, tiny_dataset) 
     assert points[-1].psnr_db == pytest.approx(every, abs=1e-4)
     assert points[0].psnr_db != pytest.approx(every, abs=1e-2)
     with pytest.raises(DataError, match=f"{whole + 1} positions"):
-        curve_over_positions(weights, tiny_dataset, "train", (whole + 1,))
+        curve_over_positions(weights, tiny_dataset, "train", (1, whole + 1))
+
+
+def test_evaluate_prints_the_curve(trained, tiny_dataset, capsys) -> None:
+    arguments = ["--weights", str(trained[0]), "--data", str(tiny_dataset.folder), "--split", "train"]
+    main(["evaluate", *arguments, "--positions", "1", "2", "--json"])
+    points = json.loads(capsys.readouterr().out)["positions"]
+    assert [point["positions"] for point in points] == [1, 2]
+    main(["evaluate", *arguments, "--positions", "2"])
+    assert f"| 2 | {points[1]['subsets']} | {points[1]['psnr_db']:.2f} |" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("count", [1, 3, 7, 20, 39, 40])

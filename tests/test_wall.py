@@ -19,7 +19,7 @@ from evnlos.transport import (
     Wall,
     tpsf_kernel,
 )
-from evnlos.transport.spline import spline_coefficients, spline_sample, spline_weights
+from evnlos.transport.spline import _scattered, spline_coefficients, spline_sample, spline_weights
 from evnlos.transport.wall import ambient_plane
 from evnlos.types import Plane
 
@@ -288,3 +288,17 @@ def test_images_of_the_wrong_size_are_refused():
         SlidingWall(torch.zeros(3, 3), PLANE, View.affine(SHAPE, 400.0), LineMotion())
     with pytest.raises(ConfigError, match="8192"):
         SlidingWall(torch.zeros(PLANE.shape), PLANE, View.affine(SHAPE, 1e6), LineMotion())
+
+
+def test_a_grid_of_points_is_sampled_as_points_in_any_order_are() -> None:
+    draw = torch.Generator().manual_seed(4)
+    coefficients = torch.rand(13, 17, generator=draw, dtype=torch.float64)
+    row = (torch.rand(9, 1, generator=draw, dtype=torch.float64) * 20 - 4).expand(9, 11)
+    column = (torch.rand(1, 11, generator=draw, dtype=torch.float64) * 24 - 4).expand(9, 11)
+    expected = _scattered(coefficients, row, column)
+    assert (expected == 0).any() and (expected > 0.1).any()  # points outside, points inside
+    torch.testing.assert_close(spline_sample(coefficients, row, column), expected, rtol=1e-12, atol=1e-12)
+    tilted = row + 0.01 * torch.arange(11)
+    torch.testing.assert_close(
+        spline_sample(coefficients, tilted, column), _scattered(coefficients, tilted, column), rtol=0, atol=0
+    )

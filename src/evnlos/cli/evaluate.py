@@ -43,6 +43,7 @@ class Command:
         split = self.split or ("test" if dataset.split.get("test") else "all")
         refuse_seen(weights.history, dataset, split)
         metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
+        curve = curve_over_positions(weights, dataset, split, self.positions) if self.positions else []
         found = evaluate(weights, dataset, split, metric).summary()
         about = {
             "weights": str(self.weights),
@@ -51,7 +52,6 @@ class Command:
             "split": split,
         }
         seen = seen_in_training(weights.history, dataset, split)
-        curve = curve_over_positions(weights, dataset, split, self.positions) if self.positions else []
         if self.json:
             points = {"positions": [to_dict(point) for point in curve]} if curve else {}
             print(json.dumps(about | {"seen_in_training": seen} | found | points))

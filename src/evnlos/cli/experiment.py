@@ -83,6 +83,11 @@ class Command:
         if unknown:
             there = ", ".join(repr(arm.name) for arm in study.arms)
             raise ConfigError(f"arm {sorted(unknown)[0]!r} is unknown; {self.name} has {there}")
+        if self.writers and any(arm.writers for arm in study.arms):
+            raise ConfigError(
+                f"--writers {self.writers} would change nothing: {self.name} compares numbers of writers; "
+                "leave it out, or choose among its --arms"
+            )
         arms = []
         for arm in study.arms:
             if self.arms and arm.name not in self.arms:

@@ -22,7 +22,7 @@ class PositionsPoint:
 
     Args:
         positions: Positions that it saw.
-        subsets: Choices of so many positions that the scores are a mean over.
+        subsets: Choices of so many positions that the scores are a mean over, at most.
         psnr_db: Mean PSNR over the pictures of all positions of the split, the scored canvas, dB.
         objects: The same of each object, dB.
     """
@@ -62,25 +62,25 @@ def curve_over_positions(
     samples = NlosDataset(dataset, split, weights.paradigm)  # type: ignore[arg-type]
     if np.isnan(samples.position_m).any():
         raise DataError("the motion of an object is unknown; give it in capture.yaml (`evnlos track` finds it)")
+    passes = {name: np.flatnonzero(samples.names == name) for name in dict.fromkeys(samples.names.tolist())}
+    # All of them before the first reconstruction, so that a count that is too large costs no time.
+    chosen = {count: {name: choices(len(mine), count) for name, mine in passes.items()} for count in counts}
     network.eval()
     rows = dataset.sampling.scored
-    objects = list(dict.fromkeys(samples.names.tolist()))
     found = []
-    for count in counts:
-        scores: dict[str, list[float]] = {name: [] for name in objects}
-        chosen: list[np.ndarray] = []
-        for name in objects:
-            mine = np.flatnonzero(samples.names == name)
-            chosen = choices(len(mine), count)
+    for count, parts_of in chosen.items():
+        means = {}
+        for name, mine in passes.items():
             places = torch.from_numpy(samples.position_m[mine].astype(np.float32))
             inputs, truth = (part[torch.from_numpy(mine)].float() for part in (samples.inputs, samples.truth))
-            for part in chosen:
+            decibel = []
+            for part in parts_of[name]:
                 some = torch.from_numpy(part)
                 drawn = network.drawn(network.see(inputs[some], places[some]), places)
-                decibel = psnr(drawn[:, rows].contiguous(), truth[:, rows].contiguous())
-                scores[name].append(float(decibel.mean()))
-        means = {name: float(np.mean(values)) for name, values in scores.items()}
-        found.append(PositionsPoint(count, len(chosen), float(np.mean(list(means.values()))), means))
+                decibel.append(psnr(drawn[:, rows].contiguous(), truth[:, rows].contiguous()).mean())
+            means[name] = float(torch.stack(decibel).mean())
+        subsets = max(len(parts) for parts in parts_of.values())
+        found.append(PositionsPoint(count, subsets, float(np.mean(list(means.values()))), means))
     return found
 
 

@@ -112,7 +112,8 @@ def carry_over(
         folder = out / "simulations" / f"{rig.name}-{name.replace(' ', '-')}-{key}"
         for step in simulated_steps(config, folder, workers):
             yield step, None
-        own_wall = FrameOperator(config, sampling) if operator is not None else None
+        same = operator is None or config.transport == own.transport
+        own_wall = operator if same else FrameOperator(config, sampling)
         yield Step(f"score {folder.name}", 1, 1), _score(name, loaded, folder, operator, own_wall)
 
 
@@ -147,18 +148,8 @@ def write_carried(found: list[CarriedOver], path: Path) -> None:
 
 def carried_table(found: list[CarriedOver]) -> str:
     """Return the findings as a table, and how well the support orders all passes by their skill."""
-    head = [
-        "set",
-        "passes",
-        "PSNR, dB",
-        "+ consistency, dB",
-        "average plate, dB",
-        "skill",
-        "support",
-        "agreement",
-        "explained",
-    ]
-    head += ["measured", "coverage", "width"]
+    head = ["set", "passes", "PSNR, dB", "+ consistency, dB", "average plate, dB"]
+    head += ["skill", "support", "agreement", "explained", "measured", "coverage", "width"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in found:
         moved = "-" if one.consistent_db is None else f"{one.consistent_db:.2f}"

@@ -86,7 +86,7 @@ def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
         config = study.simulation or default()
     glyphs = config.glyphs
     assert isinstance(glyphs, HandwritingGlyphs)
-    glyphs = replace(glyphs, writers=arm.writers or study.writers)
+    glyphs = replace(glyphs, writers=study.writers if arm.writers is None else arm.writers)
     return replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
 
 

@@ -6,24 +6,10 @@ sent something; only these are solved piece by piece for the instants of their e
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
-from evnlos.sensor._exact_math import (
-    KNEE,
-    LINE,
-    LOG_KNEE,
-    LOG_LINE,
-    LOW_PASS,
-    bend_response,
-    first_crossing,
-    light_of,
-    response,
-)
 from evnlos.sensor._exact_pass import (
-    PIECE,
     copy_light,
     fall,
     flag_direct,
@@ -32,18 +18,7 @@ from evnlos.sensor._exact_pass import (
     log_row,
     respond,
 )
-from evnlos.sensor._fast_math import single_exp
-from evnlos.sensor._random import (
-    STREAM_SHOT_CHOICE,
-    STREAM_SHOT_GAP,
-    STREAM_TIME_JITTER,
-    random_exponential,
-    random_normal,
-    random_uniform,
-)
-
-DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
-"""The factor 1 - 0.75 (I + 20) / 275 of the shot noise at black, its largest value."""
+from evnlos.sensor._exact_send import send_events
 
 
 @njit(cache=True, error_model="numpy")
@@ -52,208 +27,6 @@ def _grown(column):
     longer = np.empty(2 * len(column), column.dtype)
     longer[: len(column)] = column
     return longer
-
-
-# What sends events owns no array. Without `_nrt=False` numba would count references to those that it is handed,
-# by locked instructions that cost a sixth of all.
-_owns_nothing = njit(cache=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
-
-
-@_owns_nothing
-def _emit(out_time, out_pixel, out_on, count, time_s, pixel, on, jitter, window, seed, sent):
-    """Append an event to the columns and return their fill; where they are full it is only counted."""
-    if jitter > 0.0:
-        time_s += jitter * random_normal(seed, STREAM_TIME_JITTER, pixel, sent[pixel])
-        time_s = min(max(time_s, window[0]), window[1])
-    sent[pixel] += 1
-    if count < len(out_time):
-        out_time[count] = np.int64(np.rint(time_s * 1e6))
-        out_pixel[count] = pixel
-        out_on[count] = on
-    return count + 1
-
-
-@njit(cache=True, error_model="numpy")
-def _shot(seed, pixel, counter, intensity, rate_on, rate_off, rate_hot):
-    """Return +1, -1 or 0: what a candidate of the dominating Poisson process becomes at this light."""
-    uniform = random_uniform(seed, STREAM_SHOT_CHOICE, pixel, counter)
-    uniform *= (rate_on + rate_off) * DIM_MAX + rate_hot
-    dim = max(1.0 - 0.75 * (intensity + 20.0) / 275.0, 0.0)
-    if uniform < rate_on * dim:
-        return 1
-    if uniform < (rate_on + rate_off) * dim:
-        return -1
-    if uniform < (rate_on + rate_off) * dim + 0.5 * rate_hot:
-        return 1
-    if uniform < (rate_on + rate_off) * dim + rate_hot:
-        return -1
-    return 0
-
-
-@_owns_nothing
-def _piece(
-    out_time, out_pixel, out_on, count, pixel, start, length, light_a, light_b, log_a, log_b, filtered,
-    state, constants, jitter, window, drawn, sent,
-):  # fmt: skip
-    """Send the events of one pixel on one piece of its light, from `start` for `length` seconds.
-
-    `state` (reference, last event, next candidate of shot noise) is updated; returns the fill of the columns
-    and the filter's output at the end of the piece.
-    """
-    on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, seed = constants
-    gradient = (light_b - light_a) / length
-    speed, curve = rate * (light_a + 20.0), 0.5 * rate * gradient
-    arrival = log_b
-    if rate > 0.0:
-        kind, end = LOW_PASS, length * (speed + curve * length)
-        per_tau = (log_b - log_a) / end
-        a, b, c = log_a - per_tau, per_tau + leak * length / end, filtered - log_a + per_tau
-        decay = single_exp(-end)
-        arrival = a + per_tau * end + c * decay
-        slope_start, slope_end = b - c, b - c * decay
-        arrival += bend_response(light_a, light_b, log_b - log_a, end, 1.0 / end, 1.0 - decay, rate * length)
-    elif max(light_a, light_b) > KNEE:
-        kind, end = LOG_LINE, length
-        a, b, c = light_a, gradient, leak
-        slope_start, slope_end = b / light_a + c, b / light_b + c
-    else:
-        kind, end = LINE, length
-        a, b, c = log_a, gradient * LOG_KNEE / KNEE + leak, 0.0
-        slope_start = slope_end = b
-    monotone = slope_start * slope_end >= 0.0
-    arrived = arrival + leak * length
-    now, value, slope, stale = 0.0, filtered, slope_start, False
-    while True:
-        ready, candidate = state[1] + refractory - start, state[2] - start
-        shot_due = candidate < length
-        above, below = max(value, arrived) - state[0], min(value, arrived) - state[0]
-        if monotone and not shot_due and above < on and below > -off:
-            break  # as most pieces end after their one event
-        limit = end
-        if shot_due:
-            limit = max(now, candidate * (speed + curve * candidate) if kind == LOW_PASS else candidate)
-        if ready >= length:
-            now = end
-        elif ready > 0.0:
-            begin = ready * (speed + curve * ready) if kind == LOW_PASS else ready
-            if begin > now:
-                now, stale = begin, True
-        x, sign = limit, 0
-        if now < limit:
-            if stale:
-                value, slope, _ = response(kind, a, b, c, now)
-                stale = False
-            if value - state[0] >= on:
-                x, sign = now, 1
-            elif value - state[0] <= -off:
-                x, sign = now, -1
-            else:
-                final = arrived, slope_end
-                if limit != end:
-                    final = response(kind, a, b, c, limit)[:2]
-                x, sign = first_crossing(
-                    kind, a, b, c, now, limit, (value, slope), final, state[0] + on, state[0] - off
-                )
-        if sign != 0:
-            moment = x
-            if kind == LOW_PASS:
-                moment = 2.0 * x / (speed + math.sqrt(max(speed * speed + 4.0 * curve * x, 0.0)))
-            moment = min(moment, length)
-            state[0] += on if sign > 0 else -off
-            if x > now:
-                now, value, stale = x, state[0], True
-            state[1] = start + moment
-            count = _emit(
-                out_time, out_pixel, out_on, count, start + moment, pixel, sign > 0, jitter, window, seed, sent
-            )
-        elif shot_due:
-            light = light_a + gradient * candidate
-            choice = _shot(seed, pixel, drawn[pixel], light, rate_on, rate_off, rate_hot)
-            drawn[pixel] += 1
-            total = (rate_on + rate_off) * DIM_MAX + rate_hot
-            when = state[2]
-            state[2] += random_exponential(seed, STREAM_SHOT_GAP, pixel, drawn[pixel]) / total
-            if choice != 0 and when - state[1] >= refractory:
-                state[0] = response(kind, a, b, c, limit)[0]
-                state[1] = when
-                count = _emit(
-                    out_time, out_pixel, out_on, count, when, pixel, choice > 0, jitter, window, seed, sent
-                )
-            now = max(now, limit)
-            value, stale = response(kind, a, b, c, now)[0], True
-        else:
-            break
-    state[0] -= leak * length
-    return count, arrival
-
-
-@_owns_nothing
-def _step(
-    out_time, out_pixel, out_on, count, pixel, start, stop, light_a, light_b, log_a, log_b, filtered,
-    state, constants, jitter, window, drawn, sent,
-):  # fmt: skip
-    """Send the events of one pixel in one step, split at the knee of the log and into short log changes."""
-    length, change = stop - start, light_b - light_a
-    knee = min(light_a, light_b) < KNEE < max(light_a, light_b)
-    at, at_light, at_log = 0.0, light_a, log_a
-    for part in range(2 if knee else 1):
-        goal, log_goal = (KNEE, LOG_KNEE) if knee and part == 0 else (light_b, log_b)
-        log_from, pieces = at_log, 1
-        if constants[6] > 0.0:
-            pieces = max(1, math.ceil(abs(log_goal - log_from) / PIECE))
-        for n in range(1, pieces + 1):
-            next_light, next_log, following = goal, log_goal, length
-            if n < pieces:
-                next_log = log_from + (log_goal - log_from) * n / pieces
-                next_light = light_of(next_log)
-            if next_light != light_b:
-                following = min((next_light - light_a) / change, 1.0) * length
-            if following > at:
-                count, filtered = _piece(
-                    out_time, out_pixel, out_on, count, pixel, start + at, following - at, at_light,
-                    next_light, at_log, next_log, filtered, state, constants, jitter, window, drawn, sent,
-                )  # fmt: skip
-            at, at_light, at_log = following, next_light, next_log
-    return count, filtered
-
-
-@_owns_nothing
-def _send(
-    out_time, out_pixel, out_on, count, begin, flag_words, flags, now, then, start, stop, first, last_event,
-    candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
-    state,
-):  # fmt: skip
-    """Send the events of a tile's flagged pixels in one step, from pixel `begin` of the tile on.
-
-    Returns the fill of the columns, and the pixel that they had no room for (the tile's size: all had).
-    """
-    size, has_shot = now.shape[1], len(candidate) > 0
-    for w in range(begin // 8, len(flag_words)):
-        if flag_words[w] == 0:
-            continue
-        for i in range(max(8 * w, begin), min(8 * w + 8, size)):
-            if flags[i] == 0:
-                continue
-            pixel = first + i
-            constants = (
-                on[pixel], off[pixel], leak[pixel], rate_on[pixel], rate_off[pixel], rate_hot[pixel],
-                rate, refractory, seed,
-            )  # fmt: skip
-            drawn_0, sent_0 = drawn[pixel], sent[pixel]
-            state[0], state[1] = now[3, i], last_event[pixel]
-            state[2] = candidate[pixel] if has_shot else np.inf
-            filled, arrival = _step(
-                out_time, out_pixel, out_on, count, pixel, start, stop, now[0, i], then[0, i],
-                now[1, i], then[1, i], now[2, i], state, constants, jitter, window, drawn, sent,
-            )  # fmt: skip
-            if filled > len(out_time):
-                drawn[pixel], sent[pixel] = drawn_0, sent_0
-                return count, i
-            count, then[2, i], then[3, i] = filled, arrival, state[0]
-            last_event[pixel] = state[1]
-            if has_shot:
-                candidate[pixel] = state[2]
-    return count, size
 
 
 @njit(cache=True, error_model="numpy")
@@ -294,7 +67,7 @@ def _run_tile(
                 flags[i] |= candidate[first + i] < stop
         at = 0
         while at < size:
-            count, at = _send(
+            count, at = send_events(
                 out_time, out_pixel, out_on, count, at, flag_words, flags, now, then, start, stop, first,
                 last_event, candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate,
                 refractory, jitter, window, seed, state,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from evnlos.sensor import _exact
 from evnlos.sensor._exact_pass import log_row
+from evnlos.sensor._exact_send import DIM_MAX
 from evnlos.sensor._order import Columns, sort_times
 from evnlos.sensor._random import (
     STREAM_HOT,
@@ -66,7 +67,7 @@ class ExactArray:
             # a pixel at rest has been leaking since its last event, at a time of its own
             self._base -= self._on * uniform_field(self.seed, STREAM_LEAK_PHASE, count)
         self._time, self._window = time_s, (time_s, math.inf)
-        rate = (self._rate_on + self._rate_off) * _exact.DIM_MAX + self._rate_hot
+        rate = (self._rate_on + self._rate_off) * DIM_MAX + self._rate_hot
         self._candidate = np.zeros(0)
         if rate.any():
             gap = exponential_field(self.seed, STREAM_SHOT_GAP, count)

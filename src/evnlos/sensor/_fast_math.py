@@ -39,7 +39,7 @@ def fast_log(x):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _split(x):
-    """Return n and r of x = n ln 2 + r, |r| <= ln 2 / 2, and 2^n; x is clamped at -700."""
+    """Return r and 2^n of x = n ln 2 + r, |r| <= ln 2 / 2; x is clamped at -700."""
     x = max(x, -700.0)
     n = np.rint(x * 1.4426950408889634)
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW

@@ -86,15 +86,14 @@ def sort_events(bucket: NDArray, pixel: NDArray, on: NDArray, time_us: NDArray) 
 
 
 @njit(cache=True, nogil=True)
-def _two_level_sort(time, pixel, on, first, shift, coarse, out):
-    """Sort stably by time stamp: all events into spans of 2^shift microseconds, then each span by itself.
+def _two_level_sort(time, pixel, on, first, spans, shift, coarse, out):
+    """Sort stably by time stamp: all events into `spans` of 2^shift microseconds, then each span by itself.
 
     Both steps stay in the cache, which one table of all microseconds does not. `coarse` and `out` are columns
     for the result of each step.
     """
     coarse_time, coarse_pixel, coarse_on = coarse
     out_time, out_pixel, out_on = out
-    spans = ((time.max() - first) >> shift) + 1
     edges = np.zeros(spans + 1, np.int64)
     for i in range(len(time)):
         edges[((time[i] - first) >> shift) + 1] += 1
@@ -137,10 +136,9 @@ def sort_times(time_us: NDArray, pixel: NDArray, on: NDArray) -> Columns:
     first = int(time_us.min())
     span = int(time_us.max()) - first + 1
     if span <= max(_DENSE_LIMIT, 4 * len(time_us)):
-        columns = _columns(len(time_us))
-        _two_level_sort(
-            time_us, pixel, on, first, (span.bit_length() + 1) // 2, _columns(len(time_us)), columns
-        )
+        columns, coarse = _columns(len(time_us)), _columns(len(time_us))
+        shift = (span.bit_length() + 1) // 2
+        _two_level_sort(time_us, pixel, on, first, ((span - 1) >> shift) + 1, shift, coarse, columns)
     else:
         rank = np.argsort(time_us, kind="stable")
         columns = time_us[rank], pixel[rank], on[rank]

@@ -7,8 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from evnlos.sensor._fast_math import cos_turns, fast_log
-from evnlos.sensor._random import STREAM_FEW_PHOTONS, STREAM_PHOTONS, random_uniform
+from evnlos.sensor._random import STREAM_FEW_PHOTONS, STREAM_PHOTONS, random_normals, random_uniform
 
 FEW = 64.0
 """Mean number of electrons below which the Poisson number is drawn by inverting its distribution."""
@@ -45,17 +44,11 @@ def fill_electrons(mean, offset, read_noise, seed, number, out):
     `mean` and `offset` are electrons [N], `read_noise` the standard deviation in electrons.
     """
     for i in range(len(out)):
-        first = random_uniform(seed, STREAM_PHOTONS, i, 2 * number)
-        second = random_uniform(seed, STREAM_PHOTONS, i, 2 * number + 1)
-        length = math.sqrt(-2.0 * fast_log(first))
-        quarter = second - 0.25 if second >= 0.25 else second + 0.75
-        count = max(many_electrons(max(mean[i], FEW), length * cos_turns(second)), 0.0)
-        out[i] = count + offset[i] + read_noise * (length * cos_turns(quarter))
+        shot, read = random_normals(seed, STREAM_PHOTONS, i, number)
+        count = max(many_electrons(max(mean[i], FEW), shot), 0.0)
+        out[i] = count + offset[i] + read_noise * read
     for i in range(len(out)):
         if mean[i] < FEW:
-            first = random_uniform(seed, STREAM_PHOTONS, i, 2 * number)
-            second = random_uniform(seed, STREAM_PHOTONS, i, 2 * number + 1)
-            quarter = second - 0.25 if second >= 0.25 else second + 0.75
+            read = random_normals(seed, STREAM_PHOTONS, i, number)[1]
             count = few_electrons(mean[i], random_uniform(seed, STREAM_FEW_PHOTONS, i, number))
-            noise = math.sqrt(-2.0 * fast_log(first)) * cos_turns(quarter)
-            out[i] = count + offset[i] + read_noise * noise
+            out[i] = count + offset[i] + read_noise * read

@@ -57,11 +57,19 @@ def random_exponential(seed, stream, pixel, counter):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def random_normal(seed, stream, pixel, counter):
-    """Return a normal number of mean 0 and variance 1 (Box and Muller)."""
+def random_normals(seed, stream, pixel, counter):
+    """Return two independent normal numbers of mean 0 and variance 1 (Box and Muller)."""
     first = random_uniform(seed, stream, pixel, 2 * counter)
     second = random_uniform(seed, stream, pixel, 2 * counter + 1)
-    return math.sqrt(-2.0 * fast_log(first)) * cos_turns(second)
+    length = math.sqrt(-2.0 * fast_log(first))
+    quarter = second - 0.25 if second >= 0.25 else second + 0.75  # its cosine is the sine of `second`
+    return length * cos_turns(second), length * cos_turns(quarter)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def random_normal(seed, stream, pixel, counter):
+    """Return a normal number of mean 0 and variance 1."""
+    return random_normals(seed, stream, pixel, counter)[0]
 
 
 @njit(cache=True, error_model="numpy")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.sensor._exact import DIM_MAX
+from evnlos.sensor._exact_send import DIM_MAX
 from evnlos.sensor._random import (
     BLOCK,
     STREAM_LEAK_PHASE,
