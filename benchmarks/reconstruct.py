@@ -59,7 +59,7 @@ def main() -> None:
         for n in range(args.rounds + 5):
             events = events_of_a_position(args.events, n)
             began = time.perf_counter()
-            samples = make_samples(frame, 255.0, events, edges, None, Sampling())
+            samples = make_samples(frame, 255.0, events, edges, Sampling())
             mapped = time.perf_counter()
             see(samples.frame[0], samples.surface[0])
             seen = time.perf_counter()

@@ -14,11 +14,12 @@ import pytest
 import chromium
 from evnlos import Events
 from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
+from evnlos.app.networks import Networks, own_networks
 from evnlos.app.recorded import simulate_pass
 from evnlos.app.serve import Server, running
 from evnlos.app.setup import Setup
 from evnlos.app.sheet import message_box
-from evnlos.app.solving import from_each_frame, from_weights, from_whole_pass, named_weights
+from evnlos.app.solving import from_each_frame, from_weights, from_whole_pass
 from evnlos.app.verdict import verdict_on
 from evnlos.app.views import event_views, found_views, seen_views
 from evnlos.app.work import simulated
@@ -83,7 +84,7 @@ def test_classical_pictures_beat_black_and_the_whole_pass_beats_one_frame(app_pa
 
 
 def test_networks_see_what_they_were_trained_on(app_pass, app_weights) -> None:
-    named = named_weights((app_weights["fusion"].parent, app_weights["event"]))
+    named = own_networks((app_weights["fusion"].parent, app_weights["event"])).of(app_pass)
     assert list(named) == ["fusion-run", "event-run"]
     found = from_weights(app_pass, "fusion-run", named["fusion-run"])
     assert found.images.shape == (40, 12, 24) and found.psnr_db.shape == (40,)
@@ -92,7 +93,7 @@ def test_networks_see_what_they_were_trained_on(app_pass, app_weights) -> None:
     with pytest.raises(DataError, match="has none"):
         from_weights(blind, "fusion-run", named["fusion-run"])
     with pytest.raises(DataError):
-        named_weights((Path("nowhere"),))
+        own_networks((Path("nowhere"),))
 
 
 def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
@@ -103,13 +104,15 @@ def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
 
 
 def test_a_sheet_holds_every_position_and_asks_nobody(app_pass, app_weights) -> None:
-    first, second = simulated(SMALL, picked("R"), {"net": load_weights(app_weights["event"])})
+    own = Networks({"net": load_weights(app_weights["event"])})
+    first, between, second = simulated(SMALL, picked("R"), own)
+    assert between == (second[0], first[1])
     assert "Looking at it" in first[1] and "Looking at it" not in second[1]
     assert ">Net<" in second[0] and ">Net<" not in first[0]
     for text in (*first, *second):
         assert not re.findall(r"(?:src|href|url)\s*[=(]\s*['\"]?(?!data:)[a-z]", text)
         assert "http" not in re.sub(r"base64,[^)]*", "", text)
-    assert first[0] == next(simulated(SMALL, picked("R"), {}))[0]
+    assert first[0] == next(simulated(SMALL, picked("R"), Networks()))[0]
     views = seen_views(app_pass) + found_views([from_each_frame(app_pass)]) + event_views(app_pass)
     for view in views:
         assert len(view.pictures) == (1 if view.cursor else 40)

@@ -3,10 +3,12 @@
 import stat
 import warnings
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from evnlos.app.networks import Networks
 from evnlos.app.unpack import MOST_FILES, unpack_zip
 from evnlos.app.upload import read_upload
 from evnlos.app.work import uploaded
@@ -101,14 +103,23 @@ def test_a_capture_is_shown_and_reconstructed_and_nothing_stays(zipped_capture, 
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     found = read_upload(zipped_capture, scratch, 10 * MB)
-    assert len(found) == 8 and found.scene is not None and found.frames.shape == (8, 48, 72)
+    assert (
+        len(found) == 8
+        and found.motion is not None
+        and found.target is not None
+        and found.frames.shape == (8, 48, 72)
+    )
     pictures, message = uploaded(
-        str(zipped_capture), scratch, 10 * MB, {"net": load_weights(app_weights["fusion"])}
+        str(zipped_capture), scratch, 10 * MB, Networks({"net": load_weights(app_weights["fusion"])})
     )
     for title in (">Hidden object<", ">Wall<", ">Events<", ">Net<", ">Space-time cloud<"):
         assert title in pictures
     assert "ev-note" in message and "events from" in message
-    assert "start the page with --weights" in uploaded(str(zipped_capture), scratch, 10 * MB, {})[1]
+    # Those of the package see it where it says how its target moved.
+    packaged = uploaded(str(zipped_capture), scratch, 10 * MB, Networks())[0]
+    assert all(f">Network, {seen}<" in packaged for seen in ("frames", "events", "both"))
+    still = replace(found, motion=None)
+    assert not Networks().of(still) and list(Networks().of(replace(found, frames=None))) == ["network, events"]
     assert list(scratch.iterdir()) == []
 
 
@@ -118,10 +129,11 @@ def test_a_recording_is_shown(suffix: str, app_pass, app_weights, tmp_path) -> N
     write_events(path, app_pass.events)
     found = read_upload(path, tmp_path, 10 * MB)
     assert found.events == app_pass.events and len(found) == 40 and found.frames is None
-    networks = {name: load_weights(one) for name, one in app_weights.items()}
+    networks = Networks({name: load_weights(one) for name, one in app_weights.items()})
     pictures, message = uploaded(str(path), tmp_path, 10 * MB, networks)
     assert ">Event<" in pictures and ">Fusion<" not in pictures and ">Wall<" not in pictures
     assert "fusion looks at frames" in message
+    assert "start the page with --weights" in uploaded(str(path), tmp_path, 10 * MB, Networks())[1]
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
 
 
@@ -131,7 +143,7 @@ def test_bad_uploads_are_one_line_without_this_machines_folders(
     def said(name: str, content: bytes, limit: int = MB) -> str:
         path = tmp_path / name
         path.write_bytes(content)
-        pictures, message = uploaded(str(path), tmp_path, limit, {})
+        pictures, message = uploaded(str(path), tmp_path, limit, Networks())
         assert pictures == "" and 'role="alert"' in message and str(tmp_path) not in message
         return message
 
@@ -147,7 +159,7 @@ def test_bad_uploads_are_one_line_without_this_machines_folders(
     assert "outside" in said("out.zip", archive(tmp_path / "o", "c/capture.yaml", content=outside).read_bytes())
     vast = outside.replace(b"8", b"60000")
     assert "at most" in said("vast.zip", archive(tmp_path / "v", "c/capture.yaml", content=vast).read_bytes())
-    assert "no file yet" in uploaded(None, tmp_path, MB, {})[1]
+    assert "no file yet" in uploaded(None, tmp_path, MB, Networks())[1]
     monkeypatch.setattr("evnlos.app.upload.MOST_EVENTS", 100)
     with pytest.raises(DataError, match="100 events or more"):
         read_upload(zipped_capture, tmp_path, 10 * MB)

@@ -1,6 +1,7 @@
 """Captures: the shared ones under the standard sample, rendered ones, all that can be wrong with a folder."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,12 +89,15 @@ def test_held_out_names_must_exist_and_not_overlap(tiny_captures, tmp_path) -> N
     assert not (tmp_path / "d").exists()
 
 
-def test_an_unknown_target_gives_samples_without_truth(capture) -> None:
+def test_an_unknown_target_gives_samples_without_truth_but_its_motion_counts(capture) -> None:
     text = (capture / "capture.yaml").read_text()
     (capture / "capture.yaml").write_text(text.replace("  mask: target.png\n", ""))
-    samples = capture_samples(read_capture(capture), Sampling())
-    assert samples.truth is None and samples.position_m is None
-    assert samples.frame.shape == (8, 64, 96)
+    shot = read_capture(capture)
+    samples = capture_samples(shot, Sampling())
+    assert samples.truth is None and samples.frame.shape == (8, 64, 96)
+    np.testing.assert_array_equal(samples.position_m, shot.motion.position_m(samples.time_s))
+    still = replace(shot, info=replace(shot.info, motion=None))
+    assert capture_samples(still, Sampling()).position_m is None
 
 
 def _edit(name: str, old: str, new: str):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from PIL import Image
 from evnlos import open_dataset
 from evnlos.cli import VERBS, main
 from evnlos.config import save_yaml
+from evnlos.model import published_for
 
 NETWORK = ["--network.width", "8", "--network.depth", "2"]
 
@@ -178,6 +180,23 @@ def test_reconstruct_writes_pictures_strip_and_animation(runs, tiny_captures, tm
     assert "not an empty folder" in fails(
         capsys, "reconstruct", tiny_captures[3], "--weights", runs["epnp-frame"], "--out", tmp_path / "r"
     )
+
+
+def test_without_weights_published_ones_that_fit_are_taken(tiny_captures, tmp_path, capsys) -> None:
+    folder, unknown = tmp_path / "known", tmp_path / "unknown"
+    for copy in (folder, unknown):
+        shutil.copytree(tiny_captures[0], copy)
+        text = (copy / "capture.yaml").read_text()
+        (copy / "capture.yaml").write_text(text.replace("  mask: target.png\n", ""))
+    text = (unknown / "capture.yaml").read_text()
+    (unknown / "capture.yaml").write_text(text[: text.index("motion:")] + "rig:\n  distance_m: unknown\n")
+    taken = []
+    for number, capture in enumerate((folder, unknown)):
+        capsys.readouterr()
+        call("reconstruct", capture, "--out", tmp_path / f"out{number}", "--json")
+        taken.append(json.loads(capsys.readouterr().out)["weights"])
+    assert taken == [published_for(0.3, "frame", is_motion_known=known) for known in (True, False)]
+    assert taken[1] == "near-frame"
 
 
 def test_report_is_one_page_without_requests(runs, shots, tmp_path, capsys) -> None:

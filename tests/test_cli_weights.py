@@ -43,6 +43,26 @@ def test_a_copy_of_half_the_size_sees_the_same(run, tmp_path, capsys) -> None:
     assert "exists" in capsys.readouterr().err
 
 
+def test_a_copy_of_lower_rank_is_smaller_and_sees_nearly_the_same(run, tmp_path, capsys) -> None:
+    one, other, wrong = (tmp_path / f"{name}.safetensors" for name in ("all", "fewer", "more"))
+    main(["weights", str(run), "--half", str(one), "--rank", "8"])
+    main(["weights", str(run), "--half", str(other), "--rank", "6"])
+    assert other.stat().st_size < one.stat().st_size
+    whole, few = (load_weights(path).network for path in (one, other))
+    assert few.config.rank == few.embedding.rank == 6
+    torch.testing.assert_close(few.embedding.basis, whole.embedding.basis[:, :6])
+    x = torch.rand(4, *whole.embedding.shape)
+    whole.embedding.weights[6:] = 0
+    torch.testing.assert_close(few.embedding(x), whole.embedding(x))
+    capsys.readouterr()
+    for arguments in (["--half", str(wrong), "--rank", "9"], ["--rank", "6"]):
+        with pytest.raises(SystemExit):
+            main(["weights", str(run), *arguments])
+    said = capsys.readouterr().err
+    assert "this embedding has 8: give 1 to 8" in said and "give its file with --half" in said
+    assert not wrong.exists()
+
+
 def test_no_weights_are_named_in_one_line(tmp_path, capsys) -> None:
     with pytest.raises(SystemExit):
         main(["weights", str(tmp_path / "none")])

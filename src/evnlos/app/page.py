@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
+from evnlos.app.networks import Networks
 from evnlos.app.setup import Setup
 from evnlos.app.sheet import message_box
 from evnlos.app.words import GLOSSARY, HEAD, PAPER
 from evnlos.app.work import opening_verdict, simulated, uploaded
 from evnlos.errors import EvnlosError
-from evnlos.model import Weights
 
 _PICK, _DRAW = "Pick a character", "Draw one"
 _METAL, _MATTE = "rough metal", "matte white paint"
@@ -20,7 +20,7 @@ _FONT = ("system-ui", "sans-serif")
 
 
 def build_page(
-    gradio: Any, first: tuple[str, str], setup: Setup, weights: Mapping[str, Weights], scratch: Path, limit: int
+    gradio: Any, first: tuple[str, str], setup: Setup, networks: Networks, scratch: Path, limit: int
 ) -> Any:
     """Return the page.
 
@@ -28,7 +28,7 @@ def build_page(
         gradio: The package.
         first: Sheet and verdict that the page opens with.
         setup: Settings that the controls open with.
-        weights: Networks by name.
+        networks: The page's networks.
         scratch: Folder for uploads of this session.
         limit: Largest upload, bytes.
     """
@@ -51,14 +51,14 @@ def build_page(
             message = gr.HTML()
             shown = gr.HTML()
         gr.HTML(GLOSSARY)
-        run = _on_controls(gr, setup, weights)
+        run = _on_controls(gr, setup, networks)
         quiet: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
         for control in controls:
             control.change(run, controls, [pictures, verdict], trigger_mode="always_last", **quiet)
         # The page opens with a pass that is there already; only its verdict may still be on its way.
         page.load(lambda: opening_verdict(setup), None, verdict, **quiet)
         file.change(
-            lambda path: uploaded(path, scratch, limit, weights),
+            lambda path: uploaded(path, scratch, limit, networks),
             file,
             [shown, message],
             show_progress="minimal",
@@ -106,9 +106,7 @@ def _controls(gr: Any, setup: Setup) -> list[Any]:
     return [how, character, ink, wall, rough, distance, speed, ambient, noise, on, off, event_noise]
 
 
-def _on_controls(
-    gr: Any, setup: Setup, weights: Mapping[str, Weights]
-) -> Callable[..., Iterator[tuple[str, str]]]:
+def _on_controls(gr: Any, setup: Setup, networks: Networks) -> Callable[..., Iterator[tuple[str, str]]]:
     def run(
         how: str,
         character: str,
@@ -138,7 +136,7 @@ def _on_controls(
                 setup.seed,
             )
             target = drawn(ink) if how == _DRAW else picked(character)
-            yield from simulated(chosen, target, weights)
+            yield from simulated(chosen, target, networks)
         except EvnlosError as error:
             yield gr.skip(), message_box(str(error))
 

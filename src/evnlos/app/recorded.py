@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from evnlos.app.setup import Setup
 from evnlos.dataset import Samples, Sampling, Simulation, make_samples
 from evnlos.dataset.sampling import edges_from
-from evnlos.scene import Scene, Target
+from evnlos.scene import Motion, Scene, Target
 from evnlos.seeds import derive_seed
 from evnlos.sensor import EventCamera, FrameCamera
 from evnlos.types import Events
@@ -29,8 +29,10 @@ class Recorded:
             (edge k, edge k + 1].
         frames: One frame a position, digital numbers, [N, H, W]; None where there were no frames.
         peak: Largest digital number of a frame.
-        scene: The hidden object and its motion on the events' clock; None where they are unknown.
+        motion: The hidden object's motion on the events' clock; None where it is unknown.
+        target: The hidden object; None where it is unknown.
         simulation: The rig, where it is known.
+        distance_m: From hidden object to wall, metres, where it is noted.
         notes: What reading did, a line each.
     """
 
@@ -39,8 +41,10 @@ class Recorded:
     edges_us: NDArray[np.int64]
     frames: NDArray | None = None
     peak: int = 255
-    scene: Scene | None = None
+    motion: Motion | None = None
+    target: Target | None = None
     simulation: Simulation | None = None
+    distance_m: float | None = None
     notes: tuple[str, ...] = field(default=())
 
     def __len__(self) -> int:
@@ -54,13 +58,16 @@ class Recorded:
     def samples(self, sampling: Sampling) -> Samples:
         """Return what a network sees at each position; frames are black where there are none."""
         blank = np.zeros((len(self), *self.events.shape), np.uint8) if self.frames is None else self.frames
-        return make_samples(blank, self.peak, self.events, self.edges_us, self.scene, sampling)
+        return make_samples(
+            blank, self.peak, self.events, self.edges_us, sampling, motion=self.motion, target=self.target
+        )
 
     def truth(self, sampling: Sampling) -> NDArray[np.float32] | None:
         """Return the hidden object on a canvas's scored rows, float32 [N, h, w], 0..1; None where unknown."""
-        if self.scene is None:
+        if self.motion is None or self.target is None:
             return None
-        return self.scene.truth(sampling.canvas, self.times_s)[:, sampling.scored]
+        places = self.motion.position_m(self.times_s)
+        return self.target.rasterise(sampling.canvas, places)[:, sampling.scored]
 
 
 def simulate_pass(setup: Setup, target: Target) -> Recorded:
@@ -82,4 +89,5 @@ def simulate_pass(setup: Setup, target: Target) -> Recorded:
         wall, 0.0, simulation.duration_s, seed=derive_seed(setup.seed, "events")
     )
     frames = camera.capture(wall, times_s, seed=derive_seed(setup.seed, "frames"))
-    return Recorded(target.name, events, edges_from(times_s), frames, camera.white, scene, simulation)
+    edges_us = edges_from(times_s)
+    return Recorded(target.name, events, edges_us, frames, camera.white, scene.motion, target, simulation)

@@ -95,21 +95,23 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     except ImportError:
         raise MissingDependencyError("the page needs Gradio: pip install 'evnlos[app]'") from None
     from evnlos.app.hidden import picked
+    from evnlos.app.networks import own_networks
     from evnlos.app.page import build_page, theme
     from evnlos.app.setup import Setup
-    from evnlos.app.solving import named_weights
     from evnlos.app.work import simulated
 
-    named = named_weights(weights)
+    networks = own_networks(weights)
     setup = Setup(columns=server.columns)
-    pieces = simulated(setup, picked("R"), {})
+    pieces = simulated(setup, picked("R"), networks)
     first = next(pieces)
+    if not networks.own:  # those of the package are small and quick
+        first = next(pieces)
     # The verdict on the first rig takes seconds where nothing is compiled yet: it is made while the page loads.
     threading.Thread(target=lambda: list(pieces), daemon=True).start()
     limit = round(1e6 * server.upload_mb)
     with tempfile.TemporaryDirectory(prefix="evnlos-app-", ignore_cleanup_errors=True) as scratch:
         os.environ["GRADIO_TEMP_DIR"] = scratch
-        page = build_page(gradio, first, setup, named, Path(scratch), limit)
+        page = build_page(gradio, first, setup, networks, Path(scratch), limit)
         try:
             _, address, _ = page.queue(api_open=False).launch(
                 server_name=server.host,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.identify_rig import camera_variance
 from evnlos.evaluation.worth import judgement_of
 from evnlos.metrics import psnr
-from evnlos.model import Weights, load_weights
+from evnlos.model import JointNetwork, Weights
 from evnlos.scene import Target
 from evnlos.solver import JointProblem, PlatePass
 from evnlos.solver.recording import object_light
@@ -29,6 +28,11 @@ from evnlos.types import Plane
 _DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far a picture may go from it
 _CELLS = 16  # a side of the plate of the whole pass
 _SMOOTH = 3.0  # weight of the gradient in units of the noise's variance
+_SEEN = {  # of one position, of a whole pass
+    "frame": ("one frame", "all frames"),
+    "event": ("one position's events", "all events"),
+    "fusion": ("frame and events", "all frames and events"),
+}
 _STATIC = 1.0  # the camera's fixed pattern is about as strong as its noise
 
 
@@ -72,14 +76,14 @@ def from_whole_pass(recorded: Recorded) -> Reconstruction:
         DataError: The pass has no frames, or its rig or its motion is unknown.
     """
     simulation, rig, frames = _known(recorded)
-    if recorded.scene is None:
-        raise DataError("the motion is unknown; the whole pass needs it")
-    size_m, shape = recorded.scene.target.size_m, frames.shape[1:]
+    if recorded.motion is None or recorded.target is None:
+        raise DataError("the motion or the plate is unknown; the whole pass needs both")
+    size_m, shape = recorded.target.size_m, frames.shape[1:]
     light = object_light(frames, recorded.peak, rig, shape)
     made = rig.transport(shape)
     strip = made.source
     assert isinstance(strip, Plane)  # a rig's cells
-    places = recorded.scene.motion.position_m(recorded.times_s)
+    places = recorded.motion.position_m(recorded.times_s)
     plate = Plane(_CELLS, _CELLS, size_m / _CELLS)
     problem = JointProblem(
         PlatePass(MatrixTransport(made.matrix * rig.gain, strip, shape), plate, places), _STATIC
@@ -107,24 +111,10 @@ def from_weights(recorded: Recorded, name: str, weights: Weights) -> Reconstruct
     samples = recorded.samples(sampling)
     pictures = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
     images = pictures[:, sampling.scored].numpy()
-    saw = {"frame": "one frame", "event": "events alone", "fusion": "frame and events"}[weights.paradigm]
+    saw = _SEEN[weights.paradigm][isinstance(weights.network, JointNetwork)]
     worth = judgement_of(weights, samples, pictures)
     note = f"network: {saw}" + (f"; {worth.verdict}" if worth else "")
     return _scored(name, note, images, recorded, sampling)
-
-
-def named_weights(paths: tuple[Path, ...]) -> dict[str, Weights]:
-    """Return weights by a short name each: that of the run's folder or of the file.
-
-    Raises:
-        DataError: One of them is missing or is no weights file.
-    """
-    found: dict[str, Weights] = {}
-    for path in paths:
-        name = path.resolve().name if path.is_dir() or path.stem != "weights" else path.resolve().parent.name
-        name = name.removesuffix(".safetensors")
-        found[name if name not in found else f"{name} ({len(found) + 1})"] = load_weights(path)
-    return found
 
 
 def _known(recorded: Recorded) -> tuple[Simulation, RadiometricTransport, NDArray]:

@@ -114,8 +114,10 @@ def _read_capture(folder: Path) -> Recorded:
         np.asarray(edges),
         _own(frames),
         capture.peak,
-        capture.scene,
+        capture.motion,
+        capture.target,
         None,
+        capture.distance_m,
         tuple(notes),
     )
 

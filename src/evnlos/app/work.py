@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
+from evnlos.app.networks import Networks
 from evnlos.app.recorded import Recorded, simulate_pass
 from evnlos.app.setup import Setup
 from evnlos.app.sheet import message_box, sheet, verdict_box, waiting_box
@@ -14,17 +15,16 @@ from evnlos.app.upload import read_upload
 from evnlos.app.verdict import verdict_on
 from evnlos.app.views import View, event_views, found_views, seen_views
 from evnlos.errors import EvnlosError
-from evnlos.model import Weights
 from evnlos.scene import Target
 
 
-def simulated(setup: Setup, target: Target, weights: Mapping[str, Weights]) -> Iterator[tuple[str, str]]:
-    """Yield (sheet, verdict) of a simulated pass: first without networks and verdict, which take longer.
+def simulated(setup: Setup, target: Target, networks: Networks) -> Iterator[tuple[str, str]]:
+    """Yield (sheet, verdict) of a simulated pass three times: without networks, with them, with the verdict.
 
     Args:
         setup: Rig and camera.
         target: What is hidden.
-        weights: Networks by name.
+        networks: The page's networks.
 
     Raises:
         EvnlosError: The settings can't be.
@@ -33,11 +33,10 @@ def simulated(setup: Setup, target: Target, weights: Mapping[str, Weights]) -> I
     before, after = seen_views(recorded), event_views(recorded)
     found = [from_whole_pass(recorded), from_each_frame(recorded)]
     assert recorded.simulation is not None  # it was simulated
+    yield _sheet(recorded, before, found, after), waiting_box()
+    found += [from_weights(recorded, name, one) for name, one in networks.of(recorded).items()]
     pictures = _sheet(recorded, before, found, after)
     yield pictures, waiting_box()
-    if weights:
-        found += [from_weights(recorded, name, one) for name, one in weights.items()]
-        pictures = _sheet(recorded, before, found, after)
     yield pictures, verdict_box(verdict_on(recorded.simulation))
 
 
@@ -46,23 +45,22 @@ def opening_verdict(setup: Setup) -> str:
     return verdict_box(verdict_on(setup.simulation()))
 
 
-def uploaded(
-    path: str | None, scratch: Path, limit_bytes: int, weights: Mapping[str, Weights]
-) -> tuple[str, str]:
+def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networks) -> tuple[str, str]:
     """Return (sheet, message) of an uploaded file; whatever is wrong with it is a message of one line.
 
     Args:
         path: The file, or None where there is none.
         scratch: Folder to unpack in.
         limit_bytes: Largest file, bytes.
-        weights: Networks by name.
+        networks: The page's networks.
     """
     if not path:
         return "", message_box("no file yet: choose a recording, or a capture folder as a zip", wrong=False)
     try:
         recorded = read_upload(path, scratch, limit_bytes)
         found, refused = [], []
-        for name, one in weights.items():
+        known = networks.of(recorded)
+        for name, one in known.items():
             try:
                 found.append(from_weights(recorded, name, one))
             except EvnlosError as error:
@@ -71,8 +69,11 @@ def uploaded(
     except (EvnlosError, OSError, MemoryError) as error:
         return "", message_box(_without_folder(str(error) or "the file needs too much memory", path, scratch))
     notes = [*recorded.notes, *refused]
-    if not weights:
-        notes.append("no network to reconstruct with: start the page with --weights")
+    if not known:
+        notes.append(
+            "no network to reconstruct with: those of the package need a capture folder that states the "
+            "motion; or start the page with --weights"
+        )
     return pictures, message_box("; ".join(notes), wrong=False)
 
 

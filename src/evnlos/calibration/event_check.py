@@ -99,7 +99,7 @@ def _block_counts(events: Events, edges_us: NDArray[np.int64]) -> NDArray[np.flo
 def _surfaces(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) -> NDArray[np.float32]:
     """Return the time surfaces of a standard sample, float32 [N, 2, h, w]."""
     blank = np.zeros((len(edges_us) - 1, events.height, events.width), np.uint8)
-    return make_samples(blank, 1.0, events, edges_us, None, sampling).surface
+    return make_samples(blank, 1.0, events, edges_us, sampling).surface
 
 
 def _rms(values: NDArray) -> float:

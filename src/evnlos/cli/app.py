@@ -14,7 +14,8 @@ class Command:
     """A page to play with: hide something, choose wall and cameras, watch what can be seen; uploads too."""
 
     weights: tuple[Path, ...] = ()
-    """Weights files, or folders of runs, that reconstruct beside the classical solvers."""
+    """Weights files, or folders of runs, that reconstruct beside the classical solvers; none takes those of
+    the package."""
     server: Flat[Server] = field(default_factory=Server)
 
     def run(self) -> None:

@@ -91,7 +91,7 @@ def invert_captures(
     pictures: dict[str, torch.Tensor] = {}
     rows: list[dict[str, Any]] = []
     for motion, members in _by_motion(captures, options, rig):
-        size = _plate_m(captures[members[0]], options.track)
+        size = _plate_m(captures[members[0]], _is_tracked(captures[members[0]], options))
         plate = Plane(options.cells, options.cells, size / options.cells)
         transport = strip_transport(rig, (height, width), shape, strip_of(motion, plate))
         gram = strip_gram_of(transport)
@@ -154,7 +154,7 @@ def _by_motion(
     """Return each motion [N, 2], metres, of frames 1..N with the captures that share it."""
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
     for k, capture in enumerate(captures):
-        if options.track or capture.scene is None:
+        if _is_tracked(capture, options):
             from evnlos.tracking import track_capture
 
             if isinstance(rig, MeasuredTransport):
@@ -164,9 +164,14 @@ def _by_motion(
             found = track_capture(capture, rig)
             motion = found.at(capture.frame_times_us[1:] * 1e-6)
         else:
-            motion = capture.scene.motion.position_m(capture.frame_times_us[1:] * 1e-6)
+            assert capture.motion is not None  # else it would be tracked
+            motion = capture.motion.position_m(capture.frame_times_us[1:] * 1e-6)
         groups.setdefault(motion.tobytes(), (motion, []))[1].append(k)
     return list(groups.values())
+
+
+def _is_tracked(capture: Capture, options: PassOptions) -> bool:
+    return options.track or capture.motion is None
 
 
 def _plate_m(capture: Capture, tracked: bool) -> float:

@@ -16,8 +16,9 @@ class Command:
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder; its target may be unknown."""
-    weights: Path = Path("near-frame")
-    """Weights file, run's folder, or name of published weights (`evnlos weights` lists them)."""
+    weights: Path | None = None
+    """Weights file, run's folder, or name of published weights (`evnlos weights` lists them); none takes the
+    published ones for frames of the rig with the nearest distance, of whole passes if the motion is known."""
     out: Path = Path("reconstruction")
     """Folder for the pictures; new or empty."""
     pattern: Path | None = None
@@ -42,7 +43,7 @@ class Command:
         if self.json:
             print(json.dumps(found | {"out": str(self.out)}))
             return
-        print(f"{self.out}: {found['positions']} positions of {found['capture']} ({found['paradigm']})")
+        print(f"{self.out}: {found['positions']} positions of {found['capture']} by {found['weights']}")
         if "confidence" in found:
             print(_said(found["confidence"]))
         if "scores" in found:

@@ -12,7 +12,7 @@ import tyro
 
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError, DataError
-from evnlos.model import JointNetwork, Weights, load_weights, published, save_weights
+from evnlos.model import JointNetwork, Weights, load_weights, published, save_weights, with_rank
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,8 @@ class Command:
     """Weights file, run's folder, or name of published weights; none lists the published ones."""
     half: Path | None = None
     """File for a copy in half precision, half as large; it must not exist."""
+    rank: int | None = None
+    """Components of the linear embedding that the copy keeps, the strongest; none keeps all."""
     scores: Path | None = None
     """What `evnlos evaluate --json` printed of these weights, to be kept in the copy."""
     json: bool = False
@@ -30,15 +32,19 @@ class Command:
 
     def run(self) -> None:
         """Read the weights, print, and write the copy where one is asked for."""
+        if self.half is None and (self.rank is not None or self.scores is not None):
+            raise ConfigError("--rank and --scores are of a copy; give its file with --half")
         if self.weights is None:
-            if self.half is not None or self.scores is not None:
-                raise ConfigError("--half and --scores copy one file of weights; say which")
+            if self.half is not None:
+                raise ConfigError("--half copies one file of weights; say which")
             self._list()
             return
         loaded = load_weights(self.weights)
         if self.half is not None:
             if self.half.exists():
                 raise DataError(f"{self.half} exists; give --half another name")
+            if self.rank is not None:
+                loaded = with_rank(loaded, self.rank)
             loaded = replace(loaded, scores=_scores(self.scores) if self.scores else loaded.scores)
             save_weights(self.half, loaded, torch.float16)
         found = describe(loaded)

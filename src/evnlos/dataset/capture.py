@@ -55,6 +55,14 @@ class Capture:
         return int(np.iinfo(self.frames.dtype).max)
 
     @property
+    def distance_m(self) -> float | None:
+        """From hidden object to wall, metres, as noted in `rig`; None where it is not, or is no length."""
+        noted = self.info.rig.get("distance_m")
+        if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not 0 < noted < float("inf"):
+            return None
+        return float(noted)
+
+    @property
     def motion(self) -> LineMotion | None:
         """The target's motion on the events' clock; None where it is unknown."""
         motion = self.info.motion

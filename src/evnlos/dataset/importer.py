@@ -34,7 +34,8 @@ def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern 
     frames, peak = capture.frames[1:], float(capture.peak)
     if pattern is not None:
         frames, peak = pattern.correct(frames, peak), 1.0
-    return make_samples(frames, peak, capture.events, capture.frame_times_us, capture.scene, sampling)
+    known = {"motion": capture.motion, "target": capture.target}
+    return make_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
 
 
 def import_captures(

@@ -137,7 +137,9 @@ def simulate_object_on(config: Simulation, name: str, device: torch.device, step
     (events,) = simulate_batch(light[None], instants, drawn.pixel, [seed], dtype=torch.float32)
     edges_us = edges_from(times_s)
     peak = 2**drawn.frame_camera.bit_depth - 1
-    return make_samples(frames, peak, events, edges_us, scene, config.sampling)
+    return make_samples(
+        frames, peak, events, edges_us, config.sampling, motion=scene.motion, target=scene.target
+    )
 
 
 def _scene(config: Simulation, drawn: Simulation, name: str) -> Scene:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from evnlos.dataset.sampling import Sampling
 from evnlos.dataset.simulate import SensorSize, Simulation
-from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
-from evnlos.sensor import EventPixel
-from evnlos.transport import PaperTransport
+from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs, LineMotion
+from evnlos.sensor import EventPixel, FrameCamera
+from evnlos.transport import PaperTransport, RadiometricTransport
 
 
 def default() -> Simulation:
@@ -73,8 +74,37 @@ def _tested_on(glyphs: HandwritingGlyphs | FontGlyphs) -> Simulation:
     return replace(paper(), glyphs=glyphs, validation=0.0)
 
 
+def page() -> Simulation:
+    """Return the simulation that the networks of `evnlos app` learn from: the page's rig, its sliders moved.
+
+    Metal from smooth to rough, the distances, lights, noises and thresholds around the page's first setting;
+    beyond, where even the best linear picture shows next to nothing, the networks are not at home.
+    """
+    camera = FrameCamera()
+    well_e, read_e = camera.full_well_e, camera.read_noise_e
+    return Simulation(
+        glyphs=HandwritingGlyphs(characters=UPPER_CASE + DIGITS, writers=44),
+        motion=LineMotion((-0.08, 0.0), 0.02),
+        transport=RadiometricTransport(cell_m=0.005, ambient=0.05),
+        sensor=SensorSize(30, 48),
+        sampling=Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24),
+        vary={
+            "transport.roughness": (0.02, 0.09),
+            "transport.distance_m": (0.2, 0.4),
+            "transport.ambient": (0.0, 0.3),
+            "frame_camera.full_well_e": (well_e / 4, 2 * well_e),
+            "frame_camera.read_noise_e": (read_e / 2, 2 * read_e),
+            "pixel.threshold_on": (0.08, 0.3),
+            "pixel.threshold_off": (0.08, 0.3),
+            "pixel.shot_noise_rate_hz": (0.0, 0.2),
+        },
+        rigs=200,
+    )
+
+
 PRESETS: dict[str, Callable[[], Simulation]] = {
     "default": default,
+    "page": page,
     "paper": paper,
     "paper-nist-test": paper_nist_test,
     "paper-comic-letters": paper_comic_letters,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
-from evnlos.scene import Scene
+from evnlos.scene import Motion, Target
 from evnlos.types import Events, Plane
 
 
@@ -89,8 +89,10 @@ def make_samples(
     peak: float,
     events: Events,
     edges_us: NDArray[np.int64],
-    scene: Scene | None,
     sampling: Sampling,
+    *,
+    motion: Motion | None = None,
+    target: Target | None = None,
 ) -> Samples:
     """Turn one recording into samples: surfaces at sensor resolution, then all reduced by area averaging.
 
@@ -99,8 +101,9 @@ def make_samples(
         peak: Largest digital number of the frames.
         events: The events of the whole recording.
         edges_us: N + 1 ascending instants, microseconds; position k has the events in (edge k, edge k + 1].
-        scene: The target and its motion on the events' clock; None where unknown (then there is no truth).
         sampling: Resolution and representation.
+        motion: The target's motion on the events' clock; None where it is unknown.
+        target: The target; there is a truth only where motion and target are known.
 
     Raises:
         DataError: The number of frames and of edges disagree.
@@ -112,11 +115,14 @@ def make_samples(
         events, edges_us, sampling.tau_s * 1e6, mode=sampling.surface, radius=sampling.radius
     )  # [N, 2, H, W]
     time_s = np.asarray(edges_us[1:], dtype=np.float64) * 1e-6
-    position = scene.motion.position_m(time_s) if scene else None
+    position = None if motion is None else motion.position_m(time_s)
+    truth = None
+    if target is not None and position is not None:
+        truth = target.rasterise(sampling.canvas, position)
     return Samples(
         frame=reduce_by_area(frames / np.float32(peak), shape),
         surface=reduce_by_area(surface, shape),
-        truth=scene.target.rasterise(sampling.canvas, position) if scene and position is not None else None,
+        truth=truth,
         time_s=time_s,
         position_m=position,
         event_count=np.diff(np.searchsorted(events.t_us, edges_us, side="right")).astype(np.int64),

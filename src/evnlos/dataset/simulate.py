@@ -145,7 +145,9 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     frames = drawn.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
     edges_us = edges_from(times_s)
     peak = 2**drawn.frame_camera.bit_depth - 1
-    return make_samples(frames, peak, events, edges_us, scene, config.sampling), events
+    return make_samples(
+        frames, peak, events, edges_us, config.sampling, motion=scene.motion, target=target
+    ), events
 
 
 def split_of(config: Simulation) -> dict[str, list[str]]:

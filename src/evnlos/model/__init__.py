@@ -5,9 +5,9 @@ from evnlos.model.infer import infer
 from evnlos.model.joint import JointNetwork, new_network
 from evnlos.model.linear import LinearEstimate, fit_linear
 from evnlos.model.plates import plates
-from evnlos.model.published import published
+from evnlos.model.published import published, published_for
 from evnlos.model.unet import ResidualUNet, UNetConfig
-from evnlos.model.weights import Weights, load_weights, save_weights
+from evnlos.model.weights import Weights, load_weights, save_weights, with_rank
 
 __all__ = [
     "Confidence",
@@ -24,5 +24,7 @@ __all__ = [
     "new_network",
     "plates",
     "published",
+    "published_for",
     "save_weights",
+    "with_rank",
 ]

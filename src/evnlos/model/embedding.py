@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
 from evnlos.model.linear import LinearEstimate
 
 Scaling = Literal["dataset", "picture"]
@@ -113,6 +113,19 @@ class LinearEmbedding(nn.Module):
         self.shrinkage[:, :found] = torch.stack([estimate.shrinkage(s) for s in self.strengths])
         self.weights[:found] = estimate.weights
         self.mean_out.copy_(estimate.mean_out.flatten())
+
+    def keep(self, rank: int) -> None:
+        """Forget all but the `rank` strongest components; the estimate gives them in the order of their power.
+
+        Raises:
+            ConfigError: There are not as many.
+        """
+        if not 1 <= rank <= self.rank:
+            raise ConfigError(
+                f"the rank is to be {rank}; this embedding has {self.rank}: give 1 to {self.rank}"
+            )
+        self.basis, self.shrinkage = self.basis[:, :rank].clone(), self.shrinkage[:, :rank].clone()
+        self.weights = self.weights[:rank].clone()
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [B, C, H, W] to pictures [B, S, H, W], about 0..1; in float32 whatever surrounds it.

@@ -5,8 +5,33 @@ from __future__ import annotations
 from pathlib import Path
 
 _FOLDER = Path(__file__).parent / "published"
+_RIGS_M = {"near": 0.30, "far": 0.50}
+"""Distance from hidden object to wall of each rig that there are weights for, metres."""
+_PASS = "pass"
 
 
 def published() -> dict[str, Path]:
-    """Return the weights that come with the package: name, such as "near-frame", -> file."""
+    """Return the weights that come with the package: name, such as "near-frame", -> file.
+
+    A name is rig and paradigm; one that ends in "-pass" sees all positions of a pass together.
+    """
     return {path.stem: path for path in sorted(_FOLDER.glob("*.safetensors"))}
+
+
+def published_for(distance_m: float | None, paradigm: str, *, is_motion_known: bool) -> str:
+    """Return the name of the published weights that fit a capture best.
+
+    Args:
+        distance_m: From hidden object to wall, metres; None: unknown, taken for that of `near`.
+        paradigm: What they shall see: "frame", "event" or "fusion".
+        is_motion_known: Whether the whole pass can be seen together, which needs the motion.
+
+    Example:
+        >>> published_for(0.28, "frame", is_motion_known=False)
+        'near-frame'
+    """
+    wanted = _RIGS_M["near"] if distance_m is None else distance_m
+    names = published()
+    rigs = sorted(_RIGS_M, key=lambda rig: abs(_RIGS_M[rig] - wanted))
+    kinds = [f"{paradigm}-{_PASS}", paradigm] if is_motion_known else [paradigm]
+    return next(f"{rig}-{kind}" for rig in rigs for kind in kinds if f"{rig}-{kind}" in names)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -74,6 +75,26 @@ def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.
         "scores": weights.scores,
     }
     write_atomically(path, save(tensors, metadata={"evnlos": json.dumps(about)}))
+
+
+def with_rank(weights: Weights, rank: int) -> Weights:
+    """Return a copy of weights whose linear embedding has fewer components, the strongest.
+
+    Args:
+        weights: The weights; unchanged.
+        rank: Components to keep.
+
+    Raises:
+        ConfigError: There is no embedding, or it has fewer components.
+    """
+    network = deepcopy(weights.network)
+    if network.embedding is None:
+        raise ConfigError(
+            f"the rank is to be {rank}, and these weights have no linear embedding; leave it away"
+        )
+    network.embedding.keep(rank)
+    network.config = replace(network.config, rank=rank)
+    return replace(weights, network=network)
 
 
 def load_weights(path: str | Path) -> Weights:

@@ -21,13 +21,13 @@ from evnlos.dataset import (
 from evnlos.evaluation import reconstruct, score
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.worth import judgement_of, said
-from evnlos.model import load_weights
+from evnlos.model import load_weights, published_for
 from evnlos.report.pictures import grey, polarity, save_animation, save_png, stretched, strip
 
 
 def reconstruct_capture(
     capture: str | Path,
-    weights: str | Path,
+    weights: str | Path | None,
     out: str | Path,
     zoom: int = 4,
     pattern: FixedPattern | None = None,
@@ -43,7 +43,8 @@ def reconstruct_capture(
 
     Args:
         capture: A capture folder; its target may be unknown.
-        weights: A weights file or a run's folder.
+        weights: A weights file, a run's folder or a name of `published`; None: the published frame weights of
+            the rig whose distance is nearest, of whole passes where the motion is known.
         out: The folder for the pictures; must not exist or be empty.
         zoom: Size of a pixel in the pictures.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
@@ -51,14 +52,17 @@ def reconstruct_capture(
             confidence says how much of the frames they explain.
 
     Returns:
-        Number of positions; where the truth is known, the mean scores; where it can be told, the confidence:
-        support, threshold, measured, verdict and, with a rig, explained.
+        Capture, weights, paradigm, number of positions; where the truth is known, the mean scores; where it can
+        be told, the confidence: support, threshold, measured, verdict and, with a rig, explained.
 
     Raises:
         DataError: The capture or the weights can't be used, or `out` holds other files.
     """
     out = Path(out)
-    loaded, shot = load_weights(weights), read_capture(capture)
+    shot = read_capture(capture)
+    if weights is None:
+        weights = published_for(shot.distance_m, "frame", is_motion_known=shot.motion is not None)
+    loaded = load_weights(weights)
     sampling = from_dict(Sampling, loaded.sampling, source="the weights' sampling")
     samples = capture_samples(shot, sampling, pattern)
     check_folder(out)
@@ -81,7 +85,12 @@ def reconstruct_capture(
     rate_hz = 1e6 / float(np.median(np.diff(shot.frame_times_us)))
     save_animation(out / "animation.gif", shown, rate_hz, 2)
     write_atomically(out / "reconstruction.npy", _npy(images.numpy()))
-    found: dict[str, Any] = {"capture": shot.name, "positions": len(pictures), "paradigm": loaded.paradigm}
+    found: dict[str, Any] = {
+        "capture": shot.name,
+        "weights": str(weights),
+        "paradigm": loaded.paradigm,
+        "positions": len(pictures),
+    }
     if worth is not None:
         save_png(out / "unsure.png", strip([grey(one) for one in worth.high - worth.low]), 2)
         write_atomically(out / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))
