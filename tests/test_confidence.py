@@ -98,6 +98,28 @@ def test_noise_that_the_halves_do_not_share_is_no_support() -> None:
     assert seen.measured and "supports" in seen.verdict
 
 
+def test_what_a_network_always_draws_tells_no_object() -> None:
+    def with_habit(samples: NlosDataset) -> NlosDataset:
+        """Add a bar to the plate at every position: in both halves of every pass, whatever the object is."""
+        bar = torch.zeros(32, 32)
+        bar[:16, 8:16] = 0.7
+        for name in dict.fromkeys(samples.names.tolist()):
+            rows = np.flatnonzero(samples.names == name)
+            shown = (
+                samples.inputs[torch.from_numpy(rows)]
+                + on_canvas(bar, CANVAS, samples.position_m[rows])[:, None]
+            )
+            samples.inputs[torch.from_numpy(rows)] = shown
+        return samples
+
+    confidence = fit_confidence(Given(), with_habit(passes(0.1)), CANVAS)
+    assert float(confidence.threshold) < 0.1
+    blind = [judged(confidence, with_habit(passes(0.1, share=0.0, seed=5)), f"o{k}") for k in range(24)]
+    assert np.mean([one.agreement for one in blind]) == pytest.approx(0, abs=0.05)
+    half = [judged(confidence, with_habit(passes(0.1, share=0.6, seed=6)), f"o{k}") for k in range(24)]
+    assert all(one.measured for one in half)
+
+
 def test_a_pattern_that_does_not_move_with_the_object_is_no_support() -> None:
     samples = passes(0.0)
     confidence = fit_confidence(Given(), samples, CANVAS)

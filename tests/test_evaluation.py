@@ -148,7 +148,7 @@ def test_a_report_leads_with_what_is_gained() -> None:
             errors.setdefault(method, []).append(found.psnr_db)
             blank = {"zero": score(torch.zeros_like(truth), truth)}
             one = Evaluation(image, truth, names, found, blank)
-            results.append(RunResult(f"{method}-{seed}", "frame", method, one, [], []))
+            results.append(RunResult(f"{method}-{seed}", "frame", False, method, one, [], []))
     gain = gains_of(results)["frame"]
     assert gain.mean == pytest.approx(np.mean(errors["EPNP"]) - np.mean(errors["E2E"]))
     assert list(gains_of(results)) == ["frame"] and gains_of(results[:2]) == {}

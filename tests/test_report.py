@@ -2,6 +2,7 @@
 
 import html
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from evnlos.evaluation.identify import identify
 from evnlos.evaluation.identify_rig import Bench
 from evnlos.evaluation.identify_source import described_rig
 from evnlos.evaluation.score import score
+from evnlos.evaluation.worth import PassWorth
 from evnlos.plot.rig import rig_drawing
 from evnlos.report import RunResult, write_report
+from evnlos.report.lead import gains_of
 from evnlos.transport import PaperTransport, RadiometricTransport
 
 POSITIONS = 12
@@ -52,7 +55,7 @@ def made(tmp_path_factory):
         )
         steps += [{"settings": {"epochs": 3}, "data": {"name": "near", "origin": "captures"}}]
         found = Evaluation(image, truth, of, score(image, truth), blank)
-        runs.append(RunResult(method.lower(), "frame", method, found, [], steps))
+        runs.append(RunResult(method.lower(), "frame", False, method, found, [], steps))
     return data, runs
 
 
@@ -82,6 +85,25 @@ def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None
     assert "evnlos finetune --data near --weights epnp-1 --config epnp.yaml --out epnp" in shown
     assert "evnlos report epnp e2e --data near --split test --out report.html" in shown
     assert "torch " in shown and "/tmp/" not in page.replace(str(tmp_path), "")
+
+
+def test_the_page_says_how_far_to_believe_each_run(made, tmp_path) -> None:
+    data, runs = made
+    assert "How far to believe" not in write_report(tmp_path / "plain.html", data, runs, []).read_text()
+    said = [PassWorth("near_G", 0.62, 0.7, 0.62, True, 0.81, 0.93, 0.2), _unmeasured("near_K")]
+    joint = replace(runs[0], is_joint=True, evaluation=replace(runs[0].evaluation, worth=said))
+    page = write_report(tmp_path / "report.html", data, [*runs, joint], []).read_text()
+    shown = page.split("How far to believe them")[1].split("</table>")[0]
+    assert "EPNP joint frame" in shown and "E2E frame" not in shown
+    assert "<td>G</td><td>62%</td><td>81%</td>" in shown
+    assert "<td>K</td><td>nothing measured</td><td>-30%</td>" in shown
+    assert "96%" in shown and "0.60" in shown  # means of coverage and length
+    # A joint run is compared with joint runs alone.
+    assert ">EPNP joint frame</text>" in page and list(gains_of([*runs, joint])) == ["frame"]
+
+
+def _unmeasured(name: str) -> PassWorth:
+    return PassWorth(name, 0.0, 0.01, None, False, -0.3, 0.99, 1.0)
 
 
 def test_without_a_rig_the_page_says_how_to_name_it(made, tmp_path) -> None:

@@ -83,7 +83,9 @@ class Confidence:
 
     Args:
         mean: Mean of the true plates, float32 [32, 32].
-        power: Mean of |d|^2 over true plates, d what tells a plate from the mean one (see `telling`), [].
+        empty: What the network shows where nothing of any one object was measured, as its mean difference from
+            the mean plate, [32, 32].
+        power: Mean of |d|^2 over true plates, d what tells a plate from an empty answer (see `telling`), [].
         threshold: See `Judgement.threshold`, [].
         edges: Agreements that separate the groups of passes, ascending, [G - 1].
         low: Lower end of the interval for each group and level, [G, L].
@@ -91,6 +93,7 @@ class Confidence:
     """
 
     mean: Tensor
+    empty: Tensor
     power: Tensor
     threshold: Tensor
     edges: Tensor
@@ -127,12 +130,15 @@ class Confidence:
         return first @ second / self.power
 
     def telling(self, shown: Tensor) -> Tensor:
-        """Return what tells plates [N, 32, 32] from the average one, [N, P]: their difference from it, without
-        its own direction, so that neither a black plate nor a paler one tells anything.
+        """Return what tells plates [N, 32, 32] from the network's empty answer, [N, P].
+
+        It is their difference from the mean plate, without the mean plate's own direction, so that neither a
+        black plate nor a paler one tells anything; less the same of what the network shows when it knows
+        nothing, which would be in both halves of any pass.
         """
         mean = F.normalize(self.mean.flatten(), dim=0)
         away = (shown - self.mean).flatten(1)
-        return away - (away @ mean)[:, None] * mean
+        return away - (away @ mean)[:, None] * mean - self.empty.flatten()
 
     def checked(self) -> Confidence:
         """Return this, whose tensors may be a stranger's.
@@ -142,8 +148,9 @@ class Confidence:
         """
         shapes = {item.name: tuple(getattr(self, item.name).shape) for item in fields(self)}
         table = (GROUPS, LEVELS)
-        wanted = {"mean": (SIDE, SIDE), "power": (), "threshold": (), "edges": (GROUPS - 1,), "low": table}
-        if shapes != wanted | {"high": table}:
+        plate = (SIDE, SIDE)
+        wanted = {"mean": plate, "empty": plate, "power": (), "threshold": (), "edges": (GROUPS - 1,)}
+        if shapes != wanted | {"low": table, "high": table}:
             raise DataError(f"its tensors have the shapes {shapes}")
         if not all(bool(torch.isfinite(one).all()) for one in self.tensors().values()) or self.power <= 0:
             raise DataError("its numbers are not finite, or its power is not positive")

@@ -10,7 +10,7 @@ from typing import Any
 from evnlos.dataset import PARADIGMS, Dataset, open_dataset
 from evnlos.errors import DataError
 from evnlos.evaluation import Evaluation, available_lpips, evaluate
-from evnlos.model import load_weights
+from evnlos.model import JointNetwork, load_weights
 
 METHODS = ("simulation only", "E2E", "EPNP")
 
@@ -22,6 +22,7 @@ class RunResult:
     Args:
         name: The run's folder name.
         paradigm: "frame", "event" or "fusion".
+        is_joint: Whether it sees whole passes.
         method: "simulation only" (pre-trained, no capture seen), "E2E" (captures alone) or "EPNP" (both).
         evaluation: Pictures and scores on the split.
         log: One record an epoch.
@@ -30,10 +31,16 @@ class RunResult:
 
     name: str
     paradigm: str
+    is_joint: bool
     method: str
     evaluation: Evaluation
     log: list[dict[str, Any]]
     history: list[dict[str, Any]]
+
+    @property
+    def kind(self) -> str:
+        """What is compared with its like: the paradigm, and whether whole passes are seen."""
+        return f"joint {self.paradigm}" if self.is_joint else self.paradigm
 
 
 def gather(runs: list[str | Path], data: str | Path, split: str = "test") -> tuple[Dataset, list[RunResult]]:
@@ -53,12 +60,9 @@ def gather(runs: list[str | Path], data: str | Path, split: str = "test") -> tup
         lines = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
         refuse_seen(weights.history, dataset, split)
         evaluation = evaluate(weights, dataset, split, available_lpips())
-        results.append(
-            RunResult(
-                folder.name, weights.paradigm, method_of(weights.history), evaluation, lines, weights.history
-            )
-        )
-    results.sort(key=lambda r: (METHODS.index(r.method), PARADIGMS.index(r.paradigm)))  # type: ignore[arg-type]
+        kind = (weights.paradigm, isinstance(weights.network, JointNetwork), method_of(weights.history))
+        results.append(RunResult(folder.name, *kind, evaluation, lines, weights.history))
+    results.sort(key=lambda r: (METHODS.index(r.method), r.is_joint, PARADIGMS.index(r.paradigm)))  # type: ignore[arg-type]
     return dataset, results
 
 

@@ -17,20 +17,19 @@ _WIDTH, _LEFT, _RIGHT, _BAR, _GAP, _GROUP = 760, 150, 60, 17, 3, 16
 
 
 def gains_of(results: list[RunResult]) -> dict[str, Interval]:
-    """Return for each paradigm PSNR of EPNP minus that of E2E, dB, with a 95 % interval over the objects.
+    """Return for each kind of network PSNR of EPNP minus E2E, dB, with a 95 % interval over the objects.
 
-    Runs of one method and paradigm (seeds) are averaged.
+    A kind is what a network sees: a paradigm, position by position or whole passes. Runs of one method and kind
+    (seeds) are averaged.
     """
     found = {}
-    for paradigm in PARADIGMS:
+    for kind in _kinds(results):
         stacks = {
-            method: [
-                r.evaluation.scores.psnr_db for r in results if (r.method, r.paradigm) == (method, paradigm)
-            ]
+            method: [r.evaluation.scores.psnr_db for r in results if (r.method, r.kind) == (method, kind)]
             for method in ("EPNP", "E2E")
         }
         if stacks["EPNP"] and stacks["E2E"]:
-            found[paradigm] = paired_difference(
+            found[kind] = paired_difference(
                 np.stack(stacks["EPNP"]), np.stack(stacks["E2E"]), results[0].evaluation.names
             )
     return found
@@ -39,7 +38,7 @@ def gains_of(results: list[RunResult]) -> dict[str, Interval]:
 def lead(results: list[RunResult]) -> str:
     """Return the first section of the page: bars of mean PSNR, and what EPNP gains over E2E in words."""
     gains = gains_of(results)
-    words = "; ".join(f"{paradigm} {gain} dB" for paradigm, gain in gains.items())
+    words = "; ".join(f"{kind} {gain} dB" for kind, gain in gains.items())
     said = (
         f"<p><b>EPNP over E2E: {html.escape(words)}</b> (mean, 95 % interval over the objects).</p>"
         if words
@@ -48,18 +47,22 @@ def lead(results: list[RunResult]) -> str:
     return f"<h2>What is gained</h2>{said}{_bars(results)}"
 
 
+def _kinds(results: list[RunResult]) -> list[str]:
+    """Return the kinds of network that there are, single positions first."""
+    order = sorted(results, key=lambda r: (r.is_joint, PARADIGMS.index(r.paradigm)))  # type: ignore[arg-type]
+    return list(dict.fromkeys(r.kind for r in order))
+
+
 def _bars(results: list[RunResult]) -> str:
-    """Return mean PSNR of each method and paradigm as bars; baselines are upright lines."""
+    """Return mean PSNR of each method and kind of network as bars; baselines are upright lines."""
     means: dict[tuple[str, str], float] = {}
-    for paradigm in PARADIGMS:
+    for kind in _kinds(results):
         for method in METHODS:
             values = [
-                r.evaluation.scores.psnr_db.mean()
-                for r in results
-                if (r.method, r.paradigm) == (method, paradigm)
+                r.evaluation.scores.psnr_db.mean() for r in results if (r.method, r.kind) == (method, kind)
             ]
             if values:
-                means[paradigm, method] = float(np.mean(values))
+                means[kind, method] = float(np.mean(values))
     blanks = {name: float(scores.psnr_db.mean()) for name, scores in baselines_of(results).items()}
     low = np.floor(min([*means.values(), *blanks.values()]) - 1)
     high = np.ceil(max([*means.values(), *blanks.values()]) + 0.5)
@@ -68,12 +71,12 @@ def _bars(results: list[RunResult]) -> str:
         return _LEFT + (value - low) / (high - low) * (_WIDTH - _LEFT - _RIGHT)
 
     parts, y = [], 34.0
-    for paradigm in PARADIGMS:
-        shown = [method for method in METHODS if (paradigm, method) in means]
+    for kind in _kinds(results):
+        shown = [method for method in METHODS if (kind, method) in means]
         for method in shown:
-            value = means[paradigm, method]
+            value = means[kind, method]
             parts.append(
-                _text(_LEFT - 8, y + 13, "end", f"{method} {paradigm}")
+                _text(_LEFT - 8, y + 13, "end", f"{method} {kind}")
                 + f"<rect x={x(low):.1f} y={y} width={x(value) - x(low):.1f} height={_BAR} "
                 f"fill='{_COLOURS[method]}'/>" + _text(x(value) + 5, y + 13, "start", f"{value:.2f}")
             )

@@ -12,6 +12,7 @@ from evnlos.dataset import Dataset, character_of, read_shard
 from evnlos.evaluation import CHECKS
 from evnlos.evaluation.identify import Identification
 from evnlos.evaluation.identify_source import Described
+from evnlos.report.belief import belief_section
 from evnlos.report.curves import curves_svg
 from evnlos.report.films import animations_section, failures_section, strips_section
 from evnlos.report.gather import RunResult
@@ -69,6 +70,7 @@ def write_report(
             lead(results),
             *(_table(results, metric, *about) for metric, about in available_metrics(results).items()),
             _checks(results),
+            belief_section(results),
             _pictures(dataset, results),
             animations_section(dataset, results),
             strips_section(results),

@@ -35,7 +35,7 @@ def baselines_of(results: list[RunResult]) -> dict[str, Scores]:
 
 def label(result: RunResult) -> str:
     """Return the heading of a run's column."""
-    return f"{result.method} {result.paradigm}"
+    return f"{result.method} {result.kind}"
 
 
 def rows_of(results: list[RunResult], metric: str) -> list[tuple[str, str, list[float | None]]]:

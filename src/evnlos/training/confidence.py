@@ -27,11 +27,12 @@ _MIXED = 60  # passes without an object
 def fit_confidence(network: ResidualUNet | JointNetwork, samples: NlosDataset, canvas: Plane) -> Confidence:
     """Learn what pictures of a network are worth from passes that it was not trained on.
 
-    Agreement. With d what tells a plate from the mean one (`Confidence.telling`), the agreement is
-    <d1, d2> / E|t|^2: d1 and d2 from the two halves of a pass, t the same of true plates. For a network that
-    answers with the expectation of the truth, the law of total variance makes it the share of the objects'
-    variance that the measurement explains; noise that the halves do not share cancels. The threshold comes
-    from passes in which each position saw another object.
+    Agreement. With d what tells a plate from the network's empty answer (`Confidence.telling`), the agreement
+    is <d1, d2> / E|t|^2: d1 and d2 from the two halves of a pass, t the same of true plates. For a network that
+    answers with the expectation of the truth, whose empty answer is the mean plate, the law of total variance
+    makes it the share of the objects' variance that the measurement explains; noise that the halves do not
+    share cancels. Empty answer and threshold come from passes in which each position saw another object: a
+    joint network draws the same for all of them, and that is no sign of any object.
 
     Intervals. The central 90 % of the true levels of a plate's pixels for each level that the network gave
     (split conformal, Mondrian by level and by agreement: Vovk et al., Algorithmic Learning in a Random World,
@@ -56,16 +57,13 @@ def fit_confidence(network: ResidualUNet | JointNetwork, samples: NlosDataset, c
         halves.append(halves_of(network, samples.inputs[rows], at, canvas))
         shown.append(plates(infer(network, samples.inputs[rows], at), canvas, at)[:, 0])
         true.append(plates(samples.truth[rows].float(), canvas, at)[:, 0])
-    mean = torch.stack([one.mean(dim=0) for one in true]).mean(dim=0)
-    blank = Confidence(mean, *(torch.ones(()) for _ in range(5)))
-    power = blank.telling(torch.stack([one.mean(dim=0) for one in true])).square().sum(dim=1).mean()
-    blank = replace(blank, power=power)
-    strange = torch.stack(
-        [
-            blank.agreement(halves_of(network, samples.inputs[rows], position_m[rows], canvas))
-            for rows in _mixed(names)
-        ]
-    )
+    objects_true = torch.stack([one.mean(dim=0) for one in true])
+    mean = objects_true.mean(dim=0)
+    blank = Confidence(mean, torch.zeros_like(mean), *(torch.ones(()) for _ in range(5)))
+    mixed = [halves_of(network, samples.inputs[rows], position_m[rows], canvas) for rows in _mixed(names)]
+    blank = replace(blank, empty=blank.telling(torch.cat(mixed)).mean(dim=0).unflatten(0, mean.shape))
+    blank = replace(blank, power=blank.telling(objects_true).square().sum(dim=1).mean())
+    strange = torch.stack([blank.agreement(one) for one in mixed])
     agreement = torch.stack([blank.agreement(one) for one in halves])
     edges = torch.quantile(agreement, torch.arange(1, GROUPS) / GROUPS)
     group = torch.searchsorted(edges, agreement)
