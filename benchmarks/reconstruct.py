@@ -2,10 +2,11 @@
 
     python benchmarks/reconstruct.py                 # default network, two threads
     python benchmarks/reconstruct.py --threads 1 --weights RUN
+    python benchmarks/reconstruct.py --weights near-frame-pass
 
 One position of a capture at 160 x 100: the time surface of the events since the position before, both maps
-brought to 96 x 64, and the network, as a graph (`Reconstructor`) and layer by layer. Wall time, medians; the
-first runs are left out.
+brought to 96 x 64, and the network, as a graph (`Reconstructor`) and layer by layer. Of weights that see whole
+passes: a pass of 40 positions, all times divided by 40. Wall time, medians; the first runs are left out.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ import numpy as np
 import torch
 
 from event_pixel import machine
-from evnlos.config import to_dict
+from evnlos.config import from_dict, to_dict
 from evnlos.dataset import CHANNELS, PARADIGMS, Sampling, network_input
 from evnlos.dataset.sampling import make_samples
-from evnlos.evaluation import Reconstructor
-from evnlos.model import ResidualUNet, UNetConfig, Weights, infer, load_weights
+from evnlos.evaluation import Reconstructor, reconstruct
+from evnlos.model import JointNetwork, ResidualUNet, UNetConfig, Weights, infer, load_weights
+from evnlos.scene import LineMotion
 from evnlos.types import Events
 
 
@@ -31,6 +33,27 @@ def events_of_a_position(count: int, seed: int) -> Events:
     draw = np.random.default_rng(seed)
     columns = (draw.integers(0, n, count).astype(np.uint16) for n in (160, 100))
     return Events(np.sort(draw.integers(1, 200_000, count)), *columns, draw.random(count) < 0.5, 160, 100)
+
+
+def whole_passes(weights: Weights, events_each: int, rounds: int) -> None:
+    """Time passes of 40 positions and print a row, a position's share."""
+    draw, positions = np.random.default_rng(1), 40
+    frames = draw.integers(0, 256, (positions, 100, 160)).astype(np.uint8)
+    each = [events_of_a_position(events_each, n) for n in range(positions)]
+    stamps = np.concatenate([one.t_us + 200_000 * n for n, one in enumerate(each)])
+    columns = (np.concatenate([getattr(one, name) for one in each]) for name in ("x", "y", "p"))
+    events = Events(stamps, *columns, 160, 100)
+    edges = np.arange(positions + 1) * 200_000
+    motion, sampling = LineMotion(), from_dict(Sampling, weights.sampling)
+    parts: list[tuple[float, float]] = []
+    for _ in range(max(3, rounds // 8) + 1):
+        began = time.perf_counter()
+        samples = make_samples(frames, 255.0, events, edges, sampling, motion=motion)
+        mapped = time.perf_counter()
+        reconstruct(weights, samples.frame, samples.surface, samples.position_m)
+        parts.append((mapped - began, time.perf_counter() - mapped))
+    maps, net = (1e3 * statistics.median(part) / positions for part in zip(*parts[1:], strict=True))
+    print(f"| {weights.paradigm}, whole pass | {maps:.2f} | {net:.2f} | {maps + net:.2f} | |")
 
 
 def main() -> None:
@@ -48,12 +71,17 @@ def main() -> None:
     print(f"{args.events} events a position, {args.threads} threads")
     print("| paradigm | surface and maps, ms | network, ms | together, ms | network layer by layer, ms |")
     print("|---|---|---|---|---|")
+    if args.weights and isinstance(load_weights(args.weights).network, JointNetwork):
+        whole_passes(load_weights(args.weights), args.events, args.rounds)
+        return
     for paradigm in [load_weights(args.weights).paradigm] if args.weights else PARADIGMS:
         if args.weights:
             weights = load_weights(args.weights)
         else:
-            network = ResidualUNet(CHANNELS[paradigm], UNetConfig()).eval()
-            weights = Weights(network, paradigm, to_dict(Sampling()), [])
+            sampling = Sampling()
+            size = (sampling.height, sampling.width)
+            network = ResidualUNet(CHANNELS[paradigm], UNetConfig(), size).eval()
+            weights = Weights(network, paradigm, to_dict(sampling), [])
         see = Reconstructor(weights)
         parts: list[tuple[float, float, float]] = []
         for n in range(args.rounds + 5):
