@@ -20,6 +20,7 @@ from evnlos.evaluation.score import score
 from evnlos.evaluation.worth import PassWorth
 from evnlos.plot.rig import rig_drawing
 from evnlos.report import RunResult, write_report
+from evnlos.report.films import _worst
 from evnlos.report.lead import gains_of
 from evnlos.transport import PaperTransport, RadiometricTransport
 
@@ -104,6 +105,14 @@ def test_the_page_says_how_far_to_believe_each_run(made, tmp_path) -> None:
 
 def _unmeasured(name: str) -> PassWorth:
     return PassWorth(name, 0.0, 0.01, None, False, -0.3, 0.99, 1.0)
+
+
+def test_the_worst_pictures_are_of_several_objects() -> None:
+    gain = np.array([-5.0, -4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0])
+    names = np.array(["a", "a", "a", "b", "b", "b", "c", "c"])
+    assert _worst(gain, names) == [0, 1, 3, 4, 6, 7]
+    assert _worst(gain, np.full(8, "a")) == list(range(6))  # one object: all are of it
+    assert _worst(gain[:2], names[:2]) == [0, 1]
 
 
 def test_without_a_rig_the_page_says_how_to_name_it(made, tmp_path) -> None:

@@ -18,6 +18,8 @@ from evnlos.transport import MeasuredTransport, PaperTransport, RadiometricTrans
 from evnlos.transport.measured_file import SUFFIX
 from evnlos.transport.rig import rig_names
 
+_IN_A_FOLDER = ("rig", "lab", "dataset")  # files that are told apart by their folder
+
 
 @dataclass(frozen=True)
 class Described:
@@ -61,6 +63,7 @@ def described_rig(text: str | Path) -> Described:
             simulation = PRESETS[preset]()
             return Described(str(text), simulation.transport, simulation.frame_camera)
         return Described(str(text), rig_preset(str(text)), FrameCamera())
+    name = path.resolve().parent.name if path.stem in _IN_A_FOLDER else path.stem
     values = read_yaml(path)
     if isinstance(values.get("lab"), dict):
         values = values["lab"]
@@ -68,7 +71,7 @@ def described_rig(text: str | Path) -> Described:
         values = values["config"]
     if "kind" in values:
         either: Any = PaperTransport | RadiometricTransport | MeasuredTransport
-        return Described(path.stem, from_dict(either, values, source=str(path)), FrameCamera())
+        return Described(name, from_dict(either, values, source=str(path)), FrameCamera())
     if "transport" not in values:
         near = difflib.get_close_matches("transport", [str(key) for key in values], n=1)
         hint = f"; perhaps {near[0]!r} is meant to be it" if near else ""
@@ -78,6 +81,6 @@ def described_rig(text: str | Path) -> Described:
     lab_only = {item.name for item in fields(Lab)} - {item.name for item in fields(Simulation)}
     if lab_only & values.keys():
         lab = from_dict(Lab, values, source=str(path)).drawn()
-        return Described(path.stem, lab.transport, lab.frame_camera)
+        return Described(name, lab.transport, lab.frame_camera)
     simulation = from_dict(Simulation, values, source=str(path))
-    return Described(path.stem, simulation.transport, simulation.frame_camera)
+    return Described(name, simulation.transport, simulation.frame_camera)

@@ -59,7 +59,7 @@ def rig_drawing(
             f"stroke='{_LIGHT}' stroke-width='4'",
         )
     )
-    parts.append(("text", [(middle, deep)], f"object {100 * plate_m:g} cm, way {100 * travel_m:g} cm"))
+    parts.append(("text", [(middle, deep)], f"object {100 * plate_m:.3g} cm, way {100 * travel_m:.3g} cm"))
     reach = max(half + abs(middle) + 0.04, 0.2)
     around += [(middle - half, deep), (middle + half, deep)]
     if isinstance(rig, RadiometricTransport):
@@ -70,7 +70,7 @@ def rig_drawing(
         parts += [("line", [eye, one], f"stroke='{_SIGHT}' stroke-width='1'") for one in seen]
         parts.append(("disc", [eye], f"fill='{_SIGHT}'"))
         parts.append(
-            ("text", [eye], f"cameras, {100 * rig.camera_distance_m:g} cm, {rig.camera_angle_deg:g} deg")
+            ("text", [eye], f"cameras, {100 * rig.camera_distance_m:.3g} cm, {rig.camera_angle_deg:.3g} deg")
         )
         for occluder in rig.occluders():
             corners = np.asarray(occluder.vertices_m)[:, [0, 2]]
@@ -101,11 +101,11 @@ def _object(rig: RadiometricTransport | PaperTransport) -> tuple[float, float]:
 
 def _words(rig: RadiometricTransport | PaperTransport) -> str:
     if isinstance(rig, PaperTransport):
-        return f"relay wall (the paper's kernel, {1e3 * rig.tpsf_length_m:g} mm a unit of rho)"
+        return f"relay wall (the paper's kernel, {1e3 * rig.tpsf_length_m:.3g} mm a unit of rho)"
     return (
         "relay wall, matte"
         if rig.wall_material == "lambert"
-        else f"relay wall, metal of roughness {rig.roughness:g}"
+        else f"relay wall, metal of roughness {rig.roughness:.2g}"
     )
 
 
@@ -133,7 +133,7 @@ def _svg(parts: list, around: NDArray[np.float64], wall: str, deep: float) -> st
     drawn.append(_text(place((0.0, 0.0))[0], _MARGIN - 16, wall))
     x, top, bottom = place((low[0], 0.0))[0] + 12, place((0.0, 0.0))[1] + 4, place((0.0, deep))[1]
     drawn.append(f"<path d='M{x:.1f} {top:.1f}V{bottom:.1f}' stroke='currentColor' stroke-width='.8' />")
-    drawn.append(_text(x + 5, (top + bottom) / 2, f"{100 * deep:g} cm", "start"))
+    drawn.append(_text(x + 5, (top + bottom) / 2, f"{100 * deep:.3g} cm", "start"))
     step = max((one for one in _STEPS_M if one * scale <= 150), default=_STEPS_M[0])
     left, foot = _MARGIN, _HEIGHT - 14
     drawn.append(f"<path d='M{left} {foot - 4}v4h{step * scale:.1f}v-4' fill='none' stroke='currentColor' />")

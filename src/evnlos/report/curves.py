@@ -6,7 +6,8 @@ import html
 import math
 
 _COLOURS = ("#0b5fa5", "#b23a12", "#2f7d32", "#7a3fa0", "#8a6d00", "#00788a", "#a02c5d", "#5b6470", "#3d4fc4")
-_WIDTH, _HEIGHT, _LEFT, _TOP, _RIGHT, _BOTTOM = 980, 300, 60, 16, 190, 40
+_WIDTH, _HEIGHT, _LEFT, _TOP, _BOTTOM = 980, 300, 60, 16, 40
+_PEN, _LETTER = 44, 7.0  # room for a line of the legend, and for each letter of its name
 
 
 def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_label: str) -> str:
@@ -19,7 +20,7 @@ def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_lab
     x0, x1 = min(xs), max(max(xs), min(xs) + 1)
     ticks = _ticks(min(ys), max(ys))
     y0, y1 = min(ticks[0], min(ys)), max(ticks[-1], max(ys))
-    wide, high = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
+    wide, high = _WIDTH - _LEFT - _PEN - _LETTER * max(map(len, series)), _HEIGHT - _TOP - _BOTTOM
 
     def place(x: float, y: float) -> tuple[float, float]:
         return _LEFT + (x - x0) / (x1 - x0) * wide, _TOP + (y1 - y) / (y1 - y0) * high
@@ -29,7 +30,7 @@ def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_lab
     ]
     for tick in ticks:
         y = place(x0, tick)[1]
-        parts.append(f"<path d='M{_LEFT} {y:.1f}H{_LEFT + wide}' stroke='currentColor' opacity='.15'/>")
+        parts.append(f"<path d='M{_LEFT} {y:.1f}H{_LEFT + wide:.1f}' stroke='currentColor' opacity='.15'/>")
         parts.append(f"<text x={_LEFT - 6} y={y + 4:.1f} text-anchor=end fill=currentColor>{tick:g}</text>")
     for tick in _ticks(x0, x1):
         if x0 <= tick <= x1:
@@ -37,7 +38,8 @@ def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_lab
             parts.append(
                 f"<text x={x:.1f} y={_TOP + high + 16} text-anchor=middle fill=currentColor>{tick:g}</text>"
             )
-    parts.append(f"<text x={_LEFT + wide} y={_HEIGHT - 6} text-anchor=end fill=currentColor>{x_label}</text>")
+    below = f"x={_LEFT + wide:.1f} y={_HEIGHT - 6} text-anchor=end"
+    parts.append(f"<text {below} fill=currentColor>{html.escape(x_label)}</text>")
     parts.append(f"<text x={_LEFT} y=11 fill=currentColor>{html.escape(y_label)}</text>")
     for i, (name, points) in enumerate(series.items()):
         colour, dash = _COLOURS[i % len(_COLOURS)], ("", "6 3", "2 3")[i // 3 % 3]
@@ -45,8 +47,8 @@ def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_lab
         pen = f"stroke='{colour}' stroke-width=1.8 stroke-dasharray='{dash}'"
         parts.append(f"<polyline points='{path}' fill=none {pen}/>")
         y = _TOP + 14 + 17 * i
-        parts.append(f"<path d='M{_LEFT + wide + 12} {y - 4}h22' {pen}/>")
-        parts.append(f"<text x={_LEFT + wide + 40} y={y} fill=currentColor>{html.escape(name)}</text>")
+        parts.append(f"<path d='M{_LEFT + wide + 12:.1f} {y - 4}h22' {pen}/>")
+        parts.append(f"<text x={_LEFT + wide + 40:.1f} y={y} fill=currentColor>{html.escape(name)}</text>")
     return "".join(parts) + "</svg>"
 
 

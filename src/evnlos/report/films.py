@@ -72,9 +72,8 @@ def failures_section(results: list[RunResult]) -> str:
         found = r.evaluation
         blank = found.baselines.get("mean", found.baselines["zero"])
         gain = found.scores.psnr_db - blank.psnr_db
-        worst = np.argsort(gain, kind="stable")[:_WORST]
         cells = []
-        for k in worst:
+        for k in _worst(gain, found.names):
             name = str(found.names[k])
             position = int(np.flatnonzero(found.names == name).searchsorted(k))
             pair = data_uri(png(strip([grey(found.truth[k]), grey(found.images[k])], 1)))
@@ -89,10 +88,20 @@ def failures_section(results: list[RunResult]) -> str:
             f"<div class=movies>{''.join(cells)}</div>"
         )
     return (
-        "<h2>Where it fails</h2><p class=dim>The worst pictures of each run, by number: truth above, "
-        "picture below, PSNR and in brackets the difference to the mean training picture, dB.</p>"
-        + "".join(blocks)
+        "<h2>Where it fails</h2><p class=dim>The worst pictures of each run, by number, no more than two of an "
+        "object where there are enough: truth above, picture below, PSNR and in brackets the difference to the "
+        "mean training picture, dB.</p>" + "".join(blocks)
     )
+
+
+def _worst(gain: np.ndarray, names: np.ndarray) -> list[int]:
+    """Return the samples that gain least, spread over the objects: a whole pass would be the same picture."""
+    each = max(2, -(-_WORST // len(np.unique(names))))
+    taken: list[int] = []
+    for k in np.argsort(gain, kind="stable"):
+        if len(taken) < _WORST and np.sum(names[taken] == names[k]) < each:
+            taken.append(int(k))
+    return taken
 
 
 def _spread(indices: np.ndarray) -> np.ndarray:

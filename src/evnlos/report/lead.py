@@ -70,7 +70,8 @@ def _bars(results: list[RunResult]) -> str:
     def x(value: float) -> float:
         return _LEFT + (value - low) / (high - low) * (_WIDTH - _LEFT - _RIGHT)
 
-    parts, y = [], 34.0
+    top = 12.0 * len(blanks) + 6  # each baseline has a line for its name
+    parts, y = [], top + 4
     for kind in _kinds(results):
         shown = [method for method in METHODS if (kind, method) in means]
         for method in shown:
@@ -82,11 +83,12 @@ def _bars(results: list[RunResult]) -> str:
             )
             y += _BAR + _GAP
         y += _GROUP if shown else 0
-    for k, (name, value) in enumerate(blanks.items()):
-        title = BASELINES[name]
+    # From left to right, each name right of its line and below the one before: no line crosses a name.
+    for k, (name, value) in enumerate(sorted(blanks.items(), key=lambda pair: pair[1])):
+        line = f"M{x(value):.1f} {12 * k + 3}V{y - _GROUP:.1f}"
         parts.append(
-            f"<path d='M{x(value):.1f} 30V{y - _GROUP:.1f}' stroke=currentColor stroke-dasharray='3 3'/>"
-            + _text(x(value), 12 + 12 * (k % 2), "middle", f"{title} {value:.1f}")
+            f"<path d='{line}' stroke=currentColor stroke-dasharray='3 3'/>"
+            + _text(x(value) + 4, 12 * k + 12, "start", f"{BASELINES[name]} {value:.1f}")
         )
     parts.append(_text(_WIDTH - 4, y + 8, "end", f"mean PSNR, dB; from {low:g} dB"))
     box = f"viewBox='0 0 {_WIDTH} {y + 14:.0f}'"
