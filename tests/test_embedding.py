@@ -11,7 +11,7 @@ from evnlos.dataset import NlosDataset
 from evnlos.errors import ConfigError
 from evnlos.evaluation import Reconstructor
 from evnlos.model import Weights, fit_linear, infer, save_weights
-from evnlos.model.embedding import LinearEmbedding, Standardise
+from evnlos.model.embedding import LinearEmbedding, Standardise, embedding_for
 
 NET = UNetConfig(width=8, depth=1, rank=12, strengths=(0.1, 1.0, 10.0))
 
@@ -39,6 +39,30 @@ def test_each_strength_is_a_ridge_regression_of_its_own(samples) -> None:
         weights = torch.linalg.solve(inner + strength * unit * torch.eye(96, dtype=torch.float64), x.T @ y)
         expected = truth.double().mean(0) + (x @ weights).unflatten(1, (6, 8))
         torch.testing.assert_close(embedding(inputs)[:, k].double(), expected, atol=2e-4, rtol=0)
+
+
+def test_frame_and_events_are_undone_each_on_its_own() -> None:
+    draw = torch.Generator().manual_seed(2)
+    truth = torch.rand(60, 6, 8, generator=draw)
+    seen = torch.stack([truth, 0.5 * truth, 0 * truth], dim=1) + 0.1 * torch.randn(60, 3, 6, 8, generator=draw)
+    names = np.repeat([f"o{k}" for k in range(12)], 5)
+    both = embedding_for(3, (6, 8), 40, NET.strengths)
+    both.fit(seen, truth, names, seed=4)
+    assert (both.rank, both.pictures, both.frame.rank, both.events.rank) == (40, 6, 25, 15)
+    alone = LinearEmbedding(1, (6, 8), 25, NET.strengths)
+    alone.take(fit_linear(seen[:, :1], truth, names, rank=25, seed=4))
+    pictures = both(seen)
+    assert pictures.shape == (60, 6, 6, 8)
+    torch.testing.assert_close(pictures[:, :3], alone(seen[:, :1]))
+    # The frame's pictures know nothing of the events, and the other way round.
+    blind = seen.clone()
+    blind[:, 1:] = 0
+    torch.testing.assert_close(both(blind)[:, :3], pictures[:, :3])
+    assert not torch.allclose(both(blind)[:, 3:], pictures[:, 3:])
+    both.keep(16)
+    assert (both.frame.rank, both.events.rank) == (10, 6)
+    with pytest.raises(ConfigError, match="give 2 or more"):
+        embedding_for(3, (6, 8), 1, (1.0,))
 
 
 def test_fewer_samples_than_components_leave_the_rest_empty(samples) -> None:
@@ -93,7 +117,7 @@ def test_training_gives_a_new_network_both_and_weights_keep_them(tiny_dataset, t
 
     list(train(tiny_dataset, replace(plan, seed=1), tmp_path / "second", tmp_path / "first"))
     later = load_weights(tmp_path / "second").network
-    assert torch.equal(later.embedding.basis, embedding.basis)
+    assert torch.equal(later.embedding.events.basis, embedding.events.basis)
 
     save_weights(tmp_path / "half.safetensors", weights, torch.float16)
     half = load_weights(tmp_path / "half.safetensors")

@@ -242,7 +242,7 @@ def test_a_page_that_unfolds_is_refused(text: str, tmp_path, bounded_memory) -> 
 )
 def test_weights_that_claim_too_much_are_refused(change, network, tmp_path, bounded_memory) -> None:
     path = tmp_path / "w.safetensors"
-    about = {"format": "evnlos-weights-2", "paradigm": "frame", "network": to_dict(network.config)}
+    about = {"format": "evnlos-weights-3", "paradigm": "frame", "network": to_dict(network.config)}
     tensors = dict(network.state_dict()) | {"wide": torch.zeros(200_000)}
     if "network" not in change:
         del tensors["wide"]

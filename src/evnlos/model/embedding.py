@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.model.linear import LinearEstimate
+from evnlos.model.linear import EVENT_SHARE, LinearEstimate, fit_linear
 
 Scaling = Literal["dataset", "picture"]
 
@@ -103,6 +105,15 @@ class LinearEmbedding(nn.Module):
         """Most components of the input."""
         return self.basis.shape[1]
 
+    @property
+    def pictures(self) -> int:
+        """Pictures that come out for each input."""
+        return len(self.strengths)
+
+    def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
+        """Fit the linear estimate to standardised samples and take its numbers; arguments as in `fit_linear`."""
+        self.take(fit_linear(seen, truth, objects, self.rank, seed))
+
     def take(self, estimate: LinearEstimate) -> None:
         """Take the numbers of a linear estimate; of lower rank, where there were fewer samples."""
         found = len(estimate.powers)
@@ -143,3 +154,64 @@ class LinearEmbedding(nn.Module):
     @property
     def _wanted(self) -> str:
         return ", ".join(str(side) for side in self.shape)
+
+
+class FusionEmbedding(nn.Module):
+    """Frame and events undone each by its own ridges: [B, 3, H, W] -> [B, 2 S, H, W], the frame's first.
+
+    One regression on both would mix them by their noise in the samples that it was fitted to; apart, the network
+    behind weighs them, picture by picture and place by place.
+
+    Args:
+        size: Height and width of the input, pixels.
+        rank: Most components of frame and events together, at least 2.
+        strengths: As in `LinearEmbedding`.
+
+    Raises:
+        ConfigError: The rank is 1.
+    """
+
+    def __init__(self, size: tuple[int, int], rank: int, strengths: tuple[float, ...]) -> None:
+        super().__init__()
+        if rank < 2:
+            raise ConfigError(f"the rank is {rank}; frame and events need one component each: give 2 or more")
+        self.frame = LinearEmbedding(1, size, rank - _of_events(rank), strengths)
+        self.events = LinearEmbedding(2, size, _of_events(rank), strengths)
+        self.shape = (3, *size)
+
+    @property
+    def rank(self) -> int:
+        """Most components of frame and events together."""
+        return self.frame.rank + self.events.rank
+
+    @property
+    def pictures(self) -> int:
+        """Pictures that come out for each input."""
+        return self.frame.pictures + self.events.pictures
+
+    def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
+        """Fit both to standardised samples [N, 3, H, W]; arguments as in `fit_linear`."""
+        self.frame.fit(seen[:, :1], truth, objects, seed)
+        self.events.fit(seen[:, 1:], truth, objects, seed)
+
+    def keep(self, rank: int) -> None:
+        """Forget all but the strongest components; `rank` of frame and events together."""
+        self.frame.keep(rank - _of_events(rank))
+        self.events.keep(_of_events(rank))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, 3, H, W] to pictures [B, 2 S, H, W]."""
+        return torch.cat([self.frame(x[:, :1]), self.events(x[:, 1:])], dim=1)
+
+
+def embedding_for(
+    channels: int, size: tuple[int, int], rank: int, strengths: tuple[float, ...]
+) -> LinearEmbedding | FusionEmbedding:
+    """Return an empty embedding for what a network sees: of frame (1), events (2) or both (3 channels)."""
+    if channels == 3:
+        return FusionEmbedding(size, rank, strengths)
+    return LinearEmbedding(channels, size, rank, strengths)
+
+
+def _of_events(rank: int) -> int:
+    return max(1, round(EVENT_SHARE * rank))

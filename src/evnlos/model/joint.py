@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.model.embedding import LinearEmbedding, Standardise
+from evnlos.model.embedding import Standardise, embedding_for
 from evnlos.model.plates import on_canvas
 from evnlos.model.unet import ResidualUNet, UNetConfig
 from evnlos.types import Plane
@@ -47,8 +47,8 @@ class JointNetwork(nn.Module):
             raise ConfigError("UNetConfig.rank is 0; a joint network pools its linear embedding: give a rank")
         self.channels, self.config, self.size = channels, config, size
         self.standardise = Standardise(channels, config.scaling)
-        self.embedding = LinearEmbedding(channels, size, config.rank, config.strengths)
-        self.unet = ResidualUNet(len(config.strengths), replace(config, rank=0, scaling="dataset"))
+        self.embedding = embedding_for(channels, size, config.rank, config.strengths)
+        self.unet = ResidualUNet(self.embedding.pictures, replace(config, rank=0, scaling="dataset"))
         fine_m = pitch_m / FINER
         side = max(1, round(PLATE_M / fine_m / _CELLS)) * _CELLS
         across = (torch.arange(side) + 0.5 - side / 2) * fine_m

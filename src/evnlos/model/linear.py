@@ -16,7 +16,8 @@ _LAMBDAS = tuple(10.0 ** (k / 2) for k in range(-12, 5))  # in units of the mean
 _FOLDS = 5
 _EXTRA = 20  # columns of the random probe beyond the rank
 _POWERS = 2
-_EVENT_SHARE = 0.375  # of the rank of frame and events together
+EVENT_SHARE = 0.375
+"""The events' share of the rank of frame and events together."""
 _TINY = 1e-30
 
 
@@ -110,7 +111,7 @@ def _parts(channels: int, rank: int) -> list[tuple[slice, int]]:
     """Return the channels of the frame and of the events, each with its share of the rank."""
     if channels != 3:
         return [(slice(0, channels), rank)]
-    events = round(_EVENT_SHARE * rank)
+    events = round(EVENT_SHARE * rank)
     return [(slice(0, 1), rank - events), (slice(1, 3), events)]
 
 

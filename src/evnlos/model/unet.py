@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.model.embedding import LinearEmbedding, Scaling, Standardise
+from evnlos.model.embedding import FusionEmbedding, LinearEmbedding, Scaling, Standardise, embedding_for
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class UNetConfig:
     rank: int = 256
     """Components of the linear embedding in front of the U-Net (0 = none: the U-Net sees the maps)."""
     strengths: tuple[float, ...] = (0.03, 1.0, 30.0)
-    """Ridges of the linear embedding, in units of the best one; each gives the U-Net one picture."""
+    """Ridges of the linear embedding, in units of the best one; each gives the U-Net one picture, with frame and
+    events one of each."""
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "blocks", "shuffle", "groups"):
@@ -98,12 +99,12 @@ class ResidualUNet(nn.Module):
         super().__init__()
         self.channels, self.config = channels, config
         self.standardise = Standardise(channels, config.scaling)
-        self.embedding: LinearEmbedding | None = None
+        self.embedding: LinearEmbedding | FusionEmbedding | None = None
         if config.rank:
             if size is None:
                 raise ConfigError(f"UNetConfig.rank is {config.rank}; give the size of the inputs, or rank=0")
-            self.embedding = LinearEmbedding(channels, size, config.rank, config.strengths)
-            channels = len(config.strengths)
+            self.embedding = embedding_for(channels, size, config.rank, config.strengths)
+            channels = self.embedding.pictures
         cell, groups, blocks = config.shuffle**2, config.groups, config.blocks
         widths = [config.width * min(2**level, 8) for level in range(config.depth + 1)]
 
@@ -137,7 +138,7 @@ class ResidualUNet(nn.Module):
         height, width = x.shape[-2:]
         x = self.standardise(x)
         if self.embedding is not None:
-            x = self.embedding(x)  # [B, strengths, H, W]
+            x = self.embedding(x)  # [B, pictures, H, W]
         x = F.pad(x, (0, -width % self.multiple, 0, -height % self.multiple), mode="replicate")
         x = self.stem(F.pixel_unshuffle(x, self.config.shuffle))  # [B, width, H/s, W/s]
         skips = []

@@ -22,7 +22,7 @@ from evnlos.model.joint import JointNetwork, new_network
 from evnlos.model.published import published
 from evnlos.model.unet import ResidualUNet, UNetConfig
 
-_FORMAT = "evnlos-weights-2"
+_FORMAT = "evnlos-weights-3"
 _MEAN = "baseline.mean_image"
 _CONFIDENCE = "confidence."
 

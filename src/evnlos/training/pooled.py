@@ -35,7 +35,7 @@ class PooledSamples(HeldSamples):
     def __init__(self, samples: NlosDataset, network: JointNetwork, views: int, seed: int) -> None:
         inputs, truth, names = [], [], []
         draw = np.random.default_rng(derive_seed(seed, "views"))
-        device = network.embedding.basis.device
+        device = next(network.parameters()).device
         for name in dict.fromkeys(samples.names.tolist()):
             mine = np.flatnonzero(samples.names == name)
             if np.isnan(samples.position_m[mine]).any():

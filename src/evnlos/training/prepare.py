@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from evnlos.model import JointNetwork, ResidualUNet, fit_linear
+from evnlos.model import JointNetwork, ResidualUNet
 from evnlos.training.source import Source
 
 MOST_SAMPLES = 16_384
@@ -38,4 +38,4 @@ def prepare(
         if len(np.unique(names)) < 2:  # one object: its positions stand for objects
             names = np.arange(len(names)).astype(str)
         seen = torch.cat([network.standardise(part.float().to(device)).cpu() for part in inputs.split(256)])
-        network.embedding.take(fit_linear(seen, truth, names, network.embedding.rank, seed))
+        network.embedding.fit(seen, truth, names, seed)
