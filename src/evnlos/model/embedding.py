@@ -111,7 +111,7 @@ class LinearEmbedding(nn.Module):
         return len(self.strengths)
 
     def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
-        """Fit the linear estimate to standardised samples and take its numbers; arguments as in `fit_linear`."""
+        """Fit the linear estimate to standardised samples and take its numbers; arguments of `fit_linear`."""
         self.take(fit_linear(seen, truth, objects, self.rank, seed))
 
     def take(self, estimate: LinearEstimate) -> None:
@@ -159,8 +159,8 @@ class LinearEmbedding(nn.Module):
 class FusionEmbedding(nn.Module):
     """Frame and events undone each by its own ridges: [B, 3, H, W] -> [B, 2 S, H, W], the frame's first.
 
-    One regression on both would mix them by their noise in the samples that it was fitted to; apart, the network
-    behind weighs them, picture by picture and place by place.
+    One regression on both would mix them by their noise in the samples that it was fitted to; apart, the
+    network behind weighs them, picture by picture and place by place.
 
     Args:
         size: Height and width of the input, pixels.

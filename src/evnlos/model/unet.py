@@ -32,8 +32,8 @@ class UNetConfig:
     rank: int = 256
     """Components of the linear embedding in front of the U-Net (0 = none: the U-Net sees the maps)."""
     strengths: tuple[float, ...] = (0.03, 1.0, 30.0)
-    """Ridges of the linear embedding, in units of the best one; each gives the U-Net one picture, with frame and
-    events one of each."""
+    """Ridges of the linear embedding, in units of the best one; each gives the U-Net one picture, or one of the
+    frame and one of the events."""
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "blocks", "shuffle", "groups"):
