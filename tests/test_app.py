@@ -96,6 +96,17 @@ def test_networks_see_what_they_were_trained_on(app_pass, app_weights) -> None:
         own_networks((Path("nowhere"),))
 
 
+def test_networks_of_the_package_see_more_than_least_squares(app_pass) -> None:
+    """The camera is half as fine as the one that they were trained on."""
+    named = Networks().of(app_pass)
+    assert list(named) == ["network, frames", "network, events", "network, both"]
+    found = {name: from_weights(app_pass, name, one) for name, one in named.items()}
+    single = from_each_frame(app_pass).psnr_db.mean()
+    for name in ("network, frames", "network, both"):
+        assert found[name].psnr_db.mean() > single + 2, name
+        assert "all frames" in found[name].note and "supports" in found[name].note
+
+
 def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
     shown = [verdict_on(replace(SMALL, **one).simulation()) for one in ({"roughness": 0.02}, {"wall": "matte"})]
     assert "measured" in shown[0].meaning and "memory, not a measurement" not in shown[0].meaning

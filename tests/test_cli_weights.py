@@ -8,7 +8,7 @@ import torch
 
 from evnlos import Training, UNetConfig, load_weights, train
 from evnlos.cli import main
-from evnlos.model import published, save_weights
+from evnlos.model import JointNetwork, published, published_for, save_weights
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +108,24 @@ def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys
     path = published()[name]
     assert path.stat().st_size <= 16_000_000
     loaded = load_weights(name)
-    assert loaded.paradigm == name.split("-")[1]
+    rig, paradigm, *kind = name.split("-")
+    assert loaded.paradigm == paradigm and isinstance(loaded.network, JointNetwork) == (kind == ["pass"])
     assert loaded.confidence is not None and loaded.scores["images"] >= 160
     better = loaded.scores["overall"]["psnr_db"] - loaded.scores["baselines"]["mean"]["psnr_db"]
     assert better > 1
     # What they were trained on is not what they were scored on.
     captures = [step["data"] for step in loaded.history if step["data"]["origin"] == "captures"]
-    assert captures and not {name[-1] for data in captures for name in data["train"]} & set("GK49")
+    if rig == "page":
+        assert not captures and loaded.scores["data"] == "test"
+    else:
+        assert captures and not {name[-1] for data in captures for name in data["train"]} & set("GK49")
     main(["weights"])
     assert f"{name}: {loaded.paradigm}" in capsys.readouterr().out
+
+
+def test_the_weights_of_the_nearest_rig_are_taken() -> None:
+    assert published_for(0.36, "frame", is_motion_known=True) == "near-frame-pass"
+    assert published_for(0.44, "frame", is_motion_known=True) == "far-frame-pass"
+    assert published_for(None, "event", is_motion_known=True) == "near-event-pass"
+    # Where there are none for the nearest rig, those of the next one are.
+    assert published_for(0.5, "frame", is_motion_known=False) == "near-frame"

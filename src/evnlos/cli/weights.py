@@ -14,6 +14,8 @@ from evnlos.config import to_dict
 from evnlos.errors import ConfigError, DataError
 from evnlos.model import JointNetwork, Weights, load_weights, published, save_weights, with_rank
 
+_MOST_NAMED = 8  # of more objects, the worst and the best are named
+
 
 @dataclass(frozen=True)
 class Command:
@@ -112,7 +114,10 @@ def to_text(name: str, found: dict[str, Any]) -> str:
 def _score_line(scores: dict[str, Any]) -> str:
     """Return one line on how good the weights were found to be; a stranger's file may say anything there."""
     try:
-        each = ", ".join(f"{name} {value:.2f}" for name, value in scores["psnr_db"].items())
+        found = sorted(scores["psnr_db"].items(), key=lambda pair: pair[1])
+        shown = scores["psnr_db"].items() if len(found) <= _MOST_NAMED else (found[0], found[-1])
+        each = ", ".join(f"{name} {value:.2f}" for name, value in shown)
+        each = each if len(found) <= _MOST_NAMED else each.replace(", ", " to ")
         return f"  {scores['overall']['psnr_db']:.2f} dB on {scores['data']}, {scores['split']}: {each}"
     except (KeyError, TypeError, ValueError, AttributeError):
         return "  its scores are not what this version writes"
