@@ -8,6 +8,7 @@ import torch
 
 from evnlos import Training, UNetConfig, load_weights, train
 from evnlos.cli import main
+from evnlos.errors import DataError
 from evnlos.model import JointNetwork, published, published_for, save_weights
 
 
@@ -127,5 +128,7 @@ def test_the_weights_of_the_nearest_rig_are_taken() -> None:
     assert published_for(0.36, "frame", is_motion_known=True) == "near-frame-pass"
     assert published_for(0.44, "frame", is_motion_known=True) == "far-frame-pass"
     assert published_for(None, "event", is_motion_known=True) == "near-event-pass"
+    with pytest.raises(DataError, match="give the motion"):
+        published_for(0.3, "fusion", is_motion_known=False)
     # Where there are none for the nearest rig, those of the next one are.
     assert published_for(0.5, "frame", is_motion_known=False) == "near-frame"

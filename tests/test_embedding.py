@@ -61,6 +61,9 @@ def test_frame_and_events_are_undone_each_on_its_own() -> None:
     assert not torch.allclose(both(blind)[:, 3:], pictures[:, 3:])
     both.keep(16)
     assert (both.frame.rank, both.events.rank) == (10, 6)
+    for rank in (1, 17):
+        with pytest.raises(ConfigError, match=f"to be {rank}; this embedding has 16"):
+            both.keep(rank)
     with pytest.raises(ConfigError, match="give 2 or more"):
         embedding_for(3, (6, 8), 1, (1.0,))
 

@@ -195,7 +195,15 @@ class FusionEmbedding(nn.Module):
         self.events.fit(seen[:, 1:], truth, objects, seed)
 
     def keep(self, rank: int) -> None:
-        """Forget all but the strongest components; `rank` of frame and events together."""
+        """Forget all but the strongest components; `rank` of frame and events together.
+
+        Raises:
+            ConfigError: There are not as many, or there would not be one of each.
+        """
+        if not 2 <= rank <= self.rank:
+            raise ConfigError(
+                f"the rank is to be {rank}; this embedding has {self.rank}: give 2 to {self.rank}"
+            )
         self.frame.keep(rank - _of_events(rank))
         self.events.keep(_of_events(rank))
 

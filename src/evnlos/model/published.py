@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from evnlos.errors import DataError
+
 _FOLDER = Path(__file__).parent / "published"
 _RIGS_M = {"near": 0.30, "far": 0.50}
 """Distance from hidden object to wall of each rig that there are weights for, metres."""
@@ -26,6 +28,9 @@ def published_for(distance_m: float | None, paradigm: str, *, is_motion_known: b
         paradigm: What they shall see: "frame", "event" or "fusion".
         is_motion_known: Whether the whole pass can be seen together, which needs the motion.
 
+    Raises:
+        DataError: There are none for this paradigm.
+
     Example:
         >>> published_for(0.28, "frame", is_motion_known=False)
         'near-frame'
@@ -34,4 +39,10 @@ def published_for(distance_m: float | None, paradigm: str, *, is_motion_known: b
     names = published()
     rigs = sorted(_RIGS_M, key=lambda rig: abs(_RIGS_M[rig] - wanted))
     kinds = [f"{paradigm}-{_PASS}", paradigm] if is_motion_known else [paradigm]
-    return next(f"{rig}-{kind}" for rig in rigs for kind in kinds if f"{rig}-{kind}" in names)
+    for name in (f"{rig}-{kind}" for rig in rigs for kind in kinds):
+        if name in names:
+            return name
+    raise DataError(
+        f"no weights for {paradigm} come with the package that need no motion; give the motion in capture.yaml "
+        "(`evnlos track` finds it), or weights of your own"
+    )
