@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import glob
+import os
+import re
 import secrets
+import socket
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
@@ -47,7 +51,8 @@ class EventWriter:
         self._format = format_to_write(self.path, format)
         if not self.path.parent.is_dir():
             raise EventFileError(f"{self.path}: no such folder {self.path.parent}; create it first")
-        self._temporary = self.path.with_name(f".{self.path.name[:80]}.{secrets.token_hex(4)}.part")
+        _sweep(self.path)
+        self._temporary = self.path.with_name(f"{_prefix(self.path)}{os.getpid()}.{secrets.token_hex(4)}.part")
         self._sink: Sink | None = None
         self._blank: Events | None = None  # states the sensor
         self._names: tuple[str, ...] = ()
@@ -155,3 +160,30 @@ def write_events(
     with EventWriter(path, format=format) as writer:
         for piece in [events] if isinstance(events, Events) else events:
             writer.write(piece)
+
+
+def _prefix(path: Path) -> str:
+    """Return how the unfinished files of a path begin that processes of this machine write."""
+    machine = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:40]
+    return f".{path.name[:80]}.{machine}."
+
+
+def _sweep(path: Path) -> None:
+    """Remove unfinished files of a path whose process was killed."""
+    if os.name != "posix":  # elsewhere asking whether a process lives may end it
+        return
+    start = _prefix(path)
+    for left in path.parent.glob(f"{glob.escape(start)}*.part"):
+        owner = left.name.removeprefix(start).split(".")[0]
+        if owner.isdigit() and not _is_alive(int(owner)):
+            left.unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
