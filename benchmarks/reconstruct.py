@@ -20,7 +20,7 @@ import torch
 
 from event_pixel import machine
 from evnlos.config import from_dict, to_dict
-from evnlos.dataset import CHANNELS, PARADIGMS, Sampling, network_input
+from evnlos.dataset import CHANNELS, PARADIGMS, Paradigm, Sampling, network_input
 from evnlos.dataset.sampling import make_samples
 from evnlos.evaluation import Reconstructor, reconstruct
 from evnlos.model import JointNetwork, ResidualUNet, UNetConfig, Weights, infer, load_weights
@@ -33,6 +33,13 @@ def events_of_a_position(count: int, seed: int) -> Events:
     draw = np.random.default_rng(seed)
     columns = (draw.integers(0, n, count).astype(np.uint16) for n in (160, 100))
     return Events(np.sort(draw.integers(1, 200_000, count)), *columns, draw.random(count) < 0.5, 160, 100)
+
+
+def untrained(paradigm: Paradigm) -> Weights:
+    """Return a network of the default size with random weights."""
+    sampling = Sampling()
+    network = ResidualUNet(CHANNELS[paradigm], UNetConfig(), (sampling.height, sampling.width)).eval()
+    return Weights(network, paradigm, to_dict(sampling), [])
 
 
 def whole_passes(weights: Weights, events_each: int, rounds: int) -> None:
@@ -71,17 +78,11 @@ def main() -> None:
     print(f"{args.events} events a position, {args.threads} threads")
     print("| paradigm | surface and maps, ms | network, ms | together, ms | network layer by layer, ms |")
     print("|---|---|---|---|---|")
-    if args.weights and isinstance(load_weights(args.weights).network, JointNetwork):
-        whole_passes(load_weights(args.weights), args.events, args.rounds)
+    given = load_weights(args.weights) if args.weights else None
+    if given is not None and isinstance(given.network, JointNetwork):
+        whole_passes(given, args.events, args.rounds)
         return
-    for paradigm in [load_weights(args.weights).paradigm] if args.weights else PARADIGMS:
-        if args.weights:
-            weights = load_weights(args.weights)
-        else:
-            sampling = Sampling()
-            size = (sampling.height, sampling.width)
-            network = ResidualUNet(CHANNELS[paradigm], UNetConfig(), size).eval()
-            weights = Weights(network, paradigm, to_dict(sampling), [])
+    for weights in [given] if given is not None else map(untrained, PARADIGMS):
         see = Reconstructor(weights)
         parts: list[tuple[float, float, float]] = []
         for n in range(args.rounds + 5):
@@ -91,10 +92,10 @@ def main() -> None:
             mapped = time.perf_counter()
             see(samples.frame[0], samples.surface[0])
             seen = time.perf_counter()
-            infer(weights.network, network_input(samples.frame, samples.surface, paradigm))
+            infer(weights.network, network_input(samples.frame, samples.surface, weights.paradigm))
             parts.append((mapped - began, seen - mapped, time.perf_counter() - seen))
         maps, net, slow = (1e3 * statistics.median(part) for part in zip(*parts[5:], strict=True))
-        print(f"| {paradigm} | {maps:.2f} | {net:.2f} | {maps + net:.2f} | {slow:.2f} |")
+        print(f"| {weights.paradigm} | {maps:.2f} | {net:.2f} | {maps + net:.2f} | {slow:.2f} |")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 from evnlos.app.recorded import Recorded
@@ -46,7 +46,7 @@ class Networks:
         return found
 
 
-@lru_cache(maxsize=len(PARADIGMS) * 3)
+@cache
 def _loaded(name: str) -> Weights:
     return load_weights(name)
 

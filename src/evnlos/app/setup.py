@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from evnlos.dataset import Sampling, SensorSize, Simulation
+from evnlos.dataset import SensorSize, Simulation
+from evnlos.dataset.presets import page
 from evnlos.errors import ConfigError
-from evnlos.scene import LineMotion
 from evnlos.sensor import EventPixel, FrameCamera
 from evnlos.transport import RadiometricTransport
 
-POSITIONS = 40
+_PAGE = page()  # what the package's networks learned from: rig and samples here are the same
+POSITIONS = _PAGE.positions
 """Positions of a pass, as in a dataset."""
-TRAVEL_M = 0.16
+TRAVEL_M = _PAGE.motion.speed_m_s * _PAGE.duration_s
 """Way of the hidden object, metres, as in a dataset."""
-CELL_M = 0.005
-"""Cells of the hidden object's plane: coarse, so that a new wall takes less than a second, metres."""
-COARSE = Sampling(height=32, width=48, pitch_m=CELL_M, scored_rows=24)
-"""The standard canvas of 24 cm x 16 cm in cells of the simulation."""
+COARSE = _PAGE.sampling
+"""The standard canvas of 24 cm x 16 cm in cells of the simulation: coarse, so that a new wall takes less than a
+second."""
 
 Wall = Literal["metal", "matte"]
 
@@ -97,7 +97,7 @@ class Setup:
             dsnu_e=usual.dsnu_e / self.frame_noise**2,
         )
         return Simulation(
-            motion=LineMotion((-TRAVEL_M / 2, 0.0), self.speed_m_s),
+            motion=replace(_PAGE.motion, speed_m_s=self.speed_m_s),
             duration_s=self.duration_s,
             positions=POSITIONS,
             transport=RadiometricTransport(
@@ -105,7 +105,7 @@ class Setup:
                 # A matte wall has no roughness: one value, so that its matrix is made once.
                 roughness=self.roughness if self.wall == "metal" else 0.05,
                 distance_m=self.distance_m,
-                cell_m=CELL_M,
+                cell_m=COARSE.pitch_m,
                 ambient=self.ambient,
             ),
             sensor=SensorSize(round(self.columns * 5 / 8), self.columns),

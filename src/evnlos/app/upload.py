@@ -114,11 +114,10 @@ def _read_capture(folder: Path) -> Recorded:
         np.asarray(edges),
         _own(frames),
         capture.peak,
-        capture.motion,
-        capture.target,
-        None,
-        capture.distance_m,
-        tuple(notes),
+        motion=capture.motion,
+        target=capture.target,
+        distance_m=capture.distance_m,
+        notes=tuple(notes),
     )
 
 

@@ -114,10 +114,11 @@ def to_text(name: str, found: dict[str, Any]) -> str:
 def _score_line(scores: dict[str, Any]) -> str:
     """Return one line on how good the weights were found to be; a stranger's file may say anything there."""
     try:
-        found = sorted(scores["psnr_db"].items(), key=lambda pair: pair[1])
-        shown = scores["psnr_db"].items() if len(found) <= _MOST_NAMED else (found[0], found[-1])
-        each = ", ".join(f"{name} {value:.2f}" for name, value in shown)
-        each = each if len(found) <= _MOST_NAMED else each.replace(", ", " to ")
+        named, between = list(scores["psnr_db"].items()), ", "
+        if len(named) > _MOST_NAMED:
+            ranked = sorted(named, key=lambda pair: pair[1])
+            named, between = [ranked[0], ranked[-1]], " to "
+        each = between.join(f"{name} {value:.2f}" for name, value in named)
         return f"  {scores['overall']['psnr_db']:.2f} dB on {scores['data']}, {scores['split']}: {each}"
     except (KeyError, TypeError, ValueError, AttributeError):
         return "  its scores are not what this version writes"

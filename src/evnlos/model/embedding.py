@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.model.linear import EVENT_SHARE, LinearEstimate, fit_linear
+from evnlos.model.linear import LinearEstimate, fit_linear, rank_of_events
 
 Scaling = Literal["dataset", "picture"]
 
@@ -175,8 +175,8 @@ class FusionEmbedding(nn.Module):
         super().__init__()
         if rank < 2:
             raise ConfigError(f"the rank is {rank}; frame and events need one component each: give 2 or more")
-        self.frame = LinearEmbedding(1, size, rank - _of_events(rank), strengths)
-        self.events = LinearEmbedding(2, size, _of_events(rank), strengths)
+        self.frame = LinearEmbedding(1, size, rank - rank_of_events(rank), strengths)
+        self.events = LinearEmbedding(2, size, rank_of_events(rank), strengths)
         self.shape = (3, *size)
 
     @property
@@ -204,8 +204,8 @@ class FusionEmbedding(nn.Module):
             raise ConfigError(
                 f"the rank is to be {rank}; this embedding has {self.rank}: give 2 to {self.rank}"
             )
-        self.frame.keep(rank - _of_events(rank))
-        self.events.keep(_of_events(rank))
+        self.frame.keep(rank - rank_of_events(rank))
+        self.events.keep(rank_of_events(rank))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [B, 3, H, W] to pictures [B, 2 S, H, W]."""
@@ -219,7 +219,3 @@ def embedding_for(
     if channels == 3:
         return FusionEmbedding(size, rank, strengths)
     return LinearEmbedding(channels, size, rank, strengths)
-
-
-def _of_events(rank: int) -> int:
-    return max(1, round(EVENT_SHARE * rank))

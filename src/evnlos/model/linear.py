@@ -16,8 +16,7 @@ _LAMBDAS = tuple(10.0 ** (k / 2) for k in range(-12, 5))  # in units of the mean
 _FOLDS = 5
 _EXTRA = 20  # columns of the random probe beyond the rank
 _POWERS = 2
-EVENT_SHARE = 0.375
-"""The events' share of the rank of frame and events together."""
+_EVENT_SHARE = 0.375
 _TINY = 1e-30
 
 
@@ -107,11 +106,16 @@ def fit_linear(
     return LinearEstimate(mean_in, basis @ turned, powers, weights, mean_out.unflatten(0, shape), lam)
 
 
+def rank_of_events(rank: int) -> int:
+    """Return the events' part of the rank of frame and events together; of 2 or more both have one."""
+    return round(_EVENT_SHARE * rank)
+
+
 def _parts(channels: int, rank: int) -> list[tuple[slice, int]]:
     """Return the channels of the frame and of the events, each with its share of the rank."""
     if channels != 3:
         return [(slice(0, channels), rank)]
-    events = round(EVENT_SHARE * rank)
+    events = rank_of_events(rank)
     return [(slice(0, 1), rank - events), (slice(1, 3), events)]
 
 

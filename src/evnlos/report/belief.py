@@ -26,18 +26,16 @@ def belief_section(results: list[RunResult]) -> str:
             for one in passes
         )
         rows.append(f"<tr><td>{html.escape(character_of(name))}</td>{cells}</tr>")
-    held, wide = (
-        "".join(
-            f"<td colspan=2>{np.mean([getattr(p, key) for p in r.evaluation.worth]):{form}}</td>" for r in known
-        )
-        for key, form in (("coverage", ".0%"), ("width", ".2f"))
-    )
+    held = [np.mean([one.coverage for one in r.evaluation.worth]) for r in known]
+    wide = [np.mean([one.width for one in r.evaluation.worth]) for r in known]
+    held_cells = "".join(f"<td colspan=2>{value:.0%}</td>" for value in held)
+    wide_cells = "".join(f"<td colspan=2>{value:.2f}</td>" for value in wide)
     return (
         "<h2>How far to believe them</h2><p class=dim>Support: the share of what tells objects apart that both "
         "halves of the pass agree on, which the network says without knowing the truth. Skill: the share of it "
         "that is right; below 0 the average object would have been nearer. The intervals are to hold 90 % of "
         "the plate's pixels; a length of 1 is from black to white.</p>"
         f"<div class=wide><table><tr><th></th>{heads}</tr><tr><th></th>{names}</tr>{''.join(rows)}"
-        f"<tr class=mean><td>pixels in their interval</td>{held}</tr>"
-        f"<tr><td>length of the intervals</td>{wide}</tr></table></div>"
+        f"<tr class=mean><td>pixels in their interval</td>{held_cells}</tr>"
+        f"<tr><td>length of the intervals</td>{wide_cells}</tr></table></div>"
     )

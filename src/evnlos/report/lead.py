@@ -70,8 +70,7 @@ def _bars(results: list[RunResult]) -> str:
     def x(value: float) -> float:
         return _LEFT + (value - low) / (high - low) * (_WIDTH - _LEFT - _RIGHT)
 
-    top = 12.0 * len(blanks) + 6  # each baseline has a line for its name
-    parts, y = [], top + 4
+    parts, y = [], 12.0 * len(blanks) + 10  # each baseline has a line for its name
     for kind in _kinds(results):
         shown = [method for method in METHODS if (kind, method) in means]
         for method in shown:
