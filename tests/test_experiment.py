@@ -23,6 +23,7 @@ from evnlos.experiment import (
     checks_table,
     difference,
     gain_table,
+    jointly,
     read_records,
     run_simulated,
     run_study,
@@ -157,6 +158,23 @@ def test_wrong_plans_are_refused(tmp_path) -> None:
 def test_presets_are_whole(name) -> None:
     study = STUDIES[name]("near")
     assert study.name == name and study.test == ("G", "K", "4", "9") and len(study.arms) >= 2
+
+
+@pytest.mark.parametrize("name", ["frozen", "shots", "surface", "thresholds", "loss", "width"])
+def test_a_study_of_single_positions_has_a_joint_twin(name) -> None:
+    single, joint = STUDIES[name]("near"), jointly(STUDIES[name]("near"))
+    assert joint.name == f"{name}-joint" and [a.name for a in joint.arms] == [a.name for a in single.arms]
+    for before, after in zip(single.arms, joint.arms, strict=True):
+        first, was = after.pretraining or after.finetuning, before.pretraining or before.finetuning
+        assert first.joint and first.network.width == was.network.width and first.epochs > was.epochs
+        assert first.loss == was.loss and after.shots == before.shots and after.vary == before.vary
+        if after.pretraining and after.finetuning:
+            assert after.finetuning.freeze == before.finetuning.freeze and not after.finetuning.joint
+
+
+def test_what_has_no_embedding_has_no_joint_twin() -> None:
+    with pytest.raises(ConfigError, match="'E2E plain' has no linear embedding"):
+        jointly(STUDIES["captures"]("near"))
 
 
 def made(arm: str, seed: int, shift: float) -> Record:

@@ -14,7 +14,7 @@ from evnlos.dataset import PARADIGMS, Paradigm
 from evnlos.errors import ConfigError
 
 if TYPE_CHECKING:
-    from evnlos.experiment import Step
+    from evnlos.experiment import Arm, Step, Study
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Command:
     """What the networks see."""
     arms: tuple[str, ...] = ()
     """Only these arms, by name; all by default."""
+    joint: bool = False
+    """Networks that see all positions of a pass together, in an experiment of single positions."""
     test: tuple[str, ...] = ("G", "K", "4", "9")
     """Characters that nothing sees before the test."""
     validation: tuple[str, ...] = ()
@@ -60,17 +62,30 @@ class Command:
 
     def run(self) -> None:
         """Run what is left, with a line of progress, and print the tables."""
-        from evnlos.experiment import STUDIES, Place, Study, captures_of, read_records, run_study, show
+        alone = {
+            "simulation": self._simulation,
+            "conditions": self._conditions,
+            "carry-over": self._carry_over,
+        }
+        alone.get(self.name, self._on_captures)()
 
-        if self.name == "conditions":
-            self._conditions()
-            return
-        if self.name == "simulation":
-            self._simulation()
-            return
-        if self.name == "carry-over":
-            self._carry_over()
-            return
+    def _on_captures(self) -> None:
+        from evnlos.experiment import Place, captures_of, read_records, run_study, show
+
+        study = self._study()
+        assert self.captures is not None
+        folders = tuple(captures_of(self.captures, self.rig))
+        show(run_study(study, Place(folders, self.out, self.workers)))
+        records = [r for r in read_records(self.out / "records" / study.name) if r.rig == self.rig]
+        records = [r for r in records if r.split == study.split]
+        text = _tables(study.name, records, self.metric)
+        write_atomically(self.out / f"{study.name}-{self.rig}-{study.split}.md", text.encode())
+        print(text)
+
+    def _study(self) -> Study:
+        """Return the named study with what the command line changes."""
+        from evnlos.experiment import STUDIES, jointly
+
         if self.name not in STUDIES:
             raise ConfigError(
                 f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}, simulation, "
@@ -78,7 +93,7 @@ class Command:
             )
         if self.captures is None:
             raise ConfigError(f"the experiment {self.name} needs --captures, the folder of the capture folders")
-        study: Study = STUDIES[self.name](self.rig)
+        study = STUDIES[self.name](self.rig)
         unknown = set(self.arms) - {arm.name for arm in study.arms}
         if unknown:
             there = ", ".join(repr(arm.name) for arm in study.arms)
@@ -88,34 +103,27 @@ class Command:
                 f"--writers {self.writers} would change nothing: {self.name} compares numbers of writers; "
                 "leave it out, or choose among its --arms"
             )
-        arms = []
-        for arm in study.arms:
-            if self.arms and arm.name not in self.arms:
-                continue
-            pre, fine = arm.pretraining, arm.finetuning
-            tuned = self.finetune_epochs if pre else self.e2e_epochs
-            if pre and self.pretrain_epochs:
-                pre = replace(pre, epochs=self.pretrain_epochs)
-            if fine and tuned:
-                fine = replace(fine, epochs=tuned)
-            arms.append(replace(arm, pretraining=pre, finetuning=fine))
-        paradigms = tuple(p for p in study.paradigms if p in self.paradigms)
         study = replace(
             study,
-            arms=tuple(arms),
-            paradigms=paradigms,
+            arms=tuple(arm for arm in study.arms if not self.arms or arm.name in self.arms),
+            paradigms=tuple(p for p in study.paradigms if p in self.paradigms),
             seeds=self.seeds,
             test=self.test,
             validation=self.validation,
             writers=self.writers or study.writers,
         )
-        folders = tuple(captures_of(self.captures, self.rig))
-        show(run_study(study, Place(folders, self.out, self.workers)))
-        records = [r for r in read_records(self.out / "records" / study.name) if r.rig == self.rig]
-        records = [r for r in records if r.split == study.split]
-        text = _tables(study.name, records, self.metric)
-        write_atomically(self.out / f"{study.name}-{self.rig}-{study.split}.md", text.encode())
-        print(text)
+        study = jointly(study) if self.joint else study
+        return replace(study, arms=tuple(self._in_epochs(arm) for arm in study.arms))
+
+    def _in_epochs(self, arm: Arm) -> Arm:
+        """Return an arm with the epochs that were asked for."""
+        pre, fine = arm.pretraining, arm.finetuning
+        tuned = self.finetune_epochs if pre else self.e2e_epochs
+        if pre and self.pretrain_epochs:
+            pre = replace(pre, epochs=self.pretrain_epochs)
+        if fine and tuned:
+            fine = replace(fine, epochs=tuned)
+        return replace(arm, pretraining=pre, finetuning=fine)
 
     def _simulation(self) -> None:
         from evnlos.experiment import Simulated, read_records, run_simulated, show

@@ -9,7 +9,7 @@ from evnlos.experiment.conditions import (
     conditions_table,
     map_conditions,
 )
-from evnlos.experiment.presets import STUDIES
+from evnlos.experiment.presets import STUDIES, jointly
 from evnlos.experiment.progress import show
 from evnlos.experiment.records import read_records, write_record
 from evnlos.experiment.run import captures_of, run_study
@@ -38,6 +38,7 @@ __all__ = [
     "conditions_table",
     "difference",
     "gain_table",
+    "jointly",
     "map_conditions",
     "read_records",
     "run_simulated",

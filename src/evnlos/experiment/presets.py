@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from evnlos.dataset import Sampling
+from evnlos.errors import ConfigError
 from evnlos.experiment.study import Arm, Study
 from evnlos.model import UNetConfig
 from evnlos.training import Training, paper_finetuning, paper_pretraining
@@ -162,6 +163,43 @@ def joint(rig: str) -> Study:
         Arm("EPNP joint", "calibrated", _JOINT, _JOINT_FINETUNING),
     )
     return Study("joint", rig, arms, writers=44)
+
+
+def jointly(study: Study) -> Study:
+    """Return a study of single positions with joint networks instead: a whole pass is one sample.
+
+    A pass is worth less training than forty positions: pre-training and end-to-end training make more epochs,
+    as many as bring the validation to rest, and so does fine-tuning.
+
+    Args:
+        study: Any study; its joint arms stay as they are.
+
+    Raises:
+        ConfigError: An arm has no linear embedding that could be pooled.
+    """
+    arms = []
+    for arm in study.arms:
+        pre, fine = arm.pretraining, arm.finetuning
+        if pre is not None:
+            pre = _of_passes(pre, 6, arm.name)
+            fine = fine and replace(fine, epochs=round(fine.epochs * 8 / 3), batch_size=16)
+        elif fine is not None:
+            fine = _of_passes(fine, 5, arm.name)
+        arms.append(replace(arm, pretraining=pre, finetuning=fine))
+    return replace(study, name=f"{study.name}-joint", arms=tuple(arms))
+
+
+def _of_passes(single: Training, longer: int, arm: str) -> Training:
+    """Return the settings of a first training on whole passes, in place of one on single positions."""
+    if single.joint:
+        return single
+    if not single.network.rank:
+        raise ConfigError(f"arm {arm!r} has no linear embedding to pool over a pass; leave it out with --arms")
+    known = single.network.strengths == UNetConfig().strengths
+    network = replace(
+        single.network, rank=512, strengths=_JOINT.network.strengths if known else single.network.strengths
+    )
+    return replace(single, joint=True, epochs=longer * single.epochs, batch_size=16, network=network)
 
 
 def objects(rig: str) -> Study:
