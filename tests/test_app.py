@@ -201,8 +201,15 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
     with chromium.page(tmp_path, "--columns", "24") as home, chromium.Chromium(tmp_path / "profile") as browser:
         assert urlsplit(home).hostname == "127.0.0.1"
         browser.open(home)
+        # The pictures are there before Gradio is, and give way to its own.
         width = browser.wait("const p = document.querySelector('.ev-picture'); return p && p.offsetWidth")
         assert width > 100
+        marks = "performance.getEntriesByName('evnlos-sheet').map(mark => mark.startTime)"
+        first, then = browser.wait(f"const m = {marks}; return m.length > 1 && m.slice(0, 2)")
+        painted = browser.run("return performance.getEntriesByName('first-contentful-paint')[0].startTime")
+        assert first < painted < then
+        browser.wait("return !document.querySelector('.ev-before')")
+        assert browser.run("return document.querySelectorAll('.ev-sheet').length") == 1
         # The slider answers in the page itself, by mouse and by key.
         browser.run("const s = document.querySelector('.ev-position'); s.value = 30; s.oninput()")
         assert browser.run("return document.querySelector('.ev-now').textContent").startswith(

@@ -34,13 +34,13 @@ def build_page(
     """
     gr = gradio
     with gr.Blocks(title="evnlos", analytics_enabled=False, fill_width=True) as page:
-        gr.HTML(HEAD)
+        gr.HTML(HEAD, elem_id="ev-about")
         with gr.Tab("Simulate a pass"), gr.Row(equal_height=False):
             with gr.Column(scale=1, min_width=290):
                 controls = _controls(gr, setup)
             with gr.Column(scale=4, min_width=480):
                 verdict = gr.HTML(first[1])
-                pictures = gr.HTML(first[0])
+                pictures = gr.HTML(first[0], elem_id="ev-opening")
         with gr.Tab("Your recording"):
             gr.Markdown(
                 "An event recording in any format that `evnlos info` reads, or a capture folder as a `.zip`; "

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from evnlos.errors import ConfigError, MissingDependencyError
 
@@ -26,12 +25,6 @@ _QUIET = {
     "HF_HUB_OFFLINE": "1",
     "DO_NOT_TRACK": "1",
 }
-# The browser itself refuses what would leave this server.
-_POLICY = (
-    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; worker-src 'self' blob:; "
-    "form-action 'self'; base-uri 'self'; object-src 'none'"
-)
 
 
 @dataclass(frozen=True)
@@ -95,6 +88,7 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     except ImportError:
         raise MissingDependencyError("the page needs Gradio: pip install 'evnlos[app]'") from None
     from evnlos.app.hidden import picked
+    from evnlos.app.middleware import middleware
     from evnlos.app.networks import own_networks
     from evnlos.app.page import build_page, theme
     from evnlos.app.setup import Setup
@@ -130,9 +124,8 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
                 mcp_server=False,
                 theme=theme(gradio),
                 css=(_HERE / "page.css").read_text(encoding="utf-8"),
-                head=f"<script>{(_HERE / 'page.js').read_text(encoding='utf-8')}</script>",
                 app_kwargs={
-                    "middleware": [_policy()],
+                    "middleware": middleware(_script("page.js") + _script("opening.js")),
                     "docs_url": None,
                     "redoc_url": None,
                     "openapi_url": None,
@@ -149,24 +142,5 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
             page.close(verbose=False)
 
 
-def _policy() -> Any:
-    """Return the middleware that tells browsers to fetch nothing from anywhere else."""
-    from starlette.middleware import Middleware
-
-    class Policy:
-        def __init__(self, app: Any) -> None:
-            self.app = app
-
-        async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-            async def send_with_policy(message: Any) -> None:
-                if message["type"] == "http.response.start":
-                    extra = [
-                        (b"content-security-policy", _POLICY.encode()),
-                        (b"referrer-policy", b"no-referrer"),
-                    ]
-                    message = {**message, "headers": [*message.get("headers", []), *extra]}
-                await send(message)
-
-            await self.app(scope, receive, send_with_policy if scope["type"] == "http" else send)
-
-    return Middleware(Policy)
+def _script(name: str) -> str:
+    return f"<script>{(_HERE / name).read_text(encoding='utf-8')}</script>"
