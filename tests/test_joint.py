@@ -176,3 +176,10 @@ def test_wrong_input_is_named(sight) -> None:
         JointProblem(PlatePass(sight.transport, PLATE, POSITIONS[:1]), np.inf)
     with pytest.raises(ConfigError, match="7 positions of 6"):
         position_subsets(6, 7, 1)
+
+
+def test_the_dense_map_of_a_pass_is_the_pass(sight) -> None:
+    plate = torch.rand(PLATE.shape, dtype=sight.transport.matrix.dtype)
+    dense = sight.matrix()
+    assert dense.shape == (len(sight), SHAPE[0] * SHAPE[1], PLATE.height * PLATE.width)
+    torch.testing.assert_close((dense @ plate.flatten()).unflatten(1, SHAPE), sight(plate))

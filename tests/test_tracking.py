@@ -1,6 +1,7 @@
 """Tracking: shifts, velocities and the smoother against known motion and slow references."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,9 @@ from evnlos.dataset.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
+from evnlos.solver import PlatePass
+from evnlos.solver.operators import Gradient, normal_matrix
+from evnlos.solver.plate_pass import strip_of, strip_transport
 from evnlos.tracking import (
     Measurements,
     Track,
@@ -27,6 +31,8 @@ from evnlos.tracking import (
     temporal_noise,
     track_frames,
 )
+from evnlos.tracking.depth import Depths
+from evnlos.tracking.rig_shift import Fit
 from evnlos.transport import RadiometricTransport, SlidingWall, View
 from evnlos.types import Events, Plane
 
@@ -217,6 +223,77 @@ def test_the_calibrated_operator_finds_the_path() -> None:
     np.testing.assert_allclose(error.mean(axis=0), middle, atol=4e-3)
 
 
+def retreating(log_distance: np.ndarray, positions: np.ndarray) -> torch.Tensor:
+    """Frames of a letter whose distance changes while nothing else of the rig does."""
+    source = RIG.source()
+    strips = torch.from_numpy(letter().rasterise(source, positions)).double()
+    scale = RIG.gain * float(RIG.transport(SHAPE).matrix.double().sum() / RIG.matrix(SHAPE, source).sum())
+    fixed = replace(RIG, target_offset_m=RIG.offset_m())
+    frames = [
+        replace(fixed, distance_m=RIG.distance_m * np.exp(far)).matrix(SHAPE, source) @ strip.flatten()
+        for far, strip in zip(log_distance, strips, strict=True)
+    ]
+    return scale * torch.stack(frames).unflatten(1, SHAPE)
+
+
+@pytest.mark.parametrize("change", [0.15, 0.0])
+def test_approach_and_retreat_are_found(change) -> None:
+    positions = np.stack([np.linspace(-0.05, 0.05, 7), 0.01 * np.sin(np.arange(7.0))], axis=1)
+    away = change * (np.linspace(-0.5, 0.5, 7) + 0.2 * np.cos(np.arange(7.0)))
+    light = retreating(away, positions)
+    noisy = light + 2e-3 * torch.from_numpy(np.random.default_rng(3).standard_normal(light.shape))
+    found = rig_shift(noisy, RIG, positions + 0.002, 2e-3, 0.1, cells=10, depth=True)
+    assert found.log_distance is not None and found.log_distance_sigma is not None
+    error = found.log_distance - (away - away.mean())
+    assert np.abs(error).max() < 0.02
+    assert np.sqrt(np.mean(error**2)) < 5 * found.log_distance_sigma.mean() < 0.05
+    place = found.position_m - positions
+    assert np.abs(place - place.mean(axis=0)).max() < 3e-3
+    # Without depth the path takes the blame.
+    if change:
+        plain = rig_shift(noisy, RIG, positions + 0.002, 2e-3, 0.1, cells=10).position_m - positions
+        assert np.abs(plain - plain.mean(axis=0)).max() > 1.5 * np.abs(place - place.mean(axis=0)).max()
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_the_step_is_that_of_plate_and_places_together(depth) -> None:
+    """Slow reference: one least squares problem of all unknowns, with the plate's own shift forbidden."""
+    rng = np.random.default_rng(7)
+    plate = Plane(6, 6, 0.016)
+    state = rng.uniform(-0.03, 0.03, (4, 3 if depth else 2))
+    transport = strip_transport(RIG, SHAPE, SHAPE, strip_of(state[:, :2] + 0.0, plate))
+    fit = Fit(plate, transport, Depths(RIG, transport) if depth else None, state, RIG.distance_m)
+    light = torch.from_numpy(rng.standard_normal((4, *SHAPE)))
+    prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(plate.shape, dtype=torch.float64))
+    image, step, _ = fit.step(light, prior, 1.0)
+    maps = torch.stack(
+        [
+            PlatePass(
+                Depths(RIG, transport).at(s[2] / RIG.distance_m) if depth else transport, plate, s[None, :2]
+            )
+            .matrix()[0]
+            .double()
+            for s in state
+        ]
+    )
+    moving = torch.eye(4, dtype=torch.float64) - 0.8 / 4  # one offset a pixel, as large as the noise: 1 - 1 / 5
+    slope = fit._slopes(image)
+    frames, kinds, pixels = slope.shape
+    apart = torch.block_diag(*slope).reshape(frames * kinds, frames, pixels)
+    columns = torch.cat([maps.permute(2, 0, 1), apart])  # [unknowns, N, P]
+    weighted = torch.einsum("kl,ulp->ukp", moving, columns).flatten(1)
+    left = light.flatten(1) - maps @ image.flatten()
+    square = weighted @ columns.flatten(1).mT
+    square[:36, :36] += prior
+    pull = weighted @ left.flatten()
+    pull[:36] -= prior @ image.flatten()
+    alike = (slope @ slope.mT).flatten(0, 1)  # [N K, K]
+    bound = torch.cat([torch.zeros(36, kinds, dtype=torch.float64), alike])
+    whole = torch.cat([torch.cat([square, bound], 1), torch.cat([bound.mT, torch.zeros(kinds, kinds)], 1)])
+    reference = torch.linalg.solve(whole, torch.cat([pull, torch.zeros(kinds, dtype=torch.float64)]))
+    np.testing.assert_allclose(step.ravel(), reference[36 : 36 + frames * kinds].numpy(), rtol=2e-3, atol=1e-7)
+
+
 def test_a_track_in_pixels_needs_no_rig(registered) -> None:
     frames = ambient() + blobs(PLACES) + 2e-3 * np.random.default_rng(5).standard_normal((12, *SHAPE))
     track = track_frames(frames, np.linspace(0, 1.1, 12))
@@ -245,6 +322,8 @@ def test_settings_that_cannot_be_are_refused() -> None:
         Tracking(columns=4)
     with pytest.raises(ConfigError, match="window_s is 0"):
         Tracking(window_s=0.0)
+    with pytest.raises(ConfigError, match="depth needs a rig"):
+        track_frames(np.zeros((9, *SHAPE)), np.arange(9.0), settings=Tracking(depth=True))
     with pytest.raises(DataError, match="3 frames"):
         track_frames(np.zeros((3, *SHAPE)), np.arange(3.0))
 
@@ -278,7 +357,15 @@ def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
     assert found["mean_speed"] == pytest.approx(0.02, rel=0.1)
     assert found["position_error"] < 2e-3
     assert (tmp_path / "t.png").exists()
-    assert len(json.loads((tmp_path / "t.json").read_text())["track"]["frame_time_s"]) == 9
+    track = json.loads((tmp_path / "t.json").read_text())["track"]
+    assert len(track["frame_time_s"]) == 9 and "distance" not in track
+    main(
+        ["track", str(folder), "--rig", str(rig), "--cells", "10", "--depth", "--out", str(tmp_path / "d.png")]
+    )
+    assert "distance " in capsys.readouterr().out
+    away = json.loads((tmp_path / "d.json").read_text())["track"]["distance"]
+    assert np.mean(away["distance_m"]) == pytest.approx(RIG.distance_m, rel=0.02)
+    assert np.std(away["distance_m"]) < 0.01
 
 
 def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:

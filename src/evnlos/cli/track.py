@@ -80,6 +80,12 @@ def figures(capture: Capture, track: Track, truth: NDArray[np.float64] | None) -
         "speed_sigma": float(track.speed_sigma.mean()),
         "size_change": float(track.size[-1] / track.size[0]),
     }
+    if track.distance is not None:
+        away = track.distance
+        found["distance"] = [float(away.distance_m[0]), float(away.distance_m[-1])]
+        found["distance_sigma"] = float(away.distance_sigma.mean())
+        found["retreat"] = float((away.distance_m[-1] - away.distance_m[0]) / np.ptp(away.time_s))
+        found["distance_spread"] = float(away.distance_m.std())
     if truth is not None:
         error = track.position - truth
         rate = np.gradient(truth, track.time_s, axis=0)
@@ -104,6 +110,13 @@ def to_text(found: dict[str, Any]) -> str:
         f"position    {scale * found['position_sigma']:8.3f} {unit} standard deviation",
         f"size        {found['size_change']:8.3f} at the end over the start",
     ]
+    if "distance" in found:
+        first, last = (scale * v for v in found["distance"])
+        lines.append(
+            f"distance    {first:8.2f} {unit} at the start, {last:.2f} {unit} at the end, "
+            f"+- {scale * found['distance_sigma']:.2f} {unit}; "
+            f"{scale * found['distance_spread']:.2f} {unit} rms about its mean, which is the rig's"
+        )
     if "position_error" in found:
         x, y = (scale * v for v in found["position_offset"])
         lines.append(

@@ -14,7 +14,7 @@ from evnlos.tracking import Track
 def draw_track(
     track: Track, path: str | Path, truth: NDArray[np.float64] | None = None, title: str = ""
 ) -> Path:
-    """Draw the path, both coordinates, speed and size over time, with bands of two standard deviations.
+    """Draw the path, both coordinates, speed, and size or distance over time, with bands of two deviations.
 
     Args:
         track: The track.
@@ -56,8 +56,15 @@ def draw_track(
         rate = np.gradient(truth, track.time_s, axis=0)
         speed.plot(track.time_s, scale * np.hypot(rate[:, 0], rate[:, 1]), "--", color="k", linewidth=1)
     speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, None))
-    size.errorbar(track.frame_time_s, track.size, 2 * track.size_sigma, fmt=".", color="C3")
-    size.set(xlabel="time, s", ylabel="size over its mean", title="size of the picture")
+    if track.distance is None:
+        size.errorbar(track.frame_time_s, track.size, 2 * track.size_sigma, fmt=".", color="C3")
+        size.set(xlabel="time, s", ylabel="size over its mean", title="size of the picture")
+    else:
+        away = track.distance
+        middle, band = scale * away.distance_m, 2 * scale * away.distance_sigma
+        size.plot(away.time_s, middle, color="C3")
+        size.fill_between(away.time_s, middle - band, middle + band, color="C3", alpha=0.3)
+        size.set(xlabel="time, s", ylabel=f"distance, {unit}", title="distance from the wall")
     path = Path(path)
     figure.savefig(path, dpi=80)
     return path

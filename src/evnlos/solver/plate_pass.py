@@ -63,6 +63,17 @@ class PlatePass:
             back += y.to(strips).mT @ strips[..., k, :, :] @ x.to(strips)
         return back
 
+    def matrix(self) -> torch.Tensor:
+        """Return the dense map of each position, [N, H W, n n], in the transport's type."""
+        height, width = self.transport.source.shape  # type: ignore[union-attr] - checked above
+        cells = self.transport.matrix.unflatten(1, (height, width))  # [P, h, w]
+        dense = []
+        for y, x in self._shares:
+            rows, columns = (torch.nonzero(share.any(dim=1)).flatten() for share in (y, x))
+            near = cells[:, rows][:, :, columns] @ x[columns].to(cells)  # [P, h', n]
+            dense.append((near.mT @ y[rows].to(cells)).mT.flatten(1))
+        return torch.stack(dense)
+
     def drawn(self, plate: torch.Tensor) -> torch.Tensor:
         """Return the strip at each position, [..., N, h, w], of a plate [..., n, n]."""
         return torch.stack([y.to(plate) @ plate @ x.to(plate).mT for y, x in self._shares], dim=-3)

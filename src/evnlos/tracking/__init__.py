@@ -7,9 +7,10 @@ from evnlos.tracking.geometry import PlaneMap, plane_map
 from evnlos.tracking.registration import Registration, register
 from evnlos.tracking.rig_shift import RigShift, rig_shift
 from evnlos.tracking.smoother import Measurements, Smoothed, most_likely_acceleration, smooth
-from evnlos.tracking.track import Track
+from evnlos.tracking.track import Distance, Track
 
 __all__ = [
+    "Distance",
     "EventVelocity",
     "Measurements",
     "PlaneMap",

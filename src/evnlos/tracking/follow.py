@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from evnlos.tracking.geometry import plane_map
 from evnlos.tracking.registration import Registration, register
 from evnlos.tracking.rig_shift import rig_shift
 from evnlos.tracking.smoother import Measurements, most_likely_acceleration, smooth
-from evnlos.tracking.track import Track
+from evnlos.tracking.track import Distance, Track
 from evnlos.transport import RadiometricTransport
 from evnlos.types import Events
 
@@ -39,6 +39,8 @@ class Tracking:
     """With a rig: side of a square that surely holds the object, metres."""
     cells: int = 20
     """With a rig: cells a side of that square."""
+    depth: bool = False
+    """With a rig: also find how far the object is from the wall in each frame."""
     degree: int = 2
     """Degree of the ambient light over the wall, as a polynomial."""
 
@@ -93,6 +95,8 @@ def track_frames(
         DataError: Too few frames, or the object does not stand out.
     """
     settings = settings or Tracking()
+    if settings.depth and rig is None:
+        raise ConfigError("Tracking.depth needs a rig: without one the size of the picture tells no distance")
     if len(frames) < _LEAST_FRAMES:
         raise DataError(f"{len(frames)} frames; tracking needs {_LEAST_FRAMES} or more")
     sensor = (int(frames.shape[1]), int(frames.shape[2]))
@@ -130,7 +134,8 @@ def _in_metres(
     shape = (small.shape[1], small.shape[2])
     to_plane = plane_map(rig, shape)
     light = torch.from_numpy(small - found.background)
-    fitted = rig_shift(light, rig, to_plane(found.place_px), noise, settings.plate_m, settings.cells)
+    start_m = to_plane(found.place_px)
+    fitted = rig_shift(light, rig, start_m, noise, settings.plate_m, settings.cells, depth=settings.depth)
     sigma = np.sqrt(np.diagonal(fitted.covariance, axis1=1, axis2=2))
     velocity = None
     if by_events is not None:
@@ -142,7 +147,24 @@ def _in_metres(
             np.einsum("mab,mb->ma", slope, by_events.velocity),
             np.einsum("mab,mb->ma", slope**2, by_events.variance),
         )
-    return _joined(fitted.position_m, sigma, velocity, by_events, times_s, "m", found)
+    track = _joined(fitted.position_m, sigma, velocity, by_events, times_s, "m", found)
+    if fitted.log_distance is None or fitted.log_distance_sigma is None:
+        return track
+    return replace(track, distance=_distance(fitted.log_distance, fitted.log_distance_sigma, times_s, rig))
+
+
+def _distance(
+    log_distance: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    times_s: NDArray[np.float64],
+    rig: RadiometricTransport,
+) -> Distance:
+    blank = np.full(len(times_s), np.nan)
+    measured = Measurements(times_s, log_distance, sigma**2, blank, blank)
+    smoothed = smooth(measured, most_likely_acceleration([measured]))
+    near = rig.distance_m * np.exp(smoothed.mean[:, 0])
+    spread = np.sqrt(np.diagonal(smoothed.covariance, axis1=1, axis2=2))  # [N, 2]
+    return Distance(times_s, near, near * spread[:, 0], near * smoothed.mean[:, 1], near * spread[:, 1])
 
 
 def _joined(

@@ -1,4 +1,4 @@
-"""Positions by the calibrated operator: the places that make the frames of one plate likeliest."""
+"""Positions by the calibrated operator: places and distances that make the frames of one plate likeliest."""
 
 from __future__ import annotations
 
@@ -8,16 +8,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.solver import JointProblem, PlatePass
-from evnlos.solver.plate_pass import strip_gram_of, strip_of, strip_transport
+from evnlos.solver import PlatePass
+from evnlos.solver.operators import Gradient, normal_matrix
+from evnlos.solver.plate_pass import mean_weight, strip_of, strip_transport
+from evnlos.tracking.depth import REACH, Depths
 from evnlos.tracking.registration import middle_of_light
-from evnlos.transport import RadiometricTransport
+from evnlos.transport import MatrixTransport, RadiometricTransport
 from evnlos.types import Plane
 
-_ROUNDS = 12
+_ROUNDS = 16
 _HALF_STEP = 0.25  # cells
+_STATIC = 1.0  # a pixel's constant offset over its noise
 _PRIOR = 3.0  # weight of the plate's smoothness, in units of the noise's variance
 _MARGIN_M = 0.02
+_LONGEST_M, _SHORTEST_M = 0.01, 1e-6  # step of one round
+_UNTOLD = 1e-3  # share of a direction's information that the plate leaves, below which it is not told
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +32,17 @@ class RigShift:
     Args:
         position_m: Middle of the object's light (x, y), float64 [N, 2], metres.
         covariance: Of each position, [N, 2, 2], squared metres.
+        log_distance: ln(distance to the wall / the rig's), [N]; its mean is 0, as a plate that is nearer and
+            one that is larger and dimmer look much the same. None where it was not looked for.
+        log_distance_sigma: Its standard deviation, [N].
         plate: The object, its light's middle in the array's middle, float64 [n, n].
     """
 
     position_m: NDArray[np.float64]
     covariance: NDArray[np.float64]
     plate: torch.Tensor
+    log_distance: NDArray[np.float64] | None = None
+    log_distance_sigma: NDArray[np.float64] | None = None
 
 
 def rig_shift(
@@ -42,10 +52,15 @@ def rig_shift(
     noise: float,
     plate_m: float,
     cells: int = 20,
+    *,
+    depth: bool = False,
 ) -> RigShift:
-    """Alternate between the plate that all frames share (`JointProblem`) and the place of each frame.
+    """Find the places of a plate, and the plate, that explain the frames best: Gauss and Newton's method.
 
-    A plate and a path are only known together up to a shift; the plate's middle of light is the reference.
+    The plate is eliminated (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973): a step
+    of the places knows that the plate follows, as it does where a path is stretched or a plate comes nearer on
+    its way. A plate and a path are only known together up to a shift; the plate's middle of light is the
+    reference.
 
     Args:
         light: Frames without ambient light, white levels, [N, h, w].
@@ -54,46 +69,142 @@ def rig_shift(
         noise: Standard deviation of a sample's noise, white levels.
         plate_m: Side of a plate that surely holds the object, metres.
         cells: Cells a side of it.
+        depth: Find the distance to the wall in each frame too.
     """
     plate = Plane(cells, cells, plate_m / cells)
     shape = (int(light.shape[1]), int(light.shape[2]))
     reach = np.concatenate([start_m + _MARGIN_M, start_m - _MARGIN_M])
     # The gain's exact meaning does not matter for places.
     transport = strip_transport(rig, shape, shape, strip_of(reach, plate))
-    gram = strip_gram_of(transport)
-    light = light.double()
-    place, image = start_m.copy(), torch.zeros(plate.shape, dtype=torch.float64)
-    rest = torch.zeros(shape, dtype=torch.float64)
-    covariance = np.zeros((len(place), 2, 2))
+    depths = Depths(rig, transport) if depth else None
+    blank = torch.zeros(plate.shape, dtype=torch.float64)
+    prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), blank)
+    state = np.zeros((len(start_m), 3 if depth else 2))  # x, y, and R ln(distance / R), metres
+    state[:, :2] = start_m
+    image, covariance = blank, np.zeros((len(state), state.shape[1], state.shape[1]))
     for _ in range(_ROUNDS):
-        sight = PlatePass(transport, plate, place)
-        image = JointProblem(sight, 1.0, gram).tikhonov(light, _PRIOR * noise**2).image
-        bright = image.clamp(min=0).numpy()
-        bright = np.where(bright > 0.1 * bright.max(), bright, 0.0)
-        column, row = middle_of_light(bright)
-        offset = (np.array([column, row]) - (cells - 1) / 2) * plate.pitch_m
-        left = light - sight(image) - rest
-        step, covariance = _steps(sight, image, left, noise)
-        rest = rest + left.mean(dim=0)
+        fit = Fit(plate, transport, depths, state, rig.distance_m)
+        image, step, covariance = fit.step(light.double(), prior, noise)
+        state = state + step * min(1.0, _LONGEST_M / np.abs(step).max())
         # The place of the light's middle: the plate is drawn around it the next time.
-        place = place + np.clip(step, -0.01, 0.01) + offset
-    return RigShift(place, covariance, image)
+        state[:, :2] += _middle(image.numpy()) * plate.pitch_m
+        state[:, 2:] -= state[:, 2:].mean(axis=0)
+        state[:, 2:] = np.clip(state[:, 2:], -REACH * rig.distance_m, REACH * rig.distance_m)
+        if np.abs(step).max() < _SHORTEST_M:
+            break
+    if not depth:
+        return RigShift(state, covariance, image)
+    sigma = np.sqrt(covariance[:, 2, 2]) / rig.distance_m
+    return RigShift(state[:, :2], covariance[:, :2, :2], image, state[:, 2] / rig.distance_m, sigma)
 
 
-def _steps(
-    sight: PlatePass, image: torch.Tensor, left: torch.Tensor, noise: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the Gauss-Newton step of every position, [N, 2], metres, and its covariance."""
-    half = _HALF_STEP * sight.plate.pitch_m
-    slopes = []
-    for axis in range(2):
-        shift = np.zeros(2)
-        shift[axis] = half
-        ahead = PlatePass(sight.transport, sight.plate, sight.positions_m + shift).drawn(image)
-        behind = PlatePass(sight.transport, sight.plate, sight.positions_m - shift).drawn(image)
-        slopes.append(sight.transport((ahead - behind) / (2 * half)).flatten(1))
-    slope = torch.stack(slopes, dim=1)  # [N, 2, P]
-    normal = slope @ slope.mT
-    step = torch.linalg.solve(normal, (slope @ left.flatten(1)[..., None]))[..., 0]
-    misfit = left.square().mean(dim=(1, 2)).clamp(min=noise**2)
-    return step.numpy(), (misfit[:, None, None] * torch.linalg.inv(normal)).numpy()
+def _middle(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far the middle of a picture's light is from the picture's, (x, y), pixels."""
+    bright = np.where(image > 0.1 * image.max(), image, 0.0)
+    return np.array(middle_of_light(bright)) - (np.array(image.shape[::-1]) - 1) / 2
+
+
+class Fit:
+    """The frames as a function of plate and places, around one state.
+
+    Args:
+        plate: The plate's cells.
+        transport: The rig's matrix from the strip.
+        depths: The matrices of other distances, where those are looked for.
+        state: x, y and, with `depths`, R ln(distance / R) of each frame, [N, K], metres.
+        distance_m: R, the rig's distance, metres.
+    """
+
+    def __init__(
+        self,
+        plate: Plane,
+        transport: MatrixTransport,
+        depths: Depths | None,
+        state: NDArray[np.float64],
+        distance_m: float,
+    ) -> None:
+        self._depths, self._state, self._distance_m = depths, state, distance_m
+        self._sights = [
+            PlatePass(
+                transport if depths is None else depths.at(float(place[2]) / distance_m), plate, place[None, :2]
+            )
+            for place in state
+        ]
+        self._maps = torch.stack([sight.matrix()[0] for sight in self._sights]).float()  # [N, P, n n]
+        self._still = (1 - mean_weight(len(state), _STATIC)) / len(state)
+
+    def step(
+        self, light: torch.Tensor, prior: torch.Tensor, noise: float
+    ) -> tuple[torch.Tensor, NDArray[np.float64], NDArray[np.float64]]:
+        """Return the plate, the step of all frames [N, K], and the covariance of each [N, K, K].
+
+        Args:
+            light: Frames, float64 [N, h, w].
+            prior: Matrix of the plate's prior, [n n, n n].
+            noise: Standard deviation of a sample's noise.
+        """
+        seen = light.flatten(1)  # [N, P]
+        normal = prior + self._squared()
+        root = torch.linalg.cholesky(normal)
+        image = torch.cholesky_solve(self._back(self._moving(seen))[:, None], root)[:, 0]
+        left = seen - (self._maps @ image.float()).double()
+        slope = self._slopes(image.reshape(self._sights[0].plate.shape))  # [N, K, P]
+        frames, kinds = slope.shape[:2]
+        # Coordinates in which each frame alone would know its place equally well in all directions.
+        lower = torch.linalg.cholesky(slope @ slope.mT)
+        even = torch.linalg.solve_triangular(lower, slope, upper=False)
+        pull = (even @ self._moving(left)[..., None]).flatten()
+        flat = even.flatten(0, 1)  # [N K, P]
+        total = self._maps.sum(dim=0).double()
+        back = (even.float() @ self._maps).double().flatten(0, 1) - self._still * flat @ total  # [N K, n n]
+        shared = torch.linalg.solve_triangular(root, back.mT, upper=False)
+        one = torch.eye(len(flat), dtype=flat.dtype)
+        own = one - self._still * flat @ flat.mT
+        # A step that is the same in all frames is the plate's own: it is left out.
+        alike = torch.linalg.qr(lower.mT.flatten(0, 1))[0]  # [N K, K]
+        apart = one - alike @ alike.mT
+        told, ways = torch.linalg.eigh(apart @ (own - shared.mT @ shared) @ apart)
+        inverse = (ways * torch.where(told > _UNTOLD, 1 / told, 0.0)) @ ways.mT
+        step = (inverse @ pull).unflatten(0, (frames, kinds))
+        each = inverse.unflatten(0, (frames, kinds)).unflatten(2, (frames, kinds)).diagonal(dim1=0, dim2=2)
+        up = torch.linalg.inv(lower).mT  # [N, K, K]
+        misfit = left.square().mean(dim=1).clamp(min=noise**2)
+        covariance = misfit[:, None, None] * (up @ each.movedim(-1, 0) @ up.mT)
+        shown = image.reshape(self._sights[0].plate.shape)
+        return shown, (up @ step[..., None])[..., 0].numpy(), covariance.numpy()
+
+    def _moving(self, frames: torch.Tensor) -> torch.Tensor:
+        """Return frames [N, P] without what stands still in them, as far as it is not known."""
+        return frames - self._still * frames.sum(dim=0)
+
+    def _back(self, frames: torch.Tensor) -> torch.Tensor:
+        """Return the plate's gradient, [n n], of frames [N, P]."""
+        return torch.einsum("npc,np->c", self._maps, frames.float()).double()
+
+    def _squared(self) -> torch.Tensor:
+        """Return the plate's normal matrix, [n n, n n]."""
+        total = self._maps.sum(dim=0).double()
+        squares = torch.zeros(self._maps.shape[2], self._maps.shape[2], dtype=torch.float64)
+        for one in self._maps:
+            squares += (one.mT @ one).double()
+        return squares - self._still * total.mT @ total
+
+    def _slopes(self, image: torch.Tensor) -> torch.Tensor:
+        """Return the frames' derivatives by x, y and R ln(distance), [N, K, P], a metre."""
+        slopes = []
+        for sight, place in zip(self._sights, self._state, strict=True):
+            half = _HALF_STEP * sight.plate.pitch_m
+            own = []
+            for axis in range(2):
+                shift = np.zeros(2)
+                shift[axis] = half
+                ahead, behind = (
+                    PlatePass(sight.transport, sight.plate, sight.positions_m + way).drawn(image)
+                    for way in (shift, -shift)
+                )
+                own.append(sight.transport((ahead - behind) / (2 * half)).flatten())
+            if self._depths is not None:
+                slope = self._depths.slope(float(place[2]) / self._distance_m, sight.drawn(image)[0])
+                own.append(slope / self._distance_m)
+            slopes.append(torch.stack([one.double() for one in own]))
+        return torch.stack(slopes)

@@ -12,6 +12,27 @@ from evnlos.errors import DataError
 
 
 @dataclass(frozen=True, eq=False)
+class Distance:
+    """How far the object was from the wall, smoothed.
+
+    Its mean is that of the rig, which no pass tells: a plate that is nearer and one that is larger look alike.
+
+    Args:
+        time_s: Instants of the frames, [N], seconds.
+        distance_m: Distance, [N], metres.
+        distance_sigma: Its standard deviation, [N], metres.
+        retreat_m_s: Speed away from the wall, [N], metres a second; below 0 the object approaches.
+        retreat_sigma: Its standard deviation, [N].
+    """
+
+    time_s: NDArray[np.float64]
+    distance_m: NDArray[np.float64]
+    distance_sigma: NDArray[np.float64]
+    retreat_m_s: NDArray[np.float64]
+    retreat_sigma: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class Track:
     """Position and velocity over time, from a smoother, with their standard deviations.
 
@@ -32,6 +53,7 @@ class Track:
             away from the wall.
         size_sigma: Standard deviation of the size, [N].
         event_windows: Number of velocities that came from events.
+        distance: Distance from the wall, where it was looked for.
     """
 
     time_s: NDArray[np.float64]
@@ -46,6 +68,7 @@ class Track:
     size: NDArray[np.float64]
     size_sigma: NDArray[np.float64]
     event_windows: int
+    distance: Distance | None = None
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -108,4 +131,8 @@ class Track:
                 "size_sigma",
             )
         }
-        return {"unit": self.unit, "event_windows": self.event_windows, **arrays}
+        found = {"unit": self.unit, "event_windows": self.event_windows, **arrays}
+        if self.distance is not None:
+            depth = {name: np.round(values, 7).tolist() for name, values in vars(self.distance).items()}
+            found["distance"] = depth
+        return found
