@@ -12,7 +12,7 @@ from typing import Any
 
 from evnlos.errors import ConfigError
 
-_RULE = re.compile(r"^[\s─\-]*$")
+_RULE = re.compile(r"^[\s─╰╯-]*$")
 _HELP_INDENT = 8  # columns before the text that explains an option
 
 
@@ -64,13 +64,15 @@ def _unwrapped(words: list[str]) -> Iterator[None]:
 def in_one_line(box: str) -> str:
     r"""Return what a box of tyro's says, without frame, descriptions of options and the hint at the help.
 
+    A frame is drawn only where stdout can show it; else the lines begin with the spaces that it would take.
+
     Example:
-        >>> in_one_line("+- Wrong -+\n| No such: |\n|     --a |\n| ------- |\n| For full helptext, x |\n+---+")
+        >>> in_one_line(" Wrong \n ------ \n  No such: \n      --a \n  ------ \n  For full helptext, x \n")
         'No such: --a'
     """
-    lines = [line.strip().strip("│|")[1:].rstrip() for line in box.splitlines()]
+    lines = [line.rstrip(" │")[2:].rstrip() for line in box.splitlines()]
     sections: list[list[str]] = [[]]
-    for line in lines[1:-1]:  # without the frame's top, which has the title, and its bottom
+    for line in lines[1:]:  # without the title
         if _RULE.match(line):
             sections.append([])
         elif len(line) - len(line.lstrip()) < _HELP_INDENT:
