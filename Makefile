@@ -29,7 +29,8 @@ dist: $(READY)
 	rm -rf dist build
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
 	$(BIN)/python -c "import glob, zipfile; names = set(zipfile.ZipFile(glob.glob('dist/*.whl')[0]).namelist()); \
-	  lost = [n for n in ('evnlos/py.typed', 'evnlos/live/page.html', 'evnlos/app/page.css', 'evnlos/app/opening.js', \
+	  lost = [n for n in ('evnlos/py.typed', 'evnlos/live/page.html', 'evnlos/app/page.css', 'evnlos/app/page.js', \
+	  'evnlos/app/opening.js', \
 	  'evnlos/report/style.css', 'evnlos/evaluation/classifier.safetensors', \
 	  'evnlos/model/published/near-frame.safetensors') if n not in names]; assert not lost, lost"
 	ls -l dist

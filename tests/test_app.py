@@ -1,9 +1,17 @@
 """The page: what it shows, what it refuses, and the page itself in a real browser."""
 
+import asyncio
 import importlib.util
 import json
+import os
 import re
+import socket
+import subprocess
+import sys
+import threading
 import time
+import urllib.error
+import urllib.request
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -12,8 +20,9 @@ import numpy as np
 import pytest
 
 import chromium
-from evnlos import Events
+from evnlos import Events, hosts
 from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
+from evnlos.app.middleware import middleware
 from evnlos.app.networks import Networks, own_networks
 from evnlos.app.recorded import simulate_pass
 from evnlos.app.serve import Server, running
@@ -178,8 +187,108 @@ def test_a_server_refuses_what_cannot_be() -> None:
 
 def test_without_gradio_the_page_says_what_to_install(monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "gradio", None)
-    with pytest.raises(MissingDependencyError, match=r"evnlos\[app\]"), running(Server()):
+    with pytest.raises(MissingDependencyError, match=r"evnlos\[app\]"), running(Server(port=0)):
         pass
+
+
+def test_a_host_or_port_that_can_not_be_had_is_one_line_at_once() -> None:
+    began_s = time.monotonic()
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        for server, words in (
+            (Server(host="nonsense.invalid"), "host 'nonsense.invalid' is not known; give 127.0.0.1"),
+            (Server(host="a" * 64), "is not known"),
+            (Server(host="192.0.2.1"), "192.0.2.1 is no address of this machine; give"),
+            (Server(port=port), f"port {port} is in use; give another --port, or 0 for a free one"),
+        ):
+            with pytest.raises(ConfigError) as stop, running(server):
+                pass
+            assert words in str(stop.value) and "\n" not in str(stop.value)
+    assert time.monotonic() - began_s < 10
+
+
+def test_a_resolver_that_does_not_answer_is_not_waited_for(monkeypatch) -> None:
+    answer = threading.Event()
+
+    def slow(*_: object, **__: object) -> None:
+        answer.wait(60)
+        raise OSError
+
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
+    monkeypatch.setattr(hosts, "_PATIENCE_S", 0.1)
+    with pytest.raises(ConfigError, match="is not known"):
+        hosts.listening_address("slow.example", 0)
+    answer.set()
+
+
+def test_names_of_this_machine() -> None:
+    for name in ("127.0.0.1:7860", "localhost", "LOCALHOST:1", "[::1]:7860", "127.8.9.1"):
+        assert hosts.names_this_machine(name)
+    for name in (
+        "evil.example",
+        "127.0.0.1.evil.example",
+        "localhost.evil.example:7860",
+        "",
+        "::1",
+        "a@localhost",
+    ):
+        assert not hosts.names_this_machine(name)
+    assert hosts.names_this_machine("Lab:7860", own="lab") and not hosts.names_this_machine("lab:7860")
+
+
+@pytest.mark.parametrize(("own", "codes"), [("127.0.0.1", [200, 403]), (None, [200, 200])])
+def test_foreign_names_are_refused_unless_the_network_is_let_in(own: str | None, codes: list[int]) -> None:
+    pytest.importorskip("starlette")
+
+    async def page(scope, receive, send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b"<body></body>"})
+
+    app, found = page, []
+    for one in reversed(middleware("<script></script>", own)):
+        app = one.cls(app, *one.args, **one.kwargs)
+
+    async def send(message) -> None:
+        found.append(message)
+
+    for name in (b"localhost:7860", b"evil.example:7860"):
+        asyncio.run(app({"type": "http", "path": "/x", "headers": [(b"host", name)]}, None, send))
+    assert [message["status"] for message in found if message["type"] == "http.response.start"] == codes
+    if own is not None:
+        found.clear()
+        asyncio.run(
+            app({"type": "websocket", "path": "/", "headers": [(b"host", b"evil.example")]}, None, send)
+        )
+        assert found == [{"type": "websocket.close", "code": 1008}]
+
+
+STARTING = """
+import contextlib, tempfile, time
+from evnlos.app import serve
+
+@contextlib.contextmanager
+def starting(server, weights):
+    with tempfile.TemporaryDirectory(prefix="evnlos-app-"):
+        print("starting", flush=True)
+        time.sleep(60)
+        yield ""
+
+serve.running = starting
+serve.serve(serve.Server())
+"""
+
+
+def test_a_signal_while_it_starts_leaves_no_folder(tmp_path) -> None:
+    call, environment = [sys.executable, "-c", STARTING], {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(call, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"starting\n"
+        assert len(list(tmp_path.iterdir())) == 1
+        process.terminate()
+        assert process.stdout.read() == b""
+    assert process.returncode == 0
+    assert not list(tmp_path.iterdir())
 
 
 def strangers(addresses: list[str], home: str) -> list[str]:
@@ -198,8 +307,15 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
     if chromium.missing():
         pytest.skip(f"{chromium.missing()}: apt-get install chromium chromium-driver")
     asked: list[str] = []
-    with chromium.page(tmp_path, "--columns", "24") as home, chromium.Chromium(tmp_path / "profile") as browser:
+    with (
+        chromium.page(tmp_path, "--columns", "24", "--upload-mb", "2") as home,
+        chromium.Chromium(tmp_path / "profile") as browser,
+    ):
         assert urlsplit(home).hostname == "127.0.0.1"
+        with pytest.raises(urllib.error.HTTPError) as stop:
+            urllib.request.urlopen(urllib.request.Request(home, headers={"Host": "evil.example"}), timeout=60)
+        assert stop.value.code == 403
+        stop.value.close()
         browser.open(home)
         # The pictures are there before Gradio is, and give way to its own.
         width = browser.wait("const p = document.querySelector('.ev-picture'); return p && p.offsetWidth")
@@ -257,11 +373,19 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
         browser.give_file("input[type=file]", zipped_capture)
         browser.wait("return document.querySelectorAll('.ev-sheet').length === 2")
         assert not browser.run("return document.body.innerHTML.includes('ev-wrong')")
+        (tmp_path / "large.raw").write_bytes(bytes(3_000_000))
+        other = "button[aria-label=Clear], button[aria-label='Remove this file']"
+        browser.run(f"document.querySelector({json.dumps(other)}).click()")
+        browser.wait("return [...document.querySelectorAll('input[type=file]')].length")
+        browser.give_file("input[type=file]", tmp_path / "large.raw")
+        browser.wait("return document.body.innerText.includes('exceed the maximum allowed size')")
+        assert "2 MB" in browser.run("return document.body.innerText")
         time.sleep(0.2)
         asked += browser.requests()
         complaints = [one for one in browser.complaints() if "SEVERE" in one]
         folders = [one for one in tmp_path.iterdir() if one.name.startswith("evnlos-app-")]
-        assert any(one.name == zipped_capture.name for folder in folders for one in folder.rglob("*"))
+        uploads = {one.name for folder in folders for one in folder.rglob("*")}
+        assert zipped_capture.name in uploads and "large.raw" not in uploads
     assert len(asked) > 20 and strangers(asked, home) == []
     assert complaints == []
     assert not [one for one in tmp_path.iterdir() if one.name.startswith("evnlos-app-")]

@@ -76,13 +76,33 @@ def test_import_costs_little_beside_torch() -> None:
     """A share of torch's own import, not seconds: machines differ by more than any budget."""
     code = (
         "import json, sys, time\n"
-        "a = time.process_time()\nimport torch\nb = time.process_time()\nimport evnlos\n"
+        "a = time.process_time()\nimport torch\nb = time.process_time()\n"
+        "from evnlos import *\n"
         "c = time.process_time()\nprint(json.dumps([(c - b) / (b - a), sorted(sys.modules)]))"
     )
     runs = [json.loads(subprocess.check_output([sys.executable, "-c", code])) for _ in range(5)]
     # numba looks for scipy by itself and takes it where it is installed.
     assert not {name.split(".")[0] for name in runs[0][1]} & (FORBIDDEN - {"scipy"})
     assert min(share for share, _ in runs) < 0.6
+
+
+def test_public_names_are_those_that_a_checker_sees() -> None:
+    """Names come when they are asked for; the table, the list and the imports for type checkers agree."""
+    tree = ast.parse((SOURCE / "__init__.py").read_text())
+    block = next(
+        node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    )
+    seen = {
+        node.module.removeprefix("evnlos."): tuple(alias.name for alias in node.names)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module
+    }
+    assert seen == evnlos._FROM
+    assert {"__version__", *evnlos._HOME} == set(evnlos.__all__) <= set(dir(evnlos))
+    assert all(getattr(evnlos, stage) is importlib.import_module(f"evnlos.{stage}") for stage in STAGES)
+    for wrong in ("nonsense", "_nonsense"):
+        with pytest.raises(AttributeError, match=f"no attribute '{wrong}'"):
+            getattr(evnlos, wrong)
 
 
 @pytest.mark.parametrize("name", evnlos.__all__)

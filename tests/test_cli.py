@@ -222,6 +222,12 @@ def test_report_is_one_page_without_requests(runs, shots, tmp_path, capsys) -> N
 def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     assert "unknown command" in fails(capsys, "reconstrukt")
+    assert "--port: invalid literal" in fails(capsys, "app", "--port", "abc")
+    assert "Unrecognized options: --prot, 3; Perhaps you meant: --port INT" in fails(
+        capsys, "app", "--prot", "3"
+    )
+    assert "Missing from evnlos simulate: --out PATH; see" in fails(capsys, "simulate")
+    assert "Expected one of ('frame', 'event', 'fusion')" in fails(capsys, "train", "--paradigm", "x")
     assert "no dataset" in fails(capsys, "train", "--data", tmp_path, "--out", out)
     assert "does not exist" in fails(
         capsys, "finetune", "--weights", tmp_path / "w", "--data", shots, "--out", out

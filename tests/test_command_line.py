@@ -2,9 +2,11 @@
 
 import json
 import logging
+import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -81,6 +83,23 @@ def test_log_levels(recording, monkeypatch, capsys) -> None:
     assert "Traceback" in shown and shown.splitlines()[-1].startswith("evnlos info: error: nowhere.raw")
     main(["info", str(recording)])
     assert len(logging.getLogger("evnlos").handlers) == 1
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows(encoding: str) -> None:
+    for words, said in (
+        (("--port", "abc"), "Error parsing --port: invalid literal for int() with base 10: 'abc'"),
+        (("--prot", "3"), "Unrecognized options: --prot, 3; Perhaps you meant: --port INT"),
+        (("--port",), "Missing value for argument '--port'. Expected 1 values"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "evnlos", "app", *words],
+            env={**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "40"},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 2 and done.stdout == ""
+        assert done.stderr == f"evnlos app: error: {said}; see evnlos app --help\n"
 
 
 def test_json_is_one_object(recording, tmp_path, capsys) -> None:

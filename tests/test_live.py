@@ -587,6 +587,23 @@ def test_a_capture_is_replayed_with_its_frames(tiny_captures, tmp_path: Path, ca
     assert table["events"] <= len(read_capture(tiny_captures[0]).events)
 
 
+def test_without_weights_published_ones_of_single_positions_are_taken(
+    tiny_captures, tmp_path: Path, capsys
+) -> None:
+    write_events(tmp_path / "walk.raw", stream(500, 21, span_us=100_000))
+    for source, name in ((tiny_captures[0], "near-frame"), (tmp_path / "walk.raw", "near-event")):
+        out = tmp_path / name
+        main(["live", str(source), "--headless", "--out", str(out), "--speed", "20", "--seconds", "5"])
+        assert f"{name} makes the pictures" in capsys.readouterr().err
+        table = json.loads((out / "latency.json").read_text())
+        assert (
+            table["weights"] == name and table["paradigm"] == name.partition("-")[2] and table["pictures"] > 0
+        )
+    with pytest.raises(SystemExit) as stop:
+        main(["live", str(tmp_path / "walk.raw"), "--weights", "near-event-pass", "--headless"])
+    assert stop.value.code == 2 and "near-event or near-frame, which come with" in capsys.readouterr().err
+
+
 def test_a_run_without_a_picture_leaves_no_folder(engine: Engine, tmp_path: Path) -> None:
     write_events(tmp_path / "e.npz", stream(5))
     with pytest.raises(EventFileError, match="followed"), record.Recorder(tmp_path / "new" / "out") as recorder:

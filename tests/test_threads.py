@@ -17,7 +17,7 @@ def test_the_policy_is_set_before_pytorch_reads_it(chosen: str | None, expected:
         "    def find_spec(self, name, path, target=None):\n"
         "        if name in ('torch', 'numba'): print(name, os.environ.get('OMP_WAIT_POLICY'))\n"
         "sys.meta_path.insert(0, Watch())\n"
-        "import evnlos\n"
+        "from evnlos import train\n"
     )
     found = subprocess.run(
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True, timeout=120

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evnlos.errors import EvnlosError
+from evnlos.requirements import REQUIRED, fault_behind, faults
 from evnlos.version import __version__
 
 
@@ -48,9 +49,12 @@ _EXTRAS = {
 
 def examine() -> list[Part]:
     """Return all parts, needed ones first."""
-    checks = {"python": _python, "torch": _torch, "numba": _numba, "hdf5": _hdf5, "fonts": _fonts}
+    checks = {"torch": _torch, "numba": _numba, "hdf5": _hdf5, "fonts": _fonts}
     checks |= {"reader": _reader, "GPU": _gpu, "LPIPS": _lpips, "comic face": _comic, "disk": _disk}
-    return [*(_tried(*check) for check in checks.items()), *(_extra(module) for module in _EXTRAS)]
+    first = [_python(), *_packages()]
+    named = {part.name for part in first}
+    rest = [_tried(*check) for check in checks.items() if check[0] not in named]
+    return [*first, *rest, *(_extra(module) for module in _EXTRAS)]
 
 
 def _tried(name: str, check: Callable[[], Part]) -> Part:
@@ -58,6 +62,9 @@ def _tried(name: str, check: Callable[[], Part]) -> Part:
     try:
         return check()
     except Exception as error:
+        fault = fault_behind(error)
+        if fault is not None:
+            return Part(name, False, f"needs {fault.name}, which is {fault.found}", fault.cure, needed=True)
         cure = "reinstall evnlos and what it needs: pip install --force-reinstall evnlos"
         return Part(name, False, f"{type(error).__name__}: {error}", cure, needed=True)
 
@@ -66,6 +73,13 @@ def _python() -> Part:
     good = sys.version_info >= (3, 11)
     found = f"evnlos {__version__}, Python {platform.python_version()} on {platform.machine()}"
     return Part("python", good, found, "" if good else "install Python 3.11 or newer", needed=True)
+
+
+def _packages() -> list[Part]:
+    """Return the required packages that can't be imported, one part each; one part for all where all can."""
+    wrong = [Part(fault.name, False, fault.found, fault.cure, needed=True) for fault in faults()]
+    found = f"all {len(REQUIRED)} that evnlos needs can be imported"
+    return wrong or [Part("packages", True, found, needed=True)]
 
 
 def _torch() -> Part:

@@ -1,8 +1,10 @@
-"""What is done to Gradio's answers on their way out: a policy for the browser, our scripts in the page."""
+"""What is done around Gradio: foreign names refused, a policy for the browser, our scripts in the page."""
 
 from __future__ import annotations
 
 from typing import Any
+
+from evnlos.hosts import names_this_machine
 
 # The browser itself refuses what would leave this server.
 _POLICY = (
@@ -13,16 +15,40 @@ _POLICY = (
 _END = b"</body>"
 
 
-def middleware(scripts: str) -> list[Any]:
+def middleware(scripts: str, own: str | None) -> list[Any]:
     """Return the middleware of the page.
 
     Args:
         scripts: HTML for the end of the page's body. Gradio's own way puts scripts into the page after all of
             its own have run, seconds later.
+        own: Name of this machine that the page listens under, where nobody else shall reach it: requests under
+            foreign names are refused. None: it is open to the network, under whatever name that has for it.
     """
     from starlette.middleware import Middleware
 
-    return [Middleware(_Policy), Middleware(_Scripts, scripts=scripts)]
+    always = [Middleware(_Policy), Middleware(_Scripts, scripts=scripts)]
+    return always if own is None else [Middleware(_Names, own=own), *always]
+
+
+class _Names:
+    """Refuses requests under a foreign name: they are of a page from elsewhere whose name leads here."""
+
+    def __init__(self, app: Any, own: str) -> None:
+        self.app, self.own = app, own
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        headers = dict(scope.get("headers", ()))
+        if scope["type"] == "lifespan" or names_this_machine(
+            headers.get(b"host", b"").decode("latin-1"), self.own
+        ):
+            await self.app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            text = b"this page answers to 127.0.0.1 and localhost only"
+            about = [(b"content-type", b"text/plain"), (b"content-length", str(len(text)).encode())]
+            await send({"type": "http.response.start", "status": 403, "headers": about})
+            await send({"type": "http.response.body", "body": text})
 
 
 class _Policy:

@@ -7,11 +7,12 @@ import signal
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from evnlos.errors import ConfigError, MissingDependencyError
+from evnlos.hosts import is_local, listening_address
 
 _HERE = Path(__file__).parent
 # Every switch that Gradio and what it brings have for talking to somebody else.
@@ -63,26 +64,36 @@ def serve(server: Server, weights: tuple[Path, ...] = (), ready: Callable[[str],
 
     Raises:
         MissingDependencyError: Gradio is not installed.
-        ConfigError: Address or port cannot be had.
+        ConfigError: Host or port cannot be had.
         DataError: Weights are missing or damaged.
     """
-    with running(server, weights) as address:
-        if ready is not None:
-            ready(address)
-        waiting = threading.Event()
-        previous = signal.signal(signal.SIGTERM, lambda *_: waiting.set())
-        try:
-            waiting.wait()
-        except KeyboardInterrupt:
-            pass
-        finally:
-            signal.signal(signal.SIGTERM, previous)
+    ended = threading.Event()
+
+    def end(*_: object) -> None:
+        if not ended.is_set():  # a second signal does not stop the tidying
+            ended.set()
+            raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGTERM, end)
+    try:
+        with running(server, weights) as address:
+            if ready is not None:
+                ready(address)
+            with suppress(KeyboardInterrupt):
+                if not ended.is_set():  # the interruption may have been lost in somebody's clean-up
+                    threading.Event().wait()
+    except KeyboardInterrupt:
+        if not ended.is_set():
+            raise
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 @contextmanager
 def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     """Yield the address of the running page, and stop it afterwards. Arguments and errors as in `serve`."""
     os.environ.update(_QUIET)
+    own = server.host if is_local(listening_address(server.host, server.port)) else None
     try:
         import gradio
     except ImportError:
@@ -125,16 +136,15 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
                 theme=theme(gradio),
                 css=(_HERE / "page.css").read_text(encoding="utf-8"),
                 app_kwargs={
-                    "middleware": middleware(_script("page.js") + _script("opening.js")),
+                    "middleware": middleware(_script("page.js") + _script("opening.js"), own),
                     "docs_url": None,
                     "redoc_url": None,
                     "openapi_url": None,
                 },
             )
-        except OSError as error:
+        except OSError:  # taken since it was looked at, or none is free
             raise ConfigError(
-                f"cannot listen on {server.host} port {server.port} ({' '.join(str(error).split())[:100]}); "
-                "give another --port, or 0 for a free one"
+                f"cannot listen on {server.host} port {server.port or '7860 to 7959'}; give another --port"
             ) from None
         try:
             yield address

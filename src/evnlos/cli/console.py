@@ -8,9 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
-from tqdm import tqdm
-
-from evnlos.dataset import open_dataset
 
 T = TypeVar("T")
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -26,6 +23,10 @@ def result(as_json: bool, values: Mapping[str, Any], text: str) -> None:
 
 def progress(steps: Iterable[T], total: int, unit: str, out: Path) -> Iterator[T]:
     """Yield the steps under a progress bar that counts the shards already in `out`."""
+    from tqdm import tqdm
+
+    from evnlos.dataset import open_dataset
+
     done = 0
     if (out / "dataset.yaml").is_file():
         done = total - len(open_dataset(out).missing())

@@ -24,8 +24,9 @@ class Command:
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Capture folder or event file (replayed), event file with --follow, or udp://127.0.0.1:7000."""
-    weights: Path
-    """Weights file, or a run's folder; those of the paradigm event where SOURCE has no frames."""
+    weights: Path | None = None
+    """Weights file, run's folder, or name of published weights, of single positions; of the paradigm event
+    where SOURCE has no frames. None takes published ones: near-frame for a capture, else near-event."""
     headless: bool = False
     """Show no page; write the video and the latency table to --out."""
     out: Path | None = None
@@ -50,7 +51,7 @@ class Command:
         from evnlos.live.page import Page
         from evnlos.live.record import Recorder, check_folder
         from evnlos.live.tally import latency_table
-        from evnlos.model import load_weights
+        from evnlos.model import load_weights, published_for
 
         if self.threads < 1:
             raise ConfigError(f"threads is {self.threads}; give at least 1")
@@ -58,12 +59,18 @@ class Command:
         out = self.out or (Path("live-out") if self.headless else None)
         if out is not None:
             check_folder(out)
-        weights = load_weights(self.weights)
+        name = self.weights
+        weights = None if name is None else load_weights(name)
         pattern = load_pattern(self.pattern) if self.pattern else None
         source = open_live(self.source, self.listening, pattern)
         recorder = None
         try:
             with ExitStack() as stack:
+                if weights is None:
+                    paradigm = "frame" if source.has_frames else "event"
+                    name = published_for(None, paradigm, is_motion_known=False)
+                    weights = load_weights(name)
+                    say(f"{name} makes the pictures: weights of the package, for its own rig; see --weights")
                 engine = Engine(weights)
                 run = Run(source, engine, self.pace)
                 sinks = []
@@ -81,7 +88,7 @@ class Command:
                 run.go(sinks)
         finally:
             source.close()
-        summary = run.tally.summary() | {"paradigm": engine.paradigm}
+        summary = run.tally.summary() | {"weights": str(name), "paradigm": engine.paradigm}
         if out is not None and recorder is not None:
             summary |= {"recorded": recorder.recorded, "not_recorded": recorder.left_out}
             out.mkdir(parents=True, exist_ok=True)

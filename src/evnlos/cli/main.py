@@ -7,13 +7,14 @@ from dataclasses import MISSING, fields
 from types import ModuleType
 from typing import Any
 
-import tyro
-
 from evnlos.cli.notes import FLAG, LEVELS, LOG, VARIABLE, listen
-from evnlos.cli.verbs import VERBS, module_of
-from evnlos.config import load_yaml
+from evnlos.cli.parsing import parse
+from evnlos.cli.verbs import VERBS, module_of, summary_of
 from evnlos.errors import ConfigError, EvnlosError
+from evnlos.requirements import fault_behind
 from evnlos.version import __version__
+
+# Nothing that may be missing is imported before a command is: help, version and doctor work in any case.
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -33,11 +34,7 @@ def main(argv: list[str] | None = None) -> None:
     try:
         if verb not in VERBS:
             raise ConfigError(f"unknown command {verb!r}; give one of {', '.join(VERBS)}")
-        module = module_of(verb)
-        default = _defaults(module, rest)
-        # The kinds of glyphs and transport come from preset or file; flags change the numbers of that kind.
-        quiet = (tyro.conf.AvoidSubcommands,)
-        command = tyro.cli(module.Command, args=rest, prog=f"evnlos {verb}", default=default, config=quiet)
+        command = _command(verb, rest)
         LOG.debug("%s", command)
         command.run()
     except EvnlosError as error:
@@ -46,20 +43,39 @@ def main(argv: list[str] | None = None) -> None:
         sys.exit(2)
     except BrokenPipeError:
         sys.exit(1)
-    except OSError as error:
-        LOG.debug("where the error came from", exc_info=True)
-        print(f"evnlos {verb}: error: {error}; nothing half-written was left", file=sys.stderr)
-        sys.exit(2)
     except KeyboardInterrupt:
         print(f"evnlos {verb}: interrupted; run the same command again to go on", file=sys.stderr)
         sys.exit(130)
+    except Exception as error:
+        fault = fault_behind(error)
+        if fault is not None:
+            text = f"{fault.name} is {fault.found}; {fault.cure} (evnlos doctor looks at all that is needed)"
+        elif isinstance(error, OSError):
+            text = f"{error}; nothing half-written was left"
+        else:
+            raise
+        LOG.debug("where the error came from", exc_info=True)
+        print(f"evnlos {verb}: error: {text}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _command(verb: str, rest: list[str]) -> Any:
+    """Return the command that the words ask for."""
+    module = module_of(verb)
+    if verb == "doctor" and set(rest) <= {"--json"}:  # the parser itself may be what is missing
+        return module.Command(json="--json" in rest)
+    return parse(module.Command, rest, verb, _defaults(module, rest))
 
 
 def _defaults(module: ModuleType, rest: list[str]) -> Any:
-    """Return the command with the settings of --preset and --config as its defaults, for tyro to override."""
+    """Return the command with the settings of --preset and --config as its defaults, for flags to override."""
     presets = getattr(module, "PRESETS", None)
     if presets is None:
         return None
+    import tyro
+
+    from evnlos.config import load_yaml
+
     preset, config = _flag(rest, "--preset"), _flag(rest, "--config")
     if preset is not None and preset not in presets:
         raise ConfigError(f"--preset is {preset!r}; give one of {', '.join(presets)}")
@@ -88,7 +104,7 @@ def _overview() -> str:
     lines = [f"evnlos {__version__}: seeing moving objects around a corner with an event camera", ""]
     lines.append("usage: evnlos COMMAND [options]; evnlos COMMAND --help shows units and defaults")
     lines.append("")
-    lines += [f"  {verb:<12} {module_of(verb).Command.__doc__.splitlines()[0]}" for verb in VERBS]
+    lines += [f"  {verb:<12} {summary_of(verb)}" for verb in VERBS]
     lines.append("")
     lines.append(f"with every command: {FLAG} {{{','.join(LEVELS)}}}, or the variable {VARIABLE}; --version")
     return "\n".join(lines)

@@ -12,7 +12,7 @@ from torch import Tensor
 from evnlos.config import from_dict
 from evnlos.dataset import CHANNELS, Sampling, network_input
 from evnlos.errors import DataError
-from evnlos.model import JointNetwork, Weights
+from evnlos.model import JointNetwork, Weights, published_single
 
 
 class Reconstructor:
@@ -22,6 +22,9 @@ class Reconstructor:
 
     Args:
         weights: Network and paradigm.
+
+    Raises:
+        DataError: The network sees a whole pass.
 
     Example:
         >>> from evnlos.model import ResidualUNet, UNetConfig
@@ -35,8 +38,10 @@ class Reconstructor:
     def __init__(self, weights: Weights) -> None:
         self.paradigm = weights.paradigm
         if isinstance(weights.network, JointNetwork):
+            names = " or ".join(published_single())
             raise DataError(
-                "these weights see a whole pass; give weights of single positions (without --joint)"
+                f"these weights see a whole pass; give weights of single positions: {names}, which come with "
+                "the package, or your own, trained without --joint"
             )
         self.sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
         shape = (1, CHANNELS[weights.paradigm], self.sampling.height, self.sampling.width)  # type: ignore[index]

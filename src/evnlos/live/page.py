@@ -12,6 +12,7 @@ from importlib.resources import files
 from typing import Any
 
 from evnlos.errors import ConfigError
+from evnlos.hosts import names_this_machine
 from evnlos.live.engine import Picture
 from evnlos.live.panels import panels
 from evnlos.report.pictures import data_uri, png
@@ -144,8 +145,7 @@ def _handler(page: Page) -> type[BaseHTTPRequestHandler]:
 
         def do_GET(self) -> None:
             """Answer a request of this machine."""
-            host = self.headers.get("Host", "")
-            if host not in (f"{_HOST}:{page.port}", f"localhost:{page.port}"):
+            if not names_this_machine(self.headers.get("Host", "")):
                 self.send_error(403)  # a page from elsewhere under a name that leads here
             elif self.path == "/":
                 self._send("text/html; charset=utf-8", page.html())

@@ -20,6 +20,16 @@ def published() -> dict[str, Path]:
     return {path.stem: path for path in sorted(_FOLDER.glob("*.safetensors"))}
 
 
+def published_single() -> list[str]:
+    """Return the names of the published weights that see one position at a time.
+
+    Example:
+        >>> published_single()
+        ['near-event', 'near-frame']
+    """
+    return [name for name in published() if not name.endswith(f"-{_PASS}")]
+
+
 def published_for(distance_m: float | None, paradigm: str, *, is_motion_known: bool) -> str:
     """Return the name of the published weights that fit a capture best.
 
