@@ -2,12 +2,17 @@
 
 import html
 import re
+import shlex
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from evnlos.cli.main import main
+from evnlos.cli.verbs import module_of
 from evnlos.dataset import Sampling
 from evnlos.dataset.sampling import Samples
 from evnlos.dataset.shard import write_shard
@@ -20,7 +25,9 @@ from evnlos.evaluation.score import score
 from evnlos.evaluation.worth import PassWorth
 from evnlos.plot.rig import rig_drawing
 from evnlos.report import RunResult, write_report
+from evnlos.report.commands import Commands
 from evnlos.report.films import _worst
+from evnlos.report.gather import named
 from evnlos.report.lead import gains_of
 from evnlos.transport import PaperTransport, RadiometricTransport
 
@@ -84,8 +91,75 @@ def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None
     assert "evnlos import near_G near_K --out near --test near_G near_K" in shown
     assert "evnlos train --data sim --config epnp-1.yaml --out epnp-1" in shown
     assert "evnlos finetune --data near --weights epnp-1 --config epnp.yaml --out epnp" in shown
-    assert "evnlos report epnp e2e --data near --split test --out report.html" in shown
+    assert "evnlos report epnp e2e --data near --split test --rig main-near --out report.html" in shown
     assert "torch " in shown and "/tmp/" not in page.replace(str(tmp_path), "")
+
+
+STEPS = [
+    {
+        "settings": {"epochs": 2},
+        "data": {"name": "sim", "origin": "simulation", "config_hash": "ab12", "train": ["w_A"]},
+    },
+    {"settings": {"epochs": 3}, "data": {"name": "old", "origin": "captures", "train": ["near_1", "near_2"]}},
+]
+
+
+def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypatch) -> None:
+    """Names of runs, of files and of published weights; each line is parsed, not run."""
+    data, (run, _) = made
+    file = replace(run, name="mine", history=STEPS)
+    come = replace(run, name="near-frame-pass", history=STEPS, is_published=True)
+    live = replace(run, name="live-run", history=[{"data": {"name": "live", "origin": "simulation"}}])
+    coarse = replace(data, sampling=Sampling(), config={"pattern": "ab12"})
+    here = {"name": "near", "origin": "captures", "train": ["near_A"]}  # other captures under the same name
+    other = replace(run, name="of two words", history=[{"data": here}])
+    for dataset in (data, coarse, replace(data, origin="simulation")):
+        commands = Commands(dataset, [run, file, come, live, other], "test", described_rig("hard-far"))
+        lines = commands.again() + commands.published()
+        parsed = [_parsed(line, monkeypatch) for line in lines if not line.startswith("#")]
+        assert [type(one).__module__.rsplit(".", 1)[1] for one in parsed].count("report") == 1
+    again = "\n".join(Commands(data, [run, file, come, live, other], "test").again())
+    assert "evnlos report epnp mine near-frame-pass live-run 'of two words' --data near --split" in again
+    assert "--out near-frame-pass" not in again and "--out near-frame-pass" in "\n".join(commands.published())
+    assert "evnlos import near_1 near_2 --out old --sampling.height 32" in again
+    assert "# sim-2.yaml: settings of hash ab12 of 1 simulated objects" in again  # `sim` is another one
+    assert "evnlos simulate --config sim-2.yaml --out sim-2" in again and "--data sim-2" in again
+    assert "evnlos train --simulate live.yaml" in again and "evnlos import near_A --out near-2" in again
+    assert "--pattern pattern.safetensors" in "\n".join(Commands(coarse, [run], "test").again())
+
+
+def _parsed(line: str, monkeypatch: pytest.MonkeyPatch):
+    """Return the command that a line is read as, without running it; settings are those of the default."""
+    program, verb, *rest = shlex.split(line)
+    module = module_of(verb)
+    parsed = []
+    monkeypatch.setattr(module.Command, "run", lambda command: parsed.append(command))
+    monkeypatch.setattr(sys.modules[main.__module__], "load_yaml", lambda kind, _: kind())
+    main([verb, *rest])
+    assert program == "evnlos" and len(parsed) == 1 and not any(word in ("", ".") for word in rest)
+    return parsed[0]
+
+
+def test_weights_are_called_by_run_file_or_published_name(tmp_path, monkeypatch) -> None:
+    run = tmp_path / "runs" / "epnp"
+    run.mkdir(parents=True)
+    (run / "weights.safetensors").touch()
+    (tmp_path / "mine.safetensors").touch()
+    monkeypatch.chdir(run)
+    assert named(Path("near-frame-pass")) == ("near-frame-pass", True)
+    assert named(run) == named(Path()) == named(Path("weights.safetensors")) == ("epnp", False)
+    assert named(tmp_path / "mine.safetensors") == ("mine", False)
+    (run / "near-frame-pass").mkdir()
+    assert named(Path("near-frame-pass")) == ("near-frame-pass", False)  # a folder of that name comes first
+
+
+def test_weights_without_a_log_leave_no_empty_section(made, tmp_path) -> None:
+    data, runs = made
+    shown = write_report(tmp_path / "a.html", data, runs, []).read_text().split("<h2>Training</h2>")[1]
+    assert shown.startswith("<p class=dim>No curve, for") and "epnp, e2e." in shown.split("</p>")[0]
+    logged = replace(runs[0], log=[{"epoch": 1, "loss": 0.5}, {"epoch": 2, "loss": 0.25}])
+    shown = write_report(tmp_path / "b.html", data, [logged], []).read_text().split("<h2>Training</h2>")[1]
+    assert shown.startswith("<svg") and "No curve" not in shown
 
 
 def test_the_page_says_how_far_to_believe_each_run(made, tmp_path) -> None:

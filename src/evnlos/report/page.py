@@ -78,7 +78,7 @@ def write_report(
             limits_section(limits),
             _curves(results),
             _optics(dataset, results),
-            origin_section(dataset, results, split),
+            origin_section(dataset, results, split, None if limits is None else rig),
             "</html>",
         ]
     )
@@ -176,14 +176,18 @@ def _pictures(dataset: Dataset, results: list[RunResult]) -> str:
 
 
 def _curves(results: list[RunResult]) -> str:
-    series: dict[str, list[tuple[float, float]]] = {}
-    scores: dict[str, list[tuple[float, float]]] = {}
-    for r in results:
-        series[label(r)] = [(line["epoch"], line["loss"]) for line in r.log]
-        scores[label(r)] = [(line["epoch"], line["psnr_db"]) for line in r.log if "psnr_db" in line]
+    """Show loss and score over the epochs of the runs whose log is there, and say whose is not."""
+    logged = [r for r in results if r.log]
+    series = {label(r): [(line["epoch"], line["loss"]) for line in r.log] for r in logged}
+    scores = {
+        label(r): [(line["epoch"], line["psnr_db"]) for line in r.log if "psnr_db" in line] for r in logged
+    }
     parts = [curves_svg(series, "epoch", "loss of the training")]
     if any(scores.values()):
         parts.append(curves_svg(scores, "epoch", "PSNR on the validation objects, dB"))
+    if without := [r.name for r in results if not r.log]:
+        names = html.escape(", ".join(without))
+        parts.append(f"<p class=dim>No curve, for a weights file holds no log of its training: {names}.</p>")
     return "<h2>Training</h2>" + "".join(parts)
 
 
