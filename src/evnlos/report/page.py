@@ -12,6 +12,7 @@ from evnlos.dataset import Dataset, character_of, read_shard
 from evnlos.evaluation import CHECKS
 from evnlos.evaluation.identify import Identification
 from evnlos.evaluation.identify_source import Described
+from evnlos.events.colours import WORDS
 from evnlos.report.belief import belief_section
 from evnlos.report.curves import curves_svg
 from evnlos.report.films import animations_section, failures_section, strips_section
@@ -170,7 +171,7 @@ def _pictures(dataset: Dataset, results: list[RunResult]) -> str:
     grid = f"grid-template-columns:4.5rem repeat({len(heads) - 1},100px)"
     return (
         "<h2>Pictures</h2><p class=dim>The middle position of each object. Wall frame stretched in contrast; "
-        "events as time surface (red brighter, blue darker); reconstructions and truth from 0 to 1.</p>"
+        f"events as time surface ({WORDS}); reconstructions and truth from 0 to 1.</p>"
         f"<div class=shots style='{grid}'>{''.join(f'<div>{c}</div>' for c in cells)}</div>"
     )
 
