@@ -76,8 +76,7 @@ def preview_pictures(
         look: How it looks; None = the defaults.
 
     Example:
-        >>> from evnlos.events.colours import OFF_RGB, ON_RGB
-    from evnlos.events.summary import summarise
+        >>> from evnlos.events.summary import summarise
         >>> events = Events([0, 900], [0, 3], [1, 1], [1, 0], width=4, height=2)
         >>> pictures = preview_pictures([events], summarise([events]), Look(frames=2))
         >>> len(pictures), pictures[0].shape, pictures[0][-30, 0].tolist()
