@@ -10,9 +10,6 @@ from typing import Any
 from evnlos.dataset import Dataset, Sampling
 from evnlos.evaluation.identify_source import Described
 from evnlos.report.gather import RunResult
-from evnlos.transport import MeasuredTransport
-from evnlos.transport.measured_file import SUFFIX
-from evnlos.transport.rig import rig_names
 
 _LIVE = "live"  # what a simulation is called that is made while the network trains
 
@@ -41,7 +38,7 @@ class Commands:
         words = ["evnlos", "report", *(r.name for r in self._results), "--data", self._here]
         words += ["--split", self._split]
         if self._rig is not None:
-            words += ["--rig", _rig_word(self._rig)]
+            words += ["--rig", self._rig.word]
         return list(dict.fromkeys([*lines, shlex.join([*words, "--out", "report.html"])]))
 
     def published(self) -> list[str]:
@@ -129,14 +126,6 @@ def _unknown_settings(name: str, data: dict[str, Any]) -> str:
     count = len(data.get("train", [])) + len(data.get("validation", []))
     hashed = f" of hash {data['config_hash']}" if data.get("config_hash") else ""
     return f"# {name}.yaml: settings{hashed} of {count} simulated objects; weights keep no more of them"
-
-
-def _rig_word(rig: Described) -> str:
-    """Return what `--rig` took: a name, or a file without its folder."""
-    if isinstance(rig.transport, MeasuredTransport):
-        return f"{rig.name}{SUFFIX}"
-    is_name = rig.name in rig_names() or rig.name.startswith("simulate-")
-    return rig.name if is_name else f"{rig.name}.yaml"
 
 
 def _flag(name: str, values: list[str]) -> list[str]:

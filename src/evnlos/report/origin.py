@@ -25,7 +25,7 @@ def origin_section(dataset: Dataset, results: list[RunResult], split: str, rig: 
     commands = Commands(dataset, results, split, rig)
     parts = [
         f"<h2>How it was made</h2><p>{html.escape(environment())}</p>"
-        "<p>To make it again, beside the folders of the captures, with the files of settings below:</p>"
+        "<p>To make it again, where the folders of the captures lie, with the files of settings below:</p>"
         f"{_pre(chr(10).join(commands.again()))}"
     ]
     if behind := commands.published():
