@@ -156,7 +156,7 @@ def test_report_and_reconstruct_take_a_calibrated_folder_and_say_what_else(tmp_p
     with pytest.raises(SystemExit):
         main(["reconstruct", str(tmp_path), "--rig", "main-near", "--out", str(tmp_path / "out")])
     said = capsys.readouterr().err
-    assert "holds no rig.yaml" in said and "calibrate` wrote" in said and "`report` and `identify`" in said
+    assert "holds no rig.yaml" in said and "`calibrate` wrote" in said and "`report` and `identify`" in said
     assert not (tmp_path / "out").exists()
 
 
