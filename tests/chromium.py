@@ -124,6 +124,11 @@ class Chromium:
         """Write what the window shows as a PNG."""
         path.write_bytes(base64.b64decode(self._call("GET", f"{self._session}/screenshot")))
 
+    def devtools(self, command: str, **parameters: Any) -> Any:
+        """Send a command of the DevTools protocol, e.g. `Emulation.setEmulatedMedia`, and return its answer."""
+        body = {"cmd": command, "params": parameters}
+        return self._call("POST", f"{self._session}/goog/cdp/execute", body)
+
     def requests(self) -> list[str]:
         """Return the addresses that were asked for since the last call."""
         entries = self._call("POST", f"{self._session}/se/log", {"type": "performance"})

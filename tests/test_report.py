@@ -2,13 +2,21 @@
 
 import html
 import re
+import shlex
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from evnlos.dataset import Sampling
+from chromium import Chromium, missing
+from evnlos.cli.main import main
+from evnlos.cli.reconstruct import calibrated_folder
+from evnlos.cli.verbs import module_of
+from evnlos.config import save_yaml
+from evnlos.dataset import Sampling, Simulation
 from evnlos.dataset.sampling import Samples
 from evnlos.dataset.shard import write_shard
 from evnlos.dataset.store import Dataset, create_dataset
@@ -18,11 +26,14 @@ from evnlos.evaluation.identify_rig import Bench
 from evnlos.evaluation.identify_source import described_rig
 from evnlos.evaluation.score import score
 from evnlos.evaluation.worth import PassWorth
-from evnlos.plot.rig import rig_drawing
+from evnlos.plot.rig import PARTITION, rig_drawing
 from evnlos.report import RunResult, write_report
+from evnlos.report.commands import Commands
 from evnlos.report.films import _worst
+from evnlos.report.gather import named
 from evnlos.report.lead import gains_of
-from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.report.setup import _points, setup_section
+from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
 
 POSITIONS = 12
 
@@ -67,9 +78,16 @@ def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None
     path = write_report(tmp_path / "report.html", data, runs, [], rig=rig, limits=limits)
     page = path.read_text()
     assert path.stat().st_size < 5e6
-    assert not re.findall(r"(?:src|href)=['\"](?!data:)", page)
+    assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
     assert not re.findall(r"https?:", page.replace("http://www.w3.org/2000/svg", ""))
-    for heading in ("The set-up", "Moving", "Position by position", "Where it fails", "How it was made"):
+    for heading in (
+        "Words",
+        "The set-up",
+        "Moving",
+        "Position by position",
+        "Where it fails",
+        "How it was made",
+    ):
         assert f"<h2>{heading}</h2>" in page
     assert "What this rig can show at all" in page and html.escape(limits.verdict) in page
     assert "metal of roughness 0.05" in page
@@ -84,8 +102,167 @@ def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None
     assert "evnlos import near_G near_K --out near --test near_G near_K" in shown
     assert "evnlos train --data sim --config epnp-1.yaml --out epnp-1" in shown
     assert "evnlos finetune --data near --weights epnp-1 --config epnp.yaml --out epnp" in shown
-    assert "evnlos report epnp e2e --data near --split test --out report.html" in shown
+    assert "evnlos report epnp e2e --data near --split test --rig main-near --out report.html" in shown
     assert "torch " in shown and "/tmp/" not in page.replace(str(tmp_path), "")
+
+
+STEPS = [
+    {
+        "settings": {"epochs": 2},
+        "data": {"name": "sim", "origin": "simulation", "config_hash": "ab12", "train": ["w_A"]},
+    },
+    {"settings": {"epochs": 3}, "data": {"name": "old", "origin": "captures", "train": ["near_1", "near_2"]}},
+]
+
+
+def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypatch) -> None:
+    """Names of runs, of files and of published weights; each line is parsed, not run."""
+    data, (run, _) = made
+    file = replace(run, name="mine", history=STEPS)
+    come = replace(run, name="near-frame-pass", history=STEPS, is_published=True)
+    live = replace(run, name="live-run", history=[{"data": {"name": "live", "origin": "simulation"}}])
+    coarse = replace(data, sampling=Sampling(), config={"pattern": "ab12"})
+    here = {"name": "near", "origin": "captures", "train": ["near_A"]}  # other captures under the same name
+    other = replace(run, name="of two words", history=[{"data": here}])
+    for dataset in (data, coarse, replace(data, origin="simulation")):
+        commands = Commands(dataset, [run, file, come, live, other], "test", described_rig("hard-far"))
+        lines = commands.again() + commands.published()
+        parsed = [_parsed(line, monkeypatch) for line in lines if not line.startswith("#")]
+        assert [type(one).__module__.rsplit(".", 1)[1] for one in parsed].count("report") == 1
+    again = "\n".join(Commands(data, [run, file, come, live, other], "test").again())
+    assert "evnlos report epnp mine near-frame-pass live-run 'of two words' --data near --split" in again
+    assert "--out near-frame-pass" not in again and "--out near-frame-pass" in "\n".join(commands.published())
+    assert "evnlos import near_1 near_2 --out old --sampling.height 32" in again
+    assert "# sim-2.yaml: settings of hash ab12 of 1 simulated objects" in again  # `sim` is another one
+    assert "evnlos simulate --config sim-2.yaml --out sim-2" in again and "--data sim-2" in again
+    assert "evnlos train --simulate live.yaml" in again and "evnlos import near_A --out near-2" in again
+    assert "--pattern pattern.safetensors" in "\n".join(Commands(coarse, [run], "test").again())
+
+
+def test_report_and_reconstruct_take_a_calibrated_folder_and_say_what_else(tmp_path, capsys) -> None:
+    folder = tmp_path / "near_rig"
+    folder.mkdir()
+    transport = RadiometricTransport(roughness=0.07)
+    save_yaml(Simulation(transport=transport), folder / "rig.yaml")
+    for given in (folder, folder / "rig.yaml"):
+        assert described_rig(given).transport == transport
+        assert described_rig(given).word == described_rig(given).name == "near_rig"
+        assert calibrated_folder(given) == folder
+    save_yaml(Simulation(), tmp_path / "mine.yaml")
+    save_yaml(Simulation(), folder / "dataset.yaml")
+    assert described_rig(tmp_path / "mine.yaml").word == "mine.yaml"
+    assert described_rig(folder / "dataset.yaml").word == "near_rig/dataset.yaml"
+    assert described_rig("main-near").word == "main-near"
+    with pytest.raises(SystemExit):
+        main(["reconstruct", str(tmp_path), "--rig", "main-near", "--out", str(tmp_path / "out")])
+    said = capsys.readouterr().err
+    assert "holds no rig.yaml" in said and "`calibrate` wrote" in said and "`report` and `identify`" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_page_explains_its_words_and_fits_a_phone_and_paper(made, tmp_path) -> None:
+    path = write_report(tmp_path / "report.html", *made, [])
+    page = path.read_text()
+    for word in ("EPNP", "E2E", "fusion", "joint (whole pass)", "PSNR", "PSNR in the box", "SSIM", "MS-SSIM"):
+        assert f">{word}</dt>" in page.split("<h2>Words</h2>")[1]
+    links = re.findall(r"href='#([^']+)'", page)
+    assert "word-gmsd" in links and len(links) == len(set(links))  # at its first use, and only there
+    assert all(page.count(f"id='{one}'") == 1 for one in links)
+    tables = dict(re.findall(r"<h2>(?:<a[^>]*>)?(SSIM|GMSD)(?:</a>)?</h2>.*?class=better>([^<]*)<", page))
+    assert tables == {"SSIM": "&uarr; higher is better", "GMSD": "&darr; lower is better"}
+    if missing():
+        pytest.skip(missing())
+    (tmp_path / "profile").mkdir()
+    wide = "return document.documentElement.scrollWidth"
+    shown = (
+        "return [...document.querySelectorAll('details pre')].map(one => one.getBoundingClientRect().height)"
+    )
+    with Chromium(tmp_path / "profile") as browser:
+        browser.open(path.as_uri())
+        browser.devtools(
+            "Emulation.setDeviceMetricsOverride", width=390, height=800, deviceScaleFactor=1, mobile=True
+        )
+        assert browser.run(wide) <= 390
+        closed = "return document.querySelector('details').getBoundingClientRect().height"
+        before = browser.run(closed)
+        browser.devtools("Emulation.setEmulatedMedia", media="print")
+        assert min(browser.run(shown)) > 20 and browser.run(closed) > before + 20
+
+
+def test_the_plot_of_what_a_rig_shows_ends_where_the_values_do() -> None:
+    values = torch.tensor([10.0, 1.0, 0.1, 1e-5, 1e-2, 1e-4, 1e-9])
+    points = _points(values)
+    assert [x for x, _ in points] == [1, 2, 3, 4, 5]
+    assert [y for _, y in points] == pytest.approx([1, 0, -1, -3, -2], abs=1e-6)
+    assert _points(torch.zeros(4)) == []
+
+
+@pytest.mark.parametrize("name", ["main-near", "hard-far", "aperture-near"])
+@pytest.mark.parametrize("angle", [30.0, -30.0])
+def test_the_drawing_sketches_what_hides_the_object_and_nothing_else(name, angle) -> None:
+    rig = replace(rig_preset(name), camera_angle_deg=angle)
+    drawn = rig_drawing(rig, travel_m=0.16, plate_m=0.08).svg
+    assert drawn.count(PARTITION) == 1 and (">occluder</text>" in drawn) == (name == "aperture-near")
+    lines = [
+        [tuple(float(v) for v in one.split(",")) for one in points.split()]
+        for points in re.findall(r"polyline points='([^']*)'", drawn)
+    ]
+    (hides,) = re.findall(r"polyline points='([^']*)'[^>]*partition", drawn)
+    hides = [tuple(float(v) for v in one.split(",")) for one in hides.split()]
+    way, sights = lines[0], lines[2:4]
+    eye = sights[0][0]
+    ends = [one[1] for one in sights]
+    assert all(_cross(hides, (eye, end)) for end in way)  # neither end of the way is seen
+    assert not any(_cross(hides, (eye, end)) for end in ends)  # the wall is
+    assert not any(_cross(hides, (one, end)) for one in way for end in ends)  # and is lit
+
+
+def test_without_a_camera_nothing_is_sketched() -> None:
+    assert PARTITION not in rig_drawing(PaperTransport()).svg
+    assert "is not drawn" in setup_section("paper", PaperTransport())
+
+
+def _cross(one, other) -> bool:
+    """Return whether two segments of (x, y) ends cross."""
+
+    def side(a, b, c) -> float:
+        return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+    return side(*one, other[0]) * side(*one, other[1]) < 0 and side(*other, one[0]) * side(*other, one[1]) < 0
+
+
+def _parsed(line: str, monkeypatch: pytest.MonkeyPatch):
+    """Return the command that a line is read as, without running it; settings are those of the default."""
+    program, verb, *rest = shlex.split(line)
+    module = module_of(verb)
+    parsed = []
+    monkeypatch.setattr(module.Command, "run", lambda command: parsed.append(command))
+    monkeypatch.setattr(sys.modules[main.__module__], "load_yaml", lambda kind, _: kind())
+    main([verb, *rest])
+    assert program == "evnlos" and len(parsed) == 1 and not any(word in ("", ".") for word in rest)
+    return parsed[0]
+
+
+def test_weights_are_called_by_run_file_or_published_name(tmp_path, monkeypatch) -> None:
+    run = tmp_path / "runs" / "epnp"
+    run.mkdir(parents=True)
+    (run / "weights.safetensors").touch()
+    (tmp_path / "mine.safetensors").touch()
+    monkeypatch.chdir(run)
+    assert named(Path("near-frame-pass")) == ("near-frame-pass", True)
+    assert named(run) == named(Path()) == named(Path("weights.safetensors")) == ("epnp", False)
+    assert named(tmp_path / "mine.safetensors") == ("mine", False)
+    (run / "near-frame-pass").mkdir()
+    assert named(Path("near-frame-pass")) == ("near-frame-pass", False)  # a folder of that name comes first
+
+
+def test_weights_without_a_log_leave_no_empty_section(made, tmp_path) -> None:
+    data, runs = made
+    shown = write_report(tmp_path / "a.html", data, runs, []).read_text().split("<h2>Training</h2>")[1]
+    assert shown.startswith("<p class=dim>No curve, for") and "epnp, e2e." in shown.split("</p>")[0]
+    logged = replace(runs[0], log=[{"epoch": 1, "loss": 0.5}, {"epoch": 2, "loss": 0.25}])
+    shown = write_report(tmp_path / "b.html", data, [logged], []).read_text().split("<h2>Training</h2>")[1]
+    assert shown.startswith("<svg") and "No curve" not in shown
 
 
 def test_the_page_says_how_far_to_believe_each_run(made, tmp_path) -> None:

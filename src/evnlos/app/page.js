@@ -65,7 +65,7 @@
   const moved = (canvas, x, y, draws) => {
     const ink = canvas.getContext("2d");
     if (draws) {
-      Object.assign(ink, { lineWidth: WIDTH, lineCap: "round", strokeStyle: "#de7000" });
+      Object.assign(ink, { lineWidth: WIDTH, lineCap: "round", strokeStyle: "#e27800" });
       ink.beginPath();
       ink.moveTo(nib.x, nib.y);
       ink.lineTo(x, y);

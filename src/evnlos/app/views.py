@@ -12,6 +12,7 @@ from evnlos.app.recorded import Recorded
 from evnlos.app.solving import Reconstruction
 from evnlos.dataset import Sampling
 from evnlos.events import time_surface
+from evnlos.events.colours import WORDS
 from evnlos.plot.event_views import (
     CloudSize,
     cloud_pictures,
@@ -64,7 +65,7 @@ def seen_views(recorded: Recorded) -> list[View]:
     views.append(
         View(
             "Events",
-            f"brighter orange, darker blue, of the last {interval_ms:.3g} ms",
+            f"{WORDS}, of the last {interval_ms:.3g} ms",
             slice_pictures(events, edges),
             tuple(f"{count:,} events" for count in counts),
         )

@@ -21,7 +21,8 @@ class Command:
     """Say what a rig can show at all: modes above the noise, finest stroke, best linear picture, in words."""
 
     rigs: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names (main-near, matte-far, ..., simulate-paper), rig files, settings of `simulate` or `lab` (YAML)."""
+    """Names (main-near, matte-far, ..., simulate-paper), rig files or folders, settings of `simulate` or
+    `lab` (YAML)."""
     all: bool = False
     """All named rigs, as a table."""
     out: Path | None = None

@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from evnlos.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class Command:
@@ -24,8 +26,9 @@ class Command:
     pattern: Path | None = None
     """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
     rig: Path | None = None
-    """Folder that `calibrate` wrote: its fixed pattern is taken from the frames, the pictures are moved to
-    where its wall agrees with the frames, and it is printed how much of the frames they explain."""
+    """Folder that `calibrate` wrote, or the rig.yaml in it: its fixed pattern is taken from the frames, the
+    pictures are moved to where its wall agrees with the frames, and it is printed how much of the frames they
+    explain. No name such as main-near: that needs the light and the camera of this very rig."""
     json: bool = False
     """Print one JSON object."""
 
@@ -36,9 +39,10 @@ class Command:
         from evnlos.dataset import Simulation, load_pattern
         from evnlos.report import reconstruct_capture
 
-        source = self.pattern or self.rig
+        folder = calibrated_folder(self.rig) if self.rig else None
+        source = self.pattern or folder
         pattern = load_pattern(source) if source else None
-        rig = load_yaml(Simulation, self.rig / RIG_FILE) if self.rig else None
+        rig = load_yaml(Simulation, folder / RIG_FILE) if folder else None
         found = reconstruct_capture(self.capture, self.weights, self.out, pattern=pattern, rig=rig)
         if self.json:
             print(json.dumps(found | {"out": str(self.out)}))
@@ -48,6 +52,24 @@ class Command:
             print(_said(found["confidence"]))
         if "scores" in found:
             print("  ".join(f"{name} {value}" for name, value in found["scores"].items() if value is not None))
+
+
+def calibrated_folder(rig: Path) -> Path:
+    """Return the folder of a calibrated rig, which its `rig.yaml` may stand for.
+
+    Raises:
+        ConfigError: There is no such rig; a name is none.
+    """
+    from evnlos.calibration import RIG_FILE
+
+    folder = rig.parent if rig.name == RIG_FILE else rig
+    if not (folder / RIG_FILE).is_file():
+        raise ConfigError(
+            f"--rig is {rig}, which holds no {RIG_FILE}; `reconstruct` takes the folder that `calibrate` wrote "
+            "for this very rig (names such as main-near are for `report` and `identify`); leave it away to "
+            "reconstruct without a rig"
+        )
+    return folder
 
 
 def _said(confidence: dict[str, Any]) -> str:

@@ -20,8 +20,8 @@ class Command:
     split: str = "test"
     """Split to score."""
     rig: str | None = None
-    """Name of the rig or its file, as `identify` takes it: it is drawn, and what it can show stands beside
-    the results. The rig of a simulated dataset is known."""
+    """Name of the rig, its file, or the folder that `calibrate` wrote, as `identify` takes it: it is drawn, and
+    what it can show stands beside the results. The rig of a simulated dataset is known."""
     out: Path = Path("report.html")
     """The page."""
     json: bool = False

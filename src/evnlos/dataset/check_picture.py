@@ -9,11 +9,11 @@ from PIL import Image, ImageDraw, ImageFont
 from evnlos.dataset.capture import Capture
 from evnlos.dataset.sampling import reduce_by_area
 from evnlos.events import event_histogram
+from evnlos.events.colours import OFF_RGB, ON_RGB
 from evnlos.types import Events
 
 _PANEL_PX, _GAP_PX, _CAPTION_PX, _PLOT_PX = 320, 12, 24, 150
 _INK, _PAPER, _LINE = (40, 42, 48), (255, 255, 255), (210, 212, 216)
-_ON, _OFF = np.array([224, 112, 0]), np.array([24, 94, 190])  # told apart with every common colour blindness
 _BINS = 200
 
 
@@ -57,14 +57,14 @@ def check_picture(capture: Capture) -> Image.Image:
     draw.rectangle(box, outline=_LINE)
     middles_s = (times[1:] + times[:-1]) / 2e6
     span = float(min(centres_s[0], times[0] / 1e6)), float(max(centres_s[-1], times[-1] / 1e6))
-    _curve(draw, box, span, centres_s, rates, tuple(_ON))
-    _curve(draw, box, span, middles_s, changes, tuple(_OFF))
+    _curve(draw, box, span, centres_s, rates, ON_RGB)
+    _curve(draw, box, span, middles_s, changes, OFF_RGB)
     at = box[0] + (times[chosen] / 1e6 - span[0]) / max(span[1] - span[0], 1e-9) * (box[2] - box[0])
     draw.line((at, box[1], at, box[3]), _LINE)
     below = box[3] + 5
-    draw.text((box[0], below), f"events a second, up to {rates.max():,.0f}", tuple(_ON), font)
+    draw.text((box[0], below), f"events a second, up to {rates.max():,.0f}", ON_RGB, font)
     peak = f"{100 * changes.max():.2f}" if len(changes) else "0"
-    draw.text((box[0] + 260, below), f"change from frame to frame, up to {peak} % of white", tuple(_OFF), font)
+    draw.text((box[0] + 260, below), f"change from frame to frame, up to {peak} % of white", OFF_RGB, font)
     draw.text((box[2] - 170, below), f"{span[0]:.2f} s to {span[1]:.2f} s", _INK, font)
     return sheet
 
@@ -95,7 +95,7 @@ def _events_tint(events: Events) -> tuple[NDArray, NDArray]:
     on, off = event_histogram(events)[0]
     both = on + off
     full = np.percentile(both[both > 0], 95) if both.any() else 1.0
-    colour = np.where((on > off)[..., None], _ON, _OFF).astype(float)
+    colour = np.where((on > off)[..., None], ON_RGB, OFF_RGB).astype(float)
     return colour, np.clip(both / full, 0, 1)
 
 

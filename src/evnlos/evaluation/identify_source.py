@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from evnlos.calibration.summary import RIG_FILE
 from evnlos.config import from_dict, read_yaml
 from evnlos.dataset import Simulation
 from evnlos.dataset.lab import Lab
@@ -29,19 +30,22 @@ class Described:
         name: Name of the rig, or of its file.
         transport: Its transport.
         camera: Its frame camera.
+        word: What `--rig` takes for it: its name, or its file or folder without those above.
     """
 
     name: str
     transport: AnyTransport
     camera: FrameCamera
+    word: str = ""
 
 
 def described_rig(text: str | Path) -> Described:
-    """Return the rig of a name ("main-near"; "simulate-paper" for a preset of `simulate`) or of a YAML file.
+    """Return the rig of a name ("main-near"; "simulate-paper" for a preset of `simulate`), a file or a folder.
 
     A file holds the settings of `evnlos simulate` or `evnlos lab` (of which `transport` and `frame_camera` are
     taken; what `vary` would draw stays as written), a dataset's `dataset.yaml`, a lab's `lab.yaml`, or the
-    settings of a transport alone; or it is a measured transport (.safetensors).
+    settings of a transport alone; or it is a measured transport (.safetensors). A folder that `evnlos
+    calibrate` wrote stands for the `rig.yaml` in it.
 
     Raises:
         ConfigError: There is no such name and no such file, or the file holds something else.
@@ -51,18 +55,34 @@ def described_rig(text: str | Path) -> Described:
         0.1
     """
     path = Path(text)
+    if (path / RIG_FILE).is_file():
+        path /= RIG_FILE
+    return replace(_read(path, str(text)), word=_word(path, str(text)))
+
+
+def _word(path: Path, text: str) -> str:
+    """Return how a rig is named on a command line, without the folders above it."""
+    if not path.is_file():
+        return text
+    folder = path.resolve().parent.name
+    if path.name == RIG_FILE:
+        return folder
+    return f"{folder}/{path.name}" if path.stem in _IN_A_FOLDER else path.name
+
+
+def _read(path: Path, text: str) -> Described:
     if path.suffix == SUFFIX:
         return Described(path.stem, MeasuredTransport(file=str(path)), FrameCamera())
     if not path.is_file():
         if path.suffix in (".yaml", ".yml"):
             raise ConfigError(f"{path} does not exist; give a rig file or one of {', '.join(rig_names())}")
-        preset = str(text).removeprefix("simulate-")
-        if preset != str(text):
+        preset = text.removeprefix("simulate-")
+        if preset != text:
             if preset not in PRESETS:
                 raise ConfigError(f"simulate has no preset {preset!r}; give one of {', '.join(PRESETS)}")
             simulation = PRESETS[preset]()
-            return Described(str(text), simulation.transport, simulation.frame_camera)
-        return Described(str(text), rig_preset(str(text)), FrameCamera())
+            return Described(text, simulation.transport, simulation.frame_camera)
+        return Described(text, rig_preset(text), FrameCamera())
     name = path.resolve().parent.name if path.stem in _IN_A_FOLDER else path.stem
     values = read_yaml(path)
     if isinstance(values.get("lab"), dict):

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from evnlos.calibration import RigFit
-from evnlos.plot.figure import new_figure
+from evnlos.plot.figure import new_figure, signed_map
 
 
 def draw_calibration(fit: RigFit, path: str | Path) -> None:
@@ -23,6 +23,7 @@ def draw_calibration(fit: RigFit, path: str | Path) -> None:
         MissingDependencyError: matplotlib is not installed.
     """
     with_events = any(example.surface is not None for example in fit.example)
+    signed = signed_map()
     columns, rows = (6 if with_events else 3), len(fit.example)
     figure = new_figure((2.6 * columns, 1.85 * rows + 0.4))
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -30,20 +31,21 @@ def draw_calibration(fit: RigFit, path: str | Path) -> None:
         top = max(float(example.frame.max()), float(example.model.max()))
         miss = example.frame - example.model
         pictures = [(example.frame, "frame", "gray", 0.0, top), (example.model, "model", "gray", 0.0, top)]
-        pictures.append((miss, "frame - model, times 5", "RdBu_r", -top / 5, top / 5))
+        pictures.append((miss, "frame - model, times 5", signed, -top / 5, top / 5))
         if example.surface is not None and example.model_surface is not None:
             seen, made = (s[0] - s[1] for s in (example.surface, example.model_surface))
             peak = float(np.abs(seen).max())
             pictures += [
-                (seen, "events: ON - OFF", "RdBu_r", -peak, peak),
-                (made, "model", "RdBu_r", -peak, peak),
-                (seen - made, "difference", "RdBu_r", -peak, peak),
+                (seen, "events: ON - OFF", signed, -peak, peak),
+                (made, "model", signed, -peak, peak),
+                (seen - made, "difference", signed, -peak, peak),
             ]
         for axis in line:
             axis.set_axis_off()
         for axis, (picture, title, colours, low, high) in zip(line, pictures, strict=False):
             axis.imshow(picture, cmap=colours, vmin=low, vmax=high)
             axis.set_title(f"{example.name}: {title}" if title == "frame" else title, fontsize=8)
+    figure.supxlabel("differences and events: light orange above 0, grey at 0, dark blue below", fontsize=8)
     # Noise hardly compresses: fewer colours keep the picture small.
     drawn = BytesIO()
     figure.savefig(drawn, dpi=60, format="png")

@@ -10,13 +10,9 @@ from PIL import Image, ImageDraw
 
 from evnlos.errors import DataError
 from evnlos.events import event_histogram
+from evnlos.events.colours import OFF_RGB, ON_RGB
 from evnlos.types import Events
 
-# Orange and blue: told apart with every common kind of colour blindness, and seen on white and on black.
-ON_RGB = (222, 112, 0)
-"""Colour of events that are brighter."""
-OFF_RGB = (38, 124, 235)
-"""Colour of events that are darker."""
 _FAINTEST = 0.35  # how strongly a single event is drawn where many are usual
 _CLEAR, _BOX, _PLANE, _LATER, _ON, _OFF, _ON_NOW, _OFF_NOW = range(8)
 
@@ -120,7 +116,7 @@ def signed_pictures(maps: NDArray, top: float | None = None, faintest: float = _
 
     Example:
         >>> signed_pictures(np.array([[[1.0, 0.0]], [[0.0, 0.0]]])).tolist()
-        [[[222, 112, 0, 255], [0, 0, 0, 0]]]
+        [[[226, 120, 0, 255], [0, 0, 0, 0]]]
     """
     maps = np.asarray(maps, np.float32)
     lit = maps[maps > 0]

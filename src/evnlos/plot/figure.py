@@ -20,6 +20,20 @@ def new_figure(size: tuple[float, float]) -> Any:
     return Figure(size, layout="constrained")
 
 
+def signed_map() -> Any:
+    """Return a colour map for values of either sign, dark blue below 0, grey at 0, light orange above.
+
+    It grows lighter all the way, so the sign stays told in grey print, where a map with a pale middle loses it.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    new_figure((1.0, 1.0))  # or the line that says what to install
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("signed", ["#082060", "#8e8e92", "#ffdea0"])
+
+
 def themed(theme: Literal["light", "dark"]) -> Any:
     """Return a context in which figures are made and saved on a light or a dark ground.
 

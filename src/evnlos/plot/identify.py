@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evnlos.plot.figure import new_figure
+from evnlos.plot.figure import new_figure, signed_map
 
 if TYPE_CHECKING:
     from evnlos.evaluation.identify import Identification
@@ -39,7 +39,7 @@ def draw_identification(found: Identification, path: str | Path) -> Path:
         _picture(figure.add_subplot(pictures[row, 0]), image, title)
     for k, mode in enumerate(at.modes):
         place = figure.add_subplot(pictures[k // 4, 1 + k % 4])
-        _picture(place, mode, f"mode {k + 1}", "RdBu_r", float(mode.abs().max()))
+        _picture(place, mode, f"mode {k + 1}", signed_map(), float(mode.abs().max()))
     words = figure.add_subplot(pictures[:, 5])
     words.set_axis_off()
     strokes = " x ".join("none" if w is None else f"{1e3 * w:.1f}" for w in at.stroke_m)
@@ -47,7 +47,8 @@ def draw_identification(found: Identification, path: str | Path) -> Path:
         0.0,
         0.5,
         f"{found.modes} modes > 1e-2\n{at.patterns} patterns > noise\nbars {strokes} mm\n"
-        f"linear {at.psnr_db:.1f} dB\nmean {found.mean_db:.1f} dB\nblack {found.zero_db:.1f} dB",
+        f"linear {at.psnr_db:.1f} dB\nmean {found.mean_db:.1f} dB\nblack {found.zero_db:.1f} dB\n"
+        "modes: light > 0 > dark",
         va="center",
         fontsize=9,
     )
@@ -97,7 +98,7 @@ def _above(values: Any, floor: float) -> Any:
     return np.where(values > floor, values, np.nan)
 
 
-def _picture(axes: Any, image: Any, title: str, cmap: str = "gray", largest: float | None = None) -> None:
+def _picture(axes: Any, image: Any, title: str, cmap: Any = "gray", largest: float | None = None) -> None:
     low, high = (0.0, 1.0) if largest is None else (-largest, largest)
     axes.imshow(image.numpy(), cmap=cmap, vmin=low, vmax=high)
     axes.set_title(title, fontsize=8)

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evnlos.events.colours import OFF_HEX, ON_HEX
 from evnlos.plot.figure import new_figure
 from evnlos.types import Events
-
-_ON, _OFF = "#c84a00", "#185ebe"  # told apart with every common kind of colour blindness
 
 
 def share_on_frame_times(events: Events, times_s: ArrayLike) -> float:
@@ -60,7 +59,7 @@ def draw_time_stamps(
         shown &= (events.t_us >= 1e6 * start) & (events.t_us <= 1e6 * stop)
         for frame_ms in frames_ms:
             axes.axvline(frame_ms, color="#d8d8d8", linewidth=0.6, zorder=0)
-        for sign, colour, name in ((True, _ON, "ON"), (False, _OFF, "OFF")):
+        for sign, colour, name in ((True, ON_HEX, "ON"), (False, OFF_HEX, "OFF")):
             part = events[shown & (events.p == sign)]
             axes.scatter(part.t_us / 1e3, part.x, s=7, color=colour, linewidths=0, label=name)
         share = share_on_frame_times(events, times_s)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.errors import ConfigError
+from evnlos.events.colours import OFF_RGB, ON_RGB
 from evnlos.events.summary import Summary
 from evnlos.types import Events
 
@@ -18,11 +19,10 @@ Style = Literal["polarity", "surface"]
 """Events of each window by sign, or the newest event of each pixel, fading."""
 Background = Literal["dark", "light"]
 
-# Orange and blue: told apart with every common kind of colour blindness. Background, ON, OFF, text and events
-# without a polarity, bar.
+# Background, ON, OFF, text and events without a polarity, bar.
 _COLOURS = {
-    "dark": ((14, 16, 20), (255, 176, 66), (74, 152, 255), (205, 208, 214), (52, 56, 64)),
-    "light": ((255, 255, 255), (200, 74, 0), (24, 94, 190), (60, 64, 72), (224, 226, 230)),
+    "dark": ((14, 16, 20), ON_RGB, OFF_RGB, (205, 208, 214), (52, 56, 64)),
+    "light": ((255, 255, 255), ON_RGB, OFF_RGB, (60, 64, 72), (224, 226, 230)),
 }
 _FAINTEST = 0.3  # how strongly a single event is drawn where many are usual
 _CAPTION_PX = 26
@@ -80,7 +80,7 @@ def preview_pictures(
         >>> events = Events([0, 900], [0, 3], [1, 1], [1, 0], width=4, height=2)
         >>> pictures = preview_pictures([events], summarise([events]), Look(frames=2))
         >>> len(pictures), pictures[0].shape, pictures[0][-30, 0].tolist()
-        (2, (266, 480, 3), [255, 176, 66])
+        (2, (266, 480, 3), [226, 120, 0])
     """
     look = look or Look()
     windows = _windows(summary, look)

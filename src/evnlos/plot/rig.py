@@ -13,6 +13,8 @@ from evnlos.transport import PaperTransport, RadiometricTransport
 
 _WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
 _LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # told apart with every common kind of colour blindness
+PARTITION = "hides the object (sketch)"
+"""What stands beside the line that no rig's settings state."""
 _STEPS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
@@ -35,7 +37,8 @@ def rig_drawing(
 ) -> Drawing:
     """Return the rig from above, to scale: wall, object and its way, cameras and their view, what is between.
 
-    Where the paper's transport has no place of the camera, none is drawn.
+    Where the paper's transport has no place of the camera, none is drawn. Occluders of the rig stand where they
+    are; what hides the object from the camera is in no rig's settings, so a dotted line sketches it.
 
     Args:
         rig: The rig.
@@ -77,6 +80,12 @@ def rig_drawing(
             parts.append(
                 ("line", [tuple(c) for c in (*corners, corners[0])], "stroke='currentColor' stroke-width='3'")
             )
+            parts.append(("text", [tuple(corners.mean(axis=0))], "occluder"))
+        hidden = _partition(eye, seen, (middle - half, middle + half), deep)
+        if hidden is not None:
+            dotted = "stroke='currentColor' stroke-width='3' stroke-dasharray='2 4' data-part='partition'"
+            parts += [("line", list(hidden), dotted), ("text", [hidden[1]], PARTITION)]
+            around += list(hidden)
         if rig.lamp_m is not None:
             lamp = (rig.lamp_m[0], rig.lamp_m[2])
             parts += [("disc", [lamp], f"fill='{_LIGHT}'"), ("text", [lamp], "lamp")]
@@ -92,6 +101,31 @@ def rig_drawing(
     parts.append(("line", [(-reach, 0.0), (reach, 0.0)], "stroke='currentColor' stroke-width='5'"))
     around += [(-reach, 0.0), (reach, 0.0)]
     return Drawing(_svg(parts, np.array(around), _words(rig), deep))
+
+
+def _partition(
+    eye: tuple[float, float], seen: list[tuple[float, float]], way: tuple[float, float], deep: float
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Return a line that hides the object's whole way from the camera and leaves light and sight free.
+
+    It stands between the object's way and the camera's nearer line of sight, upright on the wall.
+
+    Returns:
+        Its ends (x, z), metres, from the object's depth on; None where the camera is no deeper than the object,
+        or there is no gap.
+    """
+    if eye[1] <= deep:
+        return None
+    side = 1.0 if eye[0] > (way[0] + way[1]) / 2 else -1.0
+    near, far = max(way, key=lambda x: side * x), min(way, key=lambda x: side * x)
+    share = deep / eye[1]
+    sight = min((x + share * (eye[0] - x) for x, _ in seen), key=lambda x: side * x)
+    if side * (sight - near) <= 0:
+        return None
+    x = (near + sight) / 2
+    steepest = deep + (x - far) / (eye[0] - far) * (eye[1] - deep)  # where the line to the far end passes
+    end = deep + 1.15 * (steepest - deep)
+    return (x, deep), (x, end)
 
 
 def _object(rig: RadiometricTransport | PaperTransport) -> tuple[float, float]:

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import DataError
-from evnlos.plot.event_views import OFF_RGB, ON_RGB, signed_pictures, time_slices
+from evnlos.events.colours import OFF_HEX, ON_HEX
+from evnlos.plot.event_views import signed_pictures, time_slices
 from evnlos.plot.figure import new_figure, themed
 from evnlos.plot.film import Theme
 from evnlos.types import Events
 
-_ON, _OFF = (tuple(level / 255 for level in colour) for colour in (ON_RGB, OFF_RGB))
 _MOST = 20_000  # points that a cloud draws
 
 
@@ -76,7 +76,7 @@ def draw_events(path: str | Path, events: Events, theme: Theme = "light") -> Pat
         figure = new_figure((10.5, 4.2))
         grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
         cloud = figure.add_subplot(grid[:, 0], projection="3d")
-        for sign, colour, name in ((True, _ON, "ON, brighter"), (False, _OFF, "OFF, darker")):
+        for sign, colour, name in ((True, ON_HEX, "ON, brighter"), (False, OFF_HEX, "OFF, darker")):
             one = part[part.p == sign]
             cloud.scatter(
                 one.t_us / 1e6, one.x, -one.y.astype(float), s=1, color=colour, linewidths=0, label=name

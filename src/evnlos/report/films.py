@@ -7,6 +7,7 @@ import html
 import numpy as np
 
 from evnlos.dataset import Dataset, read_shard
+from evnlos.events.colours import WORDS
 from evnlos.report.gather import RunResult
 from evnlos.report.pictures import animation, data_uri, grey, png, polarity, stretched, strip
 from evnlos.report.tables import label
@@ -59,8 +60,9 @@ def animations_section(dataset: Dataset, results: list[RunResult]) -> str:
             f"<figcaption>{html.escape(name)}</figcaption></figure>"
         )
     return (
-        "<h2>Moving</h2><p class=dim>Wall frame, events as time surface, truth, and the picture of "
-        f"{html.escape(label(best))}, the run with the highest mean PSNR. Print shows the first position.</p>"
+        f"<h2>Moving</h2><p class=dim>Wall frame, events as time surface ({WORDS}), truth, and the "
+        f"picture of {html.escape(label(best))}, the run with the highest mean PSNR. Print shows the first "
+        "position.</p>"
         f"<div class=movies>{''.join(cells)}</div>"
     )
 

@@ -10,7 +10,7 @@ from typing import Any
 from evnlos.dataset import PARADIGMS, Dataset, open_dataset
 from evnlos.errors import DataError
 from evnlos.evaluation import Evaluation, available_lpips, evaluate
-from evnlos.model import JointNetwork, load_weights
+from evnlos.model import JointNetwork, load_weights, published
 
 METHODS = ("simulation only", "E2E", "EPNP")
 
@@ -20,13 +20,14 @@ class RunResult:
     """One trained network, evaluated.
 
     Args:
-        name: The run's folder name.
+        name: The run's folder name, a weights file's stem, or the name of published weights.
         paradigm: "frame", "event" or "fusion".
         is_joint: Whether it sees whole passes.
         method: "simulation only" (pre-trained, no capture seen), "E2E" (captures alone) or "EPNP" (both).
         evaluation: Pictures and scores on the split.
         log: One record an epoch.
         history: The trainings behind the weights, oldest first.
+        is_published: Whether the weights come with the package, by this name.
     """
 
     name: str
@@ -36,6 +37,7 @@ class RunResult:
     evaluation: Evaluation
     log: list[dict[str, Any]]
     history: list[dict[str, Any]]
+    is_published: bool = False
 
     @property
     def kind(self) -> str:
@@ -55,15 +57,40 @@ def gather(runs: list[str | Path], data: str | Path, split: str = "test") -> tup
     results = []
     for run in map(Path, runs):
         weights = load_weights(run)
-        folder = run if run.is_dir() else run.parent
-        log = folder / "metrics.jsonl"
-        lines = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
+        name, is_published = named(run)
+        lines = _log_of(run)
         refuse_seen(weights.history, dataset, split)
         evaluation = evaluate(weights, dataset, split, available_lpips())
         kind = (weights.paradigm, isinstance(weights.network, JointNetwork), method_of(weights.history))
-        results.append(RunResult(folder.name, *kind, evaluation, lines, weights.history))
+        results.append(RunResult(name, *kind, evaluation, lines, weights.history, is_published))
     results.sort(key=lambda r: (METHODS.index(r.method), r.is_joint, PARADIGMS.index(r.paradigm)))  # type: ignore[arg-type]
     return dataset, results
+
+
+def _log_of(run: Path) -> list[dict[str, Any]]:
+    """Return the training log beside a run's weights; a weights file of another name has none."""
+    folder = run if run.is_dir() else run.parent
+    log = folder / "metrics.jsonl"
+    if not log.is_file() or not (run.is_dir() or run.stem == "weights"):
+        return []
+    return [json.loads(line) for line in log.read_text().splitlines()]
+
+
+def named(run: Path) -> tuple[str, bool]:
+    """Return what weights are called, without folders, and whether they come with the package.
+
+    A run is called by its folder, also where its `weights.safetensors` is given; any other file by its stem.
+
+    Example:
+        >>> named(Path("runs/epnp/weights.safetensors")), named(Path("shared/mine.safetensors"))
+        (('epnp', False), ('mine', False))
+    """
+    if not run.exists() and str(run) in published():
+        return str(run), True
+    run = run.resolve()
+    if run.is_dir():
+        return run.name, False
+    return (run.parent.name if run.stem == "weights" else run.stem), False
 
 
 def method_of(history: list[dict[str, Any]]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import platform
-import shlex
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -12,25 +11,55 @@ import torch
 import yaml
 
 from evnlos.dataset import Dataset
+from evnlos.evaluation.identify_source import Described
+from evnlos.report.commands import Commands
 from evnlos.report.gather import RunResult
-from evnlos.report.tables import label
 from evnlos.version import __version__
 
+_MOST_NAMES = 60  # of objects that are listed one by one; a simulation has hundreds
 _PACKAGES = ("torch", "numpy", "numba", "h5py", "Pillow")
 
 
-def origin_section(dataset: Dataset, results: list[RunResult], split: str) -> str:
-    """Return the last section: environment, commands, settings."""
-    about: dict[str, Any] = {"dataset": {"name": dataset.folder.resolve().name, "settings": dataset.config}}
-    about["runs"] = {label(r): r.history for r in results}
-    text = yaml.safe_dump(about, sort_keys=False, allow_unicode=True)
-    return (
+def origin_section(dataset: Dataset, results: list[RunResult], split: str, rig: Described | None = None) -> str:
+    """Return the section of environment, commands and settings; `rig` is the one that was named."""
+    commands = Commands(dataset, results, split, rig)
+    parts = [
         f"<h2>How it was made</h2><p>{html.escape(environment())}</p>"
-        "<p>To make it again, with the settings below in files of these names:</p>"
-        f"<pre>{html.escape(chr(10).join(commands(dataset, results, split)))}</pre>"
-        "<details><summary>Settings and versions of every training</summary>"
-        f"<pre>{html.escape(text)}</pre></details>"
+        "<p>To make it again, where the folders of the captures lie, with the files of settings below:</p>"
+        f"{_pre(chr(10).join(commands.again()))}"
+    ]
+    if behind := commands.published():
+        parts.append(
+            "<p>Weights of these names come with the package; the report needs no training of them. They were "
+            f"trained so:</p>{_pre(chr(10).join(behind))}"
+        )
+    about: dict[str, Any] = {"dataset": {"name": dataset.folder.resolve().name, "settings": dataset.config}}
+    about["runs"] = {r.name: [_without_settings(step) for step in r.history] for r in results}
+    files = "".join(f"<h3>{html.escape(name)}</h3>{_pre(_yaml(one))}" for name, one in commands.files().items())
+    return (
+        "".join(parts) + f"<details><summary>Files of settings</summary>{files}</details>"
+        f"<details><summary>Data and versions of every training</summary>{_pre(_yaml(about))}</details>"
     )
+
+
+def _without_settings(step: dict[str, Any]) -> dict[str, Any]:
+    """Return what a training was apart from its settings; of many objects their number and ends."""
+    data = {key: _short(value) for key, value in step["data"].items()}
+    return {key: value for key, value in step.items() if key != "settings"} | {"data": data}
+
+
+def _short(value: Any) -> Any:
+    if isinstance(value, list) and len(value) > _MOST_NAMES:
+        return f"{len(value)}, {value[0]} to {value[-1]}"
+    return value
+
+
+def _yaml(value: Any) -> str:
+    return yaml.safe_dump(value, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100)
+
+
+def _pre(text: str) -> str:
+    return f"<pre>{html.escape(text)}</pre>"
 
 
 def environment() -> str:
@@ -44,32 +73,3 @@ def environment() -> str:
             continue
     system = f"{platform.system()} {platform.machine()}, {torch.get_num_threads()} threads, {device}"
     return f"{', '.join(parts)}; {system}"
-
-
-def commands(dataset: Dataset, results: list[RunResult], split: str) -> list[str]:
-    """Return the commands behind the runs, trainings first, each once."""
-    made: dict[str, None] = {}
-    for r in results:
-        before = None
-        for number, step in enumerate(r.history, start=1):
-            last = number == len(r.history)
-            out = r.name if last else f"{r.name}-{number}"
-            words = ["evnlos", "finetune" if before else "train", "--data", step["data"]["name"]]
-            words += ["--weights", before] if before else []
-            made[shlex.join([*words, "--config", f"{out}.yaml", "--out", out])] = None
-            before = out
-    words = ["evnlos", "report", *(r.name for r in results), "--data", dataset.folder.resolve().name]
-    if dataset.origin == "captures":
-        names = dataset.objects()
-        held = [word for key in ("validation", "test") for word in _flag(key, dataset.split.get(key, []))]
-        folder = dataset.folder.resolve().name
-        return [shlex.join(["evnlos", "import", *names, "--out", folder, *held]), *made, _report(words, split)]
-    return [*made, _report(words, split)]
-
-
-def _flag(name: str, values: list[str]) -> list[str]:
-    return [f"--{name}", *values] if values else []
-
-
-def _report(words: list[str], split: str) -> str:
-    return shlex.join([*words, "--split", split, "--out", "report.html"])

@@ -12,10 +12,12 @@ from evnlos.dataset import Dataset, character_of, read_shard
 from evnlos.evaluation import CHECKS
 from evnlos.evaluation.identify import Identification
 from evnlos.evaluation.identify_source import Described
+from evnlos.events.colours import WORDS
 from evnlos.report.belief import belief_section
 from evnlos.report.curves import curves_svg
 from evnlos.report.films import animations_section, failures_section, strips_section
 from evnlos.report.gather import RunResult
+from evnlos.report.glossary import Glossary
 from evnlos.report.lead import lead
 from evnlos.report.origin import origin_section
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
@@ -60,15 +62,16 @@ def write_report(
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    words, metrics = Glossary(), available_metrics(results)
     content = "\n".join(
         [
             "<!doctype html><html lang=en><meta charset=utf-8>",
             "<meta name=viewport content='width=device-width,initial-scale=1'>",
             f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
-            _head(dataset, results, notes, split),
+            _head(dataset, results, notes, split, words),
             setup_section(rig.name if rig else "", rig.transport if rig else None),
             lead(results),
-            *(_table(results, metric, *about) for metric, about in available_metrics(results).items()),
+            *(_table(results, metric, *about, words) for metric, about in metrics.items()),
             _checks(results),
             belief_section(results),
             _pictures(dataset, results),
@@ -78,7 +81,8 @@ def write_report(
             limits_section(limits),
             _curves(results),
             _optics(dataset, results),
-            origin_section(dataset, results, split),
+            origin_section(dataset, results, split, None if limits is None else rig),
+            words.section(list(metrics)),
             "</html>",
         ]
     )
@@ -87,7 +91,7 @@ def write_report(
     return path
 
 
-def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: str) -> str:
+def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: str, words: Glossary) -> str:
     first = results[0].evaluation
     objects = ", ".join(character_of(name) for name in first.characters())
     lines = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
@@ -95,6 +99,7 @@ def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: s
     canvas = (
         f"{sampling.width * sampling.pitch_m * 100:g} cm x {sampling.scored_rows * sampling.pitch_m * 100:g} cm"
     )
+    psnr = words.link("psnr_db")
     no_lpips = (
         ""
         if results[0].evaluation.scores.lpips is not None
@@ -104,19 +109,23 @@ def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: s
     return (
         "<h1>Around the corner: reconstructions of hidden moving objects</h1>"
         f"<p class=dim>evnlos {__version__} · {seen}, split “{html.escape(split)}”</p>{lines}"
-        f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm a pixel; PSNR is the mean over "
+        f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm a pixel; {psnr} is the mean over "
         "the pictures of each picture's PSNR with peak 1. The first columns are what one scores without "
         "looking: an all-black picture, and the mean of the training pictures, then what pure memory scores. A "
         f"method that does not exceed them has learned nothing.{no_lpips}</p>"
-        "<p><b>E2E</b>: trained on the captures alone. <b>EPNP</b>: pre-trained on simulation, then fine-tuned "
-        "on the captures. <span class=best>Best</span> and <span class=second>second best</span> of a row are "
+        f"<p><b>{words.link('e2e')}</b>: trained on the captures alone. <b>{words.link('epnp')}</b>: "
+        "pre-trained on simulation, then fine-tuned on the captures. <span class=best>Best</span> and "
+        "<span class=second>second best</span> of a row are "
         "marked.</p>"
     )
 
 
-def _table(results: list[RunResult], metric: str, title: str, unit: str, decimals: int) -> str:
+def _table(results: list[RunResult], metric: str, title: str, unit: str, decimals: int, words: Glossary) -> str:
     skip = len(baselines_of(results))
-    heads = "".join(f"<th>{html.escape(c)}</th>" for c in columns_of(results))
+    columns = columns_of(results)
+    heads = "".join(f"<th>{html.escape(c)}</th>" for c in columns[:skip])
+    heads += "".join(f"<th>{words.label(c)}</th>" for c in columns[skip:])
+    better = "&uarr; higher is better" if larger_is_better(metric) else "&darr; lower is better"
     lines = []
     for group, character, values in rows_of(results, metric):
         ranked = values if larger_is_better(metric) else [None if v is None else -v for v in values]
@@ -128,8 +137,11 @@ def _table(results: list[RunResult], metric: str, title: str, unit: str, decimal
         )
         kind = " class=mean" if character == "mean" else ""
         lines.append(f"<tr{kind}><td>{html.escape(group)} {html.escape(character)}</td>{cells}</tr>")
-    heading = f"{title}, {unit}" if unit else title
-    return f"<h2>{heading}</h2><div class=wide><table><tr><th></th>{heads}</tr>{''.join(lines)}</table></div>"
+    heading = words.link(metric, title) + (f", {unit}" if unit else "")
+    return (
+        f"<h2>{heading}</h2><div class=wide><table><tr><th class=better>{better}</th>{heads}</tr>"
+        f"{''.join(lines)}</table></div>"
+    )
 
 
 def _checks(results: list[RunResult]) -> str:
@@ -170,20 +182,24 @@ def _pictures(dataset: Dataset, results: list[RunResult]) -> str:
     grid = f"grid-template-columns:4.5rem repeat({len(heads) - 1},100px)"
     return (
         "<h2>Pictures</h2><p class=dim>The middle position of each object. Wall frame stretched in contrast; "
-        "events as time surface (red brighter, blue darker); reconstructions and truth from 0 to 1.</p>"
+        f"events as time surface ({WORDS}); reconstructions and truth from 0 to 1.</p>"
         f"<div class=shots style='{grid}'>{''.join(f'<div>{c}</div>' for c in cells)}</div>"
     )
 
 
 def _curves(results: list[RunResult]) -> str:
-    series: dict[str, list[tuple[float, float]]] = {}
-    scores: dict[str, list[tuple[float, float]]] = {}
-    for r in results:
-        series[label(r)] = [(line["epoch"], line["loss"]) for line in r.log]
-        scores[label(r)] = [(line["epoch"], line["psnr_db"]) for line in r.log if "psnr_db" in line]
+    """Show loss and score over the epochs of the runs whose log is there, and say whose is not."""
+    logged = [r for r in results if r.log]
+    series = {label(r): [(line["epoch"], line["loss"]) for line in r.log] for r in logged}
+    scores = {
+        label(r): [(line["epoch"], line["psnr_db"]) for line in r.log if "psnr_db" in line] for r in logged
+    }
     parts = [curves_svg(series, "epoch", "loss of the training")]
     if any(scores.values()):
         parts.append(curves_svg(scores, "epoch", "PSNR on the validation objects, dB"))
+    if without := [r.name for r in results if not r.log]:
+        names = html.escape(", ".join(without))
+        parts.append(f"<p class=dim>No curve, for a weights file holds no log of its training: {names}.</p>")
     return "<h2>Training</h2>" + "".join(parts)
 
 
@@ -202,5 +218,6 @@ def _optics(dataset: Dataset, results: list[RunResult]) -> str:
     return (
         "<h2>Optics of the simulation</h2><p class=dim>Fresnel number of half a plate; blur by diffraction and "
         "radius of the tPSF in camera pixels; distance up to which the sampled wave is true, in metres.</p>"
-        f"<table><tr><th>dataset</th><th></th><th></th></tr>{''.join(lines)}</table>"
+        "<div class=wide><table><tr><th>dataset</th><th></th><th></th></tr>"
+        f"{''.join(lines)}</table></div>"
     )

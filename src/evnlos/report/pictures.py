@@ -12,11 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from evnlos.config import write_atomically
-
-_ON, _OFF = (
-    np.array([178, 58, 18]),
-    np.array([26, 92, 170]),
-)  # vermilion and blue: told apart by the colour-blind
+from evnlos.events.colours import OFF_RGB, ON_RGB
 
 
 def grey(image: ArrayLike, low: float = 0.0, high: float = 1.0) -> NDArray[np.uint8]:
@@ -32,10 +28,10 @@ def stretched(image: ArrayLike) -> NDArray[np.uint8]:
 
 
 def polarity(surface: ArrayLike) -> NDArray[np.uint8]:
-    """Return a surface [2, H, W] (ON, OFF) as 8-bit RGB [H, W, 3]: ON red, OFF blue, nothing white."""
+    """Return a surface [2, H, W] (ON, OFF) as 8-bit RGB [H, W, 3]: ON orange, OFF blue, nothing white."""
     maps = np.asarray(surface, dtype=np.float64)
     on, off = np.clip(maps / max(float(maps.max()), 1e-12), 0, 1)
-    picture = 255 - on[..., None] * (255 - _ON) - off[..., None] * (255 - _OFF)
+    picture = 255 - on[..., None] * (255 - np.array(ON_RGB)) - off[..., None] * (255 - np.array(OFF_RGB))
     return np.clip(picture, 0, 255).astype(np.uint8)
 
 

@@ -9,7 +9,7 @@ import torch
 
 from evnlos.evaluation.identify import Identification
 from evnlos.evaluation.identify_rig import AnyTransport
-from evnlos.plot.rig import rig_drawing
+from evnlos.plot.rig import PARTITION, rig_drawing
 from evnlos.report.curves import curves_svg
 from evnlos.report.pictures import data_uri, grey, png
 from evnlos.transport import MeasuredTransport
@@ -30,7 +30,12 @@ def setup_section(name: str, rig: AnyTransport | None, travel_m: float = 0.16, p
         "watch the wall and never see the object."
     )
     drawn = rig_drawing(rig, travel_m, plate_m).svg
-    return f"{head}<p>{told} Rig: {html.escape(name)}.</p><div class=rig>{drawn}</div>"
+    hides = (
+        " What hides the object is not among the settings of the rig: the dotted line is a sketch."
+        if PARTITION in drawn
+        else " What hides the object is not among the settings of the rig, and is not drawn."
+    )
+    return f"{head}<p>{told} Rig: {html.escape(name)}.</p><div class=rig>{drawn}</div><p class=dim>{hides}</p>"
 
 
 def limits_section(found: Identification | None) -> str:
@@ -38,9 +43,8 @@ def limits_section(found: Identification | None) -> str:
     if found is None:
         return ""
     at = found.at_camera
-    spectrum = [(float(k), float(v)) for k, v in enumerate(_logs(at.spectrum), start=1)]
-    picard = [(float(k), float(v)) for k, v in enumerate(_logs(at.picard), start=1)]
-    noise = [(1.0, 0.0), (float(len(at.spectrum)), 0.0)]
+    spectrum, picard = _points(at.spectrum), _points(at.picard)
+    noise = [(1.0, 0.0), (max(x for x, _ in [(2.0, 0.0), *spectrum, *picard]), 0.0)]
     series = {"singular value / noise": spectrum, "a letter's coefficient / noise": picard, "noise": noise}
     pictures = "".join(
         f"<figure><img class=large alt='{words}' src='{data_uri(png(grey(image.numpy())))}'>"
@@ -58,5 +62,9 @@ def limits_section(found: Identification | None) -> str:
     )
 
 
-def _logs(values: torch.Tensor) -> np.ndarray:
-    return np.log10(np.maximum(values.numpy(), _LOWEST))
+def _points(values: torch.Tensor) -> list[tuple[float, float]]:
+    """Return number and logarithm of each value up to the last one that stands above the lowest drawn."""
+    above = np.flatnonzero(values.numpy() > _LOWEST)
+    last = int(above[-1]) + 1 if len(above) else 0
+    logs = np.log10(np.maximum(values.numpy()[:last], _LOWEST))
+    return [(float(k), float(v)) for k, v in enumerate(logs, start=1)]
