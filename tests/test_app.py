@@ -316,6 +316,11 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
             urllib.request.urlopen(urllib.request.Request(home, headers={"Host": "evil.example"}), timeout=60)
         assert stop.value.code == 403
         stop.value.close()
+        browser.open(f"{home.rstrip('/')}/?__theme=dark")
+        assert browser.wait(
+            "const box = document.querySelector('.ev-before');"
+            " return box ? getComputedStyle(box).backgroundColor : document.querySelector('.dark') && 'gone'"
+        ) in ("rgb(10, 15, 30)", "gone")
         browser.open(home)
         # The pictures are there before Gradio is, and give way to its own.
         width = browser.wait("const p = document.querySelector('.ev-picture'); return p && p.offsetWidth")
@@ -389,3 +394,27 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
     assert len(asked) > 20 and strangers(asked, home) == []
     assert complaints == []
     assert not [one for one in tmp_path.iterdir() if one.name.startswith("evnlos-app-")]
+
+
+@pytest.mark.parametrize(
+    ("path", "root", "changed"),
+    [("/", "", True), ("/x/", "/x", True), ("/x", "/x", True), ("/config", "", False)],
+)
+def test_scripts_come_with_the_page_and_with_nothing_else(path, root, changed) -> None:
+
+    page, sent = b"<body></body>", []
+
+    async def app(scope, receive, send) -> None:
+        headers = [(b"content-length", b"%d" % len(page))]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": page})
+
+    async def send(message) -> None:
+        sent.append(message)
+
+    *_, scripts = middleware("<script>1</script>", None)
+    wrapped = scripts.cls(app, *scripts.args, **scripts.kwargs)
+    asyncio.run(wrapped({"type": "http", "path": path, "root_path": root}, None, send))
+    body = sent[1]["body"]
+    assert (body == b"<body><script>1</script></body>") == changed
+    assert dict(sent[0]["headers"])[b"content-length"] == str(len(body)).encode()

@@ -95,5 +95,6 @@ class _Scripts:
             started.clear()
             await send({**message, "body": body})
 
-        is_page = scope["type"] == "http" and scope["path"] == "/"
+        below = scope.get("root_path", "")
+        is_page = scope["type"] == "http" and scope["path"].removeprefix(below) in ("", "/")
         await self.app(scope, receive, send_with_scripts if is_page else send)
