@@ -202,7 +202,7 @@ def test_without_weights_published_ones_that_fit_are_taken(tiny_captures, tmp_pa
 def test_report_is_one_page_without_requests(runs, shots, tmp_path, capsys) -> None:
     call("report", *runs.values(), "--data", shots, "--out", tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
-    assert not re.findall(r"(?:src|href)=['\"](?!data:)", page)
+    assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
     assert not re.findall(r"https?:", page.replace("http://www.w3.org/2000/svg", ""))
     # One position, a strip of truth and runs, an animation, the worst pictures of each run.
     assert page.count("<img") == (3 + len(runs)) + (1 + len(runs)) + 1 + 6 * len(runs)

@@ -3,7 +3,6 @@
 import html
 import re
 import shlex
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -237,7 +236,7 @@ def _parsed(line: str, monkeypatch: pytest.MonkeyPatch):
     module = module_of(verb)
     parsed = []
     monkeypatch.setattr(module.Command, "run", lambda command: parsed.append(command))
-    monkeypatch.setattr(sys.modules[main.__module__], "load_yaml", lambda kind, _: kind())
+    monkeypatch.setattr("evnlos.config.load_yaml", lambda kind, _: kind())
     main([verb, *rest])
     assert program == "evnlos" and len(parsed) == 1 and not any(word in ("", ".") for word in rest)
     return parsed[0]

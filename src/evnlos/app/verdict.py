@@ -45,4 +45,4 @@ def verdict_on(simulation: Simulation) -> Verdict:
         f"On handwriting, the best linear picture from one frame reaches {found.at_camera.psnr_db:.1f} dB; "
         f"a mean character {found.mean_db:.1f} dB, an all-black picture {found.zero_db:.1f} dB."
     )
-    return Verdict(meaning[:1].upper() + meaning[1:], f"{reason}.", figures)
+    return Verdict(f"From one frame, {meaning}", f"{reason}.", figures)

@@ -23,8 +23,8 @@ _WORDS = {
     "whole pass": "The one picture that explains all frames of the pass together.",
     "dB": "PSNR: ten decibels more are a tenth of the squared error. It means something only beside the value "
     "of an all-black picture at the same instant.",
-    "verdict": "What wall and noise leave to be seen, whatever the method. Where they leave nothing, a network "
-    "may still draw a letter: it remembers one.",
+    "verdict": "What wall and noise leave to be seen in one frame, whatever the method; a whole pass shows "
+    "more. Where they leave nothing, a network may still draw a letter: it remembers one.",
 }
 
 GLOSSARY = (

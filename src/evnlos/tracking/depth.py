@@ -13,16 +13,15 @@ from evnlos.types import Plane
 
 REACH = 0.3
 """Largest change of the distance's logarithm that is looked for: 0.74 to 1.35 of the rig's own distance."""
-_NODES = -REACH * np.cos(
-    np.pi * np.arange(13) / 12
-)  # Chebyshev's: between even ones the polynomials would swing
-_BASIS = np.linalg.inv(
-    np.vander(_NODES, increasing=True)
-)  # coefficients of Lagrange's polynomials, [power, node]
+_STEP = 0.05  # of the logarithm between two matrices: the light moves by less than any wall's blur
+_NODES = np.linspace(-REACH, REACH, round(2 * REACH / _STEP) + 1)
+_NEAR = 4  # matrices that one in between is made of
+# Coefficients of Lagrange's cubics over the steps -1, 0, 1, 2, [power, matrix]
+_BASIS = np.linalg.inv(np.vander(np.arange(-1.0, _NEAR - 1.0), increasing=True))
 
 
 class Depths:
-    """Matrices from the target's plane at any distance, by Lagrange's polynomials in the distance's logarithm.
+    """Matrices from the target's plane at any distance, by Lagrange's cubics in its logarithm.
 
     Nothing else of the rig moves. What is further away is smaller in the picture, more blurred, dimmer and seen
     elsewhere: all four tell the distance.
@@ -52,18 +51,24 @@ class Depths:
 
     def at(self, log_distance: float) -> MatrixTransport:
         """Return the matrix at a distance, ln(distance / rig's distance) within +- `REACH`."""
-        weights = _weights(np.power(log_distance, np.arange(len(_NODES))))
-        return MatrixTransport(self._sum(weights, self._nodes), self._strip, self._shape)
+        first, along = _place(log_distance)
+        weights = np.power(along, np.arange(_NEAR)) @ _BASIS
+        return MatrixTransport(self._sum(weights, self._nodes[first : first + _NEAR]), self._strip, self._shape)
 
     def slope(self, log_distance: float, light: torch.Tensor) -> torch.Tensor:
         """Return the derivative by the distance's logarithm, [H W], of the picture of shining cells, [h, w]."""
-        powers = np.arange(1, len(_NODES))
-        weights = _weights(np.concatenate([[0.0], powers * np.power(log_distance, powers - 1)]))
-        return self._sum(weights, self._nodes @ light.flatten().to(self._nodes))
+        first, along = _place(log_distance)
+        powers = np.arange(1, _NEAR)
+        weights = np.concatenate([[0.0], powers * np.power(along, powers - 1)]) @ _BASIS / _STEP
+        near = self._nodes[first : first + _NEAR]
+        return self._sum(weights, near @ light.flatten().to(near))
 
-    def _sum(self, weights: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        return self._scale * torch.einsum("g,g...->...", weights.to(values), values)
+    def _sum(self, weights: NDArray[np.float64], values: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("g,g...->...", torch.from_numpy(self._scale * weights).to(values), values)
 
 
-def _weights(powers: NDArray[np.float64]) -> torch.Tensor:
-    return torch.from_numpy(powers @ _BASIS)
+def _place(log_distance: float) -> tuple[int, float]:
+    """Return the first of the matrices around a distance, and its place between the middle two, in steps."""
+    steps = (log_distance + REACH) / _STEP
+    first = min(max(int(steps) - 1, 0), len(_NODES) - _NEAR)
+    return first, steps - first - 1

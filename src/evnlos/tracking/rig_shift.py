@@ -21,7 +21,8 @@ _HALF_STEP = 0.25  # cells
 _STATIC = 1.0  # a pixel's constant offset over its noise
 _PRIOR = 3.0  # weight of the plate's smoothness, in units of the noise's variance
 _MARGIN_M = 0.02
-_LONGEST_M, _SHORTEST_M = 0.01, 1e-6  # step of one round
+_LONGEST_M = 0.01  # step of one round
+_ENOUGH = 0.1  # of a place's standard deviation: a step below it changes nothing that is known
 _UNTOLD = 1e-3  # share of a direction's information that the plate leaves, below which it is not told
 
 
@@ -90,7 +91,7 @@ def rig_shift(
         state[:, :2] += _middle(image.numpy()) * plate.pitch_m
         state[:, 2:] -= state[:, 2:].mean(axis=0)
         state[:, 2:] = np.clip(state[:, 2:], -REACH * rig.distance_m, REACH * rig.distance_m)
-        if np.abs(step).max() < _SHORTEST_M:
+        if (np.abs(step) < _ENOUGH * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).all():
             break
     if not depth:
         return RigShift(state, covariance, image)
