@@ -63,7 +63,7 @@ class Depths:
         near = self._nodes[first : first + _NEAR]
         return self._sum(weights, near @ light.flatten().to(near))
 
-    def _sum(self, weights: NDArray[np.float64], values: torch.Tensor) -> torch.Tensor:
+    def _sum(self, weights: NDArray[np.floating], values: torch.Tensor) -> torch.Tensor:
         return torch.einsum("g,g...->...", torch.from_numpy(self._scale * weights).to(values), values)
 
 

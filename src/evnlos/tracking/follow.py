@@ -96,7 +96,7 @@ def track_frames(
     """
     settings = settings or Tracking()
     if settings.depth and rig is None:
-        raise ConfigError("Tracking.depth needs a rig: without one the size of the picture tells no distance")
+        raise ConfigError("Tracking.depth needs a rig: give its file (--rig), or leave depth out")
     if len(frames) < _LEAST_FRAMES:
         raise DataError(f"{len(frames)} frames; tracking needs {_LEAST_FRAMES} or more")
     sensor = (int(frames.shape[1]), int(frames.shape[2]))
