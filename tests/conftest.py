@@ -10,6 +10,7 @@ from pathlib import Path
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import pytest
+import tyro  # noqa: F401  Its import reads all builtins, and stumbles over what a doctest leaves as `_`.
 
 ROOT = Path(__file__).resolve().parent.parent
 

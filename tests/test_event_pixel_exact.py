@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evnlos.sensor import EventPixel, EventStream, simulate_events
+from evnlos.sensor._exact_cubic import LONGEST_TAU, is_monotone, is_smooth, meet
 from evnlos.sensor._exact_math import LOG_LINE, LOW_PASS, first_crossing, response
-from evnlos.sensor._fast_math import cos_turns, fast_exp, fast_log, single_exp
+from evnlos.sensor._fast_math import cos_turns, fast_exp, fast_log
 from evnlos.sensor._order import sort_times
 from evnlos.sensor._reference import reference_exact
 
@@ -295,6 +296,53 @@ def test_kernel_is_the_brute_force(pixel):
 
 @settings(max_examples=200, deadline=None)
 @given(
+    rise=st.floats(1e-6, 2.0),
+    shares=st.tuples(st.floats(0, 3), st.floats(0, 3)),
+    place=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+    sign=st.sampled_from([-1.0, 1.0]),
+)
+def test_monotone_cubic_meets_its_levels(rise, shares, place, sign):
+    """The cubic itself, at s, is the level whose s is asked for, from any lower start."""
+    rise *= sign
+    first, second = (share * rise for share in shares)
+
+    def cubic(s):
+        bend, twist = 3 * rise - 2 * first - second, first + second - 2 * rise
+        return s * (first + s * (bend + s * twist))
+
+    assert is_monotone(rise, first, second)
+    assert not is_monotone(rise, -1e-3 * rise, second) and not is_monotone(rise, first, 3.01 * rise)
+    low, s = min(place), max(place)
+    found = meet(rise, first, second, cubic(s), low)
+    assert low <= found <= 1
+    assert abs(cubic(found) - cubic(s)) <= 1e-6 * abs(rise)
+
+
+def test_smooth_steps_are_timed_as_if_cut_into_many():
+    """The same light in its own steps and in steps cut in 20: up to tau = 1 both send the same events."""
+    step, pixel = 0.018, EventPixel(0.1, 0.1, cutoff_hz=15, **QUIET)
+    draw = np.random.default_rng(5)
+    waves = draw.uniform(0.5, 2.2, 60) * step * np.arange(200)[:, None] + draw.uniform(0, 1, 60)
+    coarse = 90 * np.exp(0.4 * np.sin(2 * np.pi * waves))
+    half = np.pi * 15 / 275 * step
+    steps = list(zip(coarse[:-1].flat, coarse[1:].flat, strict=True))
+    assert np.mean([is_smooth(a, b, math.log(a), math.log(b), half) for a, b in steps]) > 0.9
+    assert max(half * (a + b + 40) for a, b in steps) > 0.9 * LONGEST_TAU
+    times = step * np.arange(200)
+    cuts = np.linspace(0, times[-1], 199 * 20 + 1)
+    fine = np.stack([np.interp(cuts, times, column) for column in coarse.T], axis=1)
+    few, many = (
+        simulate_events(light[:, None, :], instants, pixel)
+        for light, instants in ((coarse, times), (fine, cuts))
+    )
+    errors, unpaired = _paired_errors(few, many)
+    assert len(errors) > 300 and unpaired < 5e-3
+    assert np.percentile(np.abs(errors), 99) < 0.003 * step  # where the output turns, instants are ill-defined
+    assert np.sqrt(np.mean(errors**2)) < 0.001 * step
+
+
+@settings(max_examples=200, deadline=None)
+@given(
     kind=st.sampled_from([LOW_PASS, LOG_LINE]),
     start=st.floats(-0.5, 0.5),
     slope=st.floats(-3, 3),
@@ -332,8 +380,7 @@ def test_logarithm_and_exponential_are_accurate():
     for value in draw.uniform(0, 1, 500):
         assert cos_turns(value) == pytest.approx(math.cos(2 * math.pi * value), abs=1e-14)
     for value in np.concatenate([-(10 ** draw.uniform(-12, 2.8, 700)), [0.0]]):
-        for exponential in (fast_exp, single_exp):
-            assert exponential(value) == pytest.approx(math.exp(value), rel=6e-16)
+        assert fast_exp(value) == pytest.approx(math.exp(value), rel=6e-16)
 
 
 NOISY = EventPixel(0.15, 0.12, 0.03, 60, 20, 30, refractory_s=1e-3, hot_pixel_fraction=0.01, jitter_s=1e-5)

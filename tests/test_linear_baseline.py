@@ -6,6 +6,7 @@ import torch
 
 from evnlos.errors import DataError
 from evnlos.model import fit_linear
+from evnlos.model.linear import _LAMBDAS, _left_out
 
 
 def world(noise: float, objects: int = 30, positions: int = 10, seed: int = 0):
@@ -36,6 +37,19 @@ def test_it_is_the_ridge_regression_that_it_says() -> None:
     weights = torch.linalg.solve(x.T @ x + ridge, x.T @ y)
     expected = (truth.double().mean(0).flatten() + x @ weights).clamp(0, 1).reshape(truth.shape)
     torch.testing.assert_close(found(inputs).double(), expected, atol=1e-4, rtol=0)
+
+
+def test_errors_on_objects_left_out_are_those_of_one_regression_for_each_ridge() -> None:
+    inputs, truth, _ = world(0.3)
+    code, y = inputs.flatten(1)[:, :40], truth.flatten(1) - truth.flatten(1).mean(0)
+    left = torch.arange(len(code)) % 5 == 0
+    kept = code[~left].double()
+    inner, outer = kept.T @ kept, kept.T @ y[~left].double()
+    plain = []
+    for lam in _LAMBDAS:
+        ridge = lam * inner.diagonal().mean() * torch.eye(40, dtype=torch.float64)
+        plain.append((code[left].double() @ torch.linalg.solve(inner + ridge, outer) - y[left]).square().sum())
+    torch.testing.assert_close(_left_out(code, y, left), torch.stack(plain), rtol=1e-5, atol=0)
 
 
 def test_more_noise_asks_for_more_ridge_and_never_loses_to_the_mean() -> None:

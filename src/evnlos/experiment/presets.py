@@ -182,7 +182,7 @@ def jointly(study: Study) -> Study:
         pre, fine = arm.pretraining, arm.finetuning
         if pre is not None:
             pre = _of_passes(pre, 6, arm.name)
-            fine = fine and replace(fine, epochs=round(fine.epochs * 8 / 3), batch_size=16)
+            fine = fine and replace(fine, epochs=round(fine.epochs * 8 / 3), batch_size=_JOINT.batch_size)
         elif fine is not None:
             fine = _of_passes(fine, 5, arm.name)
         arms.append(replace(arm, pretraining=pre, finetuning=fine))
@@ -195,11 +195,12 @@ def _of_passes(single: Training, longer: int, arm: str) -> Training:
         return single
     if not single.network.rank:
         raise ConfigError(f"arm {arm!r} has no linear embedding to pool over a pass; leave it out with --arms")
-    known = single.network.strengths == UNetConfig().strengths
-    network = replace(
-        single.network, rank=512, strengths=_JOINT.network.strengths if known else single.network.strengths
+    network = replace(single.network, rank=_JOINT.network.rank)
+    if network.strengths == UNetConfig().strengths:
+        network = replace(network, strengths=_JOINT.network.strengths)
+    return replace(
+        single, joint=True, epochs=longer * single.epochs, batch_size=_JOINT.batch_size, network=network
     )
-    return replace(single, joint=True, epochs=longer * single.epochs, batch_size=16, network=network)
 
 
 def objects(rig: str) -> Study:

@@ -19,10 +19,10 @@ Style = Literal["polarity", "surface"]
 """Events of each window by sign, or the newest event of each pixel, fading."""
 Background = Literal["dark", "light"]
 
-# Background, ON, OFF, text and events without a polarity, bar.
-_COLOURS = {
-    "dark": ((14, 16, 20), ON_RGB, OFF_RGB, (205, 208, 214), (52, 56, 64)),
-    "light": ((255, 255, 255), ON_RGB, OFF_RGB, (60, 64, 72), (224, 226, 230)),
+# Background, text and events without a polarity, bar.
+_GROUNDS = {
+    "dark": ((14, 16, 20), (205, 208, 214), (52, 56, 64)),
+    "light": ((255, 255, 255), (60, 64, 72), (224, 226, 230)),
 }
 _FAINTEST = 0.3  # how strongly a single event is drawn where many are usual
 _CAPTION_PX = 26
@@ -216,11 +216,11 @@ def _full_scale(maps: Iterable[NDArray[np.uint8]]) -> float:
 
 def _coloured(strength: NDArray[np.float64], background: Background) -> NDArray[np.uint8]:
     """Return strengths from 0 to 1 [3, H, W] as a picture [H, W, 3]."""
-    ground, *inks = (np.array(colour, np.float64) for colour in _COLOURS[background][:4])
+    ground, ink, _ = _GROUNDS[background]
     share = strength / np.maximum(strength.sum(axis=0), 1e-9)
-    colour = np.tensordot(share, np.stack(inks), axes=(0, 0))  # [H, W, 3]
+    colour = np.tensordot(share, np.array([ON_RGB, OFF_RGB, ink], np.float64), axes=(0, 0))  # [H, W, 3]
     opacity = strength.max(axis=0)[..., None]
-    return np.round(ground + opacity * (colour - ground)).astype(np.uint8)
+    return np.round(ground + opacity * (colour - np.array(ground))).astype(np.uint8)
 
 
 def _decimals(summary: Summary) -> int:
@@ -229,7 +229,7 @@ def _decimals(summary: Summary) -> int:
 
 def _caption(width: int, time: str, detail: str, done: float, background: Background) -> NDArray[np.uint8]:
     """Return a line of text on the recording's position: its time, what is shown, which colour is which."""
-    ground, on, off, ink, bar = _COLOURS[background]
+    ground, ink, bar = _GROUNDS[background]
     image = Image.new("RGB", (width, _CAPTION_PX), ground)
     draw = ImageDraw.Draw(image)
     draw.rectangle((0, 0, width - 1, 1), fill=bar)
@@ -238,7 +238,7 @@ def _caption(width: int, time: str, detail: str, done: float, background: Backgr
     measure: Callable[[str], float] = lambda text: draw.textlength(text, font=font)  # noqa: E731
     draw.text((6, 6), time, fill=ink, font=font)
     right = width - 6.0
-    for text, colour in (("OFF", off), ("ON", on)):
+    for text, colour in (("OFF", OFF_RGB), ("ON", ON_RGB)):
         right -= measure(text)
         draw.text((right, 6), text, fill=colour, font=font)
         right -= 10

@@ -12,7 +12,7 @@ import math
 
 from numba import njit
 
-from evnlos.sensor._fast_math import fast_log, single_exp
+from evnlos.sensor._fast_math import fast_exp, fast_log
 
 KNEE = 20.0
 LOG_KNEE = math.log(KNEE)
@@ -59,7 +59,7 @@ def response(kind, a, b, c, x):
     LOW_PASS: a + b x + c exp(-x). LOG_LINE: ln(a + b x) + c x. LINE: a + b x.
     """
     if kind == LOW_PASS:
-        decay = c * single_exp(-x)
+        decay = c * fast_exp(-x)
         return a + b * x + decay, b - decay, decay
     if kind == LOG_LINE:
         light = a + b * x

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
+from evnlos.sensor._exact_cubic import is_monotone, is_smooth, meet
 from evnlos.sensor._exact_math import (
     KNEE,
     LINE,
@@ -19,7 +20,7 @@ from evnlos.sensor._exact_math import (
     response,
 )
 from evnlos.sensor._exact_pass import PIECE
-from evnlos.sensor._fast_math import single_exp
+from evnlos.sensor._fast_math import fast_exp
 from evnlos.sensor._random import (
     STREAM_SHOT_CHOICE,
     STREAM_SHOT_GAP,
@@ -87,7 +88,7 @@ def _piece(
         kind, end = LOW_PASS, length * (speed + curve * length)
         per_tau = (log_b - log_a) / end
         a, b, c = log_a - per_tau, per_tau + leak * length / end, filtered - log_a + per_tau
-        decay = single_exp(-end)
+        decay = fast_exp(-end)
         arrival = a + per_tau * end + c * decay
         slope_start, slope_end = b - c, b - c * decay
         arrival += bend_response(light_a, light_b, log_b - log_a, end, 1.0 / end, 1.0 - decay, rate * length)
@@ -197,6 +198,29 @@ def _step(
 
 
 @_owns_nothing
+def _cubic(
+    out_time, out_pixel, out_on, count, pixel, start, length, filtered, rise, slope_0, slope_1, on, off, leak,
+    state, jitter, window, seed, sent,
+):  # fmt: skip
+    """Send the events of one pixel in a step on which its output is a monotone cubic.
+
+    It goes from `filtered` to `filtered + rise`, the leak among it; `slope_0` and `slope_1` are its slopes at
+    both ends, log units a step. `state` (reference, last event) is updated; returns the fill of the columns.
+    """
+    rising = rise > 0.0
+    size = on if rising else -off
+    done, level = 0.0, state[0] + size - filtered
+    while (rise >= level) if rising else (rise <= level):
+        done = meet(rise, slope_0, slope_1, level, done)
+        state[0] += size
+        state[1] = start + done * length
+        level += size
+        count = _emit(out_time, out_pixel, out_on, count, state[1], pixel, rising, jitter, window, seed, sent)
+    state[0] -= leak * length
+    return count
+
+
+@_owns_nothing
 def send_events(
     out_time, out_pixel, out_on, count, begin, flag_words, flags, now, then, start, stop, first, last_event,
     candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
@@ -207,6 +231,8 @@ def send_events(
     Returns the fill of the columns, and the pixel that they had no room for (the tile's size: all had).
     """
     size, has_shot = now.shape[1], len(candidate) > 0
+    length, plain = stop - start, rate > 0.0 and refractory == 0.0
+    pace = rate * length
     for w in range(begin // 8, len(flag_words)):
         if flag_words[w] == 0:
             continue
@@ -214,17 +240,33 @@ def send_events(
             if flags[i] == 0:
                 continue
             pixel = first + i
-            constants = (
-                on[pixel], off[pixel], leak[pixel], rate_on[pixel], rate_off[pixel], rate_hot[pixel],
-                rate, refractory, seed,
-            )  # fmt: skip
             drawn_0, sent_0 = drawn[pixel], sent[pixel]
             state[0], state[1] = now[3, i], last_event[pixel]
             state[2] = candidate[pixel] if has_shot else np.inf
-            filled, arrival = _step(
-                out_time, out_pixel, out_on, count, pixel, start, stop, now[0, i], then[0, i],
-                now[1, i], then[1, i], now[2, i], state, constants, jitter, window, drawn, sent,
-            )  # fmt: skip
+            light_0, light_1, filtered_0, arrival = now[0, i], then[0, i], now[2, i], then[2, i]
+            fall = leak[pixel] * length
+            rise = arrival - filtered_0 + fall
+            slope_0 = pace * (light_0 + 20.0) * (now[1, i] - filtered_0) + fall
+            slope_1 = pace * (light_1 + 20.0) * (then[1, i] - arrival) + fall
+            if (
+                plain
+                and state[2] >= stop
+                and is_smooth(light_0, light_1, now[1, i], then[1, i], 0.5 * pace)
+                and is_monotone(rise, slope_0, slope_1)
+            ):
+                filled = _cubic(
+                    out_time, out_pixel, out_on, count, pixel, start, length, filtered_0, rise, slope_0,
+                    slope_1, on[pixel], off[pixel], leak[pixel], state, jitter, window, seed, sent,
+                )  # fmt: skip
+            else:
+                constants = (
+                    on[pixel], off[pixel], leak[pixel], rate_on[pixel], rate_off[pixel], rate_hot[pixel],
+                    rate, refractory, seed,
+                )  # fmt: skip
+                filled, arrival = _step(
+                    out_time, out_pixel, out_on, count, pixel, start, stop, light_0, light_1, now[1, i],
+                    then[1, i], filtered_0, state, constants, jitter, window, drawn, sent,
+                )  # fmt: skip
             if filled > len(out_time):
                 drawn[pixel], sent[pixel] = drawn_0, sent_0
                 return count, i

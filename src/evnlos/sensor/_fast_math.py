@@ -1,4 +1,7 @@
-"""Elementary functions without branches or calls, so that a compiler runs them on whole vectors."""
+"""Elementary functions without branches or calls, so that a compiler runs them on whole vectors.
+
+Series are summed in pairs (Estrin's order): one long chain, each sum waiting for the last, takes longer.
+"""
 
 from __future__ import annotations
 
@@ -23,62 +26,31 @@ def fast_log(x):
     f = np.int64(bits - (exponent << 52)).view(np.float64) - 1.0
     s = f / (2.0 + f)
     z = s * s
-    series = 2.0 / 21.0
-    series = series * z + 2.0 / 19.0
-    series = series * z + 2.0 / 17.0
-    series = series * z + 2.0 / 15.0
-    series = series * z + 2.0 / 13.0
-    series = series * z + 2.0 / 11.0
-    series = series * z + 2.0 / 9.0
-    series = series * z + 2.0 / 7.0
-    series = series * z + 2.0 / 5.0
-    series = series * z + 2.0 / 3.0
+    z2 = z * z
+    z4 = z2 * z2
+    low = (2.0 / 3.0 + z * (2.0 / 5.0)) + z2 * (2.0 / 7.0 + z * (2.0 / 9.0))
+    high = (2.0 / 11.0 + z * (2.0 / 13.0)) + z2 * (2.0 / 15.0 + z * (2.0 / 17.0))
+    series = low + z4 * (high + z4 * (2.0 / 19.0 + z * (2.0 / 21.0)))
     e = np.float64(exponent)
     return e * _LN2_HIGH + (2.0 * s + (s * z * series + e * _LN2_LOW))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _split(x):
-    """Return r and 2^n of x = n ln 2 + r, |r| <= ln 2 / 2; x is clamped at -700."""
+def fast_exp(x):
+    """Return exp x for x <= 0 (clamped at -700), within 2 ulp, in a form that compilers vectorise.
+
+    x = n ln 2 + r with |r| <= ln 2 / 2: exp x = 2^n (1 + r + r^2 / 2 + ...).
+    """
     x = max(x, -700.0)
     n = np.rint(x * 1.4426950408889634)
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
-    return r, np.int64((np.int64(n) + 1023) << 52).view(np.float64)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def fast_exp(x):
-    """Return exp x for x <= 0 (clamped at -700), within 2 ulp, in a form that compilers vectorise."""
-    r, power = _split(x)
-    p = 1.0 / 479001600.0
-    p = p * r + 1.0 / 39916800.0
-    p = p * r + 1.0 / 3628800.0
-    p = p * r + 1.0 / 362880.0
-    p = p * r + 1.0 / 40320.0
-    p = p * r + 1.0 / 5040.0
-    p = p * r + 1.0 / 720.0
-    p = p * r + 1.0 / 120.0
-    p = p * r + 1.0 / 24.0
-    p = p * r + 1.0 / 6.0
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
-    return p * power
-
-
-@njit(cache=True, error_model="numpy")
-def single_exp(x):
-    """Return exp x for x <= 0 (clamped at -700), within 2 ulp, soon: for one number rather than a vector.
-
-    The same series as `fast_exp` in Estrin's order, a chain of five sums instead of twelve.
-    """
-    r, power = _split(x)
     r2 = r * r
     r4 = r2 * r2
     low = (1.0 + r) + r2 * (0.5 + r * (1.0 / 6.0))
     middle = (1.0 / 24.0 + r * (1.0 / 120.0)) + r2 * (1.0 / 720.0 + r * (1.0 / 5040.0))
     high = (1.0 / 40320.0 + r * (1.0 / 362880.0)) + r2 * (1.0 / 3628800.0 + r * (1.0 / 39916800.0))
-    return (low + r4 * (middle + r4 * (high + r4 * (1.0 / 479001600.0)))) * power
+    series = low + r4 * (middle + r4 * (high + r4 * (1.0 / 479001600.0)))
+    return series * np.int64((np.int64(n) + 1023) << 52).view(np.float64)
 
 
 @njit(cache=True, error_model="numpy", inline="always")

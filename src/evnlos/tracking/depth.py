@@ -41,13 +41,13 @@ class Depths:
             post_width_m=0.0,
         )
         self._strip, self._shape = strip, shape
-        self._scale = float(own.matrix.double().sum() / rig.matrix(shape, strip).sum())
         self._nodes = torch.stack(
             [
                 replace(fixed, distance_m=rig.distance_m * float(np.exp(node))).matrix(shape, strip).float()
                 for node in _NODES
             ]
         )  # [G, H W, cells]
+        self._scale = float(own.matrix.sum() / self._nodes[len(_NODES) // 2].double().sum())
 
     def at(self, log_distance: float) -> MatrixTransport:
         """Return the matrix at a distance, ln(distance / rig's distance) within +- `REACH`."""

@@ -33,10 +33,10 @@ class RigShift:
     Args:
         position_m: Middle of the object's light (x, y), float64 [N, 2], metres.
         covariance: Of each position, [N, 2, 2], squared metres.
+        plate: The object, its light's middle in the array's middle, float64 [n, n].
         log_distance: ln(distance to the wall / the rig's), [N]; its mean is 0, as a plate that is nearer and
             one that is larger and dimmer look much the same. None where it was not looked for.
         log_distance_sigma: Its standard deviation, [N].
-        plate: The object, its light's middle in the array's middle, float64 [n, n].
     """
 
     position_m: NDArray[np.float64]
@@ -131,7 +131,8 @@ class Fit:
             )
             for place in state
         ]
-        self._maps = torch.stack([sight.matrix()[0] for sight in self._sights]).float()  # [N, P, n n]
+        self._maps = torch.stack([sight.matrix()[0].float() for sight in self._sights])  # [N, P, n n]
+        self._total = self._maps.sum(dim=0).double()
         self._still = (1 - mean_weight(len(state), _STATIC)) / len(state)
 
     def step(
@@ -149,15 +150,16 @@ class Fit:
         root = torch.linalg.cholesky(normal)
         image = torch.cholesky_solve(self._back(self._moving(seen))[:, None], root)[:, 0]
         left = seen - (self._maps @ image.float()).double()
-        slope = self._slopes(image.reshape(self._sights[0].plate.shape))  # [N, K, P]
+        plate = image.reshape(self._sights[0].plate.shape)
+        slope = self._slopes(plate)  # [N, K, P]
         frames, kinds = slope.shape[:2]
         # Coordinates in which each frame alone would know its place equally well in all directions.
         lower = torch.linalg.cholesky(slope @ slope.mT)
         even = torch.linalg.solve_triangular(lower, slope, upper=False)
         pull = (even @ self._moving(left)[..., None]).flatten()
         flat = even.flatten(0, 1)  # [N K, P]
-        total = self._maps.sum(dim=0).double()
-        back = (even.float() @ self._maps).double().flatten(0, 1) - self._still * flat @ total  # [N K, n n]
+        back = (even.float() @ self._maps).double().flatten(0, 1)  # [N K, n n]
+        back -= self._still * flat @ self._total
         shared = torch.linalg.solve_triangular(root, back.mT, upper=False)
         one = torch.eye(len(flat), dtype=flat.dtype)
         own = one - self._still * flat @ flat.mT
@@ -171,8 +173,7 @@ class Fit:
         up = torch.linalg.inv(lower).mT  # [N, K, K]
         misfit = left.square().mean(dim=1).clamp(min=noise**2)
         covariance = misfit[:, None, None] * (up @ each.movedim(-1, 0) @ up.mT)
-        shown = image.reshape(self._sights[0].plate.shape)
-        return shown, (up @ step[..., None])[..., 0].numpy(), covariance.numpy()
+        return plate, (up @ step[..., None])[..., 0].numpy(), covariance.numpy()
 
     def _moving(self, frames: torch.Tensor) -> torch.Tensor:
         """Return frames [N, P] without what stands still in them, as far as it is not known."""
@@ -184,11 +185,10 @@ class Fit:
 
     def _squared(self) -> torch.Tensor:
         """Return the plate's normal matrix, [n n, n n]."""
-        total = self._maps.sum(dim=0).double()
         squares = torch.zeros(self._maps.shape[2], self._maps.shape[2], dtype=torch.float64)
         for one in self._maps:
             squares += (one.mT @ one).double()
-        return squares - self._still * total.mT @ total
+        return squares - self._still * self._total.mT @ self._total
 
     def _slopes(self, image: torch.Tensor) -> torch.Tensor:
         """Return the frames' derivatives by x, y and R ln(distance), [N, K, P], a metre."""
