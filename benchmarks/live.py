@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -32,9 +33,10 @@ from evnlos.config import to_dict
 from evnlos.dataset import CHANNELS, Sampling
 from evnlos.live.chunk import Source
 from evnlos.live.engine import Engine
+from evnlos.live.packet import USUAL_EVENTS, Packet, pack
 from evnlos.live.replay import Replay, TimedFrame
 from evnlos.live.run import Pace, Run
-from evnlos.live.udp import UdpSender, UdpSource, send_timed
+from evnlos.live.udp import UdpSource
 from evnlos.model import ResidualUNet, UNetConfig, Weights, load_weights
 from evnlos.types import Events
 
@@ -71,11 +73,27 @@ def replay(rate_hz: float, seconds: float, with_frames: bool) -> Replay:
 
 
 def send(port: int, rate_hz: float, seconds: float) -> None:
-    """Send the events by UDP in true time; what the other process does."""
-    parts = list(pieces(rate_hz, seconds))
-    columns = (np.concatenate([part.columns()[name] for part in parts]) for name in ("t_us", "x", "y", "p"))
-    with UdpSender("127.0.0.1", port) as sender:
-        send_timed(sender, Events(*columns, WIDTH, HEIGHT))
+    """Send the events by UDP in true time, in steps of 2 ms; what the other process does.
+
+    They are packed beforehand: the sender stands for a camera, not for work on this machine.
+    """
+    steps: list[tuple[int, list[bytes]]] = []
+    number = 0
+    for part in pieces(rate_hz, seconds):
+        for first in range(int(part.t_us[0]), int(part.t_us[0]) + PIECE_US, 2000):
+            events, packed = part.between(first, first + 2000), []
+            for start in range(0, len(events), USUAL_EVENTS):
+                packed.append(pack(Packet(number, events[start : start + USUAL_EVENTS])))
+                number += 1
+            steps.append((first + 2000, packed))
+    packed = [pack(Packet(number, Events.empty(WIDTH, HEIGHT), is_last=True))]
+    steps.append((steps[-1][0], packed))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        start_s = time.perf_counter()
+        for until_us, packed in steps:
+            time.sleep(max(start_s + until_us / 1e6 - time.perf_counter(), 0.0))
+            for data in packed:
+                sender.sendto(data, ("127.0.0.1", port))
 
 
 def network_of(paradigm: str, path: str | None) -> Weights:

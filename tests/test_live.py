@@ -1,5 +1,6 @@
 """Live reconstruction: the running surface, the three sources, the queue, the page, and a run without one."""
 
+import contextlib
 import io
 import json
 import re
@@ -26,7 +27,7 @@ from evnlos.live import record
 from evnlos.live.chunk import Chunk
 from evnlos.live.engine import Engine, Picture, Timing
 from evnlos.live.growing import GrowingFile
-from evnlos.live.packet import Packet, PacketError, pack, unpack
+from evnlos.live.packet import Packet, PacketError, pack, unpack, unpack_all
 from evnlos.live.page import Page
 from evnlos.live.queue import ChunkQueue
 from evnlos.live.reduction import AreaReduction
@@ -307,6 +308,27 @@ def test_packets_carry_events_and_nothing_else_passes() -> None:
             unpack(data[: body + at] + field + data[body + at + len(field) :])
     with pytest.raises(DataError, match="at most 8000"):
         pack(Packet(0, stream(8001)))
+
+
+def test_packets_decoded_together_are_those_decoded_one_by_one() -> None:
+    draw = np.random.default_rng(4)
+    for seed in range(30):
+        datagrams = [pack(Packet(k, stream(int(draw.integers(0, 60)), k), k % 3 == 0)) for k in range(8)]
+        for k in draw.integers(0, 8, seed % 9):
+            damaged = bytearray(datagrams[k])
+            damaged[draw.integers(0, len(damaged))] = draw.integers(0, 256)
+            datagrams[k] = bytes(damaged)
+        single = []
+        for data in datagrams:
+            with contextlib.suppress(PacketError):
+                single.append(unpack(data))
+        batch, malformed = unpack_all(datagrams)
+        assert malformed == len(datagrams) - len(single)
+        headings = batch.headings if batch else []
+        assert [(h.sequence, h.is_last) for h in headings] == [(p.sequence, p.is_last) for p in single]
+        for k, packet in enumerate(single):
+            assert batch is not None and batch.events(k, k + 1) == packet.events
+    assert unpack_all([b"rubbish"]) == (None, 1)
 
 
 def test_udp_counts_malformed_lost_and_late_packets_and_goes_on() -> None:

@@ -161,9 +161,8 @@ class Events:
     def _trusted(cls, columns: dict[str, NDArray], width: int, height: int) -> Events:
         """Return events of columns that a decoder has checked already; a second check costs as much again."""
         events = object.__new__(cls)
-        blank = {"adc": None, "polarity_known": None}
-        for name, value in {**blank, **columns, "width": width, "height": height}.items():
-            object.__setattr__(events, name, value)
+        vars(events).update(adc=None, polarity_known=None, width=width, height=height)
+        vars(events).update(columns)
         return events
 
     @classmethod

@@ -11,10 +11,10 @@ from types import TracebackType
 import numpy as np
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.events.io.columns import cut, join, trusted_events
+from evnlos.events.io.columns import cut, trusted_events
 from evnlos.live.chunk import UNKNOWN_US, Chunk
 from evnlos.live.clock import Clock, SystemClock
-from evnlos.live.packet import USUAL_EVENTS, Packet, PacketError, pack, unpack
+from evnlos.live.packet import USUAL_EVENTS, Batch, Heading, Packet, pack, unpack, unpack_all
 from evnlos.types import Events
 
 _BUFFER_BYTES = 1 << 22  # asked of the system, which may give less
@@ -86,18 +86,13 @@ class UdpSource:
                         return
                     continue
                 heard_s = last_s
-                packets: list[Packet] = []
-                for data in datagrams:
-                    packet = self._accepted(data)
-                    if packet is None:
-                        continue
-                    if packet.sequence == 0 and packets:  # another stream: not to be joined with the one before
-                        yield _chunk(packets, first_s, last_s)
-                        packets = []
-                    packets.append(packet)
-                    ended = ended or packet.is_last
-                if packets:
-                    yield _chunk(packets, first_s, last_s)
+                batch, malformed = unpack_all(datagrams)
+                self._faults["malformed packets"] += malformed
+                if batch is None:
+                    continue
+                for first, last in self._runs(batch):
+                    yield _chunk(batch, first, last, first_s, last_s)
+                    ended = ended or any(heading.is_last for heading in batch.headings[first:last])
         finally:
             self.close()
 
@@ -116,43 +111,48 @@ class UdpSource:
                 continue
         return found, first_s
 
-    def _accepted(self, data: bytes) -> Packet | None:
-        """Return the packet where its place in the stream allows it, and count what is wrong."""
-        try:
-            packet = unpack(data)
-        except PacketError:
+    def _runs(self, batch: Batch) -> Iterator[tuple[int, int]]:
+        """Yield (first, last + 1) of packets that follow each other in one stream; count what is left out."""
+        first = 0
+        for number, heading in enumerate(batch.headings):
+            is_next = self._is_next(heading, batch, number)
+            if (not is_next or heading.sequence == 0) and number > first:
+                yield first, number
+            if not is_next:
+                first = number + 1
+            elif heading.sequence == 0:  # another stream: not to be joined with the one before
+                first = number
+        if first < len(batch.headings):
+            yield first, len(batch.headings)
+
+    def _is_next(self, heading: Heading, batch: Batch, number: int) -> bool:
+        """Return whether a packet's place in the stream allows it, and count what is wrong."""
+        size = heading.height, heading.width
+        if heading.sequence == 0:
+            self._next, self._newest, self._size = None, None, size
+        self._size = self._size or size
+        if size != self._size:
             self._faults["malformed packets"] += 1
-            return None
-        events = packet.events
-        if packet.sequence == 0:
-            self._next, self._newest, self._size = None, None, events.shape
-        self._size = self._size or events.shape
-        if events.shape != self._size:
-            self._faults["malformed packets"] += 1
-            return None
-        gap = 0 if self._next is None else (packet.sequence - self._next) % _TURN
-        backwards = len(events) and self._newest is not None and int(events.t_us[0]) < self._newest
+            return False
+        times = batch.columns["t_us"]
+        gap = 0 if self._next is None else (heading.sequence - self._next) % _TURN
+        backwards = (
+            heading.length > 0 and self._newest is not None and int(times[batch.edges[number]]) < self._newest
+        )
         if gap >= _LATE or backwards:
             self._faults["late packets"] += 1
-            return None
+            return False
         self._faults["lost packets"] += gap
-        self._next = (packet.sequence + 1) % _TURN
-        if len(events):
-            self._newest = int(events.t_us[-1])
-        return packet
+        self._next = (heading.sequence + 1) % _TURN
+        if heading.length:
+            self._newest = int(times[batch.edges[number + 1] - 1])
+        return True
 
 
-def _chunk(packets: list[Packet], first_s: float, last_s: float) -> Chunk:
-    events = _joined([packet.events for packet in packets])
+def _chunk(batch: Batch, first: int, last: int, first_s: float, last_s: float) -> Chunk:
+    events = batch.events(first, last)
     until = int(events.t_us[-1]) if len(events) else UNKNOWN_US
-    return Chunk(events, until, first_s, last_s, restart=packets[0].sequence == 0)
-
-
-def _joined(parts: list[Events]) -> Events:
-    """Return checked events that follow each other as one."""
-    if len(parts) == 1:
-        return parts[0]
-    return trusted_events(join([part.columns() for part in parts]), parts[0].width, parts[0].height)
+    return Chunk(events, until, first_s, last_s, restart=batch.headings[first].sequence == 0)
 
 
 class UdpSender:
