@@ -125,6 +125,7 @@ def test_pixel_comes_back(fit) -> None:
     assert pixel.threshold_sigma == pytest.approx(PIXEL.threshold_sigma, abs=0.015)
     assert pixel.shot_noise_rate_hz == pytest.approx(PIXEL.shot_noise_rate_hz, rel=0.1)
     assert pixel.leak_rate_hz < 0.08
+    assert pixel.leak_rate_hz == 0 or pixel.leak_rate_hz >= fit.pixel.error["leak_rate_hz"]
     for kind in ("counts", "surfaces"):
         found = fit.residuals[f"{kind} held out"]
         assert found.noise * 0.9 < found.after < found.before

@@ -267,6 +267,9 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
     # A second call takes up what is there: nothing is made again, the table is the same.
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     assert shown.splitlines()[1] in capsys.readouterr().out
+    around = tiny_captures[0].parent
+    said = fails(capsys, "demo", "--out", tmp_path / "none", "--captures", around)
+    assert "has no capture.yaml" in said and f"{around}/*" in said and not (tmp_path / "none").exists()
 
 
 def test_the_demos_own_captures_hold_its_test_characters() -> None:

@@ -12,7 +12,7 @@ from evnlos.calibration import Calibration
 from evnlos.dataset.importer import character_of
 from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.presets import default
-from evnlos.errors import CalibrationError
+from evnlos.errors import CalibrationError, ConfigError
 from evnlos.evaluation.identify_source import described_rig
 from evnlos.experiment import Arm, Place, Step, Study, gain_table, read_records, run_study, show
 from evnlos.model import UNetConfig
@@ -58,8 +58,15 @@ def run_demo(settings: Demo) -> Path:
     """Run the main job and return the path of the report.
 
     Every step is resumable: what is done is not done again.
+
+    Raises:
+        ConfigError: One of the captures is none.
+        CalibrationError: No rig fits the captures.
     """
     began, out = time.perf_counter(), settings.out
+    for folder in settings.captures:
+        if not (folder / "capture.yaml").is_file():
+            raise ConfigError(f"{folder} has no capture.yaml; give the capture folders themselves: {folder}/*")
     out.mkdir(parents=True, exist_ok=True)
     notes = []
     folders = list(settings.captures)

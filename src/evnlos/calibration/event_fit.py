@@ -54,8 +54,9 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
 
     Six figures of the recordings (`MOMENTS`) must agree with those of simulated events under the fitted light.
     The same random draws are used for every trial, so the figures change smoothly with the settings. The cutoff
-    shows only in when events come, so it is chosen by a map of counts in tenths of a second. The refractory
-    period is left as it is: only a bound can be told.
+    shows only in when events come, so it is chosen by a map of counts in tenths of a second. A leak below its
+    standard error is taken for none: even the smallest one lets the pixels start at times of their own. The
+    refractory period is left as it is: only a bound can be told.
 
     Args:
         recordings: Light and events.
@@ -72,6 +73,8 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
     cutoff, allowed = _scan_cutoff(recordings, pixel, seed)
     pixel, values = _match(recordings, regions, observed, replace(pixel, cutoff_hz=cutoff), seed, 2)
     error = _errors(recordings, regions, pixel, values, seed)
+    if pixel.leak_rate_hz < error["leak_rate_hz"]:
+        pixel = replace(pixel, leak_rate_hz=0.0)  # not told from none
     return PixelFit(pixel, error, allowed, shortest_interval_s([r.events for r in recordings]))
 
 
