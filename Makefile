@@ -32,7 +32,7 @@ dist: $(READY)
 	  lost = [n for n in ('evnlos/py.typed', 'evnlos/live/page.html', 'evnlos/app/page.css', 'evnlos/app/page.js', \
 	  'evnlos/app/opening.js', \
 	  'evnlos/report/style.css', 'evnlos/evaluation/classifier.safetensors', \
-	  'evnlos/model/published/near-frame.safetensors') if n not in names]; assert not lost, lost"
+	  'evnlos/model/published/near-frame.safetensors', 'evnlos/model/published/near.yaml') if n not in names]; assert not lost, lost"
 	ls -l dist
 
 clean:

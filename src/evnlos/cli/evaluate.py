@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from evnlos.cli.notes import say
-from evnlos.config import to_dict
+from evnlos.config import load_yaml, to_dict
 from evnlos.dataset import open_dataset
 from evnlos.evaluation import BASELINES, CHECKS
 from evnlos.model.confidence import COVERAGE
@@ -28,6 +28,9 @@ class Command:
     """torchvision's vgg16-397923af.pth for LPIPS; by default it is looked for in the torch hub cache."""
     lpips_heads: Path | None = None
     """The linear heads vgg.pth of LPIPS v0.1; by default those of an installed `lpips`."""
+    rig: Path | None = None
+    """Folder that `calibrate` wrote, or the rig.yaml in it: the confidence then asks how much of the frames the
+    pictures explain. Without it published weights take the rig that they were trained for."""
     positions: tuple[int, ...] = ()
     """Numbers of positions, e.g. 1 2 5 10 20 40: also how the picture of a joint network grows with them."""
     json: bool = False
@@ -35,8 +38,11 @@ class Command:
 
     def run(self) -> None:
         """Evaluate and print."""
+        from evnlos.calibration import RIG_FILE
+        from evnlos.cli.reconstruct import calibrated_folder
+        from evnlos.dataset import Simulation
         from evnlos.evaluation import available_lpips, curve_over_positions, evaluate, load_lpips
-        from evnlos.model import load_weights
+        from evnlos.model import load_weights, published_rig
         from evnlos.report import refuse_seen, seen_in_training
 
         dataset, weights = open_dataset(self.data), load_weights(self.weights)
@@ -44,7 +50,9 @@ class Command:
         refuse_seen(weights.history, dataset, split)
         metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
         curve = curve_over_positions(weights, dataset, split, self.positions) if self.positions else []
-        found = evaluate(weights, dataset, split, metric).summary()
+        rig = calibrated_folder(self.rig) / RIG_FILE if self.rig else published_rig(self.weights)
+        known = load_yaml(Simulation, rig) if rig else None
+        found = evaluate(weights, dataset, split, metric, known).summary()
         about = {
             "weights": str(self.weights),
             "paradigm": weights.paradigm,

@@ -28,7 +28,8 @@ class Command:
     rig: Path | None = None
     """Folder that `calibrate` wrote, or the rig.yaml in it: its fixed pattern is taken from the frames, the
     pictures are moved to where its wall agrees with the frames, and it is printed how much of the frames they
-    explain. No name such as main-near: that needs the light and the camera of this very rig."""
+    explain. No name such as main-near: that needs the light and the camera of this very rig. Without it,
+    published weights explain the frames by the rig that they were trained for."""
     json: bool = False
     """Print one JSON object."""
 
@@ -48,6 +49,11 @@ class Command:
             print(json.dumps(found | {"out": str(self.out)}))
             return
         print(f"{self.out}: {found['positions']} positions of {found['capture']} by {found['weights']}")
+        if not found.get("moved_by_the_rig", True):
+            print(
+                f"the light is {found['light']:.2f} x that of the rig: its gain is not this capture's, and the "
+                "pictures stay as the network draws them; calibrate at this exposure, on known targets"
+            )
         if "confidence" in found:
             print(_said(found["confidence"]))
         if "scores" in found:
@@ -75,7 +81,9 @@ def calibrated_folder(rig: Path) -> Path:
 def _said(confidence: dict[str, Any]) -> str:
     """Return what there is to say of the pictures' worth, in one line."""
     words = [confidence["verdict"]]
-    if "explained" in confidence:
+    if "explained" not in confidence:
+        words.append("not checked against the frames: give the calibrated --rig")
+    elif confidence["measured"]:
         share = 100 * confidence["explained"]
         words.append(f"of what the average object leaves unexplained in the frames they explain {share:.0f} %")
     return "; ".join(words)

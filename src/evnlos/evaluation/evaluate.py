@@ -10,9 +10,18 @@ import torch
 from torch import Tensor
 
 from evnlos.config import from_dict, to_dict
-from evnlos.dataset import Dataset, NlosDataset, Sampling, character_of, network_input, read_shard
+from evnlos.dataset import (
+    Dataset,
+    NlosDataset,
+    Sampling,
+    Simulation,
+    character_of,
+    network_input,
+    read_shard,
+)
 from evnlos.errors import DataError
 from evnlos.evaluation.classifier import CHARACTERS, read_characters
+from evnlos.evaluation.consistency import FrameOperator
 from evnlos.evaluation.memory import nearer_to_truth, nearest_answer, recall
 from evnlos.evaluation.score import Perceptual, Scores, score
 from evnlos.evaluation.worth import PassWorth, worth_of
@@ -80,7 +89,11 @@ class Evaluation:
 
 
 def evaluate(
-    weights: Weights, dataset: Dataset, split: str = "test", perceptual: Perceptual | None = None
+    weights: Weights,
+    dataset: Dataset,
+    split: str = "test",
+    perceptual: Perceptual | None = None,
+    rig: Simulation | None = None,
 ) -> Evaluation:
     """Reconstruct a split of a dataset and score it.
 
@@ -91,6 +104,8 @@ def evaluate(
         dataset: Where the samples are.
         split: "train", "validation", "test" or "all".
         perceptual: LPIPS, where its weights are at hand.
+        rig: The calibrated rig that the confidence asks how much of the frames the pictures explain; weights of
+            events alone see no frames, and are not asked.
 
     Raises:
         DataError: The split is empty, or its samples were made in another way than those of the training.
@@ -102,7 +117,9 @@ def evaluate(
     if weights.confidence is None or np.isnan(samples.position_m).any():
         return found
     canvas = dataset.sampling.canvas
-    return replace(found, worth=worth_of(weights.network, weights.confidence, samples, images, canvas))
+    operator = FrameOperator(rig, dataset.sampling) if rig is not None and weights.paradigm != "event" else None
+    worth = worth_of(weights.network, weights.confidence, samples, images, canvas, operator)
+    return replace(found, worth=worth)
 
 
 def assess(

@@ -11,6 +11,10 @@ from evnlos.evaluation.consistency import FrameOperator
 from evnlos.model.plates import on_canvas
 from evnlos.types import Plane
 
+_BEYOND_NOISE = 0.05
+"""What the average object must leave above the noise, as a share of it, for a picture to be told from it."""
+_MAD = 0.6745  # of a normal distribution, in standard deviations
+
 
 def explained(
     pictures: Tensor,
@@ -22,14 +26,16 @@ def explained(
 ) -> float:
     """Return the share of what the average object leaves unexplained in the frames that the pictures explain.
 
-    1 - |y - A x - b|^2 / |y - A x0 - b|^2, with x the pictures and x0 the average plate where the plate is.
-    1 = the frames are as the pictures make them; 0 = they are as good as those of the average plate, which is
-    all that a matte wall can say; below 0 = they are worse: the pictures are not what was in front of the wall,
-    or the rig is another.
+    1 - (|m y - g m A x|^2 - n) / (|m y - g0 m A x0|^2 - n), with x the pictures, x0 the average plate where the
+    plate is, and n the noise. m takes what stands still away, each pixel's mean over the pass, and the gains g
+    and g0 are the best ones: neither ambient light nor the camera's fixed pattern nor how bright the object is
+    has to be known, only what the wall does. 1 = the frames are as the pictures make them; 0 = they are as good
+    as those of the average plate, or the frames do not tell objects from it, as before a matte wall; below 0 =
+    they are worse: the pictures are not what was in front of the wall, or the wall is another.
 
     Args:
         pictures: Pictures of the canvas, float32 [N, H, W], 0..1.
-        frames: Frames of the samples y, float32 [N, h, w], white levels, without fixed pattern.
+        frames: Frames of the samples y, float32 [N, h, w].
         position_m: The plate's centre in each, (x, y) in metres, [N, 2].
         average: The average plate, [P, P].
         operator: The rig.
@@ -44,5 +50,46 @@ def explained(
             f"{operator.size[1]} x {operator.size[0]} samples"
         )
     plain = on_canvas(average, canvas, position_m)
-    left, before = ((frames - operator(shown)).square().sum() for shown in (pictures, plain))
-    return float(1 - left / before.clamp_min(torch.finfo(torch.float32).tiny))
+    noise = _noise(frames)
+    left, before = (_left(shown, frames, operator) - noise for shown in (pictures, plain))
+    tiny = 1e-9 * _moving(frames).square().sum()  # rounding
+    if before <= _BEYOND_NOISE * noise + tiny:
+        return 0.0
+    return float(1 - left.clamp_min(0) / before)
+
+
+def light_gain(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> float:
+    """Return how much brighter the moving light of frames is than the rig makes it from pictures.
+
+    Args:
+        pictures: Pictures of the canvas, float32 [N, H, W], 0..1.
+        frames: Frames of the samples, float32 [N, h, w], white levels.
+        operator: The rig.
+    """
+    made, seen = _moving(operator(pictures)), _moving(frames)
+    return float((made * seen).sum() / made.square().sum().clamp_min(torch.finfo(torch.float64).tiny))
+
+
+def _moving(frames: Tensor) -> Tensor:
+    """Return frames without what stands still, float64."""
+    frames = frames.double()
+    return frames - frames.mean(dim=0)
+
+
+def _left(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> Tensor:
+    """Return the moving light that the pictures leave unexplained at the best gain, squared and summed."""
+    gain = max(light_gain(pictures, frames, operator), 0.0)
+    return (_moving(frames) - gain * _moving(operator(pictures))).square().sum()
+
+
+def _noise(frames: Tensor) -> Tensor:
+    """Return what noise adds to the moving light, squared and summed: from the scatter about the neighbours.
+
+    The light moves slowly and over few pixels; the median over the pixels is that of the others.
+    """
+    if len(frames) < 3:
+        return torch.zeros((), dtype=torch.float64)
+    frames = frames.double()
+    bend = frames[1:-1] - 0.5 * (frames[2:] + frames[:-2])  # 1.5 times the noise's variance
+    variance = (bend.flatten(1).abs().median(dim=1).values.median() / _MAD).square() / 1.5
+    return variance * frames[0].numel() * (len(frames) - 1)

@@ -51,7 +51,7 @@ def _judged(
     operator: FrameOperator | None,
 ) -> Judgement:
     share = None
-    if operator is not None:
+    if operator is not None and bool(frames.any()):
         share = explained(images, frames, position_m, confidence.mean, operator, canvas)
     return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
 

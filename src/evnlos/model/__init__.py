@@ -5,7 +5,7 @@ from evnlos.model.infer import infer
 from evnlos.model.joint import JointNetwork, new_network
 from evnlos.model.linear import LinearEstimate, fit_linear
 from evnlos.model.plates import plates
-from evnlos.model.published import published, published_for, published_single
+from evnlos.model.published import published, published_for, published_rig, published_single
 from evnlos.model.unet import ResidualUNet, UNetConfig
 from evnlos.model.weights import Weights, load_weights, save_weights, with_rank
 
@@ -25,6 +25,7 @@ __all__ = [
     "plates",
     "published",
     "published_for",
+    "published_rig",
     "published_single",
     "save_weights",
     "with_rank",

@@ -19,7 +19,7 @@ from evnlos.types import Plane
 
 COVERAGE = 0.9
 """Share of a plate's pixels whose true level the intervals are to hold."""
-CONFIRMED = 0.5
+CONFIRMED = 0.7
 """Share of the frames that pictures have to explain where the rig is known (see `Judgement.explained`)."""
 LEVELS = 16
 """Bins of a pixel's reconstructed level."""
@@ -39,8 +39,8 @@ class Judgement:
         low: Lower end of each pixel's interval, float32 [N, H, W], 0..1.
         high: Upper end.
         explained: Share of what the average object leaves unexplained in the frames that the pictures explain,
-            where the rig is known; 0 or less is no better than the average object, and a half is the least that
-            is believed.
+            where the rig is known; 0 or less is no better than the average object, and `CONFIRMED` is the least
+            that is believed.
     """
 
     agreement: float
@@ -65,8 +65,8 @@ class Judgement:
         """One sentence for a reader."""
         if self.agreement > self.threshold and not self.measured:
             return (
-                f"nothing measured: the pictures explain {100 * (self.explained or 0):.0f} % of what the "
-                "frames show of this object; this is not what the weights know, or not the rig"
+                f"nothing measured: the pictures explain {100 * max(self.explained or 0, 0):.0f} % of what the "
+                "frames show of this object; the wall is not that of the rig, or not one that the weights know"
             )
         if not self.measured:
             return (

@@ -20,6 +20,17 @@ def published() -> dict[str, Path]:
     return {path.stem: path for path in sorted(_FOLDER.glob("*.safetensors"))}
 
 
+def published_rig(weights: str | Path) -> Path | None:
+    """Return the calibrated rig that published weights were trained for, a `rig.yaml`; None for other weights.
+
+    Args:
+        weights: A name of `published`, or what else stands for weights.
+    """
+    name = str(weights)
+    path = _FOLDER / f"{name.partition('-')[0]}.yaml"
+    return path if name in published() and path.is_file() else None
+
+
 def published_single() -> list[str]:
     """Return the names of the published weights that see one position at a time.
 

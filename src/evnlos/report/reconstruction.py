@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from evnlos.claim import check_folder
-from evnlos.config import from_dict, write_atomically
+from evnlos.config import from_dict, load_yaml, write_atomically
 from evnlos.dataset import (
     FixedPattern,
     Sampling,
@@ -20,9 +21,13 @@ from evnlos.dataset import (
 )
 from evnlos.evaluation import reconstruct, score
 from evnlos.evaluation.consistency import FrameOperator, consistent
+from evnlos.evaluation.explained import light_gain
 from evnlos.evaluation.worth import judgement_of, said
-from evnlos.model import load_weights, published_for
+from evnlos.model import load_weights, published_for, published_rig
 from evnlos.report.pictures import grey, polarity, save_animation, save_png, stretched, strip
+
+_SAME_LIGHT = (0.75, 1.33)
+"""Range of a capture's brightness, in that of its calibrated rig, in which the rig's gain is the capture's."""
 
 
 def reconstruct_capture(
@@ -48,12 +53,14 @@ def reconstruct_capture(
         out: The folder for the pictures; must not exist or be empty.
         zoom: Size of a pixel in the pictures.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
-        rig: The calibrated rig; the pictures are then moved to where the wall agrees with the frames, and the
-            confidence says how much of the frames they explain.
+        rig: The calibrated rig; the pictures are then moved to where the wall agrees with the frames, if these
+            are as bright as the rig makes them, and the confidence says how much of the frames they explain.
+            Without one, that is told by the rig of published weights, and the pictures stay.
 
     Returns:
         Capture, weights, paradigm, number of positions; where the truth is known, the mean scores; where it can
-        be told, the confidence: support, threshold, measured, verdict and, with a rig, explained.
+        be told, the confidence: support, threshold, measured, verdict and, where a rig is known, explained;
+        with a rig, `light`, the capture's brightness in that of the rig, and whether the pictures were moved.
 
     Raises:
         DataError: The capture or the weights can't be used, or `out` holds other files.
@@ -67,10 +74,18 @@ def reconstruct_capture(
     samples = capture_samples(shot, sampling, pattern)
     check_folder(out)
     images = reconstruct(loaded, samples.frame, samples.surface, samples.position_m)
-    operator = None if rig is None else FrameOperator(rig, sampling)
+    known = published_rig(weights)
+    judge = rig or (load_yaml(Simulation, known) if known else None)
+    operator = None if judge is None else FrameOperator(judge, sampling)
     worth = judgement_of(loaded, samples, images, operator)
-    if operator is not None:
-        images = consistent(images, torch.from_numpy(samples.frame), operator)
+    light = None
+    if rig is not None and operator is not None:
+        frames = torch.from_numpy(samples.frame)
+        light = light_gain(images, frames, operator)
+        if _is_the_rigs(light):
+            images = consistent(images, frames, operator)
+            if worth is not None:  # where the frames moved a level out of its interval, the interval follows
+                worth = replace(worth, low=worth.low.minimum(images), high=worth.high.maximum(images))
     pictures = [grey(image) for image in images]
     out.mkdir(parents=True, exist_ok=True)
     for k, picture in enumerate(pictures):
@@ -91,6 +106,8 @@ def reconstruct_capture(
         "paradigm": loaded.paradigm,
         "positions": len(pictures),
     }
+    if light is not None:
+        found |= {"light": round(light, 4), "moved_by_the_rig": _is_the_rigs(light)}
     if worth is not None:
         save_png(out / "unsure.png", strip([grey(one) for one in worth.high - worth.low]), 2)
         write_atomically(out / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))
@@ -99,6 +116,10 @@ def reconstruct_capture(
         truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
         found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
     return found
+
+
+def _is_the_rigs(light: float) -> bool:
+    return _SAME_LIGHT[0] < light < _SAME_LIGHT[1]
 
 
 def _npy(array: np.ndarray) -> bytes:

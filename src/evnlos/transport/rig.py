@@ -77,6 +77,8 @@ class RadiometricTransport:
         """Return the wall's BRDF."""
         if self.wall_material == "lambert":
             return Lambert(self.albedo)
+        if self.wall_material != "ggx":
+            raise ConfigError(f"wall_material is {self.wall_material!r}; give ggx (metal) or lambert (matte)")
         return GGX.aluminium(self.roughness, self.wavelength_m, self.roughness_y)
 
     def view(self, shape: tuple[int, int]) -> View:
