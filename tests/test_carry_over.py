@@ -72,3 +72,5 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, monkeypatch) -> 
     text = (tmp_path / "carry-over-lab-w.md").read_text()
     widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
     assert widths == {13} and "Mean skill of the best" in text
+    pytest.importorskip("matplotlib")
+    assert (tmp_path / "carry-over-lab-w.png").stat().st_size > 10_000

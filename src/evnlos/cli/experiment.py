@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from evnlos.cli.notes import say
 from evnlos.config import write_atomically
 from evnlos.dataset import PARADIGMS, Paradigm
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, MissingDependencyError
 
 if TYPE_CHECKING:
     from evnlos.experiment import Arm, Step, Study
@@ -162,6 +163,7 @@ class Command:
 
     def _carry_over(self) -> None:
         from evnlos.experiment import carried_table, carry_over, show, write_carried
+        from evnlos.plot.worth import draw_worth
 
         weights = self.weights
         if weights is None:
@@ -180,6 +182,10 @@ class Command:
         text = carried_table(found) + "\n"
         write_atomically(self.out / f"{name}.md", text.encode())
         print(text)
+        try:
+            draw_worth({one.name: one.worth for one in found}, self.out / f"{name}.png")
+        except MissingDependencyError as error:
+            say(f"no {name}.png: {error}")
 
 
 def _tables(name: str, records: list, metric: str) -> str:
