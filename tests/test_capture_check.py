@@ -162,7 +162,9 @@ def test_frames_on_a_shifted_clock_are_found_with_the_cure(steady, shift_us, way
 
 
 def test_frames_in_reversed_order_are_found(steady) -> None:
-    found = {one.what: one for one in check_capture(replace(steady, frames=steady.frames[::-1]))}["clock offset"]
+    found = {one.what: one for one in check_capture(replace(steady, frames=steady.frames[::-1]))}[
+        "clock offset"
+    ]
     assert found.level == "bad" and "reversed order" in found.found and "order" in found.cure
 
 

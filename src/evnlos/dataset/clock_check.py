@@ -1,7 +1,8 @@
-"""Do frames and events of a capture tell the same course of the light? How far their clocks are apart, if not."""
+"""How far the frames of a capture are from its events, told by the course of the light in both."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -114,12 +115,13 @@ def expected_counts(level: NDArray[np.float64], threshold: float) -> NDArray[np.
     phase = (2 * np.arange(_PHASES) + 1) / _PHASES - 1  # -1..1 of the threshold
     reference = level[0][:, None] + threshold * phase
     start = [reference.mean(axis=1)]
-    for before, after in zip(level[:-1], level[1:], strict=True):
+    for before, after in itertools.pairwise(level):
         for part in np.arange(1, _STEPS + 1) / _STEPS:
             away = (before + (after - before) * part)[:, None] - reference
             reference = reference + threshold * np.trunc(away / threshold)
         start.append(reference.mean(axis=1))
-    return np.diff(np.array(start), axis=0) / threshold
+    sent: NDArray[np.float64] = np.diff(np.array(start), axis=0)
+    return sent / threshold
 
 
 def _levels(frames: NDArray, grid: tuple[int, int]) -> NDArray[np.float64]:
