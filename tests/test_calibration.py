@@ -14,7 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from evnlos.calibration import Calibration, fit_rig, fit_transport, read_shots, rows_of, write_rig
+from evnlos.calibration import (
+    Calibration,
+    Residual,
+    figures,
+    fit_rig,
+    fit_transport,
+    read_shots,
+    rows_of,
+    table,
+    warnings_of,
+    write_rig,
+)
 from evnlos.calibration.event_check import _block_counts
 from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import count_map, read_recordings, within
@@ -394,3 +405,62 @@ def test_independent_captures_are_fitted(shared_data, group, limit) -> None:
     after = model.relative(model.frames - model.predict(found.transport))
     before = model.relative(model.frames - model.predict(found.before))
     assert after < limit < before
+
+
+def test_a_number_on_the_bound_of_the_search_is_named(fit) -> None:
+    assert fit.optics.on_bound == {} and fit.unexplained is None and warnings_of(fit) == []
+    parameters = tuple(
+        replace(p, high=p.read(fit.optics.transport)) if p.name == "roughness" else p
+        for p in fit.optics.parameters
+    )
+    stuck = replace(fit, optics=replace(fit.optics, parameters=parameters))
+    rows = rows_of(stuck, EventPixel(), FrameCamera())
+    assert "on the bound of the search: 0.06" in table(rows)
+    found = figures(stuck, rows)
+    assert found["on_bound"] == ["transport.roughness"]
+    assert len(found["warnings"]) == 1 and "transport.roughness" in found["warnings"][0]
+    assert "evnlos scan" in found["warnings"][0] and "\n" not in found["warnings"][0]
+
+
+def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targets(fit, tmp_path) -> None:
+    def leaving(after: float, targets: str):
+        left = Residual(before=0.5, after=after, noise=0.1)
+        return replace(
+            fit, targets=targets, residuals={**fit.residuals, "frames held out, without pattern": left}
+        )
+
+    assert warnings_of(leaving(0.105, "known")) == []
+    (line,) = warnings_of(leaving(0.13, "known"))
+    assert "13.0 % is left where noise alone leaves 10.0 %" in line and "evnlos scan" in line
+    assert warnings_of(leaving(0.15, "unknown")) == []  # plates that are only expected leave that much
+    wrong = leaving(0.412, "unknown")
+    rows = rows_of(wrong, EventPixel(), FrameCamera())
+    with pytest.raises(DataError, match=r"41\.2 % is left .* no rig file was written"):
+        write_rig(wrong, rows, tmp_path / "refused")
+    assert not (tmp_path / "refused" / "rig.yaml").exists()
+    assert "41.2 %" in json.loads((tmp_path / "refused" / "calibration.json").read_text())["warnings"][0]
+    assert write_rig(wrong, rows, tmp_path / "forced", force=True).exists()
+    assert write_rig(leaving(0.412, "known"), rows, tmp_path / "known").exists()
+
+
+def test_the_gain_of_unknown_targets_is_called_arbitrary(fit) -> None:
+    for targets, note in (("known", ""), ("unknown", "not told by unknown targets: arbitrary")):
+        one = replace(fit, targets=targets)
+        rows = rows_of(one, EventPixel(), FrameCamera())
+        assert {row.name: row.note for row in rows}["transport.gain"] == note
+        assert figures(one, rows)["parameters"]["transport.gain"]["note"] == note
+        assert (note in table(rows)) and figures(one, rows)["targets"] == targets
+
+
+def test_a_matte_wall_ends_on_the_bounds(tmp_path, capsys) -> None:
+    """Rough metal is fitted to a matte wall that explains the frames to the noise: only the bounds tell."""
+    wall = replace(RIG, wall_material="lambert")
+    matte = replace(LAB, transport=wall, sensor=SensorSize(25, 40), frame_rate_hz=1.0)
+    shots = render_captures(matte, tmp_path / "shots")
+    words = ["calibrate", *shots, "--out", tmp_path / "rig", "--holdout", "4", "--no-events", "--columns", 16]
+    main([str(word) for word in words])
+    shown = capsys.readouterr()
+    assert "on the bound of the search" in shown.out
+    assert any(
+        line.startswith("warning: transport.") and "evnlos scan" in line for line in shown.err.splitlines()
+    )

@@ -11,7 +11,12 @@ from evnlos.dataset import read_capture
 from evnlos.dataset.capture_check import check_capture
 from evnlos.dataset.capture_info import read_capture_info
 from evnlos.dataset.capture_template import begin_capture
+from evnlos.dataset.clock_check import expected_counts
+from evnlos.dataset.lab import Lab, render_captures
+from evnlos.dataset.simulate import SensorSize
 from evnlos.errors import DataError
+from evnlos.scene import FontGlyphs
+from evnlos.transport import RadiometricTransport
 from evnlos.types import Events
 
 
@@ -131,3 +136,48 @@ def test_the_command_prints_and_its_exit_code_tells(tiny_captures, tmp_path, cap
     with pytest.raises(SystemExit) as stop:
         main(["capture", "check", str(tmp_path)])
     assert stop.value.code == 2 and "capture.yaml" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def steady(tmp_path_factory):
+    """A rendered capture at 2.5 frames a second."""
+    lab = Lab(
+        glyphs=FontGlyphs(family="kalam", characters="R"),
+        sensor=SensorSize(48, 72),
+        transport=RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06),
+        frame_rate_hz=2.5,
+    )
+    return read_capture(next(render_captures(lab, tmp_path_factory.mktemp("steady"))))
+
+
+@pytest.mark.parametrize(("shift_us", "way"), [(350_000, "late"), (-350_000, "early"), (3_000_000, "late")])
+def test_frames_on_a_shifted_clock_are_found_with_the_cure(steady, shift_us, way) -> None:
+    found = {one.what: one for one in check_capture(steady)}["clock offset"]
+    assert found.level == "good" and found.cure == ""
+    shifted = replace(steady, frame_times_us=steady.frame_times_us + shift_us)
+    found = {one.what: one for one in check_capture(shifted)}["clock offset"]
+    assert found.level == "bad" and f"too {way}" in found.found
+    stated = int(found.cure.split("offset_us: ")[1].split("}")[0])
+    assert stated == pytest.approx(-shift_us, abs=200_000)
+
+
+def test_frames_in_reversed_order_are_found(steady) -> None:
+    found = {one.what: one for one in check_capture(replace(steady, frames=steady.frames[::-1]))}[
+        "clock offset"
+    ]
+    assert found.level == "bad" and "reversed order" in found.found and "order" in found.cure
+
+
+def test_frames_that_tell_no_offset_are_called_doubtful(steady) -> None:
+    draw = np.random.default_rng(0)
+    still = (100 + 3 * draw.standard_normal(steady.frames.shape)).astype(np.uint8)
+    assert levels(replace(steady, frames=still))["clock offset"] == "doubtful"
+    assert "clock offset" not in levels(replace(steady, frames=steady.frames[:, ::2]))
+
+
+def test_pixels_without_noise_send_what_is_expected() -> None:
+    """A light that rises and falls by ten thresholds: ten events each way, less the dead zone at the turn."""
+    level = np.concatenate([np.linspace(0, 1, 11), np.linspace(1, 0, 11)[1:]])[:, None]
+    sent = expected_counts(level, 0.1)
+    assert sent[:10].sum() == pytest.approx(9.5, abs=0.51) and sent[1:10] == pytest.approx(1.0, abs=1e-6)
+    assert sent[10:].sum() == pytest.approx(-9.0, abs=0.51) and abs(sent[10]) < 0.01

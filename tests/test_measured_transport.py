@@ -306,7 +306,7 @@ def spoiled(folder: Path, source: Path, how: str) -> None:
     ("how", "match"),
     [
         ("missing line", r"lists 143 pictures of patterns.*72 x 2 repeats = 144.*pattern 5 of repeat 1"),
-        ("missing file", "does not exist"),
+        ("missing file", r"does not exist; .*frames.csv names it"),
         ("twice", "lists 1 pictures twice"),
         ("outside", "lies outside"),
         ("link", "lies outside"),

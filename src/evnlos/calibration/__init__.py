@@ -7,7 +7,15 @@ from evnlos.calibration.frame_model import FrameModel, Light
 from evnlos.calibration.frame_noise import FrameNoise, fit_frame_noise
 from evnlos.calibration.residual import Residual
 from evnlos.calibration.settings import Calibration
-from evnlos.calibration.summary import RIG_FILE, figures, residual_table, rows_of, table, write_rig
+from evnlos.calibration.summary import (
+    RIG_FILE,
+    figures,
+    residual_table,
+    rows_of,
+    table,
+    warnings_of,
+    write_rig,
+)
 from evnlos.calibration.transport_fit import TransportFit, fit_transport
 
 __all__ = [
@@ -31,5 +39,6 @@ __all__ = [
     "residual_table",
     "rows_of",
     "table",
+    "warnings_of",
     "write_rig",
 ]

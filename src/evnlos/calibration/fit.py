@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -28,6 +29,9 @@ from evnlos.sensor import EventPixel
 from evnlos.transport import MeasuredTransport, RadiometricTransport
 
 _EXAMPLES = 3
+_WITHOUT_PATTERN = "frames held out, without pattern"
+_MOST_OF_NOISE = 1.1
+_MOST_UNEXPLAINED = {"known": 0.05, "unknown": 0.2}  # plates that nobody knows are never expected exactly
 
 Surfaces = dict[str, tuple[NDArray, NDArray]]
 """Time surfaces [N, 2, h, w] of camera and model by capture."""
@@ -67,6 +71,7 @@ class RigFit:
         residuals: By "frames fit" and "frames held out"; with events also of "counts" and "surfaces"; and of
             "frames held out, without pattern", before and after the fixed pattern is taken from the frames.
         example: Held-out captures beside the fit.
+        targets: Whether the captures' targets were known.
     """
 
     simulation: Simulation
@@ -78,6 +83,18 @@ class RigFit:
     pixel: PixelFit | None
     residuals: dict[str, Residual]
     example: tuple[Example, ...]
+    targets: Literal["known", "unknown"] = "known"
+
+    @property
+    def unexplained(self) -> Residual | None:
+        """What is left of the frames held out, the pattern taken, where that is far above noise; else None.
+
+        Far is a tenth more than noise alone leaves and, beside the noise, more than 5 % of the standard
+        deviation; 20 % where targets are unknown.
+        """
+        left = self.residuals[_WITHOUT_PATTERN]
+        far = left.after > _MOST_OF_NOISE * left.noise and left.unexplained > _MOST_UNEXPLAINED[self.targets]
+        return left if far else None
 
     @property
     def worse(self) -> tuple[str, ...]:
@@ -134,7 +151,7 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
     lit = torch.from_numpy(noise.pattern.correct(held.frames(), held.peak))
     seen = models["held out"]
     corrected = seen.relative((lit - predicted["held out"]) * seen.weight)
-    residuals["frames held out, without pattern"] = replace(
+    residuals[_WITHOUT_PATTERN] = replace(
         residuals["frames held out"], before=residuals["frames held out"].after, after=corrected
     )
     simulation = _simulation(settings, fit, optics.transport, noise, settings.start.pixel)
@@ -156,7 +173,18 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
     if settings.targets == "known":
         strokes = pens_of([scene.target.mask for scene in fit.scenes])
     training = training_simulation(simulation, noise, pixel, strokes)
-    return RigFit(simulation, training, fit.names, held.names, optics, noise, pixel, residuals, examples)
+    return RigFit(
+        simulation,
+        training,
+        fit.names,
+        held.names,
+        optics,
+        noise,
+        pixel,
+        residuals,
+        examples,
+        settings.targets,
+    )
 
 
 def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[AnyTransport, tuple[str, ...]]:

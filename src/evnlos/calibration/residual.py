@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -18,3 +19,8 @@ class Residual:
     before: float
     after: float
     noise: float
+
+    @property
+    def unexplained(self) -> float:
+        """What the fit leaves beside the noise, root mean square over the camera's standard deviation."""
+        return math.sqrt(max(self.after**2 - self.noise**2, 0.0))

@@ -9,12 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from evnlos.calibration.fit import RigFit
+from evnlos.calibration.residual import Residual
 from evnlos.config import save_yaml, write_atomically
 from evnlos.dataset.fixed_pattern import PATTERN_FILE, save_pattern
 from evnlos.errors import ConfigError, DataError
 from evnlos.version import __version__
 
 RIG_FILE, TRAINING_FILE, FIGURES_FILE = "rig.yaml", "training.yaml", "calibration.json"
+
+_UNTOLD = "not told by unknown targets: arbitrary"
+_ANOTHER_WALL = "the wall may be of another kind: measure its transport (evnlos scan), or try"
+_TRY = {"known": "another --preset or start", "unknown": "known targets or another start"}
 
 
 @dataclass(frozen=True)
@@ -47,13 +52,15 @@ def rows_of(fit: RigFit, start_pixel: Any, start_camera: Any) -> list[Row]:
         start_camera: Frame camera of the start.
     """
     optics = fit.optics
+    first, last = optics.before, optics.transport
+    bound = {name: f"on the bound of the search: {value:.4g}" for name, value in optics.on_bound.items()}
     rows = [
-        Row(f"transport.{p.name}", p.read(optics.before), p.read(optics.transport), float(e), p.unit)
+        Row(f"transport.{p.name}", p.read(first), p.read(last), float(e), p.unit, bound.get(p.name, ""))
         for p, e in zip(optics.parameters, optics.error, strict=True)
     ]
-    first, last = optics.before, optics.transport
+    gain = _UNTOLD if fit.targets == "unknown" else ""
     rows += [
-        Row("transport.gain", first.gain, last.gain, None, "white levels"),
+        Row("transport.gain", first.gain, last.gain, None, "white levels", gain),
         Row("transport.ambient", first.ambient, last.ambient, None, "white levels"),
     ]
     rows += [
@@ -128,13 +135,34 @@ def _aligned(cells: list[list[str]]) -> str:
     return "\n".join(lines)
 
 
+def warnings_of(fit: RigFit) -> list[str]:
+    """Return why a fit should not be believed as it stands, one line each; none where nothing was found."""
+    found, cure = [], f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
+    if on_bound := fit.optics.on_bound:
+        names = ", ".join(f"transport.{name} ({value:.4g})" for name, value in on_bound.items())
+        found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")
+    if fit.unexplained is not None:
+        found.append(f"{_left(fit.unexplained)}; {cure}")
+    return found
+
+
+def _left(r: Residual) -> str:
+    return (
+        f"frames held out, without pattern: {100 * r.after:.1f} % is left where noise alone leaves "
+        f"{100 * r.noise:.1f} %"
+    )
+
+
 def figures(fit: RigFit, rows: list[Row]) -> dict[str, Any]:
     """Return a calibration as plain values for JSON; an unknown error is null."""
     return {
         "evnlos": __version__,
         "fitted": list(fit.fitted),
         "held_out": list(fit.held_out),
+        "targets": fit.targets,
         "worse_on_held_out": list(fit.worse),
+        "on_bound": [f"transport.{name}" for name in fit.optics.on_bound],
+        "warnings": warnings_of(fit),
         "residuals": {
             name: {"before": round(r.before, 5), "after": round(r.after, 5), "noise": round(r.noise, 5)}
             for name, r in fit.residuals.items()
@@ -180,7 +208,8 @@ def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> P
         The rig file, which `evnlos simulate --config` takes.
 
     Raises:
-        DataError: The fit is no better than the start on the held-out captures.
+        DataError: The fit is no better than the start on the held-out captures, or, with unknown targets,
+            leaves them far above the noise.
     """
     check_out(out, force)
     out.mkdir(parents=True, exist_ok=True)
@@ -192,6 +221,11 @@ def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> P
             f"{name}: the residual went from {100 * r.before:.1f} % to {100 * r.after:.1f} %, so it is no fit "
             "of the rig and no rig file was written; check that all captures show one unmoved rig, try another "
             "--preset or start, or --no-events where only events got worse"
+        )
+    if fit.targets == "unknown" and fit.unexplained is not None and not force:
+        raise DataError(
+            f"{_left(fit.unexplained)}, so it is no fit of the rig and no rig file was written; "
+            f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
         )
     save_pattern(fit.noise.pattern, out / PATTERN_FILE)
     save_yaml(fit.training, out / TRAINING_FILE)

@@ -97,6 +97,17 @@ class TransportFit:
     parameters: tuple[Parameter, ...]
     error: NDArray[np.float64]
 
+    @property
+    def on_bound(self) -> dict[str, float]:
+        """Parameters that ended on a bound of the search, within half a step, and that bound in its unit."""
+        found: dict[str, float] = {}
+        for p in self.parameters:
+            value = p.encode(p.read(self.transport))
+            for bound in (p.low, p.high):
+                if abs(value - p.encode(bound)) <= 0.5 * p.step:
+                    found[p.name] = bound
+        return found
+
 
 def parameters_of(transport: AnyTransport, fixed: tuple[str, ...] = ()) -> tuple[Parameter, ...]:
     """Return the parameters that the frames of a transport decide, without those that are known.

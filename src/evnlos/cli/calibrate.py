@@ -33,7 +33,7 @@ class Command:
 
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""
-        from evnlos.calibration import figures, fit_rig, residual_table, rows_of, table, write_rig
+        from evnlos.calibration import figures, fit_rig, residual_table, rows_of, table, warnings_of, write_rig
         from evnlos.calibration.summary import TRAINING_FILE, check_out
         from evnlos.errors import MissingDependencyError
         from evnlos.plot.calibration import draw_calibration
@@ -51,6 +51,8 @@ class Command:
             draw_calibration(fit, self.out / "check.png")
         except MissingDependencyError as error:
             say(f"note: {error}")
+        for line in warnings_of(fit):
+            say(f"warning: {line}")
         path = write_rig(fit, rows, self.out, self.force)
         if not self.json:
             print(

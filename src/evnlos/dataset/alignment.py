@@ -90,11 +90,11 @@ def find_offset(
         raise DataError("no events to find the clock offset from; state offset_us")
     signed = events.polarity_known is None or bool(events.polarity_known.any())
     same = frames.shape[1:] == events.shape
-    grid = _grid(events.shape, blocks) if same else (1, 1)
+    grid = grid_of(events.shape, blocks) if same else (1, 1)
     changes = _changes(frames, grid, signed)  # [N - 1, B]
-    clock_us, sums = _running_sums(events, grid, step_us, signed)  # [T], [T, B]
+    clock_us, sums = running_sums(events, grid, step_us, signed)  # [T], [T, B]
     offsets = np.arange(-search_us, search_us + 1, step_us, dtype=np.int64)
-    scores = np.array([_score(changes, times_us + offset, clock_us, sums) for offset in offsets])
+    scores = np.array([agreement(changes, times_us + offset, clock_us, sums) for offset in offsets])
     if np.isnan(scores).all():
         raise DataError(
             f"no offset up to {search_us} us puts frames at {times_us[0]}..{times_us[-1]} us over events at "
@@ -112,14 +112,14 @@ def find_offset(
     return found
 
 
-def _grid(shape: tuple[int, int], blocks: int) -> tuple[int, int]:
+def grid_of(shape: tuple[int, int], blocks: int) -> tuple[int, int]:
     """Return rows and columns of nearly square blocks."""
     if not 1 <= blocks <= 64:
         raise DataError(f"blocks is {blocks}; give 1 to 64")
     return tuple(max(1, min(side, round(blocks * side / max(shape)))) for side in shape)  # type: ignore[return-value]
 
 
-def _block_of(count: int, side: int) -> NDArray[np.int64]:
+def block_of(count: int, side: int) -> NDArray[np.int64]:
     """Return the block of each of `side` pixels."""
     return np.arange(side) * count // side
 
@@ -127,7 +127,7 @@ def _block_of(count: int, side: int) -> NDArray[np.int64]:
 def _changes(frames: NDArray, grid: tuple[int, int], signed: bool) -> NDArray[np.float64]:
     """Return the change of the blocks' mean logarithm from frame to frame, [N - 1, B]."""
     peak = float(np.iinfo(frames.dtype).max) if frames.dtype.kind == "u" else float(np.max(frames)) or 1.0
-    rows, columns = _block_of(grid[0], frames.shape[1]), _block_of(grid[1], frames.shape[2])
+    rows, columns = block_of(grid[0], frames.shape[1]), block_of(grid[1], frames.shape[2])
     block = (rows[:, None] * grid[1] + columns).ravel()  # [H * W]
     size = np.bincount(block)
     out = np.empty((len(frames) - 1, len(size)))
@@ -140,13 +140,13 @@ def _changes(frames: NDArray, grid: tuple[int, int], signed: bool) -> NDArray[np
     return out
 
 
-def _running_sums(
+def running_sums(
     events: Events, grid: tuple[int, int], step_us: int, signed: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return instants [T] and, for each block, the sum of all polarities up to them, [T, B]."""
     first, last = int(events.t_us[0]), int(events.t_us[-1])
     bins = int((last - first) // step_us) + 1
-    rows, columns = _block_of(grid[0], events.height), _block_of(grid[1], events.width)
+    rows, columns = block_of(grid[0], events.height), block_of(grid[1], events.width)
     block = rows[events.y] * grid[1] + columns[events.x]
     count = grid[0] * grid[1]
     weight = np.where(events.p, 1.0, -1.0) if signed else np.ones(len(events))
@@ -158,7 +158,7 @@ def _running_sums(
     return clock, np.concatenate([np.zeros((1, count)), np.cumsum(sums, axis=0)])
 
 
-def _score(
+def agreement(
     changes: NDArray[np.float64], edges_us: NDArray, clock_us: NDArray[np.float64], sums: NDArray[np.float64]
 ) -> float:
     """Return the correlation over the intervals inside the recording, NaN where there are too few."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from evnlos.dataset.capture import Capture
 from evnlos.dataset.cleaning import find_hot_pixels
+from evnlos.dataset.clock_check import LEAST_AGREEMENT, find_lag
 from evnlos.dataset.sampling import reduce_by_area
 
 Level = Literal["good", "doubtful", "bad"]
@@ -51,6 +52,7 @@ def check_capture(capture: Capture) -> list[Finding]:
         *_events(capture),
         *_flicker(capture),
         *_clock(capture),
+        *_offset(capture),
     ]
 
 
@@ -217,3 +219,44 @@ def _clock(capture: Capture) -> Iterator[Finding]:
         f"the most uneven step is off by {100 * uneven:.0f} % (20 % is safe)",
         "frames were dropped or the rate changed; a position is as long as its step",
     )
+
+
+def _offset(capture: Capture) -> Iterator[Finding]:
+    """Compare the course of the light in the frames with the events: offset, and order of the frames."""
+    lag = find_lag(capture.events, capture.frames, capture.frame_times_us)
+    if lag is None:
+        return
+    if lag.reversed:
+        yield Finding(
+            "clock offset",
+            "bad",
+            f"the events fit the frames in reversed order: correlation {lag.backwards:.2f}, forwards "
+            f"{lag.agreement:.2f}",
+            "put the frames' files into the order in which they were taken",
+        )
+        return
+    if not lag.told:
+        yield Finding(
+            "clock offset",
+            "doubtful",
+            f"frames and events share too little to tell: correlation {lag.agreement:.2f} "
+            f"({LEAST_AGREEMENT:g} is needed), frames reversed {lag.backwards:.2f}",
+            "record a blink of the light, or a trigger_channel",
+        )
+        return
+    way = "late" if lag.lag_us < 0 else "early"
+    yield _judged(
+        "clock offset",
+        abs(lag.lag_us) <= lag.limit_us,
+        False,
+        f"the frames' times are {abs(lag.lag_us) * 1e-6:.2f} s too {way} for the events (up to "
+        f"{lag.limit_us * 1e-6:.2f} s can't be told from none)",
+        _offset_cure(capture, lag.lag_us),
+    )
+
+
+def _offset_cure(capture: Capture, lag_us: int) -> str:
+    stated = capture.info.alignment.offset_us
+    if stated == "auto":
+        return f"auto went astray: state offset_us in capture.yaml, what auto found {lag_us:+d}"
+    return f"state alignment: {{offset_us: {stated + lag_us}}} in capture.yaml, or wire a trigger_channel"

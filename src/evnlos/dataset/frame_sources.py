@@ -33,8 +33,17 @@ class FrameSeries:
     what: str
 
 
-def inside(folder: Path, name: str) -> Path:
-    """Return the path of a file or folder of the capture; a name never leads out of its folder."""
+def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
+    """Return the path of a file or folder of the capture; a name never leads out of its folder.
+
+    Args:
+        folder: The capture's or scan's folder.
+        name: Path of the file below it.
+        by: File of that folder that names it, for the message.
+
+    Raises:
+        DataError: It is no name, lies outside the folder, or does not exist.
+    """
     try:
         path = (folder / name).resolve()
         there = path.exists()
@@ -43,7 +52,7 @@ def inside(folder: Path, name: str) -> Path:
     if not path.is_relative_to(folder.resolve()):
         raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
     if not there:
-        raise DataError(f"{path} does not exist; {folder / 'capture.yaml'} names it")
+        raise DataError(f"{path} does not exist; {folder / by} names it")
     return path
 
 
@@ -127,7 +136,7 @@ def _from_table(folder: Path, path: Path, size: tuple[int, int] | None) -> Frame
     except (TypeError, ValueError, OverflowError):
         raise DataError(f"{path} holds a time that is not a whole number of microseconds") from None
     _check_times(path, times)
-    images = [read_image(inside(folder, row["file"] or ""), size) for row in rows]
+    images = [read_image(inside(folder, row["file"] or "", path.name), size) for row in rows]
     for k, image in enumerate(images):
         if image.shape != images[0].shape or image.dtype != images[0].dtype:
             raise DataError(

@@ -116,7 +116,7 @@ def read_shots(folder: str | Path, info: ScanInfo) -> list[Shot]:
         DataError: The table is missing or garbled, or a pattern or the dark frames are missing.
     """
     folder = Path(folder)
-    path = inside(folder, info.frames)
+    path = inside(folder, info.frames, SCAN_FILE)
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(_bounded(csv.DictReader(file), path))
@@ -138,8 +138,12 @@ Reader = Callable[[Shot], NDArray]
 """From a shot to its picture, digital numbers [H, W]."""
 
 
-def frame_reader(folder: str | Path) -> Reader:
+def frame_reader(folder: str | Path, table: str = "frames.csv") -> Reader:
     """Return what reads the pictures of a folder, all of one size and type.
+
+    Args:
+        folder: The scan's folder.
+        table: Table that names the pictures, for messages.
 
     Raises (when it reads):
         DataError: A picture is missing, unreadable, outside the folder, or unlike the first one.
@@ -147,7 +151,7 @@ def frame_reader(folder: str | Path) -> Reader:
     folder, first = Path(folder), {}
 
     def read(shot: Shot) -> NDArray:
-        path = inside(folder, shot.file)
+        path = inside(folder, shot.file, table)
         image = read_image(path)
         shape, kind = first.setdefault("like", (image.shape, image.dtype))
         if image.shape != shape or image.dtype != kind:

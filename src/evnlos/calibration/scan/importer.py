@@ -96,7 +96,7 @@ def import_scan(folder: str | Path, settings: ScanImport | None = None) -> ScanR
     folder = Path(folder)
     info = read_scan_info(folder)
     shape = None if settings.height is None or settings.width is None else (settings.height, settings.width)
-    light = read_light(info, read_shots(folder, info), frame_reader(folder), shape)
+    light = read_light(info, read_shots(folder, info), frame_reader(folder, info.frames), shape)
     if light.bad.mean() > _MOST_BAD:
         raise DataError(
             f"{100 * light.bad.mean():.0f} % of the pixels saturate somewhere, at most {100 * _MOST_BAD:g} % "
