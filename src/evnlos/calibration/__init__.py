@@ -7,7 +7,7 @@ from evnlos.calibration.frame_model import FrameModel, Light
 from evnlos.calibration.frame_noise import FrameNoise, fit_frame_noise
 from evnlos.calibration.residual import Residual
 from evnlos.calibration.settings import Calibration
-from evnlos.calibration.summary import RIG_FILE, figures, residual_table, rows_of, table, write_rig
+from evnlos.calibration.summary import RIG_FILE, figures, residual_table, rig_file, rows_of, table, write_rig
 from evnlos.calibration.transport_fit import TransportFit, fit_transport
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "fit_transport",
     "read_shots",
     "residual_table",
+    "rig_file",
     "rows_of",
     "table",
     "write_rig",
