@@ -1,19 +1,23 @@
 """Tracking: shifts, velocities and the smoother against known motion and slow references."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from evnlos.cli import main
 from evnlos.cli.invert_pass import radiometric_rig
-from evnlos.config import save_yaml
-from evnlos.dataset import read_capture
+from evnlos.config import read_yaml, save_yaml, to_dict
+from evnlos.dataset import FixedPattern, Sampling, read_capture
+from evnlos.dataset.fixed_pattern import save_pattern
 from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
+from evnlos.model import JointNetwork, UNetConfig, Weights, save_weights
 from evnlos.plot.track import draw_track
 from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
@@ -449,6 +453,34 @@ def test_no_line_of_the_speed_lies_on_the_frame(tmp_path, monkeypatch) -> None:
     (speed,) = [axes for axes in drawn[0].axes if axes.get_title() == "speed"]
     low, high = speed.get_ylim()
     assert low == 0 and high > 1.05 * 2.0
+
+
+def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, capsys) -> None:
+    """Motion found gives a picture near that of motion stated, and the confidence that goes with it."""
+    folder, rig = capture
+    sampling = Sampling(height=24, width=36, scored_rows=18)
+    torch.manual_seed(0)
+    network = JointNetwork(1, UNetConfig(width=4, depth=1, rank=4), (24, 36), sampling.canvas.pitch_m).eval()
+    save_weights(tmp_path / "w.safetensors", Weights(network, "frame", to_dict(sampling), []))
+    without = tmp_path / folder.name
+    shutil.copytree(folder, without)
+    info = read_yaml(folder / "capture.yaml")
+    del info["motion"]
+    (without / "capture.yaml").write_text(yaml.safe_dump(info))
+    blank = np.zeros((24, 40), np.float32)
+    save_pattern(FixedPattern(blank + 1, blank), tmp_path / "pattern.safetensors")
+    shutil.copy(rig, tmp_path / "rig.yaml")
+    common = ["--weights", str(tmp_path / "w.safetensors"), "--rig", str(tmp_path)]
+    with pytest.raises(SystemExit):
+        main(["reconstruct", str(without), "--track", "--out", str(tmp_path / "none")])
+    said = capsys.readouterr().err
+    assert "--track without --rig; give the calibrated rig" in said and said.count("\n") == 1
+    assert not (tmp_path / "none").exists()
+    main(["reconstruct", str(without), *common, "--track", "--out", str(tmp_path / "found")])
+    assert "no confidence: these weights never learned it" in capsys.readouterr().out
+    main(["reconstruct", str(folder), *common, "--out", str(tmp_path / "stated")])
+    found, stated = (np.load(tmp_path / one / "reconstruction.npy") for one in ("found", "stated"))
+    assert np.abs(found - stated).mean() < 0.2 * np.abs(stated - stated[::-1]).mean()
 
 
 def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:
