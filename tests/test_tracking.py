@@ -1,17 +1,24 @@
 """Tracking: shifts, velocities and the smoother against known motion and slow references."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from evnlos.cli import main
-from evnlos.config import save_yaml
+from evnlos.cli.invert_pass import radiometric_rig
+from evnlos.config import read_yaml, save_yaml, to_dict
+from evnlos.dataset import FixedPattern, Sampling, read_capture
+from evnlos.dataset.fixed_pattern import save_pattern
 from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
+from evnlos.model import JointNetwork, UNetConfig, Weights, save_weights
+from evnlos.plot.track import draw_track
 from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
 from evnlos.solver import PlatePass
@@ -29,9 +36,12 @@ from evnlos.tracking import (
     smooth,
     static_light,
     temporal_noise,
+    track_capture,
+    track_doubts,
     track_frames,
 )
 from evnlos.tracking.depth import Depths
+from evnlos.tracking.registration import explained_change
 from evnlos.tracking.rig_shift import Fit
 from evnlos.transport import RadiometricTransport, SlidingWall, View
 from evnlos.types import Events, Plane
@@ -105,8 +115,39 @@ def test_registration_finds_growth() -> None:
 
 def test_nothing_to_see_is_refused() -> None:
     frames = 0.1 + 1e-3 * np.random.default_rng(3).standard_normal((6, *SHAPE))
-    with pytest.raises(DataError, match="stand"):
+    with pytest.raises(DataError, match=r"of 6 of 6 frames is less than 6 .* does not stand out on this wall"):
         register(frames, np.full(SHAPE, 0.1), 1e-2)
+    shown = 0.1 + blobs(PLACES)
+    shown[:2] = frames[:2]
+    with pytest.raises(DataError, match=r"of 2 of 12 frames .* leave out these frames"):
+        register(shown, np.full(SHAPE, 0.1), 1e-2)
+    shown[5] = frames[0]  # in the middle of the pass no frame can be left out
+    with pytest.raises(DataError, match=r"of 3 of 12 frames .* does not stand out on this wall"):
+        register(shown, np.full(SHAPE, 0.1), 1e-2)
+
+
+def test_light_that_no_shift_explains_is_refused() -> None:
+    """Light that changes in place has a middle but no motion; nor has light from beyond the frame."""
+    draw = np.random.default_rng(6)
+    twinkling = 0.1 + blobs(np.full((12, 2), 12.0)) * draw.uniform(0.5, 1.5, (12, *SHAPE))
+    with pytest.raises(
+        DataError, match=r"explains \d+ % of what changes between the frames, 50 % is the least"
+    ):
+        register(twinkling, np.full(SHAPE, 0.1), 1e-3)
+
+
+def test_a_frame_that_no_place_fits_is_named() -> None:
+    frames = 0.1 + blobs(PLACES)
+    frames[3] = np.nan
+    with pytest.raises(DataError, match="hardly follows any target: no place fits frame"):
+        register(frames, np.full(SHAPE, 0.1), 1e-3)
+
+
+def test_the_share_explained_leaves_noise_to_nobody() -> None:
+    moving = torch.from_numpy(blobs(PLACES))
+    noise = 0.05 * torch.randn(moving.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert explained_change(moving + noise, moving, 0.05) == pytest.approx(1, abs=0.03)
+    assert explained_change(moving, moving.mean(dim=0).expand_as(moving), 0.0) == pytest.approx(0, abs=1e-9)
 
 
 def test_smoother_is_the_gaussian_posterior() -> None:
@@ -265,7 +306,7 @@ def test_the_step_is_that_of_plate_and_places_together(depth) -> None:
     fit = Fit(plate, transport, Depths(RIG, transport) if depth else None, state, RIG.distance_m)
     light = torch.from_numpy(rng.standard_normal((4, *SHAPE)))
     prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(plate.shape, dtype=torch.float64))
-    image, step, _ = fit.step(light, prior, 1.0)
+    image, step, _, _ = fit.step(light, prior, 1.0)
     maps = torch.stack(
         [
             PlatePass(
@@ -366,6 +407,80 @@ def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
     away = json.loads((tmp_path / "d.json").read_text())["track"]["distance"]
     assert np.mean(away["distance_m"]) == pytest.approx(RIG.distance_m, rel=0.02)
     assert np.std(away["distance_m"]) < 0.01
+
+
+def test_a_rig_of_another_distance_or_wall_is_doubted(capture, tmp_path, capsys) -> None:
+    shot, settings = read_capture(capture[0]), Tracking(cells=10, events=False)
+    tracks = [track_capture(shot, replace(RIG, roughness=one), settings) for one in (RIG.roughness, 0.15)]
+    right, rough = tracks
+    assert right.misfit == pytest.approx(1, abs=0.1)
+    assert rough.misfit > 1.2 and (rough.frame_sigma > right.frame_sigma).mean() > 0.9
+    assert not track_doubts(shot, RIG, right) and not track_doubts(shot, None, replace(right, misfit=None))
+    (doubt,) = track_doubts(shot, RIG, rough)
+    assert "times the noise" in doubt and "calibrate" in doubt
+    (doubt,) = track_doubts(shot, replace(RIG, distance_m=0.5), right)
+    assert "states a distance of 0.3 m, the rig 0.5 m" in doubt
+    assert not track_doubts(shot, replace(RIG, distance_m=0.305), right)
+
+
+def test_the_command_takes_a_calibrated_folder_and_says_what_no_capture_is(capture, tmp_path, capsys) -> None:
+    folder, rig = capture
+    assert radiometric_rig(rig.parent) == radiometric_rig(rig) == RIG
+    for words, said in (
+        ([str(folder), "--rig", str(folder)], "holds no rig.yaml; give a rig file, or the folder"),
+        (
+            [str(folder.parent)],
+            f"give the folder of one capture (it holds 1 captures, such as {folder.name})",
+        ),
+        ([str(rig.parent)], "holds no capture.yaml; give the folder of one capture"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["track", *words, "--out", str(tmp_path / "t.png")])
+        assert said in capsys.readouterr().err
+
+
+def test_no_line_of_the_speed_lies_on_the_frame(tmp_path, monkeypatch) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    times = np.linspace(0, 8, 9)
+    path = np.stack([0.02 * times, np.zeros(9)], axis=1)
+    sigma, ones = np.full((9, 2), 1e-9), np.ones(9)
+    track = Track(times, path, path * 0 + [0.0199, 0], sigma, sigma, "m", times, path, sigma, ones, 0 * ones, 0)
+    draw_track(track, tmp_path / "t.png", path)
+    (speed,) = [axes for axes in drawn[0].axes if axes.get_title() == "speed"]
+    low, high = speed.get_ylim()
+    assert low == 0 and high > 1.05 * 2.0
+
+
+def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, capsys) -> None:
+    """Motion found gives a picture near that of motion stated, and the confidence that goes with it."""
+    folder, rig = capture
+    sampling = Sampling(height=24, width=36, scored_rows=18)
+    torch.manual_seed(0)
+    network = JointNetwork(1, UNetConfig(width=4, depth=1, rank=4), (24, 36), sampling.canvas.pitch_m).eval()
+    save_weights(tmp_path / "w.safetensors", Weights(network, "frame", to_dict(sampling), []))
+    without = tmp_path / folder.name
+    shutil.copytree(folder, without)
+    info = read_yaml(folder / "capture.yaml")
+    del info["motion"]
+    (without / "capture.yaml").write_text(yaml.safe_dump(info))
+    blank = np.zeros((24, 40), np.float32)
+    save_pattern(FixedPattern(blank + 1, blank), tmp_path / "pattern.safetensors")
+    shutil.copy(rig, tmp_path / "rig.yaml")
+    common = ["--weights", str(tmp_path / "w.safetensors"), "--rig", str(tmp_path)]
+    with pytest.raises(SystemExit):
+        main(["reconstruct", str(without), "--track", "--out", str(tmp_path / "none")])
+    said = capsys.readouterr().err
+    assert "--track without --rig; give the calibrated rig" in said and said.count("\n") == 1
+    assert not (tmp_path / "none").exists()
+    main(["reconstruct", str(without), *common, "--track", "--out", str(tmp_path / "found")])
+    assert "no confidence: these weights never learned it" in capsys.readouterr().out
+    main(["reconstruct", str(folder), *common, "--out", str(tmp_path / "stated")])
+    found, stated = (np.load(tmp_path / one / "reconstruction.npy") for one in ("found", "stated"))
+    assert np.abs(found - stated).mean() < 0.2 * np.abs(stated - stated[::-1]).mean()
 
 
 def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:

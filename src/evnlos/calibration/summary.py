@@ -192,6 +192,16 @@ def check_out(out: Path, force: bool) -> None:
         raise ConfigError(f"{out / RIG_FILE} exists; give another folder, or --force to replace it")
 
 
+def rig_file(path: Path) -> Path:
+    """Return the rig file of a folder that `calibrate` wrote; any other path stays as it is.
+
+    Example:
+        >>> str(rig_file(Path("rig.yaml")))
+        'rig.yaml'
+    """
+    return path / RIG_FILE if (path / RIG_FILE).is_file() else path
+
+
 def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> Path:
     """Write `calibration.json` and, where the fit stands on captures that it has not seen, the rig.
 

@@ -25,7 +25,8 @@ class Command:
     """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --rig, or
     pictures of the wall with a measured --rig."""
     rig: Path | None = None
-    """Rig file of the captures, as `evnlos calibrate` writes it, or the transport of `evnlos scan import`."""
+    """Rig file of the captures, or the folder that `evnlos calibrate` wrote, or the transport of `evnlos scan
+    import`."""
     dark: Path | None = None
     """Pictures: one taken without the hidden object; by default the scan's own dark frames."""
     positions: tuple[int, ...] = ()

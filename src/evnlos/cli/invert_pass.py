@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.calibration import RIG_FILE, rig_file
 from evnlos.cli.notes import say
 from evnlos.config import load_yaml
 from evnlos.dataset import Capture, Simulation, load_pattern, read_capture
@@ -45,7 +46,7 @@ class PassOptions:
 
 
 def radiometric_rig(path: Path) -> RadiometricTransport:
-    """Return the rig of a simulation file.
+    """Return the rig of a simulation file, or of a folder that `calibrate` wrote.
 
     Raises:
         ConfigError: It is another kind of transport.
@@ -57,11 +58,15 @@ def radiometric_rig(path: Path) -> RadiometricTransport:
 
 
 def matrix_rig(path: Path) -> RadiometricTransport | MeasuredTransport:
-    """Return the rig of a simulation file, or the measured transport that a .safetensors file is.
+    """Return the rig of a simulation file, or of a folder that `calibrate` wrote, or the measured transport
+    that a .safetensors file is.
 
     Raises:
-        ConfigError: It is another kind of transport.
+        ConfigError: It is another kind of transport, or a folder without a rig.
     """
+    path = rig_file(path)
+    if path.is_dir():
+        raise ConfigError(f"{path} holds no {RIG_FILE}; give a rig file, or the folder that `calibrate` wrote")
     if path.suffix == SUFFIX:
         return MeasuredTransport(file=str(path))
     rig = load_yaml(Simulation, path).transport
@@ -155,13 +160,15 @@ def _by_motion(
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
     for k, capture in enumerate(captures):
         if _is_tracked(capture, options):
-            from evnlos.tracking import track_capture
+            from evnlos.tracking import track_capture, track_doubts
 
             if isinstance(rig, MeasuredTransport):
                 raise ConfigError(
                     f"{capture.name}: a measured transport does not tell motion; state `motion` in capture.yaml"
                 )
             found = track_capture(capture, rig)
+            for doubt in track_doubts(capture, rig, found):
+                say(f"warning: {capture.name}: {doubt}")
             motion = found.at(capture.frame_times_us[1:] * 1e-6)
         else:
             assert capture.motion is not None  # else it would be tracked

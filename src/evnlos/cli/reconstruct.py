@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from evnlos.cli.notes import say
 from evnlos.errors import ConfigError
 
 
@@ -20,7 +21,8 @@ class Command:
     """Capture folder; its target may be unknown."""
     weights: Path | None = None
     """Weights file, run's folder, or name of published weights (`evnlos weights` lists them); none takes the
-    published ones for frames of the rig with the nearest distance, of whole passes if the motion is known."""
+    published ones for frames of the rig with the nearest distance, of whole passes if the motion is known or
+    found (--track)."""
     out: Path = Path("reconstruction")
     """Folder for the pictures; new or empty."""
     pattern: Path | None = None
@@ -30,12 +32,15 @@ class Command:
     pictures are moved to where its wall agrees with the frames, and it is printed how much of the frames they
     explain. No name such as main-near: that needs the light and the camera of this very rig. Without it,
     published weights explain the frames by the rig that they were trained for."""
+    track: bool = False
+    """Find the motion in the recording, as `evnlos track` does, also where capture.yaml states it; needs --rig,
+    and takes about a minute."""
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> None:
         """Reconstruct and print where the pictures are."""
-        from evnlos.calibration import RIG_FILE
+        from evnlos.calibration import rig_file
         from evnlos.config import load_yaml
         from evnlos.dataset import Simulation, load_pattern
         from evnlos.report import reconstruct_capture
@@ -43,8 +48,12 @@ class Command:
         folder = calibrated_folder(self.rig) if self.rig else None
         source = self.pattern or folder
         pattern = load_pattern(source) if source else None
-        rig = load_yaml(Simulation, folder / RIG_FILE) if folder else None
-        found = reconstruct_capture(self.capture, self.weights, self.out, pattern=pattern, rig=rig)
+        rig = load_yaml(Simulation, rig_file(folder)) if folder else None
+        found = reconstruct_capture(
+            self.capture, self.weights, self.out, pattern=pattern, rig=rig, track=self.track
+        )
+        for warning in found.get("warnings", []):
+            say(f"warning: {warning}")
         if self.json:
             print(json.dumps(found | {"out": str(self.out)}))
             return
@@ -54,8 +63,7 @@ class Command:
                 f"the light is {found['light']:.2f} x that of the rig: its gain is not this capture's, and the "
                 "pictures stay as the network draws them; calibrate at this exposure, on known targets"
             )
-        if "confidence" in found:
-            print(_said(found["confidence"]))
+        print(_said(found["confidence"]) if "confidence" in found else found["no_confidence"])
         if "scores" in found:
             print("  ".join(f"{name} {value}" for name, value in found["scores"].items() if value is not None))
 

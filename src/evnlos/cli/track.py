@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 from evnlos.cli.console import Flat
+from evnlos.cli.notes import say
 from evnlos.tracking import Tracking
 
 if TYPE_CHECKING:
@@ -27,7 +28,8 @@ class Command:
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder; what it says of the motion serves for comparison only."""
     rig: Path | None = None
-    """Rig file, as `evnlos calibrate` writes it: positions in metres; without it they are in image pixels."""
+    """Rig file, or the folder that `evnlos calibrate` wrote: positions in metres; without it they are in image
+    pixels."""
     pattern: Path | None = None
     """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated rig."""
     out: Path = Path("track.png")
@@ -41,7 +43,7 @@ class Command:
         from evnlos.cli.invert_pass import radiometric_rig
         from evnlos.dataset import load_pattern, read_capture
         from evnlos.plot.track import draw_track
-        from evnlos.tracking import track_capture
+        from evnlos.tracking import track_capture, track_doubts
 
         capture = read_capture(self.capture)
         rig = None if self.rig is None else radiometric_rig(self.rig)
@@ -49,9 +51,12 @@ class Command:
         track = track_capture(capture, rig, self.settings, pattern)
         truth = true_path(capture, track.time_s) if track.unit == "m" else None
         found = figures(capture, track, truth)
+        found["warnings"] = track_doubts(capture, rig, track)
         found["picture"] = str(draw_track(track, self.out, truth, capture.name))
         self.out.with_suffix(".json").write_text(json.dumps({**found, "track": track.summary()}))
         print(json.dumps(found) if self.json else to_text(found))
+        for doubt in found["warnings"]:
+            say(f"warning: {doubt}")
 
 
 def true_path(capture: Capture, t_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -80,6 +85,8 @@ def figures(capture: Capture, track: Track, truth: NDArray[np.float64] | None) -
         "speed_sigma": float(track.speed_sigma.mean()),
         "size_change": float(track.size[-1] / track.size[0]),
     }
+    if track.misfit is not None:
+        found["misfit"] = track.misfit
     if track.distance is not None:
         away = track.distance
         found["distance"] = [float(away.distance_m[0]), float(away.distance_m[-1])]
@@ -110,6 +117,10 @@ def to_text(found: dict[str, Any]) -> str:
         f"position    {scale * found['position_sigma']:8.3f} {unit} standard deviation",
         f"size        {found['size_change']:8.3f} at the end over the start",
     ]
+    if "misfit" in found:
+        lines.append(
+            f"misfit      {found['misfit']:8.2f} times the noise is left in the frames by plate and rig"
+        )
     if "distance" in found:
         first, last = (scale * v for v in found["distance"])
         lines.append(

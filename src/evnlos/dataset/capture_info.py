@@ -172,4 +172,8 @@ def read_capture_info(folder: Path) -> CaptureInfo:
         ConfigError: It is missing, or has an unknown key or a wrong type.
     """
     path = folder / "capture.yaml"
+    if not path.is_file():
+        inside = sorted(one.parent.name for one in folder.glob("*/capture.yaml"))
+        held = f" (it holds {len(inside)} captures, such as {inside[0]})" if inside else ""
+        raise ConfigError(f"{folder} holds no capture.yaml; give the folder of one capture{held}")
     return from_dict(CaptureInfo, read_yaml(path), source=str(path))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from evnlos.calibration.summary import RIG_FILE
+from evnlos.calibration.summary import RIG_FILE, rig_file
 from evnlos.config import from_dict, read_yaml
 from evnlos.dataset import Simulation
 from evnlos.dataset.lab import Lab
@@ -54,9 +54,7 @@ def described_rig(text: str | Path) -> Described:
         >>> described_rig("hard-far").transport.roughness
         0.1
     """
-    path = Path(text)
-    if (path / RIG_FILE).is_file():
-        path /= RIG_FILE
+    path = rig_file(Path(text))
     return replace(_read(path, str(text)), word=_word(path, str(text)))
 
 

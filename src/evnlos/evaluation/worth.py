@@ -40,6 +40,22 @@ def judgement_of(
     return _judged(weights.network, weights.confidence, *pass_, sampling.canvas, operator)
 
 
+def why_unjudged(weights: Weights, samples: Samples) -> str:
+    """Return in one line why `judgement_of` tells nothing, and the cure.
+
+    Args:
+        weights: The network.
+        samples: The pass.
+    """
+    if samples.position_m is None:
+        why = "the motion is unknown; state it in capture.yaml, or give --rig and --track to find it"
+    elif len(samples) < 2:
+        why = f"{len(samples)} position, 2 are the least; record a pass"
+    else:
+        why = "these weights never learned it; take those of a whole pass (`evnlos weights` lists them)"
+    return f"no confidence: {why}"
+
+
 def _judged(
     network: ResidualUNet | JointNetwork,
     confidence: Confidence,
@@ -52,7 +68,9 @@ def _judged(
 ) -> Judgement:
     share = None
     if operator is not None and bool(frames.any()):
-        share = explained(images, frames, position_m, confidence.mean, operator, canvas)
+        # What the pass shows, at each position: what changes from picture to picture is not the object.
+        shown = on_canvas(plates(images, canvas, position_m).mean(dim=0)[0], canvas, position_m)
+        share = explained(shown, frames, position_m, confidence.mean, operator, canvas)
     return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
 
 

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from evnlos.plot.figure import new_figure
 from evnlos.tracking import Track
 
+_HEADROOM = 1.1  # of the speed's axis over the largest speed, so that no line lies on the frame
+
 
 def draw_track(
     track: Track, path: str | Path, truth: NDArray[np.float64] | None = None, title: str = ""
@@ -50,12 +52,16 @@ def draw_track(
     along.set(xlabel="time, s", ylabel=f"position, {unit}", title="position")
     along.legend()
     middle, band = scale * track.speed, 2 * scale * track.speed_sigma
+    top = float((middle + band).max())
     speed.plot(track.time_s, middle, color="C2")
     speed.fill_between(track.time_s, middle - band, middle + band, color="C2", alpha=0.3)
     if truth is not None:
         rate = np.gradient(truth, track.time_s, axis=0)
-        speed.plot(track.time_s, scale * np.hypot(rate[:, 0], rate[:, 1]), "--", color="k", linewidth=1)
-    speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, None))
+        true = scale * np.hypot(rate[:, 0], rate[:, 1])
+        top = max(top, float(true.max()))
+        speed.plot(track.time_s, true, "--", color="k", linewidth=1)
+    # An upper end of None would stay where it stood before and cut a band that has just been drawn.
+    speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, _HEADROOM * top or None))
     if track.distance is None:
         size.errorbar(track.frame_time_s, track.size, 2 * track.size_sigma, fmt=".", color="C3")
         size.set(xlabel="time, s", ylabel="size over its mean", title="size of the picture")

@@ -19,12 +19,15 @@ from evnlos.dataset import (
     capture_samples,
     read_capture,
 )
+from evnlos.errors import ConfigError
 from evnlos.evaluation import reconstruct, score
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.explained import light_gain
-from evnlos.evaluation.worth import judgement_of, said
+from evnlos.evaluation.worth import judgement_of, said, why_unjudged
 from evnlos.model import load_weights, published_for, published_rig
 from evnlos.report.pictures import grey, polarity, save_animation, save_png, stretched, strip
+from evnlos.tracking import track_capture, track_doubts
+from evnlos.transport import RadiometricTransport
 
 _SAME_LIGHT = (0.75, 1.33)
 """Range of a capture's brightness, in that of its calibrated rig, in which the rig's gain is the capture's."""
@@ -37,6 +40,7 @@ def reconstruct_capture(
     zoom: int = 4,
     pattern: FixedPattern | None = None,
     rig: Simulation | None = None,
+    track: bool = False,
 ) -> dict[str, Any]:
     """Reconstruct all positions of a capture and write them as pictures.
 
@@ -49,30 +53,42 @@ def reconstruct_capture(
     Args:
         capture: A capture folder; its target may be unknown.
         weights: A weights file, a run's folder or a name of `published`; None: the published frame weights of
-            the rig whose distance is nearest, of whole passes where the motion is known.
+            the rig whose distance is nearest, of whole passes where the motion is known or found.
         out: The folder for the pictures; must not exist or be empty.
         zoom: Size of a pixel in the pictures.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
         rig: The calibrated rig; the pictures are then moved to where the wall agrees with the frames, if these
             are as bright as the rig makes them, and the confidence says how much of the frames they explain.
             Without one, that is told by the rig of published weights, and the pictures stay.
+        track: Find the motion in the recording with the rig, also where it is stated; the truth, where it is
+            known, stays where the capture states it.
 
     Returns:
         Capture, weights, paradigm, number of positions; where the truth is known, the mean scores; where it can
         be told, the confidence: support, threshold, measured, verdict and, where a rig is known, explained;
-        with a rig, `light`, the capture's brightness in that of the rig, and whether the pictures were moved.
+        else no_confidence, which says why. With a rig also `light`, the capture's brightness in that of the
+        rig, and whether the pictures were moved; with `track` the warnings of the track.
 
     Raises:
-        DataError: The capture or the weights can't be used, or `out` holds other files.
+        ConfigError: `track` without a rig of kind radiometric.
+        DataError: The capture or the weights can't be used, the object can't be tracked, or `out` holds other
+            files.
     """
     out = Path(out)
+    wall = _wall_for_track(rig) if track else None
     shot = read_capture(capture)
     if weights is None:
-        weights = published_for(shot.distance_m, "frame", is_motion_known=shot.motion is not None)
+        distance_m = shot.distance_m or (None if rig is None else _distance_m(rig))
+        weights = published_for(distance_m, "frame", is_motion_known=track or shot.motion is not None)
     loaded = load_weights(weights)
     sampling = from_dict(Sampling, loaded.sampling, source="the weights' sampling")
     samples = capture_samples(shot, sampling, pattern)
     check_folder(out)
+    warnings: list[str] = []
+    if wall is not None:
+        path = track_capture(shot, wall, pattern=pattern)
+        warnings = track_doubts(shot, wall, path)
+        samples = replace(samples, position_m=path.at(samples.time_s))
     images = reconstruct(loaded, samples.frame, samples.surface, samples.position_m)
     known = published_rig(weights)
     judge = rig or (load_yaml(Simulation, known) if known else None)
@@ -112,6 +128,10 @@ def reconstruct_capture(
         save_png(out / "unsure.png", strip([grey(one) for one in worth.high - worth.low]), 2)
         write_atomically(out / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))
         found["confidence"] = said(worth)
+    else:
+        found["no_confidence"] = why_unjudged(loaded, samples)
+    if track:
+        found["warnings"] = warnings
     if samples.truth is not None:
         truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
         found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
@@ -120,6 +140,23 @@ def reconstruct_capture(
 
 def _is_the_rigs(light: float) -> bool:
     return _SAME_LIGHT[0] < light < _SAME_LIGHT[1]
+
+
+def _wall_for_track(rig: Simulation | None) -> RadiometricTransport:
+    """Return the rig's wall, with which motion can be found.
+
+    Raises:
+        ConfigError: There is none, or of a kind that does not tell motion.
+    """
+    if rig is None:
+        raise ConfigError("--track without --rig; give the calibrated rig, which turns pixels into metres")
+    if not isinstance(rig.transport, RadiometricTransport):
+        raise ConfigError(f"--track with a rig of kind {rig.transport.kind}; give one of kind radiometric")
+    return rig.transport
+
+
+def _distance_m(rig: Simulation) -> float | None:
+    return getattr(rig.transport, "distance_m", None)
 
 
 def _npy(array: np.ndarray) -> bytes:

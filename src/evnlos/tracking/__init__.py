@@ -2,7 +2,7 @@
 
 from evnlos.tracking.background import static_light, temporal_noise
 from evnlos.tracking.event_velocity import EventVelocity, event_velocity
-from evnlos.tracking.follow import Tracking, track_capture, track_frames
+from evnlos.tracking.follow import Tracking, track_capture, track_doubts, track_frames
 from evnlos.tracking.geometry import PlaneMap, plane_map
 from evnlos.tracking.registration import Registration, register
 from evnlos.tracking.rig_shift import RigShift, rig_shift
@@ -28,5 +28,6 @@ __all__ = [
     "static_light",
     "temporal_noise",
     "track_capture",
+    "track_doubts",
     "track_frames",
 ]

@@ -23,6 +23,8 @@ from evnlos.transport import RadiometricTransport
 from evnlos.types import Events
 
 _LEAST_FRAMES = 4
+_SAME_DISTANCE = 0.03  # share by which a capture's stated distance may differ from its rig's
+_MOST_MISFIT = 1.2  # times the noise: calibrated rigs leave 0.95 to 1.05 of captures of their own
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,30 @@ def track_frames(
     return _in_metres(found, by_events, times_s, small, rig, noise, settings)
 
 
+def track_doubts(capture: Capture, rig: RadiometricTransport | None, track: Track) -> list[str]:
+    """Return why a track in metres may be wrong by more than it states, a line each; none where nothing is odd.
+
+    Args:
+        capture: The recording.
+        rig: The rig that it was followed with; None: nothing is known.
+        track: What was found.
+    """
+    doubts = []
+    stated = capture.distance_m
+    if rig is not None and stated is not None and abs(stated / rig.distance_m - 1) > _SAME_DISTANCE:
+        doubts.append(
+            f"capture.yaml states a distance of {stated:g} m, the rig {rig.distance_m:g} m, more than "
+            f"{100 * _SAME_DISTANCE:.0f} % apart: lengths and their deviations are wrong; take the rig of that "
+            "distance"
+        )
+    if track.misfit is not None and track.misfit > _MOST_MISFIT:
+        doubts.append(
+            f"the rig leaves {track.misfit:.1f} times the noise in the frames, {_MOST_MISFIT:g} is the most: "
+            "positions are worse than their stated deviations; calibrate this very rig (`evnlos calibrate`)"
+        )
+    return doubts
+
+
 def _in_pixels(
     found: Registration, by_events: EventVelocity | None, times_s: NDArray[np.float64], pixel: float
 ) -> Track:
@@ -148,6 +174,7 @@ def _in_metres(
             np.einsum("mab,mb->ma", slope**2, by_events.variance),
         )
     track = _joined(fitted.position_m, sigma, velocity, by_events, times_s, "m", found)
+    track = replace(track, misfit=fitted.misfit)
     if fitted.log_distance is None or fitted.log_distance_sigma is None:
         return track
     return replace(track, distance=_distance(fitted.log_distance, fitted.log_distance_sigma, times_s, rig))

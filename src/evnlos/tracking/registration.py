@@ -13,6 +13,7 @@ from evnlos.transport.spline import MARGIN, spline_coefficients
 
 _EDGE = 0.02  # of the template's peak; weaker light is left to the background
 _LEAST_SIGNAL = 6.0  # standard deviations of the noise that the object's peak must have
+_LEAST_EXPLAINED = 0.5  # share of what changes between the frames that one shifted picture must explain
 _STEP = np.array([2.0, 2.0, 0.2, 0.2])  # largest step of (x, y, ln size, ln brightness), pixels and shares
 _FIT_STEPS = 2
 _ROUNDS = 8
@@ -59,26 +60,34 @@ def register(frames: NDArray, background: NDArray, noise: float) -> Registration
         noise: Standard deviation of a sample's noise.
 
     Raises:
-        DataError: No frame shows light that stands out from the noise.
+        DataError: A frame shows no light that stands out from the noise, or its light does not shift as one
+            picture does.
     """
     light = torch.from_numpy(np.asarray(frames, np.float64) - background)  # [N, H, W]
     shape = (int(light.shape[1]), int(light.shape[2]))
     values = np.zeros((len(frames), 4))
-    values[:, :2] = [_middle(picture, noise) for picture in light]
+    values[:, :2] = _middles(light, noise)
     rest = torch.zeros(shape, dtype=torch.float64)
     template = torch.zeros(shape, dtype=torch.float64)
     covariance = np.zeros((len(frames), 4, 4))
+    drawn: list[torch.Tensor] = []
     for turn in range(_ROUNDS):
         template = _template(light - rest, values)
         coefficients = spline_coefficients(template)
         drawn = []
         for k in range(len(frames)):
-            values[k], covariance[k] = _fit(coefficients, light[k] - rest, values[k], noise)
+            try:
+                values[k], covariance[k] = _fit(coefficients, light[k] - rest, values[k], noise)
+            except RuntimeError:  # a singular matrix: the picture is nowhere in the frame
+                raise DataError(_unfollowed(f"no place fits frame {k}")) from None
+            if not (np.isfinite(values[k]).all() and np.isfinite(covariance[k]).all()):
+                raise DataError(_unfollowed(f"no place fits frame {k}"))
             drawn.append(_draw(coefficients, values[k], shape)[0])
         # The template's own size and brightness are free: hold their means at one.
         values[:, 2:] -= values[:, 2:].mean(axis=0)
         if turn + 1 < _ROUNDS:
             rest = (light - torch.stack(drawn)).mean(dim=0)
+    _check(values[:, :2], light, torch.stack(drawn), noise)
     return Registration(
         values[:, :2].copy(),
         np.exp(values[:, 2]),
@@ -97,20 +106,74 @@ def middle_of_light(light: NDArray) -> NDArray[np.float64]:
     return np.stack([x, y], axis=-1)
 
 
-def _middle(light: torch.Tensor, noise: float) -> NDArray[np.float64]:
-    """Return the middle of the light above a tenth of its peak.
+def _middles(light: torch.Tensor, noise: float) -> NDArray[np.float64]:
+    """Return the middle (x, y) of each frame's light above a tenth of its peak, pixels, [N, 2].
 
     Raises:
-        DataError: The peak does not stand out.
+        DataError: The peak of a frame does not stand out.
     """
-    smooth = torch.nn.functional.avg_pool2d(light[None, None], 3, 1, 1)[0, 0]
-    peak = float(smooth.max())
-    if peak < _LEAST_SIGNAL * noise / 3:
+    smooth = torch.nn.functional.avg_pool2d(light[:, None], 3, 1, 1)[:, 0]
+    peak = smooth.amax(dim=(1, 2))
+    signal = (3 * peak / noise).numpy()  # the mean of nine samples has a third of their noise
+    weak, strong = np.flatnonzero(signal < _LEAST_SIGNAL), np.flatnonzero(signal >= _LEAST_SIGNAL)
+    if len(weak):
+        cure = "leave out these frames, which are before or after the object's pass"
+        if not len(strong) or np.ptp(strong) >= len(strong):
+            cure = (
+                "the object does not stand out on this wall: take a brighter one, a longer exposure, less noise"
+            )
         raise DataError(
-            f"a frame's brightest light is {peak / noise * 3:.1f} standard deviations above the background, "
-            f"{_LEAST_SIGNAL:g} is the least; leave out frames before and after the object's pass"
+            f"the brightest light of {len(weak)} of {len(light)} frames is less than {_LEAST_SIGNAL:g} "
+            f"standard deviations above the background (frame {weak[0]}: {signal[weak[0]]:.1f}); {cure}"
         )
-    return middle_of_light((light * (smooth > 0.1 * peak)).clamp(min=0).numpy())
+    bright = smooth > 0.1 * peak[:, None, None]
+    return middle_of_light((light * bright).clamp(min=0).numpy())
+
+
+def _check(place_px: NDArray[np.float64], light: torch.Tensor, drawn: torch.Tensor, noise: float) -> None:
+    """Refuse places that mean nothing.
+
+    Args:
+        place_px: Places (x, y), [N, 2].
+        light: Frames, [N, H, W].
+        drawn: The picture in each of them, [N, H, W].
+        noise: Standard deviation of a sample's noise.
+
+    Raises:
+        DataError: A place lies outside the frames, or the picture's shifts explain little of what changes.
+    """
+    height, width = (int(side) for side in light.shape[1:])
+    outside = np.flatnonzero(((place_px < -0.5) | (place_px > np.array([width, height]) - 0.5)).any(axis=1))
+    if len(outside):
+        x, y = place_px[outside[0]]
+        raise DataError(
+            _unfollowed(f"frame {outside[0]} has it at ({x:.0f}, {y:.0f}) px of {width} x {height}")
+        )
+    share = explained_change(light, drawn, noise)
+    if share < _LEAST_EXPLAINED:
+        raise DataError(
+            _unfollowed(
+                f"one picture that shifts explains {100 * share:.0f} % of what changes between the frames, "
+                f"{100 * _LEAST_EXPLAINED:.0f} % is the least"
+            )
+        )
+
+
+def explained_change(light: torch.Tensor, drawn: torch.Tensor, noise: float) -> float:
+    """Return the share of what changes between frames [N, H, W] that the drawn ones explain; 1 without change.
+
+    Noise of the given standard deviation is nobody's to explain.
+    """
+    own = noise**2 * (1 - 1 / len(light))
+    change, left = (float((one - one.mean(dim=0)).square().mean()) - own for one in (light, light - drawn))
+    return 1 - max(left, 0.0) / change if change > 0 else 1.0
+
+
+def _unfollowed(what: str) -> str:
+    return (
+        f"the light's middle hardly follows any target: {what}; nothing to track on this wall if it is matte "
+        "(`evnlos identify` tells what a rig shows), else show more of the wall"
+    )
 
 
 def _template(light: torch.Tensor, values: NDArray[np.float64]) -> torch.Tensor:

@@ -37,6 +37,8 @@ class RigShift:
         log_distance: ln(distance to the wall / the rig's), [N]; its mean is 0, as a plate that is nearer and
             one that is larger and dimmer look much the same. None where it was not looked for.
         log_distance_sigma: Its standard deviation, [N].
+        misfit: What the plate leaves of the frames' changes, over their noise, root mean square; 1 is a rig
+            that explains all.
     """
 
     position_m: NDArray[np.float64]
@@ -44,6 +46,7 @@ class RigShift:
     plate: torch.Tensor
     log_distance: NDArray[np.float64] | None = None
     log_distance_sigma: NDArray[np.float64] | None = None
+    misfit: float = 1.0
 
 
 def rig_shift(
@@ -82,10 +85,10 @@ def rig_shift(
     prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), blank)
     state = np.zeros((len(start_m), 3 if depth else 2))  # x, y, and R ln(distance / R), metres
     state[:, :2] = start_m
-    image, covariance = blank, np.zeros((len(state), state.shape[1], state.shape[1]))
+    image, covariance, misfit = blank, np.zeros((len(state), state.shape[1], state.shape[1])), 1.0
     for _ in range(_ROUNDS):
         fit = Fit(plate, transport, depths, state, rig.distance_m)
-        image, step, covariance = fit.step(light.double(), prior, noise)
+        image, step, covariance, misfit = fit.step(light.double(), prior, noise)
         state = state + step * min(1.0, _LONGEST_M / np.abs(step).max())
         # The place of the light's middle: the plate is drawn around it the next time.
         state[:, :2] += _middle(image.numpy()) * plate.pitch_m
@@ -94,9 +97,9 @@ def rig_shift(
         if (np.abs(step) < _ENOUGH * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).all():
             break
     if not depth:
-        return RigShift(state, covariance, image)
+        return RigShift(state, covariance, image, misfit=misfit)
     sigma = np.sqrt(covariance[:, 2, 2]) / rig.distance_m
-    return RigShift(state[:, :2], covariance[:, :2, :2], image, state[:, 2] / rig.distance_m, sigma)
+    return RigShift(state[:, :2], covariance[:, :2, :2], image, state[:, 2] / rig.distance_m, sigma, misfit)
 
 
 def _middle(image: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -137,8 +140,8 @@ class Fit:
 
     def step(
         self, light: torch.Tensor, prior: torch.Tensor, noise: float
-    ) -> tuple[torch.Tensor, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the plate, the step of all frames [N, K], and the covariance of each [N, K, K].
+    ) -> tuple[torch.Tensor, NDArray[np.float64], NDArray[np.float64], float]:
+        """Return the plate, the step of all frames [N, K], the covariance of each [N, K, K], and the misfit.
 
         Args:
             light: Frames, float64 [N, h, w].
@@ -173,7 +176,8 @@ class Fit:
         up = torch.linalg.inv(lower).mT  # [N, K, K]
         misfit = left.square().mean(dim=1).clamp(min=noise**2)
         covariance = misfit[:, None, None] * (up @ each.movedim(-1, 0) @ up.mT)
-        return plate, (up @ step[..., None])[..., 0].numpy(), covariance.numpy()
+        unexplained = float(self._moving(left).square().mean().sqrt()) / noise
+        return plate, (up @ step[..., None])[..., 0].numpy(), covariance.numpy(), unexplained
 
     def _moving(self, frames: torch.Tensor) -> torch.Tensor:
         """Return frames [N, P] without what stands still in them, as far as it is not known."""

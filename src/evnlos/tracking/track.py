@@ -54,6 +54,8 @@ class Track:
         size_sigma: Standard deviation of the size, [N].
         event_windows: Number of velocities that came from events.
         distance: Distance from the wall, where it was looked for.
+        misfit: With a rig: what it leaves of the frames' changes, over their noise, root mean square. The
+            stated deviations hold it as if it were noise.
     """
 
     time_s: NDArray[np.float64]
@@ -69,6 +71,7 @@ class Track:
     size_sigma: NDArray[np.float64]
     event_windows: int
     distance: Distance | None = None
+    misfit: float | None = None
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -132,6 +135,8 @@ class Track:
             )
         }
         found = {"unit": self.unit, "event_windows": self.event_windows, **arrays}
+        if self.misfit is not None:
+            found["misfit"] = round(self.misfit, 3)
         if self.distance is not None:
             depth = {name: np.round(values, 7).tolist() for name, values in vars(self.distance).items()}
             found["distance"] = depth
