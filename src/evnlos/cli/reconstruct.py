@@ -79,8 +79,8 @@ def calibrated_folder(rig: Path) -> Path:
     folder = rig.parent if rig.name == RIG_FILE else rig
     if not (folder / RIG_FILE).is_file():
         raise ConfigError(
-            f"--rig is {rig}, which holds no {RIG_FILE}; `reconstruct` takes the folder that `calibrate` wrote "
-            "for this very rig (names such as main-near are for `report` and `identify`); leave it away to "
+            f"--rig is {rig}, which holds no {RIG_FILE}; give the folder that `calibrate` wrote for this very "
+            "rig (names such as main-near are for `report` and `identify`), or leave it away to "
             "reconstruct without a rig"
         )
     return folder
