@@ -1,7 +1,4 @@
-"""Elementary functions without branches or calls, so that a compiler runs them on whole vectors.
-
-Series are summed in pairs (Estrin's order): one long chain, each sum waiting for the last, takes longer.
-"""
+"""Elementary functions without branches or calls, so that a compiler runs them on whole vectors."""
 
 from __future__ import annotations
 
@@ -26,11 +23,16 @@ def fast_log(x):
     f = np.int64(bits - (exponent << 52)).view(np.float64) - 1.0
     s = f / (2.0 + f)
     z = s * s
-    z2 = z * z
-    z4 = z2 * z2
-    low = (2.0 / 3.0 + z * (2.0 / 5.0)) + z2 * (2.0 / 7.0 + z * (2.0 / 9.0))
-    high = (2.0 / 11.0 + z * (2.0 / 13.0)) + z2 * (2.0 / 15.0 + z * (2.0 / 17.0))
-    series = low + z4 * (high + z4 * (2.0 / 19.0 + z * (2.0 / 21.0)))
+    series = 2.0 / 21.0
+    series = series * z + 2.0 / 19.0
+    series = series * z + 2.0 / 17.0
+    series = series * z + 2.0 / 15.0
+    series = series * z + 2.0 / 13.0
+    series = series * z + 2.0 / 11.0
+    series = series * z + 2.0 / 9.0
+    series = series * z + 2.0 / 7.0
+    series = series * z + 2.0 / 5.0
+    series = series * z + 2.0 / 3.0
     e = np.float64(exponent)
     return e * _LN2_HIGH + (2.0 * s + (s * z * series + e * _LN2_LOW))
 
@@ -39,7 +41,8 @@ def fast_log(x):
 def fast_exp(x):
     """Return exp x for x <= 0 (clamped at -700), within 2 ulp, in a form that compilers vectorise.
 
-    x = n ln 2 + r with |r| <= ln 2 / 2: exp x = 2^n (1 + r + r^2 / 2 + ...).
+    x = n ln 2 + r with |r| <= ln 2 / 2: exp x = 2^n (1 + r + r^2 / 2 + ...), summed in pairs (Estrin's order),
+    so that few sums wait for each other.
     """
     x = max(x, -700.0)
     n = np.rint(x * 1.4426950408889634)

@@ -78,11 +78,9 @@ def _log(x: Tensor) -> Tensor:
     f = (bits - (exponent << 52)).view(torch.float64).sub_(1.0)
     s = f / (f + 2.0)
     z = s * s
-    z2 = z * z
-    z4 = z2 * z2
-    low = (z * (2.0 / 5.0)).add_(2.0 / 3.0).add_((z * (2.0 / 9.0)).add_(2.0 / 7.0).mul_(z2))
-    high = (z * (2.0 / 13.0)).add_(2.0 / 11.0).add_((z * (2.0 / 17.0)).add_(2.0 / 15.0).mul_(z2))
-    series = low.add_(high.add_((z * (2.0 / 21.0)).add_(2.0 / 19.0).mul_(z4)).mul_(z4))
+    series = torch.full_like(z, 2.0 / 21.0)
+    for n in (19, 17, 15, 13, 11, 9, 7, 5, 3):
+        series.mul_(z).add_(2.0 / n)
     e = exponent.to(torch.float64)
     tail = (z.mul_(s)).mul_(series).add_(e * _LN2_LOW)
     return (e * _LN2_HIGH).add_((2.0 * s).add_(tail))
