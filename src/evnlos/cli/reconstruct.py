@@ -40,7 +40,7 @@ class Command:
 
     def run(self) -> None:
         """Reconstruct and print where the pictures are."""
-        from evnlos.calibration import rig_file
+        from evnlos.calibration import RIG_FILE
         from evnlos.config import load_yaml
         from evnlos.dataset import Simulation, load_pattern
         from evnlos.report import reconstruct_capture
@@ -48,7 +48,7 @@ class Command:
         folder = calibrated_folder(self.rig) if self.rig else None
         source = self.pattern or folder
         pattern = load_pattern(source) if source else None
-        rig = load_yaml(Simulation, rig_file(folder)) if folder else None
+        rig = load_yaml(Simulation, folder / RIG_FILE) if folder else None
         found = reconstruct_capture(
             self.capture, self.weights, self.out, pattern=pattern, rig=rig, track=self.track
         )

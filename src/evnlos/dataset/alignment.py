@@ -119,16 +119,16 @@ def grid_of(shape: tuple[int, int], blocks: int) -> tuple[int, int]:
     return tuple(max(1, min(side, round(blocks * side / max(shape)))) for side in shape)  # type: ignore[return-value]
 
 
-def block_of(count: int, side: int) -> NDArray[np.int64]:
-    """Return the block of each of `side` pixels."""
-    return np.arange(side) * count // side
+def blocks_of(grid: tuple[int, int], shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return the block of each pixel of an image of `shape` (H, W), [H * W]."""
+    rows, columns = (np.arange(side) * count // side for count, side in zip(grid, shape, strict=True))
+    return (rows[:, None] * grid[1] + columns).ravel()
 
 
 def _changes(frames: NDArray, grid: tuple[int, int], signed: bool) -> NDArray[np.float64]:
     """Return the change of the blocks' mean logarithm from frame to frame, [N - 1, B]."""
     peak = float(np.iinfo(frames.dtype).max) if frames.dtype.kind == "u" else float(np.max(frames)) or 1.0
-    rows, columns = block_of(grid[0], frames.shape[1]), block_of(grid[1], frames.shape[2])
-    block = (rows[:, None] * grid[1] + columns).ravel()  # [H * W]
+    block = blocks_of(grid, frames.shape[1:])
     size = np.bincount(block)
     out = np.empty((len(frames) - 1, len(size)))
     before = np.log(frames[0].astype(np.float64).ravel() / peak + _DARK)
@@ -146,8 +146,7 @@ def running_sums(
     """Return instants [T] and, for each block, the sum of all polarities up to them, [T, B]."""
     first, last = int(events.t_us[0]), int(events.t_us[-1])
     bins = int((last - first) // step_us) + 1
-    rows, columns = block_of(grid[0], events.height), block_of(grid[1], events.width)
-    block = rows[events.y] * grid[1] + columns[events.x]
+    block = blocks_of(grid, events.shape)[events.y.astype(np.int64) * events.width + events.x]
     count = grid[0] * grid[1]
     weight = np.where(events.p, 1.0, -1.0) if signed else np.ones(len(events))
     if signed and events.polarity_known is not None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.dataset.alignment import agreement, block_of, grid_of, running_sums
+from evnlos.dataset.alignment import agreement, blocks_of, grid_of, running_sums
 from evnlos.types import Events
 
 LEAST_AGREEMENT, LEAST_RATIO = 0.2, 1.2
@@ -127,8 +127,7 @@ def expected_counts(level: NDArray[np.float64], threshold: float) -> NDArray[np.
 def _levels(frames: NDArray, grid: tuple[int, int]) -> NDArray[np.float64]:
     """Return the logarithm of the cells' mean light in each frame, [N, B]."""
     peak = float(np.iinfo(frames.dtype).max)
-    rows, columns = block_of(grid[0], frames.shape[1]), block_of(grid[1], frames.shape[2])
-    cell = (rows[:, None] * grid[1] + columns).ravel()
+    cell = blocks_of(grid, frames.shape[1:])
     sums = np.array([np.bincount(cell, frame.ravel().astype(np.float64)) for frame in frames])
     return np.log(sums / np.bincount(cell) / peak + _DARK)
 

@@ -50,9 +50,9 @@ def explained(
             f"{operator.size[1]} x {operator.size[0]} samples"
         )
     plain = on_canvas(average, canvas, position_m)
-    noise = _noise(frames)
-    left, before = (_left(shown, frames, operator) - noise for shown in (pictures, plain))
-    tiny = 1e-9 * _moving(frames).square().sum()  # rounding
+    noise, seen = _noise(frames), _moving(frames)
+    left, before = (_left(_moving(operator(shown)), seen) - noise for shown in (pictures, plain))
+    tiny = 1e-9 * seen.square().sum()  # rounding
     if before <= _BEYOND_NOISE * noise + tiny:
         return 0.0
     return float(1 - left.clamp_min(0) / before)
@@ -66,8 +66,7 @@ def light_gain(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> flo
         frames: Frames of the samples, float32 [N, h, w], white levels.
         operator: The rig.
     """
-    made, seen = _moving(operator(pictures)), _moving(frames)
-    return float((made * seen).sum() / made.square().sum().clamp_min(torch.finfo(torch.float64).tiny))
+    return _gain(_moving(operator(pictures)), _moving(frames))
 
 
 def _moving(frames: Tensor) -> Tensor:
@@ -76,16 +75,21 @@ def _moving(frames: Tensor) -> Tensor:
     return frames - frames.mean(dim=0)
 
 
-def _left(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> Tensor:
-    """Return the moving light that the pictures leave unexplained at the best gain, squared and summed."""
-    gain = max(light_gain(pictures, frames, operator), 0.0)
-    return (_moving(frames) - gain * _moving(operator(pictures))).square().sum()
+def _gain(made: Tensor, seen: Tensor) -> float:
+    return float((made * seen).sum() / made.square().sum().clamp_min(torch.finfo(torch.float64).tiny))
+
+
+def _left(made: Tensor, seen: Tensor) -> Tensor:
+    """Return what moving light that was made leaves of the one seen at the best gain, squared and summed."""
+    return (seen - max(_gain(made, seen), 0.0) * made).square().sum()
 
 
 def _noise(frames: Tensor) -> Tensor:
     """Return what noise adds to the moving light, squared and summed: from the scatter about the neighbours.
 
-    The light moves slowly and over few pixels; the median over the pixels is that of the others.
+    The light moves slowly and over few pixels; the median over the pixels is that of the others. In time alone:
+    `temporal_noise` also takes differences between neighbours, but samples share the sensor's pixels with
+    theirs, so that it finds a tenth too little here.
     """
     if len(frames) < 3:
         return torch.zeros((), dtype=torch.float64)

@@ -31,8 +31,9 @@ def judgement_of(
         images: The network's pictures, float32 [N, H, W].
         operator: The calibrated rig, where it is known.
     """
-    if weights.confidence is None or samples.position_m is None or len(samples) < 2:
+    if why_unjudged(weights, samples) is not None:
         return None
+    assert weights.confidence is not None and samples.position_m is not None  # see why_unjudged
     sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
     seen = network_input(samples.frame, samples.surface, weights.paradigm)  # type: ignore[arg-type]
     frames = torch.from_numpy(samples.frame)
@@ -40,8 +41,8 @@ def judgement_of(
     return _judged(weights.network, weights.confidence, *pass_, sampling.canvas, operator)
 
 
-def why_unjudged(weights: Weights, samples: Samples) -> str:
-    """Return in one line why `judgement_of` tells nothing, and the cure.
+def why_unjudged(weights: Weights, samples: Samples) -> str | None:
+    """Return in one line why `judgement_of` can't tell anything, and the cure; None where it can.
 
     Args:
         weights: The network.
@@ -51,8 +52,10 @@ def why_unjudged(weights: Weights, samples: Samples) -> str:
         why = "the motion is unknown; state it in capture.yaml, or give --rig and --track to find it"
     elif len(samples) < 2:
         why = f"{len(samples)} position, 2 are the least; record a pass"
-    else:
+    elif weights.confidence is None:
         why = "these weights never learned it; take those of a whole pass (`evnlos weights` lists them)"
+    else:
+        return None
     return f"no confidence: {why}"
 
 

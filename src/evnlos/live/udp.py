@@ -14,7 +14,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.events.io.columns import cut, trusted_events
 from evnlos.live.chunk import UNKNOWN_US, Chunk
 from evnlos.live.clock import Clock, SystemClock
-from evnlos.live.packet import USUAL_EVENTS, Batch, Heading, Packet, pack, unpack, unpack_all
+from evnlos.live.packet import USUAL_EVENTS, Batch, Packet, pack, unpack, unpack_all
 from evnlos.types import Events
 
 _BUFFER_BYTES = 1 << 22  # asked of the system, which may give less
@@ -115,7 +115,7 @@ class UdpSource:
         """Yield (first, last + 1) of packets that follow each other in one stream; count what is left out."""
         first = 0
         for number, heading in enumerate(batch.headings):
-            is_next = self._is_next(heading, batch, number)
+            is_next = self._is_next(batch, number)
             if (not is_next or heading.sequence == 0) and number > first:
                 yield first, number
             if not is_next:
@@ -125,8 +125,9 @@ class UdpSource:
         if first < len(batch.headings):
             yield first, len(batch.headings)
 
-    def _is_next(self, heading: Heading, batch: Batch, number: int) -> bool:
+    def _is_next(self, batch: Batch, number: int) -> bool:
         """Return whether a packet's place in the stream allows it, and count what is wrong."""
+        heading = batch.headings[number]
         size = heading.height, heading.width
         if heading.sequence == 0:
             self._next, self._newest, self._size = None, None, size

@@ -90,7 +90,8 @@ def reconstruct_capture(
         warnings = track_doubts(shot, wall, path)
         samples = replace(samples, position_m=path.at(samples.time_s))
     images = reconstruct(loaded, samples.frame, samples.surface, samples.position_m)
-    known = published_rig(weights)
+    unjudged = why_unjudged(loaded, samples)
+    known = None if unjudged else published_rig(weights)  # an operator takes a second to make
     judge = rig or (load_yaml(Simulation, known) if known else None)
     operator = None if judge is None else FrameOperator(judge, sampling)
     worth = judgement_of(loaded, samples, images, operator)
@@ -129,7 +130,7 @@ def reconstruct_capture(
         write_atomically(out / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))
         found["confidence"] = said(worth)
     else:
-        found["no_confidence"] = why_unjudged(loaded, samples)
+        found["no_confidence"] = unjudged
     if track:
         found["warnings"] = warnings
     if samples.truth is not None:
