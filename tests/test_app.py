@@ -116,6 +116,26 @@ def test_networks_of_the_package_see_more_than_least_squares(app_pass) -> None:
         assert "all frames" in found[name].note and "supports" in found[name].note
 
 
+def test_pictures_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames() -> None:
+    networks, noted = Networks(), {}
+    for name, setup in (("own", SMALL), ("rough", replace(SMALL, roughness=0.2))):
+        recorded = simulate_pass(setup, picked("R"))
+        wall = networks.wall_of(recorded)
+        network = networks.of(recorded)["network, frames"]
+        noted[name] = from_weights(recorded, "frames", network, wall).note
+        assert "supports" in from_weights(recorded, "frames", network).note  # the pictures alone do not tell
+    assert "supports" in noted["own"] and "nothing measured" in noted["rough"]
+
+
+def test_only_networks_of_the_package_bring_a_wall_for_recordings(app_pass, app_weights) -> None:
+    package, own = Networks(), own_networks((app_weights["event"],))
+    recording = replace(app_pass, simulation=None)
+    assert package.wall_of(app_pass) is not None and own.wall_of(app_pass) is not None
+    assert package.wall_of(recording) is not None and own.wall_of(recording) is None
+    assert package.wall_of(replace(recording, motion=None)) is None
+    assert package.wall_of(replace(app_pass, frames=None)) is None
+
+
 def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
     shown = [verdict_on(replace(SMALL, **one).simulation()) for one in ({"roughness": 0.02}, {"wall": "matte"})]
     assert "measured" in shown[0].meaning and "memory, not a measurement" not in shown[0].meaning

@@ -242,6 +242,25 @@ def test_light_pattern_and_noise_need_not_be_known() -> None:
     assert explained(true, pattern.expand_as(frames), *known) == 0.0
 
 
+def test_noise_that_grows_with_the_light_is_taken_off() -> None:
+    rig = lab_rig()
+    weak = replace(rig.frame_camera, full_well_e=30.0, read_noise_e=0.3)
+    operator = FrameOperator(replace(rig, frame_camera=weak), SAMPLING)
+    at = np.stack([np.linspace(-0.06, 0.06, 40), np.zeros(40)], axis=1)
+    draw = torch.Generator().manual_seed(5)
+    own, average = (torch.rand(4, 4, generator=draw) > 0.5).float(), torch.full((32, 32), 0.5)
+    true = on_canvas(own.repeat_interleave(8, 0).repeat_interleave(8, 1), SAMPLING.canvas, at)
+    light = operator(true)
+    assert operator.variance(light).max() > 1.5 * operator.variance(light).median()
+    found, share = [], []
+    for _ in range(12):
+        noise = operator.variance(light).sqrt() * torch.randn(light.shape, generator=draw)
+        found.append(explained(true, light + noise, at, average, operator, SAMPLING.canvas))
+        share.append(float(noise.square().sum() / (light - light.mean(dim=0)).square().sum()))
+    assert np.mean(share) > 0.2  # of the light, the noise is no small part
+    assert np.mean(found) == pytest.approx(1, abs=0.05)
+
+
 def test_published_weights_refuse_a_wall_that_is_not_theirs() -> None:
     path = published_rig("near-frame-pass")
     assert path is not None and published_rig("page-frame-pass") is None and published_rig(path) is None

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from evnlos.app.recorded import Recorded
-from evnlos.dataset import PARADIGMS
-from evnlos.model import Weights, load_weights, published, published_for
+from evnlos.config import load_yaml
+from evnlos.dataset import PARADIGMS, Sampling, Simulation
+from evnlos.evaluation.consistency import FrameOperator
+from evnlos.model import Weights, load_weights, published, published_for, published_rig
 
 _PAGE = "page-{}-pass"  # trained on the simulation `page`
 _TITLES = {"frame": "network, frames", "event": "network, events", "fusion": "network, both"}
@@ -44,6 +46,17 @@ class Networks:
             if name in published() and (recorded.frames is not None or paradigm == "event"):
                 found[_TITLES[paradigm]] = _loaded(name)
         return found
+
+    def wall_of(self, recorded: Recorded) -> Callable[[Sampling], FrameOperator] | None:
+        """Return the wall that has to turn the pictures into the frames: the pass's own, or the networks'.
+
+        None where there are no frames, or where the networks are the user's and so is the recording.
+        """
+        rig = recorded.simulation
+        if rig is None and not self.own and recorded.motion is not None:
+            known = published_rig(published_for(recorded.distance_m, "frame", is_motion_known=True))
+            rig = load_yaml(Simulation, known) if known else None
+        return None if rig is None or recorded.frames is None else cache(partial(FrameOperator, rig))
 
 
 @cache

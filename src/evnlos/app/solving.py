@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from evnlos.errors import DataError
 from evnlos.evaluation import reconstruct
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.identify_rig import camera_variance
-from evnlos.evaluation.worth import judgement_of
+from evnlos.evaluation.worth import judgement_of, why_unjudged
 from evnlos.metrics import psnr
 from evnlos.model import JointNetwork, Weights
 from evnlos.scene import Target
@@ -96,8 +97,20 @@ def from_whole_pass(recorded: Recorded) -> Reconstruction:
     return _scored("whole pass", "all frames, rig and motion known, nothing learned", images, recorded, fine)
 
 
-def from_weights(recorded: Recorded, name: str, weights: Weights) -> Reconstruction:
-    """Return the pictures of a network.
+def from_weights(
+    recorded: Recorded,
+    name: str,
+    weights: Weights,
+    wall: Callable[[Sampling], FrameOperator] | None = None,
+) -> Reconstruction:
+    """Return the pictures of a network, and how far to believe them.
+
+    Args:
+        recorded: The pass.
+        name: What to call the network.
+        weights: The network.
+        wall: What has to make the frames of these pictures, for a size of samples; None: the pictures alone
+            are asked.
 
     Raises:
         DataError: The pass has no frames, and the network needs them.
@@ -112,7 +125,9 @@ def from_weights(recorded: Recorded, name: str, weights: Weights) -> Reconstruct
     pictures = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
     images = pictures[:, sampling.scored].numpy()
     saw = _SEEN[weights.paradigm][isinstance(weights.network, JointNetwork)]
-    worth = judgement_of(weights, samples, pictures)
+    can_judge = why_unjudged(weights, samples) is None
+    operator = wall(sampling) if wall is not None and can_judge else None
+    worth = judgement_of(weights, samples, pictures, operator)
     note = f"network: {saw}" + (f"; {worth.verdict}" if worth else "")
     return _scored(name, note, images, recorded, sampling)
 

@@ -34,7 +34,8 @@ def simulated(setup: Setup, target: Target, networks: Networks) -> Iterator[tupl
     found = [from_whole_pass(recorded), from_each_frame(recorded)]
     assert recorded.simulation is not None  # it was simulated
     yield _sheet(recorded, before, found, after), waiting_box()
-    found += [from_weights(recorded, name, one) for name, one in networks.of(recorded).items()]
+    wall = networks.wall_of(recorded)
+    found += [from_weights(recorded, name, one, wall) for name, one in networks.of(recorded).items()]
     pictures = _sheet(recorded, before, found, after)
     yield pictures, waiting_box()
     yield pictures, verdict_box(verdict_on(recorded.simulation))
@@ -59,10 +60,10 @@ def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networ
     try:
         recorded = read_upload(path, scratch, limit_bytes)
         found, refused = [], []
-        known = networks.of(recorded)
+        known, wall = networks.of(recorded), networks.wall_of(recorded)
         for name, one in known.items():
             try:
-                found.append(from_weights(recorded, name, one))
+                found.append(from_weights(recorded, name, one, wall))
             except EvnlosError as error:
                 refused.append(str(error))
         pictures = _sheet(recorded, seen_views(recorded), found, event_views(recorded))

@@ -48,16 +48,21 @@ class FrameOperator:
         self.ambient = torch.from_numpy(reduce_by_area(torch.as_tensor(ambient).numpy(), self.size)).flatten()
         first = (sampling.height - source.height) // 2
         self.rows = slice(first, first + source.height)
-        camera = rig.frame_camera
-        level_e = camera.full_well_e * float(self.ambient.mean() + 0.1 * rig.transport.gain)
-        pixel = (level_e + camera.read_noise_e**2) / camera.full_well_e**2 + _ROUNDING / camera.white**2
-        # A sample pixel is the mean of several sensor pixels.
-        self.sigma = (pixel * (self.size[0] * self.size[1]) / (shape[0] * shape[1])) ** 0.5
+        self._camera = rig.frame_camera
+        self._pixels = shape[0] * shape[1] / (self.size[0] * self.size[1])  # of the sensor, a sample pixel
+        self.sigma = float(self.variance(self.ambient.mean() + 0.1 * rig.transport.gain).sqrt())
 
     def __call__(self, pictures: Tensor) -> Tensor:
         """Return the frames [N, h, w] that the rig makes of pictures [N, H, W]."""
         light = pictures[:, self.rows].flatten(1) @ self.matrix.T + self.ambient  # [N, h w]
         return light.unflatten(1, self.size)
+
+    def variance(self, level: Tensor) -> Tensor:
+        """Return the variance of a sample pixel at a level, white levels squared: light, reading, rounding."""
+        camera = self._camera
+        photons_e2 = camera.full_well_e * level.clamp_min(0)
+        pixel = (photons_e2 + camera.read_noise_e**2) / camera.full_well_e**2 + _ROUNDING / camera.white**2
+        return pixel / self._pixels
 
 
 def consistent(

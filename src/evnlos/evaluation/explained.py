@@ -50,7 +50,7 @@ def explained(
             f"{operator.size[1]} x {operator.size[0]} samples"
         )
     plain = on_canvas(average, canvas, position_m)
-    noise, seen = _noise(frames), _moving(frames)
+    noise, seen = _noise(frames, operator), _moving(frames)
     left, before = (_left(_moving(operator(shown)), seen) - noise for shown in (pictures, plain))
     tiny = 1e-9 * seen.square().sum()  # rounding
     if before <= _BEYOND_NOISE * noise + tiny:
@@ -84,16 +84,18 @@ def _left(made: Tensor, seen: Tensor) -> Tensor:
     return (seen - max(_gain(made, seen), 0.0) * made).square().sum()
 
 
-def _noise(frames: Tensor) -> Tensor:
+def _noise(frames: Tensor, operator: FrameOperator) -> Tensor:
     """Return what noise adds to the moving light, squared and summed: from the scatter about the neighbours.
 
-    The light moves slowly and over few pixels; the median over the pixels is that of the others. In time alone:
+    How the noise grows with the level is told by the rig's camera, how strong it is by the frames. The light
+    moves slowly and over few pixels; the median over the pixels is that of the others. In time alone:
     `temporal_noise` also takes differences between neighbours, but samples share the sensor's pixels with
     theirs, so that it finds a tenth too little here.
     """
     if len(frames) < 3:
         return torch.zeros((), dtype=torch.float64)
     frames = frames.double()
-    bend = frames[1:-1] - 0.5 * (frames[2:] + frames[:-2])  # 1.5 times the noise's variance
-    variance = (bend.flatten(1).abs().median(dim=1).values.median() / _MAD).square() / 1.5
-    return variance * frames[0].numel() * (len(frames) - 1)
+    beside = 0.5 * (frames[2:] + frames[:-2])
+    spread = (frames[1:-1] - beside) / (1.5 * operator.variance(beside)).sqrt()
+    excess = (spread.flatten(1).abs().median(dim=1).values.median() / _MAD).square()
+    return excess * operator.variance(frames).sum() * (1 - 1 / len(frames))
