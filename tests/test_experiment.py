@@ -1,6 +1,7 @@
 """Experiments: resumable, honest about what was held out, and put into tables that say what the records say."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,6 +90,27 @@ def test_a_second_run_does_nothing_again(records, place) -> None:
     assert show(run_study(STUDY, place)) == []
     after = {path: path.stat().st_mtime_ns for path in place.out.rglob("*") if path.is_file()}
     assert after == before
+
+
+def test_networks_trained_at_a_time_are_those_trained_one_by_one(records, place, tmp_path) -> None:
+    for part in ("rigs", "simulations", "shots"):
+        shutil.copytree(place.out / part, tmp_path / part)
+    study = replace(STUDY, seeds=(0,))
+    steps = list(run_study(study, replace(place, out=tmp_path, trainings=2)))
+    together = [step.part for step in steps if step.what == "train networks"]
+    assert together == [
+        0,
+        1,
+        2,
+        3,
+    ]  # pre-training and E2E, then fine-tuning; the pre-training once for two arms
+    alone = {(r.arm, r.seed): r for r in records}
+    found = [step.record for step in steps if step.record is not None]
+    assert {r.arm for r in found} == {arm for arm, _ in alone}
+    for record in found:
+        one = alone[record.arm, record.seed]
+        assert record.settings.get("run") == one.settings.get("run")
+        assert record.positions["lab_4"] == pytest.approx(one.positions["lab_4"], abs=0.02)
 
 
 def test_arms_share_what_they_have_in_common(records, place) -> None:

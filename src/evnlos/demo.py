@@ -47,7 +47,7 @@ class Demo:
     width: int = 32
     """Channels of the network at its finest level."""
     workers: int = 0
-    """Processes that simulate; 0 = one for each core."""
+    """Processes that simulate, and that train where there is no GPU; 0 = one for each core."""
     calibrate: bool = True
     """Fit the simulator to the rig of the captures first; without it, pre-train on the default simulation."""
     seed: int = 0
@@ -79,8 +79,9 @@ def run_demo(settings: Demo) -> Path:
         notes += lab.glyphs.notes()
         show(_rendered(lab, settings, folders))
     study = _study(settings, _held_out(folders, settings.test))
+    place = Place(tuple(sorted(folders)), out, settings.workers, trainings=settings.workers)
     try:
-        show(run_study(study, Place(tuple(sorted(folders)), out, settings.workers)))
+        show(run_study(study, place))
     except CalibrationError as error:
         raise CalibrationError(
             f"{error}; or give --no-calibrate to go on with the default simulation"

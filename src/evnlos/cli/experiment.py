@@ -58,6 +58,9 @@ class Command:
     """Passes over the captures in end-to-end training; by default the experiment's own number."""
     workers: int = 0
     """Processes that simulate; 0 = one for each core."""
+    trainings: int = 1
+    """Networks that are trained at a time where there is no GPU, in as many times the memory; 0 = one for each
+    core. For experiments on captures."""
     metric: Literal["psnr_db", "psnr_box_db", "ssim", "ms_ssim", "haarpsi", "gmsd", "lpips"] = "psnr_db"
     """What the printed tables show; the records hold all."""
 
@@ -76,7 +79,7 @@ class Command:
         study = self._study()
         assert self.captures is not None
         folders = tuple(captures_of(self.captures, self.rig))
-        show(run_study(study, Place(folders, self.out, self.workers)))
+        show(run_study(study, Place(folders, self.out, self.workers, self.trainings)))
         records = [r for r in read_records(self.out / "records" / study.name) if r.rig == self.rig]
         records = [r for r in records if r.split == study.split]
         text = _tables(study.name, records, self.metric)

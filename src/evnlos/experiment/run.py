@@ -25,9 +25,9 @@ from evnlos.errors import CalibrationError, DataError
 from evnlos.experiment.making import simulated_steps
 from evnlos.experiment.scoring import score_arm
 from evnlos.experiment.study import Arm, Place, Step, Study, slug
+from evnlos.experiment.trainings import Run, train_one, train_together
 from evnlos.scene import HandwritingGlyphs
 from evnlos.seeds import derive_seed
-from evnlos.training import Training, train
 
 
 def run_study(study: Study, place: Place) -> Iterator[Step]:
@@ -54,15 +54,25 @@ def run_study(study: Study, place: Place) -> Iterator[Step]:
         except DataError as error:
             raise CalibrationError(str(error)) from None
         yield Step(f"calibrate {study.rig}", 1, 1)
+    prepared = []
     for arm in study.arms:
         shots = yield from _import(study, arm, list(place.captures), place)
         made = yield from _simulate(study, arm, place)
+        prepared.append((arm, shots, made))
+    networks = []
+    for arm, shots, made in prepared:
         for paradigm in study.paradigms:
-            runs = []
-            for seed in study.seeds:
-                run, settings = yield from _train(study, arm, paradigm, seed, made, shots, place)
-                runs.append((run, settings))
-            yield from score_arm(study, arm, paradigm, runs, made, shots, place)
+            plans = [_planned(study, arm, paradigm, seed, made, shots, place) for seed in study.seeds]
+            networks.append((arm, shots, made, paradigm, plans))
+    if place.trainings != 1:
+        every = [run for *_, plans in networks for runs, _ in plans for run in runs]
+        yield from train_together(every, place.trainings)
+    for arm, shots, made, paradigm, plans in networks:
+        for runs, _ in plans:
+            for run in runs:
+                yield from train_one(run)
+        last = [(runs[-1].out, decided) for runs, decided in plans]
+        yield from score_arm(study, arm, paradigm, last, made, shots, place)
 
 
 def captures_of(root: Path, rig: str) -> list[Path]:
@@ -131,31 +141,25 @@ def _few(folders: list[Path], shots: int, held_out: tuple[str, ...]) -> list[Pat
     return [f for f in folders if f in few or character_of(f.name) in held_out]
 
 
-def _train(
+def _planned(
     study: Study, arm: Arm, paradigm: Paradigm, seed: int, made: Dataset | None, shots: Dataset, place: Place
-) -> Generator[Step, None, tuple[Path, dict[str, Any]]]:
-    """Train an arm's network and return its run and what decided it."""
-    run: Path | None = None
+) -> tuple[list[Run], dict[str, Any]]:
+    """Return the trainings of an arm's network, each from the one before it, and what decided them."""
+    runs: list[Run] = []
     decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": shots.folder.name}
     if arm.pretraining is not None:
         assert made is not None
         settings = replace(arm.pretraining, paradigm=paradigm, seed=seed)
         key = config_hash({"data": made.config_hash, "settings": to_dict(settings)})[:8]
-        run = place.out / "runs" / f"{study.rig}-pretrained-{paradigm}-seed{seed}-{key}"
-        yield from _fit(made, settings, run, None)
+        out = place.out / "runs" / f"{study.rig}-pretrained-{paradigm}-seed{seed}-{key}"
+        runs.append(Run(made, settings, out))
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
         settings = replace(arm.finetuning, paradigm=paradigm, seed=seed)
-        start = run
+        start = runs[-1].out if runs else None
         key = config_hash(
             {"data": shots.folder.name, "settings": to_dict(settings), "from": start.name if start else None}
         )[:8]
-        run = place.out / "runs" / f"{study.rig}-{slug(arm.name)}-{paradigm}-seed{seed}-{key}"
-        yield from _fit(shots, settings, run, start)
-    assert run is not None
-    return run, decided
-
-
-def _fit(data: Dataset, settings: Training, out: Path, weights: Path | None) -> Iterator[Step]:
-    for record in train(data, settings, out, weights):
-        yield Step(f"train {out.name}", record["epoch"], settings.epochs)
+        out = place.out / "runs" / f"{study.rig}-{slug(arm.name)}-{paradigm}-seed{seed}-{key}"
+        runs.append(Run(shots, settings, out, start))
+    return runs, decided

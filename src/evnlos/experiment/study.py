@@ -107,11 +107,13 @@ class Place:
         captures: Capture folders of the study's rig.
         out: Folder for rigs, datasets, runs and records.
         workers: Processes that simulate; 0 is one for each core.
+        trainings: Networks that are trained at a time where there is no GPU; 0 is one for each core.
     """
 
     captures: tuple[Path, ...]
     out: Path
     workers: int = 0
+    trainings: int = 1
 
 
 @dataclass(frozen=True)
