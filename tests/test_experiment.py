@@ -113,6 +113,12 @@ def test_networks_trained_at_a_time_are_those_trained_one_by_one(records, place,
         assert record.positions["lab_4"] == pytest.approx(one.positions["lab_4"], abs=0.02)
 
 
+def test_fewer_than_no_processes_are_refused(tmp_path) -> None:
+    for name in ("workers", "trainings"):
+        with pytest.raises(ConfigError, match=f"{name} is -1"):
+            Place((), tmp_path, **{name: -1})
+
+
 def test_arms_share_what_they_have_in_common(records, place) -> None:
     names = [path.name for path in (place.out / "runs").iterdir()]
     assert len([name for name in names if "pretrained" in name]) == 2  # one a seed, for two arms

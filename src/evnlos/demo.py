@@ -47,7 +47,7 @@ class Demo:
     width: int = 32
     """Channels of the network at its finest level."""
     workers: int = 0
-    """Processes that simulate, and that train where there is no GPU; 0 = one for each core."""
+    """Processes that simulate, and networks trained at a time where there is no GPU; 0 = one for each core."""
     calibrate: bool = True
     """Fit the simulator to the rig of the captures first; without it, pre-train on the default simulation."""
     seed: int = 0

@@ -108,12 +108,20 @@ class Place:
         out: Folder for rigs, datasets, runs and records.
         workers: Processes that simulate; 0 is one for each core.
         trainings: Networks that are trained at a time where there is no GPU; 0 is one for each core.
+
+    Raises:
+        ConfigError: A number of processes below 0.
     """
 
     captures: tuple[Path, ...]
     out: Path
     workers: int = 0
     trainings: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("workers", "trainings"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} is {getattr(self, name)}; give 0 (one for each core) or more")
 
 
 @dataclass(frozen=True)
