@@ -67,6 +67,7 @@ def run_demo(settings: Demo) -> Path:
     for folder in settings.captures:
         if not (folder / "capture.yaml").is_file():
             raise ConfigError(f"{folder} has no capture.yaml; give the capture folders themselves: {folder}/*")
+    place = Place((), out, settings.workers, trainings=settings.workers)
     out.mkdir(parents=True, exist_ok=True)
     notes = []
     folders = list(settings.captures)
@@ -79,7 +80,7 @@ def run_demo(settings: Demo) -> Path:
         notes += lab.glyphs.notes()
         show(_rendered(lab, settings, folders))
     study = _study(settings, _held_out(folders, settings.test))
-    place = Place(tuple(sorted(folders)), out, settings.workers, trainings=settings.workers)
+    place = dataclasses.replace(place, captures=tuple(sorted(folders)))
     try:
         show(run_study(study, place))
     except CalibrationError as error:

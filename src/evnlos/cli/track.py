@@ -114,7 +114,8 @@ def to_text(found: dict[str, Any]) -> str:
         + ("" if unit == "mm" else "; image pixels: give --rig for metres"),
         f"mean speed  {scale * found['mean_speed']:8.3f} {unit}/s, "
         f"+- {scale * found['speed_sigma']:.3f} at an instant",
-        f"position    {scale * found['position_sigma']:8.3f} {unit} standard deviation",
+        f"position    {scale * found['position_sigma']:8.3f} {unit} standard deviation"
+        + (" by the noise; the rig's own errors come on top" if unit == "mm" else ""),
         f"size        {found['size_change']:8.3f} at the end over the start",
     ]
     if "misfit" in found:

@@ -50,7 +50,7 @@ def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers
                 if max(tries) >= _TRIES:
                     raise EvnlosError(
                         f"a worker process died {_TRIES} times (killed, or out of memory?); "
-                        "run again with fewer at a time (--workers): what is finished is kept"
+                        "run again with fewer at a time (--workers, --trainings): what is finished is kept"
                     ) from None
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
