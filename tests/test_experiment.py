@@ -97,13 +97,9 @@ def test_networks_trained_at_a_time_are_those_trained_one_by_one(records, place,
         shutil.copytree(place.out / part, tmp_path / part)
     study = replace(STUDY, seeds=(0,))
     steps = list(run_study(study, replace(place, out=tmp_path, trainings=2)))
+    # Pre-training and E2E, then fine-tuning; the pre-training once for two arms.
     together = [step.part for step in steps if step.what == "train networks"]
-    assert together == [
-        0,
-        1,
-        2,
-        3,
-    ]  # pre-training and E2E, then fine-tuning; the pre-training once for two arms
+    assert together == [0, 1, 2, 3]
     alone = {(r.arm, r.seed): r for r in records}
     found = [step.record for step in steps if step.record is not None]
     assert {r.arm for r in found} == {arm for arm, _ in alone}

@@ -10,13 +10,13 @@ from torch import Tensor
 from evnlos.dataset import Sampling, Simulation
 from evnlos.dataset.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
+from evnlos.evaluation.identify_rig import camera_variance
 from evnlos.solver.conjugate_gradient import conjugate_gradient
 from evnlos.transport import RadiometricTransport
 from evnlos.transport.wall import ambient_plane
 from evnlos.types import Plane
 
 _TOLERANCE, _MOST_STEPS = 1e-3, 200
-_ROUNDING = 1 / 12  # variance of rounding, DN^2
 
 
 class FrameOperator:
@@ -59,10 +59,7 @@ class FrameOperator:
 
     def variance(self, level: Tensor) -> Tensor:
         """Return the variance of a sample pixel at a level, white levels squared: light, reading, rounding."""
-        camera = self._camera
-        photons_e2 = camera.full_well_e * level.clamp_min(0)
-        pixel = (photons_e2 + camera.read_noise_e**2) / camera.full_well_e**2 + _ROUNDING / camera.white**2
-        return pixel / self._pixels
+        return camera_variance(level, self._camera) / self._pixels
 
 
 def consistent(

@@ -54,13 +54,10 @@ def run_study(study: Study, place: Place) -> Iterator[Step]:
         except DataError as error:
             raise CalibrationError(str(error)) from None
         yield Step(f"calibrate {study.rig}", 1, 1)
-    prepared = []
+    networks = []
     for arm in study.arms:
         shots = yield from _import(study, arm, list(place.captures), place)
         made = yield from _simulate(study, arm, place)
-        prepared.append((arm, shots, made))
-    networks = []
-    for arm, shots, made in prepared:
         for paradigm in study.paradigms:
             plans = [_planned(study, arm, paradigm, seed, made, shots, place) for seed in study.seeds]
             networks.append((arm, shots, made, paradigm, plans))

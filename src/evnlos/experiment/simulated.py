@@ -14,9 +14,10 @@ from evnlos.evaluation import available_lpips, evaluate
 from evnlos.experiment.making import simulated_steps
 from evnlos.experiment.records import keep_scores, names_there
 from evnlos.experiment.study import Record, Step
+from evnlos.experiment.trainings import Run, train_one
 from evnlos.model import load_weights
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
-from evnlos.training import Training, train
+from evnlos.training import Training
 
 NAME = "simulation"
 """Name of the experiment."""
@@ -92,8 +93,7 @@ def run_simulated(settings: Simulated) -> Iterator[Step]:
                 }
                 key = config_hash(decided)[:8]
                 run = settings.out / "runs" / f"paper-{arm.lower()}-{paradigm}-seed{seed}-{key}"
-                for record in train(data[source], plan, run, start):
-                    yield Step(f"train {run.name}", record["epoch"], plan.epochs)
+                yield from train_one(Run(data[source], plan, run, start))
                 first = first or run
                 sets = ("nist", "comic") if arm == "pre-trained" else ("comic",)
                 for tested in sets:
