@@ -1,13 +1,17 @@
 """The event camera on a wall in continuous time: its own steps against fine ones, memory, laws, bad input."""
 
 import tracemalloc
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 
 from evnlos import EventCamera, EventPixel, EvnlosError, simulate_events
+from evnlos.errors import DataError
+from evnlos.scene import LineMotion
+from evnlos.transport import SlidingWall, View
+from evnlos.types import Plane
 
 CLEAN = EventPixel(0.15, 0.15, 0.0, 15.0, 0.0, 0.0, 0.0)
 
@@ -62,6 +66,47 @@ def test_a_recording_is_the_simulation_of_its_frames() -> None:
     assert EventCamera(CLEAN, time_step_s=0.01).record(Spot(), 0.0, 3.0) == simulate_events(
         frames, times, CLEAN
     )
+
+
+NOISY = EventPixel(0.15, 0.12, 0.03, 60.0, 0.5, 2.0, 0.0)
+PLATE = Plane(60, 70, 0.001)
+
+
+def sliding_wall(direction: tuple[float, float], image: torch.Tensor | None = None) -> SlidingWall:
+    x, y = torch.as_tensor(PLATE.x_m), torch.as_tensor(PLATE.y_m)[:, None]
+    spot = torch.exp(-(x**2 + (y - 0.01) ** 2) / (2 * 0.006**2)) + 0.4 * (torch.abs(x + y) < 0.004)
+    motion = LineMotion((-0.03, 0.0), 0.08, direction)
+    view = View.affine((45, 70), 700.0)
+    return SlidingWall(spot.float() if image is None else image, PLATE, view, motion, gain=0.7, ambient=0.1)
+
+
+@pytest.mark.parametrize("mode", ["exact", "v2e"])
+@pytest.mark.parametrize("refractory_s", [0.0, 2e-3])
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (1.0, 0.4)])
+def test_a_wall_in_strips_gives_the_events_of_its_frames(mode, refractory_s: float, direction) -> None:
+    """150 steps: two whole blocks of strips and a part; 3150 pixels: one whole tile and a part."""
+    pixel, wall = replace(NOISY, refractory_s=refractory_s), sliding_wall(direction)
+    assert (wall.strips([0.0, 1.0]) is None) == (direction[1] != 0)
+    times_s = np.arange(151) * 4e-3
+    frames = wall.irradiance(times_s).numpy() * np.float32(255)
+    expected = simulate_events(frames, times_s, pixel, mode=mode, seed=3)
+    assert len(expected) > 3000
+    camera = EventCamera(pixel, time_step_s=4e-3, mode=mode)
+    for threads in (1, 2):
+        assert camera.record(wall, 0.0, 0.6, seed=3, threads=threads) == expected
+
+
+def test_a_broken_wall_is_refused_strip_by_strip() -> None:
+    for broken in (float("nan"), float("inf")):
+        wall = sliding_wall((1.0, 0.0), torch.full(PLATE.shape, broken))
+        with pytest.raises(DataError, match="NaN or infinity"):
+            EventCamera(CLEAN, time_step_s=0.01).record(wall, 0.0, 0.1)
+
+
+def test_whole_numbers_are_thresholds_too() -> None:
+    whole = EventCamera(EventPixel(1, 1, 0.03)).record(Spot(scale=5.0), 0.0, 1.0)
+    assert len(whole) > 0
+    assert whole == EventCamera(EventPixel(1.0, 1.0, 0.03)).record(Spot(scale=5.0), 0.0, 1.0)
 
 
 def test_a_wall_at_rest_gives_no_signal() -> None:

@@ -98,10 +98,41 @@ def test_compiled_shift_equals_the_reference(position, scale):
     wall = SlidingWall(
         spot(PLANE, 0, 0).float(), PLANE, View.affine(SHAPE, scale, 0.1), DIAGONAL, gain=0.7, ambient=0.1
     )
-    fast = torch.empty(SHAPE)
-    wall._expose(fast, *position)
+    fast = torch.empty((1, *SHAPE))
+    wall._write(np.array([position]), fast)
     slow = 0.1 + 0.7 * wall._shifted(*position).clamp(min=0)
-    torch.testing.assert_close(fast, slow, rtol=0, atol=3e-7)
+    torch.testing.assert_close(fast[0], slow, rtol=0, atol=3e-7)
+
+
+def test_any_pixels_of_the_light_are_those_of_the_images():
+    """Strips start and end in the middle of rows, at places where taps lie inside and outside of the band."""
+    view = View.affine(SHAPE, 700.0)
+    level = LineMotion((-0.1, 0.01), 0.05)
+    wall = SlidingWall(spot(PLANE, 0, 0).float(), PLANE, view, level, gain=0.7, ambient=0.1)
+    times_s = np.linspace(0, 4, 7)
+    images = wall.irradiance(times_s).flatten(1).numpy()
+    for k, time_s in enumerate(times_s):
+        assert np.array_equal(wall.irradiance(time_s).numpy().ravel(), images[k])
+    strips = wall.strips(times_s)
+    assert strips is not None
+    assert len(strips) == 7
+    draw = np.random.default_rng(0)
+    for _ in range(30):
+        first, last = np.sort(draw.choice(images.shape[1] + 1, 2, replace=False))
+        out = np.empty((7, last - first), np.float32)
+        strips.write(first, out)
+        assert np.array_equal(out, images[:, first:last])
+        strips[2:5].write(first, out[:3], 255.0)
+        assert np.array_equal(out[:3], np.float32(255) * images[2:5, first:last])
+
+
+def test_walls_that_have_no_strips():
+    image, affine = spot(PLANE, 0, 0).float(), View.affine(SHAPE, 400.0, 0.1)
+    assert SlidingWall(image, PLANE, affine, DIAGONAL).strips([0.0, 1.0]) is None
+    assert SlidingWall(image, PLANE, affine, DIAGONAL).strips([1.0]) is not None
+    view = View.perspective(SHAPE, 0.4, 0.3, 0.35)
+    assert SlidingWall(image, PLANE, view, DIAGONAL).strips([1.0]) is None
+    assert SlidingWall(image.requires_grad_(), PLANE, affine, DIAGONAL).strips([1.0]) is None
 
 
 def test_wall_carries_a_gradient():

@@ -15,7 +15,7 @@ from evnlos.calibration.frame_noise import local_square
 from evnlos.errors import DataError
 from evnlos.seeds import derive_seed
 from evnlos.sensor import EventPixel, simulate_events
-from evnlos.sensor.event_camera import WHITE_DN
+from evnlos.sensor.light import WHITE_DN
 from evnlos.types import Events
 
 _STEP_PX = 0.2  # the light is linear in time between two rendered instants

@@ -21,7 +21,7 @@ from evnlos.errors import ConfigError
 from evnlos.scene import Scene
 from evnlos.seeds import derive_seed
 from evnlos.sensor import simulate_batch
-from evnlos.sensor.event_camera import WHITE_DN
+from evnlos.sensor.light import WHITE_DN
 from evnlos.transport import SlidingWall
 
 

@@ -31,7 +31,7 @@ def _grown(column):
 
 @njit(cache=True, error_model="numpy")
 def _run_tile(
-    out, count, frames, times, first, last, light, filtered, base, last_event, candidate, drawn, sent,
+    out, count, frames, origin, times, first, last, light, filtered, base, last_event, candidate, drawn, sent,
     on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
 ):  # fmt: skip
     """Run the pixels first..last - 1 through all steps of a block; see `run_tiles`."""
@@ -51,7 +51,7 @@ def _run_tile(
         soonest = candidate[first:last].min()
     for k in range(len(frames)):
         start, stop = times[k], times[k + 1]
-        copy_light(frames[k, first:last], then[0])
+        copy_light(frames[k, first - origin : last - origin], then[0])
         log_row(then[0], then[1])
         fall(now[3], my_leak, stop - start, then[3])
         if rate > 0.0:
@@ -83,22 +83,22 @@ def _run_tile(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def run_tiles(
-    frames, times, first, last, tile_px, light, filtered, base, last_event, candidate, drawn, sent,
+    frames, origin, times, first, last, tile_px, light, filtered, base, last_event, candidate, drawn, sent,
     on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
 ):  # fmt: skip
     """Run the pixels first..last - 1 through all steps of a block, tile by tile, and return what they sent.
 
-    `frames` [T, N] light in DN at times[1:]; `times` [T + 1] seconds; then [N] state (`light` DN,
-    `filtered`, `base`, `last_event` s, next shot-noise `candidate` s, counters `drawn`, `sent`) and constants
-    of the pixels (thresholds, `leak` in log units/s, noise rates in hertz). `rate` is 2 pi fc / 275, 0 = no
-    filter. Returns three columns: time stamp in microseconds, pixel, polarity.
+    `frames` [T, M] light in DN of the pixels origin..origin + M - 1 at times[1:]; `times` [T + 1] seconds;
+    then [N] state (`light` DN, `filtered`, `base`, `last_event` s, next shot-noise `candidate` s, counters
+    `drawn`, `sent`) and constants of the pixels (thresholds, `leak` in log units/s, noise rates in hertz).
+    `rate` is 2 pi fc / 275, 0 = no filter. Returns three columns: time stamp in microseconds, pixel, polarity.
     """
     out = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_)
     count = 0
     for start in range(first, last, tile_px):
         out, count = _run_tile(
-            out, count, frames, times, start, min(start + tile_px, last), light, filtered, base, last_event,
-            candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter,
-            window, seed,
+            out, count, frames, origin, times, start, min(start + tile_px, last), light, filtered, base,
+            last_event, candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, refractory,
+            jitter, window, seed,
         )  # fmt: skip
     return out[0][:count], out[1][:count], out[2][:count]

@@ -21,6 +21,7 @@ from evnlos.sensor._random import (
     uniform_field,
 )
 from evnlos.sensor._tiles import check_tiling, map_shares, pixel_thresholds
+from evnlos.sensor.light import Light
 from evnlos.sensor.pixel import EventPixel
 
 
@@ -74,20 +75,21 @@ class ExactArray:
             self._candidate = time_s + np.divide(gap, rate, out=np.full(count, np.inf), where=rate > 0)
         self._drawn = np.zeros(count, np.uint32)
 
-    def advance(self, frames: NDArray, times_s: NDArray[np.float64]) -> Columns:
-        """Take the next frames [T, N] at `times_s` [T] and return the events in order."""
+    def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
+        """Take the next light at `times_s` [T] and return the events in order."""
         times = np.concatenate([[self._time], times_s])
         rate = 2.0 * math.pi * self.pixel.cutoff_hz / 275.0
 
         def work(first: int, last: int) -> tuple[NDArray, ...]:
+            frames, origin = light.pixels(first, last)
             return _exact.run_tiles(
-                frames, times, first, last, self._tile_px, self._light, self._filtered, self._base,
+                frames, origin, times, first, last, self._tile_px, self._light, self._filtered, self._base,
                 self._last_event, self._candidate, self._drawn, self._sent, self._on, self._off, self._leak,
                 self._rate_on, self._rate_off, self._rate_hot, rate, self.pixel.refractory_s,
                 self.pixel.jitter_s, self._window, self.seed,
             )  # fmt: skip
 
-        tiles = list(map_shares(work, frames.shape[1], self._tile_px, self._threads))
+        tiles = list(map_shares(work, len(self._light), self._tile_px, self._threads, light.most_px))
         self._time = float(times_s[-1])
         return sort_times(
             np.concatenate([tile[0] for tile in tiles]),

@@ -34,7 +34,7 @@ def pixel_thresholds(
         (pixel.threshold_on, STREAM_THRESHOLD_ON),
         (pixel.threshold_off, STREAM_THRESHOLD_OFF),
     ):
-        field = np.full(count, nominal)
+        field = np.full(count, float(nominal))
         if pixel.threshold_sigma > 0:
             field += pixel.threshold_sigma * normal_field(np.uint64(seed), stream, count)
             np.maximum(field, MIN_THRESHOLD, out=field)
@@ -53,15 +53,21 @@ def check_tiling(tile_px: int, threads: int | None) -> tuple[int, int]:
     return -(-tile_px // BLOCK) * BLOCK, threads
 
 
-def map_shares(work: Callable[[int, int], _T], count: int, tile_px: int, threads: int) -> Iterator[_T]:
-    """Yield work(first, last) for each share of whole tiles, in the order of the pixels."""
-    if threads == 1 or count <= tile_px:
-        yield work(0, count)
-        return
+def map_shares(
+    work: Callable[[int, int], _T], count: int, tile_px: int, threads: int, most_px: int | None = None
+) -> Iterator[_T]:
+    """Yield work(first, last) for each share of whole tiles, in the order of the pixels.
+
+    A share has at most `most_px` pixels, but at least one tile.
+    """
     # a few shares a thread, so that a busy part of the image does not keep the others waiting
-    share = -(-count // (_SHARES * threads * tile_px)) * tile_px
+    tiles = -(-count // (tile_px * (1 if threads == 1 else _SHARES * threads)))
+    if most_px is not None:
+        tiles = min(tiles, max(1, most_px // tile_px))
+    share = tiles * tile_px
     starts = range(0, count, share)
-    yield from _pool(threads).map(lambda first: work(first, min(first + share, count)), starts)
+    each = map if threads == 1 or len(starts) == 1 else _pool(threads).map
+    yield from each(lambda first: work(first, min(first + share, count)), starts)
 
 
 @cache

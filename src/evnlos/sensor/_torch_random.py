@@ -15,6 +15,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from evnlos.sensor._fast_math import G0, G1, G2, G3, G4, G5, G6
+
 _GOLDEN = 0x9E3779B97F4A7C15
 _FACTORS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 _WORD = (1 << 64) - 1
@@ -78,9 +80,10 @@ def _log(x: Tensor) -> Tensor:
     f = (bits - (exponent << 52)).view(torch.float64).sub_(1.0)
     s = f / (f + 2.0)
     z = s * s
-    series = torch.full_like(z, 2.0 / 21.0)
-    for n in (19, 17, 15, 13, 11, 9, 7, 5, 3):
-        series.mul_(z).add_(2.0 / n)
+    z2 = z * z
+    low = (z * G1).add_(G0).add_((z * G3).add_(G2).mul_(z2))
+    high = (z * G5).add_(G4).add_(z2 * G6)
+    series = low.add_((z2 * z2).mul_(high))
     e = exponent.to(torch.float64)
     tail = (z.mul_(s)).mul_(series).add_(e * _LN2_LOW)
     return (e * _LN2_HIGH).add_((2.0 * s).add_(tail))

@@ -22,8 +22,12 @@ from evnlos.sensor._random import (
 
 @njit(cache=True, error_model="numpy", inline="always")
 def lin_log(intensity):
-    """Return the logarithm of the light in DN, linear up to 20 DN, with v2e's rounding to 1e-8 and float32."""
-    return np.float32(np.rint(log_light(intensity) * 1e8) / 1e8)
+    """Return the logarithm of the light in DN, linear up to 20 DN, with v2e's rounding to 1e-8 and float32.
+
+    A product with 1e-8 stands for the division by 1e8: no k / 1e8 lies within 1e-13 of itself from the middle
+    of two float32 numbers, so both give the same one.
+    """
+    return np.float32(np.rint(log_light(intensity) * 1e8) * 1e-8)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -57,7 +61,7 @@ def shot_choice(seed, pixel, counter, chance_on, chance_off, chance_max):
 # Each of the following loops writes one array: with more, a compiler gives up proving that they do not overlap.
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def log_row(row, log_out):
     """Fill the logarithms of a row of light."""
     for i in range(len(row)):
@@ -88,10 +92,16 @@ def _flag(lp, base, on, off, flags):
 
 
 @njit(cache=True, error_model="numpy")
-def _leak(base, leak, scale, jitter):
-    """Lower the reference of a block of pixels by one step of jittered leak."""
-    for i in range(len(base)):
-        base[i] -= (scale * leak[i]) * jitter[i]
+def _leak(base, leak, scale, jitter, seed, first, step):
+    """Lower the references of the pixels from `first` on by one step of leak, jittered block by block.
+
+    Indices are unsigned: an index that can't be negative needs no test, and the loop becomes vectors.
+    """
+    for start in range(0, len(base), BLOCK):
+        offset = np.uint64(jitter_offset(seed, (first + start) // BLOCK, step))
+        begin = np.uint64(start)
+        for i in range(np.uint64(min(BLOCK, len(base) - start))):
+            base[begin + i] -= (scale * leak[begin + i]) * jitter[offset + i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -104,7 +114,7 @@ def _grown(column):
 
 @njit(cache=True, error_model="numpy")
 def _run_tile(
-    out, count, frames, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
+    out, count, frames, origin, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
     rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
     defer, peak,
 ):  # fmt: skip
@@ -129,13 +139,9 @@ def _run_tile(
     out_step, out_pixel, out_crossings, out_shot = out
     filtered = rate[0] > 0.0
     for k in range(steps):
-        row = frames[k, first:last]
+        row = frames[k, first - origin : last - origin]
         if leak_scale[k] > 0.0:
-            scale = np.float32(leak_scale[k])
-            for start in range(0, size, BLOCK):
-                stop = min(start + BLOCK, size)
-                offset = jitter_offset(seed, (first + start) // BLOCK, first_step + k)
-                _leak(my_base[start:stop], my_leak[start:stop], scale, jitter[offset : offset + stop - start])
+            _leak(my_base, my_leak, np.float32(leak_scale[k]), jitter, seed, first, first_step + k)
         if len(table) > 0:
             _look_up(row, table, logs)
         else:
@@ -202,15 +208,15 @@ def _run_tile(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def run_tiles(
-    frames, first, last, tile_px, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
+    frames, origin, first, last, tile_px, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
     rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
     defer, peak,
 ):  # fmt: skip
     """Run the pixels first..last - 1 through all steps of a block, tile by tile, and return what they sent.
 
-    `frames` [T, N] light in DN; `lp`, `base`, thresholds, `leak`, `hazard`, `drawn` [N] state and constants of
-    the pixels; `table` [256] logarithms of 8-bit light, empty for other light; `rate`, `leak_scale`,
-    `hazard_sum`, `chance` [T].
+    `frames` [T, M] light in DN of the pixels origin..origin + M - 1; `lp`, `base`, thresholds, `leak`,
+    `hazard`, `drawn` [N] state and constants of the pixels; `table` [256] logarithms of 8-bit light, empty for
+    other light; `rate`, `leak_scale`, `hazard_sum`, `chance` [T].
     Returns four columns: step, pixel, signed number of threshold crossings, sign of a shot-noise event. `peak`
     [T] takes the largest number of crossings of a pixel in each step. With `defer` the reference stays where
     it is when a threshold is crossed: the caller decides which events pass.
@@ -219,7 +225,7 @@ def run_tiles(
     count = 0
     for start in range(first, last, tile_px):
         out, count = _run_tile(
-            out, count, frames, start, min(start + tile_px, last), lp, base, on, off, step_on, step_off,
+            out, count, frames, origin, start, min(start + tile_px, last), lp, base, on, off, step_on, step_off,
             leak, hazard, drawn, table, rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter,
             seed, first_step, defer, peak,
         )  # fmt: skip

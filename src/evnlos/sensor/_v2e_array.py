@@ -19,6 +19,7 @@ from evnlos.sensor._random import (
     normal_field,
 )
 from evnlos.sensor._tiles import check_tiling, map_shares, pixel_thresholds
+from evnlos.sensor.light import Light
 from evnlos.sensor.pixel import EventPixel
 
 _DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
@@ -69,22 +70,22 @@ class V2eArray:
         self._lp, self._base = logs.astype(self._state_type), logs.astype(self._state_type)
         self._time = time_s
 
-    def advance(self, frames: NDArray, times_s: NDArray[np.float64]) -> Columns:
-        """Take the next frames [T, N] at `times_s` [T] and return the events in order."""
+    def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
+        """Take the next light at `times_s` [T] and return the events in order."""
         if self.pixel.refractory_s == 0:
-            return self._advance(frames, times_s)
-        blocks = [self._advance(frames[k : k + 1], times_s[k : k + 1]) for k in range(len(frames))]
+            return self._advance(light, times_s)
+        blocks = [self._advance(light[k : k + 1], times_s[k : k + 1]) for k in range(len(times_s))]
         return tuple(np.concatenate(column) for column in zip(*blocks, strict=True))  # type: ignore[return-value]
 
-    def _advance(self, frames: NDArray, times_s: NDArray[np.float64]) -> Columns:
-        pixel, steps, count = self.pixel, len(frames), frames.shape[1]
+    def _advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
+        pixel, steps, count = self.pixel, len(times_s), len(self._lp)
         starts = np.concatenate([[self._time], times_s[:-1]])
         delta = times_s - starts
         if pixel.cutoff_hz > 0:
             rate = delta / (1.0 / (math.pi * 2.0 * pixel.cutoff_hz))
         else:
             rate = np.zeros(steps)
-        table = np.empty(256 if frames.dtype == np.uint8 else 0, np.float32)
+        table = np.empty(256 if light.dtype == np.uint8 else 0, np.float32)
         _v2e.log_row(np.arange(len(table)), table)
         chance = np.zeros((steps, 2))
         chance[:, 0] = 0.5 * pixel.shot_noise_rate_hz * delta
@@ -94,8 +95,9 @@ class V2eArray:
 
         def work(first: int, last: int) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
             peak = np.zeros(steps, np.int32)
+            frames, origin = light.pixels(first, last)
             records = _v2e.run_tiles(
-                frames, first, last, self._tile_px, self._lp, self._base, self._on, self._off,
+                frames, origin, first, last, self._tile_px, self._lp, self._base, self._on, self._off,
                 self._step_on, self._step_off,
                 self._leak, self._hazard, self._drawn, table, rate, pixel.leak_rate_hz * delta,
                 hazard_sum[1:], chance, self._ratio_on, self._ratio_off, jitter_table(), self.seed, self._steps,
@@ -103,7 +105,7 @@ class V2eArray:
             )  # fmt: skip
             return (*records, peak)
 
-        tiles = list(map_shares(work, count, self._tile_px, self._threads))
+        tiles = list(map_shares(work, count, self._tile_px, self._threads, light.most_px))
         peak = np.max([tile[4] for tile in tiles], axis=0)
         sub_times = [instants_within(starts[k], delta[k], times_s[k], int(peak[k])) for k in range(steps)]
         self._time, self._steps = float(times_s[-1]), self._steps + steps

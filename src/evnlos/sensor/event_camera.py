@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,15 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.sensor._exact_math import log_light
+from evnlos.sensor.light import WHITE_DN, StripLight, Strips
 from evnlos.sensor.pixel import EventPixel
 from evnlos.sensor.stream import EventStream, Mode
 from evnlos.types import Events
 
-WHITE_DN = 255.0
-"""The white level of a wall (irradiance 1.0) in the pixel's digital numbers."""
-
 _CHUNK_BYTES = 64 << 20
 _CHUNK_STEPS = 32
+_STRIP_STEPS = 64
 _RENDER_BYTES = 2 << 20  # of light at once: it is scaled while the cache still holds it
 _LONGEST_SHIFT_PX = 4.0
 _FEWEST_STEPS = 8
@@ -46,6 +45,15 @@ class Wall(Protocol):
 
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
         """Return the image at the instants `t_s` [T] in seconds, float32 [T, H, W], 1.0 = white."""
+        ...
+
+
+@runtime_checkable
+class StripWall(Wall, Protocol):
+    """A wall of which some pixels can be rendered without the others."""
+
+    def strips(self, t_s: ArrayLike) -> Strips | None:
+        """Return the light at the instants `t_s` [T] in seconds; None if it can be had in whole images only."""
         ...
 
 
@@ -111,8 +119,13 @@ class EventCamera:
         longest = _longest_step(wall, t0, t1) if self.time_step_s is None else self.time_step_s
         stream = EventStream(self.pixel, (height, width), mode=self.mode, seed=seed, threads=threads)
         stream.push(_render(wall, np.array([t0]), np.empty((1, height, width), np.float32)), [t0])
-        for times_s, frames in self._chunks(wall, t0, t1, longest):
-            stream.push(frames, times_s)
+        if self.time_step_s is not None:
+            steps = max(1, math.ceil((t1 - t0) / self.time_step_s - 1e-9))
+            times_s = np.append(t0 + self.time_step_s * np.arange(1, steps), t1).astype(np.float64)
+            _record_at(stream, wall, times_s)
+        else:
+            for times_s, frames in self._chunks(wall, t0, t1, longest):
+                stream.push(frames, times_s)
         return stream.finish()
 
     def _chunks(
@@ -123,15 +136,7 @@ class EventCamera:
         All chunks are written to the same memory: each is gone when the next one is asked for.
         """
         height, width = wall.shape
-        most = max(1, min(_CHUNK_STEPS, _CHUNK_BYTES // (4 * height * width)))
-        if self.time_step_s is not None:
-            steps = max(1, math.ceil((t1 - t0) / self.time_step_s - 1e-9))
-            times = np.append(t0 + self.time_step_s * np.arange(1, steps), t1).astype(np.float64)
-            frames = np.empty((min(most, steps), height, width), np.float32)
-            for k in range(0, steps, most):
-                part = times[k : k + most]
-                yield part, _render(wall, part, frames[: len(part)])
-            return
+        most = _most_steps(wall)
         limit = self.tolerance * min(self.pixel.threshold_on, self.pixel.threshold_off)
         step, now = longest, t0
         # the last frame of the chunk before, the chunk, and the probes
@@ -157,6 +162,26 @@ class EventCamera:
             frames[0], now = frames[count], float(times[-1])
             if error < 0.5 * limit:
                 step = min(longest, step * min(1.5, 0.9 * math.sqrt(limit / max(error, 1e-12))))
+
+
+def _record_at(stream: EventStream, wall: Wall, times_s: NDArray[np.float64]) -> None:
+    """Let the pixels see the wall at given instants: strip by strip where it can be had so, else in frames."""
+    most = min(_most_steps(wall), len(times_s))
+    frames = None
+    for part in np.split(times_s, range(_STRIP_STEPS, len(times_s), _STRIP_STEPS)):
+        strips = wall.strips(part) if isinstance(wall, StripWall) else None
+        if strips is not None:
+            stream.push_light(StripLight(strips), part)
+            continue
+        frames = np.empty((most, *wall.shape), np.float32) if frames is None else frames
+        for few in np.split(part, range(most, len(part), most)):
+            stream.push(_render(wall, few, frames[: len(few)]), few)
+
+
+def _most_steps(wall: Wall) -> int:
+    """Return how many frames are rendered together."""
+    height, width = wall.shape
+    return max(1, min(_CHUNK_STEPS, _CHUNK_BYTES // (4 * height * width)))
 
 
 def _longest_step(wall: Wall, t0: float, t1: float) -> float:

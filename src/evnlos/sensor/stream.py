@@ -14,6 +14,7 @@ from evnlos.sensor._exact_array import ExactArray
 from evnlos.sensor._order import Columns, join, sort_times
 from evnlos.sensor._random import check_seed
 from evnlos.sensor._v2e_array import V2eArray
+from evnlos.sensor.light import Frames, Light
 from evnlos.sensor.pixel import EventPixel
 from evnlos.types import Events
 
@@ -87,18 +88,20 @@ class EventStream:
         if light.shape[1:] != tuple(self.shape):
             raise DataError(f"frames are {light.shape[1]} x {light.shape[2]}; the sensor is {self.shape}")
         times = check_times(times_s, len(light), self._last_s)
-        if not len(times):
-            return
-        rows = np.ascontiguousarray(light).reshape(len(light), -1).view()  # [T, H * W]
-        rows.flags.writeable = False  # one type of input: the kernels compile once, not twice
+        if len(times):
+            self.push_light(Frames(np.ascontiguousarray(light).reshape(len(light), -1)), times)
+
+    def push_light(self, light: Light, times_s: NDArray[np.float64]) -> None:
+        """Take the next light, in whatever form, at instants [T >= 1] that follow those before; see `push`."""
         first = 0
         if np.isneginf(self._last_s):
-            self._array.start(rows[0], float(times[0]))
+            frames, _ = light[:1].pixels(0, self.shape[0] * self.shape[1])
+            self._array.start(frames[0], float(times_s[0]))
             first = 1
-        self._last_s = float(times[-1])
-        for k in range(first, len(rows), _BLOCK_STEPS):
+        self._last_s = float(times_s[-1])
+        for k in range(first, len(times_s), _BLOCK_STEPS):
             block = slice(k, k + _BLOCK_STEPS)
-            self._blocks.append(self._array.advance(rows[block], times[block]))
+            self._blocks.append(self._array.advance(light[block], times_s[block]))
 
     def finish(self) -> Events:
         """Return all events since the last call, in order; the pixels keep their state."""

@@ -14,10 +14,12 @@ from torch.nn.functional import pad
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import Motion
 from evnlos.transport.spline import MARGIN, box_average, spline_coefficients, spline_sample
+from evnlos.transport.strips import Strips
 from evnlos.transport.view import View
 from evnlos.types import Plane
 
 _MAX_CANVAS = 8192  # pixels a side
+_SAME_ROWS_PX = 1e-9
 
 
 @runtime_checkable
@@ -127,16 +129,28 @@ class SlidingWall:
             DataError: The times have more than one axis.
         """
         times = checked_times(t_s)
-        positions = self.motion.position_m(times)  # [..., 2]
-        frame = self._shifted if self.view.is_affine else self._projected
-        image = self.ambient.new_empty((times.size, *self.shape))
-        compiled = self.view.is_affine and self._canvas.device.type == "cpu" and not self._canvas.requires_grad
-        for k, (x, y) in enumerate(positions.reshape(-1, 2).tolist()):
-            if compiled:
-                self._expose(image[k], x, y)
-            else:
+        positions = self.motion.position_m(times).reshape(-1, 2)  # [T, 2]
+        image = self.ambient.new_empty((len(positions), *self.shape))
+        if self._compiled:
+            self._write(positions, image)
+        else:
+            frame = self._shifted if self.view.is_affine else self._projected
+            for k, (x, y) in enumerate(positions.tolist()):
                 image[k] = frame(x, y).clamp(min=0) * self.gain + self.ambient
         return image.reshape((*times.shape, *self.shape))
+
+    def strips(self, t_s: ArrayLike) -> Strips | None:
+        """Return the light at times `t_s` [T] for any pixels; None where only whole images can be rendered.
+
+        It can be had where the view is affine, the wall lies in main memory and the plate moves along the rows.
+        """
+        if not self._compiled:
+            return None
+        return self._strips(self.motion.position_m(checked_times(t_s)).reshape(-1, 2))
+
+    @property
+    def _compiled(self) -> bool:
+        return self.view.is_affine and self._canvas.device.type == "cpu" and not self._canvas.requires_grad
 
     def _carry_to_pixels(self) -> None:
         """Sample the wall image on the camera's pixel grid, over all of its support."""
@@ -170,32 +184,43 @@ class SlidingWall:
 
     def _shifted(self, x_m: float, y_m: float) -> torch.Tensor:
         """Return the canvas displaced by the motion: four taps along each axis, the same for all pixels."""
-        band, start, taps = self._shift(x_m, y_m)
-        window = _window(band, start, self.shape[1] + 3)
+        (across,), (down,) = self._pixels(np.array([(x_m, y_m)]))
+        whole, taps = _taps(-float(across))
+        window = _window(self._rows(float(down)), whole - 1 - self._low[0], self.shape[1] + 3)
         frame = taps[0] * window[:, : self.shape[1]]
         for k in range(1, 4):
             frame = frame + taps[k] * window[:, k : k + self.shape[1]]
         return frame
 
-    def _expose(self, out: torch.Tensor, x_m: float, y_m: float) -> None:
-        """Write the exposed frame to `out` in one pass; `_shifted` is the slow reference."""
-        from evnlos.transport.shift_kernel import expose_shifted  # numba loads slowly
+    def _write(self, positions_m: NDArray[np.float64], image: torch.Tensor) -> None:
+        """Write the frames with the plate at positions [T, 2] to `image`; `_shifted` is the slow reference."""
+        strips = self._strips(positions_m)
+        if strips is not None:
+            strips.write(0, image.flatten(1).numpy())
+        else:
+            for k in range(len(image)):
+                self._write(positions_m[k : k + 1], image[k : k + 1])
 
-        band, start, taps = self._shift(x_m, y_m)
-        expose_shifted(
-            out.numpy(), band.numpy(), start, np.array(taps, np.float32), self.gain, self.ambient.numpy()
-        )
+    def _strips(self, positions_m: NDArray[np.float64]) -> Strips | None:
+        """Return the light with the plate at positions [T, 2], unless they differ across the rows."""
+        across, down = self._pixels(positions_m)
+        if len(down) and float(np.ptp(down)) > _SAME_ROWS_PX:
+            return None
+        band = self._rows(float(down[0]) if len(down) else 0.0)
+        shifts = [_taps(-shift) for shift in across.tolist()]
+        starts = np.array([whole - 1 - self._low[0] for whole, _ in shifts], np.int64)
+        taps = np.array([weights for _, weights in shifts], np.float32).reshape(-1, 4)
+        return Strips(band.numpy(), starts, taps, self.gain, self.ambient.numpy())
 
-    def _shift(self, x_m: float, y_m: float) -> tuple[torch.Tensor, int, list[float]]:
-        """Return the canvas at the camera's rows [H, C], its column under pixel 0, and the four weights."""
+    def _pixels(self, positions_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how far positions [T, 2] move the image, pixels along the rows and across them."""
         (right_x, right_y), (down_x, down_y) = self._pixels_per_m
-        across, down = right_x * x_m + down_x * y_m, right_y * x_m + down_y * y_m
-        whole, taps = _taps(-across)
-        return self._rows(down), whole - 1 - self._low[0], taps
+        x, y = positions_m.T
+        return right_x * x + down_x * y, right_y * x + down_y * y
 
     def _rows(self, down: float) -> torch.Tensor:
         """Return the canvas at the camera's rows; motion along the rows asks for the same ones again."""
-        if self._band is not None and abs(self._band[0] - down) < 1e-9:
+        if self._band is not None and abs(self._band[0] - down) <= _SAME_ROWS_PX:
             return self._band[1]
         whole, taps = _taps(-down)
         start = whole - 1 - self._low[1]
