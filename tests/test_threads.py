@@ -1,10 +1,15 @@
 """Threads of parallel loops sleep while they wait, unless the user has chosen otherwise."""
 
+import importlib
 import os
 import subprocess
 import sys
 
 import pytest
+import torch
+from threadpoolctl import threadpool_info
+
+from evnlos.dataset.pool import run_tasks
 
 
 @pytest.mark.parametrize(("chosen", "expected"), [(None, "PASSIVE"), ("active", "active")])
@@ -25,3 +30,25 @@ def test_the_policy_is_set_before_pytorch_reads_it(chosen: str | None, expected:
     lines = found.stdout.split("\n")[:-1]
     assert any(line.startswith("torch ") for line in lines)
     assert all(line.endswith(f" {expected}") for line in lines)
+
+
+def _threads(module: str) -> list[int]:
+    """Return how many threads each library of a process has, after an import."""
+    importlib.import_module(module)
+    return [torch.get_num_threads(), *(pool["num_threads"] for pool in threadpool_info())]
+
+
+def test_a_worker_has_one_thread_in_every_library(monkeypatch) -> None:
+    """Those loaded before the worker starts its first task, and those loaded by it."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    assert max(run_tasks(_own_threads, ["numpy"] * 2, 1)) > 1 or os.cpu_count() == 1
+    for counts in run_tasks(_threads, ["scipy.linalg"] * 2, 2):
+        assert len(counts) >= 3  # PyTorch, NumPy's and SciPy's linear algebra
+        assert set(counts) == {1}
+
+
+def _own_threads(module: str) -> int:
+    """Return the most threads of a library of a new process of its own, without any limit."""
+    code = f"import {module}, threadpoolctl as t; print(max(p['num_threads'] for p in t.threadpool_info()))"
+    return int(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)

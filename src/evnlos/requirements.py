@@ -17,6 +17,7 @@ REQUIRED = {
     "pydantic": "pydantic>=2.9",
     "tyro": "tyro>=1.0",
     "tqdm": "tqdm>=4.66",
+    "threadpoolctl": "threadpoolctl>=3.5",
     "fontpkg": "fontpkg>=0.2",
     "fontpkg_caveat": "fontpkg-caveat",
     "fontpkg_kalam": "fontpkg-kalam",

@@ -116,7 +116,15 @@ def _drain(
 
 
 def _quiet_threads() -> None:
-    """Give each worker one thread: the processes are the parallelism."""
-    import torch
+    """Give each worker one thread: the processes are the parallelism.
 
+    The linear algebra of NumPy counts its threads apart from those of PyTorch, and more of them than cores make
+    small products many times slower. What is loaded is told, what is loaded later reads the environment.
+    """
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+    threadpool_limits(1)
     torch.set_num_threads(1)
