@@ -26,6 +26,7 @@ from evnlos.dataset.presets import paper
 from evnlos.dataset.sampling import edges_from
 from evnlos.scene import Scene
 from evnlos.sensor import EventCamera
+from evnlos.threads import one_thread
 from evnlos.transport import Wall
 
 PARTS = ("events", "frames", "maps")
@@ -104,7 +105,7 @@ if __name__ == "__main__":
     parser.add_argument("--repeat", type=int, default=3, help="rounds (default: 3)")
     parser.add_argument("--write", type=Path, help="file for the tables")
     options = parser.parse_args()
-    torch.set_num_threads(1)
+    one_thread()
     text = page(paper(), options.repeat, 1076)
     print(text)
     if options.write:

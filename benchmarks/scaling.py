@@ -24,13 +24,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from evnlos.dataset import SensorSize, Simulation, simulate, simulate_object
 from evnlos.dataset.presets import default, paper
 from evnlos.plot.figure import new_figure
 from evnlos.scene import HandwritingGlyphs
 from evnlos.sensor import EventPixel
+from evnlos.threads import one_thread
 from evnlos.transport import PaperTransport
 
 OBJECTS, NODES = 1_000_000, 100
@@ -83,7 +83,7 @@ def dataset_seconds(count: int) -> float:
 
 
 def objects_a_second(workers: int, count: int = 600) -> float:
-    """Return how many objects that many processes finish in a second, once a third of them is done and all run."""
+    """Return how many objects that many processes finish in a second, once a third of them is done."""
     config = replace(BASE, glyphs=HandwritingGlyphs(characters="A", writers=count))
     with tempfile.TemporaryDirectory() as folder:
         moments = [time.perf_counter() for _ in simulate(config, Path(folder) / "d", workers)]
@@ -176,7 +176,7 @@ if __name__ == "__main__":
     parser.add_argument("--write", type=Path, help="file for the tables")
     parser.add_argument("--figure", type=Path, help="picture of the sweeps")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
+    one_thread()
     simulate_object(BASE, BASE.glyphs.objects()[0])  # compiles
     measured = sweeps(arguments.repeat)
     most = os.cpu_count() or 1

@@ -30,7 +30,7 @@ STAGES = [
     "report",
     "experiment",
 ]
-LEAVES = {"claim", "types", "errors", "config", "metrics", "seeds", "version"}
+LEAVES = {"claim", "types", "errors", "config", "metrics", "seeds", "threads", "version"}
 FILES = sorted(SOURCE.rglob("*.py"))
 
 

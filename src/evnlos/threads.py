@@ -1,7 +1,22 @@
-"""How the threads of a parallel loop wait for each other; imported before PyTorch, which reads it once."""
+"""How threads wait for each other, and how many there are; imported before PyTorch, which reads that once."""
 
 import os
 
 # By default a thread that is done spins until the slowest one is. On cores that other programs use this takes
 # the time away from it, and small loops take several times as long: `docs/performance.md` has the figures.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+def one_thread() -> None:
+    """Give this process one thread in every library: where there are several, processes are the parallelism.
+
+    The linear algebra of NumPy counts its threads apart from those of PyTorch, and more of them than cores make
+    small products many times slower. What is loaded is told, what is loaded later reads the environment.
+    """
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+    threadpool_limits(1)
+    torch.set_num_threads(1)

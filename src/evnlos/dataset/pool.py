@@ -11,6 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
 from evnlos.errors import EvnlosError
+from evnlos.threads import one_thread
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -39,7 +40,7 @@ def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers
     tries = [0] * len(pending)
     left = set(range(len(pending)))
     while left:
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _quiet_threads) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread) as pool:
             try:
                 yield from _drain(pool, function, pending, left, workers)
             except BrokenProcessPool:
@@ -73,7 +74,7 @@ def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], work
     if workers <= 1:
         yield from map(function, pending)
         return
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _quiet_threads)
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread)
     try:
         flying: deque[Future] = deque()
         for task in pending:
@@ -113,18 +114,3 @@ def _drain(
             result = future.result()
             left.discard(i)
             yield result
-
-
-def _quiet_threads() -> None:
-    """Give each worker one thread: the processes are the parallelism.
-
-    The linear algebra of NumPy counts its threads apart from those of PyTorch, and more of them than cores make
-    small products many times slower. What is loaded is told, what is loaded later reads the environment.
-    """
-    import torch
-    from threadpoolctl import threadpool_limits
-
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
-    threadpool_limits(1)
-    torch.set_num_threads(1)
