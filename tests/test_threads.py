@@ -9,7 +9,8 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from evnlos.dataset.pool import run_tasks
+from evnlos.dataset.pool import run_in_order, run_tasks
+from evnlos.errors import ConfigError
 
 
 @pytest.mark.parametrize(("chosen", "expected"), [(None, "PASSIVE"), ("active", "active")])
@@ -42,10 +43,23 @@ def test_a_worker_has_one_thread_in_every_library(monkeypatch) -> None:
     """Those loaded before the worker starts its first task, and those loaded by it."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         monkeypatch.delenv(name, raising=False)
-    assert max(run_tasks(_own_threads, ["numpy"] * 2, 1)) > 1 or os.cpu_count() == 1
+    assert _own_threads("numpy") > 1 or os.cpu_count() == 1
     for counts in run_tasks(_threads, ["scipy.linalg"] * 2, 2):
         assert len(counts) >= 3  # PyTorch, NumPy's and SciPy's linear algebra
         assert set(counts) == {1}
+
+
+def test_this_process_has_its_threads_again_after_a_task() -> None:
+    before = [pool["num_threads"] for pool in threadpool_info()]
+    for counts in run_tasks(_threads, ["numpy"] * 2, 1):
+        assert 1 in counts
+        assert [pool["num_threads"] for pool in threadpool_info()] == before
+
+
+@pytest.mark.parametrize("run", [run_tasks, run_in_order])
+def test_fewer_workers_than_none_are_refused(run) -> None:
+    with pytest.raises(ConfigError, match="workers is -1; give 0"):
+        list(run(abs, [1, 2], -1))
 
 
 def _own_threads(module: str) -> int:

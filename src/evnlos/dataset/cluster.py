@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
+from evnlos.dataset.pool import processes
 from evnlos.errors import EvnlosError, MissingDependencyError
 
 Task = TypeVar("Task")
@@ -28,6 +29,7 @@ def run_on_dask(
 
     Raises:
         MissingDependencyError: Dask is not installed.
+        ConfigError: A number of workers below 0.
         EvnlosError: The scheduler does not answer, or a task killed its worker again and again.
     """
     try:
@@ -45,7 +47,10 @@ def run_on_dask(
     try:
         if scheduler is None:
             cluster = LocalCluster(
-                n_workers=workers or None, threads_per_worker=1, dashboard_address="", silence_logs=50
+                n_workers=processes(workers, len(pending)),
+                threads_per_worker=1,
+                dashboard_address="",
+                silence_logs=50,
             )
         client = Client(cluster or scheduler, timeout=20)
     except (OSError, TimeoutError, ValueError) as error:

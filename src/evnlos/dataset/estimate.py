@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import resource
 import shutil
 import sys
@@ -11,6 +10,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from evnlos.dataset.pool import processes
 from evnlos.dataset.shard import write_shard
 from evnlos.dataset.simulate import Simulation, simulate_object
 
@@ -57,6 +57,7 @@ def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 
         share: (i, n), as in `simulate`.
     """
     names = config.glyphs.objects()[share[0] - 1 :: share[1]]
+    at_once = processes(workers, len(names))
     name = names[len(names) // 2]
     simulate_object(config, name)
     began = time.process_time()
@@ -68,8 +69,7 @@ def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 
     spent = time.process_time() - began
     unit = 1 if sys.platform == "darwin" else 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-    processes = min(workers or os.cpu_count() or 1, len(names))
-    return Estimate(len(names), spent, size, peak, processes, len(events))
+    return Estimate(len(names), spent, size, peak, at_once, len(events))
 
 
 def _clock(seconds: float) -> str:

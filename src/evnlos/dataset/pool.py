@@ -10,7 +10,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
-from evnlos.errors import EvnlosError
+from threadpoolctl import ThreadpoolController
+
+from evnlos.errors import ConfigError, EvnlosError
 from evnlos.threads import one_thread
 
 Task = TypeVar("Task")
@@ -19,6 +21,17 @@ Engine = Callable[[Callable[[Any], str], Iterable[Any], int], Iterator[str]]
 """Runs a function on each task with so many processes, and yields the results as they come."""
 
 _TRIES = 3
+
+
+def processes(workers: int, tasks: int) -> int:
+    """Return how many processes `workers` asks for: that many, or one for each core, but not more than tasks.
+
+    Raises:
+        ConfigError: A number below 0.
+    """
+    if workers < 0:
+        raise ConfigError(f"workers is {workers}; give 0 (one for each core) or more")
+    return min(workers or os.cpu_count() or 1, tasks)
 
 
 def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
@@ -30,12 +43,13 @@ def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers
         workers: Processes; 1 runs everything in this process, 0 means one for each core.
 
     Raises:
+        ConfigError: A number of workers below 0.
         EvnlosError: A task broke its worker three times (killed, out of memory); other errors pass through.
     """
     pending = list(tasks)
-    workers = min(workers or os.cpu_count() or 1, len(pending))
+    workers = processes(workers, len(pending))
     if workers <= 1:
-        yield from map(function, pending)
+        yield from _run_here(function, pending)
         return
     tries = [0] * len(pending)
     left = set(range(len(pending)))
@@ -67,12 +81,13 @@ def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], work
         workers: Processes; 1 runs each task in this process when its result is asked for, 0 means one a core.
 
     Raises:
+        ConfigError: A number of workers below 0.
         EvnlosError: A worker died; other errors pass through.
     """
     pending = list(tasks)
-    workers = min(workers or os.cpu_count() or 1, len(pending))
+    workers = processes(workers, len(pending))
     if workers <= 1:
-        yield from map(function, pending)
+        yield from _run_here(function, pending)
         return
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread)
     try:
@@ -89,6 +104,15 @@ def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], work
         ) from None
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _run_here(function: Callable[[Task], Result], tasks: list[Task]) -> Iterator[Result]:
+    """Run tasks one by one in this process, with one thread of NumPy's linear algebra for small products."""
+    libraries = ThreadpoolController()
+    for task in tasks:
+        with libraries.limit(limits=1, user_api="blas"):
+            result = function(task)
+        yield result
 
 
 def _drain(
