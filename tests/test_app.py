@@ -317,7 +317,8 @@ def strangers(addresses: list[str], home: str) -> list[str]:
     return [
         a[:200]
         for a in addresses
-        if urlsplit(a).scheme not in ("data", "blob", "chrome") and urlsplit(a).netloc not in own
+        if urlsplit(a).scheme not in ("data", "blob", "chrome", "chrome-untrusted")
+        and urlsplit(a).netloc not in own
     ]
 
 

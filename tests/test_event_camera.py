@@ -96,11 +96,61 @@ def test_a_wall_in_strips_gives_the_events_of_its_frames(mode, refractory_s: flo
         assert camera.record(wall, 0.0, 0.6, seed=3, threads=threads) == expected
 
 
-def test_a_broken_wall_is_refused_strip_by_strip() -> None:
-    for broken in (float("nan"), float("inf")):
-        wall = sliding_wall((1.0, 0.0), torch.full(PLATE.shape, broken))
-        with pytest.raises(DataError, match="NaN or infinity"):
-            EventCamera(CLEAN, time_step_s=0.01).record(wall, 0.0, 0.1)
+@pytest.mark.parametrize("broken", [float("nan"), float("inf")])
+def test_a_broken_wall_is_refused_strip_by_strip(broken: float) -> None:
+    """The plate comes into view after the first image, which is dark."""
+    plate = torch.zeros(PLATE.shape)
+    plate[30, 30] = broken
+    view, motion = View.affine((45, 70), 700.0), LineMotion((-0.3, 0.0), 0.2)
+    wall = SlidingWall(plate, PLATE, view, motion)
+    assert not wall.irradiance(0.0).any()
+    with pytest.raises(DataError, match="NaN or infinity"):
+        EventCamera(CLEAN, time_step_s=0.05).record(wall, 0.0, 2.0)
+
+
+class Flicker(SlidingWall):
+    """A wall that is not what its strips say."""
+
+    def irradiance(self, t_s) -> torch.Tensor:
+        factor = 1 + 0.5 * np.sin(30 * np.asarray(t_s))
+        return super().irradiance(t_s) * torch.as_tensor(factor, dtype=torch.float32)[..., None, None]
+
+
+def test_a_subclass_with_its_own_light_is_asked_for_it() -> None:
+    wall = sliding_wall((1.0, 0.0))
+    wall.__class__ = Flicker
+    times_s = np.arange(51) * 0.01
+    frames = wall.irradiance(times_s).numpy() * np.float32(255)
+    recorded = EventCamera(CLEAN, time_step_s=0.01).record(wall, 0.0, 0.5)
+    assert recorded == simulate_events(frames, times_s, CLEAN)
+
+
+class Short(SlidingWall):
+    """A wall that forgets some instants."""
+
+    def strips(self, t_s):
+        return super().strips(np.asarray(t_s)[:-1])
+
+
+def test_strips_of_another_length_are_refused() -> None:
+    wall = sliding_wall((1.0, 0.0))
+    wall.__class__ = Short
+    with pytest.raises(DataError, match="one time in seconds a frame"):
+        EventCamera(CLEAN, time_step_s=0.01).record(wall, 0.0, 0.5)
+
+
+def test_steps_below_the_precision_of_the_times_are_refused() -> None:
+    with pytest.raises(DataError, match="times must ascend"):
+        EventCamera(CLEAN, time_step_s=1e-8).record(sliding_wall((1.0, 0.0)), 1e9, 1e9 + 1e-6)
+
+
+def test_a_wall_in_double_precision_gives_the_events_of_its_frames() -> None:
+    wall = sliding_wall(
+        (1.0, 0.0), torch.rand(PLATE.shape, dtype=torch.float64, generator=torch.manual_seed(0))
+    )
+    times_s = np.arange(101) * 4e-3
+    expected = simulate_events(wall.irradiance(times_s).numpy() * np.float32(255), times_s, NOISY, seed=1)
+    assert EventCamera(NOISY, time_step_s=4e-3).record(wall, 0.0, 0.4, seed=1) == expected
 
 
 def test_whole_numbers_are_thresholds_too() -> None:

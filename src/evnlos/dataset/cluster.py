@@ -40,6 +40,7 @@ def run_on_dask(
             'a Dask cluster needs the extra "cluster": pip install "evnlos[cluster]"'
         ) from None
     pending = list(tasks)
+    at_once = processes(workers, len(pending))
     if not pending:
         return
     set_option({"distributed.scheduler.allowed-failures": _RETRIES})
@@ -47,7 +48,7 @@ def run_on_dask(
     try:
         if scheduler is None:
             cluster = LocalCluster(
-                n_workers=processes(workers, len(pending)),
+                n_workers=at_once,
                 threads_per_worker=1,
                 dashboard_address="",
                 silence_logs=50,

@@ -13,6 +13,7 @@ from pathlib import Path
 from evnlos.dataset.pool import processes
 from evnlos.dataset.shard import write_shard
 from evnlos.dataset.simulate import Simulation, simulate_object
+from evnlos.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,15 @@ def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 
         config: The settings.
         workers: Processes; 0 means one for each core.
         share: (i, n), as in `simulate`.
+
+    Raises:
+        ConfigError: A number of workers below 0, or a share without an object.
     """
     names = config.glyphs.objects()[share[0] - 1 :: share[1]]
+    if not names:
+        raise ConfigError(
+            f"share {share[0]}/{share[1]} of {len(config.glyphs.objects())} objects is empty; give fewer shares"
+        )
     at_once = processes(workers, len(names))
     name = names[len(names) // 2]
     simulate_object(config, name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -13,7 +12,7 @@ from typing import Any, TypeVar
 from threadpoolctl import ThreadpoolController
 
 from evnlos.errors import ConfigError, EvnlosError
-from evnlos.threads import one_thread
+from evnlos.threads import cores, one_thread
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -31,7 +30,7 @@ def processes(workers: int, tasks: int) -> int:
     """
     if workers < 0:
         raise ConfigError(f"workers is {workers}; give 0 (one for each core) or more")
-    return min(workers or os.cpu_count() or 1, tasks)
+    return min(workers or cores(), tasks)
 
 
 def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 from evnlos.dataset import Dataset
 from evnlos.dataset.pool import run_tasks
 from evnlos.experiment.study import Step
+from evnlos.threads import cores
 from evnlos.training import Training, train
 
 
@@ -57,7 +57,7 @@ def train_together(runs: list[Run], at_a_time: int) -> Iterator[Step]:
     # Pre-training and end-to-end training first: fine-tuning begins where they end.
     for stage in (True, False):
         some = [run for run in todo.values() if (run.start is None) == stage]
-        at_once = max(1, min(at_a_time or os.cpu_count() or 1, len(some)))
+        at_once = max(1, min(at_a_time or cores(), len(some)))
         tasks = [(run, max(1, torch.get_num_threads() // at_once)) for run in some]
         for _ in run_tasks(_trained, tasks, at_once):
             done += 1

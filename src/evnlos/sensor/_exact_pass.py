@@ -14,10 +14,9 @@ PIECE = 0.04
 """Largest change of the log light in a piece on which crossings are solved: 4e-4 log units off a line."""
 
 # Each of the following loops writes one array: with more, a compiler gives up proving that they do not overlap.
-# "contract" lets it round a product and a sum once, where the processor can: much quicker and no less exact.
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy")
 def log_row(row, logs):
     """Fill the log light of a row of light in DN."""
     for i in range(len(row)):
@@ -38,14 +37,14 @@ def fall(base, leak, length, base_1):
         base_1[i] = base[i] - leak[i] * length
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy")
 def gain_of(light_0, light_1, half, gain):
     """Fill 1 - exp(-tau), tau being the step in the filter's own time."""
     for i in range(len(gain)):
         gain[i] = 1.0 - fast_exp(-half * (light_0[i] + light_1[i] + 40.0))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy")
 def respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, filtered_1):
     """Fill the filter's output after one step on which the log light is a line in the filter's own time."""
     for i in range(len(gain)):
@@ -57,7 +56,7 @@ def respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, filtered_1
         filtered_1[i] = before + gain[i] * (logs_0[i] - before) + change * (1.0 - gain[i] * inverse) + bend
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy")
 def flag_filtered(now, then, leak, half, length, on, off, flags):
     """Flag the pixels that may have met a threshold, or whose light bent too much for one line."""
     light_0, logs_0, filtered_0, base = now[0], now[1], now[2], now[3]

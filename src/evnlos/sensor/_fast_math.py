@@ -39,7 +39,7 @@ def fast_log(x):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def fast_exp(x):
-    """Return exp x for x <= 0 (clamped at -700), within 2 ulp, in a form that compilers vectorise.
+    """Return exp x for x <= 0 (clamped at -700), within 3 ulp, in a form that compilers vectorise.
 
     x = n ln 2 + r with |r| <= ln 2 / 2: exp x = 2^n (1 + r + r^2 / 2 + ...), summed in pairs. Adding 1.5 * 2^52
     rounds to a whole number and leaves it in the last bits.

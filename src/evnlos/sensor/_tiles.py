@@ -16,6 +16,7 @@ from evnlos.errors import ConfigError
 from evnlos.sensor._checks import check_threshold_maps
 from evnlos.sensor._random import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_ON, normal_field
 from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
+from evnlos.threads import cores
 
 _T = TypeVar("_T")
 _SHARES = 8
@@ -47,7 +48,7 @@ def check_tiling(tile_px: int, threads: int | None) -> tuple[int, int]:
     if tile_px < 1:
         raise ConfigError(f"tile_px is {tile_px}; give at least 1 pixel")
     if threads is None:
-        threads = min(torch.get_num_threads(), os.cpu_count() or 1)
+        threads = min(torch.get_num_threads(), cores())
     if threads < 1:
         raise ConfigError(f"threads is {threads}; give at least 1, or None for torch's number")
     return -(-tile_px // BLOCK) * BLOCK, threads

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -45,15 +45,6 @@ class Wall(Protocol):
 
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
         """Return the image at the instants `t_s` [T] in seconds, float32 [T, H, W], 1.0 = white."""
-        ...
-
-
-@runtime_checkable
-class StripWall(Wall, Protocol):
-    """A wall of which some pixels can be rendered without the others."""
-
-    def strips(self, t_s: ArrayLike) -> Strips | None:
-        """Return the light at the instants `t_s` [T] in seconds; None if it can be had in whole images only."""
         ...
 
 
@@ -103,7 +94,8 @@ class EventCamera:
         Memory is that of one chunk of frames (64 MiB), the state of the pixels and the events.
 
         Args:
-            wall: The light: `shape`, `irradiance(t_s)` and `speed_px_s`.
+            wall: The light: `shape`, `irradiance(t_s)` and `speed_px_s`. With fixed steps, a wall that has
+                `strips(t_s)`, as `SlidingWall` does, is rendered for the pixels at work only: much quicker.
             t0: First instant, seconds.
             t1: Last instant, seconds, after t0.
             seed: Seed of mismatch and noise.
@@ -169,13 +161,19 @@ def _record_at(stream: EventStream, wall: Wall, times_s: NDArray[np.float64]) ->
     most = min(_most_steps(wall), len(times_s))
     frames = None
     for part in np.split(times_s, range(_STRIP_STEPS, len(times_s), _STRIP_STEPS)):
-        strips = wall.strips(part) if isinstance(wall, StripWall) else None
+        strips = _strips_of(wall, part)
         if strips is not None:
             stream.push_light(StripLight(strips), part)
             continue
         frames = np.empty((most, *wall.shape), np.float32) if frames is None else frames
         for few in np.split(part, range(most, len(part), most)):
             stream.push(_render(wall, few, frames[: len(few)]), few)
+
+
+def _strips_of(wall: Wall, times_s: NDArray[np.float64]) -> Strips | None:
+    """Return the light of a wall whose class says how to render some pixels without the others (`strips`)."""
+    render: Callable[..., Strips | None] | None = getattr(type(wall), "strips", None)
+    return render(wall, times_s) if callable(render) else None
 
 
 def _most_steps(wall: Wall) -> int:

@@ -18,6 +18,10 @@ _STRIP_BYTES = 2 << 20  # of light at once: it is made and used while the cache 
 class Light(Protocol):
     """Light in DN at some instants [T], of which an array of pixels takes what it works on."""
 
+    def __len__(self) -> int:
+        """Number of instants."""
+        ...
+
     def __getitem__(self, instants: slice) -> Light:
         """Return the light at some of the instants."""
         ...
@@ -50,6 +54,10 @@ class Frames:
         self._rows = rows.view()
         self._rows.flags.writeable = False  # one type of input: the kernels compile once, not twice
         self.dtype = rows.dtype
+
+    def __len__(self) -> int:
+        """Number of instants."""
+        return len(self._rows)
 
     def __getitem__(self, instants: slice) -> Frames:
         """Return the frames at some of the instants."""
@@ -88,6 +96,10 @@ class StripLight:
     def __init__(self, strips: Strips) -> None:
         self._strips = strips
         self.most_px = max(1, _STRIP_BYTES // (4 * max(1, len(strips))))
+
+    def __len__(self) -> int:
+        """Number of instants."""
+        return len(self._strips)
 
     def __getitem__(self, instants: slice) -> StripLight:
         """Return the light at some of the instants."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, get_args
 
 import numpy as np
@@ -87,12 +88,21 @@ class EventStream:
         light = check_light(frames)
         if light.shape[1:] != tuple(self.shape):
             raise DataError(f"frames are {light.shape[1]} x {light.shape[2]}; the sensor is {self.shape}")
-        times = check_times(times_s, len(light), self._last_s)
-        if len(times):
-            self.push_light(Frames(np.ascontiguousarray(light).reshape(len(light), -1)), times)
+        self.push_light(Frames(np.ascontiguousarray(light).reshape(len(light), math.prod(self.shape))), times_s)
 
-    def push_light(self, light: Light, times_s: NDArray[np.float64]) -> None:
-        """Take the next light, in whatever form, at instants [T >= 1] that follow those before; see `push`."""
+    def push_light(self, light: Light, times_s: ArrayLike | torch.Tensor) -> None:
+        """Take the next light, in whatever form.
+
+        Args:
+            light: Light in DN at the instants.
+            times_s: Its instants, [T], seconds, ascending, after those before.
+
+        Raises:
+            DataError: Not one time an instant, times that do not ascend, or what `light` raises.
+        """
+        times_s = check_times(times_s, len(light), self._last_s)
+        if not len(times_s):
+            return
         first = 0
         if np.isneginf(self._last_s):
             frames, _ = light[:1].pixels(0, self.shape[0] * self.shape[1])

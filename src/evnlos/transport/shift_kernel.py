@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, error_model="numpy")
 def _inside(out, k, to, count, band, v, start, tap_0, tap_1, tap_2, tap_3, scale, ambient, u, white):
     """Write `count` pixels whose taps all lie inside; the taps are numbers, so that the loop is vectors."""
     k, to, v, start, u = np.uint64(k), np.uint64(to), np.uint64(v), np.uint64(start), np.uint64(u)
@@ -22,10 +22,10 @@ def _inside(out, k, to, count, band, v, start, tap_0, tap_1, tap_2, tap_3, scale
             + tap_2 * band[v, c + np.uint64(2)]
             + tap_3 * band[v, c + np.uint64(3)]
         )
-        out[k, to + i] = (scale * max(light, np.float32(0)) + ambient[v, u + i]) * white
+        out[k, to + i] = np.float32(scale * max(light, np.float32(0)) + ambient[v, u + i]) * white
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, error_model="numpy")
 def _border(out, k, to, count, band, v, start, taps, scale, ambient, u, white):
     """Write `count` pixels that have taps outside, where the band is zero."""
     columns = band.shape[1]
@@ -36,7 +36,7 @@ def _border(out, k, to, count, band, v, start, taps, scale, ambient, u, white):
         out[k, to + i] = (scale * max(light, np.float32(0)) + ambient[v, u + i]) * white
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, error_model="numpy")
 def _dark(out, k, to, count, ambient, v, u, white):
     """Write `count` pixels that no tap reaches."""
     k, to, v, u = np.uint64(k), np.uint64(to), np.uint64(v), np.uint64(u)
@@ -44,7 +44,7 @@ def _dark(out, k, to, count, ambient, v, u, white):
         out[k, to + i] = ambient[v, u + i] * white
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def expose_shifted(
     out: NDArray[np.float32],
     first: int,

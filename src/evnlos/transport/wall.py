@@ -142,9 +142,10 @@ class SlidingWall:
     def strips(self, t_s: ArrayLike) -> Strips | None:
         """Return the light at times `t_s` [T] for any pixels; None where only whole images can be rendered.
 
-        It can be had where the view is affine, the wall lies in main memory and the plate moves along the rows.
+        It can be had where the view is affine, the wall lies in main memory and the plate moves along the rows;
+        not of a subclass with an `irradiance` of its own.
         """
-        if not self._compiled:
+        if not self._compiled or type(self).irradiance is not SlidingWall.irradiance:
             return None
         return self._strips(self.motion.position_m(checked_times(t_s)).reshape(-1, 2))
 
