@@ -77,7 +77,7 @@ def page(config: Simulation, repeat: int) -> str:
         for way, (camera, whole) in ways.items():
             found = one_object(config, camera, whole)
             best[way] = min(best.get(way, found), found, key=lambda result: sum(result[0]))
-    least = sum(next(iter(best.values()))[0])
+    least, count = sum(next(iter(best.values()))[0]), len(config.glyphs.objects())
     lines = ["# One object of the paper's dataset", "", *(__doc__ or "").split("\n\n")[2:], machine(), ""]
     lines += [
         "| event camera | " + " | ".join(f"{part}, CPU s" for part in PARTS) + " | all | times | events |"
@@ -88,7 +88,8 @@ def page(config: Simulation, repeat: int) -> str:
         lines.append(f"| {way} | {cells} | {sum(spent):.2f} | {sum(spent) / least:.1f} | {events:,} |")
     lines += [
         "",
-        f"All {len(config.glyphs.objects())} objects of the preset with steps chosen by the camera: {len(config.glyphs.objects()) * least / 60:.0f} minutes of CPU.",
+        f"All {count} objects of the preset with steps chosen by the camera: "
+        f"{count * least / 60:.0f} minutes of CPU.",
     ]
     profile = cProfile.Profile(time.process_time)
     profile.runcall(one_object, config, adaptive)
