@@ -9,9 +9,8 @@ from pathlib import Path
 import torch
 
 from evnlos.dataset import Dataset
-from evnlos.dataset.pool import run_tasks
+from evnlos.dataset.pool import processes, run_tasks
 from evnlos.experiment.study import Step
-from evnlos.threads import cores
 from evnlos.training import Training, train
 
 
@@ -57,7 +56,7 @@ def train_together(runs: list[Run], at_a_time: int) -> Iterator[Step]:
     # Pre-training and end-to-end training first: fine-tuning begins where they end.
     for stage in (True, False):
         some = [run for run in todo.values() if (run.start is None) == stage]
-        at_once = max(1, min(at_a_time or cores(), len(some)))
+        at_once = max(1, processes(at_a_time, len(some)))
         tasks = [(run, max(1, torch.get_num_threads() // at_once)) for run in some]
         for _ in run_tasks(_trained, tasks, at_once):
             done += 1
