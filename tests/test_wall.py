@@ -19,8 +19,8 @@ from evnlos.transport import (
     Wall,
     tpsf_kernel,
 )
-from evnlos.transport.spline import _scattered, spline_coefficients, spline_sample, spline_weights
-from evnlos.transport.wall import ambient_plane
+from evnlos.transport.ambient import ambient_plane
+from evnlos.transport.spline import spline_coefficients, spline_sample, spline_scattered, spline_weights
 from evnlos.types import Plane
 
 SHAPE = (40, 64)
@@ -326,10 +326,13 @@ def test_a_grid_of_points_is_sampled_as_points_in_any_order_are() -> None:
     coefficients = torch.rand(13, 17, generator=draw, dtype=torch.float64)
     row = (torch.rand(9, 1, generator=draw, dtype=torch.float64) * 20 - 4).expand(9, 11)
     column = (torch.rand(1, 11, generator=draw, dtype=torch.float64) * 24 - 4).expand(9, 11)
-    expected = _scattered(coefficients, row, column)
+    expected = spline_scattered(coefficients, row, column)
     assert (expected == 0).any() and (expected > 0.1).any()  # points outside, points inside
     torch.testing.assert_close(spline_sample(coefficients, row, column), expected, rtol=1e-12, atol=1e-12)
     tilted = row + 0.01 * torch.arange(11)
     torch.testing.assert_close(
-        spline_sample(coefficients, tilted, column), _scattered(coefficients, tilted, column), rtol=0, atol=0
+        spline_sample(coefficients, tilted, column),
+        spline_scattered(coefficients, tilted, column),
+        rtol=0,
+        atol=0,
     )

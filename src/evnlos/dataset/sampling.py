@@ -141,11 +141,11 @@ def reduce_by_area(images: NDArray, shape: tuple[int, int]) -> NDArray[np.float3
     images = np.asarray(images, dtype=np.float32)
     if images.shape[-2:] == tuple(shape):
         return images
-    over_y, over_x = (_area_weights(a, b) for a, b in zip(images.shape[-2:], shape, strict=True))
+    over_y, over_x = (area_weights(a, b) for a, b in zip(images.shape[-2:], shape, strict=True))
     return np.ascontiguousarray((over_y @ images) @ over_x.T)  # [..., *shape]
 
 
-def _area_weights(inside: int, outside: int) -> NDArray[np.float32]:
+def area_weights(inside: int, outside: int) -> NDArray[np.float32]:
     """Return the fraction of each of `outside` equal cells that each of `inside` equal cells covers."""
     cell = inside / outside
     low = np.maximum(np.arange(outside)[:, None] * cell, np.arange(inside))

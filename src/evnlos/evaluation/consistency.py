@@ -13,7 +13,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.evaluation.identify_rig import camera_variance
 from evnlos.solver.conjugate_gradient import conjugate_gradient
 from evnlos.transport import RadiometricTransport
-from evnlos.transport.wall import ambient_plane
+from evnlos.transport.ambient import ambient_plane
 from evnlos.types import Plane
 
 _TOLERANCE, _MOST_STEPS = 1e-3, 200

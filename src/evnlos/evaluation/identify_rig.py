@@ -18,7 +18,7 @@ from evnlos.transport import (
     Viewing,
     tpsf_kernel,
 )
-from evnlos.transport.wall import ambient_plane
+from evnlos.transport.ambient import ambient_plane
 from evnlos.types import Plane
 
 AnyTransport = PaperTransport | RadiometricTransport | MeasuredTransport

@@ -13,7 +13,8 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.seeds import derive_seed
 from evnlos.sensor._checks import check_threshold_maps, check_times
 from evnlos.sensor._random import check_seed
-from evnlos.sensor._torch_v2e import Clips, default_tile
+from evnlos.sensor._torch_light import Clips, check_range
+from evnlos.sensor._torch_v2e import Pixels, default_tile
 from evnlos.sensor.pixel import EventPixel
 from evnlos.types import Events
 
@@ -33,11 +34,7 @@ def check_clips(clips: ArrayLike | Tensor, device: torch.device | str | None) ->
     if light.dtype not in _LIGHT:
         light = light.to(torch.float32 if light.dtype in (torch.float16, torch.bfloat16) else torch.float64)
     if light.dtype != torch.uint8 and light.numel():
-        lowest, highest = (float(value) for value in light.aminmax())
-        if not (np.isfinite(lowest) and np.isfinite(highest)):
-            raise DataError("clips holds NaN or infinity; light must be finite, 255 = white")
-        if lowest < 0:
-            raise DataError(f"clips holds {lowest:g}; light cannot be negative, black is 0")
+        check_range(light, "clips")
     return light
 
 
@@ -71,10 +68,7 @@ def run_batch(
     tile_px: int | None,
 ) -> list[Events]:
     """Return the events of each clip; see `simulate_batch`."""
-    if not isinstance(pixel, EventPixel):
-        raise ConfigError(f"pixel is {type(pixel).__name__}; give an EventPixel")
-    if pixel.hot_pixel_fraction > 0 or pixel.jitter_s > 0:
-        raise ConfigError('mode="v2e" has no hot pixels and no jitter; set them to 0 or use mode="exact"')
+    check_pixel(pixel)
     if dtype not in (torch.float32, torch.float64):
         raise ConfigError(f"dtype is {dtype}; give torch.float64 or torch.float32")
     light = check_clips(clips, device)
@@ -86,20 +80,27 @@ def run_batch(
         raise ConfigError(f"tile_px is {tile_px}; give at least 1 pixel")
     maps = None if thresholds is None else check_threshold_maps(thresholds, (height, width))
     group = max(1, (_GROUP_CPU if light.device.type == "cpu" else _GROUP_DEVICE) // (height * width))
+    if steps < 2:
+        return [Events.empty(width, height) for _ in range(count)]
     events = []
-    with torch.inference_mode():
-        for first in range(0, count if steps > 1 else 0, group):
-            some = light[first : first + group].flatten(2)  # [clips, T, H * W]
+    with torch.no_grad():
+        for first in range(0, count, group):
+            some = Clips(light[first : first + group])
             fields = None
             if maps is not None:
-                on, off = (torch.from_numpy(m).to(light.device).flatten().expand(len(some), -1) for m in maps)
+                on, off = (
+                    torch.from_numpy(m).to(light.device).flatten().expand(some.shape[0], -1) for m in maps
+                )
                 fields = on.contiguous(), off.contiguous()
             group_seeds = keys[first : first + group]
-            for time_us, where, on in Clips(some, times, pixel, group_seeds, fields, dtype, tile_px).run():
-                y = where // width
-                x = where - y * width
-                events.append(Events(time_us, x.astype(np.uint16), y.astype(np.uint16), on, width, height))
-    if steps > 1:
-        return events
-    none = np.zeros(0, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.uint16), np.zeros(0, np.bool_)
-    return [Events(*none, width, height) for _ in range(count)]
+            made = Pixels(some, times, pixel, group_seeds, fields, dtype, tile_px).run()
+            events.extend(one.to_events() for one in made)
+    return events
+
+
+def check_pixel(pixel: EventPixel) -> None:
+    """Refuse a pixel that this mode has not."""
+    if not isinstance(pixel, EventPixel):
+        raise ConfigError(f"pixel is {type(pixel).__name__}; give an EventPixel")
+    if pixel.hot_pixel_fraction > 0 or pixel.jitter_s > 0:
+        raise ConfigError('mode="v2e" has no hot pixels and no jitter; set them to 0 or use mode="exact"')

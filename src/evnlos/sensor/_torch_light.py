@@ -1,4 +1,4 @@
-"""From light to the filter's output, one frame at a time, on flat tensors and without a copy of the video.
+"""From light to the filter's output, some frames at a time, on flat tensors and without a copy of the video.
 
 Light of 8 bits goes through tables of 256 entries, other light through the logarithm. What is computed, in
 which order and in which precision is that of the numba kernels, so that a state of float64 has the same bits.
@@ -8,12 +8,91 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+from evnlos.errors import DataError
+from evnlos.sensor.event_camera import Wall
+from evnlos.sensor.light import WHITE_DN
 
 _KNEE = 20.0
 _SLOPE = math.log(_KNEE) / _KNEE
+_AHEAD = 32  # instants rendered at a time, at least
+
+
+class Blocks(Protocol):
+    """Light in DN that pixels take block by block of time."""
+
+    shape: tuple[int, int, int, int]
+    """Clips, instants, rows and columns."""
+    dtype: torch.dtype
+    device: torch.device
+
+    def block(self, first: int, last: int) -> Tensor:
+        """Return the light at the instants first..last - 1, [clips, last - first, pixels]."""
+        ...
+
+
+class Clips:
+    """Light that is there as a whole.
+
+    Args:
+        frames: Light in DN [clips, T, H, W], checked.
+    """
+
+    def __init__(self, frames: Tensor) -> None:
+        clips, steps, height, width = frames.shape
+        self.shape, self.dtype, self.device = (clips, steps, height, width), frames.dtype, frames.device
+        self._flat = frames.flatten(2)
+
+    def block(self, first: int, last: int) -> Tensor:
+        """Return the light at the instants first..last - 1, [clips, last - first, pixels]."""
+        return self._flat[:, first:last]
+
+
+class WallLight:
+    """Light that a wall renders when pixels ask for it, and forgets: a clip of any length in little memory.
+
+    Args:
+        wall: The wall; the light is where it renders.
+        times_s: Instants, float64 [T], seconds.
+
+    Raises:
+        DataError: The wall returned NaN, infinity or negative light; also by `block`.
+    """
+
+    dtype = torch.float32
+
+    def __init__(self, wall: Wall, times_s: NDArray[np.float64]) -> None:
+        self._wall, self._times_s = wall, times_s
+        height, width = wall.shape
+        self.shape: tuple[int, int, int, int] = (1, len(times_s), height, width)
+        self._first, self._held = 0, self._rendered(0, 1)
+        self.device = self._held.device
+
+    def block(self, first: int, last: int) -> Tensor:
+        """Return the light at the instants first..last - 1, [1, last - first, pixels]."""
+        if not self._first <= first <= last <= self._first + len(self._held):
+            self._first, self._held = first, self._rendered(first, max(last, first + _AHEAD))
+        return self._held[None, first - self._first : last - self._first]
+
+    def _rendered(self, first: int, last: int) -> Tensor:
+        light = self._wall.irradiance(self._times_s[first:last]).flatten(1).to(torch.float32) * WHITE_DN
+        check_range(light, "the wall's light")
+        return light
+
+
+def check_range(light: Tensor, name: str) -> None:
+    """Refuse light in DN that is not finite, or below 0."""
+    lowest, highest = torch.stack(light.aminmax()).tolist()
+    if not (math.isfinite(lowest) and math.isfinite(highest)):
+        raise DataError(f"{name} holds NaN or infinity; light must be finite, 255 = white")
+    if lowest < 0:
+        raise DataError(f"{name} holds {lowest:g}; light cannot be negative, black is 0")
 
 
 def lin_log(light: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:

@@ -1,4 +1,4 @@
-"""From crossings on a device to events in order on the host."""
+"""From crossings on a device to events in order, without leaving it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.sensor._order import Columns
 from evnlos.sensor._v2e_array import instants_within
+from evnlos.sensor.tensors import EventTensors
 
 
 class Sent(NamedTuple):
@@ -29,36 +29,44 @@ class Sent(NamedTuple):
         return Sent(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def events_in_order(sent: Sent, peaks: Tensor, times_s: NDArray[np.float64], pixels: int) -> list[Columns]:
-    """Return each clip's events by time, then pixel, then OFF before ON, on the host.
+def events_in_order(
+    sent: Sent, peaks: Tensor, times_s: NDArray[np.float64], shape: tuple[int, int]
+) -> list[EventTensors]:
+    """Return each clip's events by time, then pixel, then OFF before ON.
 
     `peaks` [clips, steps] is the number of thresholds that the busiest pixel crossed: it sets the sub-times.
     """
-    clip, order = torch.sort(sent.flat.cpu() // pixels, stable=True)
+    pixels = shape[0] * shape[1]
+    clip, order = torch.sort(sent.flat // pixels, stable=True)
     lengths = torch.bincount(clip, minlength=len(peaks)).tolist()
-    columns = [column.cpu()[order].split(lengths) for column in sent]
+    columns = [column[order].split(lengths) for column in sent]
     return [
-        _one_clip(Sent(step, flat - n * pixels, number, place), peak, times_s, pixels)
+        _one_clip(Sent(step, flat - n * pixels, number, place), peak, times_s, shape)
         for n, (peak, step, flat, number, place) in enumerate(
             zip(peaks.clamp(min=1).cpu().numpy(), *columns, strict=True)
         )
     ]
 
 
-def _one_clip(sent: Sent, peak: NDArray[np.int64], times_s: NDArray[np.float64], pixels: int) -> Columns:
+def _one_clip(
+    sent: Sent, peak: NDArray[np.int64], times_s: NDArray[np.float64], shape: tuple[int, int]
+) -> EventTensors:
     """Return the events of one clip in order, given the peak of each step."""
-    first = torch.from_numpy(np.cumsum(peak) - peak)
-    count = sent.number.abs()
-    entry = torch.repeat_interleave(torch.arange(len(count)), count)
-    following = torch.arange(len(entry)) - (torch.cumsum(count, 0) - count)[entry]
-    step, pixel, number, place = (column[entry] for column in sent)
-    place = torch.where(place < 0, torch.from_numpy(peak)[step] - 1, place + following)
+    device, pixels = sent.step.device, shape[0] * shape[1]
     # equal time stamps are one place in the order
-    distinct, rank = np.unique(step_stamps(times_s, peak), return_inverse=True)
-    key = torch.from_numpy(rank)[first[step] + place] * (2 * pixels) + 2 * pixel + (number > 0)
-    key = torch.sort(key).values.numpy()
+    stamps, ranks = np.unique(step_stamps(times_s, peak), return_inverse=True)
+    stamp, rank, most, first = (
+        torch.from_numpy(column).to(device) for column in (stamps, ranks, peak, np.cumsum(peak) - peak)
+    )
+    count = sent.number.abs()
+    entry = torch.repeat_interleave(torch.arange(len(count), device=device), count)
+    following = torch.arange(len(entry), device=device) - (torch.cumsum(count, 0) - count)[entry]
+    step, pixel, number, place = (column[entry] for column in sent)
+    place = torch.where(place < 0, most[step] - 1, place + following)
+    key = rank[first[step] + place] * (2 * pixels) + 2 * pixel + (number > 0)
+    key = torch.sort(key).values
     where = (key >> 1) % pixels
-    return distinct[key // (2 * pixels)], where.astype(np.int32), (key & 1).astype(np.bool_)
+    return EventTensors(stamp[key // (2 * pixels)], where, (key & 1).bool(), shape[0], shape[1])
 
 
 def step_stamps(times_s: NDArray[np.float64], peak: NDArray[np.int64]) -> NDArray[np.int64]:

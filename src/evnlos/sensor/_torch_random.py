@@ -104,6 +104,14 @@ def _cos_turns(turns: Tensor) -> Tensor:
     return x.neg_().mul_(series)
 
 
+def random_normals(word: Tensor, pixel: Tensor, counter: Tensor) -> tuple[Tensor, Tensor]:
+    """Return two independent normal numbers of mean 0 and variance 1 for each pixel, float64."""
+    first, second = (random_uniform(word, pixel, 2 * counter + k) for k in (0, 1))
+    length = _log(first).mul_(-2.0).sqrt_()
+    quarter = torch.where(second >= 0.25, second - 0.25, second + 0.75)
+    return length * _cos_turns(second), length * _cos_turns(quarter)
+
+
 def _first_uniform(word: Tensor, pixel: Tensor) -> Iterator[Tensor]:
     """Yield the uniform numbers of the counters 0, 1, ... of each pixel."""
     word = _pixel_word(word, pixel)

@@ -16,14 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.sensor._order import Columns
 from evnlos.sensor._random import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_ON
-from evnlos.sensor._torch_light import Filter, lin_log
+from evnlos.sensor._torch_light import Blocks, Filter, lin_log
 from evnlos.sensor._torch_noise import Leak, ShotNoise
 from evnlos.sensor._torch_order import Sent, events_in_order
 from evnlos.sensor._torch_random import fill
 from evnlos.sensor._torch_refractory import Refractory
 from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
+from evnlos.sensor.tensors import EventTensors
 
 STEPS = 32
 _TILE_CPU, _TILE_DEVICE = 16_384, 1 << 22
@@ -36,11 +36,11 @@ def default_tile(device: torch.device) -> int:
     return _TILE_CPU if device.type == "cpu" else _TILE_DEVICE
 
 
-class Clips:
+class Pixels:
     """A group of clips and the state of all their pixels, flat: pixel n of clip c is c * pixels + n.
 
     Args:
-        frames: Light in DN, uint8, float32 or float64 [clips, T, pixels].
+        light: Light in DN, uint8, float32 or float64 [clips, T, H, W].
         times_s: Instants of the frames, float64 [T].
         pixel: Parameters of the pixels.
         seeds: Seed of each clip.
@@ -51,7 +51,7 @@ class Clips:
 
     def __init__(
         self,
-        frames: Tensor,
+        light: Blocks,
         times_s: NDArray[np.float64],
         pixel: EventPixel,
         seeds: list[int],
@@ -59,8 +59,9 @@ class Clips:
         dtype: torch.dtype,
         tile_px: int,
     ) -> None:
-        self.frames, self.times_s, self.pixel = frames, times_s, pixel
-        device, (clips, _, pixels) = frames.device, frames.shape
+        self._light, self.times_s, self.pixel = light, times_s, pixel
+        device, (clips, _, height, width) = light.device, light.shape
+        pixels = height * width
         self.pixels, self._count = pixels, clips * pixels
         delta = np.diff(times_s)
         filtered = pixel.cutoff_hz > 0
@@ -83,12 +84,12 @@ class Clips:
         self._tiles = _tiles(clips, pixels, tile_px)
         capacity = max(last - first for first, last in self._tiles)
         rates = (delta / (1.0 / (math.pi * 2.0 * pixel.cutoff_hz))).tolist() if filtered else []
-        self.filter = Filter(rates, frames.dtype == torch.uint8, dtype, capacity, device)
+        self.filter = Filter(rates, light.dtype == torch.uint8, dtype, capacity, device)
         self._capacity = capacity
         self._low, self._high = (torch.empty(capacity, dtype=dtype, device=device) for _ in range(2))
         self._margin = _MARGIN[dtype]
         self._mask = torch.empty(self._count, dtype=torch.bool, device=device)
-        origin = lin_log(frames[:, 0].reshape(-1))
+        origin = lin_log(light.block(0, 1).reshape(-1))
         self._origin = origin if self.filter.relative else origin[:0]
         self.lp = torch.zeros_like(self.on) if self.filter.relative else origin.to(dtype)
         self.base = self.lp.clone()
@@ -98,19 +99,18 @@ class Clips:
         # single precision keeps the rounding of each leak step, so every pixel goes step by step
         self._every_pixel = self.leak is not None and not filtered
 
-    def run(self) -> list[Columns]:
-        """Return the events of each clip in order: times in microseconds, flat pixels, polarities."""
+    def run(self) -> list[EventTensors]:
+        """Return the events of each clip in order."""
         steps = len(self.times_s) - 1
         length = STEPS if self.refractory is None else 1
         sent = [self._block(first, min(first + length, steps)) for first in range(0, steps, length)]
-        none = torch.zeros(0, dtype=torch.int64, device=self.frames.device)
-        return events_in_order(
-            Sent.join([Sent(none, none, none, none), *sent]), self._peaks, self.times_s, self.pixels
-        )
+        none = torch.zeros(0, dtype=torch.int64, device=self._light.device)
+        sent = Sent.join([Sent(none, none, none, none), *sent])
+        return events_in_order(sent, self._peaks, self.times_s, self._light.shape[2:])
 
     def _block(self, first: int, last: int) -> Sent:
         """Run the steps first..last - 1 and return what was sent."""
-        light = self.frames[:, first + 1 : last + 1]
+        light = self._light.block(first + 1, last + 1)
         self.filter.start_block(first, last)
         if self.leak is not None:
             self.leak.start_block(first, last)

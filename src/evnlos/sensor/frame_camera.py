@@ -118,18 +118,27 @@ class FrameCamera:
         times = np.asarray(times_s, dtype=np.float64)
         if times.ndim != 1 or not np.isfinite(times).all():
             raise DataError(f"times_s has shape {times.shape}; give a 1-D array of finite seconds")
-        nodes = _GAUSS[3 if self.exposure_s > 0 else 1]
         height, width = wall.shape
         frames = np.empty((len(times), height, width), np.uint8 if self.bit_depth == 8 else np.uint16)
         seed = check_seed(seed)
         pattern = self.fixed_pattern((height, width), seed)
         for n, time in enumerate(times):
-            instants = np.array([time + 0.5 * self.exposure_s * offset for offset, _ in nodes])
+            instants, weights = self.instants(time)
             light = wall.irradiance(instants).detach().to("cpu", torch.float64)  # [Q, H, W]
-            weights = torch.tensor([weight for _, weight in nodes], dtype=torch.float64)
-            mean = torch.einsum("q,qhw->hw", weights, light).numpy()
+            mean = torch.einsum("q,qhw->hw", light.new_tensor(weights), light).numpy()
             frames[n] = self._frame(_checked(mean), seed, n, pattern)
         return frames
+
+    def instants(self, time_s: float) -> tuple[NDArray[np.float64], list[float]]:
+        """Return instants [Q], seconds, and the weights [Q] of their light in the mean over an exposure."""
+        nodes = _GAUSS[3 if self.exposure_s > 0 else 1]
+        instants = [time_s + 0.5 * self.exposure_s * offset for offset, _ in nodes]
+        return np.array(instants), [weight for _, weight in nodes]
+
+    @property
+    def dn_per_electron(self) -> float:
+        """Digital numbers that an electron adds."""
+        return (self.white - self.black_level) * self.gain / self.full_well_e
 
     def expose(
         self, irradiance: ArrayLike | torch.Tensor, seed: int = 0, first_frame: int = 0
@@ -179,7 +188,7 @@ class FrameCamera:
             np.uint64(number),
             levels.ravel(),
         )
-        levels *= (self.white - self.black_level) * self.gain / self.full_well_e
+        levels *= self.dn_per_electron
         levels += self.black_level
         return np.clip(np.rint(levels, out=levels), 0, self.white, out=levels)
 
@@ -200,6 +209,12 @@ class FrameCamera:
 
 def _checked(light: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return light, refusing what is none."""
-    if light.size and not (np.isfinite(light).all() and light.min() >= 0):
-        raise DataError("irradiance holds NaN, infinity or negative light; give at least 0, 1.0 = white")
+    if light.size:
+        check_extremes(light.min(), light.max())
     return light
+
+
+def check_extremes(lowest: float, highest: float) -> None:
+    """Refuse light of which an extreme is not finite, or below 0."""
+    if not (lowest >= 0 and highest < math.inf):  # false for NaN, which an extreme keeps
+        raise DataError("irradiance holds NaN, infinity or negative light; give at least 0, 1.0 = white")

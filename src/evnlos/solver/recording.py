@@ -10,7 +10,7 @@ from evnlos.dataset.fixed_pattern import FixedPattern
 from evnlos.dataset.sampling import reduce_by_area
 from evnlos.errors import ConfigError
 from evnlos.transport import MeasuredTransport, RadiometricTransport
-from evnlos.transport.wall import ambient_plane
+from evnlos.transport.ambient import ambient_plane
 
 
 def object_light(

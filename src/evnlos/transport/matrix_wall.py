@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 
 from evnlos.errors import ConfigError
 from evnlos.scene import Motion, Target
+from evnlos.transport.ambient import ambient_map
 from evnlos.transport.operator import MatrixTransport
 from evnlos.transport.spline import spline_coefficients, spline_weights
-from evnlos.transport.wall import ambient_map, check_gain, checked_times
+from evnlos.transport.wall import check_gain, checked_times
 from evnlos.types import Plane
 
 _CHUNK = 64  # positions drawn and carried over at a time

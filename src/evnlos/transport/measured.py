@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import Scene
+from evnlos.transport.ambient import ambient_plane
 from evnlos.transport.matrix_wall import MatrixWall
 from evnlos.transport.measured_file import Measurement, file_checksum, read_measurement
 from evnlos.transport.operator import MatrixTransport
-from evnlos.transport.wall import ambient_plane
 from evnlos.types import Plane
 
 
@@ -59,14 +59,15 @@ class MeasuredTransport:
         """Return the scanned cells, in the coordinates of the target's motion."""
         return self.measurement().about.plane
 
-    def transport(self, shape: tuple[int, int]) -> MatrixTransport:
+    def transport(self, shape: tuple[int, int], device: torch.device | str = "cpu") -> MatrixTransport:
         """Return the matrix from the scanned cells to a camera image of `shape` (H, W), without `gain`.
 
         Raises:
             ConfigError: The scan has fewer pixels than that.
         """
         measured = self.measurement()
-        return MatrixTransport(averaged(measured.matrix, measured.shape, shape), measured.about.plane, shape)
+        matrix = averaged(measured.matrix, measured.shape, shape).to(device)
+        return MatrixTransport(matrix, measured.about.plane, shape)
 
     def matrix(self, shape: tuple[int, int], source: Plane, dtype: torch.dtype = torch.float64) -> torch.Tensor:
         """Return the matrix from other cells of the same plane to the camera, without `gain`, [H W, h w].
@@ -106,8 +107,13 @@ class MeasuredTransport:
         measured = self.measurement()
         return light + averaged(measured.dark.reshape(-1, 1), measured.shape, shape).reshape(shape).clamp(min=0)
 
-    def wall(self, scene: Scene, shape: tuple[int, int]) -> MatrixWall:
+    def wall(self, scene: Scene, shape: tuple[int, int], device: torch.device | str = "cpu") -> MatrixWall:
         """Return the wall that a camera of `shape` (H, W) sees while the scene's plate moves.
+
+        Args:
+            scene: The plate and its motion.
+            shape: Size (H, W) of the camera image, pixels.
+            device: Where the matrix lies and the wall renders.
 
         Raises:
             ConfigError: The plate leaves the scanned plane, or a setting is out of range.
@@ -115,7 +121,7 @@ class MeasuredTransport:
         about = self.measurement().about
         self._check_travel(scene, about.plane)
         return MatrixWall(
-            self.transport(shape),
+            self.transport(shape, device),
             scene.target,
             scene.motion,
             magnification_px_m=about.magnification_px_m * max(shape[0] / about.height, shape[1] / about.width),

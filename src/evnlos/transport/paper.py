@@ -9,13 +9,14 @@ from typing import Literal
 import torch
 
 from evnlos.scene import Scene
+from evnlos.transport.ambient import ambient_plane
 from evnlos.transport.angular_spectrum import blur_radius_px, check_lengths, fresnel_number, sampling_limit_m
 from evnlos.transport.diffraction import Diffraction
 from evnlos.transport.operator import Transport
 from evnlos.transport.reflection import DiffuseReflection
 from evnlos.transport.tpsf import tpsf_kernel
 from evnlos.transport.view import View
-from evnlos.transport.wall import SlidingWall, ambient_plane
+from evnlos.transport.wall import SlidingWall
 from evnlos.types import Plane
 
 
@@ -104,14 +105,19 @@ class PaperTransport:
         side += 2 * min(side, math.ceil(4 * fringes) + 1)
         return Plane(side, side, self.pitch_m)
 
-    def wall(self, scene: Scene, shape: tuple[int, int]) -> SlidingWall:
+    def wall(self, scene: Scene, shape: tuple[int, int], device: torch.device | str = "cpu") -> SlidingWall:
         """Return the wall that a camera of `shape` (H, W) sees while the scene's plate moves.
+
+        Args:
+            scene: The plate and its motion.
+            shape: Size (H, W) of the camera image, pixels.
+            device: Where diffraction and reflection are computed and the wall then renders.
 
         Raises:
             ConfigError: A setting is outside its range; the text names it.
         """
         transport = self.transport(scene.target.size_m)
-        mask = torch.from_numpy(scene.target.rasterise(self.source(scene.target.size_m)))
+        mask = torch.from_numpy(scene.target.rasterise(self.source(scene.target.size_m))).to(device)
         plane = transport.output
         assert plane is not None  # both steps end on planes
         ambient = ambient_plane(self.ambient, self.ambient_gradient, shape)

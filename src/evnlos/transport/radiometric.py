@@ -60,7 +60,7 @@ def light_transport_matrix(
             Lambertian, screens have more.
         points: Quadrature points a side of a (pixel, cell); None adapts them to the lobe.
         rows: The pixels, counted row by row, whose rows of the matrix are made.
-        dtype: Floating-point type of the result; the compiled loop works in float64.
+        dtype: Floating-point type of the result; what needs no gradient is computed in float64.
         device: Device of the result.
         compiled: Whether to use the compiled loop; None does so on the CPU when no gradient is asked for.
 
@@ -104,13 +104,14 @@ def light_transport_matrix(
         )
         return matrix.to(device)
     target, target_weight = _target_points(source, over_cell)  # [Q, 2, C], [Q]
-    wall, target = wall.to(dtype=dtype, device=device), target.to(dtype=dtype, device=device)
-    matrix = torch.zeros(wall.shape[1], target.shape[-1], dtype=dtype, device=device)
+    work = dtype if differentiable else torch.float64
+    wall, target = wall.to(dtype=work, device=device), target.to(dtype=work, device=device)
     block_rows = max(1, _CHUNK // target.shape[-1])
     blocks = []
     for start in range(0, wall.shape[1], block_rows):
-        block = matrix[start : start + block_rows]
-        for patch, share in zip(wall[:, start : start + block_rows], wall_weight.tolist(), strict=True):
+        patches = wall[:, start : start + block_rows]
+        block = wall.new_zeros(patches.shape[1], target.shape[-1])
+        for patch, share in zip(patches, wall_weight.tolist(), strict=True):
             for (x, y), part in zip(target, target_weight.tolist(), strict=True):
                 pair = pair_throughput(
                     patch, x + offset_m[0], y + offset_m[1], distance_m, eye, brdf, emission_exponent
@@ -121,7 +122,7 @@ def light_transport_matrix(
                         way = visibility(patch, x + offset_m[0], y + offset_m[1], distance, occluders)
                     pair = pair * way
                 block = block + (share * part) * pair
-        blocks.append(block)
+        blocks.append(block.to(dtype))
     matrix = torch.cat(blocks)
     return matrix if emission is None else matrix * emission.flatten().to(matrix)
 

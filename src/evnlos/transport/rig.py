@@ -14,6 +14,7 @@ import torch
 
 from evnlos.errors import ConfigError
 from evnlos.scene import Scene
+from evnlos.transport.ambient import ambient_plane
 from evnlos.transport.angular_spectrum import check_lengths
 from evnlos.transport.brdf import GGX, Brdf, Lambert
 from evnlos.transport.lamp import lamp_radiance
@@ -22,7 +23,6 @@ from evnlos.transport.occluder import Occluder, check_between, visibility
 from evnlos.transport.operator import MatrixTransport
 from evnlos.transport.radiometric import light_transport_matrix
 from evnlos.transport.view import View
-from evnlos.transport.wall import ambient_plane
 from evnlos.types import Plane
 
 _LEAST_CELLS = 4  # a side of the plate: fewer show no shape at all
@@ -105,18 +105,26 @@ class RadiometricTransport:
             return polygons
         return (*polygons, Occluder.post(self.offset_m()[0] / 2, self.distance_m / 2, self.post_width_m))
 
-    def transport(self, shape: tuple[int, int]) -> MatrixTransport:
+    def transport(self, shape: tuple[int, int], device: torch.device | str = "cpu") -> MatrixTransport:
         """Return the matrix from the strip to the camera, scaled so that `gain` means what it says; cached."""
         # Light that only adds up afterwards does not belong to the matrix's key.
-        return _transport(replace(self, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0)), shape)
+        key = replace(self, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0))
+        return _transport(key, shape, torch.device(device))
 
-    def matrix(self, shape: tuple[int, int], source: Plane, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    def matrix(
+        self,
+        shape: tuple[int, int],
+        source: Plane,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> torch.Tensor:
         """Return the matrix from any cells of the target's plane to the camera, without `gain`, [H W, h w].
 
         Args:
             shape: Size (H, W) of the camera image, pixels.
             source: Cells, in the coordinates of the target's motion.
             dtype: Floating-point type of the result.
+            device: Where it is computed and stays.
 
         Raises:
             ConfigError: An occluder reaches the wall or the target's plane, or hides the wall from the camera.
@@ -142,10 +150,16 @@ class RadiometricTransport:
             occluders=occluders,
             emission=emission,
             dtype=dtype,
+            device=device,
         )
 
-    def wall(self, scene: Scene, shape: tuple[int, int]) -> MatrixWall:
+    def wall(self, scene: Scene, shape: tuple[int, int], device: torch.device | str = "cpu") -> MatrixWall:
         """Return the wall that a camera of `shape` (H, W) sees while the scene's plate moves.
+
+        Args:
+            scene: The plate and its motion.
+            shape: Size (H, W) of the camera image, pixels.
+            device: Where the matrix of the transport is made and the wall then renders.
 
         Raises:
             ConfigError: The plate leaves the strip, or needs finer cells, or a setting is out of range.
@@ -154,7 +168,7 @@ class RadiometricTransport:
         self._check_travel(scene)
         self._check_cells(scene.target.size_m)
         return MatrixWall(
-            self.transport(shape),
+            self.transport(shape, device),
             scene.target,
             scene.motion,
             # No point of the image outruns the target: the reflection moves at most as fast as the plate.
@@ -182,9 +196,9 @@ class RadiometricTransport:
 
 
 @lru_cache(maxsize=8)
-def _transport(rig: RadiometricTransport, shape: tuple[int, int]) -> MatrixTransport:
+def _transport(rig: RadiometricTransport, shape: tuple[int, int], device: torch.device) -> MatrixTransport:
     source = rig.source()
-    matrix = rig.matrix(shape, source, torch.float32)
+    matrix = rig.matrix(shape, source, torch.float32, device)
     # A square of the strip's height is the plate of the paper; it makes gains comparable between walls.
     lit = (torch.arange(source.width) - (source.width - 1) / 2).abs() <= source.height / 2
     brightest = (matrix @ lit.to(matrix).repeat(source.height)).max()

@@ -68,7 +68,7 @@ def spline_sample(coefficients: torch.Tensor, row: torch.Tensor, column: torch.T
     """
     if row.ndim == 2 and bool((row == row[:, :1]).all()) and bool((column == column[:1]).all()):
         return _on_grid(_on_grid(coefficients.mT, column[0]).mT, row[:, 0])
-    return _scattered(coefficients, row, column)
+    return spline_scattered(coefficients, row, column)
 
 
 def _on_grid(coefficients: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
@@ -83,8 +83,8 @@ def _on_grid(coefficients: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
     return value
 
 
-def _scattered(coefficients: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
-    """Evaluate at points in any order: the slow reference, and the way where the grid is tilted."""
+def spline_scattered(coefficients: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
+    """Do what `spline_sample` does, point by point: the slow reference, and the way of tilted grids."""
     height, width = coefficients.shape
     flat = coefficients.reshape(-1)
     top, left = row.floor(), column.floor()

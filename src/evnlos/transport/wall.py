@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import Protocol, runtime_checkable
 
@@ -13,13 +12,16 @@ from torch.nn.functional import pad
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import Motion
-from evnlos.transport.spline import MARGIN, box_average, spline_coefficients, spline_sample
+from evnlos.transport.ambient import ambient_map
+from evnlos.transport.slide import slide
+from evnlos.transport.spline import MARGIN, box_average, spline_coefficients, spline_sample, spline_scattered
 from evnlos.transport.strips import Strips
 from evnlos.transport.view import View
 from evnlos.types import Plane
 
 _MAX_CANVAS = 8192  # pixels a side
 _SAME_ROWS_PX = 1e-9
+_TOGETHER_PX = 1 << 25  # pixels that a device renders in one operation
 
 
 @runtime_checkable
@@ -107,15 +109,6 @@ class SlidingWall:
         view = _shifted_view(self.view, (0, 0), (1, 1)) if self.view.is_affine else self.view
         return self.motion.speed_bound_m_s(-math.inf, math.inf) * view.magnification()
 
-    def to(self, device: torch.device | str) -> SlidingWall:
-        """Return this wall with its pictures on a device, where it then renders."""
-        moved = copy.copy(self)
-        moved._band = None
-        moved.ambient, moved._wall = self.ambient.to(device), self._wall.to(device)
-        if self.view.is_affine:
-            moved._canvas = self._canvas.to(device)
-        return moved
-
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
         """Return the irradiance at times `t_s`.
 
@@ -133,6 +126,8 @@ class SlidingWall:
         image = self.ambient.new_empty((len(positions), *self.shape))
         if self._compiled:
             self._write(positions, image)
+        elif self.view.is_affine and not self._canvas.requires_grad:
+            self._slide(positions, image)
         else:
             frame = self._shifted if self.view.is_affine else self._projected
             for k, (x, y) in enumerate(positions.tolist()):
@@ -178,7 +173,8 @@ class SlidingWall:
         plane = self._plane
         column = (x - x_m - plane.center_m[0]) / plane.pitch_m + (plane.width - 1) / 2 + self._margin
         row = (y - y_m - plane.center_m[1]) / plane.pitch_m + (plane.height - 1) / 2 + self._margin
-        return spline_sample(self._wall, row, column)
+        sample = spline_sample if view.is_affine else spline_scattered  # an oblique grid is tilted
+        return sample(self._wall, row, column)
 
     def _projected(self, x_m: float, y_m: float) -> torch.Tensor:
         return self._sampled(self.view, x_m, y_m)
@@ -201,6 +197,22 @@ class SlidingWall:
         else:
             for k in range(len(image)):
                 self._write(positions_m[k : k + 1], image[k : k + 1])
+
+    def _slide(self, positions_m: NDArray[np.float64], image: torch.Tensor) -> None:
+        """Write the frames with the plate at positions [T, 2] to `image`; `_shifted` is the slow reference.
+
+        Frames on the same rows are rendered together: one by one, a GPU would mostly wait for its orders.
+        """
+        across, down = self._pixels(positions_m)
+        most = max(1, _TOGETHER_PX // (self.shape[0] * self.shape[1]))
+        if len(down) and float(np.ptp(down)) > _SAME_ROWS_PX:
+            most = 1
+        for first in range(0, len(image), most):
+            some = slice(first, first + most)
+            shifts = [_taps(-shift) for shift in across[some].tolist()]
+            starts = [whole - 1 - self._low[0] for whole, _ in shifts]
+            light = slide(self._rows(float(down[first])), starts, [taps for _, taps in shifts], self.shape[1])
+            image[some] = light.clamp_(min=0).mul_(self.gain).add_(self.ambient)
 
     def _strips(self, positions_m: NDArray[np.float64]) -> Strips | None:
         """Return the light with the plate at positions [T, 2], unless they differ across the rows."""
@@ -246,35 +258,6 @@ def checked_times(t_s: ArrayLike) -> NDArray[np.float64]:
     if times.ndim > 1:
         raise DataError(f"t_s has shape {times.shape}; give one time or a 1-D array of times")
     return times
-
-
-def ambient_map(ambient: float | ArrayLike | torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
-    """Return ambient light as a map [H, W], float32, white levels, refusing negative light."""
-    level = torch.as_tensor(ambient, dtype=torch.float32)
-    if level.ndim and tuple(level.shape) != shape:
-        raise DataError(f"the ambient light is {tuple(level.shape)}; give a number or {shape}")
-    if not bool((torch.isfinite(level) & (level >= 0)).all()):
-        raise ConfigError(
-            f"the ambient light reaches {float(level.min())}; give 0 or more white levels everywhere"
-        )
-    return level.expand(shape).clone()
-
-
-def ambient_plane(level: float, gradient: tuple[float, float], shape: tuple[int, int]) -> torch.Tensor:
-    """Return ambient light that grows linearly: level (1 + gx x + gy y), x and y from -1 to 1 over the image.
-
-    Args:
-        level: Light in the middle of the image, white levels.
-        gradient: Relative growth (gx, gy) from the middle to the right and the lower border.
-        shape: Size (H, W), pixels.
-
-    Example:
-        >>> ambient_plane(0.1, (0.5, 0.0), (1, 3))
-        tensor([[0.0500, 0.1000, 0.1500]])
-    """
-    y = torch.linspace(-1, 1, shape[0]) if shape[0] > 1 else torch.zeros(1)
-    x = torch.linspace(-1, 1, shape[1]) if shape[1] > 1 else torch.zeros(1)
-    return ambient_map(level * (1 + gradient[1] * y[:, None] + gradient[0] * x), shape)
 
 
 def _taps(shift: float) -> tuple[int, list[float]]:

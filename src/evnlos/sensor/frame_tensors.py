@@ -1,0 +1,65 @@
+"""Frames that are simulated on a device and stay there."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from evnlos.errors import DataError
+from evnlos.sensor._random import check_seed
+from evnlos.sensor._torch_photons import electrons
+from evnlos.sensor.event_camera import Wall
+from evnlos.sensor.frame_camera import FrameCamera, check_extremes
+
+Pattern = tuple[Tensor, Tensor]
+
+
+def capture_tensors(camera: FrameCamera, wall: Wall, times_s: ArrayLike, seed: int = 0) -> Tensor:
+    """Return the frames of `FrameCamera.capture` on the device where the wall renders.
+
+    Args:
+        camera: The frame camera.
+        wall: The light: `shape` and `irradiance(t_s)`.
+        times_s: Middles of the exposures, [N], seconds.
+        seed: Seed of the noise, 0 to 2**64 - 1.
+
+    Returns:
+        Digital numbers, whole float32 [N, H, W].
+
+    Raises:
+        DataError: Times that are not finite, or a wall with NaN or negative light.
+    """
+    times = np.asarray(times_s, dtype=np.float64)
+    if times.ndim != 1 or not len(times) or not np.isfinite(times).all():
+        raise DataError(f"times_s has shape {times.shape}; give a 1-D array of finite seconds, at least one")
+    seed = check_seed(seed)
+    frames, extremes = [], []
+    with torch.no_grad():
+        for number, time in enumerate(times.tolist()):
+            instants, weights = camera.instants(time)
+            light = wall.irradiance(instants).to(torch.float64)  # [Q, H, W]
+            mean = torch.einsum("q,qhw->hw", light.new_tensor(weights), light)
+            extremes.append(torch.stack(mean.aminmax()))
+            sensitivity, offset_e = _pattern(camera, wall.shape, seed, mean.device)
+            expected = (sensitivity * mean).flatten()
+            levels = electrons(expected, offset_e.flatten(), camera.read_noise_e, seed, number)
+            levels.mul_(camera.dn_per_electron).add_(camera.black_level).round_().clamp_(0, camera.white)
+            frames.append(levels.to(torch.float32).view(wall.shape))
+        lowest, highest = torch.stack(extremes).unbind(1)
+        check_extremes(float(lowest.min()), float(highest.max()))  # the device is asked only here
+        return torch.stack(frames)
+
+
+def _pattern(camera: FrameCamera, shape: tuple[int, int], seed: int, device: torch.device) -> Pattern:
+    """Return electrons a unit of light, and the offset in electrons, float64 [H, W] each, on a device."""
+    return _pattern_of(camera, shape, seed if camera.pattern_seed is None else 0, device)
+
+
+@lru_cache(maxsize=4)
+def _pattern_of(camera: FrameCamera, shape: tuple[int, int], seed: int, device: torch.device) -> Pattern:
+    sensitivity, offset_e = (torch.from_numpy(part).to(device) for part in camera.fixed_pattern(shape, seed))
+    return camera.full_well_e * sensitivity, offset_e

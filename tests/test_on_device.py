@@ -1,0 +1,254 @@
+"""The way of a GPU, from the light to the maps: stage by stage against the CPU's, and on a pretended device."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos.dataset import Sampling, SensorSize, Simulation, live_dataset
+from evnlos.dataset.on_device import simulate_object_on
+from evnlos.errors import ConfigError, DataError
+from evnlos.events import time_surface
+from evnlos.events.surface_tensors import time_surface_tensors
+from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion
+from evnlos.sensor import EventPixel, FrameCamera, simulate_batch
+from evnlos.sensor._photons import fill_electrons
+from evnlos.sensor._torch_photons import electrons
+from evnlos.sensor.event_tensors import record_tensors
+from evnlos.sensor.frame_tensors import capture_tensors
+from evnlos.sensor.tensors import EventTensors
+from evnlos.training.source import Live
+from evnlos.training.team import Team
+from evnlos.transport import PaperTransport, RadiometricTransport, SlidingWall, View
+from evnlos.transport.slide import slide
+from evnlos.types import Plane
+from pretend_device import PRETENDED, PretendedDevice
+from test_event_pixel_v2e import PIXELS, _video
+
+WALLS = {
+    "affine": PaperTransport(tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, rotation_deg=5.0),
+    "oblique": PaperTransport(tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, camera_angle_deg=10.0),
+    "metal": RadiometricTransport(cell_m=0.01),
+    "post": RadiometricTransport(cell_m=0.01, post_width_m=0.016, lamp_m=(0.1, 0.0, 0.1)),
+}
+
+
+@pytest.fixture(scope="module")
+def small() -> Simulation:
+    """One writer, four positions of a pass of two seconds, a small sensor."""
+    return Simulation(
+        glyphs=HandwritingGlyphs(characters="AT", writers=1),
+        transport=WALLS["affine"],
+        sensor=SensorSize(20, 32),
+        sampling=Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12),
+        duration_s=2.0,
+        positions=4,
+        validation=0.0,
+    )
+
+
+def stream_of(seed: int, count: int, height: int = 9, width: int = 13) -> EventTensors:
+    """Random events in order, many at one time and many at one pixel."""
+    draw = np.random.default_rng(seed)
+    time_us = np.sort(draw.integers(0, 400, count) * 50)
+    pixel, on = draw.integers(0, height * width, count), draw.integers(0, 2, count).astype(bool)
+    order = np.lexsort((on, pixel, time_us))
+    columns = (torch.from_numpy(column[order]) for column in (time_us, pixel, on))
+    return EventTensors(*columns, height, width)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("mode", "radius"), [("sae", 1), ("context", 0), ("context", 2), ("hots", 1), ("hots", 3)]
+)
+def test_surfaces_are_those_of_the_walk_through_the_events(mode, radius, seed) -> None:
+    events = stream_of(seed, 3000)
+    edges = [4000, 7000, 7050, 16_000]  # events lie before the first and after the last
+    ours = time_surface_tensors(events, edges, 3000.0, mode, radius=radius)
+    theirs = time_surface(events.to_events(), edges, 3000.0, mode, radius=radius)
+    assert theirs.max() > 0.5
+    np.testing.assert_allclose(ours.numpy(), theirs, rtol=2e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", ["sae", "context", "hots"])
+def test_no_events_make_a_blank_surface(mode) -> None:
+    surface = time_surface_tensors(stream_of(0, 0), [0, 10, 20], 5.0, mode)
+    assert surface.shape == (2, 2, 9, 13)
+    assert not surface.any()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"tau_us": 0.0}, "tau_us is 0.0"),
+        ({"radius": 65}, "radius is 65"),
+        ({"mode": "tos"}, "mode is 'tos'"),
+        ({"edges_us": [5, 5]}, "edges must ascend"),
+    ],
+)
+def test_wrong_surfaces_are_refused(given, words) -> None:
+    with pytest.raises(DataError, match=words):
+        time_surface_tensors(**{"events": stream_of(0, 5), "edges_us": [0, 10], "tau_us": 1.0, **given})
+
+
+@pytest.mark.parametrize("number", [0, 7])
+def test_electrons_are_those_of_the_compiled_loop(number) -> None:
+    draw = np.random.default_rng(number)
+    mean = np.concatenate([10.0 ** draw.uniform(-2, 5, 4000), [0.0, 63.999, 64.0]])
+    offset = draw.normal(0.0, 3.0, len(mean))
+    expected = np.empty_like(mean)
+    fill_electrons(mean, offset, 6.0, np.uint64(2**63 + 5), np.uint64(number), expected)
+    made = electrons(torch.from_numpy(mean), torch.from_numpy(offset), 6.0, 2**63 + 5, number).numpy()
+    np.testing.assert_allclose(made, expected, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "camera", [FrameCamera(), FrameCamera(pattern_seed=None, bit_depth=12, exposure_s=0.0)]
+)
+def test_frames_are_those_of_the_frame_camera(small, camera) -> None:
+    wall = wall_of(small)
+    times_s = np.array([0.4, 1.0, 1.7])
+    made = capture_tensors(camera, wall, times_s, seed=3)
+    assert made.dtype == torch.float32
+    np.testing.assert_array_equal(made.numpy(), camera.capture(wall, times_s, seed=3))
+
+
+@pytest.mark.parametrize(
+    "motion", [LineMotion(speed_m_s=0.06), LineMotion(speed_m_s=0.06, direction=(1.0, 0.3))]
+)
+def test_a_sliding_wall_renders_many_frames_as_it_renders_one(motion, monkeypatch) -> None:
+    torch.manual_seed(0)
+    view = View.affine((11, 17), 90.0, rotation_rad=0.2 * motion.direction[1])
+    image = torch.rand(24, 24)
+    wall = SlidingWall(image, Plane(24, 24, 0.005), view, motion, gain=0.7, ambient=0.05)
+    times_s = np.linspace(-30.0, 30.0, 41)  # it comes from beyond one border and leaves by the other
+    frames = [
+        wall._shifted(*place).clamp(min=0) * 0.7 + wall.ambient for place in motion.position_m(times_s).tolist()
+    ]
+    monkeypatch.setattr("evnlos.transport.wall._TOGETHER_PX", 11 * 17 * 9)
+    image = torch.empty(41, 11, 17)
+    wall._slide(motion.position_m(times_s), image)
+    torch.testing.assert_close(image, torch.stack(frames), rtol=1e-6, atol=1e-7)
+    assert image.std() > 0.01
+    wall._slide(np.zeros((0, 2)), torch.empty(0, 11, 17))
+
+
+def test_windows_far_from_the_band_are_dark() -> None:
+    frames = slide(torch.ones(2, 5), [-(10**9), -1, 10**9], [[0.25] * 4] * 3, 4)
+    assert frames[:, 0].tolist() == [[0.0] * 4, [0.75, 1.0, 1.0, 0.75], [0.0] * 4]
+
+
+def wall_of(config: Simulation, device: str = "cpu"):
+    """Return the wall of the first object."""
+    from evnlos.scene import Scene
+
+    target = config.glyphs.target(config.glyphs.objects()[0], 5)
+    scene = Scene(target, config.motion, config.duration_s)
+    return config.transport.wall(scene, (config.sensor.height, config.sensor.width), device)
+
+
+@pytest.mark.parametrize("refractory_s", [0.0, 0.03])
+def test_light_that_is_rendered_in_blocks_gives_the_events_of_whole_clips(small, refractory_s) -> None:
+    wall, times_s = wall_of(small), np.linspace(0.0, 2.0, 401)
+    pixel = EventPixel(threshold_on=0.05, threshold_off=0.05, refractory_s=refractory_s)
+    (expected,) = simulate_batch(
+        255.0 * wall.irradiance(times_s)[None], times_s, pixel, [9], dtype=torch.float32
+    )
+    assert len(expected) > 500
+    assert record_tensors(wall, times_s, pixel, 9).to_events() == expected
+
+
+class _BadWall:
+    shape, speed_px_s = (4, 6), 1.0
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+
+    def irradiance(self, t_s) -> torch.Tensor:
+        image = torch.ones(np.shape(t_s)[0], 4, 6)
+        image[np.asarray(t_s) > 0.5, 2, 3] = self.value
+        return image
+
+
+@pytest.mark.parametrize(
+    ("value", "words"), [(float("nan"), "NaN"), (-1.0, "negative"), (float("inf"), "infinity")]
+)
+def test_light_that_no_wall_has_is_refused(value, words) -> None:
+    with pytest.raises(DataError, match=words):
+        record_tensors(_BadWall(value), np.linspace(0.0, 1.0, 101), EventPixel(), 0)
+    with pytest.raises(DataError, match=words):
+        capture_tensors(FrameCamera(), _BadWall(value), [0.2, 0.9])
+
+
+def test_pixels_that_the_stepped_mode_lacks_are_refused(small) -> None:
+    with pytest.raises(ConfigError, match="no hot pixels"):
+        record_tensors(wall_of(small), np.linspace(0.0, 1.0, 11), EventPixel(hot_pixel_fraction=0.1), 0)
+    with pytest.raises(DataError, match="at least 2"):
+        record_tensors(wall_of(small), np.zeros(1), EventPixel(), 0)
+
+
+# On a pretended device: nothing is made in the wrong place, and nothing large comes back.
+
+
+def test_the_pretended_device_refuses_what_a_gpu_refuses() -> None:
+    with PretendedDevice() as mode:
+        there, here = torch.arange(6.0, device=PRETENDED), torch.ones(6)
+        with pytest.raises(RuntimeError, match="main memory"):
+            _ = there + here
+        with pytest.raises(RuntimeError):
+            there.numpy()
+        assert mode.crossings == 0
+        assert (there + here.to(PRETENDED)).tolist() == [1, 2, 3, 4, 5, 6]
+        assert mode.crossings == 6
+
+
+@pytest.mark.parametrize(
+    ("kind", "surface"), [*((kind, "sae") for kind in WALLS), ("affine", "context"), ("affine", "hots")]
+)
+def test_an_object_is_simulated_where_it_is_asked_for(small, kind, surface) -> None:
+    config = replace(small, transport=WALLS[kind], sampling=replace(small.sampling, surface=surface))
+    name = config.glyphs.objects()[0]
+    expected = simulate_object_on(config, name, "cpu", 0.02)
+    assert expected.surface.max() > 0.1
+    with PretendedDevice() as mode:
+        made = simulate_object_on(config, name, PRETENDED, 0.02)
+        crossings = mode.crossings
+        assert {part.device for part in made} == {PRETENDED}
+        for part, truth in zip(made, expected, strict=True):
+            torch.testing.assert_close(part.cpu(), truth, rtol=1e-6, atol=1e-6)
+    # how many thresholds the busiest pixel crossed in each of 100 steps, and a few counts
+    assert crossings < 100 + 100
+
+
+def test_a_plate_may_move_along_any_path(small) -> None:
+    path = PathMotion((0.0, 1.0, 2.0), ((0.0, 0.0), (0.02, 0.01), (0.03, -0.01)))
+    name = small.glyphs.objects()[0]
+    config = replace(small, motion=path)
+    expected = simulate_object_on(config, name, "cpu", 0.02)
+    with PretendedDevice():
+        made = simulate_object_on(config, name, PRETENDED, 0.02)
+        torch.testing.assert_close(made.surface.cpu(), expected.surface, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", PIXELS)
+def test_every_pixel_runs_on_a_device(name) -> None:
+    frames, times_s = _video(1, steps=40, height=6, width=50)
+    clips = torch.from_numpy(np.clip(frames, 0, 255).astype(np.float32))[None]
+    expected = simulate_batch(clips, times_s, PIXELS[name], [5])
+    with PretendedDevice():
+        assert simulate_batch(clips.to(PRETENDED), times_s, PIXELS[name], [5]) == expected
+
+
+@pytest.mark.parametrize("paradigm", ["frame", "event", "fusion"])
+def test_a_training_is_fed_on_its_device(small, paradigm) -> None:
+    source = Live(replace(live_dataset(small), step_s=0.02), paradigm, 3, 0, Team(0, 1, PRETENDED))
+    with PretendedDevice():
+        first, again = (list(source.batches(1)) for _ in range(2))
+        assert len(first) == source.steps == 3
+        for one, other in zip(first, again, strict=True):
+            assert one.seen.device == one.truth.device == PRETENDED
+            assert torch.equal(one.seen.cpu(), other.seen.cpu())
+        inputs, truth, names = source.some(4)
+        assert inputs.device.type == truth.device.type == "cpu"
+        assert len(inputs) == len(truth) == len(names) == 4
