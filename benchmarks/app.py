@@ -21,7 +21,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import chromium
-from event_pixel import machine
+from machine import machine
 
 CONTROLS = {
     "roughness of the wall (a new wall)": "Wall roughness",

@@ -12,10 +12,8 @@ those that cannot be imported (pip install evutils faery) are left out.
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import importlib.util
 import os
-import platform
 import statistics
 import tempfile
 import time
@@ -29,6 +27,7 @@ import numpy as np  # noqa: E402
 
 from evnlos.events import read_events, write_events  # noqa: E402
 from evnlos.types import Events  # noqa: E402
+from machine import machine  # noqa: E402
 
 WIDTH, HEIGHT = 1280, 720
 
@@ -156,7 +155,7 @@ def main() -> None:
         f"{arguments.events:,} events, one thread, processor time, medians of {arguments.rounds} interleaved "
         "rounds; millions of events a second.",
         "",
-        f"{machine()}",
+        machine("numpy", "evutils", "faery"),
         "",
         f"| file | bytes an event | {' | '.join(readers)} | ratios |\n|---|---|{'---|' * len(readers)}---|",
     ]
@@ -179,20 +178,6 @@ def main() -> None:
             print(lines[-1], flush=True)
     if arguments.write:
         Path(arguments.write).write_text("\n".join(lines) + "\n")
-
-
-def machine() -> str:
-    """Return processor and versions."""
-    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
-    names = [line.split(":")[1].strip() for line in info.splitlines() if line.startswith("model name")]
-    versions = {
-        name: importlib.metadata.version(name)
-        for name in ("numpy", "numba", "evutils", "faery")
-        if installed(name)
-    }
-    packages = ", ".join(f"{name} {version}" for name, version in versions.items())
-    processor = names[0] if names else platform.machine()
-    return f"{processor}, {os.cpu_count()} cores; Python {platform.python_version()}, {packages}"
 
 
 def installed(name: str) -> bool:

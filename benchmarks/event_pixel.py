@@ -17,7 +17,6 @@ import argparse
 import cProfile
 import logging
 import os
-import platform
 import pstats
 import statistics
 import subprocess
@@ -38,6 +37,7 @@ from evnlos.sensor import EventCamera, EventPixel, simulate_batch, simulate_even
 from evnlos.sensor.stream import Mode
 from evnlos.transport import Wall as CameraWall
 from evnlos.types import Events
+from machine import machine
 
 PAPER = EventPixel()
 STEP_S = 1e-3
@@ -305,21 +305,6 @@ def spin_scaling() -> float:
             list(pool.map(spin, [5_000_000] * 4))
         spent.append(time.perf_counter() - start)
     return spent[0] / spent[1]
-
-
-def machine() -> str:
-    """Return the processor, the number of cores and the versions that matter."""
-    name = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        lines = dict(line.split(":", 1) for line in info.read_text().splitlines() if ":" in line)
-        fields = {key.strip(): value.strip() for key, value in lines.items()}
-        name = (
-            f"{fields.get('model name', name)} (family {fields.get('cpu family')}, model {fields.get('model')})"
-        )
-    import numba
-
-    return f"{name}, {os.cpu_count()} cores; Python {platform.python_version()}, numba {numba.__version__}"
 
 
 def main() -> None:

@@ -28,7 +28,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from event_pixel import machine
 from evnlos.config import to_dict
 from evnlos.dataset import CHANNELS, Sampling
 from evnlos.live.chunk import Source
@@ -39,6 +38,7 @@ from evnlos.live.run import Pace, Run
 from evnlos.live.udp import UdpSource
 from evnlos.model import ResidualUNet, UNetConfig, Weights, load_weights
 from evnlos.types import Events
+from machine import machine
 
 WIDTH, HEIGHT = 160, 100
 PIECE_US = 20_000

@@ -20,10 +20,10 @@ from typing import Any
 
 import torch
 
-from event_pixel import machine
 from evnlos.dataset import Simulation, live_dataset, on_device, open_dataset, simulate, simulate_object
 from evnlos.scene import HandwritingGlyphs
 from evnlos.training import Training, train
+from machine import machine
 
 STEP_S = 0.002
 STAGES = {

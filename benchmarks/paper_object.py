@@ -21,7 +21,6 @@ from pathlib import Path
 import torch
 from numpy.typing import ArrayLike
 
-from event_pixel import machine
 from evnlos.dataset import Simulation, make_samples
 from evnlos.dataset.presets import paper
 from evnlos.dataset.sampling import edges_from
@@ -29,6 +28,7 @@ from evnlos.scene import Scene
 from evnlos.sensor import EventCamera
 from evnlos.threads import one_thread
 from evnlos.transport import Wall
+from machine import machine
 
 PARTS = ("events", "frames", "maps")
 

@@ -18,7 +18,6 @@ import time
 import numpy as np
 import torch
 
-from event_pixel import machine
 from evnlos.config import from_dict, to_dict
 from evnlos.dataset import CHANNELS, PARADIGMS, Paradigm, Sampling, network_input
 from evnlos.dataset.sampling import make_samples
@@ -26,6 +25,7 @@ from evnlos.evaluation import Reconstructor, reconstruct
 from evnlos.model import JointNetwork, ResidualUNet, UNetConfig, Weights, infer, load_weights
 from evnlos.scene import LineMotion
 from evnlos.types import Events
+from machine import machine
 
 
 def events_of_a_position(count: int, seed: int) -> Events:

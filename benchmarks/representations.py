@@ -13,10 +13,7 @@ do; the voxel grid of evutils counts into the nearest bin, ours shares each vote
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
-import importlib.util
 import os
-import platform
 import statistics
 import time
 import warnings
@@ -30,6 +27,7 @@ import numpy as np  # noqa: E402
 
 from evnlos.events import event_histogram, time_surface, voxel_grid  # noqa: E402
 from evnlos.types import Events  # noqa: E402
+from machine import machine  # noqa: E402
 
 WIDTH, HEIGHT = 1280, 720
 TAU_US = 50_000.0
@@ -140,7 +138,7 @@ def main() -> None:
         f"{len(events):,} {arguments.stream} events on {WIDTH} x {HEIGHT}, one thread, processor time, medians "
         f"of {arguments.rounds} interleaved rounds; millions of events a second.",
         "",
-        machine(),
+        machine("numpy", "evutils", "tonic"),
         "",
         f"| map | {' | '.join(names)} | ratios |\n|---|{'---|' * len(names)}---|",
     ]
@@ -159,20 +157,6 @@ def main() -> None:
 def ratio(ours: list[float], theirs: list[float]) -> float:
     """Return how many times faster ours is: the median over the rounds."""
     return statistics.median(b / a for a, b in zip(ours, theirs, strict=True))
-
-
-def machine() -> str:
-    """Return processor and versions."""
-    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").is_file() else ""
-    names = [line.split(":")[1].strip() for line in info.splitlines() if line.startswith("model name")]
-    found = {
-        name: importlib.metadata.version(name)
-        for name in ("numpy", "numba", "evutils", "tonic")
-        if importlib.util.find_spec(name) is not None
-    }
-    packages = ", ".join(f"{name} {version}" for name, version in found.items())
-    processor = names[0] if names else platform.machine()
-    return f"{processor}, {os.cpu_count()} cores; Python {platform.python_version()}, {packages}"
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import platform
 import sys
 import tempfile
 import time
@@ -32,6 +31,7 @@ from evnlos.scene import HandwritingGlyphs
 from evnlos.sensor import EventPixel
 from evnlos.threads import one_thread
 from evnlos.transport import PaperTransport
+from machine import machine
 
 OBJECTS, NODES = 1_000_000, 100
 BASE = Simulation(
@@ -115,9 +115,7 @@ def sweeps(repeat: int) -> list[Sweep]:
 def page(found: list[Sweep], rates: dict[int, float], cores: int) -> str:
     """Return the tables as Markdown."""
     lines = ["# How the cost of a simulation grows", "", f"`python {' '.join(sys.argv)}`", ""]
-    lines += [
-        f"{processor()}, {os.cpu_count()} cores; Python {platform.python_version()}, one thread a process"
-    ]
+    lines += [f"{machine()}; one thread a process"]
     lines += [f"Load average of the machine at the end: {os.getloadavg()[0]:.1f}.", ""]
     lines += [
         "| what grows | sizes | CPU s | line through them | largest miss of the line |",
@@ -159,14 +157,6 @@ def draw(found: list[Sweep], path: Path) -> None:
         axes.legend(fontsize=8)
     figure.axes[0].set_ylabel("CPU seconds")
     figure.savefig(path, dpi=100)
-
-
-def processor() -> str:
-    """Return the name of the processor where the system tells it."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 if __name__ == "__main__":

@@ -15,9 +15,8 @@ from evnlos.dataset.live import epoch_settings
 from evnlos.dataset.on_device import simulate_object_on
 from evnlos.dataset.pool import run_in_order
 from evnlos.dataset.sampling import edges_from, make_samples
-from evnlos.dataset.simulate import drawn_for
+from evnlos.dataset.simulate import drawn_for, scene_of
 from evnlos.errors import ConfigError
-from evnlos.scene import Scene
 from evnlos.seeds import derive_seed
 from evnlos.sensor import simulate_batch
 from evnlos.training.source import Live
@@ -145,7 +144,7 @@ def test_samples_made_on_a_device_are_those_of_the_same_events(few, surface) -> 
     config = replace(few, sampling=sampling, pixel=replace(few.pixel, threshold_sigma=0.02))
     name = config.glyphs.objects()[1]
     drawn = drawn_for(config, name)
-    scene = Scene(config.glyphs.target(name, derive_seed(config.seed, "glyph")), drawn.motion, drawn.duration_s)
+    scene = scene_of(drawn, name)
     shape = config.sensor.height, config.sensor.width
     wall, times_s = drawn.transport.wall(scene, shape), scene.position_times_s(config.positions)
     steps = np.linspace(0.0, drawn.duration_s, round(drawn.duration_s / 0.002) + 1)

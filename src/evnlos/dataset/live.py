@@ -16,10 +16,9 @@ from evnlos.dataset.loader import Paradigm, network_input
 from evnlos.dataset.on_device import simulate_object_on
 from evnlos.dataset.pool import run_in_order
 from evnlos.dataset.sampling import Samples
-from evnlos.dataset.simulate import Simulation, drawn_for, simulate_object, split_of
+from evnlos.dataset.simulate import Simulation, drawn_for, scene_of, simulate_object, split_of
 from evnlos.dataset.store import Dataset
 from evnlos.errors import ConfigError
-from evnlos.scene import Scene
 from evnlos.seeds import derive_seed
 
 
@@ -63,9 +62,7 @@ class LiveDataset(Dataset):
     def truth(self, name: str) -> NDArray[np.float32]:
         """Return the true pictures of an object in the first epoch, float32 [N, H, W], 0..1."""
         config = self.simulation
-        drawn = drawn_for(config, name)
-        target = config.glyphs.target(name, derive_seed(config.seed, "glyph"))
-        scene = Scene(target, drawn.motion, drawn.duration_s)
+        scene = scene_of(drawn_for(config, name), name)
         return scene.truth(config.sampling.canvas, scene.position_times_s(config.positions))
 
 

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from evnlos.dataset.sampling import area_weights, edges_from
-from evnlos.dataset.simulate import Simulation, drawn_for
+from evnlos.dataset.simulate import Simulation, drawn_for, scene_of
 from evnlos.events.surface_tensors import time_surface_tensors
-from evnlos.scene import Scene
 from evnlos.seeds import derive_seed
 from evnlos.sensor.event_tensors import record_tensors
 from evnlos.sensor.frame_tensors import capture_tensors
@@ -46,8 +45,7 @@ def simulate_object_on(
         ConfigError: The pixel has hot pixels or jitter, which this mode has not.
     """
     drawn, sampling = drawn_for(config, name), config.sampling
-    target = config.glyphs.target(name, derive_seed(config.seed, "glyph"))
-    scene = Scene(target, drawn.motion, drawn.duration_s)
+    scene = scene_of(drawn, name)
     times_s = scene.position_times_s(config.positions)
     steps = max(1, round(drawn.duration_s / step_s))
     instants = np.linspace(0.0, drawn.duration_s, steps + 1)

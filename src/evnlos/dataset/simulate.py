@@ -124,6 +124,12 @@ def _needs_a_matrix(path: str) -> bool:
     return section == "transport" and name not in ("gain", "ambient", "ambient_gradient")
 
 
+def scene_of(drawn: Simulation, name: str) -> Scene:
+    """Return what an object's pass shows, given the settings that were drawn for it."""
+    target = drawn.glyphs.target(name, derive_seed(drawn.seed, "glyph"))
+    return Scene(target, drawn.motion, drawn.duration_s)
+
+
 def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     """Simulate one object's pass: scene -> wall -> events and frames -> samples.
 
@@ -135,8 +141,7 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
         The samples of all positions, and the events of the whole pass.
     """
     drawn = drawn_for(config, name)
-    target = config.glyphs.target(name, derive_seed(config.seed, "glyph"))
-    scene = Scene(target, drawn.motion, drawn.duration_s)
+    scene = scene_of(drawn, name)
     wall = drawn.transport.wall(scene, (config.sensor.height, config.sensor.width))
     times_s = scene.position_times_s(config.positions)
     events = EventCamera(drawn.pixel).record(
@@ -146,7 +151,7 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     edges_us = edges_from(times_s)
     peak = 2**drawn.frame_camera.bit_depth - 1
     return make_samples(
-        frames, peak, events, edges_us, config.sampling, motion=scene.motion, target=target
+        frames, peak, events, edges_us, config.sampling, motion=scene.motion, target=scene.target
     ), events
 
 
