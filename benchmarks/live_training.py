@@ -4,7 +4,7 @@
     python benchmarks/live_training.py --device cpu --objects 36 --results benchmarks/results
 
 The default simulation: 160 x 100 pixels, 8 s, 40 positions; the default network, one epoch. The stages are
-those of a GPU (`simulate_object_on`, steps of 2 ms), also where the device is the CPU; a training on the CPU
+those of a GPU (`simulate_objects_on`, steps of 2 ms), also where the device is the CPU; a training on the CPU
 uses `simulate_object` instead. Wall time; the first object of each kind is left out.
 """
 
@@ -53,16 +53,16 @@ def watched(function: Callable, device: torch.device, spent: dict[str, float], s
     return timed
 
 
-def stages(config: Simulation, names: list[str], device: torch.device) -> dict[str, float]:
-    """Return seconds an object of each stage on a device, and of all."""
+def stages(config: Simulation, names: list[str], device: torch.device, together: int) -> dict[str, float]:
+    """Return seconds an object of each stage on a device, and of all; the first object is left out."""
     spent: dict[str, float] = defaultdict(float)
-    on_device.simulate_object_on(config, names[0], device, STEP_S)
+    on_device.simulate_objects_on(config, names[:1], device, STEP_S)
     before = {name: getattr(on_device, name) for name in STAGES}
     for name, stage in STAGES.items():
         setattr(on_device, name, watched(before[name], device, spent, stage))
     start = clock(device)
-    for name in names[1:]:
-        on_device.simulate_object_on(config, name, device, STEP_S)
+    for first in range(1, len(names), together):
+        on_device.simulate_objects_on(config, names[first : first + together], device, STEP_S)
     total = clock(device) - start
     for name, function in before.items():
         setattr(on_device, name, function)
@@ -75,14 +75,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--objects", type=int, default=36, help="objects simulated (default: 36)")
+    parser.add_argument("--together", type=int, default=16, help="objects simulated at a time (default: 16)")
     parser.add_argument("--results", type=Path, help="folder to write live_training.md to")
     options = parser.parse_args()
     device = torch.device(options.device)
     glyphs = HandwritingGlyphs(writers=max(1, -(-options.objects // 36)))
     config = Simulation(glyphs=glyphs, validation=0.0)
     names = glyphs.objects()[: options.objects]
-    spent = stages(config, names[:9], device)
-    lines = [f"{machine()}; device {device}", "", "| stage | ms an object | share |", "|---|---|---|"]
+    spent = stages(config, names, device, options.together)
+    lines = [
+        f"{machine('torch')}; device {device}; {options.together} objects at a time",
+        "",
+        "| stage | ms an object | share |",
+        "|---|---|---|",
+    ]
     lines += [f"| {stage} | {1e3 * s:.1f} | {100 * s / spent['all']:.0f} % |" for stage, s in spent.items()]
     simulate_object(config, names[0])
     start = time.perf_counter()

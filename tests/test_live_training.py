@@ -12,7 +12,7 @@ from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.dataset import NlosDataset, live_dataset, simulate_object
 from evnlos.dataset.live import epoch_settings
-from evnlos.dataset.on_device import simulate_object_on
+from evnlos.dataset.on_device import simulate_objects_on
 from evnlos.dataset.pool import run_in_order
 from evnlos.dataset.sampling import edges_from, make_samples
 from evnlos.dataset.simulate import drawn_for, scene_of
@@ -128,12 +128,12 @@ def test_samples_made_on_a_device_are_those_of_the_camera(few) -> None:
     config = replace(few, pixel=pixel)
     name = config.glyphs.objects()[0]
     reference, _ = simulate_object(config, name)
-    samples = simulate_object_on(config, name, CPU, 0.002)
+    samples = simulate_objects_on(config, [name], CPU, 0.002)[0]
     np.testing.assert_allclose(samples.frame.numpy(), reference.frame, atol=1e-6)
     np.testing.assert_array_equal(samples.truth.numpy(), reference.truth)
     likeness = np.corrcoef(samples.surface.numpy().ravel(), reference.surface.ravel())[0, 1]
     assert likeness > 0.98
-    again = simulate_object_on(config, name, CPU, 0.002)
+    again = simulate_objects_on(config, [name], CPU, 0.002)[0]
     assert all(torch.equal(one, other) for one, other in zip(samples, again, strict=True))
 
 
@@ -153,7 +153,7 @@ def test_samples_made_on_a_device_are_those_of_the_same_events(few, surface) -> 
     (events,) = simulate_batch(light, steps, drawn.pixel, [seed], dtype=torch.float32)
     frames = drawn.frame_camera.capture(wall, times_s, derive_seed(config.seed, name, "frames"))
     expected = make_samples(frames, 255, events, edges_from(times_s), sampling)
-    samples = simulate_object_on(config, name, CPU, 0.002)
+    samples = simulate_objects_on(config, [name], CPU, 0.002)[0]
     np.testing.assert_allclose(samples.frame.numpy(), expected.frame, atol=1e-6)
     np.testing.assert_allclose(samples.surface.numpy(), expected.surface, atol=1e-5)
 

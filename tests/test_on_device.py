@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from evnlos.dataset import Sampling, SensorSize, Simulation, live_dataset
-from evnlos.dataset.on_device import simulate_object_on
+from evnlos.dataset.on_device import simulate_objects_on
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
 from evnlos.events.surface_tensors import time_surface_tensors
@@ -99,7 +99,9 @@ def test_electrons_are_those_of_the_compiled_loop(number) -> None:
     offset = draw.normal(0.0, 3.0, len(mean))
     expected = np.empty_like(mean)
     fill_electrons(mean, offset, 6.0, np.uint64(2**63 + 5), np.uint64(number), expected)
-    made = electrons(torch.from_numpy(mean), torch.from_numpy(offset), 6.0, 2**63 + 5, number).numpy()
+    rows = torch.from_numpy(mean).expand(3, -1)
+    made = electrons(rows, torch.from_numpy(offset), 6.0, 2**63 + 5, number - 1 if number else 0).numpy()
+    made = made[1 if number else 0]
     np.testing.assert_allclose(made, expected, rtol=1e-12, atol=1e-9)
 
 
@@ -156,7 +158,7 @@ def test_light_that_is_rendered_in_blocks_gives_the_events_of_whole_clips(small,
         255.0 * wall.irradiance(times_s)[None], times_s, pixel, [9], dtype=torch.float32
     )
     assert len(expected) > 500
-    assert record_tensors(wall, times_s, pixel, 9).to_events() == expected
+    assert record_tensors([wall], times_s, [pixel], [9])[0].to_events() == expected
 
 
 class _BadWall:
@@ -176,16 +178,47 @@ class _BadWall:
 )
 def test_light_that_no_wall_has_is_refused(value, words) -> None:
     with pytest.raises(DataError, match=words):
-        record_tensors(_BadWall(value), np.linspace(0.0, 1.0, 101), EventPixel(), 0)
+        record_tensors([_BadWall(value)], np.linspace(0.0, 1.0, 101), [EventPixel()], [0])
     with pytest.raises(DataError, match=words):
         capture_tensors(FrameCamera(), _BadWall(value), [0.2, 0.9])
 
 
+def test_clips_with_pixels_of_their_own_give_the_events_of_each_alone(small) -> None:
+    pixels = [
+        EventPixel(0.05, 0.06, 0.01, cutoff_hz=5.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0),
+        EventPixel(0.08, 0.05, 0.0, cutoff_hz=200.0, leak_rate_hz=2.0, shot_noise_rate_hz=0.0),
+        EventPixel(0.10, 0.11, 0.03, cutoff_hz=40.0, leak_rate_hz=0.0, shot_noise_rate_hz=5.0),
+    ]
+    walls = [wall_of(replace(small, transport=replace(small.transport, gain=gain))) for gain in (1.0, 2.0, 3.0)]
+    times_s = np.linspace(0.0, 2.0, 101)
+    together = record_tensors(walls, times_s, pixels, [7, 8, 9])
+    for number, events in enumerate(together):
+        light = 255.0 * walls[number].irradiance(times_s)[None]
+        (alone,) = simulate_batch(light, times_s, pixels[number], [7 + number], dtype=torch.float32)
+        assert len(alone) > 200
+        assert events.to_events() == alone
+
+
+@pytest.mark.parametrize(
+    ("walls", "pixels", "words"),
+    [
+        (1, [EventPixel(), EventPixel()], "1 walls, 2 pixels"),
+        (2, [EventPixel(), EventPixel(cutoff_hz=0.0)], "their pixels in kind"),
+        (2, [EventPixel(), EventPixel(refractory_s=0.01)], "their pixels in kind"),
+        (0, [], "give one of each"),
+    ],
+)
+def test_clips_that_cannot_run_together_are_refused(small, walls, pixels, words) -> None:
+    with pytest.raises(ConfigError, match=words):
+        record_tensors([wall_of(small)] * walls, [0.0, 1.0], pixels, [0] * len(pixels))
+
+
 def test_pixels_that_the_stepped_mode_lacks_are_refused(small) -> None:
+    wall = wall_of(small)
     with pytest.raises(ConfigError, match="no hot pixels"):
-        record_tensors(wall_of(small), np.linspace(0.0, 1.0, 11), EventPixel(hot_pixel_fraction=0.1), 0)
+        record_tensors([wall], np.linspace(0.0, 1.0, 11), [EventPixel(hot_pixel_fraction=0.1)], [0])
     with pytest.raises(DataError, match="at least 2"):
-        record_tensors(wall_of(small), np.zeros(1), EventPixel(), 0)
+        record_tensors([wall], np.zeros(1), [EventPixel()], [0])
 
 
 # On a pretended device: nothing is made in the wrong place, and nothing large comes back.
@@ -209,10 +242,10 @@ def test_the_pretended_device_refuses_what_a_gpu_refuses() -> None:
 def test_an_object_is_simulated_where_it_is_asked_for(small, kind, surface) -> None:
     config = replace(small, transport=WALLS[kind], sampling=replace(small.sampling, surface=surface))
     name = config.glyphs.objects()[0]
-    expected = simulate_object_on(config, name, "cpu", 0.02)
+    expected = simulate_objects_on(config, [name], "cpu", 0.02)[0]
     assert expected.surface.max() > 0.1
     with PretendedDevice() as mode:
-        made = simulate_object_on(config, name, PRETENDED, 0.02)
+        made = simulate_objects_on(config, [name], PRETENDED, 0.02)[0]
         crossings = mode.crossings
         assert {part.device for part in made} == {PRETENDED}
         for part, truth in zip(made, expected, strict=True):
@@ -221,13 +254,24 @@ def test_an_object_is_simulated_where_it_is_asked_for(small, kind, surface) -> N
     assert crossings < 100 + 100
 
 
+@pytest.mark.parametrize("vary", [{}, {"pixel.cutoff_hz": (10.0, 80.0)}, {"pixel.refractory_s": (0.01, 0.03)}])
+def test_an_object_does_not_depend_on_those_beside_it(small, vary) -> None:
+    config = replace(small, vary={"pixel.threshold_on": (0.05, 0.2), "transport.gain": (1.0, 3.0), **vary})
+    names = list(reversed(config.glyphs.objects()))
+    together = simulate_objects_on(config, names, "cpu", 0.02)
+    assert len(together) == 2
+    for name, made in zip(names, together, strict=True):
+        (alone,) = simulate_objects_on(config, [name], "cpu", 0.02)
+        assert all(torch.equal(one, other) for one, other in zip(made, alone, strict=True))
+
+
 def test_a_plate_may_move_along_any_path(small) -> None:
     path = PathMotion((0.0, 1.0, 2.0), ((0.0, 0.0), (0.02, 0.01), (0.03, -0.01)))
     name = small.glyphs.objects()[0]
     config = replace(small, motion=path)
-    expected = simulate_object_on(config, name, "cpu", 0.02)
+    expected = simulate_objects_on(config, [name], "cpu", 0.02)[0]
     with PretendedDevice():
-        made = simulate_object_on(config, name, PRETENDED, 0.02)
+        made = simulate_objects_on(config, [name], PRETENDED, 0.02)[0]
         torch.testing.assert_close(made.surface.cpu(), expected.surface, rtol=1e-6, atol=1e-6)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.loader import Paradigm, network_input
-from evnlos.dataset.on_device import simulate_object_on
+from evnlos.dataset.on_device import simulate_objects_on
 from evnlos.dataset.pool import run_in_order
 from evnlos.dataset.sampling import Samples
 from evnlos.dataset.simulate import Simulation, drawn_for, scene_of, simulate_object, split_of
@@ -36,6 +36,8 @@ class LiveDataset(Dataset):
     """Processes that simulate on the CPU; 1 = in this process, 0 = one for each core."""
     mix: int = 8
     """Objects whose samples are shuffled together."""
+    together: int = 16
+    """Objects that a GPU simulates at a time."""
     step_s: float = 0.002
     """Time step of the pixels on a GPU, seconds; on the CPU the camera chooses its steps."""
 
@@ -53,11 +55,17 @@ class LiveDataset(Dataset):
             tasks = [(config, name) for name in names]
             made = (_tensors(samples) for samples in run_in_order(_samples, tasks, self.workers))
         else:
-            made = (simulate_object_on(config, name, device, self.step_s) for name in names)
+            made = self._on_device(config, list(names), device)
         for maps in made:
             # in half precision twice, as shards hold the maps and a loader the inputs
             frame, surface, truth = (part.half().float() for part in maps)
             yield network_input(frame, surface, paradigm).half().float(), truth[:, None]
+
+    def _on_device(
+        self, config: Simulation, names: list[str], device: torch.device
+    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        for first in range(0, len(names), self.together):
+            yield from simulate_objects_on(config, names[first : first + self.together], device, self.step_s)
 
     def truth(self, name: str) -> NDArray[np.float32]:
         """Return the true pictures of an object in the first epoch, float32 [N, H, W], 0..1."""

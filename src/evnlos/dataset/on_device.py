@@ -1,7 +1,8 @@
-"""One object's samples, made on a device from the light to the maps: nothing large passes main memory."""
+"""Samples of objects, made on a device from the light to the maps: nothing large passes main memory."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +12,12 @@ from torch import Tensor
 from evnlos.dataset.sampling import area_weights, edges_from
 from evnlos.dataset.simulate import Simulation, drawn_for, scene_of
 from evnlos.events.surface_tensors import time_surface_tensors
+from evnlos.scene import Scene
 from evnlos.seeds import derive_seed
-from evnlos.sensor.event_tensors import record_tensors
+from evnlos.sensor.event_tensors import can_share, record_tensors
 from evnlos.sensor.frame_tensors import capture_tensors
+from evnlos.sensor.tensors import EventTensors
+from evnlos.transport import Wall
 
 
 class DeviceSamples(NamedTuple):
@@ -27,42 +31,54 @@ class DeviceSamples(NamedTuple):
     """[N, H, W], 0..1."""
 
 
-def simulate_object_on(
-    config: Simulation, name: str, device: torch.device | str, step_s: float
-) -> DeviceSamples:
-    """Simulate one object's pass on a device: wall, frames, event pixels, surfaces and maps.
+def simulate_objects_on(
+    config: Simulation, names: Sequence[str], device: torch.device | str, step_s: float
+) -> list[DeviceSamples]:
+    """Simulate some objects' passes on a device: walls, frames, event pixels, surfaces and maps.
 
-    The glyph is drawn on the CPU. The pixels step from frame to frame (`mode="v2e"`) in steps of `step_s`;
-    frames, surfaces and maps are those of `simulate_object` to single precision, given the same events.
+    The glyphs are drawn on the CPU. The pixels step from frame to frame (`mode="v2e"`) in steps of `step_s`,
+    those of all objects together where they can; frames, surfaces and maps are those of `simulate_object` to
+    single precision, given the same events. An object's samples do not depend on the others.
 
     Args:
         config: The settings.
-        name: One of `config.glyphs.objects()`.
+        names: Some of `config.glyphs.objects()`.
         device: Where all else is computed, and stays.
         step_s: Time step, seconds.
 
     Raises:
         ConfigError: The pixel has hot pixels or jitter, which this mode has not.
     """
-    drawn, sampling = drawn_for(config, name), config.sampling
-    scene = scene_of(drawn, name)
-    times_s = scene.position_times_s(config.positions)
-    steps = max(1, round(drawn.duration_s / step_s))
-    instants = np.linspace(0.0, drawn.duration_s, steps + 1)
-    shape = (sampling.height, sampling.width)
+    drawn = [drawn_for(config, name) for name in names]
+    if len({one.duration_s for one in drawn}) > 1 or not can_share([one.pixel for one in drawn]):
+        return [simulate_objects_on(config, [name], device, step_s)[0] for name in names]
+    scenes = [scene_of(one, name) for one, name in zip(drawn, names, strict=True)]
+    steps = max(1, round(drawn[0].duration_s / step_s))
+    instants = np.linspace(0.0, drawn[0].duration_s, steps + 1)
     with torch.no_grad():
-        wall = drawn.transport.wall(scene, (config.sensor.height, config.sensor.width), device)
-        seed = derive_seed(config.seed, name, "events")
-        events = record_tensors(wall, instants, drawn.pixel, seed)
-        frames = capture_tensors(drawn.frame_camera, wall, times_s, derive_seed(config.seed, name, "frames"))
-        surface = time_surface_tensors(
-            events, edges_from(times_s), sampling.tau_s * 1e6, sampling.surface, radius=sampling.radius
-        )
-        return DeviceSamples(
-            _reduced(frames / drawn.frame_camera.white, shape),
-            _reduced(surface, shape),
-            torch.from_numpy(scene.truth(sampling.canvas, times_s)).to(device),
-        )
+        shape = config.sensor.height, config.sensor.width
+        walls = [one.transport.wall(scene, shape, device) for one, scene in zip(drawn, scenes, strict=True)]
+        seeds = [derive_seed(config.seed, name, "events") for name in names]
+        events = record_tensors(walls, instants, [one.pixel for one in drawn], seeds)
+        return [_samples(*one, config) for one in zip(drawn, scenes, walls, events, names, strict=True)]
+
+
+def _samples(
+    drawn: Simulation, scene: Scene, wall: Wall, events: EventTensors, name: str, config: Simulation
+) -> DeviceSamples:
+    """Return an object's maps, given its events."""
+    sampling, device = config.sampling, events.t_us.device
+    times_s = scene.position_times_s(config.positions)
+    frames = capture_tensors(drawn.frame_camera, wall, times_s, derive_seed(config.seed, name, "frames"))
+    surface = time_surface_tensors(
+        events, edges_from(times_s), sampling.tau_s * 1e6, sampling.surface, radius=sampling.radius
+    )
+    shape = sampling.height, sampling.width
+    return DeviceSamples(
+        _reduced(frames / drawn.frame_camera.white, shape),
+        _reduced(surface, shape),
+        torch.from_numpy(scene.truth(sampling.canvas, times_s)).to(device),
+    )
 
 
 def _reduced(images: Tensor, shape: tuple[int, int]) -> Tensor:

@@ -93,7 +93,8 @@ def run_batch(
                 )
                 fields = on.contiguous(), off.contiguous()
             group_seeds = keys[first : first + group]
-            made = Pixels(some, times, pixel, group_seeds, fields, dtype, tile_px).run()
+            kinds = [pixel] * some.shape[0]
+            made = Pixels(some, times, kinds, group_seeds, fields, dtype, tile_px).run()
             events.extend(one.to_events() for one in made)
     return events
 

@@ -22,6 +22,7 @@ from evnlos.sensor.light import WHITE_DN
 _KNEE = 20.0
 _SLOPE = math.log(_KNEE) / _KNEE
 _AHEAD = 32  # instants rendered at a time, at least
+_AHEAD_PX = 1 << 23  # pixels of all these instants, about
 
 
 class Blocks(Protocol):
@@ -55,33 +56,36 @@ class Clips:
 
 
 class WallLight:
-    """Light that a wall renders when pixels ask for it, and forgets: a clip of any length in little memory.
+    """Light that walls render when pixels ask for it, and forget: clips of any length in little memory.
 
     Args:
-        wall: The wall; the light is where it renders.
+        walls: One wall a clip, of one size, on one device.
         times_s: Instants, float64 [T], seconds.
 
     Raises:
-        DataError: The wall returned NaN, infinity or negative light; also by `block`.
+        DataError: A wall returned NaN, infinity or negative light; also by `block`.
     """
 
     dtype = torch.float32
 
-    def __init__(self, wall: Wall, times_s: NDArray[np.float64]) -> None:
-        self._wall, self._times_s = wall, times_s
-        height, width = wall.shape
-        self.shape: tuple[int, int, int, int] = (1, len(times_s), height, width)
+    def __init__(self, walls: Sequence[Wall], times_s: NDArray[np.float64]) -> None:
+        height, width = walls[0].shape
+        self._walls, self._times_s = walls, times_s
+        self.shape: tuple[int, int, int, int] = (len(walls), len(times_s), height, width)
+        self._ahead = max(_AHEAD, _AHEAD_PX // (len(walls) * height * width))
         self._first, self._held = 0, self._rendered(0, 1)
         self.device = self._held.device
 
     def block(self, first: int, last: int) -> Tensor:
-        """Return the light at the instants first..last - 1, [1, last - first, pixels]."""
-        if not self._first <= first <= last <= self._first + len(self._held):
-            self._first, self._held = first, self._rendered(first, max(last, first + _AHEAD))
-        return self._held[None, first - self._first : last - self._first]
+        """Return the light at the instants first..last - 1, [clips, last - first, pixels]."""
+        if not self._first <= first <= last <= self._first + self._held.shape[1]:
+            self._first, self._held = first, self._rendered(first, max(last, first + self._ahead))
+        return self._held[:, first - self._first : last - self._first]
 
     def _rendered(self, first: int, last: int) -> Tensor:
-        light = self._wall.irradiance(self._times_s[first:last]).flatten(1).to(torch.float32) * WHITE_DN
+        times_s = self._times_s[first:last]
+        light = torch.stack([wall.irradiance(times_s).to(torch.float32) for wall in self._walls])
+        light = light.flatten(2).mul_(WHITE_DN)
         check_range(light, "the wall's light")
         return light
 
@@ -107,8 +111,8 @@ def lin_log(light: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
     return logs.mul_(1e8).round_().div_(1e8).to(torch.float32)
 
 
-def filter_weight(light: Tensor, rate: float, dtype: torch.dtype) -> Tensor:
-    """Return the weight min((I + 20) / 275 d 2 pi fc, 1) of new light; `rate` is d 2 pi fc."""
+def filter_weight(light: Tensor, rate: float | Tensor, dtype: torch.dtype) -> Tensor:
+    """Return the weight min((I + 20) / 275 d 2 pi fc, 1) of new light; `rate` is d 2 pi fc, of all or each."""
     return (light.to(dtype) + 20.0).div_(275.0).mul_(rate).clamp_(max=1.0)
 
 
@@ -119,7 +123,7 @@ class Filter:
     the log light L0 of the first frame, so that its rounding is that of changes. Without a filter P = L.
 
     Args:
-        rates: d 2 pi fc of each step, empty without a filter.
+        rates: d 2 pi fc of each step and clip, float64 [clips, steps]; no steps without a filter.
         is_bytes: Whether the light has 8 bits.
         dtype: float64 or float32; float32 without a filter.
         capacity: Most pixels that `advance` ever takes.
@@ -127,10 +131,18 @@ class Filter:
     """
 
     def __init__(
-        self, rates: Sequence[float], is_bytes: bool, dtype: torch.dtype, capacity: int, device: torch.device
+        self,
+        rates: NDArray[np.float64],
+        is_bytes: bool,
+        dtype: torch.dtype,
+        capacity: int,
+        device: torch.device,
     ) -> None:
-        self._rates, self._is_bytes, self._device = rates, is_bytes, device
-        self.has_filter = len(rates) > 0
+        self._is_bytes, self._device = is_bytes, device
+        self.has_filter = rates.shape[1] > 0
+        # one number a step where all clips have the same pixels; such light alone may have 8 bits
+        self._rates: list[float] = rates[0].tolist()
+        self._each = torch.from_numpy(rates.T).to(device, dtype) if (rates != rates[:1]).any() else None
         self.relative = self.has_filter and dtype == torch.float32
         self._index = torch.empty(capacity if is_bytes else 0, dtype=torch.int64, device=device)
         self._log = torch.empty(capacity if is_bytes else 0, dtype=dtype, device=device)
@@ -153,17 +165,28 @@ class Filter:
             self._keep = list((1.0 - weights).unbind())
             self._gain = list(weights.mul_(self._logs.to(torch.float64)).unbind())
 
-    def advance(self, lp: Tensor, light: Tensor, origin: Tensor, step: int) -> None:
-        """Move the output `lp` [n] by one step, in place, given the new light (n values) and L0 [n]."""
+    def advance(self, lp: Tensor, light: Tensor, origin: Tensor, step: int, clip: Tensor | slice) -> None:
+        """Move the output `lp` [n] by one step, in place.
+
+        Args:
+            lp: Output, [n].
+            light: New light, [n], or [clips, n / clips] of whole clips.
+            origin: L0, [n].
+            step: Step of the block.
+            clip: The clip of each row of `light`.
+        """
         if self._is_bytes:
             self._advance_bytes(lp, light, origin, step)
             return
-        light = light.reshape(-1)
         if not self.has_filter:
-            lp.copy_(lin_log(light))
+            lp.copy_(lin_log(light.reshape(-1)))
             return
-        weight = filter_weight(light, self._rates[self._first + step], lp.dtype)
-        logs = lin_log(light, lp.dtype)
+        rate: float | Tensor = self._rates[self._first + step]
+        if self._each is not None:
+            rate = self._each[self._first + step, clip]
+            rate = rate[:, None] if light.ndim > 1 else rate
+        weight = filter_weight(light, rate, lp.dtype).reshape(-1)
+        logs = lin_log(light.reshape(-1), lp.dtype)
         if self.relative:
             lp.lerp_(logs.sub_(origin), weight)
         else:

@@ -28,7 +28,7 @@ class Leak:
     Args:
         seeds: Seed of each clip.
         on: ON thresholds, float64 [clips, pixels].
-        scales: Leak rate times duration of each step, float32 [steps].
+        scales: Leak rate times duration of each step, float32 [clips, steps].
     """
 
     def __init__(self, seeds: list[int], on: Tensor, scales: Tensor) -> None:
@@ -51,7 +51,7 @@ class Leak:
         steps = torch.arange(first, last, device=self._ring.device)
         words = random_word(self._words, self._blocks, steps)  # [clips, blocks, steps]
         self._offsets = words.bitwise_and_(JITTER_SIZE - 1)
-        self._now = self._scales[first:last]
+        self._now = self._scales[:, first:last]
 
     def total(self, first: int, last: int) -> Tensor:
         """Return the leak of the flat pixels first..last - 1 over the block, float32 [last - first]."""
@@ -60,7 +60,7 @@ class Leak:
         width = min(last - first, self._pixels)
         blocks = slice(start // BLOCK, -(-(start + width) // BLOCK))
         offsets = self._offsets[clip : clip + clips, blocks]  # [clips, blocks, steps]
-        weights = self._now.expand(offsets[..., 0].numel(), -1).contiguous()
+        weights = self._now[clip : clip + clips, None].expand(offsets.shape).flatten(0, 1).contiguous()
         sums = functional.embedding_bag(
             offsets.reshape(-1, offsets.shape[-1]), self._stretches, mode="sum", per_sample_weights=weights
         )  # [clips * blocks, 256]
@@ -72,7 +72,7 @@ class Leak:
         clip = flat // self._pixels
         pixel = flat - clip * self._pixels
         places = self._offsets[clip, pixel // BLOCK].t() + pixel % BLOCK  # [steps, n]
-        return (self._now[:, None] * self._factor[flat]).mul_(self._ring[places])
+        return (self._now[clip].t() * self._factor[flat]).mul_(self._ring[places])
 
 
 class ShotNoise:
@@ -80,24 +80,25 @@ class ShotNoise:
 
     Args:
         seeds: Seed of each clip.
-        nominal: Nominal thresholds (on, off), log units.
+        nominal: Nominal thresholds (on, off) of each clip, float64 [clips, 2], log units.
         on: ON thresholds of the pixels, float64 [clips, pixels].
         off: The same for OFF.
-        chance: Half the rate times the duration of each step, [steps].
+        chance: Half the rate times the duration of each step, [clips, steps].
     """
 
     def __init__(
         self,
         seeds: list[int],
-        nominal: tuple[float, float],
+        nominal: NDArray[np.float64],
         on: Tensor,
         off: Tensor,
         chance: NDArray[np.float64],
     ) -> None:
         clips, self._pixels = on.shape
         device = on.device
-        self._nominal, self._on, self._off = nominal, on, off
-        most = (nominal[0] / on + nominal[1] / off).amax(1).cpu().numpy()[:, None]
+        self._nominal, self._on, self._off = torch.from_numpy(nominal).to(device), on, off
+        likely = self._nominal[:, :1] / on + self._nominal[:, 1:] / off
+        most = likely.amax(1).cpu().numpy()[:, None]
         ceiling = np.minimum(chance * most * _DIM_MAX, 1.0 - 1e-9)
         spent = np.cumsum(np.concatenate([np.zeros((clips, 1)), -np.log1p(-ceiling)], 1), 1)[:, 1:]
         self._chance = torch.from_numpy(chance).to(device)
@@ -140,9 +141,9 @@ class ShotNoise:
         pixel = flat - clip * self._pixels
         light = frames[clip, step, pixel].to(torch.float64)
         dim = 1.0 - 0.75 * ((light + 20.0) / 275.0)
-        chance, ceiling = self._chance[first + step], self._ceiling[clip, first + step]
+        chance, ceiling = self._chance[clip, first + step], self._ceiling[clip, first + step]
         counter = self._drawn[flat].to(torch.int64)
         uniform = random_uniform(self._choice_words[clip], pixel, counter) * ceiling
-        on = uniform < chance * dim * (self._nominal[0] / self._on[clip, pixel])
-        off = uniform > ceiling - chance * dim * (self._nominal[1] / self._off[clip, pixel])
+        on = uniform < chance * dim * (self._nominal[clip, 0] / self._on[clip, pixel])
+        off = uniform > ceiling - chance * dim * (self._nominal[clip, 1] / self._off[clip, pixel])
         return on.to(torch.int64) - (off & ~on).to(torch.int64)

@@ -13,33 +13,33 @@ _MOST = 2000
 _UNASKED = 16  # steps between questions to the device whether any pixel still counts
 
 
-def electrons(mean: Tensor, offset: Tensor, read_noise: float, seed: int, number: int) -> Tensor:
-    """Return the electrons of frame `number`: a Poisson number of `mean`, `offset`, and read noise.
+def electrons(mean: Tensor, offset: Tensor, read_noise: float, seed: int, first: int) -> Tensor:
+    """Return the electrons of some frames: Poisson numbers of `mean`, `offset`, and read noise.
 
     The numbers are those of `fill_electrons` but for pixels, one in millions, whose normal number lies within
     the last digits of a step.
 
     Args:
-        mean: Electrons expected, float64 [N], 0 or more.
+        mean: Electrons expected, float64 [frames, N], 0 or more.
         offset: Electrons added, float64 [N].
         read_noise: Standard deviation, electrons.
         seed: Seed of the capture.
-        number: Number of the frame.
+        first: Number of the first frame; the others follow it.
 
     Returns:
-        float64 [N].
+        float64 [frames, N].
     """
-    pixel = torch.arange(len(mean), device=mean.device)
-    counter = torch.full_like(pixel, number)
-    shot, read = random_normals(stream_word([seed], STREAM_PHOTONS, mean.device), pixel, counter)
+    number, pixel = (torch.arange(side, device=mean.device) for side in mean.shape)
+    number = number[:, None] + first
+    shot, read = random_normals(stream_word([seed], STREAM_PHOTONS, mean.device), pixel, number)
     many = mean.clamp(min=FEW)
     root = many.sqrt()
     count = many + root * shot + (shot * shot - 1.0) / 6.0 + (shot - shot * shot * shot) / (72.0 * root)
     count = count.round_().clamp_(min=0.0)
-    few = (mean < FEW).nonzero()[:, 0]
+    frame, few = (mean < FEW).nonzero(as_tuple=True)
     if len(few):
         word = stream_word([seed], STREAM_FEW_PHOTONS, mean.device)
-        count[few] = _few(mean[few], random_uniform(word, few, counter[few]))
+        count[frame, few] = _few(mean[frame, few], random_uniform(word, few, frame + first))
     return count.add_(offset).add_(read.mul_(read_noise))
 
 

@@ -10,6 +10,7 @@ times a block, to learn how many these are, and never within a step.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
 from evnlos.sensor.tensors import EventTensors
 
 STEPS = 32
+_NOISES = ("leak_rate_hz", "shot_noise_rate_hz")
 _TILE_CPU, _TILE_DEVICE = 16_384, 1 << 22
 _MARGIN = {torch.float64: 1e-9, torch.float32: 1e-5}
 """How far inside a threshold a pixel still counts as one that may have crossed: far above the rounding."""
@@ -42,7 +44,7 @@ class Pixels:
     Args:
         light: Light in DN, uint8, float32 or float64 [clips, T, H, W].
         times_s: Instants of the frames, float64 [T].
-        pixel: Parameters of the pixels.
+        kinds: Parameters of each clip's pixels; all have a filter or none, and the same refractory period.
         seeds: Seed of each clip.
         thresholds: Maps (on, off), float64 [clips, pixels] each; None draws them.
         dtype: Precision of the state, float64 or float32.
@@ -53,38 +55,45 @@ class Pixels:
         self,
         light: Blocks,
         times_s: NDArray[np.float64],
-        pixel: EventPixel,
+        kinds: Sequence[EventPixel],
         seeds: list[int],
         thresholds: tuple[Tensor, Tensor] | None,
         dtype: torch.dtype,
         tile_px: int,
     ) -> None:
-        self._light, self.times_s, self.pixel = light, times_s, pixel
+        self._light, self.times_s = light, times_s
         device, (clips, _, height, width) = light.device, light.shape
         pixels = height * width
         self.pixels, self._count = pixels, clips * pixels
         delta = np.diff(times_s)
-        filtered = pixel.cutoff_hz > 0
+        filtered = kinds[0].cutoff_hz > 0
         dtype = dtype if filtered else torch.float32
         if thresholds is None:
-            sigma = pixel.threshold_sigma
-            on = _thresholds(pixel.threshold_on, sigma, seeds, STREAM_THRESHOLD_ON, pixels, device)
-            off = _thresholds(pixel.threshold_off, sigma, seeds, STREAM_THRESHOLD_OFF, pixels, device)
+            on, off = (
+                torch.cat(
+                    [
+                        _thresholds(kind, p, seed, pixels, device)
+                        for kind, seed in zip(kinds, seeds, strict=True)
+                    ]
+                )
+                for p in (True, False)
+            )
         else:  # v2e keeps thresholds that differ in single precision, and equal ones as a double
             on, off = (values.to(torch.float32).to(torch.float64) for values in thresholds)
         self.step_on, self.step_off = on.to(torch.float32).view(-1), off.to(torch.float32).view(-1)
         self.leak = self.shot = None
-        if pixel.leak_rate_hz > 0:
-            scales = torch.from_numpy((pixel.leak_rate_hz * delta).astype(np.float32)).to(device)
+        leaks, shots = (np.array([[getattr(kind, name)] for kind in kinds]) for name in _NOISES)  # [clips, 1]
+        if leaks.any():
+            scales = torch.from_numpy((leaks * delta).astype(np.float32)).to(device)
             self.leak = Leak(seeds, on, scales)
-        if pixel.shot_noise_rate_hz > 0:
-            chance = 0.5 * pixel.shot_noise_rate_hz * delta
-            self.shot = ShotNoise(seeds, (pixel.threshold_on, pixel.threshold_off), on, off, chance)
+        if shots.any():
+            nominal = np.array([(kind.threshold_on, kind.threshold_off) for kind in kinds], np.float64)
+            self.shot = ShotNoise(seeds, nominal, on, off, 0.5 * shots * delta)
         self.on, self.off = on.to(dtype).view(-1), off.to(dtype).view(-1)
         self._tiles = _tiles(clips, pixels, tile_px)
         capacity = max(last - first for first, last in self._tiles)
-        rates = (delta / (1.0 / (math.pi * 2.0 * pixel.cutoff_hz))).tolist() if filtered else []
-        self.filter = Filter(rates, light.dtype == torch.uint8, dtype, capacity, device)
+        rates = [delta / (1.0 / (math.pi * 2.0 * kind.cutoff_hz)) if filtered else delta[:0] for kind in kinds]
+        self.filter = Filter(np.array(rates), light.dtype == torch.uint8, dtype, capacity, device)
         self._capacity = capacity
         self._low, self._high = (torch.empty(capacity, dtype=dtype, device=device) for _ in range(2))
         self._margin = _MARGIN[dtype]
@@ -95,7 +104,8 @@ class Pixels:
         self.base = self.lp.clone()
         self._start_lp, self._start_base = torch.empty_like(self.lp), torch.empty_like(self.base)
         self._peaks = torch.zeros(clips, len(delta), dtype=torch.int64, device=device)
-        self.refractory = Refractory(pixel.refractory_s, self.lp) if pixel.refractory_s > 0 else None
+        period_s = kinds[0].refractory_s
+        self.refractory = Refractory(period_s, self.lp) if period_s > 0 else None
         # single precision keeps the rounding of each leak step, so every pixel goes step by step
         self._every_pixel = self.leak is not None and not filtered
 
@@ -158,8 +168,9 @@ class Pixels:
         self._start_lp[first:last] = lp
         self._start_base[first:last] = base
         block = self._part(light, first, last)
+        clips = slice(first // self.pixels, first // self.pixels + len(block))
         for step, row in enumerate(block.unbind(1)):
-            self.filter.advance(lp, row, origin, step)
+            self.filter.advance(lp, row, origin, step, clips)
             if step == 0:
                 low.copy_(lp)
                 high.copy_(lp)
@@ -194,8 +205,9 @@ class Pixels:
         leaks = None if self.leak is None else self.leak.steps(flat)
         shots = self._shot_map(shot, flat, len(rows)) if shot is not None and len(shot[0]) else None
         crossings = torch.empty(rows.shape, dtype=torch.int64, device=flat.device)
+        clip = flat // self.pixels
         for step, row in enumerate(rows.unbind()):
-            self.filter.advance(lp, row, origin, step)
+            self.filter.advance(lp, row, origin, step, clip)
             if leaks is not None:
                 base.sub_(leaks[step])
             change = lp - base
@@ -223,15 +235,14 @@ class Pixels:
         return hits
 
 
-def _thresholds(
-    nominal: float, sigma: float, seeds: list[int], stream: int, pixels: int, device: torch.device
-) -> Tensor:
-    """Return thresholds, float64 [clips, pixels], log units: equal, or drawn, clamped, rounded to float32."""
-    shape = (len(seeds), pixels)
+def _thresholds(kind: EventPixel, on: bool, seed: int, pixels: int, device: torch.device) -> Tensor:
+    """Return a clip's thresholds, float64 [1, pixels]: equal, or drawn, clamped and rounded to float32."""
+    nominal, sigma = kind.threshold_on if on else kind.threshold_off, kind.threshold_sigma
+    stream = STREAM_THRESHOLD_ON if on else STREAM_THRESHOLD_OFF
     if sigma == 0:
-        return torch.full(shape, nominal, dtype=torch.float64, device=device)
+        return torch.full((1, pixels), nominal, dtype=torch.float64, device=device)
     return fill(
-        torch.empty(shape, dtype=torch.float64, device=device), "normal", seeds, stream,
+        torch.empty(1, pixels, dtype=torch.float64, device=device), "normal", [seed], stream,
         lambda normal, _, __: normal.mul_(sigma).add_(nominal).clamp_(min=MIN_THRESHOLD).to(torch.float32),
     )  # fmt: skip
 

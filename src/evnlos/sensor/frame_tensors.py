@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from evnlos.errors import DataError
@@ -16,6 +16,7 @@ from evnlos.sensor.event_camera import Wall
 from evnlos.sensor.frame_camera import FrameCamera, check_extremes
 
 Pattern = tuple[Tensor, Tensor]
+_TOGETHER_PX = 1 << 22  # pixels of frames that are made in one operation
 
 
 def capture_tensors(camera: FrameCamera, wall: Wall, times_s: ArrayLike, seed: int = 0) -> Tensor:
@@ -37,21 +38,28 @@ def capture_tensors(camera: FrameCamera, wall: Wall, times_s: ArrayLike, seed: i
     if times.ndim != 1 or not len(times) or not np.isfinite(times).all():
         raise DataError(f"times_s has shape {times.shape}; give a 1-D array of finite seconds, at least one")
     seed = check_seed(seed)
-    frames, extremes = [], []
+    height, width = wall.shape
+    most = max(1, _TOGETHER_PX // (height * width))
+    made = []
     with torch.no_grad():
-        for number, time in enumerate(times.tolist()):
-            instants, weights = camera.instants(time)
-            light = wall.irradiance(instants).to(torch.float64)  # [Q, H, W]
-            mean = torch.einsum("q,qhw->hw", light.new_tensor(weights), light)
-            extremes.append(torch.stack(mean.aminmax()))
+        for first in range(0, len(times), most):
+            mean = _exposed(camera, wall, times[first : first + most])
             sensitivity, offset_e = _pattern(camera, wall.shape, seed, mean.device)
-            expected = (sensitivity * mean).flatten()
-            levels = electrons(expected, offset_e.flatten(), camera.read_noise_e, seed, number)
+            expected = (sensitivity * mean).flatten(1)
+            levels = electrons(expected, offset_e.flatten(), camera.read_noise_e, seed, first)
             levels.mul_(camera.dn_per_electron).add_(camera.black_level).round_().clamp_(0, camera.white)
-            frames.append(levels.to(torch.float32).view(wall.shape))
-        lowest, highest = torch.stack(extremes).unbind(1)
-        check_extremes(float(lowest.min()), float(highest.max()))  # the device is asked only here
-        return torch.stack(frames)
+            made.append(levels.to(torch.float32).view(mean.shape))
+    return torch.cat(made)
+
+
+def _exposed(camera: FrameCamera, wall: Wall, times_s: NDArray[np.float64]) -> Tensor:
+    """Return the light averaged over each exposure, float64 [N, H, W]."""
+    moments = [camera.instants(time) for time in times_s.tolist()]
+    light = wall.irradiance(np.concatenate([instants for instants, _ in moments])).to(torch.float64)
+    weights = light.new_tensor(moments[0][1])
+    mean = torch.einsum("q,nqhw->nhw", weights, light.unflatten(0, (len(moments), -1)))
+    check_extremes(*torch.stack(mean.aminmax()).tolist())
+    return mean
 
 
 def _pattern(camera: FrameCamera, shape: tuple[int, int], seed: int, device: torch.device) -> Pattern:
