@@ -296,3 +296,12 @@ def test_a_training_is_fed_on_its_device(small, paradigm) -> None:
         inputs, truth, names = source.some(4)
         assert inputs.device.type == truth.device.type == "cpu"
         assert len(inputs) == len(truth) == len(names) == 4
+
+
+def test_a_gpu_may_be_fed_by_the_cpu(small) -> None:
+    name = small.glyphs.objects()[0]
+    ((expected, _),) = live_dataset(small).stream([name], 0, "fusion", torch.device("cpu"))
+    with PretendedDevice():
+        ((seen, truth),) = live_dataset(small, where="cpu").stream([name], 0, "fusion", PRETENDED)
+        assert seen.device == truth.device == PRETENDED
+        assert torch.equal(seen.cpu(), expected)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,6 +22,8 @@ from evnlos.dataset.store import Dataset
 from evnlos.errors import ConfigError
 from evnlos.seeds import derive_seed
 
+Place = Literal["device", "cpu"]
+
 
 @dataclass(frozen=True)
 class LiveDataset(Dataset):
@@ -36,6 +39,8 @@ class LiveDataset(Dataset):
     """Processes that simulate on the CPU; 1 = in this process, 0 = one for each core."""
     mix: int = 8
     """Objects whose samples are shuffled together."""
+    where: Place = "device"
+    """Simulate on the device of the training, or on the CPU also beside a GPU."""
     together: int = 16
     """Objects that a GPU simulates at a time."""
     step_s: float = 0.002
@@ -46,19 +51,19 @@ class LiveDataset(Dataset):
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield input [N, C, H, W] and truth [N, 1, H, W] of each object, in order, float32.
 
-        On a CPU the samples are those of `simulate_object`, bit for bit. On a GPU everything but the drawing of
-        the glyph happens there, in steps of `step_s`.
+        Simulated on a CPU the samples are those of `simulate_object`, bit for bit. On a GPU everything but the
+        drawing of the glyph happens there, in steps of `step_s`.
         """
         config = epoch_settings(self.simulation, epoch)
         made: Iterator[tuple[Tensor, Tensor, Tensor]]
-        if device.type == "cpu":
+        if device.type == "cpu" or self.where == "cpu":
             tasks = [(config, name) for name in names]
             made = (_tensors(samples) for samples in run_in_order(_samples, tasks, self.workers))
         else:
             made = self._on_device(config, list(names), device)
         for maps in made:
             # in half precision twice, as shards hold the maps and a loader the inputs
-            frame, surface, truth = (part.half().float() for part in maps)
+            frame, surface, truth = (part.half().to(device).float() for part in maps)
             yield network_input(frame, surface, paradigm).half().float(), truth[:, None]
 
     def _on_device(
@@ -74,12 +79,13 @@ class LiveDataset(Dataset):
         return scene.truth(config.sampling.canvas, scene.position_times_s(config.positions))
 
 
-def live_dataset(config: Simulation, workers: int = 1) -> LiveDataset:
+def live_dataset(config: Simulation, workers: int = 1, where: Place = "device") -> LiveDataset:
     """Return a simulation as a dataset to train on.
 
     Args:
         config: The settings.
         workers: Processes that simulate on the CPU; 0 means one for each core.
+        where: "device" simulates where the network trains, "cpu" on the CPU also beside a GPU.
 
     Raises:
         ConfigError: No object is left to train on.
@@ -99,6 +105,7 @@ def live_dataset(config: Simulation, workers: int = 1) -> LiveDataset:
         config.optics(),
         simulation=config,
         workers=workers,
+        where=where,
     )
 
 
