@@ -1,11 +1,10 @@
 """What does a training cost that simulates its samples itself, stage by stage, beside one that reads shards?
 
-    python benchmarks/live_training.py                  # on the GPU where there is one, else on the CPU
-    python benchmarks/live_training.py --device cpu --objects 36 --results benchmarks/results
+    python benchmarks/live_training.py --results benchmarks/results   # on the GPU where there is one
 
 The default simulation: 160 x 100 pixels, 8 s, 40 positions; the default network, one epoch. The stages are
 those of a GPU (`simulate_objects_on`, steps of 2 ms), also where the device is the CPU; a training on the CPU
-uses `simulate_object` instead. Wall time; the first object of each kind is left out.
+uses `simulate_object` instead, by default in one process. Wall time, after a group and an epoch to warm up.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,55 +54,65 @@ def watched(function: Callable, device: torch.device, spent: dict[str, float], s
 
 
 def stages(config: Simulation, names: list[str], device: torch.device, together: int) -> dict[str, float]:
-    """Return seconds an object of each stage on a device, and of all; the first object is left out."""
+    """Return seconds an object of each stage on a device, and of all; one group warms it up."""
     spent: dict[str, float] = defaultdict(float)
-    on_device.simulate_objects_on(config, names[:1], device, STEP_S)
+    groups = [names[first : first + together] for first in range(0, len(names) - together + 1, together)]
+    on_device.simulate_objects_on(config, groups[0], device, STEP_S)
     before = {name: getattr(on_device, name) for name in STAGES}
     for name, stage in STAGES.items():
         setattr(on_device, name, watched(before[name], device, spent, stage))
     start = clock(device)
-    for first in range(1, len(names), together):
-        on_device.simulate_objects_on(config, names[first : first + together], device, STEP_S)
+    for group in groups[1:]:
+        on_device.simulate_objects_on(config, group, device, STEP_S)
     total = clock(device) - start
     for name, function in before.items():
         setattr(on_device, name, function)
-    spent["glyph, optics, truth"] = total - sum(spent.values())
-    return {stage: seconds / (len(names) - 1) for stage, seconds in (*spent.items(), ("all", total))}
+    spent["plates, optics, truth"] = total - sum(spent.values())
+    count = together * (len(groups) - 1)
+    return {stage: seconds / count for stage, seconds in (*spent.items(), ("all", total))}
+
+
+def throughput(config: Simulation, together: int) -> dict[str, float]:
+    """Return samples a second of an epoch that reads shards, and of one that simulates, each after one more."""
+    samples = len(config.glyphs.objects()) * config.positions
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        list(simulate(config, Path(folder, "set"), workers=0))
+        live = replace(live_dataset(config), together=together)
+        for kind, data in (("shards", open_dataset(Path(folder, "set"))), ("simulated", live)):
+            records = list(train(data, Training(epochs=2), Path(folder, kind)))
+            found[kind] = samples / records[-1]["seconds"]
+    return found
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--objects", type=int, default=36, help="objects simulated (default: 36)")
+    parser.add_argument("--groups", type=int, default=2, help="groups of objects measured (default: 2)")
     parser.add_argument("--together", type=int, default=16, help="objects simulated at a time (default: 16)")
     parser.add_argument("--results", type=Path, help="folder to write live_training.md to")
     options = parser.parse_args()
-    device = torch.device(options.device)
-    glyphs = HandwritingGlyphs(writers=max(1, -(-options.objects // 36)))
-    config = Simulation(glyphs=glyphs, validation=0.0)
-    names = glyphs.objects()[: options.objects]
+    if min(options.groups, options.together) < 1:
+        parser.error("--groups and --together are at least 1")
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    count = options.together * (options.groups + 1)
+    config = Simulation(glyphs=HandwritingGlyphs(writers=-(-count // 36)), validation=0.0)
+    names = config.glyphs.objects()[:count]
     spent = stages(config, names, device, options.together)
-    lines = [
-        f"{machine('torch')}; device {device}; {options.together} objects at a time",
-        "",
-        "| stage | ms an object | share |",
-        "|---|---|---|",
-    ]
+    where = torch.cuda.get_device_name(device) if device.type == "cuda" else "no GPU"
+    lines = ["# Training on samples simulated meanwhile", "", *(__doc__ or "").split("\n\n")[2:]]
+    lines += [f"{machine('torch')}; {where}; {options.together} objects at a time", ""]
+    lines += ["| stage | ms an object | share |", "|---|---|---|"]
     lines += [f"| {stage} | {1e3 * s:.1f} | {100 * s / spent['all']:.0f} % |" for stage, s in spent.items()]
-    simulate_object(config, names[0])
+    few = names[: 1 + min(8, count - 1)]
+    simulate_object(config, few[0])
     start = time.perf_counter()
-    for name in names[1:5]:
+    for name in few[1:]:
         simulate_object(config, name)
-    lines.append(f"| `simulate_object`, one process | {1e3 * (time.perf_counter() - start) / 4:.1f} | |")
-    lines += ["", "| training, one epoch | samples/s |", "|---|---|"]
-    settings = Training(epochs=1)
-    with tempfile.TemporaryDirectory() as folder:
-        list(simulate(config, Path(folder, "set"), workers=0))
-        for kind, data in (("shards", open_dataset(Path(folder, "set"))), ("simulated", live_dataset(config))):
-            record = list(train(data, settings, Path(folder, kind)))[-1]
-            samples = len(glyphs.objects()) * config.positions
-            lines.append(f"| {kind} | {samples / record['seconds']:.0f} |")
+    alone = (time.perf_counter() - start) / max(1, len(few) - 1)
+    lines += [f"| `simulate_object`, one process | {1e3 * alone:.1f} | |", ""]
+    lines += ["| training, second epoch | samples/s |", "|---|---|"]
+    lines += [f"| {kind} | {speed:.0f} |" for kind, speed in throughput(config, options.together).items()]
     print("\n".join(lines))
     if options.results is not None:
         (options.results / "live_training.md").write_text("\n".join(lines) + "\n")

@@ -66,11 +66,12 @@ class PretendedDevice(TorchDispatchMode):
 
     Attributes:
         crossings: How many numbers came from the device to main memory.
+        uploads: How many went from main memory to the device.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.crossings = 0
+        self.crossings = self.uploads = 0
         self._from_numbers = _FromNumbers()
 
     def __enter__(self) -> PretendedDevice:
@@ -97,6 +98,8 @@ class PretendedDevice(TorchDispatchMode):
             lambda part: part.inner if isinstance(part, _OnDevice) else part, (args, kwargs)
         )
         made = func(*plain_args, **plain_kwargs)
+        if to_device and name in _CROSSING:
+            self.uploads += sum(part.numel() for part in tensors if not isinstance(part, _OnDevice))
         if name == "aten::copy_":
             if ours and not isinstance(args[0], _OnDevice):
                 self.crossings += made.numel()

@@ -42,6 +42,7 @@ from evnlos.solver.inversion import Inversion, chosen_degree
 from evnlos.transport import MatrixTransport, MeasuredTransport, RadiometricTransport
 from evnlos.transport.measured_file import About, Measurement, read_measurement, write_measurement
 from evnlos.types import Plane
+from pretend_device import PRETENDED, PretendedDevice
 
 SHAPE = (24, 40)
 PLANE = Plane(6, 12, 0.01)
@@ -235,6 +236,10 @@ def test_simulation_of_the_measured_rig_is_that_of_the_true_one(clean) -> None:
     light = true - 0.03
     assert rms(ours - true) < 2e-3 * light.max()
     assert np.abs(ours - true).max() < 1e-2 * light.max()
+    with PretendedDevice():  # one matrix there for all objects
+        there = [measured.wall(scene, SHAPE, PRETENDED) for _ in range(2)]
+        assert there[0].transport.matrix is there[1].transport.matrix
+        np.testing.assert_allclose(there[0].irradiance(times).cpu().numpy(), ours, rtol=1e-6)
     config = Simulation(
         HandwritingGlyphs(characters="L", writers=1, plate=Plate(size_m=0.04)),
         motion=LineMotion((-0.02, 0.0)),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from evnlos.dataset import Sampling, SensorSize, Simulation, live_dataset
-from evnlos.dataset.on_device import simulate_objects_on
+from evnlos.dataset.on_device import bytes_of_a_wall, simulate_objects_on
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
 from evnlos.events.surface_tensors import time_surface_tensors
@@ -15,9 +15,9 @@ from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion
 from evnlos.sensor import EventPixel, FrameCamera, simulate_batch
 from evnlos.sensor._photons import fill_electrons
 from evnlos.sensor._torch_photons import electrons
-from evnlos.sensor.event_tensors import record_tensors
+from evnlos.sensor.event_tensors import EventTensors
 from evnlos.sensor.frame_tensors import capture_tensors
-from evnlos.sensor.tensors import EventTensors
+from evnlos.sensor.record_tensors import record_tensors
 from evnlos.training.source import Live
 from evnlos.training.team import Team
 from evnlos.transport import PaperTransport, RadiometricTransport, SlidingWall, View
@@ -137,7 +137,7 @@ def test_a_sliding_wall_renders_many_frames_as_it_renders_one(motion, monkeypatc
 
 
 def test_windows_far_from_the_band_are_dark() -> None:
-    frames = slide(torch.ones(2, 5), [-(10**9), -1, 10**9], [[0.25] * 4] * 3, 4)
+    frames = slide(torch.ones(2, 5), torch.tensor([-(10**9), -1, 10**9]), torch.full((3, 4), 0.25), 4)
     assert frames[:, 0].tolist() == [[0.0] * 4, [0.75, 1.0, 1.0, 0.75], [0.0] * 4]
 
 
@@ -234,6 +234,7 @@ def test_the_pretended_device_refuses_what_a_gpu_refuses() -> None:
         assert mode.crossings == 0
         assert (there + here.to(PRETENDED)).tolist() == [1, 2, 3, 4, 5, 6]
         assert mode.crossings == 6
+        assert mode.uploads == 6
 
 
 @pytest.mark.parametrize(
@@ -254,6 +255,18 @@ def test_an_object_is_simulated_where_it_is_asked_for(small, kind, surface) -> N
     assert crossings < 100 + 100
 
 
+@pytest.mark.parametrize("kind", WALLS)
+def test_more_steps_do_not_bring_more_from_main_memory(small, kind) -> None:
+    config = replace(small, transport=WALLS[kind])
+    uploads = []
+    for step_s in (0.04, 0.02):
+        with PretendedDevice() as mode:
+            simulate_objects_on(config, config.glyphs.objects()[:1], PRETENDED, step_s)
+            uploads.append(mode.uploads)
+    # of each of the 50 instants more: time stamp, place and four weights, and what its noise spends
+    assert uploads[1] - uploads[0] <= 50 * 16
+
+
 @pytest.mark.parametrize("vary", [{}, {"pixel.cutoff_hz": (10.0, 80.0)}, {"pixel.refractory_s": (0.01, 0.03)}])
 def test_an_object_does_not_depend_on_those_beside_it(small, vary) -> None:
     config = replace(small, vary={"pixel.threshold_on": (0.05, 0.2), "transport.gain": (1.0, 3.0), **vary})
@@ -263,6 +276,26 @@ def test_an_object_does_not_depend_on_those_beside_it(small, vary) -> None:
     for name, made in zip(names, together, strict=True):
         (alone,) = simulate_objects_on(config, [name], "cpu", 0.02)
         assert all(torch.equal(one, other) for one, other in zip(made, alone, strict=True))
+
+
+def test_what_a_gpu_lacks_is_refused_before_the_work(small) -> None:
+    config = replace(small, pixel=EventPixel(jitter_s=1e-4))
+    with pytest.raises(ConfigError, match="--simulate-on cpu"):
+        simulate_objects_on(config, config.glyphs.objects(), "cpu", 0.02)
+    assert simulate_objects_on(small, [], "cpu", 0.02) == []
+
+
+def test_few_large_walls_are_held_at_a_time() -> None:
+    full = SensorSize(600, 960)
+    assert bytes_of_a_wall(Simulation(sensor=full)) < 1 << 24
+    assert 1 << 32 < bytes_of_a_wall(Simulation(sensor=full, transport=RadiometricTransport())) < 1 << 34
+
+
+def test_the_way_of_the_samples_is_part_of_a_run(small) -> None:
+    """Steps of another length, or the CPU instead of a GPU, do not take up a run that was begun otherwise."""
+    live = live_dataset(small)
+    assert live.way(torch.device("cpu")) == live_dataset(small, where="cpu").way(PRETENDED) == {}
+    assert live.way(PRETENDED) == {"step_s": 0.002} != replace(live, step_s=0.004).way(PRETENDED)
 
 
 def test_a_plate_may_move_along_any_path(small) -> None:

@@ -33,7 +33,8 @@ class Command:
     workers: int = 1
     """Processes that simulate beside the training on the CPU, for --simulate; 0 = one for each core."""
     simulate_on: Literal["device", "cpu"] = "device"
-    """Where --simulate works beside a GPU: `device` on it, in steps of 2 ms; `cpu` in --workers processes."""
+    """Where --simulate works beside a GPU: `device` = on it, in steps of 2 ms; `cpu` = in --workers processes,
+    of which it then wants several."""
     preset: str = "default"
     """`default`, or `paper` for the paper's 200 epochs, step sizes and loss."""
     config: Path | None = None

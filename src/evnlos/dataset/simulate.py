@@ -124,9 +124,9 @@ def _needs_a_matrix(path: str) -> bool:
     return section == "transport" and name not in ("gain", "ambient", "ambient_gradient")
 
 
-def scene_of(drawn: Simulation, name: str) -> Scene:
-    """Return what an object's pass shows, given the settings that were drawn for it."""
-    target = drawn.glyphs.target(name, derive_seed(drawn.seed, "glyph"))
+def scene_of(config: Simulation, drawn: Simulation, name: str) -> Scene:
+    """Return what an object's pass shows, given the settings drawn for it: the glyph is not varied."""
+    target = config.glyphs.target(name, derive_seed(config.seed, "glyph"))
     return Scene(target, drawn.motion, drawn.duration_s)
 
 
@@ -141,7 +141,7 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
         The samples of all positions, and the events of the whole pass.
     """
     drawn = drawn_for(config, name)
-    scene = scene_of(drawn, name)
+    scene = scene_of(config, drawn, name)
     wall = drawn.transport.wall(scene, (config.sensor.height, config.sensor.width))
     times_s = scene.position_times_s(config.positions)
     events = EventCamera(drawn.pixel).record(

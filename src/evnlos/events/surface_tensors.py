@@ -12,7 +12,7 @@ from torch import Tensor
 from evnlos.errors import DataError
 from evnlos.events.grids import as_edges
 from evnlos.events.surface import Mode
-from evnlos.sensor.tensors import EventTensors
+from evnlos.sensor.event_tensors import EventTensors
 
 _NEVER = -(1 << 62)  # a time of which nothing is left
 _UNIT = 2.0**40
@@ -51,18 +51,13 @@ def time_surface_tensors(
     grid = _grids(events, edges)
     if mode == "sae":
         return _newest(events, grid, edges, tau_us)
-    value = _context(events, tau_us, radius) if mode == "context" else _mean_decay(events, tau_us, radius)
+    per_event = _context if mode == "context" else _mean_decay
+    value = per_event(events, tau_us, int(radius))
     inside = (grid >= 0) & (grid < len(edges) - 1)
     out = torch.zeros((len(edges) - 1) * 2 * _pixels(events), dtype=torch.int64, device=value.device)
     place = grid[inside] * (2 * _pixels(events)) + _places(events)[inside]
     out.scatter_add_(0, place, (value[inside] * _UNIT).round().to(torch.int64))
     return (out * (1 / _UNIT)).to(torch.float32).view(-1, 2, events.height, events.width)
-
-
-def event_counts(events: EventTensors, edges_us: ArrayLike) -> Tensor:
-    """Return the number of events with edges[g] < t <= edges[g + 1], int64 [grids]."""
-    edges = torch.from_numpy(as_edges(edges_us)).to(events.t_us.device)
-    return torch.searchsorted(events.t_us, edges, right=True).diff()
 
 
 def _pixels(events: EventTensors) -> int:

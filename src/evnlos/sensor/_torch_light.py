@@ -22,7 +22,7 @@ from evnlos.sensor.light import WHITE_DN
 _KNEE = 20.0
 _SLOPE = math.log(_KNEE) / _KNEE
 _AHEAD = 32  # instants rendered at a time, at least
-_AHEAD_PX = 1 << 23  # pixels of all these instants, about
+_AHEAD_PX = 1 << 22  # pixels of a wall's instants, about
 
 
 class Blocks(Protocol):
@@ -72,7 +72,7 @@ class WallLight:
         height, width = walls[0].shape
         self._walls, self._times_s = walls, times_s
         self.shape: tuple[int, int, int, int] = (len(walls), len(times_s), height, width)
-        self._ahead = max(_AHEAD, _AHEAD_PX // (len(walls) * height * width))
+        self._ahead = max(_AHEAD, _AHEAD_PX // (height * width))  # whatever the number of walls
         self._first, self._held = 0, self._rendered(0, 1)
         self.device = self._held.device
 

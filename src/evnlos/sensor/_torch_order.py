@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.sensor._v2e_array import instants_within
-from evnlos.sensor.tensors import EventTensors
+from evnlos.sensor.event_tensors import EventTensors
 
 
 class Sent(NamedTuple):
@@ -72,9 +72,9 @@ def _one_clip(
 def step_stamps(times_s: NDArray[np.float64], peak: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the time stamps of all sub-steps in microseconds, ascending, int64 [sum of peak]."""
     start, delta = times_s[:-1], np.diff(times_s)
-    if (peak == 1).all():
-        seconds = (start + delta).astype(np.float32)
-    else:
-        parts = [instants_within(*step) for step in zip(start, delta, times_s[1:], peak.tolist(), strict=True)]
-        seconds = np.concatenate(parts)
+    seconds = np.repeat((start + delta).astype(np.float32), peak)
+    first = np.cumsum(peak) - peak
+    for step in np.flatnonzero(peak > 1).tolist():
+        within = instants_within(start[step], delta[step], times_s[step + 1], int(peak[step]))
+        seconds[first[step] : first[step] + peak[step]] = within
     return np.maximum.accumulate(np.rint(seconds.astype(np.float64) * 1e6).astype(np.int64))

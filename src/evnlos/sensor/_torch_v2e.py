@@ -23,8 +23,8 @@ from evnlos.sensor._torch_noise import Leak, ShotNoise
 from evnlos.sensor._torch_order import Sent, events_in_order
 from evnlos.sensor._torch_random import fill
 from evnlos.sensor._torch_refractory import Refractory
+from evnlos.sensor.event_tensors import EventTensors
 from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
-from evnlos.sensor.tensors import EventTensors
 
 STEPS = 32
 _NOISES = ("leak_rate_hz", "shot_noise_rate_hz")

@@ -1,64 +1,38 @@
-"""Events that are simulated on a device and stay there."""
+"""Events that stay on the device on which they were simulated."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import torch
-from numpy.typing import ArrayLike
+from torch import Tensor
 
-from evnlos.errors import ConfigError, DataError
-from evnlos.sensor._checks import check_times
-from evnlos.sensor._random import check_seed
-from evnlos.sensor._torch_batch import check_pixel
-from evnlos.sensor._torch_light import WallLight
-from evnlos.sensor._torch_v2e import Pixels, default_tile
-from evnlos.sensor.event_camera import Wall
-from evnlos.sensor.pixel import EventPixel
-from evnlos.sensor.tensors import EventTensors
+from evnlos.types import Events
 
 
-def record_tensors(
-    walls: Sequence[Wall],
-    times_s: ArrayLike,
-    pixels: Sequence[EventPixel],
-    seeds: Sequence[int],
-    dtype: torch.dtype = torch.float32,
-) -> list[EventTensors]:
-    """Return the events of several walls, simulated together on the device where they render, and left there.
-
-    They are those of `simulate_batch` on each wall's frames in DN, whatever the other walls are; the frames
-    never exist all at once. A GPU is given as many orders for many small sensors as for one.
+@dataclass(frozen=True, eq=False)
+class EventTensors:
+    """A stream of events as tensors on one device, ordered by time, then pixel, then OFF before ON.
 
     Args:
-        walls: The light: `shape` and `irradiance(t_s)`; of one size, on one device.
-        times_s: Instants of the steps, [T], seconds, ascending.
-        pixels: Parameters of each wall's pixels; see `can_share`.
-        seeds: Seed of each wall's mismatch and noise, 0 to 2**64 - 1.
-        dtype: Precision of the filter, as in `simulate_batch`.
-
-    Raises:
-        DataError: Fewer than two times, times that do not ascend, or a wall with NaN or negative light.
-        ConfigError: Pixels that cannot run together; hot pixels or jitter, which this mode has not.
+        t_us: Times, int64 [N], microseconds.
+        pixel: Flat pixels y width + x, int64 [N].
+        on: Polarities, bool [N], True = brighter.
+        height: Sensor height, pixels.
+        width: Sensor width, pixels.
     """
-    for pixel in pixels:
-        check_pixel(pixel)
-    if not walls or not len(walls) == len(pixels) == len(seeds):
-        raise ConfigError(
-            f"{len(walls)} walls, {len(pixels)} pixels and {len(seeds)} seeds; give one of each a clip"
-        )
-    if any(wall.shape != walls[0].shape for wall in walls) or not can_share(pixels):
-        raise ConfigError("the walls differ in size, or their pixels in kind; record them one by one")
-    times = check_times(times_s, len(np.atleast_1d(times_s)))
-    if len(times) < 2:
-        raise DataError(f"times_s has {len(times)} instants; give at least 2")
-    with torch.no_grad():
-        light = WallLight(walls, times)
-        tile_px = default_tile(light.device)
-        return Pixels(light, times, pixels, [check_seed(seed) for seed in seeds], None, dtype, tile_px).run()
 
+    t_us: Tensor
+    pixel: Tensor
+    on: Tensor
+    height: int
+    width: int
 
-def can_share(pixels: Sequence[EventPixel]) -> bool:
-    """Return whether such pixels can run together: all have a filter or none, and one refractory period."""
-    return len({(pixel.cutoff_hz > 0, pixel.refractory_s) for pixel in pixels}) < 2
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    def to_events(self) -> Events:
+        """Return the same events in main memory."""
+        time_us, pixel, on = (column.cpu().numpy() for column in (self.t_us, self.pixel, self.on))
+        y, x = np.divmod(pixel, self.width)
+        return Events(time_us, x.astype(np.uint16), y.astype(np.uint16), on, self.width, self.height)

@@ -68,8 +68,8 @@ def train(
     out = Path(out)
     start = load_weights(weights) if weights else None
     network, settings = _network(settings, start, dataset.sampling)
-    about = _about(dataset, settings, start)
     with team() as processes, claim(out) if processes.rank == 0 else nullcontext():
+        about = _about(dataset, settings, start, processes.device)
         if processes.rank == 0:
             _take_up(out, about)
         processes.wait()
@@ -210,7 +210,7 @@ def _half(settings: Training, device: torch.device) -> bool:
     return torch.cpu._is_avx512_bf16_supported()
 
 
-def _about(dataset: Dataset, settings: Training, start: Weights | None) -> dict[str, Any]:
+def _about(dataset: Dataset, settings: Training, start: Weights | None, device: torch.device) -> dict[str, Any]:
     return {
         "settings": to_dict(settings),
         "data": {
@@ -220,6 +220,7 @@ def _about(dataset: Dataset, settings: Training, start: Weights | None) -> dict[
             "optics": dataset.optics,
             "train": dataset.objects("train"),
             "validation": dataset.split.get("validation", []),
+            **(dataset.way(device) if isinstance(dataset, LiveDataset) else {}),
         },
         "from": start.history[-1]["data"]["name"] if start and start.history else None,
         "versions": {

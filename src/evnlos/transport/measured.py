@@ -66,7 +66,7 @@ class MeasuredTransport:
             ConfigError: The scan has fewer pixels than that.
         """
         measured = self.measurement()
-        matrix = averaged(measured.matrix, measured.shape, shape).to(device)
+        matrix = _matrix(measured, shape, torch.device(device))
         return MatrixTransport(matrix, measured.about.plane, shape)
 
     def matrix(self, shape: tuple[int, int], source: Plane, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -166,6 +166,12 @@ def _measurement(path: str, changed_ns: int, size: int, checksum: str) -> Measur
     if checksum and (found := file_checksum(path)) != checksum:
         raise ConfigError(f"{path} has the checksum {found}, the settings say {checksum}; name the file meant")
     return read_measurement(path)
+
+
+@lru_cache(maxsize=2)
+def _matrix(measured: Measurement, shape: tuple[int, int], device: torch.device) -> torch.Tensor:
+    """Return the matrix for a camera image of `shape` on a device: one for all objects."""
+    return averaged(measured.matrix, measured.shape, shape).to(device)
 
 
 def averaged(matrix: torch.Tensor, have: tuple[int, int], want: tuple[int, int]) -> torch.Tensor:

@@ -107,6 +107,7 @@ def light_transport_matrix(
     work = dtype if differentiable else torch.float64
     wall, target = wall.to(dtype=work, device=device), target.to(dtype=work, device=device)
     block_rows = max(1, _CHUNK // target.shape[-1])
+    matrix = torch.empty(wall.shape[1], target.shape[-1], dtype=dtype, device=device)
     blocks = []
     for start in range(0, wall.shape[1], block_rows):
         patches = wall[:, start : start + block_rows]
@@ -122,8 +123,11 @@ def light_transport_matrix(
                         way = visibility(patch, x + offset_m[0], y + offset_m[1], distance, occluders)
                     pair = pair * way
                 block = block + (share * part) * pair
-        blocks.append(block.to(dtype))
-    matrix = torch.cat(blocks)
+        if differentiable:
+            blocks.append(block)
+        else:  # in place: at full resolution there may be no room for a copy
+            matrix[start : start + len(block)] = block
+    matrix = torch.cat(blocks) if differentiable else matrix
     return matrix if emission is None else matrix * emission.flatten().to(matrix)
 
 

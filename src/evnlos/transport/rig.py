@@ -25,6 +25,7 @@ from evnlos.transport.radiometric import light_transport_matrix
 from evnlos.transport.view import View
 from evnlos.types import Plane
 
+_MOST_KEPT_BYTES = 1 << 30  # a matrix on a GPU that is kept for the next object
 _LEAST_CELLS = 4  # a side of the plate: fewer show no shape at all
 
 
@@ -108,8 +109,11 @@ class RadiometricTransport:
     def transport(self, shape: tuple[int, int], device: torch.device | str = "cpu") -> MatrixTransport:
         """Return the matrix from the strip to the camera, scaled so that `gain` means what it says; cached."""
         # Light that only adds up afterwards does not belong to the matrix's key.
-        key = replace(self, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0))
-        return _transport(key, shape, torch.device(device))
+        key, where = replace(self, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0)), torch.device(device)
+        source = self.source()
+        is_large = 4 * shape[0] * shape[1] * source.height * source.width > _MOST_KEPT_BYTES
+        make = _transport.__wrapped__ if is_large and where.type != "cpu" else _transport
+        return make(key, shape, where)
 
     def matrix(
         self,
@@ -204,7 +208,7 @@ def _transport(rig: RadiometricTransport, shape: tuple[int, int], device: torch.
     brightest = (matrix @ lit.to(matrix).repeat(source.height)).max()
     if not float(brightest) > 0:
         raise ConfigError("the camera receives no light from the target; move the target or the camera")
-    return MatrixTransport(matrix / brightest, source, shape)
+    return MatrixTransport(matrix.div_(brightest), source, shape)
 
 
 def _check_sight(view: View, occluders: Sequence[Occluder]) -> None:

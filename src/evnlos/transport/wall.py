@@ -96,6 +96,8 @@ class SlidingWall:
         self._band: tuple[float, torch.Tensor] | None = None
         if view.is_affine:
             self._carry_to_pixels()
+        else:
+            self._points = view.wall_points_m().to(work.device)  # [H, W, 2]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -167,9 +169,9 @@ class SlidingWall:
         canvas_view = _shifted_view(self.view, self._low, (int(size[1]), int(size[0])))
         self._canvas = spline_coefficients(self._sampled(canvas_view, 0.0, 0.0)).contiguous()
 
-    def _sampled(self, view: View, x_m: float, y_m: float) -> torch.Tensor:
+    def _sampled(self, view: View, x_m: float, y_m: float, points: torch.Tensor | None = None) -> torch.Tensor:
         """Return the wall image with the plate at (x, y), as the pixels of `view` see it."""
-        x, y = view.wall_points_m().to(self._wall.device).unbind(-1)
+        x, y = (view.wall_points_m().to(self._wall.device) if points is None else points).unbind(-1)
         plane = self._plane
         column = (x - x_m - plane.center_m[0]) / plane.pitch_m + (plane.width - 1) / 2 + self._margin
         row = (y - y_m - plane.center_m[1]) / plane.pitch_m + (plane.height - 1) / 2 + self._margin
@@ -177,7 +179,7 @@ class SlidingWall:
         return sample(self._wall, row, column)
 
     def _projected(self, x_m: float, y_m: float) -> torch.Tensor:
-        return self._sampled(self.view, x_m, y_m)
+        return self._sampled(self.view, x_m, y_m, self._points)
 
     def _shifted(self, x_m: float, y_m: float) -> torch.Tensor:
         """Return the canvas displaced by the motion: four taps along each axis, the same for all pixels."""
@@ -207,11 +209,12 @@ class SlidingWall:
         most = max(1, _TOGETHER_PX // (self.shape[0] * self.shape[1]))
         if len(down) and float(np.ptp(down)) > _SAME_ROWS_PX:
             most = 1
+        shifts = [_taps(-shift) for shift in across.tolist()]
+        starts = torch.tensor([whole - 1 - self._low[0] for whole, _ in shifts], device=image.device)
+        taps = torch.tensor([weights for _, weights in shifts], dtype=image.dtype, device=image.device)
         for first in range(0, len(image), most):
             some = slice(first, first + most)
-            shifts = [_taps(-shift) for shift in across[some].tolist()]
-            starts = [whole - 1 - self._low[0] for whole, _ in shifts]
-            light = slide(self._rows(float(down[first])), starts, [taps for _, taps in shifts], self.shape[1])
+            light = slide(self._rows(float(down[first])), starts[some], taps[some], self.shape[1])
             image[some] = light.clamp_(min=0).mul_(self.gain).add_(self.ambient)
 
     def _strips(self, positions_m: NDArray[np.float64]) -> Strips | None:
