@@ -96,7 +96,8 @@ def main() -> None:
         parser.error("--groups and --together are at least 1")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     count = options.together * (options.groups + 1)
-    config = Simulation(glyphs=HandwritingGlyphs(writers=-(-count // 36)), validation=0.0)
+    writers = -(-count // len(HandwritingGlyphs(writers=1).objects()))
+    config = Simulation(glyphs=HandwritingGlyphs(writers=writers), validation=0.0)
     names = config.glyphs.objects()[:count]
     spent = stages(config, names, device, options.together)
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else "no GPU"
