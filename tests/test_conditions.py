@@ -28,11 +28,13 @@ def test_conditions_change_one_factor_and_clip_nothing() -> None:
             for section in ("transport", "frame_camera", "motion", "pixel", "glyphs")
             if getattr(one.simulation, section) != getattr(SMALL, section)
         }
-        expected = {"ambient": "transport", "light": "transport", "speed": "motion"}
+        rig = dict.fromkeys(("ambient", "light", "roughness", "albedo", "distance"), "transport")
+        expected = rig | {"speed": "motion"}
         assert changed == {expected.get(one.factor, "frame_camera")}
         way = one.simulation.motion.speed_m_s * one.simulation.duration_s
         assert way == pytest.approx(SMALL.motion.speed_m_s * SMALL.duration_s)
-    assert {one.factor for one in others} == {"ambient", "light", "read noise", "exposure", "speed"}
+    rig = {"roughness", "albedo", "distance"}
+    assert {one.factor for one in others} == {"ambient", "light", "read noise", "exposure", "speed"} | rig
 
 
 def test_noise_takes_from_frames_what_it_leaves_to_events(tmp_path) -> None:

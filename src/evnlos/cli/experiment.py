@@ -26,7 +26,7 @@ class Command:
     """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss, width,
     embedding, joint (whole passes) or objects (how many are simulated);
     without captures: simulation (handwriting, transfer to Comic), conditions (frames against events over
-    light, noise, exposure and speed), and carry-over (given weights on unseen hands, other things than
+    light, noise, exposure, speed and rigs), and carry-over (given weights on unseen hands, other things than
     characters, and other walls, with what their confidence says)."""
     captures: Path | None = None
     """Folder of the capture folders."""

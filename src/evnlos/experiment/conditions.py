@@ -19,6 +19,7 @@ from evnlos.metrics import psnr
 from evnlos.model import fit_linear
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs
 from evnlos.transport import RadiometricTransport
+from evnlos.transport.rig import FAR_M
 
 FULL = 0.85
 """White levels of the brightest pixel: as if the exposure had been set so that nothing is clipped."""
@@ -99,6 +100,8 @@ def conditions(base: Simulation) -> list[Condition]:
     - read noise of the frame camera, electrons.
     - exposure of the frames, seconds; their gain is set so that the level stays.
     - speed of the target, metres a second, over the same way; the surface's time constant follows it.
+    - difficulty of the rig: roughness of the metal, a matte wall, distance from target to wall, metres; the
+      brightest pixel stays as bright.
     """
     found = [Condition("base", 1.0, "", base)]
     found += [Condition("ambient", r, "of the signal", _lit(base, r)) for r in (0.0, 0.5, 2.0, 8.0)]
@@ -124,6 +127,15 @@ def conditions(base: Simulation) -> list[Condition]:
             sampling=replace(base.sampling, tau_s=tau_s),
         )
         found.append(Condition("speed", speed, "m/s", moved))
+    rig = base.transport
+    assert isinstance(rig, RadiometricTransport)
+    for roughness in (0.02, 0.1, 0.2):
+        wall = replace(rig, roughness=roughness)
+        found.append(Condition("roughness", roughness, "of the wall", replace(base, transport=wall)))
+    matte = replace(rig, wall_material="lambert")
+    found.append(Condition("albedo", matte.albedo, "of a matte wall", replace(base, transport=matte)))
+    far = replace(rig, distance_m=FAR_M)
+    found.append(Condition("distance", FAR_M, "m", replace(base, transport=far)))
     return found
 
 
