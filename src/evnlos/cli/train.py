@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from tqdm import tqdm
 
@@ -13,6 +13,7 @@ from evnlos.cli.console import Flat, result
 from evnlos.cli.notes import say
 from evnlos.config import load_yaml
 from evnlos.dataset import Dataset, Simulation, live_dataset, open_dataset
+from evnlos.dataset.live import Place
 from evnlos.errors import ConfigError
 from evnlos.training import Training, paper_pretraining, train
 
@@ -32,7 +33,7 @@ class Command:
     trains, other ones in each epoch, and nothing is stored."""
     workers: int = 1
     """Processes that simulate beside the training on the CPU, for --simulate; 0 = one for each core."""
-    simulate_on: Literal["device", "cpu"] = "device"
+    simulate_on: Place = "device"
     """Where --simulate works beside a GPU: `device` = on it, in steps of 2 ms; `cpu` = in --workers processes,
     of which it then wants several."""
     preset: str = "default"

@@ -25,6 +25,15 @@ def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise DataError(f"{name} is {value!r}; give one of {', '.join(choices)}")
 
 
+def check_surface(tau_us: float, radius: int, mode: str) -> None:
+    """Refuse a time constant, a radius or a kind of surface outside its range."""
+    if not (np.isfinite(tau_us) and tau_us > 0):
+        raise DataError(f"tau_us is {tau_us}; give a positive number of microseconds")
+    if not 0 <= radius <= 64 or int(radius) != radius:
+        raise DataError(f"radius is {radius}; give 0 to 64 pixels")
+    _choice("mode", mode, ("sae", "context", "hots"))
+
+
 def _spans(radius: int, shape: str) -> NDArray[np.int64]:
     """Return the half width of each row of the neighbourhood, from its top to its bottom."""
     rows = np.arange(-radius, radius + 1)
@@ -92,11 +101,7 @@ def time_surface(
         [[[[0.36800000071525574, 0.0]], [[0.0, 1.0]]]]
     """
     edges = as_edges(edges_us)
-    if not (np.isfinite(tau_us) and tau_us > 0):
-        raise DataError(f"tau_us is {tau_us}; give a positive number of microseconds")
-    if not 0 <= radius <= 64 or int(radius) != radius:
-        raise DataError(f"radius is {radius}; give 0 to 64 pixels")
-    _choice("mode", mode, ("sae", "context", "hots"))
+    check_surface(tau_us, radius, mode)
     _choice("shape", shape, ("box", "disc"))
     _choice("border", border, ("crop", "zero"))
     _choice("projection", projection, tuple(_PROJECTIONS))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from evnlos.errors import DataError
 from evnlos.events.grids import as_edges
-from evnlos.events.surface import Mode
+from evnlos.events.surface import Mode, check_surface
 from evnlos.sensor.event_tensors import EventTensors
 
 _NEVER = -(1 << 62)  # a time of which nothing is left
@@ -41,12 +38,7 @@ def time_surface_tensors(
     Raises:
         DataError: An argument is outside its range.
     """
-    if not (math.isfinite(tau_us) and tau_us > 0):
-        raise DataError(f"tau_us is {tau_us}; give a positive number of microseconds")
-    if not 0 <= radius <= 64 or int(radius) != radius:
-        raise DataError(f"radius is {radius}; give 0 to 64 pixels")
-    if mode not in ("sae", "context", "hots"):
-        raise DataError(f"mode is {mode!r}; give one of sae, context, hots")
+    check_surface(tau_us, radius, mode)
     edges = as_edges(edges_us)
     grid = _grids(events, edges)
     if mode == "sae":

@@ -27,7 +27,6 @@ from evnlos.sensor.event_tensors import EventTensors
 from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
 
 STEPS = 32
-_NOISES = ("leak_rate_hz", "shot_noise_rate_hz")
 _TILE_CPU, _TILE_DEVICE = 16_384, 1 << 22
 _MARGIN = {torch.float64: 1e-9, torch.float32: 1e-5}
 """How far inside a threshold a pixel still counts as one that may have crossed: far above the rounding."""
@@ -69,20 +68,17 @@ class Pixels:
         filtered = kinds[0].cutoff_hz > 0
         dtype = dtype if filtered else torch.float32
         if thresholds is None:
+            each = list(zip(kinds, seeds, strict=True))
             on, off = (
-                torch.cat(
-                    [
-                        _thresholds(kind, p, seed, pixels, device)
-                        for kind, seed in zip(kinds, seeds, strict=True)
-                    ]
-                )
-                for p in (True, False)
+                torch.cat([_thresholds(kind, sign, seed, pixels, device) for kind, seed in each])
+                for sign in (True, False)
             )
         else:  # v2e keeps thresholds that differ in single precision, and equal ones as a double
             on, off = (values.to(torch.float32).to(torch.float64) for values in thresholds)
         self.step_on, self.step_off = on.to(torch.float32).view(-1), off.to(torch.float32).view(-1)
         self.leak = self.shot = None
-        leaks, shots = (np.array([[getattr(kind, name)] for kind in kinds]) for name in _NOISES)  # [clips, 1]
+        leaks = np.array([[kind.leak_rate_hz] for kind in kinds])  # [clips, 1]
+        shots = np.array([[kind.shot_noise_rate_hz] for kind in kinds])
         if leaks.any():
             scales = torch.from_numpy((leaks * delta).astype(np.float32)).to(device)
             self.leak = Leak(seeds, on, scales)

@@ -44,7 +44,8 @@ def capture_tensors(camera: FrameCamera, wall: Wall, times_s: ArrayLike, seed: i
     with torch.no_grad():
         for first in range(0, len(times), most):
             mean = _exposed(camera, wall, times[first : first + most])
-            sensitivity, offset_e = _pattern(camera, wall.shape, seed, mean.device)
+            own = seed if camera.pattern_seed is None else 0
+            sensitivity, offset_e = _pattern(camera, wall.shape, own, mean.device)
             expected = (sensitivity * mean).flatten(1)
             levels = electrons(expected, offset_e.flatten(), camera.read_noise_e, seed, first)
             levels.mul_(camera.dn_per_electron).add_(camera.black_level).round_().clamp_(0, camera.white)
@@ -62,12 +63,8 @@ def _exposed(camera: FrameCamera, wall: Wall, times_s: NDArray[np.float64]) -> T
     return mean
 
 
+@lru_cache(maxsize=4)
 def _pattern(camera: FrameCamera, shape: tuple[int, int], seed: int, device: torch.device) -> Pattern:
     """Return electrons a unit of light, and the offset in electrons, float64 [H, W] each, on a device."""
-    return _pattern_of(camera, shape, seed if camera.pattern_seed is None else 0, device)
-
-
-@lru_cache(maxsize=4)
-def _pattern_of(camera: FrameCamera, shape: tuple[int, int], seed: int, device: torch.device) -> Pattern:
     sensitivity, offset_e = (torch.from_numpy(part).to(device) for part in camera.fixed_pattern(shape, seed))
     return camera.full_well_e * sensitivity, offset_e

@@ -167,19 +167,21 @@ class SlidingWall:
         units = self.view.pixels(torch.tensor([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)], dtype=torch.float64))
         self._pixels_per_m = (units[1:] - units[0]).tolist()  # how far a metre along x, along y moves the image
         canvas_view = _shifted_view(self.view, self._low, (int(size[1]), int(size[0])))
-        self._canvas = spline_coefficients(self._sampled(canvas_view, 0.0, 0.0)).contiguous()
+        points = canvas_view.wall_points_m().to(self._wall.device)
+        self._canvas = spline_coefficients(spline_sample(*self._at(points, 0.0, 0.0))).contiguous()
 
-    def _sampled(self, view: View, x_m: float, y_m: float, points: torch.Tensor | None = None) -> torch.Tensor:
-        """Return the wall image with the plate at (x, y), as the pixels of `view` see it."""
-        x, y = (view.wall_points_m().to(self._wall.device) if points is None else points).unbind(-1)
+    def _at(
+        self, points_m: torch.Tensor, x_m: float, y_m: float
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the wall's coefficients, and row and column of points [H, W, 2], with the plate at (x, y)."""
+        x, y = points_m.unbind(-1)
         plane = self._plane
         column = (x - x_m - plane.center_m[0]) / plane.pitch_m + (plane.width - 1) / 2 + self._margin
         row = (y - y_m - plane.center_m[1]) / plane.pitch_m + (plane.height - 1) / 2 + self._margin
-        sample = spline_sample if view.is_affine else spline_scattered  # an oblique grid is tilted
-        return sample(self._wall, row, column)
+        return self._wall, row, column
 
     def _projected(self, x_m: float, y_m: float) -> torch.Tensor:
-        return self._sampled(self.view, x_m, y_m, self._points)
+        return spline_scattered(*self._at(self._points, x_m, y_m))  # an oblique grid is tilted
 
     def _shifted(self, x_m: float, y_m: float) -> torch.Tensor:
         """Return the canvas displaced by the motion: four taps along each axis, the same for all pixels."""
