@@ -24,25 +24,27 @@ check: $(READY)
 bench: $(READY)
 	for question in benchmarks/*.py; do $(BIN)/python $$question || exit 1; done
 
-# A wheel, with what is not Python in it.
+# Two wheels, the package below 10 MB and its pretrained weights, with what is not Python in them.
 dist: $(READY)
-	rm -rf dist build
-	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
-	$(BIN)/python -c "import glob, zipfile; names = set(zipfile.ZipFile(glob.glob('dist/*.whl')[0]).namelist()); \
+	rm -rf dist build packages/*/build
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist . ./packages/evnlos-weights
+	$(BIN)/python -c "import glob, os, zipfile; names = set(zipfile.ZipFile(glob.glob('dist/evnlos-*.whl')[0]).namelist()); \
 	  lost = [n for n in ('evnlos/py.typed', 'evnlos/live/page.html', 'evnlos/app/page.css', 'evnlos/app/page.js', \
 	  'evnlos/app/opening.js', \
-	  'evnlos/report/style.css', 'evnlos/evaluation/classifier.safetensors', \
-	  'evnlos/model/published/near-frame.safetensors', 'evnlos/model/published/near.yaml') if n not in names]; assert not lost, lost"
+	  'evnlos/report/style.css', 'evnlos/evaluation/classifier.safetensors') if n not in names]; assert not lost, lost; \
+	  size = os.path.getsize(glob.glob('dist/evnlos-*.whl')[0]); assert size < 10e6, f'the wheel has {size / 1e6:.1f} MB'; \
+	  names = set(zipfile.ZipFile(glob.glob('dist/evnlos_weights-*.whl')[0]).namelist()); \
+	  lost = [n for n in ('SHA256SUMS', 'near-frame.safetensors', 'near.yaml') if f'evnlos_weights/{n}' not in names]; assert not lost, lost"
 	ls -l dist
 
 clean:
-	rm -rf $(DEMO) build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(DEMO) build dist packages/*/build src/*.egg-info packages/*/src/*.egg-info .pytest_cache .ruff_cache .hypothesis
 	find src tests benchmarks examples -name __pycache__ -prune -exec rm -rf {} +
 
 # PyTorch first: its CPU build where the package index has one, else whatever build the index gives.
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml packages/evnlos-weights/pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0+cpu" \
 	  || $(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[aedat,app,cluster,lab,plot,video,dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[aedat,app,cluster,lab,plot,video,dev]" -e packages/evnlos-weights
 	touch $@

@@ -95,7 +95,7 @@ def scene_wall(height: int, width: int) -> CameraWall:
     """Return the wall of the first letter of the `paper` preset: 8 cm at 2 cm/s, handwriting."""
     config = paper()
     target = config.glyphs.target(config.glyphs.objects()[0], derive_seed(config.seed, "glyph"))
-    return config.transport.wall(Scene(target, config.motion, SCENE_S), (height, width))
+    return config.setup.resized((height, width)).observe(Scene(target, config.motion, SCENE_S))
 
 
 def scene_events(height: int, width: int, seconds: float = SCENE_S) -> Events:

@@ -31,7 +31,7 @@ import torch
 from torch import Tensor, nn
 
 from evnlos.dataset import NlosDataset, open_dataset
-from evnlos.model import Confidence, Weights, halves_of, infer, load_weights, plates
+from evnlos.model import Confidence, Weights, halves_of, load_weights, plates
 from evnlos.model.confidence import COVERAGE
 from evnlos.training.confidence import fit_confidence
 
@@ -63,11 +63,10 @@ class Seen:
 def look(networks: list[Weights], folder: Path, split: str) -> Seen:
     """Return what the networks make of a dataset."""
     dataset = open_dataset(folder)
-    data = NlosDataset(dataset, split, networks[0].paradigm)  # type: ignore[arg-type]
+    data = NlosDataset(dataset, split, networks[0].modality)
     canvas, at = dataset.sampling.canvas, data.position_m
     drawn = [
-        plates(infer(one.network, data.inputs, at, data.names), canvas, at)[:, 0].clamp(0, 1)
-        for one in networks
+        plates(one.network.infer(data.inputs, at, data.names), canvas, at)[:, 0].clamp(0, 1) for one in networks
     ]
     names = list(dict.fromkeys(data.names.tolist()))
     rows = [np.flatnonzero(data.names == name) for name in names]
@@ -164,7 +163,7 @@ def learned_quantiles(seen: Seen) -> Callable[[Seen], Interval]:
 def methods(networks: list[Weights], calibration: Path) -> dict[str, Callable[[Seen], Interval]]:
     """Return all ways to make intervals, set on the validation split of a dataset."""
     seen, dataset = look(networks, calibration, "validation"), open_dataset(calibration)
-    data = NlosDataset(dataset, "validation", networks[0].paradigm)  # type: ignore[arg-type]
+    data = NlosDataset(dataset, "validation", networks[0].modality)
     confidence = fit_confidence(networks[0].network, data, dataset.sampling.canvas)
 
     def first(one: Seen) -> Tensor:

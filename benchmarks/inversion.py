@@ -15,8 +15,9 @@ import torch
 
 from evnlos.scene import HandwritingGlyphs, Scene
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
+from evnlos.setups import RadiometricSetup
 from evnlos.solver import Gradient, LogChange, log_change, tikhonov
-from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.transport import MatrixTransport
 
 SHAPE = (30, 48)
 TIMES_S = (3.6, 4.4)
@@ -29,8 +30,8 @@ def correlation(image: torch.Tensor, truth: torch.Tensor) -> float:
 def compare(gain: float, ambient: float, character: str, seed: int = 0) -> dict[str, float]:
     """Return r of each channel for one character in one light."""
     scene = Scene(HandwritingGlyphs().target(f"writer03_{character}"))
-    rig = RadiometricTransport(cell_m=0.005, strip_m=(0.24, 0.08), gain=gain, ambient=ambient)
-    wall = rig.wall(scene, SHAPE)
+    rig = RadiometricSetup(cell_m=0.005, strip_m=(0.24, 0.08), gain=gain, ambient=ambient)
+    wall = rig.resized(SHAPE).observe(scene)
     operator = MatrixTransport(gain * wall.transport.matrix.double(), wall.transport.source, SHAPE)
     first, last = (torch.from_numpy(scene.truth(wall.transport.source, t)).double() for t in TIMES_S)
 

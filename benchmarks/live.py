@@ -2,7 +2,7 @@
 
     python benchmarks/live.py                              # replay and UDP, event and fusion, two threads
     python benchmarks/live.py --threads 1 --sources replay --seconds 20
-    python benchmarks/live.py --paradigms event --weights RUN
+    python benchmarks/live.py --modalities event --weights RUN
     python benchmarks/live.py --write benchmarks/results/live.md
 
 Random events, the worst case for the surface, in true time: from memory, an event being due at its own
@@ -28,15 +28,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evnlos.config import to_dict
-from evnlos.dataset import CHANNELS, Sampling
+from evnlos.dataset import STANDARD_MODALITIES, Sampling
 from evnlos.live.chunk import Source
 from evnlos.live.engine import Engine
 from evnlos.live.packet import USUAL_EVENTS, Packet, pack
 from evnlos.live.replay import Replay, TimedFrame
 from evnlos.live.run import Pace, Run
 from evnlos.live.udp import UdpSource
-from evnlos.model import ResidualUNet, UNetConfig, Weights, load_weights
+from evnlos.model import UNetConfig, Weights, load_weights
 from evnlos.types import Events
 from machine import machine
 
@@ -44,7 +43,7 @@ WIDTH, HEIGHT = 160, 100
 PIECE_US = 20_000
 FRAME_US = 200_000
 COLUMNS = (
-    "source", "paradigm", "pictures/s", "M events/s", "oldest p50, ms", "p90", "p99", "max", "newest p50, ms",
+    "source", "modality", "pictures/s", "M events/s", "oldest p50, ms", "p90", "p99", "max", "newest p50, ms",
     "p99", "surface p50, ms", "network p50, ms", "surface / network / rest, %", "events dropped / lost",
     "cores used",
 )  # fmt: skip
@@ -96,14 +95,12 @@ def send(port: int, rate_hz: float, seconds: float) -> None:
                 sender.sendto(data, ("127.0.0.1", port))
 
 
-def network_of(paradigm: str, path: str | None) -> Weights:
+def network_of(modality: str, path: str | None) -> Weights:
     """Return the weights given, else an untrained network of the default size."""
     if path:
         return load_weights(path)
-    sampling = Sampling()
     torch.manual_seed(0)
-    network = ResidualUNet(CHANNELS[paradigm], UNetConfig(), (sampling.height, sampling.width))  # type: ignore[index]
-    return Weights(network.eval(), paradigm, to_dict(sampling), [])
+    return Weights(UNetConfig().build(modality, Sampling()).eval())
 
 
 def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
@@ -116,7 +113,7 @@ def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
         call = [sys.executable, __file__, "--send", str(source.port), "--rate-hz", str(rate_hz)]
         other = subprocess.Popen([*call, "--seconds", str(seconds)])
     else:
-        source = replay(rate_hz, seconds, weights.paradigm != "event")
+        source = replay(rate_hz, seconds, weights.modality.needs_frames)
         engine.begin()
     run = Run(source, engine, Pace(rate=arguments.pictures_hz))
     before = time.process_time()
@@ -127,11 +124,11 @@ def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
     spread = done["latency_ms"]
     oldest, newest = spread["oldest_event"], spread["newest_event"]
     if oldest is None:
-        return f"| {name} | {weights.paradigm} | no picture with an event |"
+        return f"| {name} | {weights.modality.name} | no picture with an event |"
     parts = [spread[part]["mean"] for part in ("surface", "network", "wait")]
     shares = " / ".join(f"{100 * part / sum(parts):.0f}" for part in parts)
     lost = done["dropped"]["events"], done["faults"].get("lost packets", 0) * 180
-    cells = [name, weights.paradigm, f"{done['pictures_hz']:.0f}", f"{done['events_hz'] / 1e6:.2f}"]
+    cells = [name, weights.modality.name, f"{done['pictures_hz']:.0f}", f"{done['events_hz'] / 1e6:.2f}"]
     cells += [f"{oldest[q]:.1f}" for q in ("p50", "p90", "p99", "max")]
     cells += [f"{newest[q]:.1f}" for q in ("p50", "p99")]
     cells += [f"{spread['surface']['p50']:.1f}", f"{spread['network']['p50']:.1f}", shares]
@@ -149,12 +146,12 @@ def main() -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sources", nargs="+", choices=("replay", "udp"), default=["replay", "udp"])
-    parser.add_argument("--paradigms", nargs="+", choices=tuple(CHANNELS), default=["event", "fusion"])
+    parser.add_argument("--modalities", nargs="+", choices=STANDARD_MODALITIES, default=["event", "fusion"])
     parser.add_argument("--rate-hz", type=float, default=1e6, help="events a second")
     parser.add_argument("--pictures-hz", type=float, default=Pace.rate, help="most pictures a second")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--threads", type=int, default=2, help="threads of the network")
-    parser.add_argument("--weights", help="weights or run, of the paradigm asked for")
+    parser.add_argument("--weights", help="weights or run, of the modality asked for")
     parser.add_argument("--write", help="file for the table")
     parser.add_argument("--send", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -176,10 +173,10 @@ def main() -> None:
     ]
     print("\n".join(lines), flush=True)
     for name in arguments.sources:
-        for paradigm in arguments.paradigms:
-            if name == "udp" and paradigm != "event":
+        for modality in arguments.modalities:
+            if name == "udp" and modality != "event":
                 continue  # packets carry no frames
-            lines.append(row(name, network_of(paradigm, arguments.weights), arguments))
+            lines.append(row(name, network_of(modality, arguments.weights), arguments))
             print(lines[-1], flush=True)
     if arguments.write:
         Path(arguments.write).write_text("\n".join(lines) + "\n")

@@ -3,8 +3,9 @@
     python benchmarks/live_training.py --results benchmarks/results   # on the GPU where there is one
 
 The default simulation: 160 x 100 pixels, 8 s, 40 positions; the default network, one epoch. The stages are
-those of a GPU (`simulate_objects_on`, steps of 2 ms), also where the device is the CPU; a training on the CPU
-uses `simulate_object` instead, by default in one process. Wall time, after a group and an epoch to warm up.
+those of a GPU (`simulate_objects_on`, v2e's pixels in steps of 2 ms), also where the device is the CPU; a
+training on the CPU uses `simulate_object` instead, by default in one process. Wall time, after a group and an
+epoch to warm up.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +24,17 @@ import torch
 
 from evnlos.dataset import Simulation, live_dataset, on_device, open_dataset, simulate, simulate_object
 from evnlos.scene import HandwritingGlyphs
+from evnlos.sensor import V2ePixel
+from evnlos.setups import PaperSetup
 from evnlos.training import Training, train
 from machine import machine
 
 STEP_S = 0.002
 STAGES = {
-    "record_tensors": "render, event pixels",
-    "capture_tensors": "frames",
-    "time_surface_tensors": "surfaces",
-    "_reduced": "maps",
+    (import_module("evnlos.sensor.record_tensors"), "record_tensors"): "render, event pixels",
+    (on_device, "capture_tensors"): "frames",
+    (on_device, "time_surface_tensors"): "surfaces",
+    (on_device, "_reduced"): "maps",
 }
 
 
@@ -57,16 +61,16 @@ def stages(config: Simulation, names: list[str], device: torch.device, together:
     """Return seconds an object of each stage on a device, and of all; one group warms it up."""
     spent: dict[str, float] = defaultdict(float)
     groups = [names[first : first + together] for first in range(0, len(names) - together + 1, together)]
-    on_device.simulate_objects_on(config, groups[0], device, STEP_S)
-    before = {name: getattr(on_device, name) for name in STAGES}
-    for name, stage in STAGES.items():
-        setattr(on_device, name, watched(before[name], device, spent, stage))
+    on_device.simulate_objects_on(config, groups[0], device)
+    before = {place: getattr(*place) for place in STAGES}
+    for place, stage in STAGES.items():
+        setattr(*place, watched(before[place], device, spent, stage))
     start = clock(device)
     for group in groups[1:]:
-        on_device.simulate_objects_on(config, group, device, STEP_S)
+        on_device.simulate_objects_on(config, group, device)
     total = clock(device) - start
-    for name, function in before.items():
-        setattr(on_device, name, function)
+    for place, function in before.items():
+        setattr(*place, function)
     spent["plates, optics, truth"] = total - sum(spent.values())
     count = together * (len(groups) - 1)
     return {stage: seconds / count for stage, seconds in (*spent.items(), ("all", total))}
@@ -77,10 +81,10 @@ def throughput(config: Simulation, together: int) -> dict[str, float]:
     samples = len(config.glyphs.objects()) * config.positions
     found = {}
     with tempfile.TemporaryDirectory() as folder:
-        list(simulate(config, Path(folder, "set"), workers=0))
+        simulate(config, Path(folder, "set"), workers=0)
         live = replace(live_dataset(config), together=together)
         for kind, data in (("shards", open_dataset(Path(folder, "set"))), ("simulated", live)):
-            records = list(train(data, Training(epochs=2), Path(folder, kind)))
+            records = train(data, Training(epochs=2), Path(folder, kind)).records
             found[kind] = samples / records[-1]["seconds"]
     return found
 
@@ -97,7 +101,8 @@ def main() -> None:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     count = options.together * (options.groups + 1)
     writers = -(-count // len(HandwritingGlyphs(writers=1).objects()))
-    config = Simulation(glyphs=HandwritingGlyphs(writers=writers), validation=0.0)
+    glyphs = HandwritingGlyphs(writers=writers)
+    config = Simulation(glyphs=glyphs, setup=PaperSetup(pixel=V2ePixel(), time_step_s=STEP_S), validation=0.0)
     names = config.glyphs.objects()[:count]
     spent = stages(config, names, device, options.together)
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else "no GPU"

@@ -42,7 +42,7 @@ for pattern, noise in (("hadamard", 2e-3), ("hadamard", 8e-3), ("raster", 2e-3),
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "scan"
         plan = ScanPlan((plane.width * PITCH, plane.height * PITCH), PITCH, plane.center_m, pattern)
-        list(write_plan(plan, folder))
+        write_plan(plan, folder)
         camera = FrameCamera(
             bit_depth=16, full_well_e=1e9, read_noise_e=noise * 1e9, prnu=0, dsnu_e=0, black_level=2000
         )

@@ -49,7 +49,7 @@ def one_object(config: Simulation, camera: EventCamera, whole: bool = False) -> 
     names = config.glyphs.objects()
     target = config.glyphs.target(names[len(names) // 2], 1)
     scene = Scene(target, config.motion, config.duration_s)
-    wall = config.transport.wall(scene, (config.sensor.height, config.sensor.width))
+    wall = config.setup.observe(scene)
     events = camera.record(WholeImages(wall) if whole else wall, 0.0, config.duration_s, seed=2, threads=1)
     seen = time.process_time()
     times_s = scene.position_times_s(config.positions)

@@ -5,8 +5,8 @@
     python benchmarks/reconstruct.py --weights near-frame-pass
 
 One position of a capture at 160 x 100: the time surface of the events since the position before, both maps
-brought to 96 x 64, and the network, as a graph (`Reconstructor`) and layer by layer. Of weights that see whole
-passes: a pass of 40 positions, all times divided by 40. Wall time, medians; the first runs are left out.
+brought to 96 x 64, and the network, as a graph (`StreamingReconstructor`) and layer by layer. Of weights that
+see whole passes: a pass of 40 positions, all times divided by 40. Wall time, medians; first runs are left out.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ import time
 import numpy as np
 import torch
 
-from evnlos.config import from_dict, to_dict
-from evnlos.dataset import CHANNELS, PARADIGMS, Paradigm, Sampling, network_input
+from evnlos.dataset import STANDARD_MODALITIES, Sampling
 from evnlos.dataset.sampling import make_samples
-from evnlos.evaluation import Reconstructor, reconstruct
-from evnlos.model import JointNetwork, ResidualUNet, UNetConfig, Weights, infer, load_weights
+from evnlos.evaluation import StreamingReconstructor, reconstruct
+from evnlos.model import UNetConfig, Weights, load_weights
 from evnlos.scene import LineMotion
 from evnlos.types import Events
 from machine import machine
@@ -35,11 +34,9 @@ def events_of_a_position(count: int, seed: int) -> Events:
     return Events(np.sort(draw.integers(1, 200_000, count)), *columns, draw.random(count) < 0.5, 160, 100)
 
 
-def untrained(paradigm: Paradigm) -> Weights:
+def untrained(modality: str) -> Weights:
     """Return a network of the default size with random weights."""
-    sampling = Sampling()
-    network = ResidualUNet(CHANNELS[paradigm], UNetConfig(), (sampling.height, sampling.width)).eval()
-    return Weights(network, paradigm, to_dict(sampling), [])
+    return Weights(UNetConfig().build(modality, Sampling()).eval())
 
 
 def whole_passes(weights: Weights, events_each: int, rounds: int) -> None:
@@ -51,7 +48,7 @@ def whole_passes(weights: Weights, events_each: int, rounds: int) -> None:
     columns = (np.concatenate([getattr(one, name) for one in each]) for name in ("x", "y", "p"))
     events = Events(stamps, *columns, 160, 100)
     edges = np.arange(positions + 1) * 200_000
-    motion, sampling = LineMotion(), from_dict(Sampling, weights.sampling)
+    motion, sampling = LineMotion(), weights.sampling
     parts: list[tuple[float, float]] = []
     for _ in range(max(3, rounds // 8) + 1):
         began = time.perf_counter()
@@ -60,7 +57,7 @@ def whole_passes(weights: Weights, events_each: int, rounds: int) -> None:
         reconstruct(weights, samples.frame, samples.surface, samples.position_m)
         parts.append((mapped - began, time.perf_counter() - mapped))
     maps, net = (1e3 * statistics.median(part) / positions for part in zip(*parts[1:], strict=True))
-    print(f"| {weights.paradigm}, whole pass | {maps:.2f} | {net:.2f} | {maps + net:.2f} | |")
+    print(f"| {weights.modality.name}, whole sequence | {maps:.2f} | {net:.2f} | {maps + net:.2f} | |")
 
 
 def main() -> None:
@@ -76,14 +73,14 @@ def main() -> None:
     edges = np.array([0, 200_000])
     print(machine())
     print(f"{args.events} events a position, {args.threads} threads")
-    print("| paradigm | surface and maps, ms | network, ms | together, ms | network layer by layer, ms |")
+    print("| modality | surface and maps, ms | network, ms | together, ms | network layer by layer, ms |")
     print("|---|---|---|---|---|")
     given = load_weights(args.weights) if args.weights else None
-    if given is not None and isinstance(given.network, JointNetwork):
+    if given is not None and given.network.sees_sequence:
         whole_passes(given, args.events, args.rounds)
         return
-    for weights in [given] if given is not None else map(untrained, PARADIGMS):
-        see = Reconstructor(weights)
+    for weights in [given] if given is not None else map(untrained, STANDARD_MODALITIES):
+        see = StreamingReconstructor(weights)
         parts: list[tuple[float, float, float]] = []
         for n in range(args.rounds + 5):
             events = events_of_a_position(args.events, n)
@@ -92,10 +89,10 @@ def main() -> None:
             mapped = time.perf_counter()
             see(samples.frame[0], samples.surface[0])
             seen = time.perf_counter()
-            infer(weights.network, network_input(samples.frame, samples.surface, weights.paradigm))
+            weights.network.infer(weights.modality.inputs(samples.frame, samples.surface))
             parts.append((mapped - began, seen - mapped, time.perf_counter() - seen))
         maps, net, slow = (1e3 * statistics.median(part) for part in zip(*parts[5:], strict=True))
-        print(f"| {weights.paradigm} | {maps:.2f} | {net:.2f} | {maps + net:.2f} | {slow:.2f} |")
+        print(f"| {weights.modality.name} | {maps:.2f} | {net:.2f} | {maps + net:.2f} | {slow:.2f} |")
 
 
 if __name__ == "__main__":

@@ -29,15 +29,16 @@ from evnlos.dataset.presets import default, paper
 from evnlos.plot.figure import new_figure
 from evnlos.scene import HandwritingGlyphs
 from evnlos.sensor import EventPixel
+from evnlos.setups import PaperSetup
 from evnlos.threads import one_thread
-from evnlos.transport import PaperTransport
 from machine import machine
 
 OBJECTS, NODES = 1_000_000, 100
 BASE = Simulation(
     glyphs=HandwritingGlyphs(characters="ABCEFHLT", writers=2),
-    transport=PaperTransport(field_of_view_m=0.585, gain=2.0),
-    pixel=EventPixel(leak_rate_hz=0.0, shot_noise_rate_hz=0.0),
+    setup=PaperSetup(
+        field_of_view_m=0.585, gain=2.0, pixel=EventPixel(leak_rate_hz=0.0, shot_noise_rate_hz=0.0)
+    ),
     duration_s=2.0,
     positions=10,
     validation=0.0,
@@ -79,15 +80,16 @@ def dataset_seconds(count: int) -> float:
     """Return the CPU time of a dataset of `count` objects on disk, made by this process."""
     config = replace(BASE, glyphs=HandwritingGlyphs(characters="A", writers=count))
     with tempfile.TemporaryDirectory() as folder:
-        return cpu_seconds(lambda: list(simulate(config, Path(folder) / "d")), 1)
+        return cpu_seconds(lambda: simulate(config, Path(folder) / "d"), 1)
 
 
 def objects_a_second(workers: int, count: int = 600) -> float:
     """Return how many objects that many processes finish in a second, once a third of them is done."""
     config = replace(BASE, glyphs=HandwritingGlyphs(characters="A", writers=count))
     with tempfile.TemporaryDirectory() as folder:
-        moments = [time.perf_counter() for _ in simulate(config, Path(folder) / "d", workers)]
-    return (count - count // 3) / (moments[-1] - moments[count // 3 - 1])
+        moments = []
+        simulate(config, Path(folder) / "d", workers, progress=lambda _: moments.append(time.perf_counter()))
+    return (count - count // 3) / (moments[-1] - moments[count // 3])
 
 
 def sweeps(repeat: int) -> list[Sweep]:
@@ -97,7 +99,9 @@ def sweeps(repeat: int) -> list[Sweep]:
     seconds = [dataset_seconds(count) for count in counts]
     found.append(Sweep("objects", "objects", [float(count) for count in counts], seconds))
     sides = [(50, 80), (100, 160), (200, 320), (400, 640)]
-    seconds = [one_object(replace(BASE, sensor=SensorSize(*side)), repeat) for side in sides]
+    seconds = [
+        one_object(replace(BASE, setup=replace(BASE.setup, sensor=SensorSize(*side))), repeat) for side in sides
+    ]
     found.append(Sweep("resolution", "pixels", [float(math.prod(side)) for side in sides], seconds))
     spans = [1.0, 2.0, 4.0, 8.0]
     seconds = [one_object(replace(BASE, duration_s=span), repeat) for span in spans]
@@ -105,7 +109,7 @@ def sweeps(repeat: int) -> list[Sweep]:
     events, seconds = [], []
     for threshold in (0.4, 0.2, 0.1, 0.05):
         pixel = replace(BASE.pixel, threshold_on=threshold, threshold_off=threshold)
-        config = replace(BASE, pixel=pixel, sensor=SensorSize(200, 320))
+        config = replace(BASE, setup=replace(BASE.setup, sensor=SensorSize(200, 320), pixel=pixel))
         events.append(float(len(simulate_object(config, config.glyphs.objects()[0])[1])))
         seconds.append(one_object(config, repeat))
     found.append(Sweep("event rate", "events", events, seconds))

@@ -19,15 +19,13 @@ from evnlos.errors import EvnlosError
 from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion, Scene
 from evnlos.scene.distance import signed_distance
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
+from evnlos.setups import RadiometricSetup
 from evnlos.tracking import Tracking, track_frames
-from evnlos.transport import RadiometricTransport
 
 SENSOR, SECONDS, FRAMES = (32, 48), 8.0, 21
 PIXEL = EventPixel(0.18, 0.21, 0.04, 40.0, 0.0, 0.3, 0.0)
 CAMERA = FrameCamera(exposure_s=0.016, full_well_e=10_000.0, read_noise_e=48.0, prnu=0.02, dsnu_e=38.0)
-RIG = RadiometricTransport(
-    cell_m=0.005, strip_m=(0.28, 0.16), gain=0.7, ambient=0.055, ambient_gradient=(0.1, 0.0)
-)
+RIG = RadiometricSetup(cell_m=0.005, strip_m=(0.28, 0.16), gain=0.7, ambient=0.055, ambient_gradient=(0.1, 0.0))
 T = np.linspace(0, SECONDS, 17)
 PATHS = {
     "line": LineMotion(),
@@ -39,13 +37,13 @@ PATHS = {
 }
 
 
-def measured(path: str, rig: RadiometricTransport, camera: FrameCamera, pixel: EventPixel) -> str:
+def measured(path: str, rig: RadiometricSetup, camera: FrameCamera, pixel: EventPixel) -> str:
     target = HandwritingGlyphs().target("writer03_R")
     inside = signed_distance(target.mask, 40)
     # The mean distance to the edge of a stroke is a quarter of its width.
     stroke = -4 * float(inside[inside < 0].mean()) * target.size_m / len(target.mask)
     scene = Scene(target, PATHS[path], SECONDS)
-    wall = rig.wall(scene, SENSOR)
+    wall = rig.resized(SENSOR).observe(scene)
     times = np.linspace(0, SECONDS, FRAMES)
     frames = camera.capture(wall, times, seed=1) / np.float32(255)
     events = EventCamera(pixel).record(wall, 0.0, SECONDS, seed=2)
@@ -62,7 +60,7 @@ def measured(path: str, rig: RadiometricTransport, camera: FrameCamera, pixel: E
     return "   ".join(columns)
 
 
-def retreating(rig: RadiometricTransport, light: float) -> str:
+def retreating(rig: RadiometricSetup, light: float) -> str:
     """Return errors where the plate retreats from the wall on its way; events do not take part."""
     target, motion = HandwritingGlyphs().target("writer03_R"), PATHS["line"]
     times, away_m = np.linspace(0, SECONDS, FRAMES), np.linspace(0.28, 0.32, FRAMES)

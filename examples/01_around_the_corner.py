@@ -16,27 +16,26 @@ from evnlos.plot.event_views import signed_pictures, slice_pictures
 from evnlos.plot.film import Column, film
 from evnlos.report.pictures import grey, save_animation
 from evnlos.scene import FontGlyphs
+from evnlos.setups import load_setup
 from evnlos.solver import JointProblem, PlatePass
 from evnlos.solver.plate_pass import strip_gram_of
 from evnlos.solver.recording import object_light
-from evnlos.transport import MatrixTransport, rig_preset
 from evnlos.types import Plane
 
 SHAPE, CANVAS = (40, 64), Sampling()
 scene = Scene(FontGlyphs(family="Nunito Black").target("nunito_black_R"))  # 8 cm, 2 cm/s, 16 cm of travel
-rig = replace(rig_preset("main-near"), cell_m=0.005)  # rough aluminium, 0.30 m away
+setup = replace(load_setup("main-near"), cell_m=0.005).resized(SHAPE)  # rough aluminium, 0.30 m away
 times_s = scene.position_times_s(40)
 places = scene.motion.position_m(times_s)
 
-wall = rig.wall(scene, SHAPE)
+wall = setup.observe(scene)
 frames = FrameCamera(exposure_s=0.016).capture(wall, times_s, seed=1)
 events = EventCamera(EventPixel(cutoff_hz=15)).record(wall, 0, 8, seed=1)
 edges_us = np.r_[0, 1e6 * times_s].astype(np.int64)
 surface = time_surface(events, edges_us, tau_us=200_000)
 
-made = rig.transport(SHAPE)
-camera = MatrixTransport(made.matrix * rig.gain, made.source, SHAPE)
-light, plate, gram = object_light(frames, 255, rig, SHAPE), Plane(16, 16, 0.005), strip_gram_of(camera)
+camera = setup.operator(setup.target_cells())
+light, plate, gram = object_light(frames, 255, setup, SHAPE), Plane(16, 16, 0.005), strip_gram_of(camera)
 truth = scene.truth(CANVAS.canvas, times_s)[:, CANVAS.scored]
 found = np.zeros_like(truth)
 for k in range(40) if len(sys.argv) > 1 else (0, 39):

@@ -7,10 +7,10 @@ import numpy as np
 
 from evnlos import FrameCamera
 from evnlos.calibration.scan import ScanCamera, ScanImport, ScanPlan, import_scan, rehearse_scan, write_plan
-from evnlos.transport import rig_preset
+from evnlos.setups import setup_preset
 
 SHAPE = (60, 96)  # pixels
-rig = rig_preset("main-near")
+rig = setup_preset("main-near")
 camera = FrameCamera(bit_depth=12, full_well_e=15_000, read_noise_e=30, prnu=0, dsnu_e=0)
 guess = ScanCamera(full_level=0.8, lobe_m=0.05, full_well_e=15_000, read_noise_e=30, bit_depth=12)
 
@@ -27,7 +27,7 @@ for pattern in ("raster", "hadamard"):
     truth *= guess.full_level / truth.sum(axis=1).max()  # exposed alike: all cells lit reach 0.8
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "scan"
-        list(write_plan(plan, folder))
+        write_plan(plan, folder)
         text = (folder / "scan.yaml").read_text().replace("white_dn: null", "white_dn: 4095")
         (folder / "scan.yaml").write_text(text)
         rehearse_scan(folder, truth, SHAPE, camera)

@@ -15,6 +15,24 @@ import tyro  # noqa: F401  Its import reads all builtins, and stumbles over what
 ROOT = Path(__file__).resolve().parent.parent
 
 
+SLOW = {
+    "test_carry_over", "test_cluster", "test_distributed", "test_examples", "test_experiment", "test_faults",
+    "test_interop_deepinv", "test_live_training", "test_mitsuba_oracle", "test_notebooks", "test_open_core",
+}  # fmt: skip
+"""Files of whole studies and trainings, and of programs that they start."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what takes long, what needs a GPU, and what needs the real data."""
+    for item in items:
+        if item.path.stem in SLOW:
+            item.add_marker(pytest.mark.slow)
+        if "shared_data" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.shared)
+        if "cuda" in item.name:
+            item.add_marker(pytest.mark.gpu)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Return the folder of real and independent data, or skip where it is not present."""
@@ -29,28 +47,26 @@ def tiny():
     """Settings of a simulation that takes a second: 16 objects, 8 positions each, a small sensor."""
     from evnlos.dataset import Sampling, SensorSize, Simulation
     from evnlos.scene import HandwritingGlyphs
-    from evnlos.transport import PaperTransport
+    from evnlos.setups import PaperSetup
 
     return Simulation(
         glyphs=HandwritingGlyphs(characters="ABCEFHLT", writers=2),
-        transport=PaperTransport(tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, field_of_view_m=0.3),
-        sensor=SensorSize(48, 72),
+        setup=PaperSetup(
+            tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, field_of_view_m=0.3, sensor=SensorSize(48, 72)
+        ),
         sampling=Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24),
         positions=8,
         validation=0.2,
-        vary={"transport.gain": (1.5, 2.0)},
+        vary={"setup.gain": (1.5, 2.0)},
     )
 
 
 @pytest.fixture(scope="session")
 def tiny_dataset(tiny, tmp_path_factory):
     """A simulated dataset on disk that tests only read."""
-    from evnlos.dataset import open_dataset, simulate
+    from evnlos.dataset import simulate
 
-    folder = tmp_path_factory.mktemp("tiny") / "simulation"
-    for _ in simulate(tiny, folder):
-        pass
-    return open_dataset(folder)
+    return simulate(tiny, tmp_path_factory.mktemp("tiny") / "simulation")
 
 
 @pytest.fixture(scope="session")
@@ -59,44 +75,42 @@ def tiny_captures(tmp_path_factory) -> list[Path]:
     from evnlos.dataset import SensorSize
     from evnlos.dataset.lab import Lab, render_captures
     from evnlos.scene import FontGlyphs
-    from evnlos.transport import RadiometricTransport
+    from evnlos.setups import RadiometricSetup
 
     lab = Lab(
         glyphs=FontGlyphs(family="kalam", characters="ALT4"),
-        sensor=SensorSize(48, 72),
-        transport=RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06),
+        setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),
         frame_rate_hz=1.0,
     )
-    return list(render_captures(lab, tmp_path_factory.mktemp("lab")))
+    return render_captures(lab, tmp_path_factory.mktemp("lab"))
 
 
 @pytest.fixture(scope="session")
 def app_pass():
     """A pass that the page simulates, at the smallest size."""
+    from evnlos.app.controls import Controls
     from evnlos.app.hidden import picked
     from evnlos.app.recorded import simulate_pass
-    from evnlos.app.setup import Setup
 
-    return simulate_pass(Setup(columns=24), picked("R"))
+    return simulate_pass(Controls(columns=24), picked("R"))
 
 
 @pytest.fixture(scope="session")
 def app_weights(tmp_path_factory) -> dict[str, Path]:
-    """Untrained weights of two paradigms, for maps of the page's smallest size."""
+    """Untrained weights of two modalities, for maps of the page's smallest size."""
     import torch
 
-    from evnlos.config import to_dict
     from evnlos.dataset import Sampling
-    from evnlos.model import ResidualUNet, UNetConfig, Weights, save_weights
+    from evnlos.model import UNetConfig, Weights, save_weights
 
     folder = tmp_path_factory.mktemp("weights")
     sampling, found = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12), {}
-    for paradigm, channels in (("fusion", 3), ("event", 2)):
+    for modality in ("fusion", "event"):
         torch.manual_seed(0)
-        network = ResidualUNet(channels, UNetConfig(width=4, depth=1, rank=0)).eval()
-        found[paradigm] = folder / f"{paradigm}-run" / "weights.safetensors"
-        found[paradigm].parent.mkdir()
-        save_weights(found[paradigm], Weights(network, paradigm, to_dict(sampling), []))
+        network = UNetConfig(width=4, depth=1, rank=0).build(modality, sampling).eval()
+        found[modality] = folder / f"{modality}-run" / "weights.safetensors"
+        found[modality].parent.mkdir()
+        save_weights(found[modality], Weights(network))
     return found
 
 

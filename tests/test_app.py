@@ -21,12 +21,12 @@ import pytest
 
 import chromium
 from evnlos import Events, hosts
+from evnlos.app.controls import Controls
 from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
 from evnlos.app.middleware import middleware
 from evnlos.app.networks import Networks, own_networks
 from evnlos.app.recorded import simulate_pass
 from evnlos.app.serve import Server, running
-from evnlos.app.setup import Setup
 from evnlos.app.sheet import message_box
 from evnlos.app.solving import from_each_frame, from_weights, from_whole_pass
 from evnlos.app.verdict import verdict_on
@@ -37,7 +37,7 @@ from evnlos.errors import ConfigError, DataError, MissingDependencyError
 from evnlos.model import load_weights
 from evnlos.plot.event_views import CloudSize, cloud_pictures, signed_pictures, smaller, time_slices
 
-SMALL = Setup(columns=24)
+SMALL = Controls(columns=24)
 
 
 def test_a_pass_is_the_same_bytes_for_the_same_settings(app_pass) -> None:
@@ -53,7 +53,7 @@ def test_settings_do_what_they_say(app_pass) -> None:
     higher = simulate_pass(replace(SMALL, threshold_on=0.3, threshold_off=0.3), picked("R"))
     assert len(higher.events) < 0.7 * len(app_pass.events)
     assert simulate_pass(replace(SMALL, ambient=0.4), picked("R")).frames.min() > app_pass.frames.max() / 2
-    usual, noisy = (Setup(frame_noise=n).simulation().frame_camera for n in (1.0, 3.0))
+    usual, noisy = (Controls(frame_noise=n).simulation().frame_camera for n in (1.0, 3.0))
     for level in (0.0, 0.3):
         # Shot and read noise in white levels, both three times as strong.
         own, more = ((c.full_well_e * level + c.read_noise_e**2) ** 0.5 / c.full_well_e for c in (usual, noisy))
@@ -88,7 +88,7 @@ def test_classical_pictures_beat_black_and_the_whole_pass_beats_one_frame(app_pa
     assert single.psnr_db[middle].mean() > single.black_db[middle].mean() + 1.5
     matte = simulate_pass(replace(SMALL, wall="matte"), picked("R"))
     assert from_whole_pass(matte).psnr_db[middle].mean() < whole.psnr_db[middle].mean() - 1.0
-    with pytest.raises(DataError, match="rig"):
+    with pytest.raises(DataError, match="setup"):
         from_each_frame(replace(app_pass, simulation=None))
 
 
@@ -282,6 +282,80 @@ def test_foreign_names_are_refused_unless_the_network_is_let_in(own: str | None,
             app({"type": "websocket", "path": "/", "headers": [(b"host", b"evil.example")]}, None, send)
         )
         assert found == [{"type": "websocket.close", "code": 1008}]
+
+
+def answered(app, **scope) -> int:
+    """Return the status that an ASGI app answers with."""
+    found = []
+
+    async def send(message) -> None:
+        found.append(message)
+
+    asyncio.run(app({"type": "http", "method": "POST", "path": "/gradio_api/upload", **scope}, None, send))
+    return next(message["status"] for message in found if message["type"] == "http.response.start")
+
+
+def test_other_sites_may_not_send_and_uploads_are_bounded(tmp_path) -> None:
+    pytest.importorskip("starlette")
+
+    async def page(scope, receive, send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b""})
+
+    app = page
+    for one in reversed(middleware("", "127.0.0.1", tmp_path, 1000)):
+        app = one.cls(app, *one.args, **one.kwargs)
+
+    def asked(length: int | None = 10, path: str = "/gradio_api/upload", **headers: str) -> int:
+        given = {"host": "localhost:7860", **headers} | (
+            {} if length is None else {"content-length": str(length)}
+        )
+        raw = [(name.replace("_", "-").encode(), value.encode()) for name, value in given.items()]
+        return answered(app, headers=raw, path=path)
+
+    assert asked() == 200  # a program, which says nothing
+    assert asked(origin="http://localhost:7860", sec_fetch_site="same-origin") == 200
+    assert asked(origin="http://localhost:7860") == 200
+    assert asked(origin="http://evil.example") == 403
+    assert asked(origin="http://localhost:9999") == 403  # another page of this machine
+    assert asked(origin="null") == 403
+    assert asked(sec_fetch_site="cross-site") == 403
+    assert asked(sec_fetch_site="same-site") == 403
+    assert asked(None) == 411
+    assert asked(5_000_000, path="/gradio_api/queue/join") == 413
+    assert asked(9_000) == 200
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "file").write_bytes(bytes(9_000))
+    assert asked(900) == 200
+    assert asked(2_000) == 507
+
+
+def test_the_page_may_not_be_framed() -> None:
+    pytest.importorskip("starlette")
+    found = []
+
+    async def page(scope, receive, send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    async def send(message) -> None:
+        found.append(message)
+
+    policy = middleware("", None)[0]
+    asyncio.run(policy.cls(page)({"type": "http", "path": "/x", "headers": []}, None, send))
+    headers = dict(found[0]["headers"])
+    assert headers[b"x-frame-options"] == b"DENY" and headers[b"x-content-type-options"] == b"nosniff"
+    assert b"frame-ancestors 'none'" in headers[b"content-security-policy"]
+
+
+def test_messages_name_no_folder_of_this_machine(tmp_path) -> None:
+    from evnlos.app.work import uploaded
+
+    folder = tmp_path / ("a" * 64)
+    folder.mkdir()
+    path = folder / "x.raw"
+    path.write_bytes(b"rubbish")
+    _, message = uploaded(str(path), tmp_path, 1000, None)  # type: ignore[arg-type]
+    assert "x.raw" in message and "a" * 64 not in message and str(tmp_path) not in message
 
 
 STARTING = """

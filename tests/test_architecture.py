@@ -19,6 +19,8 @@ STAGES = [
     "transport",
     "sensor",
     "events",
+    "lab",
+    "setups",
     "dataset",
     "model",
     "solver",
@@ -30,8 +32,23 @@ STAGES = [
     "report",
     "experiment",
 ]
-LEAVES = {"claim", "types", "errors", "config", "metrics", "seeds", "threads", "version"}
+LEAVES = {
+    "migrate",
+    "registry",
+    "types",
+    "errors",
+    "config",
+    "files",
+    "metrics",
+    "progress",
+    "seeds",
+    "threads",
+    "untrusted",
+    "version",
+}
 FILES = sorted(SOURCE.rglob("*.py"))
+TESTS = Path(__file__).parent
+MOST_DEEP_IMPORTS = 191
 
 
 def imported(path: Path, *, lazy: bool) -> set[str]:
@@ -60,6 +77,11 @@ def test_a_stage_imports_only_stages_to_its_left(path: Path) -> None:
             assert other in LEAVES or STAGES.index(other) <= STAGES.index(stage), f"{path} imports {name}"
         elif stage in LEAVES:
             assert other in LEAVES, f"the leaf {path} imports {name}"
+
+
+@pytest.mark.parametrize("path", sorted((SOURCE / "lab").glob("*.py")), ids=lambda p: p.name)
+def test_the_second_renderer_shares_no_optics(path: Path) -> None:
+    assert not [name for name in imported(path, lazy=True) if name.startswith("evnlos.transport")]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
@@ -129,3 +151,28 @@ def test_every_stage_lists_what_it_offers(stage: str) -> None:
     module = importlib.import_module(f"evnlos.{stage}")
     assert module.__all__ == sorted(module.__all__, key=lambda n: (not n.isupper(), n[0].islower(), n))
     assert module.__doc__
+
+
+def deep_imports(path: Path) -> set[str]:
+    """Return the modules inside of stages that a test file imports, past the faces of the stages."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module]
+            if node.module.startswith("evnlos.") and node.module.count(".") == 1:
+                face = importlib.import_module(node.module)
+                offered = getattr(face, "__all__", ())
+                names += [f"{node.module}.{alias.name}" for alias in node.names if alias.name not in offered]
+        for name in names:
+            place = SOURCE.joinpath(*name.split(".")[1:])
+            is_module = place.with_suffix(".py").is_file() or (place / "__init__.py").is_file()
+            if name.startswith("evnlos.") and name.count(".") > 1 and is_module:
+                found.add(name)
+    return found
+
+
+def test_tests_speak_to_the_faces_of_stages() -> None:
+    """How many modules inside of stages tests import may only shrink; a rename changes nothing."""
+    found = set().union(*(deep_imports(path) for path in TESTS.glob("*.py")))
+    assert len(found) <= MOST_DEEP_IMPORTS, f"import from the stages what these offer: {sorted(found)}"

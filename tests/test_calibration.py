@@ -32,6 +32,7 @@ from evnlos.calibration.event_statistics import count_map, read_recordings, with
 from evnlos.calibration.frame_model import FrameModel, working_shape
 from evnlos.calibration.frame_noise import fit_frame_noise
 from evnlos.calibration.least_squares import levenberg_marquardt
+from evnlos.calibration.transport_fit import values_of
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
 from evnlos.dataset import load_pattern
@@ -40,10 +41,10 @@ from evnlos.dataset.simulate import SensorSize, Simulation, simulate_object
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs, pen_width
 from evnlos.sensor import EventPixel, FrameCamera
-from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.types import Events
 
-RIG = RadiometricTransport(
+RIG = RadiometricSetup(
     roughness=0.07,
     camera_angle_deg=26.0,
     cell_m=0.005,
@@ -55,26 +56,23 @@ CAMERA = FrameCamera(exposure_s=0.016, full_well_e=8000.0, read_noise_e=20.0, pr
 PIXEL = EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0)
 LAB = Lab(
     glyphs=FontGlyphs(family="kalam", characters="ALT4EO"),
-    sensor=SensorSize(50, 80),
-    transport=RIG,
+    setup=replace(RIG, sensor=SensorSize(50, 80), frame_camera=CAMERA, pixel=PIXEL),
     frame_rate_hz=2.0,
-    frame_camera=CAMERA,
-    pixel=PIXEL,
     spread={},
 )
-START = RadiometricTransport(roughness=0.12, field_of_view_deg=26.0)
+START = RadiometricSetup(roughness=0.12, field_of_view_deg=26.0)
 HELD = ("4", "T")
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory) -> list[Path]:
     """Six captures of a known rig."""
-    return list(render_captures(LAB, tmp_path_factory.mktemp("rig")))
+    return render_captures(LAB, tmp_path_factory.mktemp("rig"))
 
 
 @pytest.fixture(scope="module")
 def fit(folders):
-    settings = Calibration(holdout=HELD, start=Simulation(transport=START), event_captures=2, columns=32)
+    settings = Calibration(holdout=HELD, start=Simulation(setup=START), event_captures=2, columns=32)
     return fit_rig(folders, settings)
 
 
@@ -95,13 +93,13 @@ def edit(folder: Path, **changes) -> None:
 
 
 def test_optics_come_back(fit) -> None:
-    found = fit.optics.transport
+    found = fit.optics.setup
     assert found.roughness == pytest.approx(RIG.roughness, rel=0.02)
     assert found.gain == pytest.approx(RIG.gain, rel=0.03)
     assert found.ambient == pytest.approx(RIG.ambient, rel=0.03)
     assert found.ambient_gradient == pytest.approx(RIG.ambient_gradient, abs=0.03)
     # Distance, angle and field of view of the camera trade against each other: what they show must agree.
-    shape = LAB.sensor.height, LAB.sensor.width
+    shape = LAB.setup.sensor.height, LAB.setup.sensor.width
     seen = [
         rig.view(shape).wall_points_m()[25, 10] - rig.view(shape).wall_points_m()[25, 70]
         for rig in (found, RIG)
@@ -146,7 +144,7 @@ def test_the_rig_file_simulates(fit, tmp_path) -> None:
     rows = rows_of(fit, EventPixel(), FrameCamera())
     rig = load_yaml(Simulation, write_rig(fit, rows, tmp_path))
     assert rig == fit.simulation
-    assert rig.transport == fit.optics.transport and rig.pixel == fit.pixel.pixel
+    assert rig.setup == fit.optics.setup.with_cameras_of(rig.setup) and rig.pixel == fit.pixel.pixel
     assert (rig.positions, rig.duration_s, rig.motion.start_m) == (16, 8.0, (-0.08, 0.0))
     samples, _ = simulate_object(replace(rig, glyphs=FontGlyphs(family="kalam", characters="A")), "kalam_A")
     assert samples.frame.shape == (16, 64, 96)
@@ -172,21 +170,22 @@ def test_the_fixed_pattern_is_found_and_left_out_of_the_training_set(fit, tmp_pa
     low, high = training.glyphs.strokes.pen
     assert low == pytest.approx(0.9 * min(pens), abs=1e-3) and high == pytest.approx(1.1 * max(pens), abs=1e-3)
     for path, (low, high) in training.vary.items():
-        section, name, *axis = path.split(".")
-        value = getattr(getattr(fit.simulation, section), name)
-        assert low <= (value[int(axis[0])] if axis else value) <= high
+        value = fit.simulation
+        for part in path.split("."):
+            value = value[int(part)] if part.isdigit() else getattr(value, part)
+        assert low <= value <= high
 
 
 def test_a_fit_that_fails_on_unseen_captures_is_refused(folders, tmp_path, capsys) -> None:
     """The captures to fit show a rougher wall than those held out, from which the search starts."""
-    rougher = replace(LAB, transport=replace(RIG, roughness=0.2), glyphs=replace(LAB.glyphs, characters="IV"))
-    shots = list(render_captures(rougher, tmp_path / "other"))
+    rougher = replace(LAB, setup=replace(LAB.setup, roughness=0.2), glyphs=replace(LAB.glyphs, characters="IV"))
+    shots = render_captures(rougher, tmp_path / "other")
     noted = yaml.safe_load((folders[0] / "capture.yaml").read_text())["rig"]
     for folder in shots:
         edit(folder, rig=noted)  # the notes claim that nothing changed
     shots += [folder for folder in folders if folder.name[-1] in "AL"]
     start, out = tmp_path / "start.yaml", tmp_path / "out"
-    save_yaml(Calibration(start=Simulation(transport=RIG), columns=24), start)
+    save_yaml(Calibration(start=Simulation(setup=RIG), columns=24), start)
     words = ["calibrate", *shots, "--out", out, "--holdout", "A", "L", "--no-events", "--config", start]
     with pytest.raises(SystemExit) as stop:
         main([str(word) for word in words])
@@ -199,13 +198,13 @@ def test_a_fit_that_fails_on_unseen_captures_is_refused(folders, tmp_path, capsy
 def test_the_command_prints_and_writes(folders, tmp_path, capsys) -> None:
     out = tmp_path / "rig"
     words = ["--out", out, "--holdout", "4", "--exclude", "A", "E", "O", "--no-events", "--preset", "paper"]
-    words += ["--start.transport.field-of-view-m", 0.6, "--columns", 24]
+    words += ["--start.setup.field-of-view-m", 0.6, "--columns", 24]
     main(["calibrate", *map(str, folders), *map(str, words)])
     text = capsys.readouterr().out
     assert "held out: lab_4" in text and "lab_E" not in text
-    assert "transport.tpsf_length_m" in text and "frames held out" in text
+    assert "setup.tpsf_length_m" in text and "frames held out" in text
     rig = load_yaml(Simulation, out / "rig.yaml")
-    assert isinstance(rig.transport, PaperTransport)
+    assert isinstance(rig.setup, PaperSetup)
     found = json.loads((out / "calibration.json").read_text())["residuals"]["frames held out"]
     assert found["after"] < 0.25 < found["before"]
 
@@ -297,7 +296,7 @@ def test_one_matrix_gives_what_the_walls_give(folders) -> None:
     model = FrameModel(fit, (25, 40), every=5)
     together = model.light(RIG)
     k = 2
-    wall = replace(RIG, gain=1.0, ambient=0.0).wall(fit.scenes[k], (25, 40))
+    wall = replace(RIG, gain=1.0, ambient=0.0).resized((25, 40)).observe(fit.scenes[k])
     alone = wall.irradiance(fit.times_s(k)[::5])
     count = len(fit.times_s(k)[::5])
     assert float((together[k * count : (k + 1) * count] - alone).abs().max()) < 2e-3 * float(alone.max())
@@ -380,7 +379,7 @@ def test_light_of_recordings_follows_the_wall(folders) -> None:
     found = read_recordings(fit, RIG, 2)
     assert [r.index for r in found] == [0, len(fit.names) - 1]
     assert found[0].times_s[[0, -1]].tolist() == [0.0, 8.0]
-    wall = RIG.wall(fit.scenes[0], fit.shape)
+    wall = RIG.resized(fit.shape).observe(fit.scenes[0])
     assert np.allclose(found[0].light[7], 255 * wall.irradiance(found[0].times_s[7]).numpy(), atol=1e-3)
 
 
@@ -399,10 +398,10 @@ def test_independent_captures_are_fitted(shared_data, group, limit) -> None:
         pytest.skip(f"no captures at {folders[0].parent}")
     fit, held = read_shots(folders, holdout=["A", "T"])
     distance = fit.captures[0].info.rig["distance_m"]
-    start = RadiometricTransport(roughness=0.1, distance_m=distance)
+    start = RadiometricSetup(roughness=0.1, distance_m=distance)
     found = fit_transport(fit, start, fixed=("distance_m",), columns=24, iterations=6)
     model = FrameModel(held, held.shape, every=4)
-    after = model.relative(model.frames - model.predict(found.transport))
+    after = model.relative(model.frames - model.predict(found.setup))
     before = model.relative(model.frames - model.predict(found.before))
     assert after < limit < before
 
@@ -410,15 +409,15 @@ def test_independent_captures_are_fitted(shared_data, group, limit) -> None:
 def test_a_number_on_the_bound_of_the_search_is_named(fit) -> None:
     assert fit.optics.on_bound == {} and fit.unexplained is None and warnings_of(fit) == []
     parameters = tuple(
-        replace(p, high=p.read(fit.optics.transport)) if p.name == "roughness" else p
+        replace(p, high=values_of(fit.optics.setup)[p.name]) if p.name == "roughness" else p
         for p in fit.optics.parameters
     )
     stuck = replace(fit, optics=replace(fit.optics, parameters=parameters))
     rows = rows_of(stuck, EventPixel(), FrameCamera())
     assert "on the bound of the search: 0.06" in table(rows)
     found = figures(stuck, rows)
-    assert found["on_bound"] == ["transport.roughness"]
-    assert len(found["warnings"]) == 1 and "transport.roughness" in found["warnings"][0]
+    assert found["on_bound"] == ["setup.roughness"]
+    assert len(found["warnings"]) == 1 and "setup.roughness" in found["warnings"][0]
     assert "evnlos scan" in found["warnings"][0] and "\n" not in found["warnings"][0]
 
 
@@ -447,20 +446,19 @@ def test_the_gain_of_unknown_targets_is_called_arbitrary(fit) -> None:
     for targets, note in (("known", ""), ("unknown", "not told by unknown targets: arbitrary")):
         one = replace(fit, targets=targets)
         rows = rows_of(one, EventPixel(), FrameCamera())
-        assert {row.name: row.note for row in rows}["transport.gain"] == note
-        assert figures(one, rows)["parameters"]["transport.gain"]["note"] == note
+        assert {row.name: row.note for row in rows}["setup.gain"] == note
+        assert figures(one, rows)["parameters"]["setup.gain"]["note"] == note
         assert (note in table(rows)) and figures(one, rows)["targets"] == targets
 
 
 def test_a_matte_wall_ends_on_the_bounds(tmp_path, capsys) -> None:
     """Rough metal is fitted to a matte wall that explains the frames to the noise: only the bounds tell."""
-    wall = replace(RIG, wall_material="lambert")
-    matte = replace(LAB, transport=wall, sensor=SensorSize(25, 40), frame_rate_hz=1.0)
+    matte = replace(
+        LAB, setup=replace(LAB.setup, wall_material="lambert", sensor=SensorSize(25, 40)), frame_rate_hz=1.0
+    )
     shots = render_captures(matte, tmp_path / "shots")
     words = ["calibrate", *shots, "--out", tmp_path / "rig", "--holdout", "4", "--no-events", "--columns", 16]
-    main([str(word) for word in words])
+    main([str(word) for word in [*words, "--wall", "formula"]])
     shown = capsys.readouterr()
     assert "on the bound of the search" in shown.out
-    assert any(
-        line.startswith("warning: transport.") and "evnlos scan" in line for line in shown.err.splitlines()
-    )
+    assert any(line.startswith("warning: setup.") and "evnlos scan" in line for line in shown.err.splitlines())

@@ -11,6 +11,8 @@ from PIL import Image
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
 from evnlos.dataset import capture_samples, character_of, read_shard, reduce_by_area
 from evnlos.dataset.sampling import Sampling
+from evnlos.errors import DataError
+from watching import Watch, stopped
 
 
 @pytest.fixture
@@ -54,7 +56,7 @@ def test_the_standard_sample_of_a_shared_capture(shared_data) -> None:
 def test_every_shared_capture_imports(shared_data, tmp_path) -> None:
     pytest.importorskip("aedat", reason="the far captures need the extra [aedat]")
     folders = [shared_data / "captures" / name for name in ("near_G", "near_S", "far_G", "far_S")]
-    list(import_captures(folders, tmp_path / "d", test=["G"]))
+    import_captures(folders, tmp_path / "d", test=["G"])
     dataset = open_dataset(tmp_path / "d")
     assert dataset.split == {"train": ["near_S", "far_S"], "validation": [], "test": ["near_G", "far_G"]}
     for name in dataset.objects():
@@ -64,28 +66,41 @@ def test_every_shared_capture_imports(shared_data, tmp_path) -> None:
 
 
 def test_import_is_resumable_and_refuses_other_captures(tiny_captures, tmp_path) -> None:
-    steps = import_captures(tiny_captures, tmp_path / "d", test=["4"])
-    next(steps)
-    steps.close()
+    stopped(import_captures, tiny_captures, tmp_path / "d", test=["4"], after=1)
     assert len(open_dataset(tmp_path / "d").missing()) == 3
-    assert len(list(import_captures(tiny_captures, tmp_path / "d", test=["4"]))) == 3
+    watch = Watch()
+    assert import_captures(tiny_captures, tmp_path / "d", test=["4"], progress=watch).missing() == []
+    assert len(watch.results) == 3
     with pytest.raises(EvnlosError, match="other settings"):
-        list(import_captures(tiny_captures[:3], tmp_path / "d"))
+        import_captures(tiny_captures[:3], tmp_path / "d")
 
 
 def test_a_changed_description_is_another_dataset(capture, tmp_path) -> None:
-    list(import_captures([capture], tmp_path / "d"))
-    list(import_captures([capture], tmp_path / "d"))
+    import_captures([capture], tmp_path / "d")
+    import_captures([capture], tmp_path / "d")
     _edit("capture.yaml", "events: events.raw", "events: events.raw\nfilters: {background_us: 5000}")(capture)
     with pytest.raises(EvnlosError, match="other settings"):
-        list(import_captures([capture], tmp_path / "d"))
+        import_captures([capture], tmp_path / "d")
 
 
 def test_held_out_names_must_exist_and_not_overlap(tiny_captures, tmp_path) -> None:
     with pytest.raises(EvnlosError, match="no capture is named Z"):
-        list(import_captures(tiny_captures, tmp_path / "d", test=["Z"]))
+        import_captures(tiny_captures, tmp_path / "d", test=["Z"])
     with pytest.raises(EvnlosError, match="choose one"):
-        list(import_captures(tiny_captures, tmp_path / "d", test=["A"], validation=["lab_A"]))
+        import_captures(tiny_captures, tmp_path / "d", test=["A"], validation=["lab_A"])
+    assert not (tmp_path / "d").exists()
+
+
+@pytest.mark.parametrize("kind", [list, tuple, iter, lambda folders: (folder for folder in folders)])
+def test_two_captures_of_one_name_are_refused_however_they_are_given(kind, tiny_captures, tmp_path) -> None:
+    twin = tmp_path / "other" / tiny_captures[0].name
+    shutil.copytree(tiny_captures[0], twin)
+    with pytest.raises(DataError):
+        import_captures(kind([tiny_captures[0], twin]), tmp_path / "d")
+    with pytest.raises(DataError):
+        import_captures(kind([tiny_captures[0], tiny_captures[0]]), tmp_path / "d")
+    with pytest.raises(DataError):
+        import_captures(kind([]), tmp_path / "d")
     assert not (tmp_path / "d").exists()
 
 
@@ -136,7 +151,7 @@ def test_a_damaged_capture_is_a_one_line_error_and_writes_nothing(damage: str, c
     break_it, says = DAMAGE[damage]
     break_it(capture)
     with pytest.raises(EvnlosError, match=says) as caught:
-        list(import_captures([capture], tmp_path / "d"))
+        import_captures([capture], tmp_path / "d")
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "d").glob("*.h5"))
 

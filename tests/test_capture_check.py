@@ -16,7 +16,7 @@ from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.simulate import SensorSize
 from evnlos.errors import DataError
 from evnlos.scene import FontGlyphs
-from evnlos.transport import RadiometricTransport
+from evnlos.setups import RadiometricSetup
 from evnlos.types import Events
 
 
@@ -143,11 +143,10 @@ def steady(tmp_path_factory):
     """A rendered capture at 2.5 frames a second."""
     lab = Lab(
         glyphs=FontGlyphs(family="kalam", characters="R"),
-        sensor=SensorSize(48, 72),
-        transport=RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06),
+        setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),
         frame_rate_hz=2.5,
     )
-    return read_capture(next(render_captures(lab, tmp_path_factory.mktemp("steady"))))
+    return read_capture(render_captures(lab, tmp_path_factory.mktemp("steady"))[0])
 
 
 @pytest.mark.parametrize(("shift_us", "way"), [(350_000, "late"), (-350_000, "early"), (3_000_000, "late")])

@@ -60,7 +60,7 @@ def test_a_celex_pair(tmp_path):
     assert shot.frame_times_us.tolist() == [30_000, 130_000, 230_000]
     assert shot.events.polarity_known is None and len(shot.events) < len(events)
     assert any("without polarity left out" in note for note in shot.notes)
-    list(import_captures([folder], tmp_path / "d"))
+    import_captures([folder], tmp_path / "d")
     samples, _ = read_shard(open_dataset(tmp_path / "d").shard("shot_A"))
     assert samples.frame.shape == (2, 64, 96) and samples.truth is None
 

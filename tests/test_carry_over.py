@@ -8,22 +8,21 @@ import pytest
 import torch
 
 from evnlos.cli import main
-from evnlos.config import save_yaml, to_dict
+from evnlos.config import save_yaml
 from evnlos.dataset import NlosDataset, Sampling, SensorSize, Simulation
 from evnlos.errors import DataError
 from evnlos.experiment.carry_over import carry_over, sets
-from evnlos.model import ResidualUNet, UNetConfig, Weights, save_weights
+from evnlos.model import UNetConfig, Weights, save_weights
 from evnlos.scene import DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS
+from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.training.confidence import fit_confidence
-from evnlos.transport import PaperTransport, RadiometricTransport
 
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
 RIG = Simulation(
-    transport=RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06),
-    sensor=SensorSize(48, 72),
+    setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),
     positions=8,
-    vary={"transport.gain": (0.5, 0.9)},
+    vary={"setup.gain": (0.5, 0.9)},
 )
 
 
@@ -32,12 +31,12 @@ def test_the_sets_change_one_thing_each() -> None:
     assert set(KINDS) < set(found) and "matte wall" in found
     for name, config in found.items():
         assert config.sampling == SAMPLING and not config.vary and config.frame_camera == RIG.frame_camera
-        moved = config.transport != RIG.transport
+        moved = config.setup != RIG.setup
         assert moved == (name not in KINDS and name != "characters of an unseen hand")
         assert moved <= isinstance(config.glyphs, HandwritingGlyphs)
         assert len(config.glyphs.objects()) == (36 if "unseen" in name else 4)
     with pytest.raises(DataError, match="radiometric"):
-        sets(replace(RIG, transport=PaperTransport()), SAMPLING, 4)
+        sets(replace(RIG, setup=PaperSetup()), SAMPLING, 4)
 
 
 def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, monkeypatch) -> None:
@@ -45,19 +44,19 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, monkeypatch) -> 
     rig.mkdir(parents=True)
     save_yaml(RIG, rig / "rig.yaml")
     torch.manual_seed(0)
-    network = ResidualUNet(1, UNetConfig(width=4, depth=1, rank=0)).eval()
-    bare = Weights(network, "frame", to_dict(SAMPLING), [])
+    network = UNetConfig(width=4, depth=1, rank=0).build("frame", SAMPLING).eval()
+    bare = Weights(network)
     save_weights(tmp_path / "bare.safetensors", bare)
     with pytest.raises(DataError, match="does not know what its pictures are worth"):
-        next(carry_over(tmp_path / "bare.safetensors", rig, tmp_path, 1))
+        carry_over(tmp_path / "bare.safetensors", rig, tmp_path, 1)
     confidence = fit_confidence(network, NlosDataset(tiny_dataset, "train", "frame"), SAMPLING.canvas)
     save_weights(tmp_path / "w.safetensors", replace(bare, confidence=confidence))
 
     def two(rig: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation]:
         base = replace(rig, sampling=sampling, vary={}, validation=0.0)
-        dim = replace(RIG.transport, gain=0.2)
+        dim = replace(RIG.setup, gain=0.2)
         icons = replace(base, glyphs=DrawingGlyphs(kinds=("icon",), each=2))
-        return {"icon": icons, "dim": replace(icons, transport=dim)}
+        return {"icon": icons, "dim": replace(icons, setup=dim)}
 
     # By name: the package's attribute `carry_over` is the function, not the module.
     monkeypatch.setattr(sys.modules["evnlos.experiment.carry_over"], "sets", two)

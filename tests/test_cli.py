@@ -47,14 +47,14 @@ def runs(shots, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
     """Pre-trained, fine-tuned and end-to-end runs, made by the commands."""
     out = tmp_path_factory.mktemp("runs")
     found = {}
-    for paradigm in ("frame", "fusion"):
-        pre, epnp, e2e = (out / f"{kind}-{paradigm}" for kind in ("pre", "epnp", "e2e"))
+    for modality in ("frame", "fusion"):
+        pre, epnp, e2e = (out / f"{kind}-{modality}" for kind in ("pre", "epnp", "e2e"))
         call(
             "train",
             "--data",
             tiny_dataset.folder,
-            "--paradigm",
-            paradigm,
+            "--modality",
+            modality,
             "--out",
             pre,
             "--epochs",
@@ -62,7 +62,7 @@ def runs(shots, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
             *NETWORK,
         )
         call("finetune", "--weights", pre, "--data", shots, "--out", epnp, "--epochs", 2)
-        call("train", "--data", shots, "--paradigm", paradigm, "--out", e2e, "--epochs", 2, *NETWORK)
+        call("train", "--data", shots, "--modality", modality, "--out", e2e, "--epochs", 2, *NETWORK)
         found |= {p.name: p for p in (pre, epnp, e2e)}
     return found
 
@@ -131,7 +131,16 @@ def test_import_splits(shots) -> None:
 
 
 def test_lab_renders_a_capture(tmp_path, capsys) -> None:
-    small = ["--sensor.height", 24, "--sensor.width", 36, "--transport.cell-m", 0.02, "--frame-rate-hz", 1]
+    small = [
+        "--setup.sensor.height",
+        24,
+        "--setup.sensor.width",
+        36,
+        "--setup.cell-m",
+        0.02,
+        "--frame-rate-hz",
+        1,
+    ]
     call("lab", "--out", tmp_path / "lab", "--glyphs.family", "kalam", "--glyphs.characters", "K", *small)
     assert (tmp_path / "lab" / "lab_K" / "capture.yaml").is_file()
     assert len(list((tmp_path / "lab" / "lab_K" / "frames").glob("*.png"))) == 9
@@ -141,7 +150,7 @@ def test_evaluate_prints_one_json_object(runs, shots, capsys) -> None:
     capsys.readouterr()
     call("evaluate", "--weights", runs["epnp-fusion"], "--data", shots, "--json")
     found = json.loads(capsys.readouterr().out)
-    assert found["paradigm"] == "fusion"
+    assert found["modality"] == "fusion"
     assert found["images"] == 8
     assert set(found["characters"]) == {"lab_4"}
     assert found["characters"]["lab_4"]["character"] == "4"
@@ -227,7 +236,9 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp
         capsys, "app", "--prot", "3"
     )
     assert "Missing from evnlos simulate: --out PATH; see" in fails(capsys, "simulate")
-    assert "Expected one of ('frame', 'event', 'fusion')" in fails(capsys, "train", "--paradigm", "x")
+    assert "no modality of kind 'x'; give one of frame, event, fusion" in fails(
+        capsys, "train", "--out", out, "--modality", "x"
+    )
     assert "no dataset" in fails(capsys, "train", "--data", tmp_path, "--out", out)
     assert "does not exist" in fails(
         capsys, "finetune", "--weights", tmp_path / "w", "--data", shots, "--out", out
@@ -253,7 +264,10 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
     from evnlos.scene import HandwritingGlyphs
 
     few = replace(
-        demo.default(), glyphs=HandwritingGlyphs(characters="AB"), sensor=SensorSize(25, 40), positions=8
+        demo.default(),
+        glyphs=HandwritingGlyphs(characters="AB"),
+        setup=replace(demo.default().setup, sensor=SensorSize(25, 40)),
+        positions=8,
     )
     monkeypatch.setattr(demo, "default", lambda: few)
     one = ["--pretrain-epochs", 1, "--finetune-epochs", 1, "--e2e-epochs", 1, "--writers", 1, "--width", 8]

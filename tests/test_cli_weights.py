@@ -9,24 +9,24 @@ import torch
 from evnlos import Training, UNetConfig, load_weights, train
 from evnlos.cli import main
 from evnlos.errors import DataError
-from evnlos.model import JointNetwork, published, published_for, save_weights
+from evnlos.model import published, published_for, save_weights
 
 
 @pytest.fixture(scope="module")
 def run(tiny_dataset, tmp_path_factory):
     out = tmp_path_factory.mktemp("weights") / "run"
-    list(train(tiny_dataset, Training(epochs=1, network=UNetConfig(width=8, depth=1, rank=8)), out))
+    train(tiny_dataset, Training(epochs=1, network=UNetConfig(width=8, depth=1, rank=8)), out)
     return out
 
 
 def test_they_say_what_they_see_and_where_they_come_from(run, capsys) -> None:
     main(["weights", str(run), "--json"])
     found = json.loads(capsys.readouterr().out)
-    assert (found["paradigm"], found["joint"], found["network"]["rank"]) == ("frame", False, 8)
+    assert (found["modality"], found["sees_sequence"], found["network"]["rank"]) == ("frame", False, 8)
     assert found["parameters"] < found["numbers"]
     main(["weights", str(run)])
     text = capsys.readouterr().out
-    assert "frame, one position at a time" in text and "1. simulation" in text
+    assert "frame, unet: one time step at a time" in text and "1. simulation" in text
 
 
 def test_a_copy_of_half_the_size_sees_the_same(run, tmp_path, capsys) -> None:
@@ -35,7 +35,7 @@ def test_a_copy_of_half_the_size_sees_the_same(run, tmp_path, capsys) -> None:
     whole = run / "weights.safetensors"
     assert copy.stat().st_size < 0.7 * whole.stat().st_size
     sampling = load_weights(whole).sampling
-    x = torch.rand(2, 1, sampling["height"], sampling["width"])
+    x = torch.rand(2, 1, sampling.height, sampling.width)
     one, other = (load_weights(path).network(x) for path in (whole, copy))
     torch.testing.assert_close(one, other, atol=0.01, rtol=0)
     capsys.readouterr()
@@ -50,10 +50,11 @@ def test_a_copy_of_lower_rank_is_smaller_and_sees_nearly_the_same(run, tmp_path,
     main(["weights", str(run), "--half", str(other), "--rank", "6"])
     assert other.stat().st_size < one.stat().st_size
     whole, few = (load_weights(path).network for path in (one, other))
-    assert few.config.rank == few.embedding.rank == 6
-    torch.testing.assert_close(few.embedding.basis, whole.embedding.basis[:, :6])
+    assert few.settings.rank == few.embedding.rank == 6
+    fewer, all_of_them = few.embedding.groups["frame"], whole.embedding.groups["frame"]
+    torch.testing.assert_close(fewer.basis, all_of_them.basis[:, :6])
     x = torch.rand(4, *whole.embedding.shape)
-    whole.embedding.weights[6:] = 0
+    all_of_them.weights[6:] = 0
     torch.testing.assert_close(few.embedding(x), whole.embedding(x))
     capsys.readouterr()
     for arguments in (["--half", str(wrong), "--rank", "9"], ["--rank", "6"]):
@@ -109,8 +110,8 @@ def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys
     path = published()[name]
     assert path.stat().st_size <= 16_000_000
     loaded = load_weights(name)
-    rig, paradigm, *kind = name.split("-")
-    assert loaded.paradigm == paradigm and isinstance(loaded.network, JointNetwork) == (kind == ["pass"])
+    rig, modality, *kind = name.split("-")
+    assert loaded.modality.name == modality and loaded.network.sees_sequence == (kind == ["pass"])
     assert loaded.confidence is not None and loaded.scores["images"] >= 160
     better = loaded.scores["overall"]["psnr_db"] - loaded.scores["baselines"]["mean"]["psnr_db"]
     assert better > 1
@@ -121,7 +122,7 @@ def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys
     else:
         assert captures and not {name[-1] for data in captures for name in data["train"]} & set("GK49")
     main(["weights"])
-    assert f"{name}: {loaded.paradigm}" in capsys.readouterr().out
+    assert f"{name}: {modality}, {loaded.network.kind}: " in capsys.readouterr().out
 
 
 def test_the_weights_of_the_nearest_rig_are_taken() -> None:

@@ -12,6 +12,7 @@ from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.dataset import simulate
 from evnlos.dataset.cluster import run_on_dask
+from evnlos.progress import Step
 
 distributed = pytest.importorskip("distributed", reason='needs the extra "cluster"')
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -27,10 +28,14 @@ def test_a_killed_worker_costs_nothing_but_time(tiny, tiny_dataset, tmp_path) ->
     ) as cluster:
         engine = partial(run_on_dask, scheduler=cluster.scheduler_address)
         made = []
-        for name in simulate(tiny, tmp_path / "d", engine=engine):
-            if not made:
+
+        def kill_a_worker(step: Step) -> None:
+            if step.done == 1:
                 os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
-            made.append(name)
+            if step.result:
+                made.append(step.result)
+
+        simulate(tiny, tmp_path / "d", engine=engine, progress=kill_a_worker)
     assert sorted(made) == sorted(tiny_dataset.objects())
     assert bytes_of(tmp_path / "d") == bytes_of(tiny_dataset.folder)
 

@@ -36,7 +36,7 @@ def test_bash_completes_commands_flags_and_choices(tmp_path) -> None:
     cases = {
         "evnlos tra": "train",
         "evnlos train --netw": "--network.width",
-        "evnlos train --paradigm ": "fusion",
+        "evnlos train --schedule ": "cosine",
     }
     ask = '. ./completion; read -ra COMP_WORDS <<< "$0"; [[ "$0" = *" " ]] && COMP_WORDS+=(""); '
     ask += 'COMP_CWORD=$((${#COMP_WORDS[@]} - 1)); _tyro_evnlos; printf "%s\\n" "${COMPREPLY[@]}"'

@@ -1,15 +1,21 @@
 """Reading characters, telling memory from sight, and intervals for differences."""
 
+import subprocess
+import sys
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import map_coordinates
 
 from evnlos import EvnlosError
-from evnlos.dataset import NlosDataset, Sampling, import_captures, open_dataset
+from evnlos.dataset import Dataset, NlosDataset, Sampling, import_captures, read_shard, simulate
 from evnlos.evaluation.classifier import CHARACTERS, load_reader, read_characters
 from evnlos.evaluation.classifier_training import train_reader
 from evnlos.evaluation.intervals import paired_difference
-from evnlos.evaluation.memory import Memory, nearer_to_truth, nearest_answer, recall
+from evnlos.evaluation.memory import compare_with_training
+from evnlos.metrics import psnr
 from evnlos.model import plates
 from evnlos.scene import FontGlyphs, find_font
 from evnlos.types import Plane
@@ -64,31 +70,92 @@ def test_a_file_of_something_else_is_refused(tmp_path) -> None:
 def tiny_shots(tiny_captures, tmp_path_factory):
     out = tmp_path_factory.mktemp("memory") / "shots"
     sampling = Sampling(height=32, width=48, scored_rows=24, pitch_m=0.005)
-    list(import_captures(tiny_captures, out, sampling, test=("4",)))
-    return open_dataset(out)
+    return import_captures(tiny_captures, out, sampling, test=("4",))
 
 
-def test_memory_lies_at_the_place_of_the_test_picture(tiny_shots) -> None:
-    memory = recall(tiny_shots, "test", "fusion")
-    assert memory is not None
+def stacked(images: torch.Tensor, samples: NlosDataset, dataset: Dataset) -> tuple[torch.Tensor, np.ndarray]:
+    """Return what `compare_with_training` does, written out over one stack of all training objects."""
+    rows, pitch_m = dataset.sampling.scored, dataset.sampling.pitch_m
+    inputs, pictures = [], []
+    for name in dataset.objects("train"):
+        known = read_shard(dataset.shard(name))[0]
+        step = [int(((known.position_m - at) ** 2).sum(axis=1).argmin()) for at in samples.position_m]
+        away_px = (samples.position_m - known.position_m[step]) / pitch_m
+        height, width = known.truth.shape[1:]
+        y, x = np.mgrid[:height, :width]
+        moved = [
+            map_coordinates(np.pad(known.truth[k], 1), [y - dy + 1, x - dx + 1], order=1, mode="constant")
+            for k, (dx, dy) in zip(step, away_px, strict=True)
+        ]
+        pictures.append(torch.from_numpy(np.stack(moved)).float()[:, rows])
+        inputs.append(samples.modality.inputs(known.frame, known.surface)[step])
+    known_inputs, seen = torch.stack(inputs).double(), samples.inputs.double()
+    frame, events = known_inputs[:, :, :1], known_inputs[:, :, 1:]
+    size = torch.stack([frame.std(unbiased=False), *[events.square().mean().sqrt()] * 2])[:, None, None]
+    owner = (((known_inputs - seen) / size) ** 2).flatten(2).mean(dim=2).argmin(dim=0)
+    nearest = torch.stack([pictures[int(g)][n] for n, g in enumerate(owner)])
+    truth = samples.truth.float()[:, rows]
+    closest = torch.stack([psnr(images, one) for one in pictures]).amax(dim=0)
+    return nearest, (psnr(images, truth) > closest).numpy()
+
+
+@pytest.mark.parametrize("together", [3, 128])
+def test_comparing_object_by_object_is_comparing_with_the_stack_of_all(together, tiny, tmp_path, monkeypatch):
+    """Motions differ from object to object, so that images are moved by parts of a pixel."""
+    monkeypatch.setattr("evnlos.evaluation.memory._TOGETHER", together)
+    config = replace(tiny, validation=0.0, held_out="T", vary={"motion.speed_m_s": (0.015, 0.02)})
+    dataset = simulate(config, tmp_path / "d")
+    samples = NlosDataset(dataset, "test", "fusion")
+    truth = samples.truth.float()[:, dataset.sampling.scored]
+    images = (truth + 0.3 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(0))).clamp(0, 1)
+    found = compare_with_training(images, samples, dataset, "test")
+    nearest, nearer = stacked(images, samples, dataset)
+    assert found is not None
+    torch.testing.assert_close(found.nearest, nearest, rtol=0, atol=2e-3)
+    np.testing.assert_array_equal(found.nearer_to_truth, nearer)
+    assert 0 < nearer.mean() <= 1
+
+
+def test_the_truth_is_nearest_to_itself_and_a_memory_to_none(tiny_shots) -> None:
     samples = NlosDataset(tiny_shots, "test", "fusion")
-    trained = NlosDataset(tiny_shots, "train", "fusion")
-    assert memory.truth.shape == (len(memory.names), *samples.truth.shape)
-    # The same motion in every capture: nothing is left to move.
-    first = trained.truth[trained.names == memory.names[0]].float()
-    assert torch.allclose(memory.truth[0], first, atol=1e-3)
-    answers = nearest_answer(memory, samples.inputs)
-    assert answers.shape == samples.truth.shape
-    assert not nearer_to_truth(answers, samples.truth.float(), memory.truth).any()
-    assert nearer_to_truth(samples.truth.float(), samples.truth.float(), memory.truth).all()
+    truth = samples.truth.float()[:, tiny_shots.sampling.scored].contiguous()
+    found = compare_with_training(truth, samples, tiny_shots, "test")
+    assert found is not None and found.nearer_to_truth.all() and found.nearest.shape == truth.shape
+    again = compare_with_training(found.nearest, samples, tiny_shots, "test")
+    assert again is not None and not again.nearer_to_truth.any()
 
 
-def test_the_nearest_measurement_answers() -> None:
-    inputs = torch.stack([torch.zeros(3, 1, 4, 4), torch.ones(3, 1, 4, 4)])
-    truth = torch.stack([torch.full((3, 4, 4), 0.25), torch.full((3, 4, 4), 0.75)])
-    asked = torch.tensor([0.1, 0.9, 0.4]).reshape(3, 1, 1, 1).expand(3, 1, 4, 4)
-    answers = nearest_answer(Memory(["a", "b"], inputs, truth), asked)
-    assert answers[:, 0, 0].tolist() == [0.25, 0.75, 0.25]
+def test_comparing_takes_memory_for_one_object_at_a_time(tmp_path) -> None:
+    """Forty training objects instead of four: the peak of a process of its own grows by their numbers alone."""
+    code = """
+import resource, sys
+import numpy as np
+from pathlib import Path
+from evnlos.dataset import Dataset, NlosDataset, Sampling, Samples, write_shard
+from evnlos.evaluation.memory import compare_with_training
+folder, count = Path(sys.argv[1]), int(sys.argv[2])
+draw = np.random.default_rng(0)
+names = [f"o_{k:02d}" for k in range(count + 1)]
+at = np.stack([np.linspace(-0.07, 0.07, 20), np.zeros(20)], axis=1)
+for name in names:
+    maps = (draw.random((20, 8, 10)) > 0.5).repeat(10, axis=1).repeat(16, axis=2).astype(np.float32)
+    both = np.stack([maps, maps], axis=1)
+    write_shard(folder / f"{name}.h5", Samples(maps, both, maps, at[:, 0], at, np.zeros(20, np.int64)), {})
+sampling = Sampling(height=80, width=160, scored_rows=80)
+data = Dataset(folder, "captures", sampling, {"train": names[1:], "test": names[:1]})
+samples = NlosDataset(data, "test", "fusion")
+images = samples.truth.float()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+compare_with_training(images, samples, data, "test")
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    grown = []
+    for count in (4, 40):
+        (tmp_path / str(count)).mkdir()
+        call = [sys.executable, "-c", code, tmp_path / str(count), str(count)]
+        grown.append(int(subprocess.run(call, capture_output=True, text=True, check=True).stdout))
+    stack_kb = 40 * 20 * 4 * 80 * 160 * 4 / 1024  # inputs and images of forty objects, float32
+    assert grown[1] < grown[0] + stack_kb / 4, (grown, stack_kb)
 
 
 def test_interval_covers_as_often_as_it_says() -> None:

@@ -7,16 +7,16 @@ import pytest
 import torch
 
 from evnlos.cli import main
-from evnlos.config import from_dict, load_yaml, to_dict
-from evnlos.dataset import NlosDataset, Sampling, SensorSize, Simulation, simulate_object
+from evnlos.config import load_yaml
+from evnlos.dataset import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate_object
 from evnlos.errors import DataError
 from evnlos.evaluation import evaluate, reconstruct
 from evnlos.evaluation.consistency import FrameOperator
 from evnlos.evaluation.explained import explained, light_gain
 from evnlos.evaluation.worth import judgement_of, risk_coverage
 from evnlos.model import (
-    ResidualUNet,
     UNetConfig,
+    UNetReconstructor,
     Weights,
     halves_of,
     load_weights,
@@ -27,19 +27,20 @@ from evnlos.model import (
 from evnlos.model.confidence import COVERAGE
 from evnlos.model.plates import on_canvas
 from evnlos.report import reconstruct_capture
+from evnlos.setups import RadiometricSetup
 from evnlos.training.confidence import fit_confidence
-from evnlos.transport import RadiometricTransport
 from evnlos.types import Plane
 
 CANVAS = Plane(48, 96, 0.0025)
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
 
 
-class Given(ResidualUNet):
+class Given(UNetReconstructor):
     """A network whose picture is its input: what is measured can be chosen."""
 
     def __init__(self) -> None:
-        super().__init__(1, UNetConfig(width=4, depth=1, rank=0))
+        sampling = Sampling(height=48, width=96, scored_rows=48)
+        super().__init__(as_modality("frame"), UNetConfig(width=4, depth=1, rank=0), sampling)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x
@@ -66,6 +67,7 @@ def passes(
         names += [f"o{k}"] * positions
     made = NlosDataset.__new__(NlosDataset)
     made.inputs, made.truth, made.names = torch.cat(inputs), torch.cat(truth), np.array(names)
+    made.modality = as_modality("frame")
     made.position_m = np.tile(at, (count, 1))
     return made
 
@@ -167,19 +169,18 @@ def test_intervals_cover_unseen_passes_as_often_as_they_say() -> None:
 def test_confidence_travels_with_the_weights(tmp_path) -> None:
     confidence = fit_confidence(Given(), passes(0.2), CANVAS)
     torch.manual_seed(0)
-    network = ResidualUNet(1, UNetConfig(width=4, depth=1, rank=0)).eval()
-    about = {"height": 48, "width": 96, "pitch_m": 0.0025, "scored_rows": 48}
-    save_weights(tmp_path / "w.safetensors", Weights(network, "frame", about, [], None, confidence))
+    sampling = Sampling(height=48, width=96, scored_rows=48)
+    network = UNetConfig(width=4, depth=1, rank=0).build("frame", sampling).eval()
+    save_weights(tmp_path / "w.safetensors", Weights(network, [], None, confidence))
     back = load_weights(tmp_path / "w.safetensors").confidence
     assert back is not None
     for name, one in confidence.tensors().items():
         torch.testing.assert_close(back.tensors()[name], one)
     for wrong in (
         replace(confidence, low=torch.zeros(2, 2)),
-        replace(confidence, power=torch.tensor(float("nan"))),
         replace(confidence, power=torch.tensor(0.0)),
     ):
-        save_weights(tmp_path / "bad.safetensors", Weights(network, "frame", about, [], None, wrong))
+        save_weights(tmp_path / "bad.safetensors", Weights(network, [], None, wrong))
         with pytest.raises(DataError, match="garbles its confidence"):
             load_weights(tmp_path / "bad.safetensors")
 
@@ -196,12 +197,12 @@ def test_confidence_needs_motion_and_passes() -> None:
 
 def lab_rig() -> Simulation:
     """The rig of the rendered captures."""
-    transport = RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06)
-    return Simulation(transport=transport, sensor=SensorSize(48, 72), sampling=SAMPLING)
+    transport = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06)
+    return Simulation(setup=replace(transport, sensor=SensorSize(48, 72)), sampling=SAMPLING)
 
 
 def test_the_truth_explains_the_frames_and_another_object_does_not() -> None:
-    operator = FrameOperator(lab_rig(), SAMPLING)
+    operator = FrameOperator(lab_rig().setup, SAMPLING)
     at = np.stack([np.linspace(-0.06, 0.06, 6), np.zeros(6)], axis=1)
     draw = torch.Generator().manual_seed(3)
     average = torch.full((32, 32), 0.5)
@@ -220,7 +221,7 @@ def test_the_truth_explains_the_frames_and_another_object_does_not() -> None:
 
 
 def test_light_pattern_and_noise_need_not_be_known() -> None:
-    operator = FrameOperator(lab_rig(), SAMPLING)
+    operator = FrameOperator(lab_rig().setup, SAMPLING)
     at = np.stack([np.linspace(-0.06, 0.06, 30), np.zeros(30)], axis=1)
     draw = torch.Generator().manual_seed(3)
     average = torch.full((32, 32), 0.5)
@@ -245,7 +246,7 @@ def test_light_pattern_and_noise_need_not_be_known() -> None:
 def test_noise_that_grows_with_the_light_is_taken_off() -> None:
     rig = lab_rig()
     weak = replace(rig.frame_camera, full_well_e=30.0, read_noise_e=0.3)
-    operator = FrameOperator(replace(rig, frame_camera=weak), SAMPLING)
+    operator = FrameOperator(replace(rig.setup, frame_camera=weak), SAMPLING)
     at = np.stack([np.linspace(-0.06, 0.06, 40), np.zeros(40)], axis=1)
     draw = torch.Generator().manual_seed(5)
     own, average = (torch.rand(4, 4, generator=draw) > 0.5).float(), torch.full((32, 32), 0.5)
@@ -265,12 +266,12 @@ def test_published_weights_refuse_a_wall_that_is_not_theirs() -> None:
     path = published_rig("near-frame-pass")
     assert path is not None and published_rig("page-frame-pass") is None and published_rig(path) is None
     rig, weights = load_yaml(Simulation, path), load_weights("near-frame-pass")
-    sampling = from_dict(Sampling, weights.sampling, source="weights")
-    operator = FrameOperator(rig, sampling)
-    matte = replace(rig.transport, wall_material="lambert")
+    sampling = weights.sampling
+    operator = FrameOperator(rig.setup, sampling)
+    matte = replace(rig.setup, wall_material="lambert")
     said = []
-    for transport in (rig.transport, matte):
-        config = replace(rig, transport=transport, positions=16)
+    for transport in (rig.setup, matte):
+        config = replace(rig, setup=transport, positions=16)
         samples, _ = simulate_object(config, "writer00_K")
         images = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
         said.append(judgement_of(weights, samples, images, operator))
@@ -283,17 +284,17 @@ def test_reconstruct_and_evaluate_say_what_the_pictures_are_worth(
     tiny_dataset, tiny_captures, tmp_path, capsys
 ) -> None:
     torch.manual_seed(0)
-    network = ResidualUNet(1, UNetConfig(width=4, depth=1, rank=0)).eval()
+    network = UNetConfig(width=4, depth=1, rank=0).build("frame", SAMPLING).eval()
     samples = NlosDataset(tiny_dataset, "train", "frame")
     confidence = fit_confidence(network, samples, SAMPLING.canvas)
-    weights = Weights(network, "frame", to_dict(SAMPLING), [], None, confidence)
+    weights = Weights(network, [], None, confidence)
     (passed,) = [one for one in evaluate(weights, tiny_dataset, "train").worth if one.name == samples.names[0]]
     assert passed.skill < 1 and 0 <= passed.width <= 1 and 0 <= passed.coverage <= 1
     save_weights(tmp_path / "w.safetensors", weights)
     main(["evaluate", "--weights", str(tmp_path / "w.safetensors"), "--data", str(tiny_dataset.folder)])
     assert "confidence: support" in capsys.readouterr().out
     out = tmp_path / "out"
-    found = reconstruct_capture(tiny_captures[0], tmp_path / "w.safetensors", out, rig=lab_rig())
+    found = reconstruct_capture(tiny_captures[0], tmp_path / "w.safetensors", out, setup=lab_rig().setup)
     assert set(found["confidence"]) == {"support", "agreement", "threshold", "measured", "verdict", "explained"}
     low, high = np.load(out / "interval.npy")
     shown = np.load(out / "reconstruction.npy")

@@ -11,12 +11,12 @@ from evnlos.dataset.presets import PRESETS
 from evnlos.dataset.variation import varied
 from evnlos.errors import ConfigError
 from evnlos.sensor import EventPixel
+from evnlos.setups import RadiometricSetup
 from evnlos.training import Training, paper_finetuning, paper_pretraining
-from evnlos.transport import RadiometricTransport
 
 CONFIGS = [
     Simulation(),
-    Simulation(transport=RadiometricTransport(), vary={"pixel.threshold_on": (0.1, 0.2)}),
+    Simulation(setup=RadiometricSetup(), vary={"setup.pixel.threshold_on": (0.1, 0.2)}),
     *(preset() for preset in PRESETS.values()),
     Lab(),
     Training(),
@@ -36,9 +36,9 @@ def test_yaml_round_trip_is_exact(config: object, tmp_path) -> None:
 def test_unknown_keys_name_the_nearest_setting() -> None:
     with pytest.raises(ConfigError, match=r"pixel\.treshold_on.*threshold_on"):
         from_dict(Simulation, {"pixel": {"treshold_on": 0.2}})
-    with pytest.raises(ConfigError, match=r"transport\.kind.*paper, radiometric"):
+    with pytest.raises(ConfigError, match=r"no setup of kind 'magic'.*paper, radiometric"):
         from_dict(Simulation, {"transport": {"kind": "magic"}})
-    with pytest.raises(ConfigError, match=r"transport\.rougness.*roughness"):
+    with pytest.raises(ConfigError, match=r"setup\.rougness.*roughness"):
         from_dict(Simulation, {"transport": {"kind": "radiometric", "rougness": 0.1}})
 
 
@@ -50,10 +50,10 @@ def test_unknown_keys_name_the_nearest_setting() -> None:
         ({"duration_s": -1.0}, "positive"),
         ({"pixel": {"threshold_on": 0.0}}, "threshold_on"),
         ({"pixel": {"threshold_on": float("nan")}}, "threshold_on"),
-        ({"vary": {"pixel.treshold_on": [0.1, 0.2]}}, "threshold_on"),
-        ({"vary": {"pixel.threshold_on": [0.3, 0.2]}}, "ascending"),
+        ({"vary": {"setup.pixel.treshold_on": [0.1, 0.2]}}, "threshold_on"),
+        ({"vary": {"setup.pixel.threshold_on": [0.3, 0.2]}}, "ascending"),
         ({"vary": {"sampling.surface": [0, 1]}}, "no number"),
-        ({"vary": {"pixel.threshold_on": [-0.3, 0.2]}}, "threshold_on"),
+        ({"vary": {"setup.pixel.threshold_on": [-0.3, 0.2]}}, "threshold_on"),
     ],
 )
 def test_wrong_values_are_one_line_errors(values: dict, says: str) -> None:
@@ -73,7 +73,7 @@ def test_wrong_yaml_files(text: str, says: str, tmp_path) -> None:
 
 def test_variation_draws_within_range_and_by_name() -> None:
     config = Simulation()
-    ranges = {"pixel.threshold_on": (0.1, 0.2), "motion.start_m.0": (-0.09, -0.07)}
+    ranges = {"setup.pixel.threshold_on": (0.1, 0.2), "motion.start_m.0": (-0.09, -0.07)}
     drawn = [varied(config, ranges, 3, name) for name in "abcdefgh"]
     values = [d.pixel.threshold_on for d in drawn]
     assert all(0.1 <= v <= 0.2 for v in values)
@@ -81,7 +81,7 @@ def test_variation_draws_within_range_and_by_name() -> None:
     assert all(-0.09 <= d.motion.start_m[0] <= -0.07 and d.motion.start_m[1] == 0 for d in drawn)
     assert varied(config, ranges, 3, "a") == drawn[0]
     # One more range leaves the draws of the others as they were.
-    assert varied(config, ranges | {"pixel.cutoff_hz": (1, 2)}, 3, "a").pixel.threshold_on == values[0]
+    assert varied(config, ranges | {"setup.pixel.cutoff_hz": (1, 2)}, 3, "a").pixel.threshold_on == values[0]
     assert config == Simulation()
 
 
@@ -92,7 +92,7 @@ def test_the_papers_settings() -> None:
     assert dataclasses.astuple(paper.pixel)[:7] == (0.15, 0.15, 0.03, 15.0, 0.01, 0.0015, 0.0)
     assert paper.pixel == EventPixel()
     assert (paper.motion.speed_m_s, paper.glyphs.plate.size_m) == (0.02, 0.08)
-    assert (paper.transport.tpsf_t, paper.transport.mean_free_path, paper.transport.rho_max) == (2.0, 0.8, 2.0)
+    assert (paper.setup.tpsf_t, paper.setup.mean_free_path, paper.setup.rho_max) == (2.0, 0.8, 2.0)
     assert (pre.epochs, pre.batch_size, pre.learning_rate, pre.step_epoch, pre.loss) == (
         200,
         16,

@@ -1,7 +1,5 @@
 """Test-time data consistency: the solution of the equation it states, and a gain where the model is right."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -10,19 +8,24 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.scene import Scene, Target
 from evnlos.sensor import FrameCamera
-from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.setups import PaperSetup, RadiometricSetup
 
 SAMPLING = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12)
 RIG = Simulation(
-    transport=RadiometricTransport(roughness=0.05, cell_m=0.01, gain=1.0, ambient=0.05),
-    sensor=SensorSize(20, 30),
-    frame_camera=FrameCamera(full_well_e=20_000, prnu=0.0, dsnu_e=0.0, bit_depth=12, exposure_s=0.0),
+    setup=RadiometricSetup(
+        roughness=0.05,
+        cell_m=0.01,
+        gain=1.0,
+        ambient=0.05,
+        sensor=SensorSize(20, 30),
+        frame_camera=FrameCamera(full_well_e=20_000, prnu=0.0, dsnu_e=0.0, bit_depth=12, exposure_s=0.0),
+    )
 )
 
 
 @pytest.fixture(scope="module")
 def operator() -> FrameOperator:
-    return FrameOperator(RIG, SAMPLING)
+    return FrameOperator(RIG.setup, SAMPLING)
 
 
 def pictures(seed: int, count: int = 3) -> torch.Tensor:
@@ -36,7 +39,7 @@ def test_the_operator_is_the_simulators_wall(operator) -> None:
     mask = torch.zeros(16, 16)
     mask[2:14, 3:6] = 1.0
     scene = Scene(Target("bar", mask.numpy(), 0.08), RIG.motion, 8.0)
-    wall = RIG.transport.wall(scene, (20, 30))
+    wall = RIG.setup.resized((20, 30)).observe(scene)
     light = wall.irradiance([4.0]).numpy()
     from evnlos.dataset.sampling import reduce_by_area
 
@@ -82,4 +85,4 @@ def test_no_trust_changes_nothing_and_wrong_sizes_are_named(operator) -> None:
     with pytest.raises(DataError, match="do not fit"):
         consistent(guess, torch.zeros(2, 16, 24), operator)
     with pytest.raises(ConfigError, match="radiometric"):
-        FrameOperator(replace(RIG, transport=PaperTransport()), SAMPLING)
+        FrameOperator(PaperSetup(), SAMPLING)

@@ -1,6 +1,7 @@
 """Samples on disk: area averaging, shards, simulation for any number of workers, resume, splits."""
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -10,14 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.utils.data import DataLoader
 
 from evnlos.config import save_yaml
 from evnlos.dataset import (
     NlosDataset,
+    Samples,
     Simulation,
-    network_input,
+    as_modality,
+    live_dataset,
     open_dataset,
     read_shard,
     reduce_by_area,
@@ -25,9 +30,13 @@ from evnlos.dataset import (
     write_shard,
 )
 from evnlos.dataset.pool import run_tasks
-from evnlos.dataset.simulate import drawn_for
+from evnlos.dataset.simulate import drawn_for, split_of
 from evnlos.errors import ConfigError, DataError, EvnlosError
-from evnlos.transport import RadiometricTransport
+from evnlos.scene import HandwritingGlyphs
+from evnlos.setups import RadiometricSetup
+from evnlos.training.source import Stored
+from evnlos.training.team import Team
+from watching import Watch, stopped
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -68,19 +77,20 @@ def test_a_sample_shows_the_plate_where_it_is(tiny_dataset) -> None:
 
 
 def test_shards_are_the_same_bytes_for_any_number_of_workers(tiny, tiny_dataset, tmp_path) -> None:
-    names = list(simulate(tiny, tmp_path / "two", workers=2))
-    assert sorted(names) == sorted(tiny_dataset.objects())
+    watch = Watch()
+    simulate(tiny, tmp_path / "two", workers=2, progress=watch)
+    assert sorted(watch.results) == sorted(tiny_dataset.objects())
+    assert [step.done for step in watch.steps] == list(range(17))
     assert contents(tmp_path / "two") == contents(tiny_dataset.folder)
 
 
 def test_a_run_goes_on_where_it_was(tiny, tiny_dataset, tmp_path) -> None:
     folder = tmp_path / "again"
-    steps = simulate(tiny, folder)
-    first = [next(steps), next(steps)]
-    steps.close()
+    first = stopped(simulate, tiny, folder, after=2)
     assert len(open_dataset(folder).missing()) == 14
-    rest = list(simulate(tiny, folder))
-    assert not set(first) & set(rest)
+    watch = Watch()
+    assert simulate(tiny, folder, progress=watch).missing() == []
+    assert not set(first) & set(watch.results)
     assert contents(folder) == contents(tiny_dataset.folder)
 
 
@@ -109,13 +119,13 @@ def test_a_killed_run_leaves_no_half_shard(tiny, tiny_dataset, tmp_path) -> None
     found = contents(tmp_path / "d")
     assert 3 <= len(found) <= 16
     assert found.items() <= contents(tiny_dataset.folder).items()
-    list(simulate(tiny, tmp_path / "d"))
+    simulate(tiny, tmp_path / "d")
     assert contents(tmp_path / "d") == contents(tiny_dataset.folder)
 
 
 def test_a_folder_of_other_settings_is_refused(tiny, tiny_dataset) -> None:
     with pytest.raises(DataError, match=r"positions: 8 -> 9"):
-        next(simulate(replace(tiny, positions=9), tiny_dataset.folder))
+        simulate(replace(tiny, positions=9), tiny_dataset.folder)
 
 
 def test_splits_are_by_object(tiny_dataset) -> None:
@@ -124,6 +134,105 @@ def test_splits_are_by_object(tiny_dataset) -> None:
     assert not train & held_out
     with pytest.raises(DataError, match="no objects in split 'test'"):
         tiny_dataset.objects("test")
+
+
+def test_held_out_characters_are_matched_exactly(tiny) -> None:
+    glyphs = HandwritingGlyphs(characters="03ufUF?", writers=2)
+    asked = replace(tiny, glyphs=glyphs, validation=0.0, held_out="?U")
+    split = split_of(asked)
+    assert split["test"] == ["writer00_U", "writer00_u003f", "writer01_U", "writer01_u003f"]
+    assert split["train"] == [name for name in glyphs.objects() if name not in split["test"]]
+
+
+@pytest.mark.parametrize("text", ["Z", "AZ", "A B", "a", "u0041"])
+def test_a_held_out_character_that_no_object_shows_is_an_error(text: str, tiny, tmp_path) -> None:
+    config = replace(tiny, held_out=text)
+    with pytest.raises(ConfigError) as caught:
+        simulate(config, tmp_path / "d")
+    assert repr(next(c for c in text if c not in "AB")) in str(caught.value)
+    assert not (tmp_path / "d").exists()
+    with pytest.raises(ConfigError):
+        live_dataset(config)
+
+
+@pytest.mark.parametrize("wrong", [{"workers": -1}, {"share": (0, 2)}, {"share": (3, 2)}])
+def test_a_simulation_that_cannot_be_makes_no_folder(wrong: dict, tiny, tmp_path) -> None:
+    with pytest.raises(ConfigError):
+        simulate(tiny, tmp_path / "d", **wrong)
+    assert not (tmp_path / "d").exists()
+
+
+def test_samples_are_read_when_they_are_asked_for(tiny_dataset) -> None:
+    lazy, loaded = (NlosDataset(tiny_dataset, "train", "fusion") for _ in range(2))
+    assert len(lazy) == len(loaded) == len(loaded.load().inputs)
+    for index in (
+        0,
+        7,
+        8,
+        len(lazy) - 1,
+        -1,
+        slice(6, 20, 3),
+        torch.tensor([40, 3, 3, 99, 0]),
+        torch.arange(0),
+    ):
+        for one, other in zip(lazy[index], loaded[index], strict=True):
+            assert one.dtype == torch.float32
+            torch.testing.assert_close(one, other, rtol=0, atol=0)
+    with pytest.raises(IndexError):
+        lazy[len(lazy)]
+    assert not lazy.in_memory
+    assert len(pickle.dumps(loaded)) == len(pickle.dumps(lazy)) < 30_000  # workers get no maps
+    assert loaded.bytes() == loaded.inputs.nbytes + loaded.truth.nbytes == lazy.bytes()
+
+
+@pytest.mark.parametrize("way", [{"num_workers": 0}, {"num_workers": 2, "multiprocessing_context": "spawn"}])
+def test_a_data_loader_with_workers_just_works(way: dict, tiny_dataset) -> None:
+    samples = NlosDataset(tiny_dataset, "train", "event")
+    batches = list(DataLoader(samples, batch_size=30, **way))
+    assert not samples.in_memory
+    for parts, whole in zip(zip(*batches, strict=True), samples[:], strict=True):
+        assert torch.equal(torch.cat(parts), whole)
+
+
+def test_memory_does_not_grow_with_the_dataset(tmp_path) -> None:
+    """Samples of 300 MB, in a process of their own: its peak grows by some of them only."""
+    steps, shape = 20, (200, 300)
+    maps = np.zeros((steps, *shape), np.float32)
+    one = Samples(maps, np.stack([maps, maps], axis=1), maps, np.arange(20.0), None, np.zeros(20, np.int64))
+    for k in range(30):
+        write_shard(tmp_path / f"o_{k:02d}.h5", one, {"object": f"o_{k:02d}"})
+    code = """
+import resource, sys
+from pathlib import Path
+from evnlos.dataset import Dataset, NlosDataset, Sampling
+folder = Path(sys.argv[1])
+names = sorted(path.stem for path in folder.glob("*.h5"))
+data = Dataset(folder, "captures", Sampling(), {"train": names})
+NlosDataset(data, "train", "fusion")[0]
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+samples = NlosDataset(data, "train", "fusion")
+for k in range(0, len(samples), 3):
+    samples[k]
+assert samples.bytes() > 280e6
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 30_000  # kB
+
+
+def test_a_dataset_larger_than_the_memory_is_trained_on_from_disk(tiny_dataset, monkeypatch) -> None:
+    team = Team(0, 1, torch.device("cpu"))
+    held = Stored(NlosDataset(tiny_dataset, "train", "fusion"), 32, 5, team)
+    monkeypatch.setattr("evnlos.dataset.loader.free_memory", lambda: 1000)
+    samples = NlosDataset(tiny_dataset, "train", "fusion")
+    read = Stored(samples, 32, 5, team)
+    for one, other in zip(held.batches(3), read.batches(3), strict=True):
+        assert torch.equal(one.seen, other.seen) and torch.equal(one.truth, other.truth)
+        assert (one.share, one.weight) == (other.share, other.weight)
+    torch.testing.assert_close(read.mean_image(), held.mean_image(), rtol=0, atol=1e-6)
+    for one, other in zip(held.some(50), read.some(50), strict=True):
+        assert np.array_equal(one, other)
+    assert not samples.in_memory
 
 
 def test_a_flipped_bit_in_a_shard_is_found(tiny_dataset, tmp_path) -> None:
@@ -148,22 +257,22 @@ def test_a_flipped_bit_in_a_shard_is_found(tiny_dataset, tmp_path) -> None:
         read_shard(tmp_path / "b.h5")
 
 
-def test_paradigms_are_one_switch(tiny_dataset) -> None:
+def test_modalities_are_one_switch(tiny_dataset) -> None:
     sets = {
-        paradigm: NlosDataset(tiny_dataset, "validation", paradigm) for paradigm in ("frame", "event", "fusion")
+        modality: NlosDataset(tiny_dataset, "validation", modality) for modality in ("frame", "event", "fusion")
     }
     assert [d.inputs.shape[1] for d in sets.values()] == [1, 2, 3]
     np.testing.assert_array_equal(sets["fusion"].inputs[:, :1], sets["frame"].inputs)
     np.testing.assert_array_equal(sets["fusion"].inputs[:, 1:], sets["event"].inputs)
     seen, truth = sets["fusion"][5]
     assert (seen.shape, truth.shape) == ((3, 32, 48), (1, 32, 48))
-    with pytest.raises(DataError, match="paradigm"):
-        network_input(np.zeros((1, 4, 4)), np.zeros((1, 2, 4, 4)), "sound")
+    with pytest.raises(ConfigError, match="modality"):
+        as_modality("sound")
 
 
 def test_a_network_is_given_levels_as_they_were_measured() -> None:
     frame, surface = np.random.default_rng(0).random((2, 8, 8)), np.random.default_rng(1).random((2, 2, 8, 8))
-    seen = network_input(frame, surface, "fusion").numpy()
+    seen = as_modality("fusion").inputs(frame, surface).numpy()
     np.testing.assert_allclose(seen[:, 0], frame, atol=1e-6)
     np.testing.assert_allclose(seen[:, 1:], surface, atol=1e-6)
 
@@ -216,15 +325,15 @@ def test_bytes_do_not_depend_on_who_holds_the_objects_of_the_file(tiny_dataset, 
 
 def test_optics_are_drawn_for_groups_of_objects_and_light_for_each() -> None:
     config = Simulation(
-        transport=RadiometricTransport(),
-        vary={"transport.roughness": (0.03, 0.08), "transport.gain": (0.5, 1.5), "pixel.cutoff_hz": (10, 90)},
+        setup=RadiometricSetup(),
+        vary={"setup.roughness": (0.03, 0.08), "setup.gain": (0.5, 1.5), "setup.pixel.cutoff_hz": (10, 90)},
         rigs=3,
     )
     names = config.glyphs.objects()[:40]
     drawn = [drawn_for(config, name) for name in names]
-    assert len({d.transport.roughness for d in drawn}) == 3
-    assert len({d.transport.gain for d in drawn}) == len({d.pixel.cutoff_hz for d in drawn}) == 40
+    assert len({d.setup.roughness for d in drawn}) == 3
+    assert len({d.setup.gain for d in drawn}) == len({d.pixel.cutoff_hz for d in drawn}) == 40
     own = [drawn_for(replace(config, rigs=0), name) for name in names]
-    assert len({d.transport.roughness for d in own}) == 40
+    assert len({d.setup.roughness for d in own}) == 40
     with pytest.raises(ConfigError, match="rigs"):
         Simulation(rigs=-1)

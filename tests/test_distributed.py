@@ -65,7 +65,7 @@ def test_the_parts_of_a_batch_are_the_batch_of_one_process(size: int, tiny_datas
 
 
 def test_two_processes_train_what_one_does_and_survive_a_kill(tiny_dataset, tmp_path) -> None:
-    log = list(train(tiny_dataset, SETTINGS, tmp_path / "one"))
+    log = train(tiny_dataset, SETTINGS, tmp_path / "one").records
     command = [*TORCHRUN, "-m", "evnlos", "train", *FLAGS, "--epochs", "2"]
     command += ["--data", str(tiny_dataset.folder), "--out"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -70,7 +70,7 @@ def test_every_flag_that_a_page_shows_exists() -> None:
         assert start >= 0, verb
         part = spec[start : next((other for other in order if other > start), len(spec))]
         flags[verb] = set(re.findall(r"--[a-z][\w.-]*", " ".join(re.findall(r"'flags': \[(.*?)\]", part))))
-    assert "--network.rank" in flags["train"] and "--no-restandardise" in flags["finetune"]
+    assert "--network.rank" in flags["train"] and "--keep-normalization" in flags["finetune"]
     checked, wrong = 0, []
     for page in PAGES:
         for command in commands_on(page):

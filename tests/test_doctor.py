@@ -11,7 +11,7 @@ from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.dataset import Simulation
 from evnlos.errors import DataError
-from evnlos.transport import RadiometricTransport
+from evnlos.setups import RadiometricSetup
 
 
 def test_this_installation_is_whole(capsys) -> None:
@@ -36,8 +36,8 @@ def test_a_broken_part_is_named_and_the_exit_code_tells(monkeypatch, capsys) -> 
 
 def test_what_is_cited_is_what_was_used(tmp_path, capsys) -> None:
     save_yaml(Simulation(), tmp_path / "paper.yaml")
-    save_yaml(Simulation(transport=RadiometricTransport()), tmp_path / "metal.yaml")
-    save_yaml(Simulation(transport=RadiometricTransport(wall_material="lambert")), tmp_path / "matte.yaml")
+    save_yaml(Simulation(setup=RadiometricSetup()), tmp_path / "metal.yaml")
+    save_yaml(Simulation(setup=RadiometricSetup(wall_material="lambert")), tmp_path / "matte.yaml")
     common = {"evnlos", "epnp", "event pixel", "time surface"}
     assert set(entries_for(tmp_path / "paper.yaml")) == common | {"angular spectrum"}
     assert set(entries_for(tmp_path / "metal.yaml")) == common | {"rough metal"}

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos import EvnlosError, ResidualUNet, Training, UNetConfig, load_weights, train
-from evnlos.dataset import NlosDataset
+from evnlos import EvnlosError, Training, UNetConfig, load_weights, train
+from evnlos.dataset import NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError
-from evnlos.evaluation import Reconstructor
-from evnlos.model import Weights, fit_linear, infer, save_weights
-from evnlos.model.embedding import LinearEmbedding, Standardise, embedding_for
+from evnlos.evaluation import StreamingReconstructor
+from evnlos.model import Weights, fit_linear, save_weights
+from evnlos.model.embedding import InputNormalization, LinearEmbedding, LinearEmbeddings
 
 NET = UNetConfig(width=8, depth=1, rank=12, strengths=(0.1, 1.0, 10.0))
 
@@ -46,9 +46,10 @@ def test_frame_and_events_are_undone_each_on_its_own() -> None:
     truth = torch.rand(60, 6, 8, generator=draw)
     seen = torch.stack([truth, 0.5 * truth, 0 * truth], dim=1) + 0.1 * torch.randn(60, 3, 6, 8, generator=draw)
     names = np.repeat([f"o{k}" for k in range(12)], 5)
-    both = embedding_for(3, (6, 8), 40, NET.strengths)
+    both = LinearEmbeddings(as_modality("fusion"), (6, 8), 40, NET.strengths)
     both.fit(seen, truth, names, seed=4)
-    assert (both.rank, both.pictures, both.frame.rank, both.events.rank) == (40, 6, 25, 15)
+    frame, events = both.groups["frame"], both.groups["events"]
+    assert (both.rank, both.images, frame.rank, events.rank) == (40, 6, 25, 15)
     alone = LinearEmbedding(1, (6, 8), 25, NET.strengths)
     alone.take(fit_linear(seen[:, :1], truth, names, rank=25, seed=4))
     pictures = both(seen)
@@ -60,12 +61,12 @@ def test_frame_and_events_are_undone_each_on_its_own() -> None:
     torch.testing.assert_close(both(blind)[:, :3], pictures[:, :3])
     assert not torch.allclose(both(blind)[:, 3:], pictures[:, 3:])
     both.keep(16)
-    assert (both.frame.rank, both.events.rank) == (10, 6)
+    assert (frame.rank, events.rank) == (10, 6)
     for rank in (1, 17):
         with pytest.raises(ConfigError, match=f"to be {rank}; this embedding has 16"):
             both.keep(rank)
     with pytest.raises(ConfigError, match="give 2 or more"):
-        embedding_for(3, (6, 8), 1, (1.0,))
+        LinearEmbeddings(as_modality("fusion"), (6, 8), 1, (1.0,))
 
 
 def test_fewer_samples_than_components_leave_the_rest_empty(samples) -> None:
@@ -78,12 +79,12 @@ def test_fewer_samples_than_components_leave_the_rest_empty(samples) -> None:
     assert (embedding.basis.abs().sum(0) > 0).sum() <= 10
 
 
-@pytest.mark.parametrize("channels", [1, 2, 3])
+@pytest.mark.parametrize(("modality", "channels"), [("frame", 1), ("event", 2), ("fusion", 3)])
 @pytest.mark.parametrize("scaling", ["dataset", "picture"])
-def test_frames_lose_their_mean_and_events_keep_their_zero(channels: int, scaling: str) -> None:
+def test_frames_lose_their_mean_and_events_keep_their_zero(modality: str, channels: int, scaling: str) -> None:
     draw = torch.Generator().manual_seed(channels)
     x = torch.rand(5, channels, 6, 8, generator=draw) * torch.arange(1, 6)[:, None, None, None]
-    layer = Standardise(channels, scaling)
+    layer = InputNormalization(as_modality(modality), scaling)
     layer.fit(x)
     found = layer(x)
     for k in range(5):
@@ -98,71 +99,68 @@ def test_frames_lose_their_mean_and_events_keep_their_zero(channels: int, scalin
 
 
 def test_scaled_by_itself_a_picture_tells_neither_gain_nor_ambient_light() -> None:
-    layer = Standardise(1, "picture")
+    layer = InputNormalization(as_modality("frame"), "picture")
     x = torch.rand(2, 1, 6, 8)
     torch.testing.assert_close(layer(0.5 * x + 0.2), layer(x), atol=1e-5, rtol=0)
     assert torch.isfinite(layer(torch.zeros(1, 1, 6, 8))).all()
 
 
 def test_training_gives_a_new_network_both_and_weights_keep_them(tiny_dataset, tmp_path) -> None:
-    plan = Training(epochs=1, network=NET, precision="float32", paradigm="fusion")
-    list(train(tiny_dataset, plan, tmp_path / "first"))
+    plan = Training(epochs=1, network=NET, precision="float32", modality="fusion")
+    train(tiny_dataset, plan, tmp_path / "first")
     weights = load_weights(tmp_path / "first")
     known = NlosDataset(tiny_dataset, "train", "fusion")
-    standardise, embedding = weights.network.standardise, weights.network.embedding
+    normalization, embedding = weights.network.normalization, weights.network.embedding
     assert embedding is not None and embedding.rank == NET.rank
-    wanted = Standardise(3, "dataset")
+    wanted = InputNormalization(as_modality("fusion"), "dataset")
     wanted.fit(known.inputs.float())
-    torch.testing.assert_close(standardise.mean, wanted.mean)
-    seen = standardise(known.inputs.float())
+    torch.testing.assert_close(normalization.mean, wanted.mean)
+    seen = normalization(known.inputs.float())
     pictures, truth = embedding(seen)[:, 1], known.truth.float()
     assert (pictures - truth).square().mean() < 0.8 * (truth.mean(0) - truth).square().mean()
 
-    list(train(tiny_dataset, replace(plan, seed=1), tmp_path / "second", tmp_path / "first"))
+    train(tiny_dataset, replace(plan, seed=1), tmp_path / "second", tmp_path / "first")
     later = load_weights(tmp_path / "second").network
-    assert torch.equal(later.embedding.events.basis, embedding.events.basis)
+    assert torch.equal(later.embedding.groups["events"].basis, embedding.groups["events"].basis)
 
     save_weights(tmp_path / "half.safetensors", weights, torch.float16)
     half = load_weights(tmp_path / "half.safetensors")
     assert (tmp_path / "half.safetensors").stat().st_size < 0.55 * (
         tmp_path / "first" / "weights.safetensors"
     ).stat().st_size
-    one, other = (infer(w.network, known.inputs[:4]) for w in (weights, half))
+    one, other = (w.network.infer(known.inputs[:4]) for w in (weights, half))
     torch.testing.assert_close(one, other, atol=0.02, rtol=0)
 
 
 def test_fine_tuning_takes_the_scale_of_the_new_data_only_where_it_shall(tiny_dataset, tmp_path) -> None:
     plan = Training(epochs=1, network=NET, precision="float32")
-    list(train(tiny_dataset, plan, tmp_path / "first"))
+    train(tiny_dataset, plan, tmp_path / "first")
     weights = load_weights(tmp_path / "first")
-    weights.network.standardise.mean.fill_(7.0)
+    weights.network.normalization.mean.fill_(7.0)
     save_weights(tmp_path / "other.safetensors", weights)
     for keep in (False, True):
-        settings = replace(plan, restandardise=not keep)
-        list(train(tiny_dataset, settings, tmp_path / f"{keep}", tmp_path / "other.safetensors"))
-        mean = load_weights(tmp_path / f"{keep}").network.standardise.mean
+        settings = replace(plan, keep_normalization=keep)
+        train(tiny_dataset, settings, tmp_path / f"{keep}", tmp_path / "other.safetensors")
+        mean = load_weights(tmp_path / f"{keep}").network.normalization.mean
         assert (float(mean) == 7.0) == keep
 
 
 def test_a_single_position_is_seen_as_in_a_batch(tiny_dataset, tmp_path) -> None:
     sampling = tiny_dataset.sampling
-    network = ResidualUNet(1, NET, (sampling.height, sampling.width)).eval()
+    network = NET.build("frame", sampling).eval()
     known = NlosDataset(tiny_dataset, "train", "frame")
-    network.embedding.take(fit_linear(known.inputs, known.truth, known.names, NET.rank))
-    about = {"height": sampling.height, "width": sampling.width, "scored_rows": sampling.scored_rows}
-    see = Reconstructor(Weights(network, "frame", about, []))
+    network.embedding.groups["frame"].take(fit_linear(known.inputs, known.truth, known.names, NET.rank))
+    see = StreamingReconstructor(Weights(network))
     surface = np.zeros((2, sampling.height, sampling.width))
     frame = known.inputs[3, 0].float()
     torch.testing.assert_close(
-        see(frame.numpy(), surface), infer(network, known.inputs[3:4])[0], atol=1e-4, rtol=0
+        see(frame.numpy(), surface), network.infer(known.inputs[3:4])[0], atol=1e-4, rtol=0
     )
 
 
 def test_wrong_sizes_and_settings_are_named() -> None:
-    with pytest.raises(ConfigError, match="give the size"):
-        ResidualUNet(1, NET)
     with pytest.raises(EvnlosError, match=r"takes \[B, 1, 6, 8\]"):
-        ResidualUNet(1, NET, (6, 8))(torch.zeros(1, 1, 8, 8))
+        NET.build("frame", Sampling(height=6, width=8, scored_rows=6))(torch.zeros(1, 1, 8, 8))
     with pytest.raises(ConfigError, match=r"rank is -1"):
         UNetConfig(rank=-1)
     with pytest.raises(ConfigError, match="strengths"):

@@ -8,11 +8,11 @@ import torch
 import torch.nn.functional as F
 
 from evnlos import EvnlosError
-from evnlos.dataset import CHANNELS
+from evnlos.dataset import STANDARD_MODALITIES, Sampling
 from evnlos.errors import DataError
-from evnlos.evaluation import Evaluation, Reconstructor, load_lpips, reconstruct, score
+from evnlos.evaluation import Evaluation, StreamingReconstructor, load_lpips, reconstruct, score
 from evnlos.evaluation import lpips as module
-from evnlos.model import ResidualUNet, UNetConfig, Weights
+from evnlos.model import UNetConfig, Weights
 from evnlos.report.curves import curves_svg
 from evnlos.report.gather import RunResult, method_of
 from evnlos.report.lead import gains_of, lead
@@ -122,14 +122,15 @@ def test_curves_hold_every_point_and_name() -> None:
 
 def test_a_reconstructor_gives_the_same_pictures_one_at_a_time() -> None:
     draw = np.random.default_rng(0)
+    sampling = Sampling(height=22, width=34, scored_rows=16)
     frame, surface = draw.random((3, 22, 34), np.float32), draw.random((3, 2, 22, 34), np.float32)
-    for paradigm, channels in CHANNELS.items():
-        network = ResidualUNet(channels, UNetConfig(width=8, depth=2, rank=0)).eval()
+    for modality in STANDARD_MODALITIES:
+        network = UNetConfig(width=8, depth=2, rank=0).build(modality, sampling).eval()
         for parameter in network.parameters():
             torch.nn.init.normal_(parameter, std=0.1)
-        weights = Weights(network, paradigm, {"height": 22, "width": 34, "scored_rows": 16}, [])
+        weights = Weights(network)
         expected = reconstruct(weights, frame, surface)
-        see = Reconstructor(weights)
+        see = StreamingReconstructor(weights)
         for k in range(3):
             torch.testing.assert_close(see(frame[k], surface[k]), expected[k], atol=1e-5, rtol=1e-4)
     with pytest.raises(DataError, match="do not fit"):

@@ -24,18 +24,18 @@ from evnlos.experiment import (
     checks_table,
     difference,
     gain_table,
-    jointly,
+    on_sequences,
     read_records,
     run_simulated,
     run_study,
-    show,
     summary_table,
     write_record,
 )
 from evnlos.model import UNetConfig
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
+from evnlos.setups import RadiometricSetup
 from evnlos.training import Training
-from evnlos.transport import RadiometricTransport
+from watching import Watch
 
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
 SMALL = Training(epochs=1, network=UNetConfig(width=4, depth=1, rank=8))
@@ -55,8 +55,7 @@ def place(tiny_captures, tmp_path_factory) -> Place:
     rig.mkdir(parents=True)
     simulation = Simulation(
         glyphs=HandwritingGlyphs(characters="AB"),
-        transport=RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06),
-        sensor=SensorSize(48, 72),
+        setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),
         positions=8,
         validation=0.0,
     )
@@ -69,7 +68,7 @@ def place(tiny_captures, tmp_path_factory) -> Place:
 
 @pytest.fixture(scope="module")
 def records(place) -> list[Record]:
-    return show(run_study(STUDY, place))
+    return run_study(STUDY, place)
 
 
 def test_every_arm_seed_and_refinement_has_its_record(records, place) -> None:
@@ -87,7 +86,7 @@ def test_every_arm_seed_and_refinement_has_its_record(records, place) -> None:
 
 def test_a_second_run_does_nothing_again(records, place) -> None:
     before = {path: path.stat().st_mtime_ns for path in place.out.rglob("*") if path.is_file()}
-    assert show(run_study(STUDY, place)) == []
+    assert run_study(STUDY, place) == []
     after = {path: path.stat().st_mtime_ns for path in place.out.rglob("*") if path.is_file()}
     assert after == before
 
@@ -96,12 +95,12 @@ def test_networks_trained_at_a_time_are_those_trained_one_by_one(records, place,
     for part in ("rigs", "simulations", "shots"):
         shutil.copytree(place.out / part, tmp_path / part)
     study = replace(STUDY, seeds=(0,))
-    steps = list(run_study(study, replace(place, out=tmp_path, trainings=2)))
+    watch = Watch()
+    found = run_study(study, replace(place, out=tmp_path, trainings=2), watch)
     # Pre-training and E2E, then fine-tuning; the pre-training once for two arms.
-    together = [step.part for step in steps if step.what == "train networks"]
+    together = [step.done for step in watch.steps if step.what == "train networks"]
     assert together == [0, 1, 2, 3]
     alone = {(r.arm, r.seed): r for r in records}
-    found = [step.record for step in steps if step.record is not None]
     assert {r.arm for r in found} == {arm for arm, _ in alone}
     for record in found:
         one = alone[record.arm, record.seed]
@@ -133,7 +132,7 @@ def test_an_ensemble_is_the_mean_of_its_pictures(records) -> None:
 
 def test_validation_leaves_the_test_characters_unread(place) -> None:
     study = replace(STUDY, name="choose", arms=ARMS[:1], seeds=(0,), validation=("L",))
-    found = show(run_study(study, place))
+    found = run_study(study, place)
     assert [r.split for r in found] == ["validation"]
     shots = open_dataset(place.out / "shots" / found[0].settings["captures"])
     assert sorted(shots.objects()) == ["lab_A", "lab_L", "lab_T"]
@@ -144,19 +143,19 @@ def test_few_shots_are_nested_and_keep_the_test(place) -> None:
     kept = []
     for count in (1, 2):
         arm = replace(ARMS[0], name=f"{count} shots", shots=count)
-        found = show(run_study(replace(STUDY, name="few", arms=(arm,), seeds=(0,)), place))
+        found = run_study(replace(STUDY, name="few", arms=(arm,), seeds=(0,)), place)
         shots = open_dataset(place.out / "shots" / found[0].settings["captures"])
         assert shots.objects("test") == ["lab_4"] and len(shots.objects("train")) == count
         kept.append(set(shots.objects("train")))
     assert kept[0] < kept[1]
     with pytest.raises(DataError, match="9 shots"):
-        show(run_study(replace(STUDY, arms=(replace(ARMS[0], shots=9),)), place))
+        run_study(replace(STUDY, arms=(replace(ARMS[0], shots=9),)), place)
 
 
 def test_captures_that_no_rig_fits_say_so(tiny_captures, tmp_path) -> None:
     place = Place(tuple(tiny_captures[:1]), tmp_path)
     with pytest.raises(CalibrationError, match="capture"):
-        show(run_study(replace(STUDY, test=()), place))
+        run_study(replace(STUDY, test=()), place)
 
 
 def test_wrong_plans_are_refused(tmp_path) -> None:
@@ -185,20 +184,26 @@ def test_presets_are_whole(name) -> None:
 
 
 @pytest.mark.parametrize("name", ["frozen", "shots", "surface", "thresholds", "loss", "width"])
-def test_a_study_of_single_positions_has_a_joint_twin(name) -> None:
-    single, joint = STUDIES[name]("near"), jointly(STUDIES[name]("near"))
-    assert joint.name == f"{name}-joint" and [a.name for a in joint.arms] == [a.name for a in single.arms]
-    for before, after in zip(single.arms, joint.arms, strict=True):
+def test_a_study_of_single_positions_has_a_sequence_twin(name) -> None:
+    single, twin = STUDIES[name]("near"), on_sequences(STUDIES[name]("near"))
+    assert twin.name == f"{name}-sequence" and [a.name for a in twin.arms] == [a.name for a in single.arms]
+    for before, after in zip(single.arms, twin.arms, strict=True):
         first, was = after.pretraining or after.finetuning, before.pretraining or before.finetuning
-        assert first.joint and first.network.width == was.network.width and first.epochs > was.epochs
+        assert (
+            first.network.kind == "sequence"
+            and first.network.width == was.network.width
+            and first.epochs > was.epochs
+        )
         assert first.loss == was.loss and after.shots == before.shots and after.vary == before.vary
         if after.pretraining and after.finetuning:
-            assert after.finetuning.freeze == before.finetuning.freeze and not after.finetuning.joint
+            assert (
+                after.finetuning.freeze == before.finetuning.freeze and after.finetuning.network.kind == "unet"
+            )
 
 
-def test_what_has_no_embedding_has_no_joint_twin() -> None:
+def test_what_has_no_embedding_has_no_sequence_twin() -> None:
     with pytest.raises(ConfigError, match="'E2E plain' has no linear embedding"):
-        jointly(STUDIES["captures"]("near"))
+        on_sequences(STUDIES["captures"]("near"))
 
 
 def made(arm: str, seed: int, shift: float) -> Record:
@@ -259,7 +264,13 @@ def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeyp
     assert split_of(sets["nist"])["test"] == sets["nist"].glyphs.objects()
     assert [name[-1] for name in split_of(sets["comic"])["test"]] == ["G", "K", "4", "9"]
 
-    small = replace(paper(), sensor=SensorSize(20, 30), positions=4, sampling=SAMPLING, validation=0.0)
+    small = replace(
+        paper(),
+        setup=replace(paper().setup, sensor=SensorSize(20, 30)),
+        positions=4,
+        sampling=SAMPLING,
+        validation=0.0,
+    )
     monkeypatch.setattr(
         simulated,
         "simulations",
@@ -276,11 +287,11 @@ def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeyp
         pretraining=SMALL,
         finetuning=SMALL,
         end_to_end=SMALL,
-        paradigms=("frame",),
+        modalities=("frame",),
         seeds=(0,),
         workers=1,
     )
-    found = show(run_simulated(settings))
+    found = run_simulated(settings)
     assert [(r.rig, r.arm) for r in found] == [
         ("nist", "pre-trained"),
         ("comic", "pre-trained"),
@@ -288,4 +299,4 @@ def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeyp
         ("comic", "E2E"),
     ]
     assert [list(r.positions) for r in found[1:]] == [["kalam_G"]] * 3
-    assert show(run_simulated(settings)) == []
+    assert run_simulated(settings) == []

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,11 +16,13 @@ import numpy as np
 import pytest
 
 from evnlos import Events, EvnlosError, open_dataset, write_events
-from evnlos.claim import claim, is_empty
 from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.dataset import simulate
 from evnlos.dataset.verify import find_faults
+from evnlos.files import claim, is_empty
+from evnlos.progress import Step
+from watching import Watch, stopped
 
 COMMAND = [sys.executable, "-m", "evnlos"]
 TINY_RUN = ["train", "--epochs", "2", "--network.width", "8", "--network.depth", "2", "--network.shuffle", "1"]
@@ -55,6 +58,14 @@ def in_a_new_process(arguments: list[str]) -> None:
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if not path.name.startswith(".")}
+
+
+DEAD = 4_194_304  # more than any process has for a number
+
+
+def unfinished(path: Path, owner: int) -> Path:
+    """Return the name under which a process of this machine writes a file."""
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{owner}.0123abcd.part")
 
 
 def alive(group: int) -> list[int]:
@@ -104,10 +115,11 @@ def test_a_shard_of_other_settings_is_found(copy, tiny, tmp_path) -> None:
     from dataclasses import replace
 
     other = replace(tiny, seed=7)
-    name = next(iter(simulate(other, tmp_path / "other")))
+    (name,) = stopped(simulate, other, tmp_path / "other", after=1)
     shutil.copy(tmp_path / "other" / f"{name}.h5", copy.shard(name))
-    faults = [fault for fault in find_faults(copy) if fault]
-    assert [(fault.name, fault.reason) for fault in faults] == [(name, "it was made with other settings")]
+    assert [(fault.name, fault.reason) for fault in find_faults(copy)] == [
+        (name, "it was made with other settings")
+    ]
 
 
 def test_settings_changed_by_hand_are_not_repaired_with(copy, capsys) -> None:
@@ -120,11 +132,13 @@ def test_settings_changed_by_hand_are_not_repaired_with(copy, capsys) -> None:
 
 
 def test_shares_made_apart_are_the_dataset(tiny, tiny_dataset, tmp_path) -> None:
-    made = [list(simulate(tiny, tmp_path / "d", 1, (i, 3))) for i in (2, 3, 1)]
-    assert sorted(name for share in made for name in share) == sorted(tiny_dataset.objects())
+    watch = Watch()
+    for i in (2, 3, 1):
+        simulate(tiny, tmp_path / "d", 1, (i, 3), progress=watch)
+    assert sorted(watch.results) == sorted(tiny_dataset.objects())
     assert bytes_of(tmp_path / "d") == bytes_of(tiny_dataset.folder)
     with pytest.raises(EvnlosError, match="share 4 of 3"):
-        next(simulate(tiny, tmp_path / "d", 1, (4, 3)))
+        simulate(tiny, tmp_path / "d", 1, (4, 3))
 
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "x", "1"])
@@ -146,14 +160,16 @@ def test_a_dry_run_says_what_it_would_take_and_writes_nothing(settings, tiny_dat
 
 def test_a_folder_has_one_run_at_a_time(tiny, tmp_path) -> None:
     folder = tmp_path / "d"
-    running = simulate(tiny, folder)
-    next(running)
-    second = subprocess.run(
-        [*COMMAND, "simulate", "--out", str(folder)], capture_output=True, text=True, timeout=120
-    )
-    assert second.returncode == 2
-    assert "another process is at work" in second.stderr
-    running.close()
+    command = [*COMMAND, "simulate", "--out", str(folder)]
+    seconds = []
+
+    def run_a_second_time(step: Step) -> None:
+        if not seconds:
+            seconds.append(subprocess.run(command, capture_output=True, text=True, timeout=120))
+
+    simulate(tiny, folder, progress=run_a_second_time)
+    assert seconds[0].returncode == 2
+    assert "another process is at work" in seconds[0].stderr
     with claim(folder):
         pass
     with claim(tmp_path / "new"):
@@ -162,10 +178,17 @@ def test_a_folder_has_one_run_at_a_time(tiny, tmp_path) -> None:
 
 def test_what_a_killed_process_left_half_written_is_swept(tiny, tiny_dataset, tmp_path) -> None:
     folder = tmp_path / "d"
-    next(simulate(tiny, folder))
-    (folder / ".x.h5.abc.tmp").write_bytes(b"half")
-    list(simulate(tiny, folder))
-    assert not list(folder.glob(".*.tmp"))
+    stopped(simulate, tiny, folder, after=1)
+    left = unfinished(folder / "x.h5", DEAD)
+    elsewhere = left.with_name(left.name.replace(f".{socket.gethostname()}.", ".another-machine."))
+    alive = unfinished(folder / "y.h5", os.getpid())
+    theirs = folder / ".draft.tmp"
+    for path in (left, elsewhere, alive, theirs):
+        path.write_bytes(b"half")
+    simulate(tiny, folder)
+    assert [path.exists() for path in (left, elsewhere, alive, theirs)] == [False, False, True, True]
+    for path in (alive, theirs):
+        path.unlink()
     assert bytes_of(folder) == bytes_of(tiny_dataset.folder)
 
 
@@ -186,7 +209,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(settings, tiny_dataset, tmp
         kept = bytes_of(place / "d")
         assert 1 < len(kept) < len(whole)
         assert all(whole[name] == content for name, content in kept.items())
-        assert not list((place / "d").glob(".*.tmp"))
+        assert not list((place / "d").glob(".*.part"))
         subprocess.run(["mount", "-o", f"remount,size={4 * size}", str(place)], check=True)
         subprocess.run(command, check=True, capture_output=True, timeout=120)
         assert bytes_of(place / "d") == whole
@@ -217,6 +240,45 @@ def test_ctrl_c_ends_all_processes_within_seconds(settings, tmp_path) -> None:
     assert not alive(process.pid)
 
 
+@pytest.mark.parametrize(
+    ("number", "to_all", "moment"),
+    [
+        (signal.SIGTERM, False, "starting"),
+        (signal.SIGKILL, False, "starting"),
+        (signal.SIGINT, True, "starting"),
+        (signal.SIGKILL, False, "at work"),
+        (signal.SIGTERM, False, "at work"),
+    ],
+)
+def test_workers_end_with_their_parent(number, to_all: bool, moment: str, settings, tmp_path) -> None:
+    """They used to wait for work for ever, and to print tracebacks at Ctrl-C while they started."""
+    folder = tmp_path / "d"
+    command = [*COMMAND, "simulate", "--config", str(settings), "--workers", "2", "--out", str(folder)]
+    listens = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=listens
+    )
+    deadline = time.monotonic() + 90
+    while len(alive(process.pid)) < 4 and time.monotonic() < deadline:  # itself, two workers and the tracker
+        time.sleep(0.02)
+    while moment == "at work" and not list(folder.glob("*.h5")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    (os.killpg if to_all else os.kill)(process.pid, number)
+    began = time.monotonic()
+    while alive(process.pid) and time.monotonic() - began < 20:
+        time.sleep(0.05)
+    left = alive(process.pid)
+    for one in left:
+        os.kill(one, signal.SIGKILL)
+    assert not left
+    _, err = process.communicate(timeout=20)
+    if number != signal.SIGKILL:
+        assert process.returncode == 128 + number
+        assert "run the same command again" in err.splitlines()[-1]
+        assert "Traceback" not in err
+    assert not list(folder.glob(".*.part"))
+
+
 DIES = """
 import os, signal, sys
 from pathlib import Path
@@ -244,11 +306,12 @@ def dies_at(rename: int, arguments: list[str]) -> None:
 
 @pytest.mark.parametrize("rename", [1, 2, 4])
 def test_a_killed_import_ends_with_the_same_bytes(rename: int, tiny_captures, tmp_path) -> None:
+    """Renames: dataset.yaml, then check picture and shard of each capture."""
     arguments = ["import", *map(str, tiny_captures), "--sampling.height", "32", "--sampling.width", "48"]
     arguments += ["--sampling.scored-rows", "24", "--test", "4", "--out"]
     main([*arguments, str(tmp_path / "whole")])
     dies_at(rename, [*arguments, str(tmp_path / "killed")])
-    assert len(list((tmp_path / "killed").glob("*.h5"))) == max(0, rename - 2)
+    assert len(list((tmp_path / "killed").glob("*.h5"))) == max(0, rename - 2) // 2
     main([*arguments, str(tmp_path / "killed")])
     for part in ("", "checks"):
         whole = {
@@ -306,3 +369,39 @@ def test_a_killed_conversion_ends_with_the_same_bytes(suffix: str, tmp_path) -> 
     main(["convert", str(tmp_path / "in.raw"), str(killed)])
     assert killed.read_bytes() == whole.read_bytes()
     assert sorted(killed.parent.iterdir()) == sorted([alive, killed])  # what was left half-written is swept
+
+
+def test_a_run_that_goes_on_with_other_threads_says_so(tiny_dataset, tiny_run, tmp_path) -> None:
+    """Gradients are summed in another order then, and the weights are other bytes."""
+    notes = (tiny_run / "run.yaml").read_text()
+    assert "threads: 1" in notes
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "run.yaml").write_text(notes.replace("threads: 1", "threads: 7"))
+    command = [*COMMAND, *TINY_RUN, "--data", str(tiny_dataset.folder), "--out", str(out)]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0
+    said = [line for line in run.stderr.splitlines() if line.startswith("warning")]
+    assert len(said) == 1 and "begun with 7 threads and goes on with 1" in said[0]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="limits of a process are those of Unix")
+def test_a_whole_file_is_not_called_damaged_where_memory_is_limited(tmp_path) -> None:
+    pytest.importorskip("aedat")
+    import resource
+
+    draw = np.random.default_rng(0)
+    times = np.sort(draw.integers(0, 10**6, 100))
+    events = Events(
+        times, draw.integers(0, 64, 100), draw.integers(0, 48, 100), times % 2 == 0, width=64, height=48
+    )
+    write_events(tmp_path / "a.aedat4", events)
+    limit = partial(resource.setrlimit, resource.RLIMIT_AS, (2_500_000_000, 2_500_000_000))
+    read = subprocess.run(
+        [*COMMAND, "info", str(tmp_path / "a.aedat4")],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        preexec_fn=limit,
+    )
+    assert read.returncode == 0, read.stderr

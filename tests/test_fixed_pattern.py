@@ -92,11 +92,11 @@ def test_an_import_takes_the_pattern_from_the_frames(tiny_captures, tmp_path) ->
     offset = np.full((48, 72), 0.03, np.float32)
     shifted = FixedPattern(np.full((48, 72), 2.0, np.float32), offset)
     for name, pattern in (("plain", None), ("corrected", shifted)):
-        list(import_captures(tiny_captures, tmp_path / name, sampling, pattern=pattern))
+        import_captures(tiny_captures, tmp_path / name, sampling, pattern=pattern)
     plain, corrected = (open_dataset(tmp_path / name) for name in ("plain", "corrected"))
     name = plain.objects()[0]
     one, other = (read_shard(d.shard(name))[0] for d in (plain, corrected))
     np.testing.assert_allclose(other.frame, (one.frame - 0.03) / 2, atol=2e-4)  # stored in half precision
     np.testing.assert_array_equal(other.surface, one.surface)
     with pytest.raises(DataError, match="pattern"):
-        list(import_captures(tiny_captures, tmp_path / "plain", sampling, pattern=shifted))
+        import_captures(tiny_captures, tmp_path / "plain", sampling, pattern=shifted)

@@ -1,11 +1,14 @@
 """The frame camera against the closed forms of its noise model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
 from evnlos import EvnlosError, FrameCamera
+from evnlos.errors import ConfigError
 from evnlos.sensor._photons import few_electrons, many_electrons
 
 QUIET = {"read_noise_e": 0.0, "prnu": 0.0, "dsnu_e": 0.0, "full_well_e": 1e10, "bit_depth": 16}
@@ -115,3 +118,25 @@ def test_frames_of_any_light_have_shot_noise(mean: float) -> None:
     np.testing.assert_allclose(shares, stats.poisson.pmf(values, mean), atol=0.006)
     frames = seen.reshape(20, -1).astype(float)
     assert abs(np.corrcoef(frames[0], frames[1])[0, 1]) < 0.05  # each frame has noise of its own
+
+
+def test_electrons_are_collected_over_the_exposure() -> None:
+    """A tenth of the exposure is a tenth of the signal and of its variance; the well is finite."""
+    camera = FrameCamera(
+        exposure_s=0.01, full_well_e=10_000.0, read_noise_e=0.0, prnu=0.0, dsnu_e=0.0, bit_depth=12,
+        electrons_per_s=1e6, gain=1.0,
+    )  # fmt: skip
+    light = np.full((1, 100, 100), 0.5)
+    long, short = (
+        replace(camera, exposure_s=time).expose(light, seed=1).astype(float) for time in (0.01, 0.001)
+    )
+    unit = camera.dn_per_electron
+    assert long.mean() / unit == pytest.approx(5000, rel=0.01)
+    assert short.mean() / unit == pytest.approx(500, rel=0.01)
+    assert short.var() / unit**2 == pytest.approx(500, rel=0.1)
+    full = replace(camera, exposure_s=0.1).expose(light, seed=1).astype(float)
+    assert full.mean() / unit == pytest.approx(10_000, rel=0.01)
+    amplified = replace(camera, exposure_s=0.001, gain=8.0).expose(light, seed=1).astype(float)
+    assert amplified.mean() == pytest.approx(8 * short.mean(), rel=0.01)
+    with pytest.raises(ConfigError):
+        FrameCamera(electrons_per_s=1e6, exposure_s=0.0)

@@ -16,15 +16,13 @@ from evnlos.dataset.lab import Lab
 from evnlos.errors import ConfigError, DataError
 from evnlos.evaluation.identify import counted, identify, singular_values
 from evnlos.evaluation.identify_linear import LinearEstimator, bars, finest_bars
-from evnlos.evaluation.identify_rig import Bench, camera_variance, carried_on, seen_rig
-from evnlos.evaluation.identify_source import described_rig
+from evnlos.evaluation.identify_rig import Bench, camera_variance, linearized
 from evnlos.evaluation.identify_table import rig_table
 from evnlos.evaluation.identify_words import verdict
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.sensor import FrameCamera
+from evnlos.setups import PaperSetup, RadiometricSetup, named_setup, setup_names, setup_preset
 from evnlos.solver.glyph_prior import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_plates
-from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
-from evnlos.transport.rig import rig_names
 
 SMALL = Bench(cells=8, height=12, width=20, writers=1)
 
@@ -137,7 +135,7 @@ def test_noise_is_that_of_the_camera(level, known):
     ],
 )
 def test_mode_counts_of_the_presets(name, count):
-    found = counted(singular_values(seen_rig(rig_preset(name)).matrix), 1e-2)
+    found = counted(singular_values(linearized(setup_preset(name)).matrix), 1e-2)
     assert abs(found - count) <= max(1, 0.03 * count)
 
 
@@ -149,14 +147,14 @@ def plate_in_the_middle() -> Scene:
 
 def test_the_matrix_is_the_rig_that_the_lab_renders():
     for rig in (
-        RadiometricTransport(roughness=0.3, gain=0.6, ambient=0.1, ambient_gradient=(0.2, -0.1)),
-        RadiometricTransport(roughness=0.3, strip_m=(0.24, 0.12), gain=0.6),
-        RadiometricTransport(wall_material="lambert", lamp_m=(-0.4, 0.0, 0.05)),
+        RadiometricSetup(roughness=0.3, gain=0.6, ambient=0.1, ambient_gradient=(0.2, -0.1)),
+        RadiometricSetup(roughness=0.3, strip_m=(0.24, 0.12), gain=0.6),
+        RadiometricSetup(wall_material="lambert", lamp_m=(-0.4, 0.0, 0.05)),
     ):
         scene, bench = plate_in_the_middle(), Bench(height=12, width=20)
-        seen = seen_rig(rig, bench)
+        seen = linearized(rig, bench)
         mask = torch.from_numpy(scene.target.rasterise(bench.plate)).double().flatten()
-        rendered = rig.wall(scene, bench.shape).irradiance(4.0)
+        rendered = rig.resized(bench.shape).observe(scene).irradiance(4.0)
         expected = (seen.ambient + seen.matrix @ mask).reshape(bench.shape).float()
         torch.testing.assert_close(rendered, expected, rtol=1e-4, atol=1e-6)
 
@@ -164,23 +162,23 @@ def test_the_matrix_is_the_rig_that_the_lab_renders():
 def test_the_papers_matrix_is_its_wall_but_for_diffraction():
     scene, bench = plate_in_the_middle(), Bench(height=25, width=40)
     for length_m in (0.004, 0.02):
-        rig = PaperTransport(tpsf_length_m=length_m, gain=0.9, field_of_view_m=0.3)
-        seen = seen_rig(rig, bench)
+        rig = PaperSetup(tpsf_length_m=length_m, gain=0.9, field_of_view_m=0.3)
+        seen = linearized(rig, bench)
         mask = torch.from_numpy(scene.target.rasterise(bench.plate)).double().flatten()
-        rendered = rig.wall(scene, bench.shape).irradiance(4.0).double().flatten()
+        rendered = rig.resized(bench.shape).observe(scene).irradiance(4.0).double().flatten()
         expected = seen.ambient + seen.matrix @ mask
         assert float((rendered - expected).abs().max()) < 0.03 * float(expected.max())
 
 
 def test_a_cut_tpsf_is_told_apart():
-    cut = identify(PaperTransport(tpsf_length_m=0.02), bench=Bench(cells=16, height=20, width=32, writers=1))
+    cut = identify(PaperSetup(tpsf_length_m=0.02), bench=Bench(cells=16, height=20, width=32, writers=1))
     assert "kink" in cut.warnings[0]
-    assert "rho = 2 with taper 0" in cut.warnings[0]
+    assert "rho_max 2, taper 0" in cut.warnings[0]
     faded = identify(
-        PaperTransport(tpsf_length_m=0.02, taper=1.0), bench=Bench(cells=16, height=20, width=32, writers=1)
+        PaperSetup(tpsf_length_m=0.02, taper=1.0), bench=Bench(cells=16, height=20, width=32, writers=1)
     )
     assert not faded.warnings
-    assert carried_on(PaperTransport()).rho_max == 8.0
+    assert PaperSetup().without_artifacts() == PaperSetup(rho_max=8.0, taper=0.5)
 
 
 def test_prior_and_test_share_no_character():
@@ -193,14 +191,14 @@ def test_prior_and_test_share_no_character():
 
 def test_a_sharp_rig_shows_more_than_a_matte_wall():
     bench = Bench(cells=16, height=30, width=48, writers=1)
-    easy, matte = (identify(rig_preset(name), bench=bench, name=name) for name in ("easy", "matte"))
+    easy, matte = (identify(setup_preset(name), bench=bench, name=name) for name in ("easy", "matte"))
     assert easy.modes > 5 * matte.modes
     assert easy.at_camera.patterns > 2 * matte.at_camera.patterns
     assert easy.at_camera.psnr_db > matte.at_camera.psnr_db + 1 > matte.mean_db + 1
     assert easy.at_camera.patterns > easy.at_fixed.patterns
     assert matte.at_camera.finest_m is None
     assert "memory" in matte.verdict and "memory, not a measurement" not in easy.verdict
-    averaged = identify(rig_preset("easy"), bench=dataclasses.replace(bench, frames=100))
+    averaged = identify(setup_preset("easy"), bench=dataclasses.replace(bench, frames=100))
     assert averaged.at_camera.noise == pytest.approx(easy.at_camera.noise / 10)
     assert averaged.at_camera.patterns > easy.at_camera.patterns
     assert averaged.at_camera.finest_m < easy.at_camera.finest_m
@@ -209,7 +207,7 @@ def test_a_sharp_rig_shows_more_than_a_matte_wall():
 
 
 def test_a_post_resolves_across_itself_only():
-    found = identify(rig_preset("aperture"), bench=Bench(cells=16, height=30, width=48, writers=1))
+    found = identify(setup_preset("aperture"), bench=Bench(cells=16, height=30, width=48, writers=1))
     upright, lying = found.at_camera.stroke_m
     assert upright is not None and upright < 0.012
     assert lying is None
@@ -218,8 +216,8 @@ def test_a_post_resolves_across_itself_only():
 
 def test_picard_and_picture():
     """The coefficients of a noiseless picture, from the definition; the same seed draws the same picture."""
-    one, same, other = (identify(rig_preset("hard"), bench=SMALL, seed=seed) for seed in (0, 0, 1))
-    rig = seen_rig(rig_preset("hard"), SMALL)
+    one, same, other = (identify(setup_preset("hard"), bench=SMALL, seed=seed) for seed in (0, 0, 1))
+    rig = linearized(setup_preset("hard"), SMALL)
     plates = handwritten_plates(SMALL.plate, 1)
     light = rig.ambient + rig.matrix @ plates.mean
     whitened = rig.matrix / camera_variance(light, FrameCamera()).sqrt()[:, None]
@@ -250,7 +248,7 @@ def test_command(tmp_path, capsys):
     small = ["--cells", "8", "--height", "12", "--width", "20", "--writers", "1"]
     main(["identify", "matte-near", "--json", *small])
     found = json.loads(capsys.readouterr().out)
-    assert (found["rig"], found["modes_above_1e-2"]) == ("matte-near", 3)
+    assert (found["setup"], found["modes_above_1e-2"]) == ("matte-near", 3)
     assert "memory" in found["verdict"]
     main(["identify", "matte-near", "hard-far", "--out", str(tmp_path / "o"), *small])
     shown = capsys.readouterr().out
@@ -261,26 +259,26 @@ def test_command(tmp_path, capsys):
 
 
 def test_rig_files(tmp_path):
-    assert described_rig("simulate-paper").transport == PaperTransport()
+    assert named_setup("simulate-paper").setup.optics() == PaperSetup().optics()
     path = tmp_path / "rig.yaml"
-    save_yaml(rig_preset("hard"), path)
-    assert described_rig(path).transport == rig_preset("hard")
-    save_yaml(Simulation(transport=PaperTransport(taper=0.3)), path)
-    assert described_rig(path).transport == PaperTransport(taper=0.3)
-    lab = Lab(name="bench", transport=rig_preset("aperture"))
+    save_yaml(setup_preset("hard"), path)
+    assert named_setup(path).setup == setup_preset("hard")
+    save_yaml(Simulation(setup=PaperSetup(taper=0.3)), path)
+    assert named_setup(path).setup == PaperSetup(taper=0.3)
+    lab = Lab(name="bench", setup=setup_preset("aperture"))
     save_yaml(lab, path)
-    assert described_rig(path).transport == rig_preset("aperture")
-    assert described_rig(path).camera == lab.drawn().frame_camera
+    assert named_setup(path).setup == setup_preset("aperture")
+    assert named_setup(path).setup.frame_camera == lab.setup.frame_camera
     path.write_text("transport: {kind: radiometric, roughness: 0.2}\nframe_camera: {read_noise_e: 3.0}\n")
-    assert described_rig(path).camera.read_noise_e == 3.0
+    assert named_setup(path).setup.frame_camera.read_noise_e == 3.0
 
 
 @pytest.mark.parametrize(
     ("text", "match"),
     [
         ("kind: radiometric\nroughnes: 0.1\n", "roughness"),
-        ("transprt: {}\n", "has no `transport`.*transprt"),
-        ("transport: {kind: mirror}\n", "kind is 'mirror'"),
+        ("setip: {}\n", "has no `setup`.*setip"),
+        ("transport: {kind: mirror}\n", "no setup of kind 'mirror'"),
         ("- 1\n", "mapping"),
     ],
 )
@@ -288,21 +286,21 @@ def test_bad_rig_files(tmp_path, text, match):
     path = tmp_path / "rig.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=match):
-        described_rig(path)
+        named_setup(path)
 
 
 @pytest.mark.parametrize(
     ("match", "make"),
     [
-        ("perhaps you meant 'main-near'", lambda: described_rig("main-nera")),
-        ("does not exist", lambda: described_rig("nothing.yaml")),
-        ("no preset 'papr'", lambda: described_rig("simulate-papr")),
+        ("perhaps you meant 'main-near'", lambda: named_setup("main-nera")),
+        ("does not exist", lambda: named_setup("nothing.yaml")),
+        ("no preset 'papr'", lambda: named_setup("simulate-papr")),
         ("cells is 4", lambda: Bench(cells=4)),
         ("cells is 100", lambda: Bench(cells=100)),
         ("plate_m is 0", lambda: Bench(plate_m=0.0)),
         ("fixed_noise", lambda: Bench(fixed_noise=float("nan"))),
-        ("does not see the wall", lambda: seen_rig(RadiometricTransport(camera_angle_deg=80.0), SMALL)),
-        ("no light", lambda: seen_rig(PaperTransport(offset_m=(5.0, 0.0)), SMALL)),
+        ("does not see the wall", lambda: linearized(RadiometricSetup(camera_angle_deg=80.0), SMALL)),
+        ("no light", lambda: linearized(PaperSetup(offset_m=(5.0, 0.0)), SMALL)),
     ],
 )
 def test_bad_input(match, make):
@@ -318,5 +316,5 @@ def test_bad_sizes():
 def test_no_rig(capsys):
     with pytest.raises(SystemExit):
         main(["identify"])
-    assert "no rig given" in capsys.readouterr().err
-    assert len(rig_names()) == 12
+    assert "no setup given" in capsys.readouterr().err
+    assert len(setup_names()) == 12

@@ -6,11 +6,12 @@ import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import Target
+from evnlos.setups import RadiometricSetup
 from evnlos.solver import Gradient, JointProblem, PlatePass, total_variation
 from evnlos.solver.operators import normal_matrix
-from evnlos.solver.plate_pass import strip_gram_of, strip_of, strip_transport
+from evnlos.solver.plate_pass import matrix_of, strip_gram_of, strip_of
 from evnlos.solver.recording import position_subsets
-from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.transport import MatrixTransport
 from evnlos.types import Plane
 
 PLATE = Plane(4, 4, 0.01)
@@ -124,10 +125,10 @@ def test_total_variation_is_that_of_one_picture(sight) -> None:
 
 
 def test_a_pass_shows_more_than_a_picture() -> None:
-    rig = RadiometricTransport(roughness=0.05, cell_m=0.01, gain=1.0)
+    rig = RadiometricSetup(roughness=0.05, cell_m=0.01, gain=1.0)
     plate = Plane(10, 10, 0.008)
     positions = np.stack([np.linspace(-0.06, 0.06, 8), np.zeros(8)], axis=1)
-    transport = strip_transport(rig, (16, 24), (16, 24), strip_of(positions, plate))
+    transport = matrix_of(rig.resized((16, 24)).operator(strip_of(positions, plate), (16, 24)))
     truth = torch.zeros(10, 10, dtype=torch.float64)
     truth[2:8, 2:4] = truth[6:8, 2:8] = 1
     generator = torch.Generator().manual_seed(0)
@@ -143,10 +144,10 @@ def test_a_pass_shows_more_than_a_picture() -> None:
 
 def test_white_levels_are_the_rigs() -> None:
     """A strip of other cells at a smaller size shows a plate as bright as the rig's own wall does."""
-    rig = RadiometricTransport(roughness=0.08, cell_m=0.008, gain=0.9)
+    rig = RadiometricSetup(roughness=0.08, cell_m=0.008, gain=0.9)
     lit = torch.ones(10, 10, dtype=torch.float64)
     plate, place = Plane(10, 10, 0.008), np.array([(0.01, 0.0)])
-    small = strip_transport(rig, (20, 32), (10, 16), strip_of(place, plate))
+    small = matrix_of(rig.resized((20, 32)).operator(strip_of(place, plate), (10, 16)))
     own = rig.transport((20, 32))
     wall = rig.gain * own(torch.from_numpy(Target("square", np.ones((4, 4))).rasterise(own.source, place[0])))
     wall = wall.unflatten(0, (10, 2)).unflatten(2, (16, 2)).mean(dim=(1, 3))

@@ -9,21 +9,22 @@ import torch
 
 from evnlos import EvnlosError, Training, UNetConfig, evaluate, load_weights, train
 from evnlos.cli import main
-from evnlos.dataset import NlosDataset
+from evnlos.dataset import NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.evaluation import Reconstructor, curve_over_positions
+from evnlos.evaluation import StreamingReconstructor, curve_over_positions
 from evnlos.evaluation.positions import choices
-from evnlos.model import JointNetwork, infer
+from evnlos.model import SequenceConfig, SequenceReconstructor
 from evnlos.scene import FontGlyphs
 from evnlos.types import Plane
+from watching import stopped
 
-NET = UNetConfig(width=8, depth=1, shuffle=2, rank=24, strengths=(0.01, 1.0))
-PLAN = Training(epochs=6, network=NET, precision="float32", joint=True, batch_size=4, views=2)
+NET = SequenceConfig(width=8, depth=1, shuffle=2, rank=24, strengths=(0.01, 1.0))
+PLAN = Training(epochs=6, network=NET, precision="float32", batch_size=4, sequence_augmentations=2)
 PITCH_M = 0.0025
 
 
-def network(channels: int = 1) -> JointNetwork:
-    return JointNetwork(channels, NET, (64, 96), PITCH_M)
+def network() -> SequenceReconstructor:
+    return SequenceReconstructor(as_modality("frame"), NET, Sampling(height=64, width=96, pitch_m=PITCH_M))
 
 
 def test_pictures_of_a_moving_plate_meet_on_the_plate_and_come_back() -> None:
@@ -32,17 +33,17 @@ def test_pictures_of_a_moving_plate_meet_on_the_plate_and_come_back() -> None:
     truth = torch.from_numpy(target.rasterise(Plane(64, 96, PITCH_M), places)).float()
     at = torch.from_numpy(places).float()
     net = network()
-    plate = net.plate_of(truth, at)
+    plate = net.plane_of(truth, at)
     assert plate.shape == (80, 80)
-    error = (net.drawn(plate, at) - truth).square().mean()
+    error = (net.on_canvas(plate, at) - truth).square().mean()
     assert 10 * torch.log10(1 / error) > 27
-    shuffled = net.plate_of(truth, at.flip(0))
-    assert (net.drawn(shuffled, at) - truth).square().mean() > 4 * error
+    shuffled = net.plane_of(truth, at.flip(0))
+    assert (net.on_canvas(shuffled, at) - truth).square().mean() > 4 * error
 
 
 def test_the_mean_is_over_the_positions_that_see_a_pixel() -> None:
     net = network()
-    net.embedding.mean_out.fill_(0.5)  # every position answers one half everywhere
+    net.embedding.groups["frame"].mean_out.fill_(0.5)  # every position answers one half everywhere
     inputs, places = torch.zeros(3, 1, 64, 96), torch.tensor([[0.0, 0.0], [0.1, 0.0], [-0.03, 0.0]])
     pooled = net.pooled(inputs, places)
     inner = pooled[:, 4:-4, 4:-4]
@@ -54,22 +55,22 @@ def test_the_mean_is_over_the_positions_that_see_a_pixel() -> None:
 @pytest.fixture(scope="module")
 def trained(tiny_dataset, tmp_path_factory):
     out = tmp_path_factory.mktemp("joint") / "run"
-    return out, list(train(tiny_dataset, PLAN, out))
+    return out, train(tiny_dataset, PLAN, out).records
 
 
 def test_a_joint_run_learns_scores_and_is_read_back(trained, tiny_dataset) -> None:
     out, log = trained
     assert log[-1]["loss"] < log[0]["loss"]
     weights = load_weights(out)
-    assert isinstance(weights.network, JointNetwork)
+    assert weights.network.kind == "sequence" and weights.network.sees_sequence
     found = evaluate(weights, tiny_dataset, "train")
     assert found.images.shape == found.truth.shape
     assert found.scores.mean()["psnr_db"] > found.baselines["zero"].mean()["psnr_db"]
     samples = NlosDataset(tiny_dataset, "train", "frame")
-    both = infer(weights.network, samples.inputs, samples.position_m, samples.names)
+    both = weights.network.infer(samples.inputs, samples.position_m, samples.names)
     name = samples.names[0]
     mine = samples.names == name
-    alone = infer(weights.network, samples.inputs[torch.from_numpy(mine)], samples.position_m[mine])
+    alone = weights.network.infer(samples.inputs[torch.from_numpy(mine)], samples.position_m[mine])
     torch.testing.assert_close(both[torch.from_numpy(mine)], alone)
 
 
@@ -106,20 +107,18 @@ def test_choices_are_equally_spaced_and_within_the_pass(count: int) -> None:
 
 def test_a_killed_joint_run_goes_on_to_the_same_bytes(trained, tiny_dataset, tmp_path) -> None:
     out, _ = trained
-    going = train(tiny_dataset, PLAN, tmp_path / "again")
-    next(going), next(going)
-    going.close()
-    list(train(tiny_dataset, PLAN, tmp_path / "again"))
+    stopped(train, tiny_dataset, PLAN, tmp_path / "again", after=2)
+    train(tiny_dataset, PLAN, tmp_path / "again")
     one, other = (load_weights(run).network.state_dict() for run in (out, tmp_path / "again"))
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_fine_tuning_keeps_the_kind_and_frozen_parts(trained, tiny_dataset, tmp_path) -> None:
     out, _ = trained
-    plan = replace(PLAN, joint=False, epochs=1, freeze=("encoder",))
-    list(train(tiny_dataset, plan, tmp_path / "fine", out))
+    plan = replace(PLAN, network=UNetConfig(), epochs=1, freeze=("encoder",))
+    train(tiny_dataset, plan, tmp_path / "fine", out)
     old, new = load_weights(out).network, load_weights(tmp_path / "fine").network
-    assert isinstance(new, JointNetwork)
+    assert new.kind == "sequence"
     assert torch.equal(old.unet.stem.weight, new.unet.stem.weight)
     assert not torch.equal(old.unet.head.weight, new.unet.head.weight)
 
@@ -128,11 +127,11 @@ def test_what_a_joint_network_cannot_do_is_said(trained, tiny_dataset) -> None:
     weights = load_weights(trained[0])
     samples = NlosDataset(tiny_dataset, "train", "frame")
     with pytest.raises(DataError, match="where the target was"):
-        infer(weights.network, samples.inputs)
+        weights.network.infer(samples.inputs)
     unknown = np.full_like(samples.position_m, np.nan)
     with pytest.raises(EvnlosError, match=r"capture\.yaml"):
-        infer(weights.network, samples.inputs, unknown)
-    with pytest.raises(DataError, match="whole pass"):
-        Reconstructor(weights)
+        weights.network.infer(samples.inputs, unknown)
+    with pytest.raises(DataError, match="whole sequences"):
+        StreamingReconstructor(weights)
     with pytest.raises(ConfigError, match="rank"):
-        JointNetwork(1, replace(NET, rank=0), (64, 96), PITCH_M)
+        replace(NET, rank=0)

@@ -1,6 +1,8 @@
 """The virtual laboratory: captures in the format of real ones, from a rig file, with a sensor of their own."""
 
 import dataclasses
+import socket
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +17,21 @@ from evnlos.dataset.lab_sensor import SENSOR_SPREAD
 from evnlos.dataset.presets import default
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, Scene
-from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
+from evnlos.setups import PaperSetup, RadiometricSetup, setup_names, setup_preset
 from evnlos.transport.diffraction import Diffraction
-from evnlos.transport.rig import rig_names
 from evnlos.types import Plane
+from watching import stopped
 
 
 def small(**changes) -> Lab:
     """Return a lab that renders a capture in a second or so."""
-    rig = RadiometricTransport(cell_m=0.01, gain=0.7, ambient=0.06, **changes.pop("rig", {}))
+    setup = replace(Lab().setup, cell_m=0.01, gain=0.7, ambient=0.06, ambient_gradient=(0.0, 0.0))
+    cameras = {name: changes.pop(name) for name in ("sensor", "frame_camera", "pixel") if name in changes}
+    setup = replace(setup, **{"sensor": SensorSize(24, 36), **cameras, **changes.pop("rig", {})})
     settings = {
         "glyphs": FontGlyphs(family="kalam", characters="AL"),
-        "sensor": SensorSize(24, 36),
         "frame_rate_hz": 1.0,
-        "transport": rig,
+        "setup": setup,
     }
     return Lab(**settings | changes)
 
@@ -50,8 +53,8 @@ def test_sensor_is_drawn_from_the_stated_ranges():
     for seed in range(40):
         lab = Lab(seed=seed).drawn()
         for path, (low, high) in SENSOR_SPREAD.items():
-            part, name = path.split(".")
-            value = getattr(getattr(lab, part), name)
+            _, part, name = path.split(".")
+            value = getattr(getattr(lab.setup, part), name)
             assert low <= value <= high
             seen[path].append(value)
     for path, (low, high) in SENSOR_SPREAD.items():
@@ -60,9 +63,12 @@ def test_sensor_is_drawn_from_the_stated_ranges():
 
 def test_a_rig_keeps_its_sensor_and_another_rig_has_its_own():
     assert Lab(seed=3).drawn() == Lab(seed=3).drawn() == Lab(seed=3).drawn().drawn()
-    assert Lab(seed=3).drawn().pixel != Lab(seed=4).drawn().pixel
-    assert Lab(name="other", seed=3).drawn().pixel != Lab(seed=3).drawn().pixel
-    assert Lab(seed=3).drawn().frame_camera.pattern_seed != Lab(seed=4).drawn().frame_camera.pattern_seed
+    assert Lab(seed=3).drawn().setup.pixel != Lab(seed=4).drawn().setup.pixel
+    assert Lab(name="other", seed=3).drawn().setup.pixel != Lab(seed=3).drawn().setup.pixel
+    assert (
+        Lab(seed=3).drawn().setup.frame_camera.pattern_seed
+        != Lab(seed=4).drawn().setup.frame_camera.pattern_seed
+    )
     fixed = Lab(spread={})
     assert fixed.drawn() == fixed
 
@@ -70,9 +76,9 @@ def test_a_rig_keeps_its_sensor_and_another_rig_has_its_own():
 def test_the_sensor_is_not_the_training_simulators():
     training = default()
     for path, (low, high) in SENSOR_SPREAD.items():
-        part, name = path.split(".")
-        if path not in training.vary and path != "pixel.hot_pixel_fraction":
-            used = getattr(getattr(training, part), name)
+        _, part, name = path.split(".")
+        if path not in training.vary and path != "setup.pixel.hot_pixel_fraction":
+            used = getattr(getattr(training.setup, part), name)
             assert not low < used < high, path
 
 
@@ -89,20 +95,19 @@ def test_what_was_drawn_is_written_down(rendered):
     lab, notes = small(name="near"), read_yaml(rendered / "lab.yaml")
     drawn = lab.drawn()
     assert from_dict(Lab, notes["lab"]) == lab
-    assert from_dict(type(drawn.pixel), notes["drawn"]["pixel"]) == drawn.pixel
+    assert from_dict(type(drawn.setup.pixel), notes["drawn"]["pixel"]) == drawn.setup.pixel
     about = read_capture(rendered / "near_L").info.rig["rendered"]
-    assert from_dict(type(drawn.pixel), about["pixel"]) == drawn.pixel
-    assert from_dict(type(drawn.frame_camera), about["frame_camera"]) == drawn.frame_camera
-    assert from_dict(RadiometricTransport, about["transport"]) == lab.transport
+    assert from_dict(RadiometricSetup, about["setup"]) == drawn.setup
 
 
 def test_a_run_is_taken_up_again(rendered, tmp_path):
     """A killed run leaves a draft; what is done is kept, what is missing comes out the same."""
     out = tmp_path / "near"
     lab = small(name="near")
-    first = next(iter(render_captures(lab, out)))
-    (out / ".near_L.tmp" / "frames").mkdir(parents=True)
-    (out / ".near_L.tmp" / "events.raw").write_bytes(b"half")
+    (first,) = stopped(render_captures, lab, out, after=1)
+    draft = out / f".near_L.{socket.gethostname()}.4194304.0123abcd.part"  # of a process that is dead
+    (draft / "frames").mkdir(parents=True)
+    (draft / "events.raw").write_bytes(b"half")
     stamp = (first / "capture.yaml").stat().st_mtime_ns
     assert [path.name for path in render_captures(lab, out)] == ["near_A", "near_L"]
     assert (first / "capture.yaml").stat().st_mtime_ns == stamp
@@ -112,9 +117,9 @@ def test_a_run_is_taken_up_again(rendered, tmp_path):
 def test_more_characters_may_be_added_but_no_other_rig(rendered):
     more = small(name="near", glyphs=FontGlyphs(family="kalam", characters="ALI"))
     with pytest.raises(DataError, match=r"begun with other settings.*seed: 0 -> 1"):
-        list(render_captures(dataclasses.replace(more, seed=1), rendered))
+        render_captures(dataclasses.replace(more, seed=1), rendered)
     before = content(rendered / "near_A")
-    assert len(list(render_captures(more, rendered))) == 3
+    assert len(render_captures(more, rendered)) == 3
     assert content(rendered / "near_A") == before
 
 
@@ -147,14 +152,14 @@ def test_a_rig_file_reaches_every_option(tmp_path):
     path = tmp_path / "rig.yaml"
     path.write_text(RIG_FILE)
     lab = load_yaml(Lab, path)
-    assert len(lab.transport.occluders()) == 1
-    assert 0.3 <= lab.drawn().pixel.threshold_on <= 0.4
+    assert len(lab.setup.occluders()) == 1
+    assert 0.3 <= lab.drawn().setup.pixel.threshold_on <= 0.4
     (folder,) = render_captures(lab, tmp_path / "o")
     capture = read_capture(folder)
     assert "1 occluder(s), torch-lit target" in capture.info.rig["wall"]
     # Each option changes what the camera sees.
     scene = Scene(lab.glyphs.target("kalam_L"), lab.motion, lab.duration_s)
-    seen = lab.transport.wall(scene, (24, 36)).irradiance(4.0)
+    seen = lab.setup.resized((24, 36)).observe(scene).irradiance(4.0)
     for change in (
         {"lamp_m": None},
         {"occluders_m": ()},
@@ -162,20 +167,20 @@ def test_a_rig_file_reaches_every_option(tmp_path):
         {"ambient_gradient": (0.0, 0.0)},
         {"wall_material": "ggx"},
     ):
-        other = dataclasses.replace(lab.transport, **change).wall(scene, (24, 36)).irradiance(4.0)
+        other = dataclasses.replace(lab.setup, **change).resized((24, 36)).observe(scene).irradiance(4.0)
         assert float((other - seen).abs().max()) > 1e-3, change
 
 
 def test_the_documents_rig_file():
     text = (Path(__file__).parent.parent / "docs" / "lab.md").read_text()
     lab = from_dict(Lab, yaml.safe_load(text.split("```yaml")[1].split("```")[0]))
-    assert (lab.name, lab.transport.lamp_m, lab.spread) == (
+    assert (lab.name, lab.setup.lamp_m, lab.spread) == (
         "bench",
         (-0.5, 0.1, 0.05),
-        {"pixel.threshold_on": (0.18, 0.28)},
+        {"setup.pixel.threshold_on": (0.18, 0.28)},
     )
-    coarse = dataclasses.replace(lab.transport, cell_m=0.01)
-    assert coarse.wall(scene(), (6, 9)).irradiance(4.0).shape == (6, 9)
+    coarse = dataclasses.replace(lab.setup, cell_m=0.01)
+    assert coarse.resized((6, 9)).observe(scene()).irradiance(4.0).shape == (6, 9)
 
 
 @pytest.mark.parametrize("name", ["matte-near", "aperture-far"])
@@ -183,34 +188,33 @@ def test_named_rigs_render(name, tmp_path):
     lab = lab_preset(name)
     lab = dataclasses.replace(
         lab,
-        transport=dataclasses.replace(lab.transport, cell_m=0.01),
+        setup=dataclasses.replace(dataclasses.replace(lab.setup, cell_m=0.01), sensor=SensorSize(24, 36)),
         glyphs=FontGlyphs(family="kalam", characters="T"),
-        sensor=SensorSize(24, 36),
         frame_rate_hz=0.5,
     )
     (folder,) = render_captures(lab, tmp_path / "o")
     capture = read_capture(folder)
     assert folder.name == f"{name}_T"
-    assert capture.frames.mean() > 1.3 * 255 * lab.transport.ambient
+    assert capture.frames.mean() > 1.3 * 255 * lab.setup.ambient
     assert capture.info.rig["distance_m"] == (0.5 if name.endswith("far") else 0.3)
 
 
 def test_all_names():
-    assert rig_names()[:3] == ["mirror-near", "mirror-far", "easy-near"]
-    for name in rig_names():
-        assert lab_preset(name).transport.gain == 0.7
-    assert rig_preset("main-far").distance_m == 0.5
-    assert rig_preset("main-far", 0.4).distance_m == 0.4
+    assert setup_names()[:3] == ["mirror-near", "mirror-far", "easy-near"]
+    for name in setup_names():
+        assert lab_preset(name).setup.gain == 0.7
+    assert setup_preset("main-far").distance_m == 0.5
+    assert setup_preset("main-far", 0.4).distance_m == 0.4
 
 
 def test_occluders_of_a_rig_are_those_of_its_matrix():
     """A plate-sized screen right before the target leaves only what passes beside it."""
     wide = ((-0.4, -0.3, 0.29), (0.0, -0.3, 0.29), (0.0, 0.3, 0.29), (-0.4, 0.3, 0.29))
-    rig = RadiometricTransport(wall_material="lambert", cell_m=0.01, occluders_m=(wide,))
+    rig = RadiometricSetup(wall_material="lambert", cell_m=0.01, occluders_m=(wide,))
     with pytest.raises(ConfigError, match="no light"):
         rig.transport((6, 9))
     half = tuple((min(x, -0.173), y, z) for x, y, z in wide)
-    left = RadiometricTransport(wall_material="lambert", cell_m=0.01, occluders_m=(half,))
+    left = RadiometricSetup(wall_material="lambert", cell_m=0.01, occluders_m=(half,))
     matrix = left.matrix((6, 9), Plane(2, 2, 0.04))
     assert float(matrix[:, 0].sum()) < 0.2 * float(matrix[:, 1].sum())
     assert torch.isfinite(matrix).all()
@@ -221,46 +225,62 @@ def scene() -> Scene:
 
 
 BAD = [
-    ("does not see the wall", lambda: RadiometricTransport(camera_angle_deg=80.0).wall(scene(), (6, 9))),
-    ("must stand before the wall", lambda: RadiometricTransport(camera_angle_deg=95.0).wall(scene(), (6, 9))),
-    ("distance_m is -0.3", lambda: RadiometricTransport(distance_m=-0.3).wall(scene(), (6, 9))),
-    ("distance_m is nan", lambda: RadiometricTransport(distance_m=float("nan")).wall(scene(), (6, 9))),
+    ("does not see the wall", lambda: RadiometricSetup(camera_angle_deg=80.0).resized((6, 9)).observe(scene())),
+    (
+        "must stand before the wall",
+        lambda: RadiometricSetup(camera_angle_deg=95.0).resized((6, 9)).observe(scene()),
+    ),
+    ("distance_m is -0.3", lambda: RadiometricSetup(distance_m=-0.3).resized((6, 9)).observe(scene())),
+    ("distance_m is nan", lambda: RadiometricSetup(distance_m=float("nan")).resized((6, 9)).observe(scene())),
     (
         "crosses the wall",
-        lambda: RadiometricTransport(occluders_m=(((0, 0, -0.1), (0, 0.1, 0.1), (0.1, 0, 0.1)),)).occluders(),
+        lambda: RadiometricSetup(occluders_m=(((0, 0, -0.1), (0, 0.1, 0.1), (0.1, 0, 0.1)),)).occluders(),
     ),
     (
         "reaches z = 0.35 m and the target's plane at 0.3 m",
-        lambda: RadiometricTransport(occluders_m=(((-0.2, 0, 0.35), (-0.2, 0.1, 0.2), (-0.1, 0, 0.2)),)).wall(
-            scene(), (6, 9)
+        lambda: (
+            RadiometricSetup(occluders_m=(((-0.2, 0, 0.35), (-0.2, 0.1, 0.2), (-0.1, 0, 0.2)),))
+            .resized((6, 9))
+            .observe(scene())
         ),
     ),
     (
         r"hides the wall from \d+ % of the camera's pixels",
-        lambda: RadiometricTransport(
-            occluders_m=(((0.1, -0.1, 0.2), (0.2, -0.1, 0.2), (0.2, 0.1, 0.2), (0.1, 0.1, 0.2)),)
-        ).wall(scene(), (6, 9)),
+        lambda: (
+            RadiometricSetup(
+                occluders_m=(((0.1, -0.1, 0.2), (0.2, -0.1, 0.2), (0.2, 0.1, 0.2), (0.1, 0.1, 0.2)),)
+            )
+            .resized((6, 9))
+            .observe(scene())
+        ),
     ),
     (
         "needs 4 cells a side to show any shape: give at most 0.005 m",
-        lambda: small(rig={}).transport.wall(tiny_plate(), (6, 9)),
+        lambda: small(rig={}).setup.resized((6, 9)).observe(tiny_plate()),
     ),
-    ("cell_m is 0", lambda: RadiometricTransport(cell_m=0.0).wall(scene(), (6, 9))),
-    ("strip_height_m is 0", lambda: RadiometricTransport(strip_m=(0.24, 0.0)).wall(scene(), (6, 9))),
-    ("set strip_m to at least", lambda: RadiometricTransport(strip_m=(0.1, 0.08)).wall(scene(), (6, 9))),
+    ("cell_m is 0", lambda: RadiometricSetup(cell_m=0.0).resized((6, 9)).observe(scene())),
+    ("strip_height_m is 0", lambda: RadiometricSetup(strip_m=(0.24, 0.0)).resized((6, 9)).observe(scene())),
+    ("set strip_m to at least", lambda: RadiometricSetup(strip_m=(0.1, 0.08)).resized((6, 9)).observe(scene())),
     (
         "samples of 1e-06 m carry a field no farther than",
-        lambda: PaperTransport(wave_pitch_m=1e-6).wall(scene(), (6, 9)),
+        lambda: PaperSetup(wave_pitch_m=1e-6).resized((6, 9)).observe(scene()),
     ),
-    ("pitch_m is 0", lambda: PaperTransport(pitch_m=0.0).wall(scene(), (6, 9))),
-    ("perhaps you meant 'matte-near'", lambda: rig_preset("mate-near")),
-    ("rig 'main-close' is unknown", lambda: rig_preset("main-close")),
+    ("pitch_m is 0", lambda: PaperSetup(pitch_m=0.0).resized((6, 9)).observe(scene())),
+    ("perhaps you meant 'matte-near'", lambda: setup_preset("mate-near")),
+    ("setup 'main-close' is unknown", lambda: setup_preset("main-close")),
     ("Lab.name", lambda: Lab(name="a/b")),
     ("duration_s is 0", lambda: Lab(duration_s=0.0)),
     ("needs two frames", lambda: Lab(duration_s=1.0, frame_rate_hz=0.5)),
-    ("captures hold 8 bits", lambda: Lab(frame_camera=dataclasses.replace(Lab().frame_camera, bit_depth=12))),
-    ("threshold_on", lambda: Lab(spread={"pixel.threshold_on": (0.0, 0.2)})),
-    ("treshold", lambda: Lab(spread={"pixel.treshold_on": (0.1, 0.2)})),
+    (
+        "captures hold 8 bits",
+        lambda: Lab(
+            setup=dataclasses.replace(
+                Lab().setup, frame_camera=dataclasses.replace(Lab().setup.frame_camera, bit_depth=12)
+            )
+        ),
+    ),
+    ("threshold_on", lambda: Lab(spread={"setup.pixel.threshold_on": (0.0, 0.2)})),
+    ("treshold", lambda: Lab(spread={"setup.pixel.treshold_on": (0.1, 0.2)})),
     ("size_m", lambda: FontGlyphs(plate=dataclasses.replace(FontGlyphs().plate, size_m=0.0))),
 ]
 
@@ -279,17 +299,17 @@ def test_bad_rigs(match, make):
 def test_a_wrong_rig_writes_nothing(tmp_path):
     lab = small(rig={"camera_angle_deg": 80.0})
     with pytest.raises(ConfigError, match="does not see the wall"):
-        list(render_captures(lab, tmp_path / "o"))
+        render_captures(lab, tmp_path / "o")
     assert not (tmp_path / "o").exists()
 
 
 def test_a_foreign_folder_is_left_alone(tmp_path):
     (tmp_path / "o" / "lab_A").mkdir(parents=True)
     with pytest.raises(DataError, match=r"without a capture.yaml"):
-        list(render_captures(small(), tmp_path / "o"))
+        render_captures(small(), tmp_path / "o")
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="is a file"):
-        list(render_captures(small(), tmp_path / "file"))
+        render_captures(small(), tmp_path / "file")
 
 
 def test_a_pitch_at_the_limit_still_propagates():

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import socket
+import struct
 import threading
 import urllib.error
 import urllib.request
@@ -17,9 +18,9 @@ import pytest
 import torch
 from PIL import Image
 
-from evnlos import EvnlosError, ResidualUNet, UNetConfig
+from evnlos import EvnlosError, UNetConfig
 from evnlos.cli import main
-from evnlos.dataset import capture_samples, read_capture, reduce_by_area
+from evnlos.dataset import STANDARD_MODALITIES, Sampling, capture_samples, read_capture, reduce_by_area
 from evnlos.errors import ConfigError, DataError, EventFileError
 from evnlos.evaluation import reconstruct
 from evnlos.events import read_events, time_surface, write_events
@@ -42,7 +43,6 @@ from evnlos.model import Weights, save_weights
 from evnlos.types import Events
 
 ABOUT = {"height": 16, "width": 24, "scored_rows": 12, "tau_s": 0.05}
-CHANNELS = {"frame": 1, "event": 2, "fusion": 3}
 NEVER = lambda: False  # noqa: E731
 
 
@@ -67,12 +67,12 @@ def stream(count: int, seed: int = 0, span_us: int = 100_000, width: int = 30, h
     return Events(t_us, x.astype(np.uint16), y.astype(np.uint16), draw.random(count) < 0.5, width, height)
 
 
-def weights(paradigm: str = "event", **about) -> Weights:
+def weights(modality: str = "event", **about) -> Weights:
     torch.manual_seed(0)
-    network = ResidualUNet(CHANNELS[paradigm], UNetConfig(width=4, depth=1, rank=0)).eval()
+    network = UNetConfig(width=4, depth=1, rank=0).build(modality, Sampling(**ABOUT | about)).eval()
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
-    return Weights(network, paradigm, ABOUT | about, [])
+    return Weights(network)
 
 
 @pytest.fixture(scope="module")
@@ -281,7 +281,7 @@ def test_what_can_not_be_followed_is_one_line(tmp_path: Path) -> None:
 
 def test_packets_carry_events_and_nothing_else_passes() -> None:
     for seed in range(20):
-        events = stream(seed * 11, seed, width=32_768, height=300)
+        events = stream(seed * 11, seed, width=32_768, height=100)
         found = unpack(pack(Packet(seed, events, seed % 2 == 1)))
         assert (found.sequence, found.events, found.is_last) == (seed, events, seed % 2 == 1)
     assert unpack(pack(Packet(2**32 + 3, events))).sequence == 3
@@ -351,7 +351,51 @@ def test_udp_counts_malformed_lost_and_late_packets_and_goes_on() -> None:
             sender.sendto(data, ("127.0.0.1", source.port))
     found = joined([part.events for part in source.chunks(NEVER)])
     assert found == joined([*parts[:3], *parts[5:]])
-    assert source.faults() == {"malformed packets": 3, "lost packets": 2, "late packets": 2}
+    assert source.faults() == {
+        "malformed packets": 3,
+        "lost packets": 2,
+        "late packets": 2,
+        "streams taken up anew": 0,
+    }
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        Packet(1, Events([(1 << 60) - 1], [0], [0], [True], 30, 20)),
+        Packet((1 << 31) - 1, Events([0], [0], [0], [True], 30, 20)),
+        Packet(1, Events([0], [0], [0], [True], 2048, 2048)),
+    ],
+    ids=["far time", "far number", "other sensor"],
+)
+@pytest.mark.parametrize("is_first", [False, True])
+def test_one_forged_packet_does_not_stop_a_stream(forged: Packet, is_first: bool) -> None:
+    events, source = stream(3000, 12), UdpSource(idle_s=5.0)
+    parts = [events[at : at + 10] for at in range(0, 3000, 10)]
+    packets = [pack(Packet(k + 2, part, k == 299)) for k, part in enumerate(parts)]
+    before = [] if is_first else [pack(Packet(0, Events.empty(30, 20)))]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for data in (*before, pack(forged), *packets):
+            sender.sendto(data, ("127.0.0.1", source.port))
+    chunks = list(source.chunks(NEVER))
+    found = [chunk for chunk in chunks if chunk.events.shape == (20, 30)]
+    taken = sum(len(chunk.events) for chunk in found)
+    if forged.events.shape == (2048, 2048) and not is_first:
+        assert taken == 3000 and source.faults()["streams taken up anew"] == 0
+        return
+    assert source.faults()["streams taken up anew"] == 1
+    assert 3000 - 10 * 99 <= taken <= 3000 - 10 * 99 + 1
+    assert [chunk.restart for chunk in chunks].count(True) == 1 + (not is_first)
+    assert joined([chunk.events for chunk in found][-1:])[-5:] == events[-5:]
+
+
+def test_a_packet_can_not_claim_a_sensor_beyond_memory() -> None:
+    header = struct.Struct("<4sBBHIHHq")
+    with pytest.raises(PacketError, match="sensor"):
+        unpack(header.pack(b"EVNL", 1, 0, 0, 0, 32_768, 32_768, 0))
+    assert unpack(header.pack(b"EVNL", 1, 0, 0, 0, 2048, 2048, 0)).events.shape == (2048, 2048)
+    with pytest.raises(DataError, match="sensor"):
+        pack(Packet(0, Events.empty(2049, 2048)))
 
 
 def test_a_sender_that_begins_anew_begins_a_new_stream(engine: Engine) -> None:
@@ -371,8 +415,13 @@ def test_a_sender_that_begins_anew_begins_a_new_stream(engine: Engine) -> None:
 
 
 def test_udp_gives_up_when_nothing_comes_and_a_stream_of_nothing_is_no_picture(engine: Engine) -> None:
+    source, turns = UdpSource(idle_s=0.06), iter(range(8))
+    assert list(source.chunks(lambda: next(turns, None) is None)) == []
+    assert next(turns, None) is None  # nobody sent yet: that is no stream which ended
     source = UdpSource(idle_s=0.06)
-    assert list(source.chunks(NEVER)) == []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto(pack(Packet(0, Events.empty(30, 20))), ("127.0.0.1", source.port))
+    assert len(list(source.chunks(NEVER))) == 1
     source = UdpSource(idle_s=5.0)
     with UdpSender("127.0.0.1", source.port) as sender:
         sender.send(Events.empty(30, 20))
@@ -417,19 +466,19 @@ def test_a_frame_outlives_its_dropped_chunk() -> None:
     assert queue.take(0)[0].frame is None
 
 
-@pytest.mark.parametrize("paradigm", CHANNELS)
-def test_at_a_frame_the_live_picture_is_the_one_of_reconstruct(paradigm: str, tiny_captures) -> None:
-    loaded, shot = weights(paradigm), read_capture(tiny_captures[0])
+@pytest.mark.parametrize("modality", STANDARD_MODALITIES)
+def test_at_a_frame_the_live_picture_is_the_one_of_reconstruct(modality: str, tiny_captures) -> None:
+    loaded, shot = weights(modality), read_capture(tiny_captures[0])
     live = Engine(loaded)
     samples = capture_samples(shot, live.sampling)
     expected = reconstruct(loaded, samples.frame, samples.surface)
-    found = {}
+    found, events, counted = {}, 0, {}
     for part in capture_replay(tiny_captures[0], speed=10, clock=Turned()).chunks(NEVER):
         picture = live.see([part])
+        events += 0 if picture is None else picture.events
         if part.frame is not None and picture is not None:
-            found[part.until_us] = picture
-    wanted = shot.events.t_us <= max(found)
-    assert sum(picture.events for picture in found.values()) == int(wanted.sum()) or paradigm != "frame"
+            found[part.until_us], counted[part.until_us] = picture, events
+    assert counted == {t_us: int((shot.events.t_us <= t_us).sum()) for t_us in found}
     for k, t_us in enumerate(shot.frame_times_us[1:]):
         np.testing.assert_allclose(found[int(t_us)].surface, samples.surface[k], atol=1e-6)
         np.testing.assert_allclose(found[int(t_us)].image, expected[k].numpy(), atol=1e-5)
@@ -451,7 +500,7 @@ def test_the_engine_tells_how_long_events_waited() -> None:
 
 def test_weights_that_do_not_fit_are_one_line(tmp_path: Path) -> None:
     source = Replay([stream(10)], name="walk.raw")
-    with pytest.raises(DataError, match=r"'fusion' see frames and walk\.raw has none; .* paradigm 'event'"):
+    with pytest.raises(DataError, match=r"'fusion' see frames and walk\.raw has none; .* modality 'event'"):
         Run(source, Engine(weights("fusion")))
     with pytest.raises(ConfigError, match="makes 'sae'"):
         Engine(weights(surface="context"))
@@ -564,7 +613,7 @@ def test_headless_writes_video_and_table(event_weights: Path, tmp_path: Path, ca
     ]
     main([*call, "--speed", "2", "--rate", "40", "--json"])
     table = recorded(out, capsys)
-    assert table["events"] == 3000 and table["paradigm"] == "event"
+    assert table["events"] == 3000 and table["modality"] == "event"
     assert 0 < table["recorded"] + table["not_recorded"] <= table["pictures"]
     assert table["latency_ms"]["network"]["p50"] > 0
     if video_kind() == "mp4":
@@ -605,7 +654,7 @@ def test_a_capture_is_replayed_with_its_frames(tiny_captures, tmp_path: Path, ca
     call = ["live", str(tiny_captures[0]), "--weights", str(tmp_path / "f.safetensors"), "--headless", "--json"]
     main([*call, "--out", str(out), "--speed", "20", "--rate", "30"])
     table = recorded(out, capsys)
-    assert table["paradigm"] == "fusion" and table["pictures"] > 0
+    assert table["modality"] == "fusion" and table["pictures"] > 0
     assert table["events"] <= len(read_capture(tiny_captures[0]).events)
 
 
@@ -619,7 +668,7 @@ def test_without_weights_published_ones_of_single_positions_are_taken(
         assert f"{name} makes the pictures" in capsys.readouterr().err
         table = json.loads((out / "latency.json").read_text())
         assert (
-            table["weights"] == name and table["paradigm"] == name.partition("-")[2] and table["pictures"] > 0
+            table["weights"] == name and table["modality"] == name.partition("-")[2] and table["pictures"] > 0
         )
     with pytest.raises(SystemExit) as stop:
         main(["live", str(tmp_path / "walk.raw"), "--weights", "near-event-pass", "--headless"])
@@ -730,6 +779,25 @@ def test_the_stream_brings_each_new_picture_and_the_end(page: Page, engine: Engi
         while not (message := next(heard))[1].get("ended"):
             pass
         assert message[0] == "state"
+
+
+def test_a_ninth_viewer_is_told_and_silent_ones_are_let_go(engine: Engine, monkeypatch, capfd) -> None:
+    monkeypatch.setattr("evnlos.live.page._SILENT_S", 0.5)
+    with Page(Tally(Replay([]), ChunkQueue(10)).now) as page, contextlib.ExitStack() as open_ones:
+        silent = open_ones.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
+        for _ in range(8):
+            open_ones.enter_context(get(page.url + "stream"))
+        with pytest.raises(urllib.error.HTTPError) as stop:
+            get(page.url + "stream")
+        assert stop.value.code == 503
+        stop.value.close()
+        assert silent.recv(1) == b""  # its time was up
+        silent.close()
+        leaver = socket.create_connection(("127.0.0.1", page.port))
+        leaver.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        leaver.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+        leaver.close()
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_run_with_a_page_shows_its_pictures(event_weights: Path, tmp_path: Path, capsys) -> None:

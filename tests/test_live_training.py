@@ -10,7 +10,7 @@ import torch
 from evnlos import EvnlosError, Training, UNetConfig, load_weights, train
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import NlosDataset, live_dataset, simulate_object
+from evnlos.dataset import NlosDataset, live_dataset
 from evnlos.dataset.live import epoch_settings
 from evnlos.dataset.on_device import simulate_objects_on
 from evnlos.dataset.pool import run_in_order
@@ -18,9 +18,10 @@ from evnlos.dataset.sampling import edges_from, make_samples
 from evnlos.dataset.simulate import drawn_for, scene_of
 from evnlos.errors import ConfigError
 from evnlos.seeds import derive_seed
-from evnlos.sensor import simulate_batch
+from evnlos.sensor import V2ePixel, simulate_batch
 from evnlos.training.source import Live
 from evnlos.training.team import Team
+from watching import stopped
 
 CPU = torch.device("cpu")
 ALONE = Team(0, 1, CPU)
@@ -77,13 +78,11 @@ def test_a_mix_is_shuffled_and_loses_nothing(few) -> None:
 
 
 def test_training_without_a_dataset_goes_on_after_a_stop_with_the_same_bytes(few, tmp_path) -> None:
-    log = list(train(live_dataset(few), SETTINGS, tmp_path / "whole"))
+    log = train(live_dataset(few), SETTINGS, tmp_path / "whole").records
     assert [record["epoch"] for record in log] == [1, 2]
     assert all(np.isfinite(record["loss"]) and "psnr_db" in record for record in log)
-    stopped = train(live_dataset(few), SETTINGS, tmp_path / "stopped")
-    next(stopped)
-    stopped.close()
-    list(train(live_dataset(few), SETTINGS, tmp_path / "stopped"))
+    stopped(train, live_dataset(few), SETTINGS, tmp_path / "stopped", after=1)
+    train(live_dataset(few), SETTINGS, tmp_path / "stopped")
     whole, again = ((tmp_path / name / "weights.safetensors").read_bytes() for name in ("whole", "stopped"))
     assert whole == again
     weights = load_weights(tmp_path / "whole")
@@ -94,7 +93,7 @@ def test_training_without_a_dataset_goes_on_after_a_stop_with_the_same_bytes(few
     )
     np.testing.assert_allclose(weights.mean_image.numpy(), expected, atol=1e-6)
     with pytest.raises(EvnlosError, match="other settings"):
-        next(train(live_dataset(replace(few, seed=5)), SETTINGS, tmp_path / "whole"))
+        train(live_dataset(replace(few, seed=5)), SETTINGS, tmp_path / "whole")
 
 
 def test_the_command_simulates_as_it_trains(few, tmp_path, capsys) -> None:
@@ -131,39 +130,24 @@ def test_nobody_to_train_on_is_refused(few) -> None:
         live_dataset(replace(few, glyphs=replace(few.glyphs, characters="A"), validation=0.9))
 
 
-def test_samples_made_on_a_device_are_those_of_the_camera(few) -> None:
-    """The path of a GPU, run on the CPU: events of other steps and v2e's time grid, so alike and not equal."""
-    pixel = replace(few.pixel, threshold_sigma=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0)
-    config = replace(few, pixel=pixel)
-    name = config.glyphs.objects()[0]
-    reference, _ = simulate_object(config, name)
-    samples = simulate_objects_on(config, [name], CPU, 0.002)[0]
-    np.testing.assert_allclose(samples.frame.numpy(), reference.frame, atol=1e-6)
-    np.testing.assert_array_equal(samples.truth.numpy(), reference.truth)
-    likeness = np.corrcoef(samples.surface.numpy().ravel(), reference.surface.ravel())[0, 1]
-    assert likeness > 0.98
-    again = simulate_objects_on(config, [name], CPU, 0.002)[0]
-    assert all(torch.equal(one, other) for one, other in zip(samples, again, strict=True))
-
-
 @pytest.mark.parametrize("surface", ["sae", "context", "hots"])
 def test_samples_made_on_a_device_are_those_of_the_same_events(few, surface) -> None:
-    """Given the same steps, and pixels of the same precision, each stage is that of the CPU."""
+    """Each stage is that of the CPU."""
     sampling = replace(few.sampling, surface=surface, radius=2)
-    config = replace(few, sampling=sampling, pixel=replace(few.pixel, threshold_sigma=0.02))
+    config = replace(few, sampling=sampling).with_setup(pixel=V2ePixel(threshold_sigma=0.02), time_step_s=0.002)
     name = config.glyphs.objects()[1]
     drawn = drawn_for(config, name)
     scene = scene_of(config, drawn, name)
     shape = config.sensor.height, config.sensor.width
-    wall, times_s = drawn.transport.wall(scene, shape), scene.position_times_s(config.positions)
+    wall, times_s = drawn.setup.resized(shape).observe(scene), scene.position_times_s(config.positions)
     steps = np.linspace(0.0, drawn.duration_s, round(drawn.duration_s / 0.002) + 1)
     light = 255.0 * wall.irradiance(steps)[None]
     seed = derive_seed(config.seed, name, "events")
-    (events,) = simulate_batch(light, steps, drawn.pixel, [seed], dtype=torch.float32)
+    (events,) = simulate_batch(light, steps, drawn.pixel, [seed])
     assert len(events) > 1000
     frames = drawn.frame_camera.capture(wall, times_s, derive_seed(config.seed, name, "frames"))
     expected = make_samples(frames, 255, events, edges_from(times_s), sampling)
-    samples = simulate_objects_on(config, [name], CPU, 0.002)[0]
+    samples = simulate_objects_on(config, [name], CPU)[0]
     np.testing.assert_allclose(samples.frame.numpy(), expected.frame, atol=1e-6)
     np.testing.assert_allclose(samples.surface.numpy(), expected.surface, atol=1e-5)
 

@@ -18,7 +18,8 @@ from evnlos.interop.mitsuba_oracle import (
     trace_rig,
     wall_image,
 )
-from evnlos.transport import GGX, Lambert, Occluder, RadiometricTransport, View, light_transport_matrix
+from evnlos.setups import RadiometricSetup
+from evnlos.transport import GGX, Lambert, Occluder, View, light_transport_matrix
 from evnlos.types import Plane
 
 SHAPE = (8, 12)
@@ -81,7 +82,7 @@ def test_a_notched_and_tilted_occluder():
     pytest.importorskip("mitsuba")
     flat = [(-0.15, -0.03), (-0.05, -0.03), (-0.05, 0.04), (-0.1, -0.01), (-0.15, 0.04)]
     notched = Occluder(tuple((x, y, 0.2 + 0.5 * y) for x, y in flat))
-    rig = RadiometricTransport(roughness=0.3)
+    rig = RadiometricSetup(roughness=0.3)
     place = {"offset_m": rig.offset_m(), "occluders": (notched,)}
     matrix = light_transport_matrix(rig.view(SHAPE), PATTERN, 0.3, rig.brdf(), points=SHADOW_POINTS, **place)
     expected = (matrix @ torch.as_tensor(pattern()).flatten()).reshape(SHAPE).numpy()

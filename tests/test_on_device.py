@@ -8,29 +8,31 @@ import torch
 
 from evnlos.dataset import Sampling, SensorSize, Simulation, live_dataset
 from evnlos.dataset.on_device import bytes_of_a_wall, simulate_objects_on
+from evnlos.dataset.simulate import simulate_object
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
 from evnlos.events.surface_tensors import time_surface_tensors
 from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion
-from evnlos.sensor import EventPixel, FrameCamera, simulate_batch
+from evnlos.sensor import EventCamera, EventPixel, FrameCamera, V2ePixel, simulate_batch
 from evnlos.sensor._photons import fill_electrons
 from evnlos.sensor._torch_photons import electrons
 from evnlos.sensor.event_tensors import EventTensors
 from evnlos.sensor.frame_tensors import capture_tensors
 from evnlos.sensor.record_tensors import record_tensors
+from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.training.source import Live
 from evnlos.training.team import Team
-from evnlos.transport import PaperTransport, RadiometricTransport, SlidingWall, View
+from evnlos.transport import SlidingWall, View
 from evnlos.transport.slide import slide
 from evnlos.types import Plane
 from pretend_device import PRETENDED, PretendedDevice
 from test_event_pixel_v2e import PIXELS, _video
 
 WALLS = {
-    "affine": PaperTransport(tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, rotation_deg=5.0),
-    "oblique": PaperTransport(tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, camera_angle_deg=10.0),
-    "metal": RadiometricTransport(cell_m=0.01),
-    "post": RadiometricTransport(cell_m=0.01, post_width_m=0.016, lamp_m=(0.1, 0.0, 0.1)),
+    "affine": PaperSetup(tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, rotation_deg=5.0),
+    "oblique": PaperSetup(tpsf_length_m=0.004, pitch_m=1e-3, gain=2.0, camera_angle_deg=10.0),
+    "metal": RadiometricSetup(cell_m=0.01),
+    "post": RadiometricSetup(cell_m=0.01, post_width_m=0.016, lamp_m=(0.1, 0.0, 0.1)),
 }
 
 
@@ -39,8 +41,7 @@ def small() -> Simulation:
     """One writer, four positions of a pass of two seconds, a small sensor."""
     return Simulation(
         glyphs=HandwritingGlyphs(characters="AT", writers=1),
-        transport=WALLS["affine"],
-        sensor=SensorSize(20, 32),
+        setup=replace(WALLS["affine"], sensor=SensorSize(20, 32), pixel=V2ePixel(), time_step_s=0.02),
         sampling=Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12),
         duration_s=2.0,
         positions=4,
@@ -147,7 +148,7 @@ def wall_of(config: Simulation, device: str = "cpu"):
 
     target = config.glyphs.target(config.glyphs.objects()[0], 5)
     scene = Scene(target, config.motion, config.duration_s)
-    return config.transport.wall(scene, (config.sensor.height, config.sensor.width), device)
+    return config.setup.observe(scene, device)
 
 
 @pytest.mark.parametrize("refractory_s", [0.0, 0.03])
@@ -155,7 +156,7 @@ def test_light_that_is_rendered_in_blocks_gives_the_events_of_whole_clips(small,
     wall, times_s = wall_of(small), np.linspace(0.0, 2.0, 401)
     pixel = EventPixel(threshold_on=0.05, threshold_off=0.05, refractory_s=refractory_s)
     (expected,) = simulate_batch(
-        255.0 * wall.irradiance(times_s)[None], times_s, pixel, [9], dtype=torch.float32
+        255.0 * wall.irradiance(times_s)[None], times_s, pixel, [9], dtype=torch.float64
     )
     assert len(expected) > 500
     assert record_tensors([wall], times_s, [pixel], [9])[0].to_events() == expected
@@ -189,12 +190,12 @@ def test_clips_with_pixels_of_their_own_give_the_events_of_each_alone(small) -> 
         EventPixel(0.08, 0.05, 0.0, cutoff_hz=200.0, leak_rate_hz=2.0, shot_noise_rate_hz=0.0),
         EventPixel(0.10, 0.11, 0.03, cutoff_hz=40.0, leak_rate_hz=0.0, shot_noise_rate_hz=5.0),
     ]
-    walls = [wall_of(replace(small, transport=replace(small.transport, gain=gain))) for gain in (1.0, 2.0, 3.0)]
+    walls = [wall_of(replace(small, setup=replace(small.setup, gain=gain))) for gain in (1.0, 2.0, 3.0)]
     times_s = np.linspace(0.0, 2.0, 101)
     together = record_tensors(walls, times_s, pixels, [7, 8, 9])
     for number, events in enumerate(together):
         light = 255.0 * walls[number].irradiance(times_s)[None]
-        (alone,) = simulate_batch(light, times_s, pixels[number], [7 + number], dtype=torch.float32)
+        (alone,) = simulate_batch(light, times_s, pixels[number], [7 + number])
         assert len(alone) > 200
         assert events.to_events() == alone
 
@@ -241,12 +242,14 @@ def test_the_pretended_device_refuses_what_a_gpu_refuses() -> None:
     ("kind", "surface"), [*((kind, "sae") for kind in WALLS), ("affine", "context"), ("affine", "hots")]
 )
 def test_an_object_is_simulated_where_it_is_asked_for(small, kind, surface) -> None:
-    config = replace(small, transport=WALLS[kind], sampling=replace(small.sampling, surface=surface))
+    config = replace(
+        small, setup=WALLS[kind].with_cameras_of(small.setup), sampling=replace(small.sampling, surface=surface)
+    )
     name = config.glyphs.objects()[0]
-    expected = simulate_objects_on(config, [name], "cpu", 0.02)[0]
+    expected = simulate_objects_on(config, [name], "cpu")[0]
     assert expected.surface.max() > 0.1
     with PretendedDevice() as mode:
-        made = simulate_objects_on(config, [name], PRETENDED, 0.02)[0]
+        made = simulate_objects_on(config, [name], PRETENDED)[0]
         crossings = mode.crossings
         assert {part.device for part in made} == {PRETENDED}
         for part, truth in zip(made, expected, strict=True):
@@ -257,54 +260,83 @@ def test_an_object_is_simulated_where_it_is_asked_for(small, kind, surface) -> N
 
 @pytest.mark.parametrize("kind", WALLS)
 def test_more_steps_do_not_bring_more_from_main_memory(small, kind) -> None:
-    config = replace(small, transport=WALLS[kind])
+    config = replace(small, setup=WALLS[kind].with_cameras_of(small.setup))
     uploads = []
     for step_s in (0.04, 0.02):
+        stepped = replace(config, setup=replace(config.setup, time_step_s=step_s))
         with PretendedDevice() as mode:
-            simulate_objects_on(config, config.glyphs.objects()[:1], PRETENDED, step_s)
+            simulate_objects_on(stepped, config.glyphs.objects()[:1], PRETENDED)
             uploads.append(mode.uploads)
     # of each of the 50 instants more: time stamp, place and four weights, and what its noise spends
     assert uploads[1] - uploads[0] <= 50 * 16
 
 
-@pytest.mark.parametrize("vary", [{}, {"pixel.cutoff_hz": (10.0, 80.0)}, {"pixel.refractory_s": (0.01, 0.03)}])
+@pytest.mark.parametrize(
+    "vary", [{}, {"setup.pixel.cutoff_hz": (10.0, 80.0)}, {"setup.pixel.refractory_s": (0.01, 0.03)}]
+)
 def test_an_object_does_not_depend_on_those_beside_it(small, vary) -> None:
-    config = replace(small, vary={"pixel.threshold_on": (0.05, 0.2), "transport.gain": (1.0, 3.0), **vary})
+    config = replace(small, vary={"setup.pixel.threshold_on": (0.05, 0.2), "setup.gain": (1.0, 3.0), **vary})
     names = list(reversed(config.glyphs.objects()))
-    together = simulate_objects_on(config, names, "cpu", 0.02)
+    together = simulate_objects_on(config, names, "cpu")
     assert len(together) == 2
     for name, made in zip(names, together, strict=True):
-        (alone,) = simulate_objects_on(config, [name], "cpu", 0.02)
+        (alone,) = simulate_objects_on(config, [name], "cpu")
         assert all(torch.equal(one, other) for one, other in zip(made, alone, strict=True))
 
 
 def test_what_a_gpu_lacks_is_refused_before_the_work(small) -> None:
-    config = replace(small, pixel=EventPixel(jitter_s=1e-4))
-    with pytest.raises(ConfigError, match="--simulate-on cpu"):
-        simulate_objects_on(config, config.glyphs.objects(), "cpu", 0.02)
-    assert simulate_objects_on(small, [], "cpu", 0.02) == []
+    config = small.with_setup(pixel=EventPixel())
+    with pytest.raises(ConfigError, match="no torch backend"):
+        simulate_objects_on(config, config.glyphs.objects(), "cpu")
+    assert simulate_objects_on(small, [], "cpu") == []
 
 
 def test_few_large_walls_are_held_at_a_time() -> None:
     full = SensorSize(600, 960)
-    assert bytes_of_a_wall(Simulation(sensor=full)) < 1 << 24
-    assert 1 << 32 < bytes_of_a_wall(Simulation(sensor=full, transport=RadiometricTransport())) < 1 << 34
+    assert bytes_of_a_wall(Simulation(setup=PaperSetup(sensor=full))) < 1 << 24
+    assert 1 << 32 < bytes_of_a_wall(Simulation(setup=RadiometricSetup(sensor=full))) < 1 << 34
 
 
-def test_the_way_of_the_samples_is_part_of_a_run(small) -> None:
-    """Steps of another length, or the CPU instead of a GPU, do not take up a run that was begun otherwise."""
+@pytest.mark.parametrize("pixel", [V2ePixel(leak_rate_hz=0.3, shot_noise_rate_hz=1.0), V2ePixel(cutoff_hz=0.0)])
+def test_the_same_settings_give_the_same_samples_with_and_without_the_torch_backend(small, pixel) -> None:
+    """What a GPU simulates is what the CPU's kernels simulate: one YAML file, one physics."""
+    config = replace(small, setup=replace(replace(small.setup, gain=2.0), pixel=pixel))
+    for name in config.glyphs.objects():
+        samples, events = simulate_object(config, name)
+        (made,) = simulate_objects_on(config, [name], "cpu")
+        assert len(events) > 1000
+        np.testing.assert_allclose(made.surface.numpy(), samples.surface, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(made.frame.numpy(), samples.frame, atol=1e-6)
+        np.testing.assert_array_equal(made.truth.numpy(), samples.truth)
+
+
+def test_events_of_a_wall_are_those_of_the_compiled_loops(small) -> None:
+    wall, pixel = wall_of(small), V2ePixel(0.05, 0.06, 0.01, 40.0, 0.3, 2.0)
+    expected = EventCamera(pixel, time_step_s=0.01).record(wall, 0.0, 2.0, seed=4)
+    instants = np.append(0.0, EventCamera(pixel, time_step_s=0.01).fixed_instants(0.0, 2.0))
+    (made,) = record_tensors([wall], instants, [pixel], [4])
+    assert len(expected) > 1000
+    assert made.to_events() == expected
+
+
+def test_beside_a_gpu_the_settings_alone_say_what_is_simulated(small) -> None:
     live = live_dataset(small)
-    assert live.way(torch.device("cpu")) == live_dataset(small, where="cpu").way(PRETENDED) == {}
-    assert live.way(PRETENDED) == {"step_s": 0.002} != replace(live, step_s=0.004).way(PRETENDED)
+    assert live._uses(PRETENDED)
+    assert live.note(PRETENDED) == ""
+    continuous = live_dataset(replace(small, setup=replace(small.setup, pixel=EventPixel(), time_step_s=None)))
+    assert not continuous._uses(PRETENDED)
+    assert "no torch backend" in continuous.note(PRETENDED)
+    assert continuous.note(torch.device("cpu")) == ""
+    assert live_dataset(small, where="cpu").note(PRETENDED) == ""
 
 
 def test_a_plate_may_move_along_any_path(small) -> None:
     path = PathMotion((0.0, 1.0, 2.0), ((0.0, 0.0), (0.02, 0.01), (0.03, -0.01)))
     name = small.glyphs.objects()[0]
     config = replace(small, motion=path)
-    expected = simulate_objects_on(config, [name], "cpu", 0.02)[0]
+    expected = simulate_objects_on(config, [name], "cpu")[0]
     with PretendedDevice():
-        made = simulate_objects_on(config, [name], PRETENDED, 0.02)[0]
+        made = simulate_objects_on(config, [name], PRETENDED)[0]
         torch.testing.assert_close(made.surface.cpu(), expected.surface, rtol=1e-6, atol=1e-6)
 
 
@@ -317,9 +349,9 @@ def test_every_pixel_runs_on_a_device(name) -> None:
         assert simulate_batch(clips.to(PRETENDED), times_s, PIXELS[name], [5]) == expected
 
 
-@pytest.mark.parametrize("paradigm", ["frame", "event", "fusion"])
-def test_a_training_is_fed_on_its_device(small, paradigm) -> None:
-    source = Live(replace(live_dataset(small), step_s=0.02), paradigm, 3, 0, Team(0, 1, PRETENDED))
+@pytest.mark.parametrize("modality", ["frame", "event", "fusion"])
+def test_a_training_is_fed_on_its_device(small, modality) -> None:
+    source = Live(live_dataset(small), modality, 3, 0, Team(0, 1, PRETENDED))
     with PretendedDevice():
         first, again = (list(source.batches(1)) for _ in range(2))
         assert len(first) == source.steps == 3

@@ -10,17 +10,16 @@ from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
 from evnlos.errors import ConfigError
+from evnlos.setups import RadiometricSetup, setup_preset
 from evnlos.transport import (
     GGX,
     Lambert,
     LightTransport,
     Occluder,
     Patches,
-    RadiometricTransport,
     View,
     lamp_radiance,
     light_transport_matrix,
-    rig_preset,
 )
 from evnlos.transport.brdf import conductor_fresnel
 from evnlos.transport.occluder import visibility
@@ -313,8 +312,8 @@ def test_lamp():
 
 
 def test_torch_lit_rig_is_the_bare_one_times_the_light():
-    bare = RadiometricTransport(roughness=0.3, cell_m=0.02)
-    lit = RadiometricTransport(roughness=0.3, cell_m=0.02, lamp_m=(-0.5, 0.0, 0.05))
+    bare = RadiometricSetup(roughness=0.3, cell_m=0.02)
+    lit = RadiometricSetup(roughness=0.3, cell_m=0.02, lamp_m=(-0.5, 0.0, 0.05))
     ratio = lit.transport((4, 6)).matrix / bare.transport((4, 6)).matrix
     torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
     assert float(ratio.max() / ratio.min()) > 1.05
@@ -369,12 +368,12 @@ def test_real_photograph_is_explained_by_the_occluder(shared_data):
 
 
 def test_presets():
-    assert rig_preset("aperture").occluders()[0].vertices_m[0][2] == pytest.approx(0.15)
-    assert [rig_preset(name).roughness for name in ("easy", "main", "hard")] == [0.02, 0.05, 0.1]
-    assert isinstance(rig_preset("matte", 0.5).brdf(), Lambert)
-    assert rig_preset("main", 0.5).distance_m == 0.5
+    assert setup_preset("aperture").occluders()[0].vertices_m[0][2] == pytest.approx(0.15)
+    assert [setup_preset(name).roughness for name in ("easy", "main", "hard")] == [0.02, 0.05, 0.1]
+    assert isinstance(setup_preset("matte", 0.5).brdf(), Lambert)
+    assert setup_preset("main", 0.5).distance_m == 0.5
     with pytest.raises(ConfigError, match="easy, main"):
-        rig_preset("none")
+        setup_preset("none")
 
 
 @pytest.mark.parametrize(
@@ -405,7 +404,7 @@ def test_presets():
             ),
         ),
         ("give a View", lambda: light_transport_matrix(Plane(1, 1, 1.0), Plane(1, 1, 1.0), 1.0, GGX())),
-        ("does not see", lambda: RadiometricTransport(camera_angle_deg=80.0).view((10, 10))),
+        ("does not see", lambda: RadiometricSetup(camera_angle_deg=80.0).view((10, 10))),
     ],
 )
 def test_bad_input(match, make):

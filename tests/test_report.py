@@ -12,7 +12,6 @@ import torch
 
 from chromium import Chromium, missing
 from evnlos.cli.main import main
-from evnlos.cli.reconstruct import calibrated_folder
 from evnlos.cli.verbs import module_of
 from evnlos.config import save_yaml
 from evnlos.dataset import Sampling, Simulation
@@ -22,17 +21,17 @@ from evnlos.dataset.store import Dataset, create_dataset
 from evnlos.evaluation import Evaluation
 from evnlos.evaluation.identify import identify
 from evnlos.evaluation.identify_rig import Bench
-from evnlos.evaluation.identify_source import described_rig
 from evnlos.evaluation.score import score
 from evnlos.evaluation.worth import PassWorth
-from evnlos.plot.rig import PARTITION, rig_drawing
+from evnlos.plot.rig import PARTITION, setup_drawing
 from evnlos.report import RunResult, write_report
 from evnlos.report.commands import Commands
+from evnlos.report.curves import curves_svg
 from evnlos.report.films import _worst
 from evnlos.report.gather import named
 from evnlos.report.lead import gains_of
 from evnlos.report.setup import _points, setup_section
-from evnlos.transport import PaperTransport, RadiometricTransport, rig_preset
+from evnlos.setups import PaperSetup, RadiometricSetup, calibrated_folder, named_setup, setup_preset
 
 POSITIONS = 12
 
@@ -72,8 +71,8 @@ def made(tmp_path_factory):
 
 def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None:
     data, runs = made
-    rig = described_rig("main-near")
-    limits = identify(rig.transport, rig.camera, Bench(cells=8, height=12, width=20, writers=1), "main-near")
+    rig = named_setup("main-near")
+    limits = identify(rig.setup, Bench(cells=8, height=12, width=20, writers=1), "main-near")
     path = write_report(tmp_path / "report.html", data, runs, [], rig=rig, limits=limits)
     page = path.read_text()
     assert path.stat().st_size < 5e6
@@ -101,7 +100,7 @@ def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None
     assert "evnlos import near_G near_K --out near --test near_G near_K" in shown
     assert "evnlos train --data sim --config epnp-1.yaml --out epnp-1" in shown
     assert "evnlos finetune --data near --weights epnp-1 --config epnp.yaml --out epnp" in shown
-    assert "evnlos report epnp e2e --data near --split test --rig main-near --out report.html" in shown
+    assert "evnlos report epnp e2e --data near --split test --setup main-near --out report.html" in shown
     assert "torch " in shown and "/tmp/" not in page.replace(str(tmp_path), "")
 
 
@@ -124,7 +123,7 @@ def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypat
     here = {"name": "near", "origin": "captures", "train": ["near_A"]}  # other captures under the same name
     other = replace(run, name="of two words", history=[{"data": here}])
     for dataset in (data, coarse, replace(data, origin="simulation")):
-        commands = Commands(dataset, [run, file, come, live, other], "test", described_rig("hard-far"))
+        commands = Commands(dataset, [run, file, come, live, other], "test", named_setup("hard-far"))
         lines = commands.again() + commands.published()
         parsed = [_parsed(line, monkeypatch) for line in lines if not line.startswith("#")]
         assert [type(one).__module__.rsplit(".", 1)[1] for one in parsed].count("report") == 1
@@ -141,28 +140,28 @@ def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypat
 def test_report_and_reconstruct_take_a_calibrated_folder_and_say_what_else(tmp_path, capsys) -> None:
     folder = tmp_path / "near_rig"
     folder.mkdir()
-    transport = RadiometricTransport(roughness=0.07)
-    save_yaml(Simulation(transport=transport), folder / "rig.yaml")
+    transport = RadiometricSetup(roughness=0.07)
+    save_yaml(Simulation(setup=transport), folder / "rig.yaml")
     for given in (folder, folder / "rig.yaml"):
-        assert described_rig(given).transport == transport
-        assert described_rig(given).word == described_rig(given).name == "near_rig"
+        assert named_setup(given).setup == transport
+        assert named_setup(given).word == named_setup(given).name == "near_rig"
         assert calibrated_folder(given) == folder
     save_yaml(Simulation(), tmp_path / "mine.yaml")
     save_yaml(Simulation(), folder / "dataset.yaml")
-    assert described_rig(tmp_path / "mine.yaml").word == "mine.yaml"
-    assert described_rig(folder / "dataset.yaml").word == "near_rig/dataset.yaml"
-    assert described_rig("main-near").word == "main-near"
+    assert named_setup(tmp_path / "mine.yaml").word == "mine.yaml"
+    assert named_setup(folder / "dataset.yaml").word == "near_rig/dataset.yaml"
+    assert named_setup("main-near").word == "main-near"
     with pytest.raises(SystemExit):
-        main(["reconstruct", str(tmp_path), "--rig", "main-near", "--out", str(tmp_path / "out")])
+        main(["reconstruct", str(tmp_path), "--setup", "main-near", "--out", str(tmp_path / "out")])
     said = capsys.readouterr().err
-    assert "holds no rig.yaml" in said and "`calibrate` wrote" in said and "`report` and `identify`" in said
+    assert "holds no rig.yaml" in said and "`calibrate` wrote" in said and "main-near" in said
     assert not (tmp_path / "out").exists()
 
 
 def test_the_page_explains_its_words_and_fits_a_phone_and_paper(made, tmp_path) -> None:
     path = write_report(tmp_path / "report.html", *made, [])
     page = path.read_text()
-    for word in ("EPNP", "E2E", "fusion", "joint (whole pass)", "PSNR", "PSNR in the box", "SSIM", "MS-SSIM"):
+    for word in ("EPNP", "E2E", "fusion", "sequence", "PSNR", "PSNR in the box", "SSIM", "MS-SSIM"):
         assert f">{word}</dt>" in page.split("<h2>Words</h2>")[1]
     links = re.findall(r"href='#([^']+)'", page)
     assert "word-gmsd" in links and len(links) == len(set(links))  # at its first use, and only there
@@ -199,8 +198,8 @@ def test_the_plot_of_what_a_rig_shows_ends_where_the_values_do() -> None:
 @pytest.mark.parametrize("name", ["main-near", "hard-far", "aperture-near"])
 @pytest.mark.parametrize("angle", [30.0, -30.0])
 def test_the_drawing_sketches_what_hides_the_object_and_nothing_else(name, angle) -> None:
-    rig = replace(rig_preset(name), camera_angle_deg=angle)
-    drawn = rig_drawing(rig, travel_m=0.16, plate_m=0.08).svg
+    rig = replace(setup_preset(name), camera_angle_deg=angle)
+    drawn = setup_drawing(rig, travel_m=0.16, plate_m=0.08).svg
     assert drawn.count(PARTITION) == 1 and (">occluder</text>" in drawn) == (name == "aperture-near")
     lines = [
         [tuple(float(v) for v in one.split(",")) for one in points.split()]
@@ -217,8 +216,8 @@ def test_the_drawing_sketches_what_hides_the_object_and_nothing_else(name, angle
 
 
 def test_without_a_camera_nothing_is_sketched() -> None:
-    assert PARTITION not in rig_drawing(PaperTransport()).svg
-    assert "is not drawn" in setup_section("paper", PaperTransport())
+    assert PARTITION not in setup_drawing(PaperSetup()).svg
+    assert "is not drawn" in setup_section("paper", PaperSetup())
 
 
 def _cross(one, other) -> bool:
@@ -268,15 +267,15 @@ def test_the_page_says_how_far_to_believe_each_run(made, tmp_path) -> None:
     data, runs = made
     assert "How far to believe" not in write_report(tmp_path / "plain.html", data, runs, []).read_text()
     said = [PassWorth("near_G", 0.62, 0.7, 0.62, True, 0.81, 0.93, 0.2), _unmeasured("near_K")]
-    joint = replace(runs[0], is_joint=True, evaluation=replace(runs[0].evaluation, worth=said))
-    page = write_report(tmp_path / "report.html", data, [*runs, joint], []).read_text()
+    on_sequences = replace(runs[0], sees_sequence=True, evaluation=replace(runs[0].evaluation, worth=said))
+    page = write_report(tmp_path / "report.html", data, [*runs, on_sequences], []).read_text()
     shown = page.split("How far to believe them")[1].split("</table>")[0]
-    assert "EPNP joint frame" in shown and "E2E frame" not in shown
+    assert "EPNP sequence frame" in shown and "E2E frame" not in shown
     assert "<td>G</td><td>62%</td><td>81%</td>" in shown
     assert "<td>K</td><td>nothing measured</td><td>-30%</td>" in shown
     assert "96%" in shown and "0.60" in shown  # means of coverage and length
-    # A joint run is compared with joint runs alone.
-    assert ">EPNP joint frame</text>" in page and list(gains_of([*runs, joint])) == ["frame"]
+    # A run on sequences is compared with runs on sequences alone.
+    assert ">EPNP sequence frame</text>" in page and list(gains_of([*runs, on_sequences])) == ["frame"]
 
 
 def _unmeasured(name: str) -> PassWorth:
@@ -299,11 +298,17 @@ def test_without_a_rig_the_page_says_how_to_name_it(made, tmp_path) -> None:
 def test_the_drawing_of_a_rig_is_to_scale() -> None:
     from xml.dom.minidom import parseString
 
-    for rig in (RadiometricTransport(distance_m=0.3), PaperTransport(distance_m=0.5)):
-        drawing = parseString(rig_drawing(rig, travel_m=0.16, plate_m=0.08).svg)
+    for rig in (RadiometricSetup(distance_m=0.3), PaperSetup(distance_m=0.5)):
+        drawing = parseString(setup_drawing(rig, travel_m=0.16, plate_m=0.08).svg)
         lines = [one.getAttribute("points") for one in drawing.getElementsByTagName("polyline")]
         way, plate = (np.array([[float(v) for v in p.split(",")] for p in line.split()]) for line in lines[:2])
         wall = np.array([[float(v) for v in p.split(",")] for p in lines[-1].split()])
         length = float(np.ptp(plate[:, 0]))
         assert np.ptp(way[:, 0]) == pytest.approx(3 * length, abs=0.3)  # 24 cm beside 8 cm
         assert plate[0, 1] - wall[0, 1] == pytest.approx(length * rig.distance_m / 0.08, rel=0.01)
+
+
+@pytest.mark.parametrize("value", [0.0, 18.5, -3e9])
+def test_a_run_of_one_epoch_has_a_curve(value: float) -> None:
+    drawing = curves_svg({"run": [(1.0, value)]}, "epoch", "dB")
+    assert "nan" not in drawing and drawing.count("<polyline") == 1

@@ -1,5 +1,6 @@
 """Where a required package is missing or broken: which one and the cure, in one line, from every command."""
 
+import ast
 import json
 import subprocess
 import sys
@@ -33,6 +34,31 @@ def test_the_list_is_that_of_the_project() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert sorted(REQUIRED.values()) == sorted(project["dependencies"])
     assert faults() == []
+
+
+def test_what_the_package_imports_is_declared() -> None:
+    """Also where an import stands inside a function: a package for development is none for users."""
+    of_extras = {
+        "aedat",
+        "av",
+        "matplotlib",
+        "mitsuba",
+        "deepinv",
+        "gradio",
+        "starlette",
+        "dask",
+        "distributed",
+    }
+    of_required = {"llvmlite": "numba", "pydantic_core": "pydantic"}  # they bring them
+    undeclared = {}
+    for path in sorted(Path(evnlos.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for name in (of_required.get(name.split(".")[0], name.split(".")[0]) for name in names):
+                if name not in sys.stdlib_module_names | REQUIRED.keys() | of_extras | {"evnlos"}:
+                    undeclared.setdefault(name, []).append(str(path))
+    assert undeclared == {}
 
 
 @pytest.mark.parametrize("module", REQUIRED)

@@ -15,10 +15,10 @@ import torch
 from safetensors.torch import save
 
 import evnlos
-from evnlos import EvnlosError, ResidualUNet, UNetConfig, load_weights, open_dataset
+from evnlos import EvnlosError, UNetConfig, load_weights, open_dataset
 from evnlos.config import to_dict
-from evnlos.dataset import read_capture, read_shard
-from evnlos.model import Weights, save_weights
+from evnlos.dataset import Sampling, read_capture, read_shard
+from evnlos.model import Reconstructor, Weights, save_weights
 from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
 
 COUNTS = {"weights": 60, "checkpoint": 100, "shard": 120, "dataset": 50, "capture": 40}
@@ -36,9 +36,9 @@ def bounded_memory() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def network() -> ResidualUNet:
+def network() -> Reconstructor:
     torch.manual_seed(0)
-    return ResidualUNet(1, UNetConfig(width=8, depth=1, shuffle=1, rank=0))
+    return UNetConfig(width=8, depth=1, shuffle=1, rank=0).build("frame", Sampling())
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def loader(request, network, tiny_dataset, tiny_captures, tmp_path) -> tuple[lis
     kind = request.param
     if kind == "weights":
         path = tmp_path / "weights.safetensors"
-        save_weights(path, Weights(network, "frame", {}, [], torch.zeros(4, 4)))
+        save_weights(path, Weights(network, [], torch.zeros(4, 4)))
         return [path], lambda: load_weights(path)
     if kind == "checkpoint":
         path, optimiser = tmp_path / "checkpoint.safetensors", torch.optim.Adam(network.parameters())
@@ -232,7 +232,7 @@ def test_a_page_that_unfolds_is_refused(text: str, tmp_path, bounded_memory) -> 
         {"network": {"width": 64, "depth": 16, "blocks": 64, "shuffle": 1}},
         {"network": [1]},
         {"network": None},
-        {"paradigm": ["frame"]},
+        {"modality": ["frame"]},
         {"history": 5},
         {"history": [1]},
         {"sampling": "none"},
@@ -242,7 +242,8 @@ def test_a_page_that_unfolds_is_refused(text: str, tmp_path, bounded_memory) -> 
 )
 def test_weights_that_claim_too_much_are_refused(change, network, tmp_path, bounded_memory) -> None:
     path = tmp_path / "w.safetensors"
-    about = {"format": "evnlos-weights-3", "paradigm": "frame", "network": to_dict(network.config)}
+    about = {"format": "evnlos-weights-4", "modality": "frame", "network": to_dict(network.settings)}
+    about |= {"sampling": to_dict(Sampling())}
     tensors = dict(network.state_dict()) | {"wide": torch.zeros(200_000)}
     if "network" not in change:
         del tensors["wide"]
@@ -252,7 +253,7 @@ def test_weights_that_claim_too_much_are_refused(change, network, tmp_path, boun
     assert "\n" not in str(caught.value)
     if "network" not in change:
         path.write_bytes(save(tensors, metadata={"evnlos": json.dumps(about)}))
-        assert load_weights(path).paradigm == "frame"
+        assert load_weights(path).modality.name == "frame"
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[1]", "1", "{}"], ids=["deep", "list", "number", "empty"])
@@ -281,7 +282,7 @@ def test_a_checkpoint_of_other_tensors_is_refused(network, tmp_path) -> None:
         {"optimiser.0.exp_avg": torch.zeros(3)},
         {"optimiser.9999.exp_avg": torch.zeros(3)},
         {"optimiser.x": torch.zeros(3)},
-        {"network.stem.weight": torch.zeros(1)},
+        {"network.unet.stem.weight": torch.zeros(1)},
     ):
         path.write_bytes(save(state | strange, metadata=about))
         with pytest.raises(EvnlosError, match="delete it to start afresh"):

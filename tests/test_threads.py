@@ -15,7 +15,7 @@ from evnlos.threads import cores
 
 
 @pytest.mark.parametrize(("chosen", "expected"), [(None, "PASSIVE"), ("active", "active")])
-def test_the_policy_is_set_before_pytorch_reads_it(chosen: str | None, expected: str) -> None:
+def test_a_command_sets_the_policy_before_pytorch_reads_it(chosen: str | None, expected: str) -> None:
     environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
     environment |= {"OMP_WAIT_POLICY": chosen} if chosen else {}
     script = (
@@ -24,14 +24,53 @@ def test_the_policy_is_set_before_pytorch_reads_it(chosen: str | None, expected:
         "    def find_spec(self, name, path, target=None):\n"
         "        if name in ('torch', 'numba'): print(name, os.environ.get('OMP_WAIT_POLICY'))\n"
         "sys.meta_path.insert(0, Watch())\n"
-        "from evnlos import train\n"
+        "sys.argv = ['evnlos', 'doctor']\n"
+        "from evnlos.cli import main\n"
+        "main()\n"
     )
     found = subprocess.run(
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True, timeout=120
     )
-    lines = found.stdout.split("\n")[:-1]
+    lines = [line for line in found.stdout.splitlines() if line.startswith(("torch ", "numba "))]
     assert any(line.startswith("torch ") for line in lines)
     assert all(line.endswith(f" {expected}") for line in lines)
+
+
+def test_importing_the_package_changes_nothing_in_the_process() -> None:
+    """Neither variables nor threads, warnings, signals, hooks or the state of anybody's random numbers."""
+    script = """
+import importlib, logging, os, pkgutil, random, signal, sys, warnings
+import h5py, numba, numpy, scipy, tyro, PIL.Image, threadpoolctl, torch
+
+def state():
+    return {
+        "environment": dict(os.environ),
+        "folder": os.getcwd(),
+        "warnings": list(warnings.filters),
+        "signals": [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)],
+        "hooks": (sys.excepthook, sys.displayhook, sys.getrecursionlimit()),
+        "logging": (list(logging.root.handlers), logging.root.level),
+        "torch": (torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled()),
+        "random": (random.getstate(), str(numpy.random.get_state()), torch.random.get_rng_state().tolist()),
+        "numpy": numpy.geterr(),
+    }
+
+before = state()
+import evnlos
+for module in pkgutil.walk_packages(evnlos.__path__, "evnlos."):
+    if module.name.rpartition(".")[2] not in ("__main__", "_aedat4_child"):
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:
+            assert error.name in ("mitsuba", "deepinv", "gradio", "starlette"), error
+after = state()
+print([key for key in before if before[key] != after[key]])
+"""
+    environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"}
+    found = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert found.stdout.strip() == "[]", found.stdout + found.stderr
 
 
 def _threads(module: str) -> list[int]:

@@ -10,20 +10,21 @@ import torch
 import yaml
 
 from evnlos.cli import main
-from evnlos.cli.invert_pass import radiometric_rig
-from evnlos.config import read_yaml, save_yaml, to_dict
+from evnlos.cli.invert_pass import linear_setup
+from evnlos.config import read_yaml, save_yaml
 from evnlos.dataset import FixedPattern, Sampling, read_capture
 from evnlos.dataset.fixed_pattern import save_pattern
 from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
-from evnlos.model import JointNetwork, UNetConfig, Weights, save_weights
+from evnlos.model import SequenceConfig, Weights, save_weights
 from evnlos.plot.track import draw_track
 from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
 from evnlos.sensor import EventCamera, EventPixel, FrameCamera
+from evnlos.setups import RadiometricSetup
 from evnlos.solver import PlatePass
 from evnlos.solver.operators import Gradient, normal_matrix
-from evnlos.solver.plate_pass import strip_of, strip_transport
+from evnlos.solver.plate_pass import matrix_of, strip_of
 from evnlos.tracking import (
     Measurements,
     Track,
@@ -43,11 +44,11 @@ from evnlos.tracking import (
 from evnlos.tracking.depth import Depths
 from evnlos.tracking.registration import explained_change
 from evnlos.tracking.rig_shift import Fit
-from evnlos.transport import RadiometricTransport, SlidingWall, View
+from evnlos.transport import SlidingWall, View
 from evnlos.types import Events, Plane
 
 SHAPE = (24, 36)
-RIG = RadiometricTransport(
+RIG = RadiometricSetup(
     roughness=0.04, camera_angle_deg=20.0, field_of_view_deg=40.0, cell_m=0.008, gain=0.8, ambient=0.05
 )
 
@@ -242,7 +243,7 @@ def test_the_plane_map_leads_back_to_the_cell() -> None:
 
 def test_a_matte_wall_shows_no_place() -> None:
     with pytest.raises(DataError, match="without the rig"):
-        plane_map(RadiometricTransport(wall_material="lambert"), SHAPE)
+        plane_map(RadiometricSetup(wall_material="lambert"), SHAPE)
 
 
 def letter() -> Target:
@@ -302,7 +303,7 @@ def test_the_step_is_that_of_plate_and_places_together(depth) -> None:
     rng = np.random.default_rng(7)
     plate = Plane(6, 6, 0.016)
     state = rng.uniform(-0.03, 0.03, (4, 3 if depth else 2))
-    transport = strip_transport(RIG, SHAPE, SHAPE, strip_of(state[:, :2] + 0.0, plate))
+    transport = matrix_of(RIG.resized(SHAPE).operator(strip_of(state[:, :2] + 0.0, plate), SHAPE))
     fit = Fit(plate, transport, Depths(RIG, transport) if depth else None, state, RIG.distance_m)
     light = torch.from_numpy(rng.standard_normal((4, *SHAPE)))
     prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(plate.shape, dtype=torch.float64))
@@ -373,25 +374,29 @@ def test_settings_that_cannot_be_are_refused() -> None:
 def capture(tmp_path_factory):
     lab = Lab(
         glyphs=FontGlyphs(family="kalam", characters="L"),
-        sensor=SensorSize(24, 40),
-        transport=RIG,
+        setup=replace(
+            RIG,
+            sensor=SensorSize(24, 40),
+            frame_camera=FrameCamera(exposure_s=0.016, full_well_e=8000.0, read_noise_e=20.0),
+            pixel=EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0),
+        ),
         motion=LineMotion((-0.04, 0.0), 0.02),
         duration_s=4.0,
         frame_rate_hz=2.0,
-        frame_camera=FrameCamera(exposure_s=0.016, full_well_e=8000.0, read_noise_e=20.0),
-        pixel=EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0),
         spread={},
     )
     folder = tmp_path_factory.mktemp("rig")
     (made,) = render_captures(lab, folder / "captures")
-    save_yaml(Simulation(transport=RIG), folder / "rig.yaml")
+    save_yaml(Simulation(setup=RIG), folder / "rig.yaml")
     return made, folder / "rig.yaml"
 
 
 def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
     folder, rig = capture
     pytest.importorskip("matplotlib")
-    main(["track", str(folder), "--rig", str(rig), "--cells", "10", "--out", str(tmp_path / "t.png"), "--json"])
+    main(
+        ["track", str(folder), "--setup", str(rig), "--cells", "10", "--out", str(tmp_path / "t.png"), "--json"]
+    )
     found = json.loads(capsys.readouterr().out)
     assert found["unit"] == "m"
     assert found["travel"] == pytest.approx(0.08, rel=0.05)
@@ -401,7 +406,17 @@ def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
     track = json.loads((tmp_path / "t.json").read_text())["track"]
     assert len(track["frame_time_s"]) == 9 and "distance" not in track
     main(
-        ["track", str(folder), "--rig", str(rig), "--cells", "10", "--depth", "--out", str(tmp_path / "d.png")]
+        [
+            "track",
+            str(folder),
+            "--setup",
+            str(rig),
+            "--cells",
+            "10",
+            "--depth",
+            "--out",
+            str(tmp_path / "d.png"),
+        ]
     )
     assert "distance " in capsys.readouterr().out
     away = json.loads((tmp_path / "d.json").read_text())["track"]["distance"]
@@ -425,9 +440,9 @@ def test_a_rig_of_another_distance_or_wall_is_doubted(capture, tmp_path, capsys)
 
 def test_the_command_takes_a_calibrated_folder_and_says_what_no_capture_is(capture, tmp_path, capsys) -> None:
     folder, rig = capture
-    assert radiometric_rig(rig.parent) == radiometric_rig(rig) == RIG
+    assert linear_setup(rig.parent).optics() == linear_setup(rig).optics() == RIG.optics()
     for words, said in (
-        ([str(folder), "--rig", str(folder)], "holds no rig.yaml; give a rig file, or the folder"),
+        ([str(folder), "--setup", str(folder)], "holds no rig.yaml; give the folder"),
         (
             [str(folder.parent)],
             f"give the folder of one capture (it holds 1 captures, such as {folder.name})",
@@ -459,11 +474,11 @@ def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, caps
     """Motion found gives a picture near that of motion stated, and the confidence that goes with it."""
     folder, rig = capture
     # The network is untrained, and its light anything: let the rig move its pictures all the same.
-    monkeypatch.setattr("evnlos.report.reconstruction._SAME_LIGHT", (0.0, np.inf))
+    monkeypatch.setattr("evnlos.evaluation.model._SAME_LIGHT", (0.0, np.inf))
     sampling = Sampling(height=24, width=36, scored_rows=18)
     torch.manual_seed(0)
-    network = JointNetwork(1, UNetConfig(width=4, depth=1, rank=4), (24, 36), sampling.canvas.pitch_m).eval()
-    save_weights(tmp_path / "w.safetensors", Weights(network, "frame", to_dict(sampling), []))
+    network = SequenceConfig(width=4, depth=1, rank=4).build("frame", sampling).eval()
+    save_weights(tmp_path / "w.safetensors", Weights(network))
     without = tmp_path / folder.name
     shutil.copytree(folder, without)
     info = read_yaml(folder / "capture.yaml")
@@ -472,11 +487,11 @@ def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, caps
     blank = np.zeros((24, 40), np.float32)
     save_pattern(FixedPattern(blank + 1, blank), tmp_path / "pattern.safetensors")
     shutil.copy(rig, tmp_path / "rig.yaml")
-    common = ["--weights", str(tmp_path / "w.safetensors"), "--rig", str(tmp_path)]
+    common = ["--weights", str(tmp_path / "w.safetensors"), "--setup", str(tmp_path)]
     with pytest.raises(SystemExit):
         main(["reconstruct", str(without), "--track", "--out", str(tmp_path / "none")])
     said = capsys.readouterr().err
-    assert "--track without --rig; give the calibrated rig" in said and said.count("\n") == 1
+    assert "--track without --setup; give the calibrated setup" in said and said.count("\n") == 1
     assert not (tmp_path / "none").exists()
     main(["reconstruct", str(without), *common, "--track", "--out", str(tmp_path / "found")])
     assert "no confidence: these weights never learned it" in capsys.readouterr().out
@@ -488,12 +503,24 @@ def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, caps
 def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:
     folder, rig = capture
     pytest.importorskip("matplotlib")
-    options = ["--rig", str(rig), "--positions", "1", "8", "--cells", "10", "--solver", "tikhonov", "--json"]
+    options = ["--setup", str(rig), "--positions", "1", "8", "--cells", "10", "--solver", "tikhonov", "--json"]
     out = ["--out", str(tmp_path / "j.png")]
     main(["invert", str(folder), *options, "--out", str(tmp_path / "i.png")])
     rows = json.loads(capsys.readouterr().out)["rows"]
     main(
-        ["invert", str(folder), "--rig", str(rig), "--cells", "8", "--lam", "gcv", "--solver", "tikhonov", *out]
+        [
+            "invert",
+            str(folder),
+            "--setup",
+            str(rig),
+            "--cells",
+            "8",
+            "--lam",
+            "gcv",
+            "--solver",
+            "tikhonov",
+            *out,
+        ]
     )
     assert capsys.readouterr().out.splitlines()[2].split()[0] == "8"
     db = {(row["solver"], row["positions"]): row["psnr_db"] for row in rows}
@@ -505,4 +532,4 @@ def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:
 def test_a_folder_without_a_rig_is_no_photograph(capture, capsys) -> None:
     with pytest.raises(SystemExit):
         main(["invert", str(capture[0])])
-    assert "give one NPZ file, or capture folders and their --rig" in capsys.readouterr().err
+    assert "give one NPZ file, or capture folders and --setup" in capsys.readouterr().err

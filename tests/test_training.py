@@ -8,10 +8,12 @@ import torch
 
 from evnlos import EvnlosError, ResidualUNet, Training, UNetConfig, evaluate, load_weights, train
 from evnlos.dataset import NlosDataset
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
 from evnlos.model import save_weights
+from evnlos.model.sequence import SequenceConfig
 from evnlos.training import LOSSES, balanced_loss, paper_loss, step_size
 from evnlos.training.held_out import validate
+from evnlos.training.source import half_mirrored, with_mirrored
 
 SMALL = UNetConfig(width=8, depth=2, shuffle=1, rank=0)
 QUICK = Training(
@@ -20,7 +22,7 @@ QUICK = Training(
 
 
 def run(dataset, settings, out, weights=None) -> list[dict]:
-    return list(train(dataset, settings, out, weights))
+    return train(dataset, settings, out, weights).records
 
 
 @pytest.fixture(scope="module")
@@ -106,13 +108,13 @@ def test_a_run_that_has_ended_is_not_trained_again(trained, tiny_dataset) -> Non
 
 def test_fine_tuning_starts_from_the_weights_and_keeps_frozen_parts(trained, tiny_dataset, tmp_path) -> None:
     out, _ = trained
-    settings = replace(QUICK, freeze=("encoder", "latent"), learning_rate=1e-3, paradigm="event")
+    settings = replace(QUICK, freeze=("encoder", "latent"), learning_rate=1e-3, modality="event")
     run(tiny_dataset, settings, tmp_path / "fine", out)
     old, new = load_weights(out), load_weights(tmp_path / "fine")
-    assert new.paradigm == "frame"  # that of the weights
+    assert new.modality.name == "frame"  # that of the weights
     assert [step["data"]["origin"] for step in new.history] == ["simulation", "simulation"]
     for name, value in old.network.state_dict().items():
-        frozen = name.split(".")[0] in ("standardise", "embedding", "stem", "encoder", "down", "latent")
+        frozen = not name.startswith(("unet.up.", "unet.decoder.", "unet.head."))
         assert torch.equal(value, new.network.state_dict()[name]) == frozen, name
 
 
@@ -123,10 +125,11 @@ def test_step_sizes() -> None:
     np.testing.assert_allclose([step_size(cosine, e) for e in (0, 5, 10)], [1, 0.5, 0], atol=1e-12)
 
 
-def test_a_collapsed_network_is_recognised(tiny_dataset, tmp_path) -> None:
+def test_a_collapsed_network_is_recognised(trained, tiny_dataset, tmp_path) -> None:
+    assert not trained[1][-1]["collapsed"]
     log = run(tiny_dataset, replace(QUICK, epochs=1, loss="paper", learning_rate=1e-9), tmp_path / "stuck")
-    assert log[-1]["collapsed"] is False or log[-1]["psnr_db"] < log[-1]["zero_db"] + 0.1
-    net = ResidualUNet(1, SMALL)
+    assert log[-1]["collapsed"] and log[-1]["psnr_db"] < log[-1]["zero_db"] + 0.1
+    net = SMALL.build("frame", tiny_dataset.sampling)
     for p in net.parameters():
         torch.nn.init.zeros_(p)
     held_out = NlosDataset(tiny_dataset, "validation", "frame")
@@ -162,3 +165,39 @@ def test_weights_round_trip(trained, tmp_path) -> None:
 def test_any_part_can_be_frozen(part: str, tiny_dataset, trained, tmp_path) -> None:
     log = run(tiny_dataset, replace(QUICK, epochs=1, freeze=(part,)), tmp_path / part, trained[0])
     assert np.isfinite(log[-1]["loss"])
+
+
+def test_half_of_a_mirrored_batch_is_upside_down_with_its_pictures() -> None:
+    draw = torch.Generator().manual_seed(0)
+    seen, truth = torch.rand(400, 2, 6, 5, generator=draw), torch.rand(400, 1, 6, 5, generator=draw)
+    inputs, pictures = half_mirrored(seen, truth, seed=3)
+    turned = (inputs == seen.flip(-2)).flatten(1).all(dim=1)
+    assert ((inputs == seen).flatten(1).all(dim=1) ^ turned).all()
+    assert torch.equal(turned, (pictures == truth.flip(-2)).flatten(1).all(dim=1))
+    assert 150 < int(turned.sum()) < 250
+    assert torch.equal(half_mirrored(seen, truth, seed=3)[0], inputs)
+    assert not torch.equal(half_mirrored(seen, truth, seed=4)[0], inputs)
+
+
+def test_mirrored_samples_come_in_pairs_and_no_more_than_asked_for() -> None:
+    def some(count: int):
+        draw = torch.Generator().manual_seed(count)
+        return torch.rand(count, 2, 4, 3, generator=draw), torch.rand(count, 4, 3), np.full(count, "a")
+
+    inputs, pictures, names = with_mirrored(some)(10)
+    assert len(inputs) == len(pictures) == len(names) == 10
+    assert torch.equal(inputs[:5].flip(-2), inputs[5:]) and torch.equal(pictures[:5].flip(-2), pictures[5:])
+
+
+def test_mirrored_training_is_another_one_that_repeats(tiny_dataset, tmp_path) -> None:
+    mirrored = replace(QUICK, mirror=True)
+    for name, settings in (("a", mirrored), ("b", mirrored), ("plain", QUICK)):
+        run(tiny_dataset, settings, tmp_path / name)
+    same, again, plain = ((tmp_path / n / "weights.safetensors").read_bytes() for n in ("a", "b", "plain"))
+    assert same == again != plain
+
+
+def test_sequences_are_not_mirrored(tiny_dataset, tmp_path) -> None:
+    with pytest.raises(ConfigError, match="whole sequences, which are not mirrored"):
+        run(tiny_dataset, replace(QUICK, mirror=True, network=SequenceConfig()), tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -12,10 +12,10 @@ from evnlos.calibration.captures import read_shots
 from evnlos.calibration.evidence import WRITERS, MovingLight
 from evnlos.calibration.unlabelled import CELLS, fit_unlabelled
 from evnlos.errors import ConfigError, DataError
+from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.solver.glyph_prior import handwritten_plates
-from evnlos.transport import PaperTransport, RadiometricTransport
 
-RIG = RadiometricTransport(roughness=0.06)
+RIG = RadiometricSetup(roughness=0.06)
 PLACES = np.stack([np.linspace(-0.06, 0.06, 7), np.zeros(7)], axis=1)
 SHAPE = (6, 10)
 
@@ -68,17 +68,17 @@ def test_the_right_wall_is_the_likeliest_and_shows_the_plates() -> None:
 def test_a_rig_is_found_without_its_targets(tiny_captures, tmp_path) -> None:
     fit, held = read_shots(tiny_captures, holdout=("4",), plate_m=0.08)
     assert all(capture.target is None for capture in (*fit.captures, *held.captures))
-    start = RadiometricTransport(roughness=0.12)  # the lab's is 0.05
+    start = RadiometricSetup(roughness=0.12)  # the lab's is 0.05
     known = ("distance_m", "target_offset_m", "camera_distance_m", "camera_angle_deg", "field_of_view_deg")
     found = fit_unlabelled(fit, held, start, fixed=known, iterations=4)
-    assert found.optics.transport.roughness == pytest.approx(0.05, rel=0.1)
+    assert found.optics.setup.roughness == pytest.approx(0.05, rel=0.1)
     assert found.check.after < found.check.before
     assert found.check.noise <= found.check.after
     assert all(capture.target is not None for capture in (*found.fitted.captures, *found.held_out.captures))
 
 
 def test_unknown_targets_need_a_radiometric_start_and_a_motion(tiny_captures, tmp_path) -> None:
-    start = replace(Calibration().start, transport=PaperTransport())
+    start = replace(Calibration().start, setup=PaperSetup())
     with pytest.raises(ConfigError, match="radiometric"):
         Calibration(targets="unknown", start=start)
     folder = tmp_path / "lab_A"

@@ -8,12 +8,11 @@ import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import LineMotion, PathMotion, Scene, Target
+from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.transport import (
     DiffuseReflection,
     MatrixTransport,
     MatrixWall,
-    PaperTransport,
-    RadiometricTransport,
     SlidingWall,
     View,
     Wall,
@@ -178,11 +177,11 @@ def test_speed_bounds_the_image_motion():
 
 def test_paper_wall_equals_the_plain_chain_of_steps():
     """Every frame rendered on its own, the slow way: draw, diffract, convolve, sample."""
-    config = PaperTransport(
+    config = PaperSetup(
         pitch_m=0.001, tpsf_length_m=0.008, gain=0.9, ambient=0.02, ambient_gradient=(0.2, -0.1)
     )
     scene = Scene(letter(), LineMotion((-0.02, 0.005), 0.02))
-    wall = config.wall(scene, (60, 96))
+    wall = config.resized((60, 96)).observe(scene)
     view = config.view((60, 96))
     transport = config.transport(0.08)
     source = transport.source
@@ -205,10 +204,10 @@ def test_paper_wall_equals_the_plain_chain_of_steps():
 
 
 def test_paper_defaults():
-    config = PaperTransport()
-    figures = config.figures(0.08, (100, 160))
+    config = PaperSetup()
+    figures = config.optical_values(0.08)
     assert figures["fresnel_number"] == pytest.approx(6400)
-    wall = config.wall(Scene(letter()), (50, 80))
+    wall = config.resized((50, 80)).observe(Scene(letter()))
     light = wall.irradiance(np.linspace(0, 8, 5))
     assert light.shape == (5, 50, 80)
     assert float(light.min()) >= 0.05
@@ -222,7 +221,7 @@ def test_paper_defaults():
 
 def test_offset_is_the_middle_of_the_image():
     for angle in (0.0, 25.0):
-        view = PaperTransport(offset_m=(0.03, -0.01), rotation_deg=20.0, camera_angle_deg=angle).view((41, 61))
+        view = PaperSetup(offset_m=(0.03, -0.01), rotation_deg=20.0, camera_angle_deg=angle).view((41, 61))
         assert view.wall_points_m()[20, 30].tolist() == pytest.approx([0.03, -0.01], abs=1e-12)
 
 
@@ -273,10 +272,10 @@ def test_matrix_wall_scalar_and_array_times_agree():
 
 
 def test_radiometric_wall():
-    config = RadiometricTransport(roughness=0.3, cell_m=0.01, gain=0.6, ambient=0.1)
+    config = RadiometricSetup(roughness=0.3, cell_m=0.01, gain=0.6, ambient=0.1)
     lit = Scene(Target("plate", np.ones((8, 8)), 0.08))
-    wall = config.wall(lit, (20, 32))
-    assert wall.transport is config.wall(lit, (20, 32)).transport  # one matrix for all targets
+    wall = config.resized((20, 32)).observe(lit)
+    assert wall.transport is config.resized((20, 32)).observe(lit).transport  # one matrix for all targets
     middle = wall.irradiance(4.0)
     assert float(middle.max()) == pytest.approx(0.7, abs=1e-3)
     x = torch.arange(32.0)
@@ -284,7 +283,7 @@ def test_radiometric_wall():
     centre = (light * x).sum((1, 2)) / light.sum((1, 2))
     assert float(centre[1] - centre[0]) > 3
     with pytest.raises(ConfigError, match="strip_m"):
-        config.wall(Scene(lit.target, LineMotion((0.0, 0.0))), (20, 32))
+        config.resized((20, 32)).observe(Scene(lit.target, LineMotion((0.0, 0.0))))
 
 
 def test_spline_interpolates_and_its_weights_add_up():

@@ -4,7 +4,6 @@ import importlib
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-import evnlos.threads  # noqa: F401 - before PyTorch
 from evnlos.version import __version__
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
         simulate,
     )
     from evnlos.errors import EvnlosError
-    from evnlos.evaluation import evaluate, reconstruct
+    from evnlos.evaluation import evaluate, load_model, reconstruct
     from evnlos.events import (
         CelexOptions,
         iter_events,
@@ -34,16 +33,9 @@ if TYPE_CHECKING:
     from evnlos.model import ResidualUNet, UNetConfig, load_weights
     from evnlos.scene import LineMotion, PathMotion, Scene, Target, find_font
     from evnlos.sensor import EventCamera, EventPixel, FrameCamera, simulate_events
+    from evnlos.setups import PaperSetup, RadiometricSetup, Setup, load_setup
     from evnlos.training import Training, train
-    from evnlos.transport import (
-        GGX,
-        Lambert,
-        PaperTransport,
-        RadiometricTransport,
-        View,
-        angular_spectrum,
-        tpsf_kernel,
-    )
+    from evnlos.transport import GGX, Lambert, View, angular_spectrum, tpsf_kernel
     from evnlos.types import Events, Plane
 
 __all__ = [
@@ -57,13 +49,14 @@ __all__ = [
     "Lambert",
     "LineMotion",
     "NlosDataset",
-    "PaperTransport",
+    "PaperSetup",
     "PathMotion",
     "Plane",
-    "RadiometricTransport",
+    "RadiometricSetup",
     "ResidualUNet",
     "Sampling",
     "Scene",
+    "Setup",
     "Simulation",
     "Target",
     "Training",
@@ -76,6 +69,8 @@ __all__ = [
     "import_captures",
     "iter_events",
     "keep_known_polarity",
+    "load_model",
+    "load_setup",
     "load_weights",
     "open_dataset",
     "psnr",
@@ -105,7 +100,7 @@ _FROM = {
         "simulate",
     ),
     "errors": ("EvnlosError",),
-    "evaluation": ("evaluate", "reconstruct"),
+    "evaluation": ("evaluate", "load_model", "reconstruct"),
     "events": (
         "CelexOptions",
         "iter_events",
@@ -121,12 +116,11 @@ _FROM = {
     "model": ("ResidualUNet", "UNetConfig", "load_weights"),
     "scene": ("LineMotion", "PathMotion", "Scene", "Target", "find_font"),
     "sensor": ("EventCamera", "EventPixel", "FrameCamera", "simulate_events"),
+    "setups": ("PaperSetup", "RadiometricSetup", "Setup", "load_setup"),
     "training": ("Training", "train"),
     "transport": (
         "GGX",
         "Lambert",
-        "PaperTransport",
-        "RadiometricTransport",
         "View",
         "angular_spectrum",
         "tpsf_kernel",

@@ -7,6 +7,7 @@ from typing import Any
 
 from evnlos.config import read_yaml
 from evnlos.errors import DataError
+from evnlos.migrate import migrate
 from evnlos.version import __version__
 
 ENTRIES = {
@@ -138,12 +139,13 @@ def entries_for(path: str | Path | None = None) -> dict[str, str]:
 
 
 def _of_simulation(values: dict[str, Any]) -> set[str]:
-    transport, wanted = values.get("transport"), set()
-    if isinstance(transport, dict):
+    setup, wanted = migrate("Simulation", values).get("setup"), set()
+    if isinstance(setup, dict):
         wanted.add("event pixel")
-        if transport.get("kind", "paper") == "paper":
+        kind = setup.get("kind", "paper")
+        if kind == "paper":
             wanted.add("angular spectrum")
-        elif transport["kind"] != "measured" and transport.get("wall_material", "ggx") == "ggx":
+        elif kind == "radiometric" and setup.get("wall_material", "ggx") == "ggx":
             wanted.add("rough metal")
     if isinstance(values.get("sampling"), dict):
         wanted.add("time surface")

@@ -6,33 +6,48 @@ import dataclasses
 import difflib
 import hashlib
 import json
-import os
-import tempfile
 import types
 import typing
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from yaml.composer import ComposerError
 
 from evnlos.errors import ConfigError
+from evnlos.files import write_atomically
+from evnlos.migrate import migrate
+from evnlos.registry import NESTED, Kinded
+from evnlos.untrusted import open_regular
 
 T = TypeVar("T")
 
 
-class _Loader(yaml.SafeLoader):
-    """Plain YAML without aliases: with them, a few lines of a stranger's file stand for more than memory."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            mark = self.peek_event().start_mark
-            raise ComposerError(None, None, "an alias (*name) stands here; write the value out", mark)
-        return super().compose_node(parent, index)
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast where it was built
+_MOST_BYTES, _BYTES_A_NODE = 1 << 20, 16
+_MOST_DEPTH = 100
+RANGES = {
+    "_px_m": (1e-9, 1e9),
+    "_m_s": (1e-9, 1e4),
+    "_us": (0, 2**62),
+    "_hz": (1e-9, 1e9),
+    "_mhz": (1e-3, 1e4),
+    "_deg": (1e-12, 1e4),
+    "_ms": (1e-6, 1e10),
+    "_s": (1e-9, 1e7),
+    "_m": (1e-12, 1e4),
+    "_e": (1e-9, 1e9),
+    "_mb": (1e-6, 1e6),
+    "seed": (0, 2**63 - 1),
+}
+"""Smallest and largest size of a number that is not 0, by the unit that its name ends in."""
+_NO_UNIT, _MOST_COUNT = (1e-30, 1e30), 2**63 - 1
+LONG_YAML = 1 << 26
+"""Bytes of a YAML file that names every object of a dataset, at most."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes a value that occurs twice twice, so that `_Loader` takes it."""
+    """Writes a value that occurs twice twice, so that `read_yaml` takes it."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -54,26 +69,57 @@ def from_dict(cls: type[T], values: dict[str, Any], *, source: str = "the config
 
     Args:
         cls: A (nested) frozen dataclass.
-        values: Keys are field names; fields that are left out keep their defaults.
+        values: Keys are field names, today's or those of older versions (`evnlos.migrate`); fields that are
+            left out keep their defaults.
         source: What to call the values in an error, e.g. the file they came from.
 
     Raises:
         ConfigError: An unknown key (the nearest field is named), a wrong type, or a value outside its range.
     """
-    from pydantic import TypeAdapter, ValidationError  # here: `import evnlos` stays quick
+    from pydantic import ValidationError  # here: `import evnlos` stays quick
 
     if not isinstance(values, dict):
         raise ConfigError(
             f"{source} holds a {type(values).__name__}; give a mapping of setting names to values"
         )
-    _refuse_unknown(cls, values, source, "")
-    adapter = TypeAdapter(cls)
     try:
-        return adapter.validate_python(values)
+        values = _migrated(cls, values)
+    except ConfigError as error:  # a kind that nobody knows
+        raise ConfigError(f"{source}: {error}") from None
+    _refuse_unknown(cls, values, source, "")
+    try:
+        found = _adapter(cls).validate_python(values)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "(top level)"
-        raise ConfigError(f"{source}: {place} = {first.get('input')!r}: {first['msg']}") from None
+        loc, value = tuple(first["loc"]), first.get("input")
+        if first["type"] == NESTED and "ctx" in first:
+            loc, value = (*loc, *first["ctx"]["loc"]), first["ctx"]["input"]
+        place = ".".join(str(part) for part in loc) or "(top level)"
+        raise ConfigError(f"{source}: {place} = {_shown(value)}: {first['msg']}") from None
+    except (
+        ArithmeticError,
+        MemoryError,
+        TypeError,
+        LookupError,
+    ) as error:  # of a range that only fits together
+        raise ConfigError(f"{source}: its numbers do not fit together ({error})") from None
+    return found
+
+
+@lru_cache(maxsize=64)
+def _adapter(cls: Any) -> Any:
+    """Return what builds a settings class from a mapping; making one takes longer than using it."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(cls)
+
+
+def _shown(value: Any) -> str:
+    """Return a value as it stands in a message; Python writes out no number of thousands of digits."""
+    try:
+        return repr(value)[:200]
+    except ValueError:
+        return "a number of thousands of digits"
 
 
 def load_yaml(cls: type[T], path: str | Path) -> T:
@@ -85,25 +131,60 @@ def load_yaml(cls: type[T], path: str | Path) -> T:
     return from_dict(cls, read_yaml(path), source=str(path))
 
 
-def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read a YAML file that holds a mapping.
+def read_yaml(path: str | Path, most_bytes: int = _MOST_BYTES) -> dict[str, Any]:
+    """Read a YAML file that holds a mapping: plain values, no aliases, no tags.
+
+    With aliases a few lines of a stranger's file stand for more than memory, and a file of many values takes
+    minutes, so that a small file holds at most one value for every 16 bytes of `most_bytes`.
+
+    Args:
+        path: The file.
+        most_bytes: Size of the file, bytes, at most.
 
     Raises:
-        ConfigError: The file is missing, is not YAML, or holds something other than a mapping.
+        ConfigError: The file is missing, too large, is not YAML, or holds something other than a mapping.
     """
     path = Path(path)
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        with open_regular(path) as file:
+            content = file.read(most_bytes + 1)
+        if len(content) > most_bytes:
+            raise ConfigError(f"{path} is larger than {most_bytes / 1e6:.0f} MB; leave values out")
+        text = content.decode("utf-8")
+        _check_plain(text, most_bytes // _BYTES_A_NODE)
+        values = yaml.load(text, _Loader)
     except FileNotFoundError:
         raise ConfigError(f"{path} does not exist; give the path of a YAML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} can't be read as a YAML file: {error}") from None
-    except (yaml.YAMLError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError, ArithmeticError, LookupError, TypeError) as error:
+        # PyYAML hands on what Python says of impossible dates and of numbers without digits, or with thousands.
         reason = " ".join(str(error).split())
-        raise ConfigError(f"{path} is not valid YAML: {reason}") from None
+        raise ConfigError(f"{path} is not valid YAML: {reason[:500]}") from None
     if not isinstance(values, dict):
         raise ConfigError(f"{path} holds {type(values).__name__}; give a mapping of setting names to values")
     return values
+
+
+def _check_plain(text: str, most: int) -> None:
+    """Refuse YAML with aliases, deep nesting or many values, before anything is built of it.
+
+    Raises:
+        ValueError: It holds one of these.
+    """
+    depth = 0
+    for count, event in enumerate(yaml.parse(text, _Loader)):
+        place = f"line {event.start_mark.line + 1}" if event.start_mark else "it"
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"{place}: an alias (*name) stands here; write the value out")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > _MOST_DEPTH:
+            raise ValueError(f"{place} is nested more than {_MOST_DEPTH} deep")
+        if count > most:
+            raise ValueError(f"{place}: more than {most} values; leave some out")
 
 
 def save_yaml(config: Any, path: str | Path) -> None:
@@ -111,22 +192,6 @@ def save_yaml(config: Any, path: str | Path) -> None:
     values = to_dict(config) if dataclasses.is_dataclass(config) else config
     text = yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     write_atomically(path, text.encode())
-
-
-def write_atomically(path: str | Path, content: bytes) -> None:
-    """Write a file so that a reader sees either all of it or nothing: temporary file, fsync, rename."""
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def config_hash(config: Any) -> str:
@@ -151,9 +216,23 @@ def differing_keys(ours: dict[str, Any], theirs: dict[str, Any], prefix: str = "
     return found
 
 
+def _migrated(cls: Any, values: Any) -> Any:
+    """Return the values with every nested mapping in the names of this version."""
+    candidates = _dataclasses_in(cls, values)
+    if not candidates or not isinstance(values, dict):
+        return values
+    chosen = candidates[0]
+    if len(candidates) > 1:
+        kind = values.get("kind")
+        chosen = next((one for one in candidates if getattr(one, "kind", None) == kind), chosen)
+    values = migrate(chosen.__name__, values)
+    hints = typing.get_type_hints(chosen)
+    return {key: _migrated(hints[key], value) if key in hints else value for key, value in values.items()}
+
+
 def _refuse_unknown(cls: Any, values: Any, source: str, prefix: str) -> None:
     """Walk dataclass and mapping together; pydantic's own message would not name the nearest field."""
-    candidates = _dataclasses_in(cls)
+    candidates = _dataclasses_in(cls, values)
     if not candidates or not isinstance(values, dict):
         return
     chosen = _tagged(candidates, values, source, prefix)
@@ -161,18 +240,62 @@ def _refuse_unknown(cls: Any, values: Any, source: str, prefix: str) -> None:
     names = [field.name for field in dataclasses.fields(chosen)]
     for key, value in values.items():
         if key not in names:
-            near = difflib.get_close_matches(str(key), names, n=1)
+            near = difflib.get_close_matches(str(key)[:100], names, n=1)
             cure = f"perhaps you meant {near[0]!r}" if near else f"known settings: {', '.join(names)}"
             raise ConfigError(f"{source}: unknown setting {prefix}{key!s}; {cure}")
+        if not _is_free(hints[key]):
+            check_numbers(value, f"{source}: {prefix}{key}", str(key))
         _refuse_unknown(hints[key], value, source, f"{prefix}{key}.")
 
 
-def _dataclasses_in(cls: Any) -> list[type]:
-    """Return the dataclass that a type hint names, or those of its union."""
+def _is_free(hint: Any) -> bool:
+    """Return whether a field holds notes of any kind, whose numbers nothing is computed with."""
+    return any(part is Any for part in typing.get_args(hint))
+
+
+def check_numbers(value: Any, what: str, name: str = "") -> None:
+    """Refuse numbers outside the range of their unit, which the end of their name says (docs/units.md).
+
+    Settings check their own, narrower ranges besides.
+
+    Args:
+        value: A number, a dataclass, or a tuple, list or mapping of these; anything else is left alone.
+        what: What to call it in an error.
+        name: Name of the setting.
+
+    Raises:
+        ConfigError: A number is NaN or infinite, or its size is outside the range.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        hints = typing.get_type_hints(type(value))
+        for item in dataclasses.fields(value):
+            if not _is_free(hints[item.name]):
+                check_numbers(getattr(value, item.name), f"{what}.{item.name}".lstrip("."), item.name)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            check_numbers(inner, f"{what}.{str(key)[:80]}", str(key).rpartition(".")[2])
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            check_numbers(inner, what, name)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        least, most = next((ends for unit, ends in RANGES.items() if name.endswith(unit)), _NO_UNIT)
+        if isinstance(value, int):
+            least, most = 0, min(most, _MOST_COUNT)
+        if isinstance(value, float) and value == 0:
+            return
+        if not least <= abs(value) <= most:  # NaN, too
+            ends = f"{least:g} to {most:g}, or 0" if least else f"at most {most:g}"
+            raise ConfigError(f"{what} is {_shown(value)}; its size has to be {ends}")
+
+
+def _dataclasses_in(cls: Any, values: Any) -> list[type]:
+    """Return the dataclass that a type hint names for such values, or those of its union."""
     if typing.get_origin(cls) is typing.Annotated:
-        return _dataclasses_in(typing.get_args(cls)[0])
+        return _dataclasses_in(typing.get_args(cls)[0], values)
     if typing.get_origin(cls) in (typing.Union, types.UnionType):
-        return [found for part in typing.get_args(cls) for found in _dataclasses_in(part)]
+        return [found for part in typing.get_args(cls) for found in _dataclasses_in(part, values)]
+    if isinstance(cls, type) and issubclass(cls, Kinded):
+        return [cls.class_for(values)]
     if isinstance(cls, type) and dataclasses.is_dataclass(cls):
         return [cls]
     return []
@@ -186,6 +309,6 @@ def _tagged(candidates: list[type], values: dict[str, Any], source: str, prefix:
         field.default: cls for cls in candidates for field in dataclasses.fields(cls) if field.name == "kind"
     }
     kind = values.get("kind")
-    if kind not in kinds:
-        raise ConfigError(f"{source}: {prefix}kind is {kind!r}; give one of {', '.join(map(str, kinds))}")
+    if not isinstance(kind, str) or kind not in kinds:
+        raise ConfigError(f"{source}: {prefix}kind is {_shown(kind)}; give one of {', '.join(map(str, kinds))}")
     return kinds[kind]

@@ -1,8 +1,37 @@
 """The errors that bad input raises: one sentence with the value, the limit and the cure."""
 
+import re
+
+_UNSEEN = "\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff"
+_CONTROLS = re.compile(f"[{_UNSEEN}]")
+_CONTROLS_OF_LINES = re.compile(f"(?![\n\t])[{_UNSEEN}]")
+_MOST = 4000  # characters of a message: a stranger's file may hold names of any length
+
+
+def printable(text: object, *, lines: bool = False) -> str:
+    r"""Return a text whose control characters are written out, as in a Python string.
+
+    Names in a stranger's file may hold line breaks, codes that change the terminal, and marks that turn the
+    order of letters round.
+
+    Args:
+        text: What to show.
+        lines: Whether line breaks and tabs stay.
+
+    Example:
+        >>> printable("two\nlines\x1b[31m")
+        'two\\nlines\\x1b[31m'
+    """
+    pattern = _CONTROLS_OF_LINES if lines else _CONTROLS
+    return pattern.sub(lambda found: found[0].encode("unicode_escape").decode(), str(text))
+
 
 class EvnlosError(Exception):
     """Base of every error that bad input raises; its text is one line a user can act on."""
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        return printable(text if len(text) <= _MOST else f"{text[: _MOST // 2]} ... {text[-_MOST // 2 :]}")
 
 
 class ConfigError(EvnlosError):

@@ -9,6 +9,7 @@ REQUIRED = {
     "numpy": "numpy>=1.26",
     "torch": "torch>=2.6",
     "numba": "numba>=0.61",
+    "scipy": "scipy>=1.12",
     "h5py": "h5py>=3.11",
     "safetensors": "safetensors>=0.4.5",
     "filelock": "filelock>=3.12",

@@ -1,10 +1,18 @@
-"""How threads wait for each other, and how many there are; imported before PyTorch, which reads that once."""
+"""How many threads there are, and how they wait for each other."""
 
 import os
 
-# By default a thread that is done spins until the slowest one is. On cores that other programs use this takes
-# the time away from it, and small loops take several times as long: `docs/performance.md` has the figures.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+def sleep_while_waiting() -> None:
+    """Let threads of parallel loops sleep while they wait, unless the user has chosen.
+
+    By default a thread that is done spins until the slowest one is. On cores that other programs use this takes
+    the time away from it, and small loops take several times as long: `docs/performance.md` has the figures.
+    PyTorch and numba read the variable once, at their import, so this comes before; processes that are started
+    later inherit it. The program `evnlos` calls it; a library must not decide it for
+    the program that imports it.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def cores() -> int:

@@ -8,10 +8,10 @@ from functools import cache, partial
 from pathlib import Path
 
 from evnlos.app.recorded import Recorded
-from evnlos.config import load_yaml
-from evnlos.dataset import PARADIGMS, Sampling, Simulation
+from evnlos.dataset import STANDARD_MODALITIES, Sampling, as_modality
 from evnlos.evaluation.consistency import FrameOperator
 from evnlos.model import Weights, load_weights, published, published_for, published_rig
+from evnlos.setups import load_setup
 
 _PAGE = "page-{}-pass"  # trained on the simulation `page`
 _TITLES = {"frame": "network, frames", "event": "network, events", "fusion": "network, both"}
@@ -39,12 +39,12 @@ class Networks:
             return {}
         is_simulated = recorded.simulation is not None
         found = {}
-        for paradigm in PARADIGMS:
-            name = _PAGE.format(paradigm)
+        for modality in STANDARD_MODALITIES:
+            name = _PAGE.format(modality)
             if not is_simulated:
-                name = published_for(recorded.distance_m, paradigm, is_motion_known=True)
-            if name in published() and (recorded.frames is not None or paradigm == "event"):
-                found[_TITLES[paradigm]] = _loaded(name)
+                name = published_for(recorded.distance_m, modality, is_motion_known=True)
+            if name in published() and (recorded.frames is not None or not as_modality(modality).needs_frames):
+                found[_TITLES[modality]] = _loaded(name)
         return found
 
     def wall_of(self, recorded: Recorded) -> Callable[[Sampling], FrameOperator] | None:
@@ -52,10 +52,10 @@ class Networks:
 
         None where there are no frames, or where the networks are the user's and so is the recording.
         """
-        rig = recorded.simulation
+        rig = None if recorded.simulation is None else recorded.simulation.setup
         if rig is None and not self.own and recorded.motion is not None:
             known = published_rig(published_for(recorded.distance_m, "frame", is_motion_known=True))
-            rig = load_yaml(Simulation, known) if known else None
+            rig = load_setup(known) if known else None
         return None if rig is None or recorded.frames is None else cache(partial(FrameOperator, rig))
 
 

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from evnlos.app.controls import Controls
 from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
 from evnlos.app.networks import Networks
-from evnlos.app.setup import Setup
 from evnlos.app.sheet import message_box
 from evnlos.app.words import GLOSSARY, HEAD, PAPER
 from evnlos.app.work import opening_verdict, simulated, uploaded
@@ -20,24 +20,24 @@ _FONT = ("system-ui", "sans-serif")
 
 
 def build_page(
-    gradio: Any, first: tuple[str, str], setup: Setup, networks: Networks, scratch: Path, limit: int
+    gradio: Any, first: tuple[str, str], opening: Controls, networks: Networks, scratch: Path, limit: int
 ) -> Any:
     """Return the page.
 
     Args:
         gradio: The package.
         first: Sheet and verdict that the page opens with.
-        setup: Settings that the controls open with.
+        opening: Settings that the controls open with.
         networks: The page's networks.
         scratch: Folder for uploads of this session.
         limit: Largest upload, bytes.
     """
     gr = gradio
-    with gr.Blocks(title="evnlos", analytics_enabled=False, fill_width=True) as page:
+    with gr.Blocks(title="evnlos", analytics_enabled=False, fill_width=True, delete_cache=(600, 3600)) as page:
         gr.HTML(HEAD, elem_id="ev-about")
         with gr.Tab("Simulate a pass"), gr.Row(equal_height=False):
             with gr.Column(scale=1, min_width=290):
-                controls = _controls(gr, setup)
+                controls = _controls(gr, opening)
             with gr.Column(scale=4, min_width=480):
                 verdict = gr.HTML(first[1])
                 pictures = gr.HTML(first[0], elem_id="ev-opening")
@@ -51,12 +51,12 @@ def build_page(
             message = gr.HTML()
             shown = gr.HTML()
         gr.HTML(GLOSSARY)
-        run = _on_controls(gr, setup, networks)
+        run = _on_controls(gr, opening, networks)
         quiet: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
         for control in controls:
             control.change(run, controls, [pictures, verdict], trigger_mode="always_last", **quiet)
         # The page opens with a pass that is there already; only its verdict may still be on its way.
-        page.load(lambda: opening_verdict(setup), None, verdict, **quiet)
+        page.load(lambda: opening_verdict(opening), None, verdict, **quiet)
         file.change(
             lambda path: uploaded(path, scratch, limit, networks),
             file,
@@ -75,7 +75,7 @@ def theme(gradio: Any) -> Any:
     )
 
 
-def _controls(gr: Any, setup: Setup) -> list[Any]:
+def _controls(gr: Any, opening: Controls) -> list[Any]:
     def slider(low: float, high: float, value: float, step: float, label: str, info: str = "") -> Any:
         return gr.Slider(low, high, value=value, step=step, label=label, info=info or None)
 
@@ -94,19 +94,19 @@ def _controls(gr: Any, setup: Setup) -> list[Any]:
     )
     with gr.Accordion("Rig", open=True):
         wall = gr.Radio([_METAL, _MATTE], value=_METAL, label="Wall")
-        rough = slider(0.01, 0.3, setup.roughness, 0.01, "Wall roughness (metal)")
-        distance = slider(15, 60, 100 * setup.distance_m, 1, "Distance from object to wall, cm")
-        speed = slider(0.5, 20, 100 * setup.speed_m_s, 0.5, "Speed of the object, cm/s")
-        ambient = slider(0, 0.7, setup.ambient, 0.01, "Ambient light, white levels")
+        rough = slider(0.01, 0.3, opening.roughness, 0.01, "Wall roughness (metal)")
+        distance = slider(15, 60, 100 * opening.distance_m, 1, "Distance from object to wall, cm")
+        speed = slider(0.5, 20, 100 * opening.speed_m_s, 0.5, "Speed of the object, cm/s")
+        ambient = slider(0, 0.7, opening.ambient, 0.01, "Ambient light, white levels")
     with gr.Accordion("Cameras", open=True):
-        noise = slider(0.2, 10, setup.frame_noise, 0.1, "Frame noise, times the usual camera's")
-        on = slider(0.03, 0.6, setup.threshold_on, 0.01, "Threshold of brighter events, log light")
-        off = slider(0.03, 0.6, setup.threshold_off, 0.01, "Threshold of darker events, log light")
-        event_noise = slider(0, 2, setup.event_noise_hz, 0.01, "Event noise, events a second and pixel")
+        noise = slider(0.2, 10, opening.frame_noise, 0.1, "Frame noise, times the usual camera's")
+        on = slider(0.03, 0.6, opening.threshold_on, 0.01, "Threshold of brighter events, log light")
+        off = slider(0.03, 0.6, opening.threshold_off, 0.01, "Threshold of darker events, log light")
+        event_noise = slider(0, 2, opening.event_noise_hz, 0.01, "Event noise, events a second and pixel")
     return [how, character, ink, wall, rough, distance, speed, ambient, noise, on, off, event_noise]
 
 
-def _on_controls(gr: Any, setup: Setup, networks: Networks) -> Callable[..., Iterator[tuple[str, str]]]:
+def _on_controls(gr: Any, opening: Controls, networks: Networks) -> Callable[..., Iterator[tuple[str, str]]]:
     def run(
         how: str,
         character: str,
@@ -122,7 +122,7 @@ def _on_controls(gr: Any, setup: Setup, networks: Networks) -> Callable[..., Ite
         event_noise_hz: float,
     ) -> Iterator[tuple[str, str]]:
         try:
-            chosen = Setup(
+            chosen = Controls(
                 "matte" if wall == _MATTE else "metal",
                 rough,
                 distance_cm / 100,
@@ -132,8 +132,8 @@ def _on_controls(gr: Any, setup: Setup, networks: Networks) -> Callable[..., Ite
                 on,
                 off,
                 event_noise_hz,
-                setup.columns,
-                setup.seed,
+                opening.columns,
+                opening.seed,
             )
             target = drawn(ink) if how == _DRAW else picked(character)
             yield from simulated(chosen, target, networks)

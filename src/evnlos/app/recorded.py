@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.app.setup import Setup
+from evnlos.app.controls import Controls
 from evnlos.dataset import Samples, Sampling, Simulation, make_samples
 from evnlos.dataset.sampling import edges_from
 from evnlos.scene import Motion, Scene, Target
@@ -70,24 +70,24 @@ class Recorded:
         return self.target.rasterise(sampling.canvas, places)[:, sampling.scored]
 
 
-def simulate_pass(setup: Setup, target: Target) -> Recorded:
+def simulate_pass(controls: Controls, target: Target) -> Recorded:
     """Simulate one pass of a hidden object.
 
     Args:
-        setup: Rig and camera.
+        controls: Rig and camera.
         target: What is hidden.
 
     Raises:
         ConfigError: The rig can't be, or the camera gets no light.
     """
-    simulation = setup.simulation()
+    simulation = controls.simulation()
     scene = Scene(target, simulation.motion, simulation.duration_s)
-    wall = simulation.transport.wall(scene, (simulation.sensor.height, simulation.sensor.width))
+    wall = simulation.setup.observe(scene)
     times_s = scene.position_times_s(simulation.positions)
     camera: FrameCamera = simulation.frame_camera
-    events = EventCamera(simulation.pixel, _TOLERANCE).record(
-        wall, 0.0, simulation.duration_s, seed=derive_seed(setup.seed, "events")
+    events = EventCamera(simulation.pixel, _TOLERANCE, simulation.setup.time_step_s).record(
+        wall, 0.0, simulation.duration_s, seed=derive_seed(controls.seed, "events")
     )
-    frames = camera.capture(wall, times_s, seed=derive_seed(setup.seed, "frames"))
+    frames = camera.capture(wall, times_s, seed=derive_seed(controls.seed, "frames"))
     edges_us = edges_from(times_s)
     return Recorded(target.name, events, edges_us, frames, camera.white, scene.motion, target, simulation)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import tempfile
@@ -94,20 +95,26 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     """Yield the address of the running page, and stop it afterwards. Arguments and errors as in `serve`."""
     os.environ.update(_QUIET)
     own = server.host if is_local(listening_address(server.host, server.port)) else None
+    if own is None:
+        logging.getLogger("evnlos").warning(
+            "warning: --host %s opens the page to the network, and it asks for no password: whoever reaches it "
+            "may upload files and use this machine's time; put it behind a proxy that asks, or use ssh -L",
+            server.host,
+        )
     try:
         import gradio
     except ImportError:
         raise MissingDependencyError("the page needs Gradio: pip install 'evnlos[app]'") from None
+    from evnlos.app.controls import Controls
     from evnlos.app.hidden import picked
     from evnlos.app.middleware import middleware
     from evnlos.app.networks import own_networks
     from evnlos.app.page import build_page, theme
-    from evnlos.app.setup import Setup
     from evnlos.app.work import simulated
 
     networks = own_networks(weights)
-    setup = Setup(columns=server.columns)
-    pieces = simulated(setup, picked("R"), networks)
+    controls = Controls(columns=server.columns)
+    pieces = simulated(controls, picked("R"), networks)
     first = next(pieces)
     if not networks.own:  # those of the package are small and quick
         first = next(pieces)
@@ -116,7 +123,7 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     limit = round(1e6 * server.upload_mb)
     with tempfile.TemporaryDirectory(prefix="evnlos-app-", ignore_cleanup_errors=True) as scratch:
         os.environ["GRADIO_TEMP_DIR"] = scratch
-        page = build_page(gradio, first, setup, networks, Path(scratch), limit)
+        page = build_page(gradio, first, controls, networks, Path(scratch), limit)
         try:
             _, address, _ = page.queue(api_open=False).launch(
                 server_name=server.host,
@@ -136,7 +143,9 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
                 theme=theme(gradio),
                 css=(_HERE / "page.css").read_text(encoding="utf-8"),
                 app_kwargs={
-                    "middleware": middleware(_script("page.js") + _script("opening.js"), own),
+                    "middleware": middleware(
+                        _script("page.js") + _script("opening.js"), own, Path(scratch), limit
+                    ),
                     "docs_url": None,
                     "redoc_url": None,
                     "openapi_url": None,

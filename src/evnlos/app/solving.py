@@ -9,31 +9,27 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.app.controls import COARSE
 from evnlos.app.recorded import Recorded
-from evnlos.app.setup import COARSE
-from evnlos.config import from_dict
-from evnlos.dataset import Sampling, Simulation
+from evnlos.dataset import Sampling
 from evnlos.errors import DataError
 from evnlos.evaluation import reconstruct
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.identify_rig import camera_variance
 from evnlos.evaluation.worth import judgement_of, why_unjudged
 from evnlos.metrics import psnr
-from evnlos.model import JointNetwork, Weights
+from evnlos.model import Weights
 from evnlos.scene import Target
+from evnlos.setups import Setup
+from evnlos.setups.base import dense_matrix
 from evnlos.solver import JointProblem, PlatePass
 from evnlos.solver.recording import object_light
-from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.transport import MatrixTransport
 from evnlos.types import Plane
 
 _DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far a picture may go from it
 _CELLS = 16  # a side of the plate of the whole pass
 _SMOOTH = 3.0  # weight of the gradient in units of the noise's variance
-_SEEN = {  # of one position, of a whole pass
-    "frame": ("one frame", "all frames"),
-    "event": ("one position's events", "all events"),
-    "fusion": ("frame and events", "all frames and events"),
-}
 _STATIC = 1.0  # the camera's fixed pattern is about as strong as its noise
 
 
@@ -62,8 +58,8 @@ def from_each_frame(recorded: Recorded) -> Reconstruction:
     Raises:
         DataError: The pass has no frames, or its rig is unknown.
     """
-    simulation, _, frames = _known(recorded)
-    operator = FrameOperator(simulation, COARSE)
+    setup, frames = _known(recorded)
+    operator = FrameOperator(setup, COARSE)
     seen = torch.from_numpy(recorded.samples(COARSE).frame)
     flat = torch.full((len(frames), COARSE.height, COARSE.width), _DIM)
     images = consistent(flat, seen, operator, trust=_TRUST)[:, COARSE.scored].numpy()
@@ -76,20 +72,20 @@ def from_whole_pass(recorded: Recorded) -> Reconstruction:
     Raises:
         DataError: The pass has no frames, or its rig or its motion is unknown.
     """
-    simulation, rig, frames = _known(recorded)
+    setup, frames = _known(recorded)
     if recorded.motion is None or recorded.target is None:
         raise DataError("the motion or the plate is unknown; the whole pass needs both")
     size_m, shape = recorded.target.size_m, frames.shape[1:]
-    light = object_light(frames, recorded.peak, rig, shape)
-    made = rig.transport(shape)
-    strip = made.source
-    assert isinstance(strip, Plane)  # a rig's cells
+    light = object_light(frames, recorded.peak, setup, shape)
+    strip = setup.target_cells()
+    assert strip is not None  # `_known` refuses setups without
+    made = setup.resized(shape).operator(strip, dtype=torch.float32)
     places = recorded.motion.position_m(recorded.times_s)
     plate = Plane(_CELLS, _CELLS, size_m / _CELLS)
     problem = JointProblem(
-        PlatePass(MatrixTransport(made.matrix * rig.gain, strip, shape), plate, places), _STATIC
+        PlatePass(MatrixTransport(dense_matrix(made, torch.float32), strip, shape), plate, places), _STATIC
     )
-    variance = camera_variance(light.mean() + rig.ambient, simulation.frame_camera)
+    variance = camera_variance(light.mean() + setup.ambient, setup.frame_camera)
     image = problem.tikhonov(light, _SMOOTH * float(variance)).image
     found = Target("found", image.clamp(0, 1).float().numpy(), size_m)
     fine = Sampling()
@@ -115,16 +111,17 @@ def from_weights(
     Raises:
         DataError: The pass has no frames, and the network needs them.
     """
-    if recorded.frames is None and weights.paradigm != "event":
+    if recorded.frames is None and weights.modality.needs_frames:
         raise DataError(
-            f"{name} looks at frames ({weights.paradigm}), and the recording has none; "
-            "give weights of the paradigm event, or upload a capture folder"
+            f"{name} looks at frames ({weights.modality.name}), and the recording has none; "
+            "give weights of the modality event, or upload a capture folder"
         )
-    sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
+    sampling = weights.sampling
     samples = recorded.samples(sampling)
     pictures = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
     images = pictures[:, sampling.scored].numpy()
-    saw = _SEEN[weights.paradigm][isinstance(weights.network, JointNetwork)]
+    noun = weights.modality.noun
+    saw = f"all {noun}" if weights.network.sees_sequence else f"{noun} of one time step"
     can_judge = why_unjudged(weights, samples) is None
     operator = wall(sampling) if wall is not None and can_judge else None
     worth = judgement_of(weights, samples, pictures, operator)
@@ -132,11 +129,11 @@ def from_weights(
     return _scored(name, note, images, recorded, sampling)
 
 
-def _known(recorded: Recorded) -> tuple[Simulation, RadiometricTransport, NDArray]:
+def _known(recorded: Recorded) -> tuple[Setup, NDArray]:
     simulation, frames = recorded.simulation, recorded.frames
-    if simulation is None or frames is None or not isinstance(simulation.transport, RadiometricTransport):
-        raise DataError("the rig or the frames are unknown; a classical picture needs both")
-    return simulation, simulation.transport, frames
+    if simulation is None or frames is None or simulation.setup.target_cells() is None:
+        raise DataError("the setup or the frames are unknown; a classical picture needs both")
+    return simulation.setup, frames
 
 
 def _scored(

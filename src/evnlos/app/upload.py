@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from evnlos.app.controls import POSITIONS
 from evnlos.app.recorded import Recorded
-from evnlos.app.setup import POSITIONS
 from evnlos.app.unpack import unpack_zip
 from evnlos.dataset import read_capture
 from evnlos.dataset.capture_info import read_capture_info
@@ -22,6 +22,7 @@ MOST_EVENTS = 20_000_000
 """Events that are read, at most: 260 MB."""
 _MOST_PIXELS = 2_100_000  # of a sensor whose pixels all get maps
 _MOST_MAP_BYTES = 1 << 30  # of all maps of a pass
+_MOST_FRAME_BYTES = 1 << 28  # of the frames of a capture
 _ZIP = b"PK\x03\x04"
 
 
@@ -65,6 +66,11 @@ def _read_recording(path: Path) -> Recorded:
     events, complete = _first_events(Recording(path))
     if not len(events):
         raise DataError(f"{path.name} holds no event; check it with evnlos info")
+    if events.width * events.height > _MOST_PIXELS:
+        raise DataError(
+            f"{path.name} is of a sensor of {events.width} x {events.height} pixels; "
+            f"at most {_MOST_PIXELS:,} are shown"
+        )
     first, last = int(events.t_us[0]), int(events.t_us[-1])
     edges = np.round(np.linspace(first - 1, max(last, first + POSITIONS), POSITIONS + 1)).astype(np.int64)
     notes = [f"{len(events):,} events of a sensor of {events.width} x {events.height} pixels"]
@@ -99,7 +105,7 @@ def _read_capture(folder: Path) -> Recorded:
         raise DataError(
             f"{info.events} holds {MOST_EVENTS:,} events or more; cut it with evnlos convert before you zip it"
         )
-    capture = read_capture(folder)
+    capture = read_capture(folder, _MOST_FRAME_BYTES)
     frames, edges = capture.frames[1:], capture.frame_times_us
     if not len(frames):
         raise DataError("the capture has one frame; a position needs two, with events between")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from evnlos.dataset import Simulation
 from evnlos.evaluation import Bench, Identification, identify
+from evnlos.sensor import EventPixel
+from evnlos.setups import Setup
 
 _CELLS, _WRITERS = 16, 2  # a coarse question, answered while one waits; `evnlos identify` asks the fine one
 
@@ -27,9 +29,9 @@ class Verdict:
 
 
 @lru_cache(maxsize=64)
-def _identified(transport: object, camera: object, shape: tuple[int, int]) -> Identification:
-    bench = Bench(cells=_CELLS, height=shape[0], width=shape[1], writers=_WRITERS)
-    return identify(transport, camera, bench)  # type: ignore[arg-type]
+def _identified(setup: Setup) -> Identification:
+    height, width = setup.shape
+    return identify(setup, Bench(cells=_CELLS, height=height, width=width, writers=_WRITERS))
 
 
 def verdict_on(simulation: Simulation) -> Verdict:
@@ -38,8 +40,8 @@ def verdict_on(simulation: Simulation) -> Verdict:
     Raises:
         ConfigError: The rig can't be, or the camera gets no light.
     """
-    shape = (simulation.sensor.height, simulation.sensor.width)
-    found = _identified(simulation.transport, simulation.frame_camera, shape)
+    # The event pixel is no part of the question: one answer for all of its settings.
+    found = _identified(replace(simulation.setup, pixel=EventPixel()))
     reason, _, meaning = found.verdict.partition(": ")
     figures = (
         f"On handwriting, the best linear picture from one frame reaches {found.at_camera.psnr_db:.1f} dB; "

@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from evnlos.app.controls import Controls
 from evnlos.app.networks import Networks
 from evnlos.app.recorded import Recorded, simulate_pass
-from evnlos.app.setup import Setup
 from evnlos.app.sheet import message_box, sheet, verdict_box, waiting_box
 from evnlos.app.solving import Reconstruction, from_each_frame, from_weights, from_whole_pass
 from evnlos.app.upload import read_upload
@@ -18,18 +18,18 @@ from evnlos.errors import EvnlosError
 from evnlos.scene import Target
 
 
-def simulated(setup: Setup, target: Target, networks: Networks) -> Iterator[tuple[str, str]]:
+def simulated(controls: Controls, target: Target, networks: Networks) -> Iterator[tuple[str, str]]:
     """Yield (sheet, verdict) of a simulated pass three times: without networks, with them, with the verdict.
 
     Args:
-        setup: Rig and camera.
+        controls: Rig and camera.
         target: What is hidden.
         networks: The page's networks.
 
     Raises:
         EvnlosError: The settings can't be.
     """
-    recorded = simulate_pass(setup, target)
+    recorded = simulate_pass(controls, target)
     before, after = seen_views(recorded), event_views(recorded)
     found = [from_whole_pass(recorded), from_each_frame(recorded)]
     assert recorded.simulation is not None  # it was simulated
@@ -41,9 +41,9 @@ def simulated(setup: Setup, target: Target, networks: Networks) -> Iterator[tupl
     yield pictures, verdict_box(verdict_on(recorded.simulation))
 
 
-def opening_verdict(setup: Setup) -> str:
+def opening_verdict(controls: Controls) -> str:
     """Return the verdict on the rig that the page opens with."""
-    return verdict_box(verdict_on(setup.simulation()))
+    return verdict_box(verdict_on(controls.simulation()))
 
 
 def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networks) -> tuple[str, str]:
@@ -85,6 +85,7 @@ def _sheet(recorded: Recorded, before: list[View], found: list[Reconstruction], 
 
 def _without_folder(text: str, path: str, scratch: Path) -> str:
     """Return a message without the folders of this machine."""
-    for folder in {scratch, scratch.resolve(), Path(path).parent, Path(path).resolve().parent}:
+    folders = {scratch, scratch.resolve(), Path(path).parent, Path(path).resolve().parent}
+    for folder in sorted(folders, key=lambda one: len(str(one)), reverse=True):  # the inner ones first
         text = re.sub(re.escape(str(folder)) + r"/(unpacked-[^/]*/)?", "", text)
     return text

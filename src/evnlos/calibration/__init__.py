@@ -8,10 +8,10 @@ from evnlos.calibration.frame_noise import FrameNoise, fit_frame_noise
 from evnlos.calibration.residual import Residual
 from evnlos.calibration.settings import Calibration
 from evnlos.calibration.summary import (
+    FIGURES_FILE,
     RIG_FILE,
     figures,
     residual_table,
-    rig_file,
     rows_of,
     table,
     warnings_of,
@@ -20,6 +20,7 @@ from evnlos.calibration.summary import (
 from evnlos.calibration.transport_fit import TransportFit, fit_transport
 
 __all__ = [
+    "FIGURES_FILE",
     "RIG_FILE",
     "Calibration",
     "Example",
@@ -38,7 +39,6 @@ __all__ = [
     "fit_transport",
     "read_shots",
     "residual_table",
-    "rig_file",
     "rows_of",
     "table",
     "warnings_of",

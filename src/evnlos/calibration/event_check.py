@@ -12,7 +12,7 @@ from evnlos.calibration.event_statistics import Recording, simulated
 from evnlos.calibration.residual import Residual
 from evnlos.dataset.sampling import Sampling, make_samples, reduce_by_area
 from evnlos.seeds import derive_seed
-from evnlos.sensor import EventPixel
+from evnlos.sensor import PixelSettings
 from evnlos.types import Events
 
 _DRAWS = 4  # simulations whose mean stands for the model: one alone would add its own noise
@@ -24,8 +24,8 @@ Maps = dict[str, NDArray[np.float32]]
 def event_residuals(
     shots: Shots,
     recordings: Sequence[Recording],
-    before: EventPixel,
-    after: EventPixel,
+    before: PixelSettings,
+    after: PixelSettings,
     sampling: Sampling,
     seed: int,
 ) -> tuple[dict[str, Residual], dict[str, tuple[NDArray, NDArray]]]:
@@ -64,7 +64,7 @@ def event_residuals(
 
 def _mean_maps(
     recordings: Sequence[Recording],
-    pixel: EventPixel,
+    pixel: PixelSettings,
     edges: list[NDArray[np.int64]],
     sampling: Sampling,
     seed: int,

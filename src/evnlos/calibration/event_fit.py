@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.calibration.event_models import MODELS, fit_model, is_better, misfit, thinned
 from evnlos.calibration.event_statistics import (
     Recording,
     Regions,
@@ -18,15 +19,17 @@ from evnlos.calibration.event_statistics import (
     simulated,
 )
 from evnlos.calibration.least_squares import forward_jacobian, levenberg_marquardt
-from evnlos.sensor import EventPixel
+from evnlos.sensor import EventPixel, PixelSettings
 from evnlos.types import Events
 
 _LOG_NAMES = ("threshold_on", "threshold_off", "threshold_sigma", "shot_noise_rate_hz")
 _NAMES = (*_LOG_NAMES, "leak_rate_hz")
 _STEPS = (0.05, 0.05, 0.2, 0.1, 0.03)
 _LOWEST = (math.log(0.02), math.log(0.02), math.log(0.002), math.log(1e-4), 0.0)
-_HIGHEST = (0.0, 0.0, math.log(0.3), math.log(1e3), 10.0)
+_HIGHEST = (math.log(3.0), math.log(3.0), math.log(0.3), math.log(1e3), 10.0)
 _CUTOFFS_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
+CONTINUOUS = "continuous"
+"""Name of v2e's event model."""
 _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
 
@@ -39,14 +42,19 @@ class PixelFit:
         pixel: The pixel.
         error: Standard error by name, from the scatter between the recordings; infinite where one recording is
             all there is.
-        cutoff_range_hz: Corner frequencies that agree with the recordings within two standard errors.
+        cutoff_range_hz: Corner frequencies that agree with the recordings within two standard errors; None for
+            a model without.
         dead_time_s: No pixel can be blind for longer: its shortest time between two events, seconds.
+        on_edge: Names of what ended on the edge of what was tried.
+        compared: Misfit on captures held out, by name of the event model (see `event_models.misfit`).
     """
 
-    pixel: EventPixel
+    pixel: PixelSettings
     error: dict[str, float]
-    cutoff_range_hz: tuple[float, float]
+    cutoff_range_hz: tuple[float, float] | None
     dead_time_s: float
+    on_edge: tuple[str, ...] = ()
+    compared: dict[str, float] = field(default_factory=dict)
 
 
 def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int = 0) -> PixelFit:
@@ -74,8 +82,42 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
     pixel, values = _match(recordings, regions, observed, replace(pixel, cutoff_hz=cutoff), seed, 2)
     error = _errors(recordings, regions, pixel, values, seed)
     if pixel.leak_rate_hz < error["leak_rate_hz"]:
-        pixel = replace(pixel, leak_rate_hz=0.0)  # not told from none
-    return PixelFit(pixel, error, allowed, shortest_interval_s([r.events for r in recordings]))
+        pixel = replace(pixel, leak_rate_hz=0.0, initial_phase=None)  # not told from none: at rest at first
+    edge = tuple(
+        n for n in ("threshold_on", "threshold_off") if math.log(getattr(pixel, n)) > _HIGHEST[0] - 0.02
+    )
+    if cutoff in (_CUTOFFS_HZ[0], _CUTOFFS_HZ[-1]) and allowed[0] == allowed[1]:
+        edge = (*edge, "cutoff_hz")
+    return PixelFit(pixel, error, allowed, shortest_interval_s([r.events for r in recordings]), edge)
+
+
+def choose_pixel(
+    known: PixelFit, recordings: Sequence[Recording], held: Sequence[Recording], *, seed: int = 0
+) -> PixelFit:
+    """Return the fit of the event model whose events are nearest to those of captures held out.
+
+    Another model than v2e's must be better by a tenth, and by more than thrice the scatter of the difference.
+
+    Args:
+        known: The fit of v2e's continuous pixel.
+        recordings: Light and events to fit.
+        held: Light and events to judge on.
+        seed: Seed of the simulations.
+    """
+    few, judged = ([thinned(r) for r in part] for part in (recordings, held))
+    best, least = known, misfit(judged, known.pixel, seed)
+    compared = {CONTINUOUS: float(least.sum())}
+    for name in MODELS:
+        found = fit_model(few, name, known.pixel, seed=seed)
+        pixel, cutoff = found.pixel, None
+        if isinstance(pixel, EventPixel):
+            corner, cutoff = _scan_cutoff(few, pixel, seed)
+            pixel = replace(pixel, cutoff_hz=corner)
+        after = misfit(judged, pixel, seed)
+        compared[name] = float(after.sum())
+        if is_better(least, after):
+            best, least = PixelFit(pixel, found.error, cutoff, known.dead_time_s, found.on_edge), after
+    return replace(best, compared=compared)
 
 
 def _first_guess(
@@ -100,7 +142,7 @@ def _with(pixel: EventPixel, values: NDArray[np.float64]) -> EventPixel:
         name: float(v) if name not in _LOG_NAMES else math.exp(v)
         for name, v in zip(_NAMES, values, strict=True)
     }
-    return replace(pixel, **chosen)
+    return replace(pixel, **chosen, initial_phase=None)  # at rest at first where nothing leaks
 
 
 def _values(pixel: EventPixel) -> list[float]:

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Shots
-from evnlos.calibration.frame_model import AnyTransport
 from evnlos.calibration.frame_noise import local_square
 from evnlos.errors import DataError
 from evnlos.seeds import derive_seed
-from evnlos.sensor import EventPixel, simulate_events
+from evnlos.sensor import PixelSettings, simulate_events
 from evnlos.sensor.light import WHITE_DN
+from evnlos.setups import Setup
 from evnlos.types import Events
 
 _STEP_PX = 0.2  # the light is linear in time between two rendered instants
@@ -54,13 +54,13 @@ class Recording:
         """Length of the part that counts, seconds."""
         return float(self.times_s[-1]) - self.settled_us * 1e-6
 
-    def simulate(self, pixel: EventPixel, seed: int) -> Events:
+    def simulate(self, pixel: PixelSettings, seed: int) -> Events:
         """Return the events of a pixel under the same light."""
         return simulate_events(self.light, self.times_s, pixel, seed=seed)
 
 
-def read_recordings(shots: Shots, transport: AnyTransport, count: int) -> list[Recording]:
-    """Render the light of `count` captures, evenly chosen, from a fitted transport.
+def read_recordings(shots: Shots, setup: Setup, count: int) -> list[Recording]:
+    """Render the light of `count` captures, evenly chosen, from a fitted setup.
 
     Raises:
         DataError: The sensor is so large that not even one capture's light fits in 1 GiB.
@@ -70,7 +70,7 @@ def read_recordings(shots: Shots, transport: AnyTransport, count: int) -> list[R
     recordings, used = [], 0
     for k in chosen:
         capture, scene = shots.captures[k], shots.scenes[k]
-        wall = transport.wall(scene, shots.shape)
+        wall = setup.resized(shots.shape).observe(scene)
         first, last = (float(t) * 1e-6 for t in capture.frame_times_us[[0, -1]])
         steps = max(8, math.ceil((last - first) * wall.speed_px_s / _STEP_PX))
         used += 4 * (steps + 1) * height * width
@@ -151,6 +151,6 @@ def count_map(events: Events, polarity: bool, after_us: int) -> NDArray[np.int64
     return np.bincount(flat, minlength=events.width * events.height).reshape(events.height, events.width)
 
 
-def simulated(recordings: Sequence[Recording], pixel: EventPixel, seed: int) -> list[Events]:
+def simulated(recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> list[Events]:
     """Return simulated events of all recordings; the same seed draws the same mismatch and noise."""
     return [r.simulate(pixel, derive_seed(seed, "calibration", k)) for k, r in enumerate(recordings)]

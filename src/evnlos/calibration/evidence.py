@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.setups import Setup
 from evnlos.solver import PlatePass
 from evnlos.solver.glyph_prior import handwritten_plates
 from evnlos.solver.plate_pass import strip_gram_of, strip_of
-from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.transport import MatrixTransport
 from evnlos.types import Plane
 
 WRITERS = 3
@@ -110,7 +111,7 @@ class MovingLight:
         """Standard deviation of what moves, white levels."""
         return float(self.moving.square().mean().sqrt())
 
-    def explained(self, rig: RadiometricTransport) -> Explained:
+    def explained(self, rig: Setup) -> Explained:
         """Return how a rig explains the frames at its best gain and noise."""
         from scipy.optimize import minimize  # scipy loads slowly
 
@@ -129,7 +130,7 @@ class MovingLight:
         plates = self._plates(terms, gain, variance)
         return Explained(float(found.fun), gain, math.sqrt(variance), plates)
 
-    def explained_at(self, rig: RadiometricTransport, gain: float, noise: float) -> Explained:
+    def explained_at(self, rig: Setup, gain: float, noise: float) -> Explained:
         """Return how a rig explains the frames at a gain and a noise that other passes told."""
         terms, variance = self.terms(rig), noise**2
         return Explained(terms.cost(gain, variance), gain, noise, self._plates(terms, gain, variance))
@@ -138,7 +139,7 @@ class MovingLight:
         plates = self._prior.mean + terms.code(gain, variance) @ terms.turn.mT @ self._prior.root.mT
         return plates.unflatten(1, self.plate.shape)
 
-    def terms(self, rig: RadiometricTransport) -> EvidenceTerms:
+    def terms(self, rig: Setup) -> EvidenceTerms:
         """Return what the evidence of a rig is made of, all but gain and noise."""
         sight = self.sight(rig)
         gram = sight.gram(strip_gram_of(sight.transport), static=math.inf)
@@ -156,12 +157,12 @@ class MovingLight:
             samples=self.moving[0].numel() - self.moving[0, 0].numel(),
         )
 
-    def predicted(self, rig: RadiometricTransport, known: Explained) -> torch.Tensor:
+    def predicted(self, rig: Setup, known: Explained) -> torch.Tensor:
         """Return what moves in the frames that a rig makes of known plates, [P, N, h, w]."""
         frames = known.gain * self.sight(rig)(known.plates)
         return frames - frames.mean(dim=1, keepdim=True)
 
-    def sight(self, rig: RadiometricTransport) -> PlatePass:
+    def sight(self, rig: Setup) -> PlatePass:
         """Return the operator from a plate to all frames, at gain 1."""
         shape = (int(self.moving.shape[2]), int(self.moving.shape[3]))
         matrix = rig.matrix(shape, self._strip)

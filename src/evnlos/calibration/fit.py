@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,22 +14,25 @@ from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Shots, read_shots
 from evnlos.calibration.event_check import event_residuals
-from evnlos.calibration.event_fit import PixelFit, fit_pixel
+from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import read_recordings
-from evnlos.calibration.frame_model import AnyTransport, FrameModel
+from evnlos.calibration.frame_model import FrameModel
 from evnlos.calibration.frame_noise import FrameNoise, fit_frame_noise
 from evnlos.calibration.residual import Residual
 from evnlos.calibration.settings import Calibration
 from evnlos.calibration.training_set import pens_of, training_simulation
 from evnlos.calibration.transport_fit import TransportFit, fit_transport
 from evnlos.calibration.unlabelled import fit_unlabelled
-from evnlos.dataset.simulate import SensorSize, Simulation
+from evnlos.calibration.wall_optics import fit_wall
+from evnlos.dataset.simulate import Simulation
 from evnlos.errors import DataError
 from evnlos.scene import LineMotion, Strokes
 from evnlos.sensor import EventPixel
-from evnlos.transport import MeasuredTransport, RadiometricTransport
+from evnlos.sensor.pixel import continuous
+from evnlos.setups import RadiometricSetup, SensorSize, Setup
 
 _EXAMPLES = 3
+_FEWEST_FOR_ANY = 5  # captures: fewer do not tell a wall's slopes from a camera's place
 _WITHOUT_PATTERN = "frames held out, without pattern"
 _MOST_OF_NOISE = 1.1
 _MOST_UNEXPLAINED = {"known": 0.05, "unknown": 0.2}  # plates that nobody knows are never expected exactly
@@ -72,6 +76,7 @@ class RigFit:
             "frames held out, without pattern", before and after the fixed pattern is taken from the frames.
         example: Held-out captures beside the fit.
         targets: Whether the captures' targets were known.
+        mean_frame: Residual of the frames held out where the mean of the fitted frames stands for the model.
     """
 
     simulation: Simulation
@@ -84,6 +89,7 @@ class RigFit:
     residuals: dict[str, Residual]
     example: tuple[Example, ...]
     targets: Literal["known", "unknown"] = "known"
+    mean_frame: float = math.inf
 
     @property
     def unexplained(self) -> Residual | None:
@@ -98,10 +104,13 @@ class RigFit:
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """Names of the residuals on held-out captures that the fit did not lower."""
-        return tuple(
+        """Residuals on held-out captures that the fit did not lower, or not below those of the mean frame."""
+        found = [
             name for name, r in self.residuals.items() if name.endswith("held out") and not r.after < r.before
-        )
+        ]
+        if not self.residuals["frames held out"].after < self.mean_frame and "frames held out" not in found:
+            found.append("frames held out")
+        return tuple(found)
 
 
 def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) -> RigFit:
@@ -133,15 +142,16 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
     )
     start, fixed = _at_known_distance(settings, fit)
     residuals: dict[str, Residual] = {}
-    if settings.targets == "known":
+    if isinstance(start, RadiometricSetup) and _is_any(settings, fit):
+        optics = fit_wall(fit, held, start, fit_distance=settings.fit_distance).optics
+    elif settings.targets == "known":
         optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
     else:
-        assert isinstance(start, RadiometricTransport)  # `Calibration` refuses any other
         found = fit_unlabelled(fit, held, start, fixed=fixed)
         optics, fit, held = found.optics, found.fitted, found.held_out
         residuals["every other frame held out"] = found.check
     models = {"fit": FrameModel(fit, fit.shape), "held out": FrameModel(held, held.shape)}
-    predicted = {name: model.predict(optics.transport) for name, model in models.items()}
+    predicted = {name: model.predict(optics.setup) for name, model in models.items()}
     noise = fit_frame_noise(fit, predicted["fit"].numpy(), settings.start.frame_camera)
     for name, model in models.items():
         before = model.relative((model.frames - model.predict(optics.before)) * model.weight)
@@ -154,18 +164,19 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
     residuals[_WITHOUT_PATTERN] = replace(
         residuals["frames held out"], before=residuals["frames held out"].after, after=corrected
     )
-    simulation = _simulation(settings, fit, optics.transport, noise, settings.start.pixel)
+    start_pixel = continuous(settings.start.pixel)
+    simulation = _simulation(settings, fit, optics.setup, noise, start_pixel)
     pixel: PixelFit | None = None
     surfaces: Surfaces = {}
     if settings.events:
-        recordings = read_recordings(fit, optics.transport, settings.event_captures)
-        pixel = fit_pixel(recordings, settings.start.pixel, seed=settings.seed)
-        simulation = replace(simulation, pixel=pixel.pixel)
-        checks = {"fit": (fit, recordings), "held out": (held, None)}
-        for name, (shots, known) in checks.items():
-            found = known or read_recordings(shots, optics.transport, settings.event_captures)
+        recordings = read_recordings(fit, optics.setup, settings.event_captures)
+        there = read_recordings(held, optics.setup, settings.event_captures)
+        pixel = fit_pixel(recordings, start_pixel, seed=settings.seed)
+        pixel = choose_pixel(pixel, recordings, there, seed=settings.seed)
+        simulation = simulation.with_setup(pixel=pixel.pixel)
+        for name, (shots, found) in {"fit": (fit, recordings), "held out": (held, there)}.items():
             events, surfaces = event_residuals(
-                shots, found, settings.start.pixel, pixel.pixel, simulation.sampling, settings.seed
+                shots, found, start_pixel, pixel.pixel, simulation.sampling, settings.seed
             )
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
@@ -184,25 +195,32 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
         residuals,
         examples,
         settings.targets,
+        float(seen.relative((seen.frames - models["fit"].frames.mean(dim=0)) * seen.weight)),
     )
 
 
-def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[AnyTransport, tuple[str, ...]]:
+def _is_any(settings: Calibration, fit: Shots) -> bool:
+    """Return whether a wall of any kind is fitted."""
+    enough = settings.wall == "any" or (settings.wall == "auto" and len(fit.captures) >= _FEWEST_FOR_ANY)
+    return settings.targets == "known" and enough
+
+
+def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[Setup, tuple[str, ...]]:
     """Return the start at the measured distance of target and wall, and the names of what is known."""
     noted = shots.captures[0].info.rig.get("distance_m")
-    transport = settings.start.transport
-    assert not isinstance(transport, MeasuredTransport)  # `Calibration` refuses it
+    setup = settings.start.setup
     if noted is not None:
         if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not noted > 0:
             raise DataError(
                 f"{shots.names[0]}: rig.distance_m is {noted!r}; give the metres from target to wall, above 0"
             )
-        transport = replace(transport, distance_m=float(noted))
-    return transport, () if settings.fit_distance else ("distance_m",)
+        if setup.default_distance_m is not None:
+            setup = setup.with_parameters({"distance_m": float(noted)})
+    return setup, () if settings.fit_distance else ("distance_m",)
 
 
 def _simulation(
-    settings: Calibration, shots: Shots, transport: AnyTransport, noise: FrameNoise, pixel: EventPixel
+    settings: Calibration, shots: Shots, setup: Setup, noise: FrameNoise, pixel: EventPixel
 ) -> Simulation:
     """Return the start with everything that the captures tell: plate, motion, length, positions, sensor."""
     scene, start = shots.scenes[0], settings.start
@@ -217,10 +235,7 @@ def _simulation(
         motion=replace(motion, start_m=(float(x), float(y)), start_s=0.0),
         duration_s=float(times[-1] - times[0]),
         positions=len(times) - 1,
-        transport=transport,
-        sensor=SensorSize(*shots.shape),
-        frame_camera=noise.camera,
-        pixel=pixel,
+        setup=replace(setup, sensor=SensorSize(*shots.shape), frame_camera=noise.camera, pixel=pixel),
     )
 
 

@@ -1,4 +1,4 @@
-"""What a transport predicts for the frames of captures, and the light that fits them best."""
+"""What a setup predicts for the frames of captures, and the light that fits them best."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from evnlos.calibration.captures import Shots
 from evnlos.dataset.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
-from evnlos.transport import PaperTransport, RadiometricTransport
-
-AnyTransport = PaperTransport | RadiometricTransport
+from evnlos.setups import Setup
+from evnlos.setups.base import dense_matrix
+from evnlos.types import Plane
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Light:
     ambient: float
     gradient: tuple[float, float]
 
-    def into(self, transport: AnyTransport) -> AnyTransport:
-        """Return the transport with this gain and ambient light.
+    def into(self, setup: Setup) -> Setup:
+        """Return the setup with this gain and ambient light.
 
         Raises:
             DataError: No camera shows such light: the gain is not positive, or the ambient light is negative.
@@ -45,13 +45,13 @@ class Light:
         # A dark corner may come out a hair below zero; a wall that is dark everywhere has no gradient.
         level = max(self.ambient, 0.0)
         steep = abs(gx) + abs(gy)
-        shrink = min(1.0, 1.0 / steep) if steep > 0 else 1.0
+        shrink = min(1.0, (1.0 - 1e-6) / steep) if steep > 0 else 1.0
         gradient = (gx * shrink, gy * shrink) if level > 0 else (0.0, 0.0)
-        return replace(transport, gain=self.gain, ambient=level, ambient_gradient=gradient)
+        return replace(setup, gain=self.gain, ambient=level, ambient_gradient=gradient)
 
 
 class FrameModel:
-    """The frames of captures at a working size, beside what a transport makes of the same targets.
+    """The frames of captures at a working size, beside what a setup makes of the same targets.
 
     Pixels that a frame shows at its largest number are saturated and take no part.
 
@@ -83,15 +83,16 @@ class FrameModel:
         self._ramp = torch.stack([torch.ones(shape), x.expand(shape), y[:, None].expand(shape)])  # [3, h, w]
         self._drawn: dict[object, torch.Tensor] = {}
 
-    def light(self, transport: AnyTransport) -> torch.Tensor:
+    def light(self, setup: Setup) -> torch.Tensor:
         """Return the light of every frame at gain 1 without ambient light, float32 [N, h, w]."""
-        plain = replace(transport, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0))
-        if isinstance(plain, RadiometricTransport):
+        plain = replace(setup, gain=1.0, ambient=0.0, ambient_gradient=(0.0, 0.0)).resized(self.shape)
+        cells = plain.target_cells()
+        if cells is not None and plain.is_linear:
             # One matrix carries the frames of all captures at once.
-            matrix = plain.transport(self.shape).matrix
-            strips = self._strips(plain)
-            return (strips @ matrix.T.to(strips)).reshape(-1, *self.shape)
-        walls = [plain.wall(scene, self.shape) for scene in self._scenes]
+            matrix = dense_matrix(plain.operator(cells, dtype=torch.float32), torch.float32)
+            strips = self._strips(cells)
+            return (strips @ matrix.T).reshape(-1, *self.shape) + self._along(plain)
+        walls = [plain.observe(scene) for scene in self._scenes]
         return torch.cat([wall.irradiance(times) for wall, times in zip(walls, self._times, strict=True)])
 
     def fit(self, light: torch.Tensor) -> tuple[Light, torch.Tensor]:
@@ -113,19 +114,25 @@ class FrameModel:
         floor = level if abs(level) > 1e-9 else 1e-9
         return Light(gain, level, (gx / floor, gy / floor)), residual
 
-    def predict(self, transport: AnyTransport) -> torch.Tensor:
-        """Return the frames that the transport, with its own gain and ambient light, predicts, [N, h, w]."""
-        gx, gy = transport.ambient_gradient
-        ambient = transport.ambient * (torch.tensor([1.0, gx, gy]) @ self._ramp.flatten(1))
-        return transport.gain * self.light(transport) + ambient.reshape(self.shape)
+    def predict(self, setup: Setup) -> torch.Tensor:
+        """Return the frames that the setup, with its own gain and ambient light, predicts, [N, h, w]."""
+        return setup.gain * self.light(setup) + setup.ambient_light(self.shape)
+
+    def _along(self, setup: Setup) -> torch.Tensor | float:
+        """Return the light of what moves along with the targets, [N, h, w], or nothing."""
+        places = [
+            scene.motion.position_m(times) for scene, times in zip(self._scenes, self._times, strict=True)
+        ]
+        where, index = np.unique(np.concatenate(places), axis=0, return_inverse=True)
+        light = setup.companion_light(where)
+        return 0.0 if light is None else light[torch.from_numpy(index.reshape(-1))]
 
     def relative(self, residual: torch.Tensor) -> float:
         """Return the root mean square of a residual over the frames' standard deviation, over all pixels."""
         return relative_residual(residual, self.frames, self.weight)
 
-    def _strips(self, transport: RadiometricTransport) -> torch.Tensor:
+    def _strips(self, plane: Plane) -> torch.Tensor:
         """Return every frame's target on the strip of cells, float32 [N, cells]; drawn once for each strip."""
-        plane = transport.source()
         if plane not in self._drawn:
             drawn = [
                 scene.target.rasterise(plane, scene.motion.position_m(times))
@@ -178,13 +185,10 @@ def working_shape(shape: tuple[int, int], columns: int) -> tuple[int, int]:
     return min(candidates, key=lambda s: (round(abs(s[0] * width / (s[1] * height) - 1), 6), s[1]))
 
 
-def fitting_strip(transport: AnyTransport, shots: Shots) -> AnyTransport:
-    """Return the transport with a strip that holds every target of the captures on its way."""
-    if not isinstance(transport, RadiometricTransport):
-        return transport
+def fitting_strip(setup: Setup, shots: Shots) -> Setup:
+    """Return the setup with room for every target of the captures on its way."""
     reach: NDArray[np.float64] = np.zeros(2)
     for k, scene in enumerate(shots.scenes):
         places = np.abs(scene.motion.position_m(shots.times_s(k))).max(axis=0)
         reach = np.maximum(reach, places + scene.target.size_m / 2)
-    width, height = (max(s, round(float(2 * r), 9)) for s, r in zip(transport.strip_m, reach, strict=True))
-    return replace(transport, strip_m=(width, height))
+    return setup.covering((float(2 * reach[0]), float(2 * reach[1])))

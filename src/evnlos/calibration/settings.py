@@ -9,13 +9,13 @@ from typing import Literal
 from evnlos.dataset.simulate import Simulation
 from evnlos.errors import ConfigError
 from evnlos.scene import HandwritingGlyphs
-from evnlos.transport import MeasuredTransport, PaperTransport, RadiometricTransport
+from evnlos.setups import PaperSetup, RadiometricSetup
 
 
 def _rough_metal() -> Simulation:
     return Simulation(
         glyphs=HandwritingGlyphs(characters="ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789", writers=8),
-        transport=RadiometricTransport(roughness=0.1),
+        setup=RadiometricSetup(roughness=0.1),
     )
 
 
@@ -32,6 +32,9 @@ class Calibration:
     targets: Literal["known", "unknown"] = "known"
     """Whether the captures' targets are known; where not, any handwriting is as likely, and what the files say
     of targets is not looked at."""
+    wall: Literal["auto", "any", "formula"] = "auto"
+    """Whether the wall may be of any kind (slopes of its facets, texture, bend; what shines along), or is rough
+    metal by one formula; `auto` is the first where targets are known and five captures or more are fitted."""
     fit_distance: bool = False
     """Fit the distance of target and wall too; else that of the capture's notes is taken as measured."""
     events: bool = True
@@ -50,13 +53,14 @@ class Calibration:
             raise ConfigError(
                 f"Calibration.holdout_share is {self.holdout_share}; give a share between 0 and 1"
             )
-        if isinstance(self.start.transport, MeasuredTransport):
+        setup = self.start.setup
+        if not setup.parameters():
             raise ConfigError(
-                "start.transport is measured, which leaves no optics to fit; give paper or radiometric"
+                f"start.setup is {setup.kind}, which leaves no optics to fit; give paper or radiometric"
             )
-        if self.targets == "unknown" and not isinstance(self.start.transport, RadiometricTransport):
+        if self.targets == "unknown" and not setup.is_linear:
             raise ConfigError(
-                f"start.transport is {self.start.transport.kind}; a fit to unknown targets needs radiometric"
+                f"start.setup is {setup.kind}, which is not linear; a fit to unknown targets needs radiometric"
             )
         if self.columns < 16:
             raise ConfigError(f"Calibration.columns is {self.columns}; give 16 pixels or more")
@@ -72,8 +76,8 @@ def rough_metal() -> Calibration:
 def paper() -> Calibration:
     """Return the calibration of the paper's transport: tPSF length and shape, and an affine view."""
     start = _rough_metal()
-    transport = PaperTransport(pitch_m=1e-3, rho_max=6.0, taper=0.3, field_of_view_m=0.5)
-    return Calibration(start=Simulation(glyphs=start.glyphs, transport=transport))
+    transport = PaperSetup(pitch_m=1e-3, rho_max=6.0, taper=0.3, field_of_view_m=0.5)
+    return Calibration(start=Simulation(glyphs=start.glyphs, setup=transport))
 
 
 PRESETS: dict[str, Callable[[], Calibration]] = {"default": rough_metal, "paper": paper}

@@ -10,12 +10,20 @@ from typing import Any
 
 from evnlos.calibration.fit import RigFit
 from evnlos.calibration.residual import Residual
-from evnlos.config import save_yaml, write_atomically
+from evnlos.calibration.transport_fit import values_of
+from evnlos.calibration.wall_optics import WALL_FILE
+from evnlos.config import save_yaml
 from evnlos.dataset.fixed_pattern import PATTERN_FILE, save_pattern
+from evnlos.dataset.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
+from evnlos.files import write_atomically
+from evnlos.setups import CALIBRATED_FILE, FittedSetup
 from evnlos.version import __version__
 
-RIG_FILE, TRAINING_FILE, FIGURES_FILE = "rig.yaml", "training.yaml", "calibration.json"
+RIG_FILE, TRAINING_FILE, FIGURES_FILE = CALIBRATED_FILE, "training.yaml", "calibration.json"
+
+_MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25
+_GOOD, _FAIR, _POOR = 3.0, 6.0, 10.0  # per cent of the light beside the noise
 
 _UNTOLD = "not told by unknown targets: arbitrary"
 _ANOTHER_WALL = "the wall may be of another kind: measure its transport (evnlos scan), or try"
@@ -52,25 +60,26 @@ def rows_of(fit: RigFit, start_pixel: Any, start_camera: Any) -> list[Row]:
         start_camera: Frame camera of the start.
     """
     optics = fit.optics
-    first, last = optics.before, optics.transport
+    first, last = optics.before, optics.setup
+    start, end = values_of(first), values_of(last)
     bound = {name: f"on the bound of the search: {value:.4g}" for name, value in optics.on_bound.items()}
     rows = [
-        Row(f"transport.{p.name}", p.read(first), p.read(last), float(e), p.unit, bound.get(p.name, ""))
+        Row(f"setup.{p.name}", start[p.name], end[p.name], float(e), p.unit, bound.get(p.name, ""))
         for p, e in zip(optics.parameters, optics.error, strict=True)
     ]
     gain = _UNTOLD if fit.targets == "unknown" else ""
     rows += [
-        Row("transport.gain", first.gain, last.gain, None, "white levels", gain),
-        Row("transport.ambient", first.ambient, last.ambient, None, "white levels"),
+        Row("setup.gain", first.gain, last.gain, None, "white levels", gain),
+        Row("setup.ambient", first.ambient, last.ambient, None, "white levels"),
     ]
     rows += [
-        Row(f"transport.ambient_gradient.{k}", first.ambient_gradient[k], last.ambient_gradient[k], None, "")
+        Row(f"setup.ambient_gradient.{k}", first.ambient_gradient[k], last.ambient_gradient[k], None, "")
         for k in range(2)
     ]
     camera = fit.noise.camera
     units = {"full_well_e": "electrons", "read_noise_e": "electrons", "prnu": "", "dsnu_e": "electrons"}
     rows += [
-        Row(f"frame_camera.{name}", getattr(start_camera, name), getattr(camera, name), None, unit)
+        Row(f"setup.frame_camera.{name}", getattr(start_camera, name), getattr(camera, name), None, unit)
         for name, unit in units.items()
     ]
     left = zip(("prnu", "dsnu_e"), fit.noise.remaining, strict=True)
@@ -85,29 +94,31 @@ def _pixel_rows(fit: RigFit, start: Any) -> list[Row]:
         return []
     pixel, error = fit.pixel.pixel, fit.pixel.error
     rows = [
-        Row(f"pixel.{name}", getattr(start, name), getattr(pixel, name), error[name], unit)
-        for name, unit in (
-            ("threshold_on", "log units"),
-            ("threshold_off", "log units"),
-            ("threshold_sigma", "log units"),
-            ("leak_rate_hz", "Hz"),
-            ("shot_noise_rate_hz", "Hz"),
-        )
-    ]
-    low, high = fit.pixel.cutoff_range_hz
-    rows.append(
         Row(
-            "pixel.cutoff_hz",
-            start.cutoff_hz,
-            pixel.cutoff_hz,
-            None,
-            "Hz",
-            f"of those tried: {low:g} to {high:g}",
+            f"setup.pixel.{name}",
+            getattr(start, name, getattr(pixel, name)),
+            getattr(pixel, name),
+            value,
+            unit_of(name),
         )
-    )
-    bound = f"not identified: at most {fit.pixel.dead_time_s:g}"
-    rows.append(Row("pixel.refractory_s", start.refractory_s, pixel.refractory_s, None, "s", bound))
+        for name, value in error.items()
+    ]
+    if fit.pixel.cutoff_range_hz is not None:
+        low, high = fit.pixel.cutoff_range_hz
+        tried = f"of those tried: {low:g} to {high:g}"
+        cutoff = getattr(pixel, "cutoff_hz", 0.0)
+        rows.append(Row("setup.pixel.cutoff_hz", start.cutoff_hz, cutoff, None, "Hz", tried))
+    if hasattr(pixel, "refractory_s"):
+        bound = f"not identified: at most {fit.pixel.dead_time_s:g}"
+        kept = getattr(pixel, "refractory_s", 0.0)
+        rows.append(Row("setup.pixel.refractory_s", start.refractory_s, kept, None, "s", bound))
     return rows
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of an event pixel's number by its name."""
+    endings = {"_per_dn_hz": "Hz/DN", "_hz": "Hz", "_dn": "DN", "noise": "log units"}
+    return next((unit for ending, unit in endings.items() if name.endswith(ending)), "log units")
 
 
 def table(rows: list[Row]) -> str:
@@ -139,11 +150,49 @@ def warnings_of(fit: RigFit) -> list[str]:
     """Return why a fit should not be believed as it stands, one line each; none where nothing was found."""
     found, cure = [], f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
     if on_bound := fit.optics.on_bound:
-        names = ", ".join(f"transport.{name} ({value:.4g})" for name, value in on_bound.items())
+        names = ", ".join(f"setup.{name} ({value:.4g})" for name, value in on_bound.items())
         found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")
     if fit.unexplained is not None:
         found.append(f"{_left(fit.unexplained)}; {cure}")
+    return found + _event_warnings(fit)
+
+
+def _event_warnings(fit: RigFit) -> list[str]:
+    """Return where the event pixel does not make what the camera recorded."""
+    counts = fit.residuals.get("counts held out")
+    if fit.pixel is None or counts is None:
+        return []
+    found = []
+    if counts.after > _MOST_OF_COUNTS * counts.noise and counts.unexplained > _LEAST_OF_COUNTS:
+        found.append(
+            f"counts held out: {100 * counts.after:.0f} % is left where noise alone leaves "
+            f"{100 * counts.noise:.0f} %: this sensor is not of the event model's kind, so do not rely on a "
+            "network that has seen simulated events alone; train with frames, or fine-tune on captures"
+        )
+    if fit.pixel.on_edge:
+        found.append(
+            f"pixel.{', pixel.'.join(fit.pixel.on_edge)}: ended on the edge of what was tried, so the event "
+            "pixel is not known; the sensor may be of another kind"
+        )
     return found
+
+
+def expectation(fit: RigFit) -> str:
+    """Return in one line what training on the calibrated simulation can be expected to bring."""
+    left = fit.residuals["frames held out, without pattern"]
+    share, frames = 100 * left.unexplained, "frames"
+    if not left.after < 1:
+        return f"EPNP: do not use this setup, its {frames} are further from the camera's than their mean"
+    if share < _GOOD:
+        what = "ahead of end-to-end training by 2 dB or more with some hundred simulated objects"
+    elif share < _FAIR:
+        what = "ahead of end-to-end training by about 1 dB"
+    elif share < _POOR:
+        what = "about level with end-to-end training; only fine-tuned networks"
+    else:
+        what = "behind end-to-end training; measure the wall instead (evnlos scan)"
+    events = "; events: not to be trusted without fine-tuning" if _event_warnings(fit) else ""
+    return f"EPNP on this setup: {what} ({share:.1f} % of the light unexplained beside the noise){events}"
 
 
 def _left(r: Residual) -> str:
@@ -161,8 +210,10 @@ def figures(fit: RigFit, rows: list[Row]) -> dict[str, Any]:
         "held_out": list(fit.held_out),
         "targets": fit.targets,
         "worse_on_held_out": list(fit.worse),
-        "on_bound": [f"transport.{name}" for name in fit.optics.on_bound],
+        "event_models": {} if fit.pixel is None else fit.pixel.compared,
+        "on_bound": [f"setup.{name}" for name in fit.optics.on_bound],
         "warnings": warnings_of(fit),
+        "expectation": expectation(fit),
         "residuals": {
             name: {"before": round(r.before, 5), "after": round(r.after, 5), "noise": round(r.noise, 5)}
             for name, r in fit.residuals.items()
@@ -190,16 +241,6 @@ def check_out(out: Path, force: bool) -> None:
         raise ConfigError(f"{out} is a file; give a folder for the rig")
     if (out / RIG_FILE).exists() and not force:
         raise ConfigError(f"{out / RIG_FILE} exists; give another folder, or --force to replace it")
-
-
-def rig_file(path: Path) -> Path:
-    """Return the rig file of a folder that `calibrate` wrote; any other path stays as it is.
-
-    Example:
-        >>> str(rig_file(Path("rig.yaml")))
-        'rig.yaml'
-    """
-    return path / RIG_FILE if (path / RIG_FILE).is_file() else path
 
 
 def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> Path:
@@ -238,6 +279,17 @@ def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> P
             f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
         )
     save_pattern(fit.noise.pattern, out / PATTERN_FILE)
-    save_yaml(fit.training, out / TRAINING_FILE)
-    save_yaml(fit.simulation, out / RIG_FILE)
+    save_yaml(_with_wall(fit, fit.training, out), out / TRAINING_FILE)
+    save_yaml(_with_wall(fit, fit.simulation, out), out / RIG_FILE)
     return out / RIG_FILE
+
+
+def _with_wall(fit: RigFit, simulation: Simulation, out: Path) -> Simulation:
+    """Return the simulation with the file of its fitted wall in the rig's folder; copied there."""
+    setup = simulation.setup
+    if not isinstance(setup, FittedSetup):
+        return simulation
+    path = (out / WALL_FILE).resolve()
+    if Path(setup.file).resolve() != path:
+        write_atomically(path, Path(setup.file).read_bytes())
+    return simulation.with_setup(file=str(path), misfit="; ".join(warnings_of(fit)))

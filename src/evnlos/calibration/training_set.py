@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -11,18 +12,20 @@ from evnlos.calibration.event_fit import PixelFit
 from evnlos.calibration.frame_noise import FrameNoise
 from evnlos.dataset.simulate import Simulation
 from evnlos.scene import HandwritingGlyphs, Strokes, pen_width
-from evnlos.transport import RadiometricTransport
 
 _PEN_MARGIN = 0.1  # the pens' range is widened by this fraction at both ends
 _SPREAD = {
-    "transport.roughness": 0.04,
-    "transport.gain": 0.08,
-    "transport.ambient": 0.08,
-    "frame_camera.full_well_e": 0.1,
-    "frame_camera.read_noise_e": 0.1,
-    "pixel.threshold_on": 0.05,
-    "pixel.threshold_off": 0.05,
-    "pixel.shot_noise_rate_hz": 0.1,
+    "setup.roughness": 0.04,
+    "setup.slopes": 0.03,
+    "setup.gain": 0.08,
+    "setup.ambient": 0.08,
+    "setup.frame_camera.full_well_e": 0.1,
+    "setup.frame_camera.read_noise_e": 0.1,
+    "setup.pixel.threshold_on": 0.05,
+    "setup.pixel.threshold_off": 0.05,
+    "setup.pixel.shot_noise_rate_hz": 0.1,
+    "setup.pixel.photon_noise": 0.2,
+    "setup.pixel.leak_rate_per_dn_hz": 0.1,
 }
 """Relative half-widths: far more than the fit's own errors, because no wall is exactly its model."""
 
@@ -59,16 +62,19 @@ def training_simulation(
         glyphs = replace(glyphs, strokes=strokes)
     vary = dict(fitted.vary)
     for path, spread in _SPREAD.items():
-        section, name = path.split(".")
-        if hasattr(getattr(fitted, section), name):
-            value = getattr(getattr(fitted, section), name)
+        value: Any = fitted
+        for name in path.split("."):
+            value = getattr(value, name, None)
+        if value is not None:
             vary[path] = (value * (1 - spread), value * (1 + spread))
-    transport = fitted.transport
-    if isinstance(transport, RadiometricTransport) and transport.target_offset_m is not None:
-        for axis, value in enumerate(transport.target_offset_m):
-            vary[f"transport.target_offset_m.{axis}"] = (value - _SLACK_M, value + _SLACK_M)
+    for one in fitted.setup.parameters():
+        if one.role == "place":
+            vary[f"setup.{one.name}"] = (one.value - _SLACK_M, one.value + _SLACK_M)
     if pixel is not None:
-        vary["pixel.cutoff_hz"] = pixel.cutoff_range_hz
-        vary["pixel.leak_rate_hz"] = (0.0, max(_LEAK_HZ, fitted.pixel.leak_rate_hz))
+        if pixel.cutoff_range_hz is not None:
+            vary["setup.pixel.cutoff_hz"] = pixel.cutoff_range_hz
+        vary["setup.pixel.leak_rate_hz"] = (0.0, max(_LEAK_HZ, getattr(pixel.pixel, "leak_rate_hz", 0.0)))
     camera = replace(fitted.frame_camera, prnu=prnu, dsnu_e=dsnu, pattern_seed=None)
-    return replace(fitted, glyphs=glyphs, frame_camera=camera, vary=vary, rigs=_RIGS)
+    return replace(
+        fitted, glyphs=glyphs, setup=replace(fitted.setup, frame_camera=camera), vary=vary, rigs=_RIGS
+    )

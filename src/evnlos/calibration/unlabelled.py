@@ -12,11 +12,18 @@ from evnlos.calibration.captures import Shots
 from evnlos.calibration.evidence import Explained, MovingLight
 from evnlos.calibration.frame_model import FrameModel, working_shape
 from evnlos.calibration.residual import Residual
-from evnlos.calibration.transport_fit import Parameter, TransportFit, moved, parameters_of, sampled
+from evnlos.calibration.transport_fit import (
+    TransportFit,
+    encoded,
+    moved,
+    parameters_of,
+    rescaled,
+    values_of,
+)
 from evnlos.dataset.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import Target
-from evnlos.transport import RadiometricTransport
+from evnlos.setups import Parameter, Setup
 
 CELLS = 12
 """Cells a side of the unknown plate."""
@@ -46,7 +53,7 @@ class UnlabelledFit:
 
 
 def fit_unlabelled(
-    fit: Shots, held: Shots, start: RadiometricTransport, *, fixed: tuple[str, ...] = (), iterations: int = 25
+    fit: Shots, held: Shots, start: Setup, *, fixed: tuple[str, ...] = (), iterations: int = 25
 ) -> UnlabelledFit:
     """Fit a rig to passes of unknown objects with known motion, and check it on other passes.
 
@@ -63,7 +70,7 @@ def fit_unlabelled(
     Raises:
         DataError: The captures move in different ways, or no camera near the start explains them.
     """
-    start = replace(start, target_offset_m=start.offset_m())
+    start = start.with_parameters(values_of(start))
     light = _moving(fit, slice(None))
     parameters = parameters_of(start, fixed)
     found = _search(light, _scanned(light, start), parameters, iterations)
@@ -73,7 +80,7 @@ def fit_unlabelled(
     unseen = _moving(held, slice(None)).explained_at(found, known.gain, known.noise)
     seen, other = _with_plates(fit, known), _with_plates(held, unseen)
     full = FrameModel(seen, fit.shape, max(1, len(fit.frames()) // 200))
-    lit = [full.fit(full.light(sampled(rig)))[0].into(sampled(rig)) for rig in (start, found)]
+    lit = [full.fit(full.light(rig.coarsened()))[0].into(rig.coarsened()) for rig in (start, found)]
     optics = TransportFit(lit[0], lit[1], parameters, _errors(light, found, parameters))
     return UnlabelledFit(optics, seen, other, Residual(before, after, known.noise / light.spread))
 
@@ -98,24 +105,20 @@ def _moving(shots: Shots, frames: slice) -> MovingLight:
     return MovingLight(torch.from_numpy(np.stack(pictures)), first, shots.plate_m, CELLS)
 
 
-def _scanned(light: MovingLight, start: RadiometricTransport) -> RadiometricTransport:
-    trials = (
-        replace(start, field_of_view_deg=start.field_of_view_deg * a, roughness=start.roughness * b)
-        for a, b in _SCANS
-    )
+def _scanned(light: MovingLight, start: Setup) -> Setup:
+    trials = (rescaled(start, magnification=a, blur=b) for a, b in _SCANS)
     return min(trials, key=lambda rig: _cost(light, rig))
 
 
-def _search(
-    light: MovingLight, start: RadiometricTransport, parameters: tuple[Parameter, ...], iterations: int
-) -> RadiometricTransport:
+def _search(light: MovingLight, start: Setup, parameters: tuple[Parameter, ...], iterations: int) -> Setup:
     from scipy.optimize import minimize  # scipy loads slowly
 
-    middle = np.array([p.encode(p.read(start)) for p in parameters])
+    here = values_of(start)
+    middle = np.array([encoded(p, here[p.name]) for p in parameters])
     scale = np.array([_SCALE * p.step for p in parameters])
 
     def cost(at: NDArray[np.float64]) -> float:
-        return _cost(light, _rig(start, parameters, middle + at * scale))
+        return _cost(light, moved(start, parameters, middle + at * scale))
 
     def slope(at: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         here, half = cost(at), 0.5 / _SCALE
@@ -123,7 +126,7 @@ def _search(
         return here, np.array([(up - down) / (2 * half) for up, down in pairs])
 
     bounds = [
-        ((p.encode(p.low) - m) / s, (p.encode(p.high) - m) / s)
+        ((encoded(p, p.low) - m) / s, (encoded(p, p.high) - m) / s)
         for p, m, s in zip(parameters, middle, scale, strict=True)
     ]
     found = minimize(
@@ -136,25 +139,17 @@ def _search(
     )
     if not found.fun < _FAR:
         raise DataError("no camera near the start explains the frames; give a start that is nearer to the rig")
-    return _rig(start, parameters, middle + found.x * scale)
+    return moved(start, parameters, middle + found.x * scale)
 
 
-def _rig(
-    start: RadiometricTransport, parameters: tuple[Parameter, ...], values: NDArray[np.float64]
-) -> RadiometricTransport:
-    rig = moved(start, parameters, values)
-    assert isinstance(rig, RadiometricTransport)
-    return rig
-
-
-def _cost(light: MovingLight, rig: RadiometricTransport) -> float:
+def _cost(light: MovingLight, rig: Setup) -> float:
     try:
         return light.explained(rig).cost
     except ConfigError:  # a camera that can't be, e.g. one that sees past the wall: the search turns back
         return _FAR
 
 
-def _missed(given: MovingLight, asked: MovingLight, rig: RadiometricTransport) -> float:
+def _missed(given: MovingLight, asked: MovingLight, rig: Setup) -> float:
     """Return how far some frames are from what others predict of them, over the spread of what moves."""
     away = asked.moving - asked.predicted(rig, given.explained(rig))
     return float(away.square().mean().sqrt()) / asked.spread
@@ -170,19 +165,18 @@ def _with_plates(shots: Shots, found: Explained) -> Shots:
     )
 
 
-def _errors(
-    light: MovingLight, rig: RadiometricTransport, parameters: tuple[Parameter, ...]
-) -> NDArray[np.float64]:
+def _errors(light: MovingLight, rig: Setup, parameters: tuple[Parameter, ...]) -> NDArray[np.float64]:
     """Return the standard error of each number, the others held, from the evidence's curvature."""
-    values = np.array([p.encode(p.read(rig)) for p in parameters])
+    known = values_of(rig)
+    values = np.array([encoded(p, known[p.name]) for p in parameters])
     count = light.moving.numel()
     here = _cost(light, rig) * count
     found: list[float] = []
     for k, p in enumerate(parameters):
         step = np.zeros(len(values))
         step[k] = p.step
-        sides = [_cost(light, _rig(rig, parameters, values + sign * step)) * count for sign in (1, -1)]
+        sides = [_cost(light, moved(rig, parameters, values + sign * step)) * count for sign in (1, -1)]
         bend = (sum(sides) - 2 * here) / p.step**2
         error = bend**-0.5 if bend > 0 else np.inf
-        found.append(error * (p.read(rig) if p.log else 1.0))
+        found.append(error * (known[p.name] if p.log else 1.0))
     return np.array(found)

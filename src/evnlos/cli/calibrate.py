@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from evnlos.calibration.settings import PRESETS, Calibration
 from evnlos.cli.console import Flat, Folders
 from evnlos.cli.notes import say
+from evnlos.setups import load_setup
 
 __all__ = ["PRESETS", "Command"]
+
+
+def with_setup(settings: Calibration, word: str) -> Calibration:
+    """Return the calibration that starts from the setup of `--setup`."""
+    return replace(settings, start=replace(settings.start, setup=load_setup(word)))
 
 
 @dataclass(frozen=True)
@@ -25,6 +31,9 @@ class Command:
     """Kind of wall: `default` is rough metal (GGX roughness, camera), `paper` the tPSF and an affine view."""
     config: Path | None = None
     """YAML file with settings that replace the preset's."""
+    setup: str | None = None
+    """Where the search starts, of the kind that is fitted: a name, a settings file, or a folder of
+    `calibrate`."""
     force: bool = False
     """Write the rig file also where the fit fails on the held-out captures, or where one exists."""
     json: bool = False
@@ -34,7 +43,7 @@ class Command:
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""
         from evnlos.calibration import figures, fit_rig, residual_table, rows_of, table, warnings_of, write_rig
-        from evnlos.calibration.summary import TRAINING_FILE, check_out
+        from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
         from evnlos.errors import MissingDependencyError
         from evnlos.plot.calibration import draw_calibration
 
@@ -59,3 +68,4 @@ class Command:
                 f"\nto pre-train on:   evnlos simulate --config {path.with_name(TRAINING_FILE)} --out DATASET"
             )
             print(f"captures alike:    evnlos import CAPTURE... --pattern {self.out} --out DATASET")
+            print(expectation(fit))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from evnlos.cli.notes import say
-from evnlos.config import load_yaml, to_dict
+from evnlos.config import to_dict
 from evnlos.dataset import open_dataset
 from evnlos.evaluation import BASELINES, CHECKS
 from evnlos.model.confidence import COVERAGE
@@ -28,34 +28,32 @@ class Command:
     """torchvision's vgg16-397923af.pth for LPIPS; by default it is looked for in the torch hub cache."""
     lpips_heads: Path | None = None
     """The linear heads vgg.pth of LPIPS v0.1; by default those of an installed `lpips`."""
-    rig: Path | None = None
-    """Folder that `calibrate` wrote, or the rig.yaml in it: the confidence then asks how much of the frames the
-    pictures explain. Without it published weights take the rig that they were trained for."""
+    setup: Path | None = None
+    """The calibrated setup (the folder that `calibrate` wrote): the confidence then asks how much of the frames
+    the pictures explain. Without it published weights take the setup that they were trained for."""
     positions: tuple[int, ...] = ()
-    """Numbers of positions, e.g. 1 2 5 10 20 40: also how the picture of a joint network grows with them."""
+    """Numbers of positions, e.g. 1 2 5 10 20 40: also how the image of a sequence network grows with them."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> None:
         """Evaluate and print."""
-        from evnlos.calibration import RIG_FILE
-        from evnlos.cli.reconstruct import calibrated_folder
-        from evnlos.dataset import Simulation
         from evnlos.evaluation import available_lpips, curve_over_positions, evaluate, load_lpips
         from evnlos.model import load_weights, published_rig
         from evnlos.report import refuse_seen, seen_in_training
+        from evnlos.setups import calibrated_folder, load_setup
 
         dataset, weights = open_dataset(self.data), load_weights(self.weights)
         split = self.split or ("test" if dataset.split.get("test") else "all")
         refuse_seen(weights.history, dataset, split)
         metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
         curve = curve_over_positions(weights, dataset, split, self.positions) if self.positions else []
-        rig = calibrated_folder(self.rig) / RIG_FILE if self.rig else published_rig(self.weights)
-        known = load_yaml(Simulation, rig) if rig else None
+        word = calibrated_folder(self.setup) if self.setup else published_rig(self.weights)
+        known = load_setup(word) if word else None
         found = evaluate(weights, dataset, split, metric, known).summary()
         about = {
             "weights": str(self.weights),
-            "paradigm": weights.paradigm,
+            "modality": weights.modality.name,
             "data": str(self.data),
             "split": split,
         }
@@ -74,7 +72,7 @@ class Command:
 
 def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
     print(
-        f"{about['weights']} ({about['paradigm']}) on {about['data']}, split {about['split']}: "
+        f"{about['weights']} ({about['modality']}) on {about['data']}, split {about['split']}: "
         f"{found['images']} pictures"
     )
     names = list(found["overall"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,12 +15,13 @@ from tqdm import tqdm
 from evnlos.cli.event_files import amount, refuse_existing
 from evnlos.cli.notes import say
 from evnlos.cli.preview import look_of, write_preview
-from evnlos.config import load_yaml
+from evnlos.config import load_yaml, to_dict
+from evnlos.errors import ConfigError
 from evnlos.events import EventWriter
 from evnlos.events.recording import Cut, Recording
-from evnlos.sensor.pixel import EventPixel
+from evnlos.sensor.event_model import Phase, PixelSettings
+from evnlos.sensor.pixel import EventPixel, Logarithm, Mode
 from evnlos.sensor.presets import pixel_preset
-from evnlos.sensor.stream import Mode
 from evnlos.sensor.video import Tone, Video, open_video, video_events
 from evnlos.types import Events
 
@@ -49,10 +50,34 @@ class PixelChanges:
     """Rate of events of a hot pixel, hertz (mode exact only)."""
     jitter_s: float | None = None
     """Standard deviation of the time stamps, seconds (mode exact only)."""
+    initial_phase: Phase | None = None
+    """State before the first frame: random = between two events, rest = just after one; by default random with
+    leak, rest without (mode exact only)."""
+    pattern_seed: int | None = None
+    """Seed of thresholds, leak rates and hot pixels: one sensor for all recordings."""
+    logarithm: Logarithm | None = None
+    """lin-log: a line below 20 DN, as in v2e; true: of the light over --pixel.dark-dn (mode exact only)."""
+    exposure: float | None = None
+    """DN at the pixel per DN of the video (mode exact only)."""
+    dark_dn: float | None = None
+    """Dark level of a true logarithm, DN at the pixel."""
+    cutoff_floor_dn: float | None = None
+    """What the filter's bandwidth keeps in the dark, DN (mode exact only)."""
 
-    def applied(self, pixel: EventPixel) -> EventPixel:
-        """Return the pixel with these changes."""
-        return replace(pixel, **{name: value for name, value in asdict(self).items() if value is not None})
+    def applied(self, pixel: PixelSettings) -> PixelSettings:
+        """Return the pixel with these changes.
+
+        Raises:
+            ConfigError: A change that this kind of pixel has not.
+        """
+        changes = {name: value for name, value in asdict(self).items() if value is not None}
+        known = {item.name for item in fields(pixel)}  # type: ignore[arg-type]
+        if unknown := sorted(changes.keys() - known):
+            flag = "--pixel." + unknown[0].replace("_", "-")
+            raise ConfigError(f"{flag} is nothing that a {type(pixel).__name__} has; leave it out")
+        if "leak_rate_hz" in changes and isinstance(pixel, EventPixel):
+            changes.setdefault("initial_phase", None)  # settled anew
+        return replace(pixel, **changes)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
@@ -64,7 +89,8 @@ class Command:
     out: Path
     """The event file; its ending says the format: .h5, .npz, .raw (EVT3), .aedat4, .csv."""
     pixel: str = "davis346"
-    """paper, v2e_clean, v2e_noisy, davis346, prophesee_gen3, prophesee_gen4, celex_v, or a YAML file."""
+    """paper, v2e_clean, v2e_noisy, davis346, prophesee_gen3, prophesee_gen4, celex_v, voltmeter_dvs346,
+    voltmeter_dvs240, or a YAML file with the settings of any event model (`kind`)."""
     changes: Annotated[PixelChanges, tyro.conf.arg(name="pixel")] = field(default_factory=PixelChanges)
     """Parameters in place of the preset's, which stand where none is given."""
     mode: Mode = "exact"
@@ -133,14 +159,14 @@ class _Clock:
             yield time_s, light
 
 
-def _pixel(name: str) -> EventPixel:
+def _pixel(name: str) -> PixelSettings:
     if Path(name).suffix in (".yaml", ".yml"):
-        return load_yaml(EventPixel, name)
+        return load_yaml(PixelSettings, name)
     return pixel_preset(name)
 
 
 def _found(
-    command: Command, video: Video, pixel: EventPixel, clock: _Clock, events: int, on: int
+    command: Command, video: Video, pixel: PixelSettings, clock: _Clock, events: int, on: int
 ) -> dict[str, Any]:
     pixels = video.width * video.height
     return {
@@ -156,7 +182,7 @@ def _found(
         "on_off_ratio": on / (events - on) if events > on else None,
         "rate_hz": events / clock.last_s,
         "rate_per_pixel_hz": events / clock.last_s / pixels,
-        "pixel": asdict(pixel),
+        "pixel": to_dict(pixel),
         "pixel_name": command.pixel,
         "mode": command.mode,
         "seed": command.seed,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from evnlos.cli.notes import say
-from evnlos.config import write_atomically
-from evnlos.dataset import PARADIGMS, Paradigm
+from evnlos.dataset import STANDARD_MODALITIES
 from evnlos.errors import ConfigError, MissingDependencyError
+from evnlos.files import write_atomically
+from evnlos.progress import ProgressBars
 
 if TYPE_CHECKING:
-    from evnlos.experiment import Arm, Step, Study
+    from evnlos.experiment import Arm, Study
 
 
 @dataclass(frozen=True)
@@ -24,26 +24,29 @@ class Command:
 
     name: Annotated[str, tyro.conf.Positional]
     """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss, width,
-    embedding, joint (whole passes) or objects (how many are simulated);
+    embedding, sequence (whole sequences) or objects (how many are simulated);
     without captures: simulation (handwriting, transfer to Comic), conditions (frames against events over
-    light, noise, exposure, speed and rigs), and carry-over (given weights on unseen hands, other things than
-    characters, and other walls, with what their confidence says)."""
+    light, noise, exposure, speed and rigs), carry-over (given weights on unseen hands, other things than
+    characters, and other walls, with what their confidence says), and mismatch (the demo on walls, lenses and
+    sensors that the simulator does not describe)."""
     captures: Path | None = None
     """Folder of the capture folders."""
     weights: Path | None = None
-    """Weights for carry-over, which were trained for the rig OUT/rigs/RIG."""
+    """Weights for carry-over, which were trained for the setup OUT/rigs/NAME, NAME as for --captures-of."""
     out: Path = Path("experiments")
     """Folder for rigs, datasets, runs, records and tables; experiments in one folder share what they can."""
-    rig: str = "near"
+    captures_of: str = "near"
     """Which captures: those whose names begin with this and an underscore."""
+    rigs: tuple[str, ...] = ()
+    """For mismatch: rooms of `evnlos lab`, or, with --captures, folders of captures in it; all by default."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of initial weights and order of the samples."""
-    paradigms: tuple[Paradigm, ...] = PARADIGMS
+    modalities: tuple[str, ...] = STANDARD_MODALITIES
     """What the networks see."""
     arms: tuple[str, ...] = ()
     """Only these arms, by name; all by default."""
-    joint: bool = False
-    """Networks that see all positions of a pass together, in an experiment of single positions."""
+    sequence: bool = False
+    """Networks that see all time steps of a sequence together, in an experiment of single time steps."""
     test: tuple[str, ...] = ("G", "K", "4", "9")
     """Characters that nothing sees before the test."""
     validation: tuple[str, ...] = ()
@@ -70,34 +73,36 @@ class Command:
             "simulation": self._simulation,
             "conditions": self._conditions,
             "carry-over": self._carry_over,
+            "mismatch": self._mismatch,
         }
         alone.get(self.name, self._on_captures)()
 
     def _on_captures(self) -> None:
-        from evnlos.experiment import Place, captures_of, read_records, run_study, show
+        from evnlos.experiment import Place, captures_of, read_records, run_study
 
         study = self._study()
         assert self.captures is not None
-        folders = tuple(captures_of(self.captures, self.rig))
-        show(run_study(study, Place(folders, self.out, self.workers, self.trainings)))
-        records = [r for r in read_records(self.out / "records" / study.name) if r.rig == self.rig]
+        folders = tuple(captures_of(self.captures, self.captures_of))
+        with ProgressBars() as progress:
+            run_study(study, Place(folders, self.out, self.workers, self.trainings), progress)
+        records = [r for r in read_records(self.out / "records" / study.name) if r.rig == self.captures_of]
         records = [r for r in records if r.split == study.split]
         text = _tables(study.name, records, self.metric)
-        write_atomically(self.out / f"{study.name}-{self.rig}-{study.split}.md", text.encode())
+        write_atomically(self.out / f"{study.name}-{self.captures_of}-{study.split}.md", text.encode())
         print(text)
 
     def _study(self) -> Study:
         """Return the named study with what the command line changes."""
-        from evnlos.experiment import STUDIES, jointly
+        from evnlos.experiment import STUDIES, on_sequences
 
         if self.name not in STUDIES:
             raise ConfigError(
                 f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}, simulation, "
-                "conditions, carry-over"
+                "conditions, carry-over, mismatch"
             )
         if self.captures is None:
             raise ConfigError(f"the experiment {self.name} needs --captures, the folder of the capture folders")
-        study = STUDIES[self.name](self.rig)
+        study = STUDIES[self.name](self.captures_of)
         unknown = set(self.arms) - {arm.name for arm in study.arms}
         if unknown:
             there = ", ".join(repr(arm.name) for arm in study.arms)
@@ -110,13 +115,13 @@ class Command:
         study = replace(
             study,
             arms=tuple(arm for arm in study.arms if not self.arms or arm.name in self.arms),
-            paradigms=tuple(p for p in study.paradigms if p in self.paradigms),
+            modalities=tuple(p for p in study.modalities if p in self.modalities),
             seeds=self.seeds,
             test=self.test,
             validation=self.validation,
             writers=self.writers or study.writers,
         )
-        study = jointly(study) if self.joint else study
+        study = on_sequences(study) if self.sequence else study
         return replace(study, arms=tuple(self._in_epochs(arm) for arm in study.arms))
 
     def _in_epochs(self, arm: Arm) -> Arm:
@@ -130,9 +135,9 @@ class Command:
         return replace(arm, pretraining=pre, finetuning=fine)
 
     def _simulation(self) -> None:
-        from evnlos.experiment import Simulated, read_records, run_simulated, show
+        from evnlos.experiment import Simulated, read_records, run_simulated
 
-        settings = Simulated(self.out, paradigms=self.paradigms, seeds=self.seeds, workers=self.workers)
+        settings = Simulated(self.out, modalities=self.modalities, seeds=self.seeds, workers=self.workers)
         epochs = {
             "pretraining": self.pretrain_epochs,
             "finetuning": self.finetune_epochs,
@@ -140,7 +145,8 @@ class Command:
         }
         changed = {name: replace(getattr(settings, name), epochs=n) for name, n in epochs.items() if n}
         settings = replace(settings, writers=self.writers or settings.writers, **changed)
-        show(run_simulated(settings))
+        with ProgressBars() as progress:
+            run_simulated(settings, progress)
         text = ""
         for tested in ("nist", "comic"):
             records = [r for r in read_records(self.out / "records" / "simulation") if r.rig == tested]
@@ -149,38 +155,26 @@ class Command:
         print(text)
 
     def _conditions(self) -> None:
-        from evnlos.experiment import base_simulation, conditions, conditions_table, map_conditions, show
+        from evnlos.experiment import base_simulation, conditions, conditions_table, map_conditions
 
         chosen = conditions(base_simulation(self.writers or 2))
-        findings = []
-
-        def steps() -> Iterator[Step]:
-            for step, finding in map_conditions(chosen, self.out / "conditions", self.workers):
-                findings.append(finding)
-                yield step
-
-        show(steps())
+        with ProgressBars() as progress:
+            findings = map_conditions(chosen, self.out / "conditions", self.workers, progress=progress)
         text = conditions_table(findings) + "\n"
         write_atomically(self.out / "conditions.md", text.encode())
         print(text)
 
     def _carry_over(self) -> None:
-        from evnlos.experiment import carried_table, carry_over, show, write_carried
+        from evnlos.experiment import carried_table, carry_over, write_carried
         from evnlos.plot.worth import draw_worth
 
         weights = self.weights
         if weights is None:
             raise ConfigError("carry-over needs --weights, a weights file or a run's folder")
-        found = []
-
-        def steps() -> Iterator[Step]:
-            for step, one in carry_over(weights, self.out / "rigs" / self.rig, self.out, self.workers):
-                if one is not None:
-                    found.append(one)
-                yield step
-
-        show(steps())
-        name = f"carry-over-{self.rig}-{weights.stem}"
+        rig = self.out / "rigs" / self.captures_of
+        with ProgressBars() as progress:
+            found = carry_over(weights, rig, self.out, self.workers, progress=progress)
+        name = f"carry-over-{self.captures_of}-{weights.stem}"
         write_carried(found, self.out / f"{name}.json")
         text = carried_table(found) + "\n"
         write_atomically(self.out / f"{name}.md", text.encode())
@@ -189,6 +183,22 @@ class Command:
             draw_worth({one.name: one.worth for one in found}, self.out / f"{name}.png")
         except MissingDependencyError as error:
             say(f"no {name}.png: {error}")
+
+    def _mismatch(self) -> None:
+        from evnlos.demo import Demo
+        from evnlos.mismatch import mismatch_table, run_mismatch
+
+        base = Demo(out=self.out, test=self.test, workers=self.workers)
+        base = replace(
+            base,
+            writers=self.writers or base.writers,
+            pretrain_epochs=self.pretrain_epochs or base.pretrain_epochs,
+            finetune_epochs=self.finetune_epochs or base.finetune_epochs,
+            e2e_epochs=self.e2e_epochs or base.e2e_epochs,
+        )
+        with ProgressBars() as progress:
+            found = run_mismatch(base, self.rigs, self.captures, self.seeds, progress)
+        print(mismatch_table(found))
 
 
 def _tables(name: str, records: list, metric: str) -> str:

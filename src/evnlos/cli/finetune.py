@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from evnlos.cli.console import Flat
+from evnlos.cli.console import Flat, result
 from evnlos.cli.train import fit
 from evnlos.dataset import open_dataset
-from evnlos.training import Training, finetuning, paper_finetuning
+from evnlos.progress import ProgressBars
+from evnlos.training import (
+    Training,
+    alternatives,
+    choose_and_finetune,
+    finetuning,
+    paper_finetuning,
+    read_choice,
+)
 
 PRESETS = {"default": finetuning, "paper": paper_finetuning}
 
 
 @dataclass(frozen=True)
 class Command:
-    """Fine-tune weights on few captures (EPNP): paradigm and network are those of the weights.
+    """Fine-tune weights on few captures (EPNP): modality and network are those of the weights.
 
-    After a simulation that was fitted to the rig, less is better: --epochs 3 --learning-rate 2e-4
-    --no-restandardise.
+    After a simulation that was fitted to the setup, less is better: --epochs 3 --learning-rate 2e-4
+    --keep-normalization. With --choose captures that are held out decide, and fine-tuning cannot lose much.
     """
 
     weights: Path
@@ -31,10 +39,23 @@ class Command:
     """`default`, or `paper` for the paper's 100 epochs at 1e-5 with its loss."""
     config: Path | None = None
     """YAML file with settings."""
+    choose: bool = False
+    """Try these settings, a fifth and five times the learning rate, keeping the normalization and not, on two
+    halves of the training captures in turn; take the best, part of the way to it, or nothing."""
     json: bool = False
     """Print one JSON object."""
     settings: Flat[Training] = field(default_factory=finetuning)
 
     def run(self) -> None:
         """Train, with a progress bar over the epochs."""
-        fit(open_dataset(self.data), self.settings, self.out, self.weights, self.json)
+        dataset = open_dataset(self.data)
+        if not self.choose:
+            fit(dataset, self.settings, self.out, self.weights, self.json)
+            return
+        candidates = alternatives(self.settings)
+        with ProgressBars() as progress:
+            trained = choose_and_finetune(dataset, candidates, self.out, self.weights, progress=progress)
+        choice = read_choice(self.out)
+        assert choice is not None
+        values = {"run": str(self.out), "weights": str(trained.file), **asdict(choice)}
+        result(self.json, values, f"{self.out}: {choice.sentence()}; weights in {trained.file}")

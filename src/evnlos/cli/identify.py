@@ -1,4 +1,4 @@
-"""`evnlos identify`: a rig in, what it can show at all out."""
+"""`evnlos identify`: a setup in, what it can show at all out."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ import tyro
 
 from evnlos.cli.console import Flat
 from evnlos.cli.notes import say
-from evnlos.config import write_atomically
 from evnlos.errors import ConfigError
 from evnlos.evaluation.identify_rig import Bench
+from evnlos.files import write_atomically
 
 
 @dataclass(frozen=True)
 class Command:
-    """Say what a rig can show at all: modes above the noise, finest stroke, best linear picture, in words."""
+    """Say what a setup can show at all: modes above the noise, finest stroke, best linear picture, in words."""
 
-    rigs: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names (main-near, matte-far, ..., simulate-paper), rig files or folders, settings of `simulate` or
-    `lab` (YAML)."""
+    setups: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names (main-near, matte-far, ..., simulate-paper), settings files, folders of `calibrate`, files of
+    `scan import`."""
+    setup: tuple[str, ...] = ()
+    """The same, as in the other commands."""
     all: bool = False
-    """All named rigs, as a table."""
+    """All named walls, as a table."""
     out: Path | None = None
-    """Folder for a figure of each rig and identify.json with all curves."""
+    """Folder for a figure of each setup and identify.json with all curves."""
     json: bool = False
-    """Print one JSON object, or a list where several rigs are asked for."""
+    """Print one JSON object, or a list where several setups are asked for."""
     seed: int = 0
     """Seed of the one noisy picture of the figure."""
     bench: Flat[Bench] = field(default_factory=Bench)
@@ -38,18 +40,19 @@ class Command:
         from tqdm import tqdm
 
         from evnlos.evaluation.identify import identify
-        from evnlos.evaluation.identify_source import described_rig
         from evnlos.evaluation.identify_table import rig_table
         from evnlos.plot.identify import draw_identification, draw_rigs
-        from evnlos.transport.rig import rig_names
+        from evnlos.setups import named_setup, setup_names
 
-        names = [*self.rigs, *(rig_names() if self.all else [])]
+        names = [*self.setups, *self.setup, *(setup_names() if self.all else [])]
         if not names:
-            raise ConfigError(f"no rig given; give a rig file, --all, or names: {', '.join(rig_names())}")
-        rigs = [described_rig(name) for name in names]
+            raise ConfigError(
+                f"no setup given; give a settings file, --all, or names: {', '.join(setup_names())}"
+            )
+        setups = [named_setup(name) for name in names]
         found = [
-            identify(rig.transport, rig.camera, self.bench, rig.name, self.seed)
-            for rig in tqdm(rigs, desc="identify", unit=" rigs", disable=len(rigs) == 1)
+            identify(one.setup, self.bench, one.name, self.seed)
+            for one in tqdm(setups, desc="identify", unit=" setups", disable=len(setups) == 1)
         ]
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)

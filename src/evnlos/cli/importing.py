@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tqdm import tqdm
 
-from evnlos.cli.console import Folders, progress, result
-from evnlos.dataset import Capture, Sampling, check_picture, import_captures, load_pattern, open_dataset
+from evnlos.cli.console import Folders, result
+from evnlos.dataset import Capture, Sampling, check_picture, import_captures, load_pattern
+from evnlos.files import write_atomically
+from evnlos.progress import ProgressBars
 
 
 @dataclass(frozen=True)
@@ -36,18 +39,17 @@ class Command:
 
     def run(self) -> None:
         """Import, with a progress bar over the captures."""
-        imported = import_captures(
-            self.captures,
-            self.out,
-            self.sampling,
-            test=self.test,
-            validation=self.validation,
-            pattern=load_pattern(self.pattern) if self.pattern else None,
-            look=self._look,
-        )
-        for _ in progress(imported, len(self.captures), "captures", self.out):
-            pass
-        dataset = open_dataset(self.out)
+        with ProgressBars() as progress:
+            dataset = import_captures(
+                self.captures,
+                self.out,
+                self.sampling,
+                test=self.test,
+                validation=self.validation,
+                pattern=load_pattern(self.pattern) if self.pattern else None,
+                look=self._look,
+                progress=progress,
+            )
         counts = ", ".join(f"{len(names)} {split}" for split, names in dataset.split.items())
         text = f"{self.out}: {len(dataset.objects())} captures ({counts})"
         result(self.json, {"out": str(self.out), "split": dataset.split}, text)
@@ -60,4 +62,6 @@ class Command:
         if self.check_pictures:
             folder = self.out / "checks"
             folder.mkdir(exist_ok=True)
-            check_picture(capture).save(folder / f"{capture.name}.png")
+            drawn = io.BytesIO()
+            check_picture(capture).save(drawn, "PNG")
+            write_atomically(folder / f"{capture.name}.png", drawn.getvalue())

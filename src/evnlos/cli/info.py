@@ -8,6 +8,7 @@ from typing import Any
 
 from evnlos.cli.console import Flat
 from evnlos.cli.event_files import EventFile, Reading, amount, counted
+from evnlos.errors import printable
 from evnlos.events import ReadReport
 from evnlos.events.summary import WINDOW_US, Summary, summarise
 
@@ -99,7 +100,7 @@ def to_text(name: str, found: dict[str, Any]) -> str:
         ("", f"first at {line.removeprefix(f'{name}: ').split('; ')[0]}") for line in found["first_faults"]
     ]
     lines = [f"{name}: {found['format']}, {amount(found['bytes'], 'B')}"]
-    return "\n".join(lines + [f"  {title:<10}{text}" for title, text in rows])
+    return "\n".join(map(printable, lines + [f"  {title:<10}{text}" for title, text in rows]))
 
 
 def _event_rows(found: dict[str, Any]) -> list[tuple[str, str]]:

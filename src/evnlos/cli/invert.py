@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import time
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import torch
 import tyro
 
 from evnlos.errors import ConfigError
+from evnlos.files import write_atomically
 
 LAM_TIKHONOV, LAM_TV = 4.0, 0.3  # best on eight characters of one rig, docs/inversion.md
 
@@ -22,17 +24,17 @@ class Command:
     """Invert a photograph of a matte wall, or whole passes of captures, by the operator alone."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --rig, or
-    pictures of the wall with a measured --rig."""
-    rig: Path | None = None
-    """Rig file of the captures, or the folder that `evnlos calibrate` wrote, or the transport of `evnlos scan
-    import`."""
+    """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --setup, or
+    pictures of the wall with a measured --setup."""
+    setup: Path | None = None
+    """The setup of the captures: a name, a settings file, the folder that `evnlos calibrate` wrote, or the file
+    of `evnlos scan import`."""
     dark: Path | None = None
     """Pictures: one taken without the hidden object; by default the scan's own dark frames."""
     positions: tuple[int, ...] = ()
     """Captures: how many of the frames 1, 2, ... to use, equally spaced; none = all, several = a curve."""
     pattern: Path | None = None
-    """Captures: the camera's fixed pattern, to be removed; a file, or the folder of its calibrated rig."""
+    """Captures: the camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup."""
     track: bool = False
     """Captures: find the motion in the recording also where capture.yaml states it."""
     static: float = 1.0
@@ -65,13 +67,13 @@ class Command:
 
     def run(self) -> None:
         """Invert, print the figures, write the picture."""
-        if self.rig is not None:
+        if self.setup is not None:
             still = all(path.is_file() for path in self.files)
-            (self._invert_stills if still else self._invert_captures)(self.rig)
+            (self._invert_stills if still else self._invert_captures)(self.setup)
             return
         if len(self.files) != 1 or self.files[0].is_dir():
             raise ConfigError(
-                f"{len(self.files)} paths without --rig; give one NPZ file, or capture folders and their --rig"
+                f"{len(self.files)} paths without --setup; give one NPZ file, or capture folders and --setup"
             )
         from evnlos.cli.invert_still import figures_of
         from evnlos.plot.inversion import draw_inversion
@@ -112,19 +114,16 @@ class Command:
         ]
         found["picture"] = str(draw_inversion(self.out, panels))
         arrays: dict[str, Any] = {name.replace(" ", "_"): s.image.numpy() for name, s in solved.items()}
-        np.savez(self.out.with_suffix(".npz"), **arrays)
+        _save_arrays(self.out, arrays)
         found["seconds"] = round(time.perf_counter() - clock, 1)
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_stills(self, path: Path) -> None:
-        from evnlos.cli.invert_pass import matrix_rig
         from evnlos.cli.invert_still import StillOptions, invert_stills
         from evnlos.plot.inversion import draw_inversion
-        from evnlos.transport import MeasuredTransport
+        from evnlos.setups import load_setup
 
-        rig = matrix_rig(path)
-        if not isinstance(rig, MeasuredTransport):
-            raise ConfigError(f"{path} is a {rig.kind} rig; pictures need a measured one, captures are folders")
+        setup = load_setup(path)
         lam, rule = _weight(self.lam)
         if rule == "gcv" and self.solver != "tikhonov":
             raise ConfigError("--lam gcv serves --solver tikhonov only; use cv, discrepancy or a number")
@@ -133,7 +132,7 @@ class Command:
         options = StillOptions(
             self.dark, solvers, lam, rule, self.noise_sigma, self.background_degree, self.bin
         )
-        found, pictures = invert_stills(self.files, rig, options)
+        found, pictures = invert_stills(self.files, setup, options)
         panels = [
             (f"{file.stem}, {name}", image[None])
             for name, images in pictures.items()
@@ -141,11 +140,11 @@ class Command:
         ]
         found["picture"] = str(draw_inversion(self.out, panels))
         arrays: dict[str, Any] = {name: images.numpy() for name, images in pictures.items()}
-        np.savez(self.out.with_suffix(".npz"), **arrays)
+        _save_arrays(self.out, arrays)
         found["file"] = " ".join(found["files"])
         print(json.dumps(found) if self.json else to_text(found))
 
-    def _invert_captures(self, rig: Path) -> None:
+    def _invert_captures(self, setup: Path) -> None:
         from evnlos.cli.invert_pass import PassOptions, invert_captures, print_pass
         from evnlos.plot.inversion import draw_inversion
 
@@ -160,7 +159,7 @@ class Command:
             lam = dict.fromkeys(lam, number)
         solvers = tuple(lam) if self.solver == "all" else (self.solver,)
         options = PassOptions(
-            rig,
+            setup,
             self.positions,
             self.pattern,
             self.track,
@@ -176,8 +175,15 @@ class Command:
         best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
         found["picture"] = str(draw_inversion(self.out, [(name, image[None]) for name, image in best.items()]))
         arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
-        np.savez(self.out.with_suffix(".npz"), **arrays)
+        _save_arrays(self.out, arrays)
         print_pass(found, self.json)
+
+
+def _save_arrays(picture: Path, arrays: dict[str, Any]) -> None:
+    """Write arrays as NPZ beside the picture that shows them."""
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    write_atomically(picture.with_suffix(".npz"), content.getvalue())
 
 
 def correlation(image: torch.Tensor, truth: torch.Tensor) -> float:

@@ -1,4 +1,4 @@
-"""`evnlos invert CAPTURE... --rig RIG.yaml`: one picture of each object from its whole pass."""
+"""`evnlos invert CAPTURE... --setup SETUP`: one picture of each object from its whole pass."""
 
 from __future__ import annotations
 
@@ -13,19 +13,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration import RIG_FILE, rig_file
 from evnlos.cli.notes import say
-from evnlos.config import load_yaml
-from evnlos.dataset import Capture, Simulation, load_pattern, read_capture
+from evnlos.dataset import Capture, load_pattern, read_capture
 from evnlos.dataset.sampling import Sampling
 from evnlos.errors import ConfigError
 from evnlos.metrics import psnr
 from evnlos.scene import Target
+from evnlos.setups import Setup, load_setup
+from evnlos.setups.base import linear_kinds
 from evnlos.solver import JointProblem, PlatePass
-from evnlos.solver.plate_pass import strip_gram_of, strip_of, strip_transport
+from evnlos.solver.plate_pass import matrix_of, strip_gram_of, strip_of
 from evnlos.solver.recording import object_light, position_subsets
-from evnlos.transport import MeasuredTransport, RadiometricTransport
-from evnlos.transport.measured_file import SUFFIX
 from evnlos.types import Plane
 
 
@@ -33,7 +31,7 @@ from evnlos.types import Plane
 class PassOptions:
     """What `evnlos invert` was told about captures."""
 
-    rig: Path
+    setup: Path
     positions: tuple[int, ...]
     pattern: Path | None
     track: bool
@@ -45,36 +43,19 @@ class PassOptions:
     subsets: int
 
 
-def radiometric_rig(path: Path) -> RadiometricTransport:
-    """Return the rig of a simulation file, or of a folder that `calibrate` wrote.
+def linear_setup(word: Path | str) -> Setup:
+    """Return the setup of a word (see `load_setup`), which has to be linear.
 
     Raises:
-        ConfigError: It is another kind of transport.
+        ConfigError: It is of another kind, or there is none.
     """
-    rig = matrix_rig(path)
-    if not isinstance(rig, RadiometricTransport):
-        raise ConfigError(f"{path} holds a transport of kind {rig.kind}; give a rig of kind radiometric")
-    return rig
-
-
-def matrix_rig(path: Path) -> RadiometricTransport | MeasuredTransport:
-    """Return the rig of a simulation file, or of a folder that `calibrate` wrote, or the measured transport
-    that a .safetensors file is.
-
-    Raises:
-        ConfigError: It is another kind of transport, or a folder without a rig.
-    """
-    path = rig_file(path)
-    if path.is_dir():
-        raise ConfigError(f"{path} holds no {RIG_FILE}; give a rig file, or the folder that `calibrate` wrote")
-    if path.suffix == SUFFIX:
-        return MeasuredTransport(file=str(path))
-    rig = load_yaml(Simulation, path).transport
-    if not isinstance(rig, RadiometricTransport | MeasuredTransport):
+    setup = load_setup(word)
+    if not setup.is_linear:
         raise ConfigError(
-            f"{path} holds a transport of kind {rig.kind}; give a rig of kind radiometric or measured"
+            f"{word} holds a setup of kind {setup.kind}, which is not linear; give one of kind "
+            f"{' or '.join(linear_kinds())}"
         )
-    return rig
+    return setup
 
 
 def invert_captures(
@@ -82,7 +63,7 @@ def invert_captures(
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and the plates [cells, cells] by name, of every capture and solver."""
     clock = time.perf_counter()
-    rig = matrix_rig(options.rig)
+    setup = linear_setup(options.setup)
     captures = [read_capture(folder) for folder in folders]
     pattern = None if options.pattern is None else load_pattern(options.pattern)
     height, width = captures[0].frames.shape[1:]
@@ -92,13 +73,13 @@ def invert_captures(
         )
     columns = min(options.columns, width)
     shape = (max(1, round(height * columns / width)), columns)
-    light = torch.stack([object_light(c.frames[1:], c.peak, rig, shape, pattern) for c in captures])
+    light = torch.stack([object_light(c.frames[1:], c.peak, setup, shape, pattern) for c in captures])
     pictures: dict[str, torch.Tensor] = {}
     rows: list[dict[str, Any]] = []
-    for motion, members in _by_motion(captures, options, rig):
+    for motion, members in _by_motion(captures, options, setup):
         size = _plate_m(captures[members[0]], _is_tracked(captures[members[0]], options))
         plate = Plane(options.cells, options.cells, size / options.cells)
-        transport = strip_transport(rig, (height, width), shape, strip_of(motion, plate))
+        transport = matrix_of(setup.resized((height, width)).operator(strip_of(motion, plate), shape))
         gram = strip_gram_of(transport)
         for count in options.positions or (len(motion),):
             for chosen in position_subsets(len(motion), count, options.subsets):
@@ -111,7 +92,7 @@ def invert_captures(
                         db = _score(captures[member], image, size, motion)
                         rows.append({"capture": name, "positions": count, "solver": solver, "psnr_db": db})
                         pictures[f"{name}_{solver}_{count}"] = image
-    figures = {"rig": str(options.rig), "captures": [c.name for c in captures], "rows": rows}
+    figures = {"setup": str(options.setup), "captures": [c.name for c in captures], "rows": rows}
     figures["seconds"] = round(time.perf_counter() - clock, 1)
     return figures, pictures
 
@@ -154,7 +135,7 @@ def _solve(problem: JointProblem, images: torch.Tensor, solver: str, factor: flo
 
 
 def _by_motion(
-    captures: Sequence[Capture], options: PassOptions, rig: RadiometricTransport | MeasuredTransport
+    captures: Sequence[Capture], options: PassOptions, setup: Setup
 ) -> list[tuple[NDArray[np.float64], list[int]]]:
     """Return each motion [N, 2], metres, of frames 1..N with the captures that share it."""
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
@@ -162,12 +143,8 @@ def _by_motion(
         if _is_tracked(capture, options):
             from evnlos.tracking import track_capture, track_doubts
 
-            if isinstance(rig, MeasuredTransport):
-                raise ConfigError(
-                    f"{capture.name}: a measured transport does not tell motion; state `motion` in capture.yaml"
-                )
-            found = track_capture(capture, rig)
-            for doubt in track_doubts(capture, rig, found):
+            found = track_capture(capture, setup)
+            for doubt in track_doubts(capture, setup, found):
                 say(f"warning: {capture.name}: {doubt}")
             motion = found.at(capture.frame_times_us[1:] * 1e-6)
         else:

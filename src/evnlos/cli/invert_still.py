@@ -1,4 +1,4 @@
-"""`evnlos invert PICTURE... --rig transport.safetensors`: still pictures of the wall, a measured transport."""
+"""`evnlos invert PICTURE... --setup transport.safetensors`: still pictures of the wall, a measured setup."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from evnlos.calibration.scan.importer import fill_bad
 from evnlos.cli.notes import say
 from evnlos.dataset.frame_sources import read_image
 from evnlos.errors import ConfigError
+from evnlos.setups import Setup
+from evnlos.setups.base import dense_matrix
+from evnlos.setups.measured import averaged
 from evnlos.solver.inversion import Inversion, chosen_degree
 from evnlos.solver.solution import Solution
 from evnlos.solver.tikhonov import Rule
-from evnlos.transport import MatrixTransport, MeasuredTransport
-from evnlos.transport.measured import averaged
+from evnlos.transport import MatrixTransport
 
 _FINEST = 48  # pixels a side that a rough wall's light needs
 
@@ -38,7 +40,7 @@ class StillOptions:
 
 
 def invert_stills(
-    files: Sequence[Path], rig: MeasuredTransport, options: StillOptions
+    files: Sequence[Path], setup: Setup, options: StillOptions
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and the pictures [files, h, w] on the scanned cells by solver.
 
@@ -50,7 +52,7 @@ def invert_stills(
         DataError: A picture can't be read.
     """
     clock = time.perf_counter()
-    measured = rig.measurement()
+    measured = setup.measurement()
     pictures = [read_image(path, measured.shape) for path in files]
     peaks = {float(np.iinfo(picture.dtype).max) for picture in pictures}
     if len(peaks) > 1:
@@ -60,7 +62,7 @@ def invert_stills(
         raise ConfigError(f"a picture reaches {brightest} DN, the scan's white is {white:g}; save both alike")
     light = torch.from_numpy(np.stack(pictures).astype(np.float32)) / white
     if options.dark is None:
-        light = light - rig.ambient_light(measured.shape)
+        light = light - setup.ambient_light(measured.shape)
     else:
         light = light - torch.from_numpy(read_image(options.dark, measured.shape).astype(np.float32)) / white
     filled = fill_bad(light.numpy(), measured.bad.numpy(), measured.shape)
@@ -68,12 +70,13 @@ def invert_stills(
     flat = averaged(torch.from_numpy(filled).flatten(1).mT, measured.shape, shape)
     image = flat.mT.unflatten(1, shape).double()
     image = image / image.abs().max().clamp(min=1e-12)
-    matrix = rig.transport(shape).matrix.double()
-    operator = MatrixTransport(matrix / torch.linalg.matrix_norm(matrix, 2), rig.source(), shape)
+    cells = measured.about.plane
+    matrix = dense_matrix(setup.operator(cells, shape))
+    operator = MatrixTransport(matrix / torch.linalg.matrix_norm(matrix, 2), cells, shape)
     degree = chosen_degree(operator, image) if options.degree is None else options.degree
     found: dict[str, Any] = {
         "files": [str(path) for path in files],
-        "transport": rig.file,
+        "setup": setup.wall_description(),
         "wall": list(shape),
         "background_degree": degree,
         "solutions": {},

@@ -1,19 +1,22 @@
-"""`evnlos lab`: a rig in, pseudo-real capture folders out."""
+"""`evnlos lab`: a setup in, pseudo-real capture folders out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
-from evnlos.cli.console import Flat, progress
+from evnlos.cli.console import Flat
 from evnlos.cli.notes import say
-from evnlos.dataset.lab import Lab, lab_preset, render_captures
-from evnlos.transport.rig import rig_names
+from evnlos.dataset.lab import Lab, lab_of, render_captures
+from evnlos.progress import ProgressBars
 
 PRESETS: dict[str, Callable[[], Lab]] = {"default": Lab}
-PRESETS.update((name, partial(lab_preset, name)) for name in rig_names())
+
+
+def with_setup(settings: Lab, word: str) -> Lab:
+    """Return the lab with the setup of `--setup`."""
+    return lab_of(word, settings)
 
 
 @dataclass(frozen=True)
@@ -22,10 +25,13 @@ class Command:
 
     out: Path
     """Folder for the capture folders; a capture that is there is done."""
-    preset: str = "default"
-    """A named rig: mirror, easy, main, hard, matte or aperture, with -near or -far; `default` is main-near."""
+    setup: str | None = None
+    """The setup: a name (mirror, easy, main, hard, matte or aperture, with -near or -far), a room (two-lobes,
+    one-sided, curved, brushed, streaks, torch: outside the simulator's model), a settings file, or a folder
+    that `evnlos calibrate` wrote; by default main-near. A name but a room's leaves light and cameras to the
+    lab."""
     config: Path | None = None
-    """Rig file: YAML with settings of the laboratory."""
+    """YAML file with settings of the laboratory."""
     workers: int = 1
     """Processes; 0 = one for each core. The captures are the same for any number."""
     settings: Flat[Lab] = field(default_factory=Lab)
@@ -34,8 +40,6 @@ class Command:
         """Render, with a progress bar over the captures."""
         for note in self.settings.glyphs.notes():
             say(note)
-        names = self.settings.glyphs.objects()
-        rendered = render_captures(self.settings, self.out, workers=self.workers)
-        for _ in progress(rendered, len(names), "captures", self.out):
-            pass
-        print(f"{self.out}: {len(names)} captures; settings and the drawn sensor in {self.out / 'lab.yaml'}")
+        with ProgressBars() as progress:
+            rendered = render_captures(self.settings, self.out, workers=self.workers, progress=progress)
+        print(f"{self.out}: {len(rendered)} captures; settings and the drawn sensor in {self.out / 'lab.yaml'}")

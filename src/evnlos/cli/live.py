@@ -12,8 +12,8 @@ import tyro
 
 from evnlos.cli.console import Flat
 from evnlos.cli.notes import say
-from evnlos.config import write_atomically
 from evnlos.errors import ConfigError
+from evnlos.files import write_atomically
 from evnlos.live.run import Pace, Run
 from evnlos.live.sources import Listening, open_live
 
@@ -25,7 +25,7 @@ class Command:
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Capture folder or event file (replayed), event file with --follow, or udp://127.0.0.1:7000."""
     weights: Path | None = None
-    """Weights file, run's folder, or name of published weights, of single positions; of the paradigm event
+    """Weights file, run's folder, or name of published weights, of single positions; of the modality event
     where SOURCE has no frames. None takes published ones: near-frame for a capture, else near-event."""
     headless: bool = False
     """Show no page; write the video and the latency table to --out."""
@@ -67,8 +67,8 @@ class Command:
         try:
             with ExitStack() as stack:
                 if weights is None:
-                    paradigm = "frame" if source.has_frames else "event"
-                    name = published_for(None, paradigm, is_motion_known=False)
+                    modality = "frame" if source.has_frames else "event"
+                    name = published_for(None, modality, is_motion_known=False)
                     weights = load_weights(name)
                     say(f"{name} makes the pictures: weights of the package, for its own rig; see --weights")
                 engine = Engine(weights)
@@ -76,7 +76,7 @@ class Command:
                 sinks = []
                 if not self.headless:
                     page = stack.enter_context(
-                        Page(run.tally.now, self.port, f"{source.name}, {engine.paradigm}")
+                        Page(run.tally.now, self.port, f"{source.name}, {engine.modality.name}")
                     )
                     sinks.append(page)
                     say(f"{page.url} shows the pictures; Ctrl-C ends")
@@ -88,7 +88,7 @@ class Command:
                 run.go(sinks)
         finally:
             source.close()
-        summary = run.tally.summary() | {"weights": str(name), "paradigm": engine.paradigm}
+        summary = run.tally.summary() | {"weights": str(name), "modality": engine.modality.name}
         if out is not None and recorder is not None:
             summary |= {"recorded": recorder.recorded, "not_recorded": recorder.left_out}
             out.mkdir(parents=True, exist_ok=True)

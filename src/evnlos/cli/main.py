@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from dataclasses import MISSING, fields
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import MISSING, fields, is_dataclass, replace
 from types import ModuleType
-from typing import Any
+from typing import Any, TextIO, cast
 
-from evnlos.cli.notes import FLAG, LEVELS, LOG, VARIABLE, listen
-from evnlos.cli.parsing import parse
+from evnlos.cli.notes import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen
+from evnlos.cli.parsing import parse, todays_words
 from evnlos.cli.verbs import VERBS, module_of, summary_of
-from evnlos.errors import ConfigError, EvnlosError
+from evnlos.errors import ConfigError, EvnlosError, printable
+from evnlos.registry import Kinded, kind_of
 from evnlos.requirements import fault_behind
+from evnlos.threads import sleep_while_waiting
 from evnlos.version import __version__
 
 # Nothing that may be missing is imported before a command is: help, version and doctor work in any case.
@@ -19,6 +25,8 @@ from evnlos.version import __version__
 
 def main(argv: list[str] | None = None) -> None:
     """Run a command; bad input ends with one line on stderr and exit code 2."""
+    if argv is None:  # a process of its own, not a call from another program
+        sleep_while_waiting()
     try:
         arguments = listen(sys.argv[1:] if argv is None else argv)
     except ConfigError as error:
@@ -30,33 +38,62 @@ def main(argv: list[str] | None = None) -> None:
     if arguments[0] == "--version":
         print(__version__)
         return
-    verb, rest = arguments[0], arguments[1:]
+    verb, rest = arguments[0], todays_words(arguments[0], arguments[1:])
     try:
-        if verb not in VERBS:
-            raise ConfigError(f"unknown command {verb!r}; give one of {', '.join(VERBS)}")
-        command = _command(verb, rest)
-        LOG.debug("%s", command)
-        command.run()
+        with _terminable():
+            if verb not in VERBS:
+                raise ConfigError(f"unknown command {verb!r}; give one of {', '.join(VERBS)}")
+            command = _command(verb, rest)
+            LOG.debug("%s", command)
+            with redirect_stdout(cast(TextIO, PlainOutput(sys.stdout))):
+                command.run()
+            sys.stdout.flush()  # a full disk behind it is told while the exit code can say so
     except EvnlosError as error:
         LOG.debug("where the error came from", exc_info=True)
         print(f"evnlos {verb}: error: {error}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:
         sys.exit(1)
-    except KeyboardInterrupt:
-        print(f"evnlos {verb}: interrupted; run the same command again to go on", file=sys.stderr)
-        sys.exit(130)
+    except KeyboardInterrupt as stop:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # once is enough
+        how, number = ("terminated", 143) if isinstance(stop, _Terminated) else ("interrupted", 130)
+        print(f"evnlos {verb}: {how}; run the same command again to go on", file=sys.stderr)
+        sys.exit(number)
     except Exception as error:
         fault = fault_behind(error)
         if fault is not None:
             text = f"{fault.name} is {fault.found}; {fault.cure} (evnlos doctor looks at all that is needed)"
+        elif isinstance(error, MemoryError):
+            text = "the memory that this process may use is not enough; give it less to do at a time"
         elif isinstance(error, OSError):
             text = f"{error}; nothing half-written was left"
         else:
             raise
         LOG.debug("where the error came from", exc_info=True)
-        print(f"evnlos {verb}: error: {text}", file=sys.stderr)
+        print(f"evnlos {verb}: error: {printable(text)}", file=sys.stderr)
         sys.exit(2)
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process was asked to end by SIGTERM, and does so as if by Ctrl-C."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Raise `_Terminated` at SIGTERM, so that workers end and half-written files go."""
+
+    def end(*_: object) -> None:
+        raise _Terminated
+
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _command(verb: str, rest: list[str]) -> Any:
@@ -68,7 +105,7 @@ def _command(verb: str, rest: list[str]) -> Any:
 
 
 def _defaults(module: ModuleType, rest: list[str]) -> Any:
-    """Return the command with the settings of --preset and --config as its defaults, for flags to override."""
+    """Return the command with the settings of --preset, --config and --setup as defaults of the flags."""
     presets = getattr(module, "PRESETS", None)
     if presets is None:
         return None
@@ -82,12 +119,37 @@ def _defaults(module: ModuleType, rest: list[str]) -> Any:
     settings = presets[preset or "default"]()
     if config is not None:
         settings = load_yaml(type(settings), config)
+    word = _flag(rest, "--setup")
+    if word is not None and hasattr(module, "with_setup"):
+        settings = module.with_setup(settings, word)
+    settings = _of_kinds(settings, rest)
     required = {
         item.name: tyro.MISSING
         for item in fields(module.Command)
         if item.default is MISSING and item.default_factory is MISSING
     }
     return module.Command(**required | {"settings": settings})
+
+
+def _of_kinds(settings: Any, words: list[str], prefix: str = "--") -> Any:
+    """Return settings in which the flags `--FIELD.kind KIND` have chosen the kind, with its own defaults.
+
+    The other flags of the field then are those of that kind, also of one that a plugin brings; so for a field
+    within a field, as `--setup.pixel.kind`. Cameras stay where only the wall's kind changes.
+    """
+    for item in fields(settings):
+        here, flag = getattr(settings, item.name), f"{prefix}{item.name}"
+        if not is_dataclass(here) or isinstance(here, type):
+            continue
+        kind = _flag(words, f"{flag}.kind") if isinstance(here, Kinded) else None
+        if kind is not None and kind != kind_of(here):
+            before, here = here, here.registry[kind]()  # type: ignore[union-attr] - a family's settings
+            if hasattr(here, "with_cameras_of"):
+                here = here.with_cameras_of(before)
+        here = _of_kinds(here, words, f"{flag}.")
+        if here is not getattr(settings, item.name):
+            settings = replace(settings, **{item.name: here})
+    return settings
 
 
 def _flag(arguments: list[str], name: str) -> str | None:

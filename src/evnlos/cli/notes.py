@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from typing import Any, TextIO
 
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, printable
 
 LEVELS = ("debug", "info", "warning", "error")
 """What is said, most first: where an error came from; notes; only warnings; only errors."""
@@ -19,7 +20,30 @@ class _Stderr(logging.Handler):
     """Print each record on the stderr of the moment."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        print(self.format(record), file=sys.stderr)
+        print(printable(self.format(record), lines=True), file=sys.stderr)
+
+
+class PlainOutput:
+    """A stream without the control codes that names in a stranger's file may hold; line breaks and tabs stay.
+
+    Args:
+        stream: Where the text goes.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text."""
+        self._stream.write(printable(text, lines=True))
+        return len(text)
+
+    def flush(self) -> None:
+        """Write out what is held."""
+        self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def say(text: str) -> None:

@@ -10,10 +10,63 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+from evnlos.cli.notes import say
 from evnlos.errors import ConfigError
 
 _RULE = re.compile(r"^[\s─╰╯-]*$")
 _HELP_INDENT = 8  # columns before the text that explains an option
+
+
+_CAMERAS = ("sensor", "frame-camera", "pixel")
+_RENAMED = {  # flag of an older version -> the words of today
+    "--rig": ("--setup",),
+    "--paradigm": ("--modality",),
+    "--paradigms": ("--modalities",),
+    "--views": ("--sequence-augmentations",),
+    "--restandardise": ("--no-keep-normalization",),
+    "--no-restandardise": ("--keep-normalization",),
+}
+_RENAMED_IN = {  # the same, of one command
+    ("train", "--joint"): ("--network.kind", "sequence"),
+    ("train", "--no-joint"): ("--network.kind", "unet"),
+    ("experiment", "--rig"): ("--captures-of",),
+    ("lab", "--preset"): ("--setup",),
+    ("experiment", "--joint"): ("--sequence",),
+    ("experiment", "--no-joint"): ("--no-sequence",),
+}
+
+
+_MOVED = {  # beginning of the flags of a setting that moved, by command
+    "simulate": {"--transport.": "--setup."} | {f"--{part}.": f"--setup.{part}." for part in _CAMERAS},
+    "lab": {"--transport.": "--setup."} | {f"--{part}.": f"--setup.{part}." for part in _CAMERAS},
+    "calibrate": {"--start.transport.": "--start.setup."}
+    | {f"--start.{part}.": f"--start.setup.{part}." for part in _CAMERAS},
+}
+
+
+def todays_words(verb: str, words: list[str]) -> list[str]:
+    """Return the words after a verb with the flags of older versions in those of today, and say so on stderr.
+
+    Args:
+        verb: The command.
+        words: What follows it.
+    """
+    found: list[str] = []
+    for word in words:
+        flag, equals, value = word.partition("=")
+        today = _RENAMED_IN.get((verb, flag), _RENAMED.get(flag))
+        for before, now in _MOVED.get(verb, {}).items():
+            if flag.startswith(before):
+                today = (now + flag.removeprefix(before),)
+        if today is None:
+            found.append(word)
+            continue
+        say(f"note: {flag} is now {' '.join(today)}")
+        found += [*today[:-1], f"{today[-1]}{equals}{value}"]
+    if verb == "experiment" and found[:1] == ["joint"]:
+        say("note: the experiment joint is now called sequence")
+        found[0] = "sequence"
+    return found
 
 
 def parse(command: type, words: list[str], verb: str, default: Any = None) -> Any:
@@ -41,6 +94,11 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
         if not end.code:
             raise
         raise ConfigError(f"{in_one_line(said.getvalue())}; see evnlos {verb} --help") from None
+    except (ArithmeticError, MemoryError, ValueError) as error:  # of a setting that only fits together
+        raise ConfigError(f"the settings do not fit together ({error}); see evnlos {verb} --help") from None
+    from evnlos.config import check_numbers  # needs packages that may be missing
+
+    check_numbers(found, "")
     print(said.getvalue(), end="", file=sys.stderr)  # warnings, if there were any
     return found
 

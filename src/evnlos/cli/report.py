@@ -19,9 +19,9 @@ class Command:
     """Folder of the dataset to score on."""
     split: str = "test"
     """Split to score."""
-    rig: str | None = None
-    """Name of the rig, its file, or the folder that `calibrate` wrote, as `identify` takes it: it is drawn, and
-    what it can show stands beside the results. The rig of a simulated dataset is known."""
+    setup: str | None = None
+    """The setup: a name, a settings file, or the folder that `calibrate` wrote, as `identify` takes it: it is
+    drawn, and what it can show stands beside the results. The setup of a simulated dataset is known."""
     out: Path = Path("report.html")
     """The page."""
     json: bool = False
@@ -30,16 +30,16 @@ class Command:
     def run(self) -> None:
         """Evaluate the runs and write the page."""
         from evnlos.evaluation.identify import identify
-        from evnlos.evaluation.identify_source import described_rig
         from evnlos.report import gather, to_text, write_report
         from evnlos.report.tables import baselines_of
+        from evnlos.setups import named_setup
 
         dataset, results = gather(list(self.runs), self.data, self.split)
-        rig = None if self.rig is None else described_rig(self.rig)
-        limits = None if rig is None else identify(rig.transport, rig.camera, name=rig.name)
-        if rig is None and dataset.origin == "simulation":
-            rig = described_rig(self.data / "dataset.yaml")
-        path = write_report(self.out, dataset, results, [], self.split, rig, limits)
+        setup = None if self.setup is None else named_setup(self.setup)
+        limits = None if setup is None else identify(setup.setup, name=setup.name)
+        if setup is None and dataset.origin == "simulation":
+            setup = named_setup(self.data / "dataset.yaml")
+        path = write_report(self.out, dataset, results, [], self.split, setup, limits)
         about: dict[str, Any] = {"report": str(path), "csv": str(path.with_suffix(".csv"))}
         about["runs"] = {r.name: r.evaluation.scores.mean() for r in results}
         about["baselines"] = {name: scores.mean() for name, scores in baselines_of(results).items()}

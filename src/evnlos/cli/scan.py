@@ -14,6 +14,7 @@ from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cli.console import Flat
 from evnlos.cli.notes import say
 from evnlos.config import to_dict
+from evnlos.progress import ProgressBars
 
 if TYPE_CHECKING:
     from evnlos.calibration.scan.importer import ScanResult
@@ -42,14 +43,11 @@ class Command:
         self._plan() if self.action == "plan" else self._import()
 
     def _plan(self) -> None:
-        from tqdm import tqdm
-
         from evnlos.calibration.scan import write_plan
 
         info, found = self.plan.info(), self.plan.estimate()
-        files = sum(
-            1 for _ in tqdm(write_plan(self.plan, self.folder), desc="plan", unit=" files", disable=self.json)
-        )
+        with ProgressBars(quiet=self.json) as progress:
+            files = len(write_plan(self.plan, self.folder, progress))
         if self.json:
             print(json.dumps({"folder": str(self.folder), "files": files, **asdict(found)}))
             return
@@ -72,7 +70,7 @@ class Command:
         from evnlos.calibration.scan import import_scan
         from evnlos.errors import MissingDependencyError
         from evnlos.plot.scan import draw_scan
-        from evnlos.transport.measured_file import SUFFIX, write_measurement
+        from evnlos.setups.measured_file import SUFFIX, write_measurement
 
         torch.set_num_threads(1)
         out = self.folder / f"transport{SUFFIX}" if self.out is None else self.out
@@ -95,7 +93,7 @@ class Command:
             print(json.dumps(found))
             return
         print("\n".join(to_lines(result)))
-        print(f"transport: {{kind: measured, file: {out}, checksum: {checksum}}}")
+        print(f"setup: {{kind: measured, file: {out}, checksum: {checksum}}}")
 
 
 def figures_of(result: ScanResult) -> dict[str, Any]:

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from evnlos.cli.console import Flat, progress, result
+from evnlos.cli.console import Flat, result
 from evnlos.cli.notes import say
-from evnlos.dataset import Simulation, open_dataset, simulate
+from evnlos.dataset import Simulation, simulate
 from evnlos.dataset.cluster import run_on_dask
 from evnlos.dataset.estimate import estimate
 from evnlos.dataset.pool import run_tasks
 from evnlos.dataset.presets import PRESETS
 from evnlos.errors import ConfigError
+from evnlos.progress import ProgressBars
+from evnlos.setups import load_setup
+from evnlos.setups.base import is_camera
+from evnlos.setups.load import is_name
 
 __all__ = ["PRESETS", "Command"]
+
+
+def with_setup(settings: Simulation, word: str) -> Simulation:
+    """Return the simulation with the setup of `--setup`, without the ranges over the wall that it had."""
+    setup = load_setup(word)
+    if is_name(word):
+        setup = setup.with_cameras_of(settings.setup)
+    over_cameras = {
+        path: ends for path, ends in settings.vary.items() if not path.startswith("setup.") or is_camera(path)
+    }
+    return replace(settings, setup=setup, vary=over_cameras)
 
 
 @dataclass(frozen=True)
@@ -30,6 +45,10 @@ class Command:
     `paper-comic-digits` for its test sets."""
     config: Path | None = None
     """YAML file with settings that replace the preset's."""
+    setup: str | None = None
+    """The setup instead of the preset's: a name (main-near, matte-far, ...), a settings file, a folder that
+    `evnlos calibrate` wrote, or a file of `evnlos scan import`. A name leaves the cameras to the preset; ranges
+    over the preset's wall are dropped."""
     workers: int = 0
     """Processes; 0 = one for each core."""
     shard: str = "1/1"
@@ -38,6 +57,8 @@ class Command:
     """Processes on this machine, or a Dask cluster (extra `cluster`) on a shared file system."""
     scheduler: str | None = None
     """Address of a running Dask scheduler, e.g. tcp://node1:8786; by default a cluster on this machine."""
+    force: bool = False
+    """Begin although the machine's memory will hardly do."""
     dry_run: bool = False
     """Only simulate one object and print what the whole would take: time, disk, memory."""
     json: bool = False
@@ -49,6 +70,8 @@ class Command:
         config = self.settings
         for note in config.glyphs.notes():
             say(note)
+        for line in config.setup.warnings():
+            say(f"warning: {line}")
         for name, value in config.optics().items():
             say(f"{name} {value:.3g}")
         share = _share(self.shard)
@@ -60,10 +83,8 @@ class Command:
                 print(line)
             return
         engine = run_tasks if self.engine == "local" else partial(run_on_dask, scheduler=self.scheduler)
-        made = simulate(config, self.out, self.workers, share, engine)
-        for _ in progress(made, len(range(share[0] - 1, total, share[1])), "objects", self.out):
-            pass
-        missing = open_dataset(self.out).missing()
+        with ProgressBars() as progress:
+            missing = simulate(config, self.out, self.workers, share, engine, progress, self.force).missing()
         about = {"out": str(self.out), "objects": total, "samples": total * config.positions}
         text = f"{self.out}: {total} objects, {total * config.positions} samples, {len(missing)} missing"
         result(self.json, about | {"missing": missing}, text)

@@ -12,6 +12,7 @@ import tyro
 
 from evnlos.cli.console import Flat
 from evnlos.cli.notes import say
+from evnlos.files import write_atomically
 from evnlos.tracking import Tracking
 
 if TYPE_CHECKING:
@@ -27,9 +28,9 @@ class Command:
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder; what it says of the motion serves for comparison only."""
-    rig: Path | None = None
-    """Rig file, or the folder that `evnlos calibrate` wrote: positions in metres; without it they are in image
-    pixels."""
+    setup: Path | None = None
+    """Setup of the capture (a file, or the folder that `evnlos calibrate` wrote): positions in metres; without
+    it they are in image pixels."""
     pattern: Path | None = None
     """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated rig."""
     out: Path = Path("track.png")
@@ -40,20 +41,21 @@ class Command:
 
     def run(self) -> None:
         """Follow, print, write the picture."""
-        from evnlos.cli.invert_pass import radiometric_rig
+        from evnlos.cli.invert_pass import linear_setup
         from evnlos.dataset import load_pattern, read_capture
         from evnlos.plot.track import draw_track
         from evnlos.tracking import track_capture, track_doubts
 
         capture = read_capture(self.capture)
-        rig = None if self.rig is None else radiometric_rig(self.rig)
+        setup = None if self.setup is None else linear_setup(self.setup)
         pattern = None if self.pattern is None else load_pattern(self.pattern)
-        track = track_capture(capture, rig, self.settings, pattern)
+        track = track_capture(capture, setup, self.settings, pattern)
         truth = true_path(capture, track.time_s) if track.unit == "m" else None
         found = figures(capture, track, truth)
-        found["warnings"] = track_doubts(capture, rig, track)
+        found["warnings"] = track_doubts(capture, setup, track)
         found["picture"] = str(draw_track(track, self.out, truth, capture.name))
-        self.out.with_suffix(".json").write_text(json.dumps({**found, "track": track.summary()}))
+        text = json.dumps({**found, "track": track.summary()})
+        write_atomically(self.out.with_suffix(".json"), text.encode())
         print(json.dumps(found) if self.json else to_text(found))
         for doubt in found["warnings"]:
             say(f"warning: {doubt}")
@@ -111,7 +113,7 @@ def to_text(found: dict[str, Any]) -> str:
     lines = [
         f"{found['capture']}: {found['frames']} frames, {found['event_windows']} windows of events",
         f"travel      {scale * found['travel']:8.2f} {unit}, direction {found['direction_deg']:.1f} deg"
-        + ("" if unit == "mm" else "; image pixels: give --rig for metres"),
+        + ("" if unit == "mm" else "; image pixels: give --setup for metres"),
         f"mean speed  {scale * found['mean_speed']:8.3f} {unit}/s, "
         f"+- {scale * found['speed_sigma']:.3f} at an instant",
         f"position    {scale * found['position_sigma']:8.3f} {unit} standard deviation"

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from tqdm import tqdm
+import torch
 
 from evnlos.cli.console import Flat, result
 from evnlos.cli.notes import say
@@ -15,6 +14,7 @@ from evnlos.config import load_yaml
 from evnlos.dataset import Dataset, Simulation, live_dataset, open_dataset
 from evnlos.dataset.live import Place
 from evnlos.errors import ConfigError
+from evnlos.progress import ProgressBars
 from evnlos.training import Training, paper_pretraining, train
 
 PRESETS = {"default": Training, "paper": paper_pretraining}
@@ -34,8 +34,8 @@ class Command:
     workers: int = 1
     """Processes that simulate beside the training on the CPU, for --simulate; 0 = one for each core."""
     simulate_on: Place = "device"
-    """Where --simulate works beside a GPU: `device` = on it, in steps of 2 ms; `cpu` = in --workers processes,
-    of which it then wants several."""
+    """Where --simulate works beside a GPU: `device` = on it, where the event model can (v2e, with a time step);
+    `cpu` = in --workers processes, of which it then wants several. The physics is the same."""
     preset: str = "default"
     """`default`, or `paper` for the paper's 200 epochs, step sizes and loss."""
     config: Path | None = None
@@ -52,8 +52,10 @@ class Command:
             fit(open_dataset(self.data), self.settings, self.out, None, self.json)
         else:
             assert self.simulate is not None
-            config = load_yaml(Simulation, self.simulate)
-            fit(live_dataset(config, self.workers, self.simulate_on), self.settings, self.out, None, self.json)
+            dataset = live_dataset(load_yaml(Simulation, self.simulate), self.workers, self.simulate_on)
+            if note := dataset.note(torch.device("cuda" if torch.cuda.is_available() else "cpu")):
+                say(f"note: {note}")
+            fit(dataset, self.settings, self.out, None, self.json)
 
 
 def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, as_json: bool) -> None:
@@ -62,18 +64,17 @@ def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, a
     Of several processes that `torchrun` started, only the first speaks.
     """
     quiet = int(os.environ.get("RANK", "0")) > 0
-    record: dict[str, Any] = {}
-    records = train(dataset, settings, out, weights)
-    with tqdm(records, total=settings.epochs, desc=out.name, unit="epoch", disable=quiet) as bar:
-        for record in bar:
-            bar.set_postfix({key: record[key] for key in ("loss", "psnr_db") if key in record})
+    if not quiet and (misfit := dataset.config.get("setup", {}).get("misfit")):
+        say(f"warning: the simulation's setup does not fit its captures: {misfit}")
+    with ProgressBars(quiet) as progress:
+        trained = train(dataset, settings, out, weights, progress)
     if quiet:
         return
+    record = trained.records[-1]
     if record.get("collapsed"):
         say(
             f"warning: the network answers the same to every input ({record['psnr_db']} dB; all-black has "
             f"{record['zero_db']} dB): it has collapsed; use --loss balanced, or train for more epochs"
         )
-    file = out / "weights.safetensors"
-    text = f"{out}: {record['epoch']} epochs, loss {record['loss']}, weights in {file}"
-    result(as_json, {"run": str(out), "weights": str(file), **record}, text)
+    text = f"{out}: {record['epoch']} epochs, loss {record['loss']}, weights in {trained.file}"
+    result(as_json, {"run": str(out), "weights": str(trained.file), **record}, text)

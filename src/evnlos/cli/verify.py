@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tqdm import tqdm
 
 from evnlos.cli.console import result
 from evnlos.dataset import open_dataset
+from evnlos.dataset.store import PAGE
 from evnlos.dataset.verify import find_faults, repair
 from evnlos.errors import DataError
+from evnlos.progress import ProgressBars
 
 
 @dataclass(frozen=True)
@@ -33,22 +34,25 @@ class Command:
         """Check, report, and repair where asked."""
         dataset = open_dataset(self.dataset)
         total = len(dataset.objects())
-        found = tqdm(find_faults(dataset), total=total, unit=" objects", desc=self.dataset.name)
-        faults = [fault for fault in found if fault is not None]
+        with ProgressBars() as progress:
+            faults = find_faults(dataset, progress)
         about = {"dataset": str(self.dataset), "objects": total, "faults": {f.name: f.reason for f in faults}}
         if not self.json:
             for fault in faults:
-                print(f"{dataset.shard(fault.name)}: {fault.reason}")
+                place = dataset.folder / PAGE if fault.name == PAGE else dataset.shard(fault.name)
+                print(f"{place}: {fault.reason}")
         if not faults:
             result(self.json, about | {"repaired": 0}, f"{self.dataset}: {total} objects, all whole")
         elif not self.repair:
             if self.json:
                 print(json.dumps(about | {"repaired": 0}))
+            shards = sum(fault.name != PAGE for fault in faults)
+            page = f" and {PAGE} is not as it was written" if shards < len(faults) else ""
             raise DataError(
-                f"{self.dataset}: {len(faults)} of {total} shards are faulty; --repair makes them again"
+                f"{self.dataset}: {shards} of {total} shards are faulty{page}; --repair makes shards again"
             )
         else:
-            made = repair(dataset, faults, self.workers)
-            count = sum(1 for _ in tqdm(made, total=len(faults), unit=" objects", desc="repair"))
-            text = f"{self.dataset}: {count} of {len(faults)} faulty shards made again"
-            result(self.json, about | {"repaired": count}, text)
+            with ProgressBars() as progress:
+                repair(dataset, faults, self.workers, progress)
+            text = f"{self.dataset}: {len(faults)} of {len(faults)} faulty shards made again"
+            result(self.json, about | {"repaired": len(faults)}, text)

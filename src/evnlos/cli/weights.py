@@ -10,9 +10,8 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from evnlos.config import to_dict
-from evnlos.errors import ConfigError, DataError
-from evnlos.model import JointNetwork, Weights, load_weights, published, save_weights, with_rank
+from evnlos.errors import ConfigError, DataError, printable
+from evnlos.model import Weights, describe_network, load_weights, published, save_weights, with_rank
 
 _MOST_NAMED = 8  # of more objects, the worst and the best are named
 
@@ -78,25 +77,24 @@ def describe(weights: Weights) -> dict[str, Any]:
     """Return what a user of the weights must know, as plain values."""
     state = weights.network.state_dict().values()
     return {
-        "paradigm": weights.paradigm,
-        "joint": isinstance(weights.network, JointNetwork),
+        **describe_network(weights.network),
+        "sees_sequence": weights.network.sees_sequence,
         "parameters": sum(p.numel() for p in weights.network.parameters()),
         "numbers": sum(value.numel() for value in state),
-        "network": to_dict(weights.network.config),
-        "sampling": weights.sampling,
         "history": weights.history,
         "confidence": weights.confidence is not None,
         "scores": weights.scores,
+        "digest": weights.is_sealed,
     }
 
 
 def to_text(name: str, found: dict[str, Any]) -> str:
     """Return the description as lines for people."""
-    sees = "a whole pass" if found["joint"] else "one position at a time"
+    sees = "whole sequences" if found["sees_sequence"] else "one time step at a time"
     sampling = found["sampling"]
     lines = [
-        f"{name}: {found['paradigm']}, {sees}; {found['parameters']:,} trained parameters, "
-        f"{found['numbers'] - found['parameters']:,} numbers in closed form",
+        f"{name}: {found['modality']}, {found['network']['kind']}: {sees}; {found['parameters']:,} trained "
+        f"parameters, {found['numbers'] - found['parameters']:,} numbers in closed form",
         f"  maps {sampling.get('width')} x {sampling.get('height')}, pitch {sampling.get('pitch_m')} m, "
         f"surface {sampling.get('surface')}, tau {sampling.get('tau_s')} s",
     ]
@@ -106,9 +104,11 @@ def to_text(name: str, found: dict[str, Any]) -> str:
             f"  {number}. {data.get('origin')} {data.get('name')}: {len(data.get('train', []))} objects, "
             f"{plan.get('epochs')} epochs at {plan.get('learning_rate')}, seed {plan.get('seed')}"
         )
+    if not found["digest"]:
+        lines.append("  without a digest, as earlier versions wrote them: damage to the numbers goes unseen")
     if found["scores"]:
         lines.append(_score_line(found["scores"]))
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def _score_line(scores: dict[str, Any]) -> str:

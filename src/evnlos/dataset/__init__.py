@@ -6,28 +6,39 @@ from evnlos.dataset.check_picture import check_picture
 from evnlos.dataset.fixed_pattern import PATTERN_FILE, FixedPattern, load_pattern, save_pattern
 from evnlos.dataset.importer import capture_samples, character_of, import_captures
 from evnlos.dataset.live import LiveDataset, live_dataset
-from evnlos.dataset.loader import CHANNELS, PARADIGMS, HeldSamples, NlosDataset, Paradigm, network_input
+from evnlos.dataset.loader import HeldSamples, NlosDataset
+from evnlos.dataset.modality import (
+    MODALITIES,
+    STANDARD_MODALITIES,
+    ChannelGroup,
+    Modality,
+    as_modality,
+    modality_order,
+)
 from evnlos.dataset.sampling import Samples, Sampling, make_samples, reduce_by_area
-from evnlos.dataset.shard import read_shard, write_shard
+from evnlos.dataset.shard import ShardIndex, read_shard, read_shard_index, write_shard
 from evnlos.dataset.simulate import SensorSize, Simulation, simulate, simulate_object
 from evnlos.dataset.store import Dataset, create_dataset, open_dataset
 
 __all__ = [
-    "CHANNELS",
-    "PARADIGMS",
+    "MODALITIES",
     "PATTERN_FILE",
+    "STANDARD_MODALITIES",
     "Capture",
     "CaptureInfo",
+    "ChannelGroup",
     "Dataset",
     "FixedPattern",
     "HeldSamples",
     "LiveDataset",
+    "Modality",
     "NlosDataset",
-    "Paradigm",
     "Samples",
     "Sampling",
     "SensorSize",
+    "ShardIndex",
     "Simulation",
+    "as_modality",
     "capture_samples",
     "character_of",
     "check_picture",
@@ -36,10 +47,11 @@ __all__ = [
     "live_dataset",
     "load_pattern",
     "make_samples",
-    "network_input",
+    "modality_order",
     "open_dataset",
     "read_capture",
     "read_shard",
+    "read_shard_index",
     "reduce_by_area",
     "save_pattern",
     "simulate",

@@ -21,10 +21,13 @@ from evnlos.dataset.cleaning import (
 from evnlos.dataset.dot_grid import find_dots
 from evnlos.dataset.frame_sources import FrameSeries, inside, read_frame_series, read_image
 from evnlos.dataset.registration import homography_from_points, registration_error, warp_frames
-from evnlos.errors import DataError
+from evnlos.errors import DataError, printable
 from evnlos.events import CelexOptions, event_histogram, keep_known_polarity, read_events, read_triggers
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.types import Events
+from evnlos.untrusted import check_memory
+
+_MOST_US = 2**62  # of a time stamp: differences of two fit into 64 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +87,14 @@ class Capture:
         return Scene(self.target, motion, duration_s=max(float(self.frame_times_us[-1]) * 1e-6, 1e-6))
 
 
-def read_capture(folder: str | Path) -> Capture:
+def read_capture(folder: str | Path, most_frame_bytes: int | None = None) -> Capture:
     """Read a capture folder: `capture.yaml`, the event file, the frames and the target's mask.
 
     The order is: dark frame and flat field, registration, filters of the events, clock, region of interest.
 
     Args:
         folder: The folder of one shot.
+        most_frame_bytes: Memory that its frames may take, bytes; None = a quarter of what is free, up to 2 GiB.
 
     Raises:
         DataError: A file is missing, a frame has another size than the camera, or clock or pixels do not fit.
@@ -102,7 +106,7 @@ def read_capture(folder: str | Path) -> Capture:
     if not folder.is_dir():
         raise DataError(f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)")
     info = read_capture_info(folder)
-    series = read_frame_series(folder, info)
+    series = read_frame_series(folder, info, most_frame_bytes)
     notes = [f"{len(series.images)} frames from {series.what}"]
     events, told = _read_events(folder, info)
     notes += told
@@ -119,7 +123,9 @@ def read_capture(folder: str | Path) -> Capture:
     if not len(events):
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
     target = _read_target(folder, info.target)
-    return Capture(folder.name, info, events, np.ascontiguousarray(frames), times_us, target, tuple(notes))
+    return Capture(
+        folder.name, info, events, np.ascontiguousarray(frames), times_us, target, tuple(map(printable, notes))
+    )
 
 
 def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
@@ -171,6 +177,9 @@ def _prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tup
     if info.registration is not None:
         matrix, how = _homography(folder, info.registration, info)
         shape = (info.camera.height, info.camera.width)
+        check_memory(
+            16 * len(frames) * shape[0] * shape[1], f"{folder}: registering its frames", "leave frames out"
+        )
         changed, covered = warp_frames(frames / np.float32(peak) if changed is None else changed, matrix, shape)
         notes.append(
             f"frames registered by {how}; they cover {100 * float(covered.mean()):.0f} % of the events' view"
@@ -216,11 +225,15 @@ def _place_in_time(
                 f"{folder / info.events}: {len(chosen)} rising edges on channel {alignment.trigger_channel} "
                 f"for {len(frames)} frames; check the channel, or leave out frames without an edge"
             )
+        if len(chosen) and max(abs(int(chosen[0])), abs(int(chosen[-1]))) > _MOST_US // 2:
+            raise DataError(f"{folder / info.events}: its triggers are later than {_MOST_US // 2} us")
         return chosen + int(alignment.offset_us), [
             f"frame times from trigger channel {alignment.trigger_channel}"
         ]
     if alignment.offset_us != "auto":
         offset = int(alignment.offset_us)
+        if abs(int(times_us[0]) + offset) > _MOST_US or abs(int(times_us[-1]) + offset) > _MOST_US:
+            raise DataError(f"{folder}: frames shifted by {offset} us leave +-{_MOST_US} us; check offset_us")
         return times_us + offset, [f"frames' clock shifted by {offset} us"] if offset else []
     try:
         found = find_offset(

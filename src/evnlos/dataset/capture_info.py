@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError
+from evnlos.untrusted import MOST_SENSOR_PIXELS
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,14 @@ class CameraInfo:
     """Exposure of a frame, seconds."""
     clock_mhz: int | None = None
     """Clock of a CeleX-V sensor, MHz, where the file's name does not say it."""
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.width <= 65_536 and 1 <= self.height <= 65_536):
+            raise ConfigError(f"camera is {self.width} x {self.height} pixels; give sides of 1 to 65536")
+        if self.width * self.height > MOST_SENSOR_PIXELS:
+            raise ConfigError(
+                f"camera is {self.width} x {self.height} pixels; at most {MOST_SENSOR_PIXELS:,} are read"
+            )
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from evnlos.config import write_atomically
 from evnlos.errors import DataError
+from evnlos.files import write_atomically
 
 _TEMPLATE = """\
 # One shot: a hidden target moves past, an event camera and a frame camera watch the wall.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
 from evnlos.dataset.pool import processes
@@ -15,7 +15,7 @@ _RETRIES = 3
 
 def run_on_dask(
     function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0, scheduler: str | None = None
-) -> Iterator[Result]:
+) -> Generator[Result, None, None]:
     """Run `function` on each task on a Dask cluster and yield the results as they come.
 
     A task whose worker dies is run again elsewhere; it writes its own file atomically, so nothing is half done.

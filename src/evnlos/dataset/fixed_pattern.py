@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from evnlos.config import write_atomically
 from evnlos.errors import DataError
+from evnlos.files import write_atomically
 
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from evnlos.dataset.capture_info import CaptureInfo
 from evnlos.errors import DataError
 from evnlos.events import read_timed_frames
 from evnlos.sensor.video import open_video
+from evnlos.untrusted import check_memory, memory_left, open_image, open_regular
 
 _RECORDINGS = (".aedat4", ".bin")
 
@@ -59,37 +61,42 @@ def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
 def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
     """Read a grey picture as uint8 or uint16 [H, W]; `size` is (rows, columns)."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if size is not None and image.size != (size[1], size[0]):
                 wide, high = image.size
                 raise DataError(f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}")
+            if image.mode == "F" and not np.isfinite(np.asarray(image)).all():
+                raise DataError(f"{path} holds NaN or infinity; leave it out or mend it")
             array = np.asarray(image if image.mode.startswith("I;16") else image.convert("L"))
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise DataError(f"{path} can't be read as a picture: {error}") from None
     return array
 
 
-def read_frame_series(folder: Path, info: CaptureInfo) -> FrameSeries:
+def read_frame_series(folder: Path, info: CaptureInfo, most_bytes: int | None = None) -> FrameSeries:
     """Read the frames that a capture names.
 
     Args:
         folder: The capture's folder.
         info: Its description.
+        most_bytes: Memory that they may take, bytes; None = a quarter of what is free, at most 2 GiB.
 
     Raises:
-        DataError: A file is missing or unreadable, or frames carry no time and no rate is stated.
+        DataError: A file is missing or unreadable, the frames take too much memory, or they carry no time and
+            no rate is stated.
         EventFileError: A recording of the camera is damaged.
     """
     path = inside(folder, info.frames)
+    most = min(memory_left() // 4, 1 << 31) if most_bytes is None else most_bytes
     size = None if info.registration is not None else (info.camera.height, info.camera.width)
     if path.suffix.lower() == ".csv":
-        return _from_table(folder, path, size)
+        return _from_table(folder, path, size, most)
     if path.suffix.lower() in _RECORDINGS:
         found = read_timed_frames(path)
         times = found.t_us if found.t_us is not None else _at_rate(path, len(found.images), info)
         series = FrameSeries(found.images, times, path.name)
     else:
-        series = _from_video(path, info)
+        series = _from_video(folder, path, info, most)
     _check_times(path, series.times_us)
     if size is not None and series.images.shape[1:] != size:
         high, wide = series.images.shape[1:]
@@ -110,12 +117,17 @@ def _at_rate(path: Path, count: int, info: CaptureInfo) -> NDArray[np.int64]:
     return np.round(np.arange(count) * (1e6 / _rate(path, info))).astype(np.int64)
 
 
-def _from_video(path: Path, info: CaptureInfo) -> FrameSeries:
+def _from_video(folder: Path, path: Path, info: CaptureInfo, most: int) -> FrameSeries:
     """Read a video, animation, array or folder of pictures as 16 bits."""
+    if path.is_dir():
+        for one in path.iterdir():
+            inside(folder, str(one.relative_to(folder.resolve())), f"{info.frames}")
     timed = path.is_file() and path.suffix.lower() != ".npy"
     video = open_video(path, fps=None if timed else _rate(path, info))
+    _check_size(path, (video.frames or 1) * video.width * video.height * 2, most)
     times_s, images = [], []
     for time_s, light in video:
+        _check_size(path, (len(images) + 1) * light.size * 2, most)
         times_s.append(time_s)
         images.append(np.clip(np.round(light * (65_535 / 255)), 0, 65_535).astype(np.uint16))
     if not images:
@@ -123,9 +135,9 @@ def _from_video(path: Path, info: CaptureInfo) -> FrameSeries:
     return FrameSeries(np.stack(images), np.round(np.array(times_s) * 1e6).astype(np.int64), path.name)
 
 
-def _from_table(folder: Path, path: Path, size: tuple[int, int] | None) -> FrameSeries:
+def _from_table(folder: Path, path: Path, size: tuple[int, int] | None, most: int) -> FrameSeries:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with open_regular(path) as opened, TextIOWrapper(opened, encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path} can't be read as a table: {error}") from None
@@ -136,17 +148,32 @@ def _from_table(folder: Path, path: Path, size: tuple[int, int] | None) -> Frame
     except (TypeError, ValueError, OverflowError):
         raise DataError(f"{path} holds a time that is not a whole number of microseconds") from None
     _check_times(path, times)
-    images = [read_image(inside(folder, row["file"] or "", path.name), size) for row in rows]
-    for k, image in enumerate(images):
-        if image.shape != images[0].shape or image.dtype != images[0].dtype:
+    named: dict[str, int] = {}
+    for k, row in enumerate(rows):
+        before = named.setdefault(row["file"] or "", k)
+        if before != k:
+            raise DataError(f"{path}: frames {before} and {k} are both {row['file']}; name every picture once")
+    first = read_image(inside(folder, rows[0]["file"] or "", path.name), size)
+    _check_size(path, len(rows) * first.nbytes, most)
+    images = np.empty((len(rows), *first.shape), first.dtype)
+    for k, row in enumerate(rows):
+        image = read_image(inside(folder, row["file"] or "", path.name), size) if k else first
+        if image.shape != first.shape or image.dtype != first.dtype:
             raise DataError(
-                f"{path}: frame {k} is {image.dtype} {image.shape}, frame 0 {images[0].dtype} "
-                f"{images[0].shape}; give frames of one camera"
+                f"{path}: frame {k} is {image.dtype} {image.shape}, frame 0 {first.dtype} "
+                f"{first.shape}; give frames of one camera"
             )
-    return FrameSeries(np.stack(images), times, path.name)
+        images[k] = image
+    return FrameSeries(images, times, path.name)
+
+
+def _check_size(path: Path, needed: int, most: int) -> None:
+    check_memory(needed, f"{path}: its frames", "leave frames out, or make them smaller", most)
 
 
 def _check_times(path: Path, times: NDArray[np.int64]) -> None:
+    if len(times) and max(abs(int(times[0])), abs(int(times[-1]))) > 2**62:
+        raise DataError(f"{path}: times leave +-2^62 us; give microseconds")
     if (np.diff(times) <= 0).any():
         i = int(np.argmax(np.diff(times) <= 0))
         raise DataError(f"{path}: frame {i + 1} at {times[i + 1]} us follows {times[i]} us; times must ascend")

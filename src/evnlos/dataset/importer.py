@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from evnlos.claim import claim
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.capture import Capture, read_capture
 from evnlos.dataset.capture_info import read_capture_info
 from evnlos.dataset.fixed_pattern import FixedPattern
 from evnlos.dataset.sampling import Samples, Sampling, make_samples
 from evnlos.dataset.shard import write_shard
-from evnlos.dataset.store import Dataset, create_dataset
+from evnlos.dataset.store import Dataset, claim_dataset
 from evnlos.errors import DataError
+from evnlos.progress import Progress, Step, silent
 
 
 def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern | None = None) -> Samples:
@@ -47,8 +47,9 @@ def import_captures(
     validation: Iterable[str] = (),
     pattern: FixedPattern | None = None,
     look: Callable[[Capture], None] | None = None,
-) -> Iterator[tuple[str, Samples]]:
-    """Import capture folders, yielding each capture's name and samples as its shard is in place.
+    progress: Progress = silent,
+) -> Dataset:
+    """Import capture folders as a dataset, or what is missing of it, and return it.
 
     Args:
         folders: Capture folders; the folder's name becomes the object's name, the part behind the last
@@ -59,12 +60,16 @@ def import_captures(
         validation: The same for validation.
         pattern: Fixed pattern of the frame camera, to be taken from all frames.
         look: Called with each capture that was read, before its samples are made: to tell of it, or to draw it.
+        progress: Called when the work begins and as each shard is in place, with the capture's name.
+
+    Returns:
+        The dataset.
 
     Raises:
         DataError: No folder, two captures of one name, or a held-out name that no capture has.
     """
-    paths = {Path(folder).resolve().name: Path(folder).resolve() for folder in folders}
-    given = list(folders) if isinstance(folders, (list, tuple)) else list(paths)
+    given = [Path(folder).resolve() for folder in folders]
+    paths = {path.name: path for path in given}
     if not paths:
         raise DataError("no captures given; name at least one capture folder")
     if len(paths) != len(given):
@@ -79,9 +84,10 @@ def import_captures(
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
     captures: dict[str, Capture] = {first.name: read_capture(first)}
-    with claim(dataset.folder):
-        create_dataset(dataset)
-        for name in dataset.missing():
+    with claim_dataset(dataset):
+        what, total, missing = f"import {dataset.folder.name}", len(paths), dataset.missing()
+        progress(Step(what, total - len(missing), total, "captures"))
+        for done, name in enumerate(missing, start=total - len(missing) + 1):
             capture = captures.pop(name, None) or read_capture(paths[name])
             if look is not None:
                 look(capture)
@@ -89,7 +95,8 @@ def import_captures(
             camera = capture.info.camera.name
             attributes = {"object": name, "config_hash": dataset.config_hash, "camera": camera}
             write_shard(dataset.shard(name), samples, attributes)
-            yield name, samples
+            progress(Step(what, done, total, "captures", name))
+    return dataset
 
 
 def character_of(name: str) -> str:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
-from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,12 @@ from PIL import Image
 
 from evnlos.config import differing_keys, read_yaml, save_yaml, to_dict
 from evnlos.dataset.lab_sensor import SENSOR_SPREAD
-from evnlos.dataset.pool import run_tasks
-from evnlos.dataset.simulate import SensorSize
+from evnlos.dataset.pool import processes, run_tasks
 from evnlos.dataset.variation import check_ranges, varied
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
+from evnlos.files import new_folder
+from evnlos.progress import Progress, Step, silent
 from evnlos.scene import (
     FontGlyphs,
     Glyphs,
@@ -26,14 +26,32 @@ from evnlos.scene import (
     Scene,
 )
 from evnlos.seeds import derive_seed
-from evnlos.sensor import EventCamera, EventPixel, FrameCamera
-from evnlos.transport import RadiometricTransport, rig_preset
+from evnlos.sensor import EventPixel, FrameCamera
+from evnlos.setups import RadiometricSetup, Setup, named_setup, setup_preset
+from evnlos.setups.load import is_name
 from evnlos.version import __version__
 
 LIGHT = {"gain": 0.7, "ambient": 0.06, "ambient_gradient": (0.3, -0.2)}
 """Light of the lab: dimmer and less even than in the training simulator."""
+_CAMERAS = {
+    "frame_camera": FrameCamera(exposure_s=0.016, full_well_e=9000.0, read_noise_e=12.0),
+    "pixel": EventPixel(
+        threshold_on=0.21,
+        threshold_off=0.24,
+        threshold_sigma=0.04,
+        cutoff_hz=40.0,
+        leak_rate_hz=0.05,
+        shot_noise_rate_hz=0.08,
+        refractory_s=0.0005,
+    ),
+}
 
 _SKETCH = (6, 10)  # pixels
+
+
+def in_the_lab(setup: Setup) -> Setup:
+    """Return a wall and its geometry in the lab's light, before the lab's cameras."""
+    return replace(setup, **LIGHT, **_CAMERAS)
 
 
 @dataclass(frozen=True)
@@ -50,26 +68,9 @@ class Lab:
     """Length of a pass, seconds."""
     frame_rate_hz: float = 5.0
     """Frames a second, hertz; a pass of 8 s has the 40 positions of the paper."""
-    transport: RadiometricTransport = field(default_factory=lambda: RadiometricTransport(**LIGHT))
-    """The rig: wall, camera, occluders, torch, ambient light."""
-    sensor: SensorSize = field(default_factory=SensorSize)
-    """Size of the sensor."""
-    frame_camera: FrameCamera = field(
-        default_factory=lambda: FrameCamera(exposure_s=0.016, full_well_e=9000.0, read_noise_e=12.0)
-    )
-    """The frame camera; 8-bit, as captures are."""
-    pixel: EventPixel = field(
-        default_factory=lambda: EventPixel(
-            threshold_on=0.21,
-            threshold_off=0.24,
-            threshold_sigma=0.04,
-            cutoff_hz=40.0,
-            leak_rate_hz=0.05,
-            shot_noise_rate_hz=0.08,
-            refractory_s=0.0005,
-        )
-    )
-    """The event pixel: on purpose not that of the training simulator."""
+    setup: Setup = field(default_factory=lambda: in_the_lab(RadiometricSetup()))
+    """Wall, geometry, light and cameras; the frame camera has 8 bits, as captures have, and the event pixel is
+    on purpose not that of the training simulator."""
     spread: dict[str, tuple[float, float]] = field(default_factory=lambda: dict(SENSOR_SPREAD))
     """Settings drawn once for the rig, uniformly: dotted name -> (low, high); {} takes them as they stand."""
     seed: int = 0
@@ -85,10 +86,11 @@ class Lab:
             raise ConfigError(
                 f"Lab.duration_s is {self.duration_s} s at {self.frame_rate_hz} Hz; a sample needs two frames"
             )
-        if self.frame_camera.bit_depth != 8:
+        if self.setup.frame_camera.bit_depth != 8:
             raise ConfigError(
-                f"Lab.frame_camera.bit_depth is {self.frame_camera.bit_depth}; captures hold 8 bits"
+                f"Lab.setup.frame_camera.bit_depth is {self.setup.frame_camera.bit_depth}; captures hold 8 bits"
             )
+        _ = self.setup.event_camera  # refuses a step that does not fit the model
         check_ranges(self, self.spread)
 
     def drawn(self) -> Lab:
@@ -96,33 +98,60 @@ class Lab:
 
         Example:
             >>> one, other = Lab(seed=1).drawn(), Lab(seed=2).drawn()
-            >>> one.pixel == other.pixel, 0.18 <= one.pixel.threshold_on <= 0.28, one.spread
+            >>> one.setup.pixel == other.setup.pixel, 0.18 <= one.setup.pixel.threshold_on <= 0.28, one.spread
             (False, True, {})
         """
         if not self.spread:
             return self
         pattern = derive_seed(self.seed, self.name, "fixed pattern")
-        own = replace(self, frame_camera=replace(self.frame_camera, pattern_seed=pattern))
+        camera = replace(self.setup.frame_camera, pattern_seed=pattern)
+        own = replace(self, setup=replace(self.setup, frame_camera=camera))
         return replace(varied(own, self.spread, self.seed, self.name), spread={})
 
 
 def lab_preset(name: str) -> Lab:
-    """Return the lab of a named rig, e.g. "main-near" (see `rig_preset`), in the lab's light.
+    """Return the lab of a named rig, e.g. "main-near" (see `setup_preset`), in the lab's light.
 
     Raises:
         ConfigError: The name is unknown.
 
     Example:
-        >>> lab_preset("aperture-far").transport.distance_m
+        >>> lab_preset("aperture-far").setup.distance_m
         0.5
     """
-    return Lab(name=name, transport=replace(rig_preset(name), **LIGHT))
+    return Lab(name=name, setup=in_the_lab(setup_preset(name)))
+
+
+def lab_of(word: str | Path, lab: Lab | None = None) -> Lab:
+    """Return the lab with the setup of a word (see `load_setup`), and its name.
+
+    Args:
+        word: A name, which leaves light and cameras to the lab, the name of a room, or a file or folder, which
+            state all. A room's cameras are as stated, with no `spread`.
+        lab: All other settings; None is the default lab.
+
+    Raises:
+        ConfigError: The word names no setup.
+    """
+    lab = Lab() if lab is None else lab
+    found = named_setup(word)
+    name = re.sub(r"[^A-Za-z0-9._-]", "-", found.name).lstrip(".-_") or lab.name
+    if not is_name(word):
+        return replace(lab, name=name, setup=found.setup)
+    setup = replace(found.setup, sensor=lab.setup.sensor)
+    if setup.is_lit:
+        return replace(lab, name=name, setup=setup, spread={})
+    return replace(lab, name=name, setup=in_the_lab(setup))
 
 
 def render_captures(
-    lab: Lab, out: str | Path, names: list[str] | None = None, workers: int = 1
-) -> Iterator[Path]:
-    """Render one capture folder an object, yielding each as it is done, and `lab.yaml` beside them.
+    lab: Lab,
+    out: str | Path,
+    names: list[str] | None = None,
+    workers: int = 1,
+    progress: Progress = silent,
+) -> list[Path]:
+    """Render one capture folder per object, and `lab.yaml` beside them.
 
     A capture that exists is done and is kept, so that a run can be taken up again; the captures are the same
     for any number of workers.
@@ -132,6 +161,10 @@ def render_captures(
         out: The folder for the captures; new, or begun with the same settings (other characters may be added).
         names: Objects of `lab.glyphs`; all by default.
         workers: Processes; 0 means one for each core.
+        progress: Called when the work begins and as each capture is in place, with its folder.
+
+    Returns:
+        The capture folders, in the order of `names`.
 
     Raises:
         DataError: `out` is a file, or was begun with other settings, or holds a folder in a capture's place.
@@ -140,6 +173,7 @@ def render_captures(
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise DataError(f"{out} is a file; give a folder for the captures")
+    processes(workers, 1)
     drawn = lab.drawn()
     names = lab.glyphs.objects() if names is None else names
     folders = {name: out / _folder_name(lab, name) for name in names}
@@ -148,16 +182,16 @@ def render_captures(
             raise DataError(f"{folder} is there without a capture.yaml; move it away, it is no capture")
     # A wrong rig is an error before anything is written; a few pixels are enough to find it.
     if names:
-        drawn.transport.wall(_scene(drawn, names[0]), _SKETCH)
+        drawn.setup.resized(_SKETCH).observe(_scene(drawn, names[0]))
     out.mkdir(parents=True, exist_ok=True)
     _record(lab, drawn, out)
-    missing = []
-    for name, folder in folders.items():
-        if folder.is_dir():
-            yield folder
-        else:
-            missing.append((drawn, name, folder))
-    yield from run_tasks(_render, missing, workers)
+    missing = [(drawn, name, folder) for name, folder in folders.items() if not folder.is_dir()]
+    what, total, there = f"render {out.name}", len(folders), len(folders) - len(missing)
+    progress(Step(what, there, total, "captures"))
+    with closing(run_tasks(_render, missing, workers)) as finished:
+        for done, folder in enumerate(finished, start=there + 1):
+            progress(Step(what, done, total, "captures", folder))
+    return list(folders.values())
 
 
 def _record(lab: Lab, drawn: Lab, out: Path) -> None:
@@ -171,7 +205,7 @@ def _record(lab: Lab, drawn: Lab, out: Path) -> None:
             raise DataError(
                 f"{out} was begun with other settings ({'; '.join(differing[:3])}); give another folder"
             )
-    sensor = {"pixel": to_dict(drawn.pixel), "frame_camera": to_dict(drawn.frame_camera)}
+    sensor = {"pixel": to_dict(drawn.setup.pixel), "frame_camera": to_dict(drawn.setup.frame_camera)}
     save_yaml({"evnlos": __version__, "lab": asked, "drawn": sensor}, path)
 
 
@@ -184,47 +218,38 @@ def _scene(lab: Lab, name: str) -> Scene:
     return Scene(lab.glyphs.target(name, lab.seed), lab.motion, lab.duration_s)
 
 
-def _shape(lab: Lab) -> tuple[int, int]:
-    return lab.sensor.height, lab.sensor.width
-
-
 def _render(task: tuple[Lab, str, Path]) -> Path:
-    """Render into a temporary folder, then rename: a capture is there whole or not at all."""
+    """Render a capture into a folder that is there whole or not at all."""
     lab, name, folder = task
     scene = _scene(lab, name)
-    wall = lab.transport.wall(scene, _shape(lab))
+    wall = lab.setup.observe(scene)
     times_s = np.arange(round(lab.duration_s * lab.frame_rate_hz) + 1) / lab.frame_rate_hz
     seed = derive_seed(lab.seed, name)
-    events = EventCamera(lab.pixel).record(wall, 0.0, lab.duration_s, seed=derive_seed(seed, "events"))
-    frames = lab.frame_camera.capture(wall, times_s, seed=derive_seed(seed, "frames"))
-
-    draft = folder.with_name(f".{folder.name}.tmp")
-    shutil.rmtree(draft, ignore_errors=True)
-    (draft / "frames").mkdir(parents=True)
-    write_events(draft / "events.raw", events)
-    rows = ["t_us,file"]
-    for k, (time_s, frame) in enumerate(zip(times_s, frames, strict=True)):
-        Image.fromarray(frame).save(draft / f"frames/{k:04d}.png")
-        rows.append(f"{round(time_s * 1e6)},frames/{k:04d}.png")
-    (draft / "frames.csv").write_text("\n".join(rows) + "\n")
-    Image.fromarray(np.round(scene.target.mask * 255).astype(np.uint8)).save(draft / "target.png")
-    save_yaml(_description(lab, folder.name, scene.target.size_m), draft / "capture.yaml")
-    draft.rename(folder)
+    events = lab.setup.event_camera.record(wall, 0.0, lab.duration_s, seed=derive_seed(seed, "events"))
+    frames = lab.setup.frame_camera.capture(wall, times_s, seed=derive_seed(seed, "frames"))
+    with new_folder(folder) as draft:
+        (draft / "frames").mkdir()
+        write_events(draft / "events.raw", events)
+        rows = ["t_us,file"]
+        for k, (time_s, frame) in enumerate(zip(times_s, frames, strict=True)):
+            Image.fromarray(frame).save(draft / f"frames/{k:04d}.png")
+            rows.append(f"{round(time_s * 1e6)},frames/{k:04d}.png")
+        (draft / "frames.csv").write_text("\n".join(rows) + "\n")
+        Image.fromarray(np.round(scene.target.mask * 255).astype(np.uint8)).save(draft / "target.png")
+        save_yaml(_description(lab, folder.name, scene.target.size_m), draft / "capture.yaml")
     return folder
 
 
 def _description(lab: Lab, name: str, plate_m: float) -> dict[str, Any]:
-    rig = lab.transport
-    parts = ["matte" if rig.wall_material == "lambert" else f"aluminium, GGX roughness {rig.roughness:g}"]
-    parts += [f"{len(rig.occluders())} occluder(s)"] if rig.occluders() else []
-    parts += ["torch-lit target"] if rig.lamp_m is not None else []
+    setup = lab.setup
+    distance_m = setup.default_distance_m if lab.motion.z_m is None else lab.motion.z_m
     return {
         "camera": {
             "name": "rendered laboratory",
-            "width": lab.sensor.width,
-            "height": lab.sensor.height,
+            "width": setup.sensor.width,
+            "height": setup.sensor.height,
             "frame_rate_hz": lab.frame_rate_hz,
-            "exposure_s": lab.frame_camera.exposure_s,
+            "exposure_s": setup.frame_camera.exposure_s,
         },
         "events": "events.raw",
         "frames": "frames.csv",
@@ -236,15 +261,9 @@ def _description(lab: Lab, name: str, plate_m: float) -> dict[str, Any]:
             "start_us": round(lab.motion.start_s * 1e6),
         },
         "rig": {
-            "distance_m": rig.distance_m,
-            "wall": "rendered: " + ", ".join(parts),
-            "ambient": f"{rig.ambient:g} of the white level in the middle",
-            "rendered": {
-                "by": f"evnlos {__version__}",
-                "seed": lab.seed,
-                "transport": to_dict(rig),
-                "pixel": to_dict(lab.pixel),
-                "frame_camera": to_dict(lab.frame_camera),
-            },
+            **({} if distance_m is None else {"distance_m": distance_m}),
+            "wall": f"rendered: {setup.wall_description()}",
+            "ambient": f"{setup.ambient:g} of the white level in the middle",
+            "rendered": {"by": f"evnlos {__version__}", "seed": lab.seed, "setup": to_dict(setup)},
         },
     }

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 SENSOR_SPREAD: dict[str, tuple[float, float]] = {
-    "pixel.threshold_on": (0.18, 0.28),
-    "pixel.threshold_off": (0.20, 0.30),
-    "pixel.threshold_sigma": (0.035, 0.06),
-    "pixel.cutoff_hz": (25.0, 90.0),
-    "pixel.leak_rate_hz": (0.02, 0.15),
-    "pixel.shot_noise_rate_hz": (0.03, 0.20),
-    "pixel.refractory_s": (2e-4, 1.5e-3),
-    "pixel.hot_pixel_fraction": (0.0, 4e-4),
-    "pixel.jitter_s": (2e-5, 2e-4),
-    "frame_camera.exposure_s": (0.012, 0.030),
-    "frame_camera.full_well_e": (6_000.0, 12_000.0),
-    "frame_camera.read_noise_e": (8.0, 16.0),
-    "frame_camera.prnu": (0.012, 0.025),
-    "frame_camera.dsnu_e": (5.0, 15.0),
+    "setup.pixel.threshold_on": (0.18, 0.28),
+    "setup.pixel.threshold_off": (0.20, 0.30),
+    "setup.pixel.threshold_sigma": (0.035, 0.06),
+    "setup.pixel.cutoff_hz": (25.0, 90.0),
+    "setup.pixel.leak_rate_hz": (0.02, 0.15),
+    "setup.pixel.shot_noise_rate_hz": (0.03, 0.20),
+    "setup.pixel.refractory_s": (2e-4, 1.5e-3),
+    "setup.pixel.hot_pixel_fraction": (0.0, 4e-4),
+    "setup.pixel.jitter_s": (2e-5, 2e-4),
+    "setup.frame_camera.exposure_s": (0.012, 0.030),
+    "setup.frame_camera.full_well_e": (6_000.0, 12_000.0),
+    "setup.frame_camera.read_noise_e": (8.0, 16.0),
+    "setup.frame_camera.prnu": (0.012, 0.025),
+    "setup.frame_camera.dsnu_e": (5.0, 15.0),
 }
 """Uniform ranges of a rig's sensor.
 

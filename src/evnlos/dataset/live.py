@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.config import config_hash, to_dict
-from evnlos.dataset.loader import Paradigm, network_input
-from evnlos.dataset.on_device import bytes_of_a_wall, simulate_objects_on
+from evnlos.dataset.modality import Modality, as_modality
+from evnlos.dataset.on_device import bytes_of_a_wall, no_backend, simulate_objects_on
 from evnlos.dataset.pool import run_in_order
 from evnlos.dataset.sampling import Samples
 from evnlos.dataset.simulate import Simulation, drawn_for, scene_of, simulate_object, split_of
@@ -32,8 +32,9 @@ _MOST_BYTES = 4 << 30  # of walls that a GPU holds at a time
 class LiveDataset(Dataset):
     """A simulation that takes the place of a dataset on disk; make it with `live_dataset`.
 
-    Made on a CPU, epoch 0 is the dataset that `simulate` would write; epoch n has other handwriting, settings
-    from the same ranges and other noise, and is the same whenever it is asked for. A GPU has other time steps.
+    Epoch 0 is the dataset that `simulate` would write; epoch n has other handwriting, settings from the same
+    ranges and other noise, and is the same whenever it is asked for. The settings alone decide the physics: a
+    GPU simulates where the event model has a torch backend, else the CPU does.
     """
 
     simulation: Simulation = field(default_factory=Simulation)
@@ -43,21 +44,19 @@ class LiveDataset(Dataset):
     mix: int = 8
     """Objects whose samples are shuffled together."""
     where: Place = "device"
-    """Simulate on the device of the training, or on the CPU also beside a GPU."""
+    """Simulate on the device of the training, where the event model can, or on the CPU also beside a GPU."""
     together: int = 16
     """Objects that a GPU simulates at a time."""
-    step_s: float = 0.002
-    """Time step of the pixels on a GPU, seconds; on the CPU the camera chooses its steps."""
 
     def stream(
-        self, names: Iterable[str], epoch: int, paradigm: Paradigm, device: torch.device
+        self, names: Iterable[str], epoch: int, modality: str | Modality, device: torch.device
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield input [N, C, H, W] and truth [N, 1, H, W] of each object, in order, float32.
 
         Simulated on a CPU the samples are those of `simulate_object`, bit for bit. On a GPU all but the drawing
-        of the plate happens there, in steps of `step_s`.
+        of the plate happens there; see `simulate_objects_on`.
         """
-        config = epoch_settings(self.simulation, epoch)
+        config, seen = epoch_settings(self.simulation, epoch), as_modality(modality)
         made: Iterator[tuple[Tensor, Tensor, Tensor]]
         if self._uses(device):
             made = self._on_device(config, list(names), device)
@@ -69,21 +68,24 @@ class LiveDataset(Dataset):
         for maps in made:
             # in half precision twice, as shards hold the maps and a loader the inputs
             frame, surface, truth = (part.half().to(device).float() for part in maps)
-            yield network_input(frame, surface, paradigm).half().float(), truth[:, None]
+            yield seen.inputs(frame, surface).half().float(), truth[:, None]
 
-    def way(self, device: torch.device) -> dict[str, float]:
-        """Return what besides the settings decides the samples: the time step, where a GPU makes them."""
-        return {"step_s": self.step_s} if self._uses(device) else {}
+    def note(self, device: torch.device) -> str:
+        """Return one line on why the CPU simulates beside a GPU; "" where it does not, or was asked to."""
+        if self.where == "cpu" or device.type == "cpu" or self._uses(device):
+            return ""
+        return no_backend(self.simulation)
 
     def _uses(self, device: torch.device) -> bool:
-        return self.where == "device" and device.type != "cpu"
+        has_backend = self.simulation.pixel.torch_backend() is not None
+        return self.where == "device" and device.type != "cpu" and has_backend
 
     def _on_device(
         self, config: Simulation, names: list[str], device: torch.device
     ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         together = max(1, min(self.together, _MOST_BYTES // bytes_of_a_wall(config)))
         for first in range(0, len(names), together):
-            yield from simulate_objects_on(config, names[first : first + together], device, self.step_s)
+            yield from simulate_objects_on(config, names[first : first + together], device)
 
     def truth(self, name: str) -> NDArray[np.float32]:
         """Return the true pictures of an object in the first epoch, float32 [N, H, W], 0..1."""
@@ -98,7 +100,8 @@ def live_dataset(config: Simulation, workers: int = 1, where: Place = "device") 
     Args:
         config: The settings.
         workers: Processes that simulate on the CPU; 0 means one for each core.
-        where: "device" simulates where the network trains, "cpu" on the CPU also beside a GPU.
+        where: "device" simulates where the network trains if the event model has a torch backend, "cpu" on the
+            CPU also beside a GPU.
 
     Raises:
         ConfigError: No object is left to train on.

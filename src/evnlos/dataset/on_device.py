@@ -17,8 +17,7 @@ from evnlos.scene import Scene
 from evnlos.seeds import derive_seed
 from evnlos.sensor.event_tensors import EventTensors
 from evnlos.sensor.frame_tensors import capture_tensors
-from evnlos.sensor.record_tensors import can_share, record_tensors
-from evnlos.transport import PaperTransport, Wall
+from evnlos.transport import Wall
 
 
 class DeviceSamples(NamedTuple):
@@ -33,57 +32,57 @@ class DeviceSamples(NamedTuple):
 
 
 def simulate_objects_on(
-    config: Simulation, names: Sequence[str], device: torch.device | str, step_s: float
+    config: Simulation, names: Sequence[str], device: torch.device | str
 ) -> list[DeviceSamples]:
     """Simulate some objects' passes on a device: walls, frames, event pixels, surfaces and maps.
 
-    The plates are drawn on the CPU. The pixels step from frame to frame (`mode="v2e"`) in steps of `step_s`,
-    those of all objects together where they can. Surfaces and maps are those of `simulate_object` to single
-    precision, given the same events; frames are its frames but for digital numbers, about one in a hundred
-    thousand, that the last bits of the light decide. An object's samples do not depend on the others.
+    The plates are drawn on the CPU. The event pixels are those of the settings, run by the torch backend of
+    their model, those of all objects together where they can. The samples are those of `simulate_object` but
+    for what the last bits of the light decide: about one digital number in a hundred thousand, and the events
+    of pixels that stop within rounding of a threshold. An object's samples do not depend on the others.
 
     Args:
         config: The settings.
         names: Some of `config.glyphs.objects()`.
         device: Where all else is computed, and stays.
-        step_s: Time step, seconds.
 
     Raises:
-        ConfigError: The pixel has hot pixels or jitter, which this mode has not.
+        ConfigError: The event model has no torch backend.
     """
+    run = config.pixel.torch_backend()
+    if run is None:
+        raise ConfigError(no_backend(config))
     device = torch.device(device)
     if device.type == "cuda" and device.index is None:  # one name for one device: matrices are kept by it
         device = torch.device("cuda", torch.cuda.current_device())
     drawn = [drawn_for(config, name) for name in names]
-    for one in drawn:
-        if one.pixel.hot_pixel_fraction > 0 or one.pixel.jitter_s > 0:
-            raise ConfigError(
-                f"hot_pixel_fraction is {one.pixel.hot_pixel_fraction}, jitter_s {one.pixel.jitter_s}; a GPU "
-                "simulates neither: set both to 0, or simulate on the CPU (`evnlos train --simulate-on cpu`)"
-            )
     if not drawn:
         return []
-    if len({one.duration_s for one in drawn}) > 1 or not can_share([one.pixel for one in drawn]):
-        return [simulate_objects_on(config, [name], device, step_s)[0] for name in names]
+    pixels = [one.pixel for one in drawn]
+    if len({one.duration_s for one in drawn}) > 1 or not drawn[0].pixel.can_run_together(pixels):
+        return [simulate_objects_on(config, [name], device)[0] for name in names]
     scenes = [scene_of(config, one, name) for one, name in zip(drawn, names, strict=True)]
-    steps = max(1, round(drawn[0].duration_s / step_s))
-    instants = np.linspace(0.0, drawn[0].duration_s, steps + 1)
+    camera = drawn[0].setup.event_camera
+    instants = np.append(0.0, camera.fixed_instants(0.0, drawn[0].duration_s))
     with torch.no_grad():
-        shape = config.sensor.height, config.sensor.width
-        walls = [one.transport.wall(scene, shape, device) for one, scene in zip(drawn, scenes, strict=True)]
+        walls = [one.setup.observe(scene, device) for one, scene in zip(drawn, scenes, strict=True)]
         seeds = [derive_seed(config.seed, name, "events") for name in names]
-        events = record_tensors(walls, instants, [one.pixel for one in drawn], seeds)
+        events = run(walls, instants, pixels, seeds)
         return [_samples(*one, config) for one in zip(drawn, scenes, walls, events, names, strict=True)]
+
+
+def no_backend(config: Simulation) -> str:
+    """Return one line on an event model that only the CPU runs."""
+    kind = getattr(config.pixel, "kind", type(config.pixel).__name__)
+    return (
+        f"the event model {kind!r} has no torch backend, so the CPU simulates it; give it several workers, or "
+        "take setup.pixel.kind v2e with a setup.time_step_s"
+    )
 
 
 def bytes_of_a_wall(config: Simulation) -> int:
     """Return about how much an object's wall takes on a device, bytes: its matrix and keyframes, if any."""
-    pixels = config.sensor.height * config.sensor.width
-    if isinstance(config.transport, PaperTransport):
-        return 4 * 4 * pixels
-    source = config.transport.source()
-    keyframes = 2 * (source.extent_m[1] + config.glyphs.plate.size_m) / source.pitch_m
-    return 4 * pixels * (source.height * source.width + round(keyframes))
+    return config.setup.bytes_of_a_scene(config.glyphs.plate.size_m)
 
 
 def _samples(

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from multiprocessing.connection import wait as wait_for
 from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -16,10 +24,11 @@ from evnlos.threads import cores, one_thread
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-Engine = Callable[[Callable[[Any], str], Iterable[Any], int], Iterator[str]]
+Engine = Callable[[Callable[[Any], str], Iterable[Any], int], Generator[str, None, None]]
 """Runs a function on each task with so many processes, and yields the results as they come."""
 
 _TRIES = 3
+_GRACE_S = 5.0  # in which a worker may leave what it writes
 
 
 def processes(workers: int, tasks: int) -> int:
@@ -33,7 +42,9 @@ def processes(workers: int, tasks: int) -> int:
     return min(workers or cores(), tasks)
 
 
-def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+def run_tasks(
+    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int
+) -> Generator[Result, None, None]:
     """Run `function` on each task and yield the results as they come.
 
     Args:
@@ -53,7 +64,7 @@ def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers
     tries = [0] * len(pending)
     left = set(range(len(pending)))
     while left:
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread) as pool:
+        with _workers(workers) as pool:
             try:
                 yield from _drain(pool, function, pending, left, workers)
             except BrokenProcessPool:
@@ -66,9 +77,6 @@ def run_tasks(function: Callable[[Task], Result], tasks: Iterable[Task], workers
                         f"a worker process died {_TRIES} times (killed, or out of memory?); "
                         "run again with fewer at a time (--workers, --trainings): what is finished is kept"
                     ) from None
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
 
 
 def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
@@ -88,21 +96,90 @@ def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], work
     if workers <= 1:
         yield from _run_here(function, pending)
         return
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread)
-    try:
-        flying: deque[Future] = deque()
-        for task in pending:
-            flying.append(pool.submit(function, task))
-            if len(flying) >= 2 * workers:
+    with _workers(workers) as pool:
+        try:
+            flying: deque[Future] = deque()
+            for task in pending:
+                flying.append(pool.submit(function, task))
+                if len(flying) >= 2 * workers:
+                    yield flying.popleft().result()
+            while flying:
                 yield flying.popleft().result()
-        while flying:
-            yield flying.popleft().result()
-    except BrokenProcessPool:
-        raise EvnlosError(
-            "a worker process died (killed, or out of memory?); run the command again with fewer --workers"
-        ) from None
-    finally:
+        except BrokenProcessPool:
+            raise EvnlosError(
+                "a worker process died (killed, or out of memory?); run the command again with fewer --workers"
+            ) from None
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Give a pool whose processes end with the block, at once where it is left early, and with this process.
+
+    They don't hear Ctrl-C, which a terminal sends to all: this process ends them, also those that still start.
+    """
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin)
+    try:
+        resource_tracker.ensure_running()  # it unblocks the signal when it starts
+        with _undisturbed():
+            pool.submit(int)  # the first task starts all processes, and inherit what is blocked
+        yield pool
+        pool.shutdown()
+    except BaseException:
+        running = list((pool._processes or {}).values())  # the manager takes them away as they end
         pool.shutdown(wait=False, cancel_futures=True)
+        for process in running:
+            process.terminate()
+        until = time.monotonic() + _GRACE_S
+        for process in running:
+            process.join(max(0.0, until - time.monotonic()))
+            if process.is_alive():
+                process.kill()
+        raise
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Hold back Ctrl-C and SIGTERM from this process, and Ctrl-C for ever from those that it starts meanwhile.
+
+    A started process takes over which signals are blocked; one whose start breaks off tells it at length.
+    """
+    numbers, noted = (signal.SIGINT, signal.SIGTERM), list[int]()
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    is_main = threading.current_thread() is threading.main_thread() and None not in handlers.values()
+    has_masks = hasattr(signal, "pthread_sigmask")  # not on Windows
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if has_masks else set()
+    try:
+        if is_main:  # another thread may hear a signal that is blocked here, and then it is handled here
+            for number in numbers:
+                signal.signal(number, lambda one, _: noted.append(one))
+        yield
+    finally:
+        if has_masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if is_main:
+            for number in numbers:
+                signal.signal(number, handlers[number])
+    for number in noted:
+        signal.raise_signal(number)
+
+
+def _begin() -> None:
+    """Prepare a worker: one thread, an end that leaves no half-written file, and no life after its parent."""
+    one_thread()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), name="parent", daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent's end of a pipe is closed: by SIGTERM, and then at once."""
+    wait_for([parent])
+    until = time.monotonic() + _GRACE_S
+    while time.monotonic() < until:
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(_GRACE_S / 20)
+    os._exit(1)
 
 
 def _run_here(function: Callable[[Task], Result], tasks: list[Task]) -> Iterator[Result]:

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from evnlos.dataset.sampling import Sampling
-from evnlos.dataset.simulate import SensorSize, Simulation
+from evnlos.dataset.simulate import Simulation
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs, LineMotion
-from evnlos.sensor import EventPixel, FrameCamera
-from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.setups.presets import as_in_the_paper, page_setup, rough_paper
 
 
 def default() -> Simulation:
@@ -21,20 +20,20 @@ def default() -> Simulation:
     """
     return Simulation(
         glyphs=HandwritingGlyphs(characters="ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789", writers=8),
-        transport=PaperTransport(field_of_view_m=0.585, tpsf_length_m=0.02),
+        setup=rough_paper(),
         vary={
-            "transport.field_of_view_m": (0.55, 0.62),
-            "transport.tpsf_length_m": (0.006, 0.03),
-            "transport.rho_max": (2.0, 5.0),
-            "transport.stretch": (1.0, 1.2),
-            "transport.gain": (0.8, 2.4),
-            "transport.ambient": (0.02, 0.1),
-            "transport.ambient_gradient.0": (-0.4, 0.4),
-            "transport.ambient_gradient.1": (-0.4, 0.4),
-            "pixel.threshold_on": (0.1, 0.35),
-            "pixel.threshold_off": (0.1, 0.35),
-            "pixel.cutoff_hz": (10.0, 200.0),
-            "pixel.shot_noise_rate_hz": (0.0, 1.0),
+            "setup.field_of_view_m": (0.55, 0.62),
+            "setup.tpsf_length_m": (0.006, 0.03),
+            "setup.rho_max": (2.0, 5.0),
+            "setup.stretch": (1.0, 1.2),
+            "setup.gain": (0.8, 2.4),
+            "setup.ambient": (0.02, 0.1),
+            "setup.ambient_gradient.0": (-0.4, 0.4),
+            "setup.ambient_gradient.1": (-0.4, 0.4),
+            "setup.pixel.threshold_on": (0.1, 0.35),
+            "setup.pixel.threshold_off": (0.1, 0.35),
+            "setup.pixel.cutoff_hz": (10.0, 200.0),
+            "setup.pixel.shot_noise_rate_hz": (0.0, 1.0),
         },
     )
 
@@ -46,11 +45,7 @@ def paper() -> Simulation:
     """
     return Simulation(
         glyphs=HandwritingGlyphs(),
-        transport=PaperTransport(
-            distance_m=0.5, wavelength_m=500e-9, tpsf_t=2.0, mean_free_path=0.8, rho_max=2.0
-        ),
-        sensor=SensorSize(600, 960),
-        pixel=EventPixel(0.15, 0.15, 0.03, 15.0, 0.01, 0.0015, 0.0),
+        setup=as_in_the_paper(),
     )
 
 
@@ -80,23 +75,22 @@ def page() -> Simulation:
     Metal from smooth to rough, the distances, lights, noises and thresholds around the page's first setting;
     beyond, where even the best linear picture shows next to nothing, the networks are not at home.
     """
-    camera = FrameCamera()
-    well_e, read_e = camera.full_well_e, camera.read_noise_e
+    setup = page_setup()
+    well_e, read_e = setup.frame_camera.full_well_e, setup.frame_camera.read_noise_e
     return Simulation(
         glyphs=HandwritingGlyphs(characters=UPPER_CASE + DIGITS, writers=44),
         motion=LineMotion((-0.08, 0.0), 0.02),
-        transport=RadiometricTransport(cell_m=0.005, ambient=0.05),
-        sensor=SensorSize(30, 48),
+        setup=setup,
         sampling=Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24),
         vary={
-            "transport.roughness": (0.02, 0.09),
-            "transport.distance_m": (0.2, 0.4),
-            "transport.ambient": (0.0, 0.3),
-            "frame_camera.full_well_e": (well_e / 4, 2 * well_e),
-            "frame_camera.read_noise_e": (read_e / 2, 2 * read_e),
-            "pixel.threshold_on": (0.08, 0.3),
-            "pixel.threshold_off": (0.08, 0.3),
-            "pixel.shot_noise_rate_hz": (0.0, 0.2),
+            "setup.roughness": (0.02, 0.09),
+            "setup.distance_m": (0.2, 0.4),
+            "setup.ambient": (0.0, 0.3),
+            "setup.frame_camera.full_well_e": (well_e / 4, 2 * well_e),
+            "setup.frame_camera.read_noise_e": (read_e / 2, 2 * read_e),
+            "setup.pixel.threshold_on": (0.08, 0.3),
+            "setup.pixel.threshold_off": (0.08, 0.3),
+            "setup.pixel.shot_noise_rate_hz": (0.0, 0.2),
         },
         rigs=200,
     )

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.config import write_atomically
 from evnlos.dataset.sampling import Samples
 from evnlos.errors import DataError
+from evnlos.files import write_atomically
 from evnlos.types import Events
+from evnlos.untrusted import open_hdf5, stored
 
 SUFFIX = ".h5"
 _MAPS = ("frame", "surface", "truth")
@@ -68,24 +72,21 @@ def _put(file: h5py.File, name: str, values: np.ndarray, chunks: tuple[int, ...]
     dataset.flush()
 
 
-def read_shard(path: str | Path) -> tuple[Samples, dict]:
-    """Read a shard's samples and its attributes; every checksum is verified on the way.
+def read_shard(path: str | Path, steps: slice | NDArray[np.int64] | None = None) -> tuple[Samples, dict]:
+    """Read a shard's samples and its attributes; every checksum of what is read is verified on the way.
 
     A shard may be a stranger's: no other file is read, and memory is taken only for what this one can hold.
+
+    Args:
+        path: The shard.
+        steps: Time steps to read, a slice or ascending indices; None is all. Others are not even decompressed.
 
     Raises:
         DataError: The file is missing, is not a shard, or a checksum does not fit.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            found = {name: _array(file, name, axes) for name, axes in _AXES.items()}
-            attributes = {key: _plain(value) for key, value in file.attrs.items()}
-    except FileNotFoundError:
-        raise DataError(f"{path} does not exist; run the command that made the dataset again") from None
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
-        raise DataError(
-            f"{path} is damaged ({_one_line(error)}); delete it and run the command again"
-        ) from None
+    with _damage(path), open_hdf5(path) as file:
+        found = {name: _array(file, name, axes, steps) for name, axes in _AXES.items()}
+        attributes = {key: _plain(value) for key, value in file.attrs.items()}
     frame, surface, time_s, count = (found[name] for name in ("frame", "surface", "time_s", "event_count"))
     if frame is None or surface is None or time_s is None or count is None:
         raise DataError(
@@ -114,24 +115,68 @@ def read_shard(path: str | Path) -> tuple[Samples, dict]:
     return samples, attributes
 
 
-def _array(file: h5py.File, name: str, axes: int) -> NDArray | None:
-    """Return a dataset's values, or None where the file has none of that name.
+class ShardIndex(NamedTuple):
+    """What a shard holds, without its maps."""
+
+    length: int
+    """Time steps."""
+    shape: tuple[int, int]
+    """Height and width of the maps, pixels."""
+    has_truth: bool
+    """Whether the true images are known."""
+    position_m: NDArray[np.float64] | None
+    """Target's centre (x, y), [N, 2], metres; None where the motion is unknown."""
+
+
+def read_shard_index(path: str | Path) -> ShardIndex:
+    """Read how much a shard holds and where its target was; the maps are left on disk.
+
+    Raises:
+        DataError: The file is missing or is not a shard.
+    """
+    with _damage(path), open_hdf5(path) as file:
+        position_m, frame, truth = _array(file, "position_m", 2), stored(file, "frame"), stored(file, "truth")
+        if not isinstance(frame, h5py.Dataset) or frame.ndim != 3:
+            raise ValueError("it has no frames")
+        return ShardIndex(len(frame), frame.shape[1:], truth is not None, position_m)
+
+
+@contextmanager
+def _damage(path: str | Path) -> Iterator[None]:
+    """Turn what HDF5 says of a file that is missing or damaged into one line.
+
+    Raises:
+        DataError: The file is missing or damaged.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise DataError(f"{path} does not exist; run the command that made the dataset again") from None
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+        raise DataError(
+            f"{path} is damaged ({_one_line(error)}); delete it and run the command again"
+        ) from None
+
+
+def _array(
+    file: h5py.File, name: str, axes: int, steps: slice | NDArray[np.int64] | None = None
+) -> NDArray | None:
+    """Return a dataset's values at some time steps, or None where the file has none of that name.
 
     Raises:
         ValueError: The values lie outside the file, are no numbers, or are more than the file can hold.
     """
-    link = file.get(name, getlink=True)
-    if link is None:
+    node = stored(file, name)
+    if node is None:
         return None
-    node = file[name] if isinstance(link, h5py.HardLink) else None
-    if not isinstance(node, h5py.Dataset) or node.external or node.is_virtual:
-        raise ValueError(f"{name} is not stored in this file")
+    if not isinstance(node, h5py.Dataset):
+        raise ValueError(f"{name} is no dataset")
     if node.dtype.kind not in "fiu" or node.ndim != axes:
         raise ValueError(f"{name} is {node.dtype} with {node.ndim} axes")
-    size, stored = node.size * node.dtype.itemsize, node.id.get_storage_size()
-    if size > min(_DEFLATE * stored, _MOST_BYTES):
-        raise ValueError(f"{name} claims {size} bytes and stores {stored}")
-    return node[()]
+    size, held = node.size * node.dtype.itemsize, node.id.get_storage_size()
+    if size > min(_DEFLATE * held, _MOST_BYTES):
+        raise ValueError(f"{name} claims {size} bytes and stores {held}")
+    return node[()] if steps is None else node[steps]
 
 
 def _plain(value: object) -> object:

@@ -2,45 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from evnlos.claim import claim
 from evnlos.config import config_hash, to_dict
-from evnlos.dataset.pool import Engine, run_tasks
+from evnlos.dataset.pool import Engine, processes, run_tasks
 from evnlos.dataset.sampling import Samples, Sampling, edges_from, make_samples
 from evnlos.dataset.shard import write_shard
-from evnlos.dataset.store import Dataset, create_dataset
+from evnlos.dataset.store import Dataset, claim_dataset
 from evnlos.dataset.variation import check_ranges, varied
 from evnlos.errors import ConfigError
+from evnlos.progress import Progress, Step, silent
 from evnlos.scene import (
     Glyphs,
     HandwritingGlyphs,
     LineMotion,
     Scene,
+    character_name,
 )
 from evnlos.seeds import derive_seed
-from evnlos.sensor import EventCamera, EventPixel, FrameCamera
-from evnlos.transport import MeasuredTransport, PaperTransport, RadiometricTransport
+from evnlos.sensor import FrameCamera, PixelSettings
+from evnlos.setups import PaperSetup, SensorSize, Setup
+from evnlos.setups.base import CAMERA_FIELDS, LIGHT_FIELDS
 from evnlos.types import Events
-
-
-@dataclass(frozen=True)
-class SensorSize:
-    """Pixels of the sensor that carries both the frame and the event pixels."""
-
-    height: int = 100
-    """Rows, pixels."""
-    width: int = 160
-    """Columns, pixels."""
-
-    def __post_init__(self) -> None:
-        for name in ("height", "width"):
-            if not 8 <= getattr(self, name) <= 8192:
-                raise ConfigError(f"SensorSize.{name} is {getattr(self, name)}; give 8 to 8192 pixels")
+from evnlos.untrusted import check_memory
 
 
 @dataclass(frozen=True)
@@ -55,25 +44,19 @@ class Simulation:
     """Length of a pass, seconds."""
     positions: int = 40
     """Equidistant positions of an object, one sample each."""
-    transport: PaperTransport | RadiometricTransport | MeasuredTransport = field(default_factory=PaperTransport)
-    """How its light reaches the wall and the camera."""
-    sensor: SensorSize = field(default_factory=SensorSize)
-    """Size of the sensor."""
-    frame_camera: FrameCamera = field(default_factory=FrameCamera)
-    """The frame camera."""
-    pixel: EventPixel = field(default_factory=EventPixel)
-    """The event pixel."""
+    setup: Setup = field(default_factory=PaperSetup)
+    """Wall, geometry, ambient light and cameras: how the light becomes frames and events."""
     sampling: Sampling = field(default_factory=Sampling)
     """Resolution and representation of the stored samples."""
     vary: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Settings drawn for each object from a range: dotted name -> (low, high)."""
     rigs: int = 0
-    """Number of different walls and cameras that the ranges of the transport are drawn for, shared by the
+    """Number of different walls and geometries that the ranges of the setup are drawn for, shared by the
     objects (each costs a light-transport matrix); 0 = one for each object."""
     validation: float = 0.05
     """Share of the objects that is held out for validation, 0..1."""
     held_out: str = ""
-    """Characters whose objects are for testing alone."""
+    """Characters whose objects are for testing alone, one after the other: GK49."""
     keep_events: bool = False
     """Store the events of each object beside the maps."""
     seed: int = 0
@@ -90,6 +73,7 @@ class Simulation:
             )
         if not 0 <= self.validation < 1:
             raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
+        _ = self.setup.event_camera  # refuses a step that does not fit the model
         check_ranges(self, self.vary)
 
     def optics(self) -> dict[str, float]:
@@ -101,9 +85,30 @@ class Simulation:
             >>> round(Simulation().optics()["fresnel_number"])
             6400
         """
-        if not isinstance(self.transport, PaperTransport):
-            return {}
-        return self.transport.figures(self.glyphs.plate.size_m, (self.sensor.height, self.sensor.width))
+        return self.setup.optical_values(self.glyphs.plate.size_m)
+
+    def with_setup(self, **changes: Any) -> Simulation:
+        """Return the simulation with some settings of its setup replaced, by name.
+
+        Args:
+            changes: Settings of the setup, e.g. `pixel=EventPixel(...)`.
+        """
+        return replace(self, setup=replace(self.setup, **changes))
+
+    @property
+    def frame_camera(self) -> FrameCamera:
+        """The setup's frame camera."""
+        return self.setup.frame_camera
+
+    @property
+    def pixel(self) -> PixelSettings:
+        """The setup's event model and its parameters."""
+        return self.setup.pixel
+
+    @property
+    def sensor(self) -> SensorSize:
+        """The size of the setup's sensor."""
+        return self.setup.sensor
 
 
 def drawn_for(config: Simulation, name: str) -> Simulation:
@@ -121,7 +126,7 @@ def drawn_for(config: Simulation, name: str) -> Simulation:
 
 def _needs_a_matrix(path: str) -> bool:
     section, name, *_ = path.split(".")
-    return section == "transport" and name not in ("gain", "ambient", "ambient_gradient")
+    return section == "setup" and name not in (*LIGHT_FIELDS, *CAMERA_FIELDS)
 
 
 def scene_of(config: Simulation, drawn: Simulation, name: str) -> Scene:
@@ -142,24 +147,54 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     """
     drawn = drawn_for(config, name)
     scene = scene_of(config, drawn, name)
-    wall = drawn.transport.wall(scene, (config.sensor.height, config.sensor.width))
+    setup = drawn.setup
+    wall = setup.observe(scene)
     times_s = scene.position_times_s(config.positions)
-    events = EventCamera(drawn.pixel).record(
-        wall, 0.0, drawn.duration_s, seed=derive_seed(config.seed, name, "events")
-    )
-    frames = drawn.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
+    seed = derive_seed(config.seed, name, "events")
+    events = setup.event_camera.record(wall, 0.0, drawn.duration_s, seed=seed)
+    frames = setup.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
     edges_us = edges_from(times_s)
-    peak = 2**drawn.frame_camera.bit_depth - 1
+    peak = 2**setup.frame_camera.bit_depth - 1
     return make_samples(
         frames, peak, events, edges_us, config.sampling, motion=scene.motion, target=scene.target
     ), events
 
 
+def object_bytes(config: Simulation) -> int:
+    """Return the memory that simulating one object takes at least, bytes, without simulating anything.
+
+    Counted are the states of the sensor's pixels, its frames, the maps, and the events that noise alone sends.
+
+    Args:
+        config: The settings.
+    """
+    pixels, cells = config.sensor.height * config.sensor.width, config.sampling.height * config.sampling.width
+    noise_hz = sum(getattr(config.pixel, name, 0.0) for name in ("leak_rate_hz", "shot_noise_rate_hz"))
+    noise_hz += getattr(config.pixel, "hot_pixel_fraction", 0.0) * getattr(
+        config.pixel, "hot_pixel_rate_hz", 0.0
+    )
+    noise = pixels * config.duration_s * noise_hz
+    return int(100 * pixels + config.positions * (4 * pixels + 32 * cells) + 26 * noise)
+
+
 def split_of(config: Simulation) -> dict[str, list[str]]:
-    """Return the split by object: those held out for testing, a seeded share for validation, the others."""
+    """Return the split by object: those held out for testing, a seeded share for validation, the others.
+
+    Raises:
+        ConfigError: No object shows one of the characters that are to be held out.
+    """
     every = config.glyphs.objects()
-    tested = [name for name in every if name.rsplit("_", 1)[-1] in config.held_out]
-    names = [name for name in every if name not in set(tested)]
+    held_out = set()
+    for char in config.held_out:
+        shown = {name for name in every if name.endswith(f"_{character_name(char)}")}
+        if not shown:
+            raise ConfigError(
+                f"held_out is {config.held_out!r}, and none of the {len(every)} objects shows {char!r}; give "
+                "characters that the glyphs have, one after the other and nothing between"
+            )
+        held_out |= shown
+    tested = [name for name in every if name in held_out]
+    names = [name for name in every if name not in held_out]
     count = round(config.validation * len(names))
     order = np.random.default_rng(derive_seed(config.seed, "split")).permutation(len(names))
     chosen = {names[i] for i in order[:count]}
@@ -176,8 +211,10 @@ def simulate(
     workers: int = 1,
     share: tuple[int, int] = (1, 1),
     engine: Engine = run_tasks,
-) -> Iterator[str]:
-    """Simulate a dataset, yielding the name of each object as its shard is in place.
+    progress: Progress = silent,
+    force: bool = False,
+) -> Dataset:
+    """Simulate a dataset, or what is missing of it, and return it.
 
     Shards that exist are not made again, so a run that was killed goes on where it was. The shards are
     the same bytes for any number of workers.
@@ -189,14 +226,28 @@ def simulate(
         share: (i, n): only every n-th object, beginning with the i-th; i from 1 to n. The n shares together,
             made anywhere and in any order, are the dataset.
         engine: What runs the tasks: processes here, or `run_on_dask`.
+        progress: Called when the work begins and as each shard is in place, with the object's name.
+        force: Whether to begin although the machine's memory will hardly do.
+
+    Returns:
+        The dataset; of a share, with the shards of the others still missing.
 
     Raises:
-        ConfigError: The share is none.
-        DataError: The folder holds something else, or another process is at work in it.
+        ConfigError: The share is none, a number of workers below 0, or a held-out character that no
+            object shows.
+        DataError: An object takes more memory than there is, the folder holds something else, or another
+            process is at work in it.
     """
     first, stride = share
     if not 1 <= first <= stride:
         raise ConfigError(f"share {first} of {stride} is none; give i/n with i from 1 to n")
+    processes(workers, 1)
+    if not force:
+        check_memory(
+            object_bytes(config),
+            "an object",
+            "take a smaller sensor, fewer positions or less time; or force it",
+        )
     values = to_dict(config)
     dataset = Dataset(
         Path(folder),
@@ -207,12 +258,20 @@ def simulate(
         config_hash=config_hash(config),
         optics=config.optics(),
     )
-    with claim(folder, f"{first}-of-{stride}" if stride > 1 else ""):
-        create_dataset(dataset)
-        ours = set(config.glyphs.objects()[first - 1 :: stride])
-        missing = [name for name in dataset.missing() if name in ours]
+    with claim_dataset(dataset, f"{first}-of-{stride}" if stride > 1 else ""):
+        share_names = set(config.glyphs.objects()[first - 1 :: stride])
+        missing = [name for name in dataset.missing() if name in share_names]
+        what, total, there = (
+            f"simulate {dataset.folder.name}",
+            len(share_names),
+            len(share_names) - len(missing),
+        )
+        progress(Step(what, there, total, "objects"))
         tasks = [(config, name, dataset.shard(name), dataset.config_hash) for name in missing]
-        yield from engine(_simulate_shard, tasks, workers)
+        with closing(engine(_simulate_shard, tasks, workers)) as finished:
+            for done, name in enumerate(finished, start=there + 1):
+                progress(Step(what, done, total, "objects", name))
+    return dataset
 
 
 def _simulate_shard(task: tuple[Simulation, str, Path, str]) -> str:

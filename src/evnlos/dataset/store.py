@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from evnlos.claim import is_empty
-from evnlos.config import differing_keys, from_dict, read_yaml, save_yaml, to_dict
+from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.dataset.sampling import Sampling
 from evnlos.dataset.shard import SUFFIX
 from evnlos.errors import DataError
+from evnlos.files import claim, is_empty
 from evnlos.version import __version__
 
 SPLITS = ("train", "validation", "test")
+PAGE = "dataset.yaml"
+"""Name of the file that describes a dataset, in its folder."""
+_DIGEST = "digest"
 
 
 @dataclass(frozen=True)
@@ -62,28 +67,57 @@ class Dataset:
         return [name for name in self.objects() if not self.shard(name).is_file()]
 
 
-def create_dataset(dataset: Dataset) -> Dataset:
-    """Create the folder and `dataset.yaml`, or take up a folder that was begun with the same settings.
+_KEYS = {item.name for item in fields(Dataset)} - {"folder"} | {_DIGEST}
+
+
+def check_dataset(dataset: Dataset) -> bool:
+    """Return whether the folder holds the dataset already, begun with the same settings; write nothing.
 
     Raises:
         DataError: The folder holds a dataset of other settings (the differing keys are named), or other files.
     """
-    path = dataset.folder / "dataset.yaml"
-    content = _content(dataset)
+    path = dataset.folder / PAGE
     if path.is_file():
-        theirs = read_yaml(path)
-        differing = differing_keys(_comparable(content), _comparable(theirs))
+        theirs = read_yaml(path, LONG_YAML)
+        differing = differing_keys(_comparable(_content(dataset)), _comparable(theirs))
         if differing:
             shown = "; ".join(differing[:6]) + (
                 f"; and {len(differing) - 6} more" if len(differing) > 6 else ""
             )
             raise DataError(f"{dataset.folder} holds a dataset of other settings ({shown}); give another --out")
-        return dataset
+        return True
     if not is_empty(dataset.folder):
-        raise DataError(f"{dataset.folder} is not empty and holds no dataset.yaml; give a new folder")
-    dataset.folder.mkdir(parents=True, exist_ok=True)
-    save_yaml(content, path)
+        raise DataError(f"{dataset.folder} is not empty and holds no {PAGE}; give a new folder")
+    return False
+
+
+def create_dataset(dataset: Dataset) -> Dataset:
+    """Create the folder and `dataset.yaml`, or take up a folder that was begun with the same settings.
+
+    Raises:
+        DataError: As `check_dataset`.
+    """
+    if not check_dataset(dataset):
+        dataset.folder.mkdir(parents=True, exist_ok=True)
+        content = _content(dataset)
+        save_yaml(content | {_DIGEST: config_hash(content)}, dataset.folder / PAGE)
     return dataset
+
+
+@contextmanager
+def claim_dataset(dataset: Dataset, part: str = "") -> Iterator[None]:
+    """Hold a dataset's folder for this process, and create the dataset there or take it up.
+
+    Args:
+        dataset: What is to be there.
+        part: Name of the share of the work, as in `claim`.
+
+    Raises:
+        DataError: As `check_dataset`, and then the folder stays as it is; or another process holds it.
+    """
+    with claim(dataset.folder, part, check=lambda: check_dataset(dataset)):
+        create_dataset(dataset)
+        yield
 
 
 def open_dataset(folder: str | Path) -> Dataset:
@@ -96,12 +130,17 @@ def open_dataset(folder: str | Path) -> Dataset:
         DataError: It is not a dataset, or its splits overlap.
     """
     folder = Path(folder)
-    path = folder / "dataset.yaml"
+    path = folder / PAGE
     if not path.is_file():
         raise DataError(
             f"{folder} is no dataset: {path.name} is missing; make one with `evnlos simulate` or `import`"
         )
-    values = read_yaml(path)
+    values = read_yaml(path, LONG_YAML)
+    unknown = values.keys() - _KEYS
+    if unknown:
+        raise DataError(
+            f"{path} holds an unknown entry {min(map(str, unknown))[:40]!r}; make the dataset again"
+        )
     try:
         split = {str(key): list(names) for key, names in values["split"].items()}
         sampling = from_dict(Sampling, values["sampling"], source=str(path))
@@ -122,6 +161,21 @@ def open_dataset(folder: str | Path) -> Dataset:
     return Dataset(folder, origin, sampling, split, settings, key, optics, version)
 
 
+def is_page_changed(dataset: Dataset) -> bool:
+    """Return whether a dataset's `dataset.yaml` is not as it was written: damaged, or edited by hand.
+
+    Files of earlier versions have no digest; then the settings of a simulation are compared with their hash.
+
+    Args:
+        dataset: An open dataset.
+    """
+    values = read_yaml(dataset.folder / PAGE, LONG_YAML)
+    stated = values.pop(_DIGEST, None)
+    if stated is not None:
+        return stated != config_hash(values)
+    return dataset.origin == "simulation" and config_hash(dataset.config) != dataset.config_hash
+
+
 def _is_plain(name: str) -> bool:
     """Return whether a name can only be a file of the folder itself: no path, no drive, nothing hidden."""
     return name.isprintable() and not (
@@ -136,4 +190,6 @@ def _content(dataset: Dataset) -> dict[str, Any]:
 
 
 def _comparable(content: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in content.items() if key not in ("version", "config_hash", "optics")}
+    return {
+        key: value for key, value in content.items() if key not in ("version", "config_hash", "optics", _DIGEST)
+    }

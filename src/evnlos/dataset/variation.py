@@ -11,6 +11,7 @@ import numpy as np
 
 from evnlos.errors import ConfigError
 from evnlos.seeds import derive_seed
+from evnlos.setups.base import is_camera
 
 T = TypeVar("T")
 Ranges = dict[str, tuple[float, float]]
@@ -21,7 +22,7 @@ def varied(config: T, ranges: Ranges, seed: int, name: str) -> T:
 
     Args:
         config: A nested frozen dataclass.
-        ranges: Dotted name of a number (`pixel.threshold_on`; `offset_m.0` for the first entry of a
+        ranges: Dotted name of a number (`setup.pixel.threshold_on`; `setup.offset_m.0` for the first entry of a
             tuple) -> (low, high), in the setting's own unit.
         seed: The run's seed.
         name: The object's name; the same seed and name draw the same settings.
@@ -30,7 +31,7 @@ def varied(config: T, ranges: Ranges, seed: int, name: str) -> T:
         ConfigError: A name is unknown (the nearest is named) or is not a number.
     """
     for path, (low, high) in ranges.items():
-        draw = np.random.default_rng(derive_seed(seed, name, "vary", path)).uniform(low, high)
+        draw = np.random.default_rng(derive_seed(seed, name, "vary", _seed_word(path))).uniform(low, high)
         config = _replaced(config, path.split("."), float(draw), path)
     return config
 
@@ -50,6 +51,14 @@ def check_ranges(config: object, ranges: Ranges) -> None:
             raise _unknown(path, first, names)
         for value in (low, high):
             _replaced(getattr(config, first), rest, value, path)
+
+
+def _seed_word(path: str) -> str:
+    """Return the word that a setting's draw is seeded with: it stays when settings move, and so do datasets."""
+    section, _, rest = path.partition(".")
+    if section != "setup":
+        return path
+    return rest if is_camera(rest) else f"transport.{rest}"
 
 
 def _unknown(path: str, key: str, names: list[str]) -> ConfigError:

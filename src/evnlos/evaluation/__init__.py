@@ -12,9 +12,10 @@ from evnlos.evaluation.evaluate import (
 from evnlos.evaluation.identify import Identification, identify
 from evnlos.evaluation.identify_rig import Bench
 from evnlos.evaluation.lpips import available_lpips, load_lpips
+from evnlos.evaluation.model import Model, Reconstruction, load_model
 from evnlos.evaluation.positions import PositionsPoint, curve_over_positions
-from evnlos.evaluation.reconstructor import Reconstructor
 from evnlos.evaluation.score import Scores, score
+from evnlos.evaluation.streaming import StreamingReconstructor
 
 __all__ = [
     "BASELINES",
@@ -22,9 +23,11 @@ __all__ = [
     "Bench",
     "Evaluation",
     "Identification",
+    "Model",
     "PositionsPoint",
-    "Reconstructor",
+    "Reconstruction",
     "Scores",
+    "StreamingReconstructor",
     "assess",
     "available_lpips",
     "check_sampling",
@@ -32,6 +35,7 @@ __all__ = [
     "evaluate",
     "identify",
     "load_lpips",
+    "load_model",
     "reconstruct",
     "score",
 ]

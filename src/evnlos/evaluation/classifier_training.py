@@ -19,8 +19,8 @@ from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
-from evnlos.config import write_atomically
 from evnlos.evaluation.classifier import CHARACTERS, CharacterReader
+from evnlos.files import write_atomically
 from evnlos.model.plates import SIDE
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.seeds import derive_seed

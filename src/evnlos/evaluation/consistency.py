@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
-from evnlos.dataset import Sampling, Simulation
+from evnlos.dataset import Sampling
 from evnlos.dataset.sampling import reduce_by_area
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import DataError
 from evnlos.evaluation.identify_rig import camera_variance
-from evnlos.solver.conjugate_gradient import conjugate_gradient
-from evnlos.transport import RadiometricTransport
-from evnlos.transport.ambient import ambient_plane
+from evnlos.setups import Setup
+from evnlos.setups.base import dense_matrix
 from evnlos.types import Plane
 
 _TOLERANCE, _MOST_STEPS = 1e-3, 200
 
 
 class FrameOperator:
-    """What a calibrated rig makes of a picture on the canvas: frame = A x + ambient, at the samples' size.
+    """What a calibrated setup makes of a picture on the canvas: frame = A x + ambient, at the samples' size.
 
     Args:
-        rig: The calibrated simulation (`rig.yaml` or `training.yaml`).
+        setup: The calibrated setup (`load_setup` of the calibrated folder).
         sampling: Size of samples and canvas.
 
     Attributes:
@@ -33,24 +30,18 @@ class FrameOperator:
         sigma: Standard deviation of the noise of a sample pixel, white levels.
 
     Raises:
-        ConfigError: The rig has another transport than a radiometric one.
+        ConfigError: The setup is not linear.
     """
 
-    def __init__(self, rig: Simulation, sampling: Sampling) -> None:
-        if not isinstance(rig.transport, RadiometricTransport):
-            raise ConfigError(
-                f"the rig's transport is {rig.transport.kind!r}; data consistency needs the radiometric one"
-            )
-        shape = (rig.sensor.height, rig.sensor.width)
+    def __init__(self, setup: Setup, sampling: Sampling) -> None:
         self.size = (sampling.height, sampling.width)
-        self.matrix, source = _matrix(rig.transport, shape, sampling)
-        ambient = ambient_plane(rig.transport.ambient, rig.transport.ambient_gradient, shape)
-        self.ambient = torch.from_numpy(reduce_by_area(torch.as_tensor(ambient).numpy(), self.size)).flatten()
+        self.matrix, source = _matrix(setup, sampling)
+        self.ambient = torch.from_numpy(reduce_by_area(setup.ambient_light().numpy(), self.size)).flatten()
         first = (sampling.height - source.height) // 2
         self.rows = slice(first, first + source.height)
-        self._camera = rig.frame_camera
+        self._camera, shape = setup.frame_camera, setup.shape
         self._pixels = shape[0] * shape[1] / (self.size[0] * self.size[1])  # of the sensor, a sample pixel
-        self.sigma = float(self.variance(self.ambient.mean() + 0.1 * rig.transport.gain).sqrt())
+        self.sigma = float(self.variance(self.ambient.mean() + 0.1 * setup.gain).sqrt())
 
     def __call__(self, pictures: Tensor) -> Tensor:
         """Return the frames [N, h, w] that the rig makes of pictures [N, H, W]."""
@@ -98,6 +89,8 @@ def consistent(
         return z + (spread * pushed).unsqueeze(-2)
 
     right = (spread * (away @ matrix)).unsqueeze(-2)  # [N, 1, cells]
+    from evnlos.solver.conjugate_gradient import conjugate_gradient
+
     found = conjugate_gradient(normal, right, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS)
     moved = pictures.clone()
     move = (spread * found.image.squeeze(-2)).unflatten(1, (-1, pictures.shape[2]))
@@ -105,16 +98,13 @@ def consistent(
     return moved.clamp(0, 1)
 
 
-def _matrix(
-    transport: RadiometricTransport, shape: tuple[int, int], sampling: Sampling
-) -> tuple[Tensor, Plane]:
-    """Return the matrix from canvas cells to sample pixels, and the cells."""
-    height = min(sampling.height, 2 * round(transport.strip_m[1] / sampling.pitch_m / 2))
-    canvas = (sampling.width * sampling.pitch_m, height * sampling.pitch_m)
-    fine = replace(transport, cell_m=sampling.pitch_m, strip_m=canvas)
-    made = fine.transport(shape)
-    cells = made.matrix.shape[1]
-    images = (transport.gain * made.matrix).T.reshape(cells, *shape).numpy()
-    small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(cells, -1)
-    # The gain is defined by a lit square of the strip's height: the strip must keep its height.
-    return torch.from_numpy(small).T.contiguous(), fine.source()
+def _matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
+    """Return the matrix from canvas cells to sample pixels, and the cells: rows that the target reaches."""
+    cells, height = setup.target_cells(), sampling.height
+    if cells is not None:
+        height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
+    plane = Plane(height, sampling.width, sampling.pitch_m)
+    matrix = dense_matrix(setup.operator(plane, dtype=torch.float32), torch.float32)
+    images = matrix.T.reshape(-1, *setup.shape).numpy()
+    small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(len(images), -1)
+    return torch.from_numpy(small).T.contiguous(), plane

@@ -9,23 +9,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evnlos.config import from_dict, to_dict
+from evnlos.config import to_dict
 from evnlos.dataset import (
     Dataset,
     NlosDataset,
     Sampling,
-    Simulation,
     character_of,
-    network_input,
     read_shard,
 )
 from evnlos.errors import DataError
 from evnlos.evaluation.classifier import CHARACTERS, read_characters
 from evnlos.evaluation.consistency import FrameOperator
-from evnlos.evaluation.memory import nearer_to_truth, nearest_answer, recall
+from evnlos.evaluation.memory import compare_with_training
 from evnlos.evaluation.score import Perceptual, Scores, score
 from evnlos.evaluation.worth import PassWorth, worth_of
-from evnlos.model import Weights, infer, plates
+from evnlos.model import Weights, plates
+from evnlos.setups import Setup
 from evnlos.types import Plane
 
 BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest shot"}
@@ -93,31 +92,32 @@ def evaluate(
     dataset: Dataset,
     split: str = "test",
     perceptual: Perceptual | None = None,
-    rig: Simulation | None = None,
+    setup: Setup | None = None,
 ) -> Evaluation:
     """Reconstruct a split of a dataset and score it.
 
     The baseline "mean" is the mean of the true pictures that the network was trained on last.
 
     Args:
-        weights: The network and its paradigm.
+        weights: The network.
         dataset: Where the samples are.
         split: "train", "validation", "test" or "all".
         perceptual: LPIPS, where its weights are at hand.
-        rig: The calibrated rig that the confidence asks how much of the frames the pictures explain; weights of
-            events alone see no frames, and are not asked.
+        setup: The calibrated setup that the confidence asks how much of the frames the pictures explain;
+            weights of events alone see no frames, and are not asked.
 
     Raises:
         DataError: The split is empty, or its samples were made in another way than those of the training.
     """
     check_sampling(weights, dataset.sampling)
-    samples = NlosDataset(dataset, split, weights.paradigm)  # type: ignore[arg-type]
-    images = infer(weights.network, samples.inputs, samples.position_m, samples.names)
-    found = assess(images, samples, dataset, split, weights.paradigm, weights.mean_image, perceptual)
+    samples = NlosDataset(dataset, split, weights.modality)
+    images = weights.network.infer(samples.inputs, samples.position_m, samples.names)
+    found = assess(images, samples, dataset, split, weights.mean_image, perceptual)
     if weights.confidence is None or np.isnan(samples.position_m).any():
         return found
     canvas = dataset.sampling.canvas
-    operator = FrameOperator(rig, dataset.sampling) if rig is not None and weights.paradigm != "event" else None
+    checks_frames = setup is not None and "frame" in weights.modality.slices
+    operator = FrameOperator(setup, dataset.sampling) if setup is not None and checks_frames else None
     worth = worth_of(weights.network, weights.confidence, samples, images, canvas, operator)
     return replace(found, worth=worth)
 
@@ -127,7 +127,6 @@ def assess(
     samples: NlosDataset,
     dataset: Dataset,
     split: str,
-    paradigm: str,
     mean_image: Tensor | None = None,
     perceptual: Perceptual | None = None,
 ) -> Evaluation:
@@ -138,7 +137,6 @@ def assess(
         samples: The samples of the split.
         dataset: Where they are from.
         split: "train", "validation", "test" or "all".
-        paradigm: What the baseline "nearest" compares measurements by.
         mean_image: The baseline "mean", [H, W]; None leaves it out.
         perceptual: LPIPS, where its weights are at hand.
     """
@@ -150,10 +148,9 @@ def assess(
         blank["mean"] = mean_image.float()[rows].expand_as(truth).contiguous()
     checks = _reading(dataset, split, images, truth, samples.names)
     learned = dataset.split.get("train") and split in ("test", "validation")
-    if learned and (memory := recall(dataset, split, paradigm)) is not None:
-        blank["nearest"] = nearest_answer(memory, samples.inputs)[:, rows].contiguous()
-        away = nearer_to_truth(images, truth, memory.truth[:, :, rows])
-        checks["nearer_to_truth"] = round(float(away.mean()), 4)
+    if learned and (found := compare_with_training(images, samples, dataset, split)) is not None:
+        blank["nearest"] = found.nearest
+        checks["nearer_to_truth"] = round(float(found.nearer_to_truth.mean()), 4)
     baselines = {name: score(image, truth, perceptual) for name, image in blank.items()}
     return Evaluation(images, truth, samples.names, score(images, truth, perceptual), baselines, checks)
 
@@ -181,19 +178,18 @@ def reconstruct(
     """Reconstruct samples, also those without a truth.
 
     Args:
-        weights: The network and its paradigm.
+        weights: The network.
         frame: Frames, float32 [N, H, W], 0..1, as in `Samples`.
         surface: Time surfaces, float32 [N, 2, H, W].
-        position_m: The target's centre, (x, y) in metres, [N, 2], which joint weights need.
+        position_m: The target's centre, (x, y) in metres, [N, 2], which weights of whole sequences need.
 
     Returns:
         Pictures, float32 [N, H, W], 0..1.
 
     Raises:
-        DataError: The weights are joint ones and the positions are unknown.
+        DataError: The weights see whole sequences, and the positions are unknown.
     """
-    seen = network_input(frame, surface, weights.paradigm)  # type: ignore[arg-type]
-    return infer(weights.network, seen, position_m)
+    return weights.network.infer(weights.modality.inputs(frame, surface), position_m)
 
 
 def check_sampling(weights: Weights, sampling: Sampling) -> None:
@@ -202,8 +198,7 @@ def check_sampling(weights: Weights, sampling: Sampling) -> None:
     Raises:
         DataError: Names the settings that differ.
     """
-    trained = from_dict(Sampling, weights.sampling, source="the weights' sampling")
-    if trained != sampling:
+    if weights.sampling != sampling:
         raise DataError(
-            f"the weights were trained on samples of {trained}; these are {sampling}: make them alike"
+            f"the weights were trained on samples of {weights.sampling}; these are {sampling}: make them alike"
         )

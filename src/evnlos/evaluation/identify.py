@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from evnlos.evaluation.identify_linear import LinearEstimator, finest_bars
 from evnlos.evaluation.identify_rig import (
-    AnyTransport,
     Bench,
-    SeenRig,
+    LinearizedSetup,
     camera_variance,
-    carried_on,
-    seen_rig,
+    linearized,
 )
 from evnlos.evaluation.identify_scan import scan_notes
-from evnlos.evaluation.identify_words import truncation_note, verdict
+from evnlos.evaluation.identify_words import artifact_note, verdict
 from evnlos.seeds import derive_seed
-from evnlos.sensor import FrameCamera
-from evnlos.solver.glyph_prior import Plates, handwritten_plates
-from evnlos.transport import MeasuredTransport, PaperTransport
+from evnlos.setups import Setup
+
+if TYPE_CHECKING:
+    from evnlos.solver.glyph_prior import Plates
 
 MODE_LEVEL = 1e-2
 """Singular values above this share of the largest count as usable modes."""
@@ -66,8 +65,7 @@ class Identification:
 
     Args:
         name: Name of the rig.
-        transport: Its settings.
-        camera: Its frame camera.
+        setup: Its settings.
         bench: How the question was put.
         singular: Singular values over the largest, float64 [n], descending.
         modes: How many of them lie above 1e-2.
@@ -82,8 +80,7 @@ class Identification:
     """
 
     name: str
-    transport: AnyTransport
-    camera: FrameCamera
+    setup: Setup
     bench: Bench
     singular: torch.Tensor
     modes: int
@@ -99,7 +96,7 @@ class Identification:
     def summary(self, arrays: bool = False) -> dict[str, Any]:
         """Return plain numbers and words; with `arrays` also singular values and Picard coefficients."""
         found: dict[str, Any] = {
-            "rig": self.name,
+            "setup": self.name,
             "verdict": self.verdict,
             "warnings": list(self.warnings),
             "modes_above_1e-2": self.modes,
@@ -107,8 +104,7 @@ class Identification:
             "psnr_mean_db": round(self.mean_db, 2),
             "typical_stroke_m": round(self.stroke_m, 5),
             "bench": asdict(self.bench),
-            "frame_camera": asdict(self.camera),
-            "transport": asdict(self.transport),
+            "settings": asdict(self.setup),
         }
         for name, one in (("camera_noise", self.at_camera), ("fixed_noise", self.at_fixed)):
             found[name] = {
@@ -127,10 +123,9 @@ class Identification:
 
 
 def identify(
-    transport: AnyTransport,
-    camera: FrameCamera | None = None,
+    setup: Setup,
     bench: Bench | None = None,
-    name: str = "rig",
+    name: str = "setup",
     seed: int = 0,
 ) -> Identification:
     """Say what one picture of the wall can show of a plate at a known place, whatever the method.
@@ -141,44 +136,46 @@ def identify(
     never saw.
 
     Args:
-        transport: The rig.
-        camera: Its frame camera; None is the default one.
+        setup: The setup; its frame camera's noise is what counts.
         bench: Cells, pixels and noise; None is the default, that of the table in docs/identifiability.md.
         name: What to call the rig.
         seed: Seed of the one picture that is drawn with noise.
 
     Raises:
-        ConfigError: The rig can't be, or the camera gets no light from the plate.
+        ConfigError: The setup is geometrically impossible, or the camera gets no light from the target.
 
     Example:
-        >>> from evnlos.transport import rig_preset
-        >>> found = identify(rig_preset("matte"), bench=Bench(cells=8, height=12, width=20, writers=1))
+        >>> from evnlos.setups import load_setup
+        >>> found = identify(load_setup("matte-near"), bench=Bench(cells=8, height=12, width=20, writers=1))
         >>> found.modes
         3
     """
-    bench, camera = bench or Bench(), camera or FrameCamera()
-    rig = seen_rig(transport, bench)
+    bench = bench or Bench()
+    seen = linearized(setup, bench)
+    from evnlos.solver.glyph_prior import handwritten_plates
+
     plates = handwritten_plates(bench.plate, bench.writers)
-    singular = singular_values(rig.matrix)
-    light = rig.ambient + rig.matrix @ plates.mean
-    own = camera_variance(light, camera, bench.frames, bench.known_pattern)
-    fixed = torch.full_like(own, (bench.fixed_noise * rig.white) ** 2 / bench.frames)
-    at_camera, at_fixed = (at_noise(rig, variance, plates, seed) for variance in (own, fixed))
+    singular = singular_values(seen.matrix)
+    light = seen.ambient + seen.matrix @ plates.mean
+    own = camera_variance(light, setup.frame_camera, bench.frames, bench.known_pattern)
+    fixed = torch.full_like(own, (bench.fixed_noise * seen.white) ** 2 / bench.frames)
+    at_camera, at_fixed = (at_noise(seen, variance, plates, seed) for variance in (own, fixed))
     warnings = []
-    if isinstance(transport, PaperTransport) and transport.taper < 1:
-        wide = singular_values(seen_rig(carried_on(transport), bench).matrix)
-        note = truncation_note(transport, counted(singular, KINK_LEVEL), counted(wide, KINK_LEVEL), KINK_LEVEL)
+    plain = setup.without_artifacts()
+    if plain is not None:
+        wide = singular_values(linearized(plain, bench).matrix)
+        note = artifact_note(setup, plain, counted(singular, KINK_LEVEL), counted(wide, KINK_LEVEL), KINK_LEVEL)
         warnings += [note] if note else []
-    if isinstance(transport, MeasuredTransport):
-        warnings += scan_notes(transport, bench, rig, singular, MODE_LEVEL)
+    noise = setup.resized(seen.shape).operator_noise(seen.plate)
+    if noise is not None:
+        warnings += scan_notes(noise, seen, singular, MODE_LEVEL)
     zero_db, mean_db = (
         _psnr((plates.test - blank).square().mean(dim=-1))
         for blank in (torch.zeros_like(plates.mean), plates.mean)
     )
     return Identification(
         name,
-        transport,
-        camera,
+        setup,
         bench,
         singular,
         counted(singular, MODE_LEVEL),
@@ -193,17 +190,17 @@ def identify(
     )
 
 
-def at_noise(rig: SeenRig, variance: torch.Tensor, plates: Plates, seed: int = 0) -> AtNoise:
+def at_noise(seen: LinearizedSetup, variance: torch.Tensor, plates: Plates, seed: int = 0) -> AtNoise:
     """Return what is left of a rig at independent noise of a given variance.
 
     Args:
-        rig: The linear map.
+        seen: The linear map.
         variance: Variance of each pixel's noise, white levels squared, [H W], above 0.
         plates: Prior and test.
         seed: Seed of the one picture that is drawn with noise.
     """
-    cells, shape = rig.plate.width, rig.plate.shape
-    whitened = rig.matrix / variance.sqrt()[:, None]
+    cells, shape = seen.plate.width, seen.plate.shape
+    whitened = seen.matrix / variance.sqrt()[:, None]
     gram = whitened.mT @ whitened
     power, axes = torch.linalg.eigh(gram)
     power, axes = power.flip(0).clamp(min=0), axes.flip(1)
@@ -214,9 +211,9 @@ def at_noise(rig: SeenRig, variance: torch.Tensor, plates: Plates, seed: int = 0
     shapeless = LinearEstimator.white(gram, power, axes)
     generator = torch.Generator().manual_seed(derive_seed(seed, "identify"))
     noise = torch.randn(len(variance), generator=generator, dtype=torch.float64)
-    seen = gram @ (typical - plates.mean) + whitened.mT @ noise
+    backprojected = gram @ (typical - plates.mean) + whitened.mT @ noise
     strokes = [finest_bars(shapeless, cells, upright) for upright in (True, False)]
-    upright, lying = (None if one is None else one * rig.plate.pitch_m for one in strokes)
+    upright, lying = (None if one is None else one * seen.plate.pitch_m for one in strokes)
     return AtNoise(
         float(variance.mean().sqrt()),
         estimator.patterns_seen,
@@ -225,7 +222,7 @@ def at_noise(rig: SeenRig, variance: torch.Tensor, plates: Plates, seed: int = 0
         power.sqrt(),
         power.sqrt() * (axes.mT @ typical).abs(),
         axes[:, :8].mT.reshape(8, *shape),
-        estimator.estimate(seen).reshape(shape),
+        estimator.estimate(backprojected).reshape(shape),
     )
 
 

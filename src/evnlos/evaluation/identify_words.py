@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from evnlos.transport import PaperTransport
+from dataclasses import fields
+
+from evnlos.setups import Setup
 
 _SHAPE = 4  # bars of a quarter of the plate tell where a letter is filled and where it is open
 _EXTRA_MODES = 1.1
@@ -44,20 +46,21 @@ def verdict(patterns: int, finest_m: tuple[float | None, float | None], stroke_m
     return f"With this wall and noise {patterns} patterns can be told apart, and {bars}: {meaning}."
 
 
-def truncation_note(transport: PaperTransport, cut: int, whole: int, level: float) -> str | None:
-    """Return a warning where the edge of the tPSF's disc shows modes that the wall does not have.
+def artifact_note(setup: Setup, plain: Setup, cut: int, whole: int, level: float) -> str | None:
+    """Return a warning where what a setup's model adds to a real wall shows modes that the wall does not have.
 
     Args:
-        transport: The transport, with its hard or tapered edge.
-        cut: Singular values above `level` with that edge.
-        whole: The same for the kernel carried on and faded out.
+        setup: The setup.
+        plain: The same without that (`Setup.without_artifacts`), e.g. a tPSF without its hard edge.
+        cut: Singular values of the setup above `level`.
+        whole: The same without the artifact.
         level: Share of the largest singular value.
     """
     if cut <= _EXTRA_MODES * whole:
         return None
-    edge = f"the tPSF ends at rho = {transport.rho_max:g} with taper {transport.taper:g}"
-    wide = f"carried on to rho = {4 * transport.rho_max:g} and faded out"
+    changed = [item.name for item in fields(setup) if getattr(setup, item.name) != getattr(plain, item.name)]
+    here, there = (", ".join(f"{name} {getattr(one, name):g}" for name in changed) for one in (setup, plain))
     return (
-        f"{edge}: {cut} singular values lie above {level:g} of the largest, {whole} with the kernel {wide}; "
-        "the kink at the edge makes the operator look better conditioned than a wall is (raise taper towards 1)"
+        f"{setup.wall_description()} with {here}: {cut} singular values lie above {level:g} of the largest, "
+        f"{whole} with {there}; {setup.artifact} makes the operator look better conditioned than a wall is"
     )

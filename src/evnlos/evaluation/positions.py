@@ -1,4 +1,4 @@
-"""How a joint network's picture grows with the number of positions that it sees."""
+"""How the image of a sequence network grows with the number of positions that it sees."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from evnlos.dataset import Dataset, NlosDataset
 from evnlos.errors import DataError
 from evnlos.evaluation.evaluate import check_sampling
 from evnlos.metrics import psnr
-from evnlos.model import JointNetwork, Weights
+from evnlos.model import Weights
 
 _MOST_SUBSETS = 8
 
 
 @dataclass(frozen=True)
 class PositionsPoint:
-    """Scores of a joint network that saw a part of each pass.
+    """Scores of a sequence network that saw a part of each pass.
 
     Args:
         positions: Positions that it saw.
@@ -44,22 +44,23 @@ def curve_over_positions(
     at all N positions, whose places are known.
 
     Args:
-        weights: A joint network.
+        weights: Those of a network of whole sequences.
         dataset: Where the samples are.
         split: "train", "validation", "test" or "all".
         counts: Numbers of positions, each from 1 to the positions of a pass.
 
     Raises:
-        DataError: The network sees single positions, the motion of an object is unknown, a count is more than
+        DataError: The network sees single time steps, the motion of an object is unknown, a count is more than
             a pass has, or the samples were made in another way than those of the training.
     """
     network = weights.network
-    if not isinstance(network, JointNetwork):
+    if not network.sees_sequence:
         raise DataError(
-            "these weights see single positions; give those of a joint network (train with `--joint`)"
+            "these weights see single time steps; give those of a network of whole sequences (train with "
+            "--network.kind sequence)"
         )
     check_sampling(weights, dataset.sampling)
-    samples = NlosDataset(dataset, split, weights.paradigm)  # type: ignore[arg-type]
+    samples = NlosDataset(dataset, split, weights.modality)
     if np.isnan(samples.position_m).any():
         raise DataError("the motion of an object is unknown; give it in capture.yaml (`evnlos track` finds it)")
     passes = {name: np.flatnonzero(samples.names == name) for name in dict.fromkeys(samples.names.tolist())}
@@ -76,7 +77,7 @@ def curve_over_positions(
             decibel = []
             for part in parts_of[name]:
                 some = torch.from_numpy(part)
-                drawn = network.drawn(network.see(inputs[some], places[some]), places)
+                drawn = network.draw(inputs[some], places[some], places)
                 decibel.append(psnr(drawn[:, rows].contiguous(), truth[:, rows].contiguous()).mean())
             means[name] = float(torch.stack(decibel).mean())
         subsets = max(len(parts) for parts in parts_of.values())

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evnlos.metrics import gmsd, haarpsi, ms_ssim, psnr, ssim
+from evnlos.metrics import HAAR_LEAST_SIDE, gmsd, haarpsi, ms_ssim, psnr, ssim
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 _MARGIN = 2  # pixels around the target's bounding box: the blur of its edge belongs to it
@@ -24,7 +24,7 @@ class Scores:
         ssim: On the scored canvas.
         psnr_box_db: On the smallest box that holds the target, grown by 2 pixels.
         ms_ssim: On the scored canvas, as many scales as it holds.
-        haarpsi: On the scored canvas.
+        haarpsi: On the scored canvas; None where a side has fewer than 16 pixels.
         gmsd: On the scored canvas; smaller is better.
         lpips: With the VGG trunk; None where it is not at hand.
     """
@@ -33,7 +33,7 @@ class Scores:
     ssim: np.ndarray
     psnr_box_db: np.ndarray
     ms_ssim: np.ndarray
-    haarpsi: np.ndarray
+    haarpsi: np.ndarray | None
     gmsd: np.ndarray
     lpips: np.ndarray | None = None
 
@@ -51,6 +51,7 @@ def score(images: Tensor, truth: Tensor, perceptual: Perceptual | None = None) -
         truth: True pictures.
         perceptual: LPIPS of [N, 1, H, W] pairs, where its weights are at hand.
     """
+    large = min(images.shape[-2:]) >= HAAR_LEAST_SIDE
     boxes = [_box(picture) for picture in truth]
     in_box = [psnr(image[box], picture[box]) for image, picture, box in zip(images, truth, boxes, strict=True)]
     return Scores(
@@ -58,7 +59,7 @@ def score(images: Tensor, truth: Tensor, perceptual: Perceptual | None = None) -
         ssim=ssim(images, truth).double().numpy(),
         psnr_box_db=torch.stack(in_box).double().numpy(),
         ms_ssim=ms_ssim(images, truth).double().numpy(),
-        haarpsi=haarpsi(images, truth).double().numpy(),
+        haarpsi=haarpsi(images, truth).double().numpy() if large else None,
         gmsd=gmsd(images, truth).double().numpy(),
         lpips=perceptual(images[:, None], truth[:, None]).double().numpy() if perceptual else None,
     )

@@ -10,11 +10,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from evnlos.config import from_dict
-from evnlos.dataset import NlosDataset, Samples, Sampling, network_input
+from evnlos.dataset import NlosDataset, Samples
 from evnlos.evaluation.consistency import FrameOperator
 from evnlos.evaluation.explained import explained
-from evnlos.model import Confidence, JointNetwork, Judgement, ResidualUNet, Weights, halves_of, plates
+from evnlos.model import Confidence, Judgement, Reconstructor, Weights, halves_of, plates
 from evnlos.model.plates import on_canvas
 from evnlos.types import Plane
 
@@ -34,11 +33,10 @@ def judgement_of(
     if why_unjudged(weights, samples) is not None:
         return None
     assert weights.confidence is not None and samples.position_m is not None  # see why_unjudged
-    sampling = from_dict(Sampling, weights.sampling, source="the weights' sampling")
-    seen = network_input(samples.frame, samples.surface, weights.paradigm)  # type: ignore[arg-type]
+    seen = weights.modality.inputs(samples.frame, samples.surface)
     frames = torch.from_numpy(samples.frame)
     pass_ = (seen, frames, images, samples.position_m)
-    return _judged(weights.network, weights.confidence, *pass_, sampling.canvas, operator)
+    return _judged(weights.network, weights.confidence, *pass_, weights.sampling.canvas, operator)
 
 
 def why_unjudged(weights: Weights, samples: Samples) -> str | None:
@@ -60,7 +58,7 @@ def why_unjudged(weights: Weights, samples: Samples) -> str | None:
 
 
 def _judged(
-    network: ResidualUNet | JointNetwork,
+    network: Reconstructor,
     confidence: Confidence,
     inputs: Tensor,
     frames: Tensor,
@@ -113,7 +111,7 @@ class PassWorth:
 
 @torch.inference_mode()
 def worth_of(
-    network: ResidualUNet | JointNetwork,
+    network: Reconstructor,
     confidence: Confidence,
     samples: NlosDataset,
     images: Tensor,
@@ -128,7 +126,7 @@ def worth_of(
         samples: The passes, all of known motion.
         images: The network's pictures of all samples, float32 [N, H, W].
         canvas: Their geometry.
-        operator: The rig that the network was trained for; the inputs then begin with the frame.
+        operator: The rig that the network was trained for; the modality then has a group "frame".
 
     Raises:
         DataError: The motion of a pass is unknown.
@@ -138,7 +136,7 @@ def worth_of(
         mine = np.flatnonzero(samples.names == name)
         rows, at = torch.from_numpy(mine), samples.position_m[mine]
         inputs = samples.inputs[rows]
-        pass_ = (inputs, inputs[:, 0].float(), images[rows], at)
+        pass_ = (inputs, _frames(samples, inputs), images[rows], at)
         said = _judged(network, confidence, *pass_, canvas, operator)
         true, shown = samples.truth[rows].float(), images[rows]
         average = on_canvas(confidence.mean, canvas, at)
@@ -158,6 +156,12 @@ def worth_of(
             )
         )
     return found
+
+
+def _frames(samples: NlosDataset, inputs: Tensor) -> Tensor:
+    """Return the frames in inputs, [n, H, W]; zeros where the modality has none."""
+    own = samples.modality.slices.get("frame")
+    return inputs[:, 0].float() * 0 if own is None else inputs[:, own][:, 0].float()
 
 
 def risk_coverage(support: ArrayLike, risk: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.types import Events
+from evnlos.untrusted import MOST_SENSOR_PIXELS
 
 WINDOW_US = 10_000
 """Length of the windows in which the peak rate is counted, microseconds."""
@@ -92,6 +93,33 @@ class _Peak:
         self._open, self._have = int(windows[-1]), int(counts[-1])
 
 
+class _Counts:
+    """Events of each pixel; of a sensor of very many pixels, only of those that sent one."""
+
+    def __init__(self, pixels: int) -> None:
+        self._where = None if pixels <= MOST_SENSOR_PIXELS else np.zeros(0, np.int64)
+        self._counts = np.zeros(pixels if self._where is None else 0, np.int64)
+
+    def add(self, where: NDArray[np.int64]) -> None:
+        if self._where is None:
+            self._counts += np.bincount(where, minlength=len(self._counts))
+            return
+        new, counts = np.unique(where, return_counts=True)
+        merged, places = np.unique(np.concatenate([self._where, new]), return_inverse=True)
+        both = np.concatenate([self._counts, counts])
+        self._where, self._counts = merged, np.bincount(places, both, len(merged)).astype(np.int64)
+
+    def active(self) -> int:
+        return int(np.count_nonzero(self._counts))
+
+    def busiest(self) -> tuple[int, int]:
+        """Return the first of the pixels with the most events, and how many these are."""
+        if not len(self._counts):
+            return 0, 0
+        top = int(np.argmax(self._counts))
+        return (top if self._where is None else int(self._where[top])), int(self._counts[top])
+
+
 def summarise(pieces: Iterable[Events]) -> Summary:
     """Return what a recording holds; pieces come in the order of time, as `iter_events` yields them.
 
@@ -106,7 +134,7 @@ def summarise(pieces: Iterable[Events]) -> Summary:
     width = height = total = on = unknown = silences = 0
     first = last = 0
     longest, peak = Silence(), _Peak()
-    counts = np.zeros(1, np.int64)
+    counts = _Counts(0)
     columns: tuple[str, ...] = ("t_us", "x", "y", "p")
     for events in pieces:
         if not len(events):
@@ -115,7 +143,7 @@ def summarise(pieces: Iterable[Events]) -> Summary:
             first = last = int(events.t_us[0])
             columns = tuple(events.columns())
             height, width = events.shape
-            counts = np.zeros(height * width, np.int64)
+            counts = _Counts(height * width)
         since = events.t_us - first
         gaps = np.diff(since, prepend=last - first)
         silences += int(np.count_nonzero(gaps > WINDOW_US))
@@ -124,13 +152,13 @@ def summarise(pieces: Iterable[Events]) -> Summary:
             longest = Silence(int(gaps[widest]), int(since[widest] - gaps[widest]))
         peak.add(since)
         where = events.y.astype(np.int64) * width + events.x
-        counts += np.bincount(where, minlength=len(counts))
+        counts.add(where)
         total += len(events)
         on += int(np.count_nonzero(events.p))
         if events.polarity_known is not None:
             unknown += len(events) - int(np.count_nonzero(events.polarity_known))
         last = int(events.t_us[-1])
-    top = int(np.argmax(counts))
+    top, most = counts.busiest()
     return Summary(
         width=width,
         height=height,
@@ -143,7 +171,7 @@ def summarise(pieces: Iterable[Events]) -> Summary:
         peak_us=peak.window * WINDOW_US,
         longest_silence=longest,
         silences=silences,
-        active_pixels=int(np.count_nonzero(counts)),
-        busiest=(top % width, top // width, int(counts[top])) if total else None,
+        active_pixels=counts.active(),
+        busiest=(top % width, top // width, most) if total else None,
         columns=columns,
     )

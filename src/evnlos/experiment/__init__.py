@@ -9,13 +9,19 @@ from evnlos.experiment.conditions import (
     conditions_table,
     map_conditions,
 )
-from evnlos.experiment.presets import STUDIES, jointly
-from evnlos.experiment.progress import show
+from evnlos.experiment.presets import STUDIES, on_sequences
 from evnlos.experiment.records import read_records, write_record
 from evnlos.experiment.run import captures_of, run_study
 from evnlos.experiment.simulated import Simulated, run_simulated
-from evnlos.experiment.study import Arm, Place, Record, Step, Study
-from evnlos.experiment.table import character_table, checks_table, difference, gain_table, summary_table
+from evnlos.experiment.study import Arm, Place, Record, Study
+from evnlos.experiment.table import (
+    character_table,
+    checks_table,
+    difference,
+    gain_table,
+    means_of,
+    summary_table,
+)
 
 __all__ = [
     "STUDIES",
@@ -26,7 +32,6 @@ __all__ = [
     "Place",
     "Record",
     "Simulated",
-    "Step",
     "Study",
     "base_simulation",
     "captures_of",
@@ -38,12 +43,12 @@ __all__ = [
     "conditions_table",
     "difference",
     "gain_table",
-    "jointly",
     "map_conditions",
+    "means_of",
+    "on_sequences",
     "read_records",
     "run_simulated",
     "run_study",
-    "show",
     "summary_table",
     "write_carried",
     "write_record",

@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from evnlos.calibration import RIG_FILE
-from evnlos.config import config_hash, from_dict, load_yaml, to_dict, write_atomically
-from evnlos.dataset import NlosDataset, Sampling, Simulation, open_dataset, read_shard
+from evnlos.calibration.transport_fit import values_of
+from evnlos.config import config_hash, load_yaml, to_dict
+from evnlos.dataset import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
+from evnlos.dataset.pool import processes
 from evnlos.errors import DataError
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.evaluation.worth import PassWorth, risk_coverage, worth_of
-from evnlos.experiment.making import simulated_steps
 from evnlos.experiment.scoring import TRUST
-from evnlos.experiment.study import Step
+from evnlos.files import write_atomically
 from evnlos.metrics import psnr
-from evnlos.model import Weights, infer, load_weights
+from evnlos.model import Weights, load_weights
 from evnlos.model.plates import on_canvas
+from evnlos.progress import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS
-from evnlos.transport import RadiometricTransport
 
 
 @dataclass(frozen=True)
@@ -63,31 +64,32 @@ def sets(rig: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation
     Raises:
         DataError: The rig's wall is not radiometric.
     """
-    wall = rig.transport
-    if not isinstance(wall, RadiometricTransport):
-        raise DataError(f"the rig's transport is {wall.kind!r}; give a calibrated rig (radiometric)")
+    wall: Any = rig.setup  # of rough metal, as the sets say
+    known = values_of(wall)
+    if "roughness" not in known:
+        raise DataError(f"the setup is {wall.kind!r}; give a calibrated one (radiometric)")
     base = replace(rig, sampling=sampling, vary={}, rigs=0, validation=0.0, held_out="", keep_events=False)
     hand = HandwritingGlyphs(characters=UPPER_CASE + DIGITS, writers=1, first_writer=TRAIN_WRITERS)
     some = replace(hand, characters="".join((UPPER_CASE + DIGITS)[:: max(1, 36 // each)][:each]))
     offset = wall.target_offset_m  # None: in the mirror direction, at any distance
     beyond = None if offset is None else (1.5 * offset[0], 1.5 * offset[1])
-    farther = replace(wall, distance_m=1.5 * wall.distance_m, target_offset_m=beyond)
+    farther = replace(wall, distance_m=1.5 * known["distance_m"], target_offset_m=beyond)
     walls = {
-        "wall 1.5 x as rough": replace(wall, roughness=wall.roughness * 1.5),
-        "wall 3 x as rough": replace(wall, roughness=min(1.0, wall.roughness * 3)),
+        "wall 1.5 x as rough": wall.with_parameters({"roughness": 1.5 * known["roughness"]}),
+        "wall 3 x as rough": wall.with_parameters({"roughness": min(1.0, 3 * known["roughness"])}),
         "1.5 x as far": farther,
         "a third of the light": replace(wall, gain=wall.gain / 3, ambient=wall.ambient / 3),
         "matte wall": replace(wall, wall_material="lambert"),
     }
     found = {"characters of an unseen hand": replace(base, glyphs=hand)}
     found |= {kind: replace(base, glyphs=DrawingGlyphs(kinds=(kind,), each=each)) for kind in KINDS}
-    return found | {name: replace(base, glyphs=some, transport=other) for name, other in walls.items()}
+    return found | {name: replace(base, glyphs=some, setup=other) for name, other in walls.items()}
 
 
 def carry_over(
-    weights: Path, rig: Path, out: Path, workers: int = 0, each: int = 12
-) -> Iterator[tuple[Step, CarriedOver | None]]:
-    """Run one network on all sets, yielding each step and, with the last of a set, what came of it.
+    weights: Path, rig: Path, out: Path, workers: int = 0, each: int = 12, progress: Progress = silent
+) -> list[CarriedOver]:
+    """Run one network on all sets and return what came of each.
 
     Args:
         weights: Weights file, or a run's folder.
@@ -95,6 +97,7 @@ def carry_over(
         out: Folder for datasets and results.
         workers: Processes that simulate; 0 = one for each core.
         each: Objects of a set.
+        progress: Called with each step of the simulations, and after each set, with what came of it.
 
     Raises:
         DataError: The weights do not know what their pictures are worth, or the rig can't be used.
@@ -104,27 +107,33 @@ def carry_over(
         raise DataError(
             f"{weights} does not know what its pictures are worth; train on a dataset with a validation split"
         )
-    sampling = from_dict(Sampling, loaded.sampling, source="the weights' sampling")
+    sampling = loaded.sampling
     own = load_yaml(Simulation, rig / RIG_FILE)
-    operator = FrameOperator(own, sampling) if loaded.paradigm != "event" else None
+    operator = FrameOperator(own.setup, sampling) if "frame" in loaded.modality.slices else None
+    processes(workers, 1)
+    found = list[CarriedOver]()
     for name, config in sets(own, sampling, each).items():
         key = config_hash(config)[:8]
         folder = out / "simulations" / f"{rig.name}-{name.replace(' ', '-')}-{key}"
-        for step in simulated_steps(config, folder, workers):
-            yield step, None
-        same = operator is None or config.transport == own.transport
-        own_wall = operator if same else FrameOperator(config, sampling)
-        yield Step(f"score {folder.name}", 1, 1), _score(name, loaded, folder, operator, own_wall)
+        dataset = simulate(config, folder, workers, progress=progress)
+        same = operator is None or config.setup == own.setup
+        own_wall = operator if same else FrameOperator(config.setup, sampling)
+        found.append(_score(name, loaded, dataset, operator, own_wall))
+        progress(Step(f"score {folder.name}", 1, 1, "sets", found[-1]))
+    return found
 
 
 def _score(
-    name: str, weights: Weights, folder: Path, operator: FrameOperator | None, own_wall: FrameOperator | None
+    name: str,
+    weights: Weights,
+    dataset: Dataset,
+    operator: FrameOperator | None,
+    own_wall: FrameOperator | None,
 ) -> CarriedOver:
     """Score a set; `operator` is the rig that the network was trained for, `own_wall` that of the set."""
     assert weights.confidence is not None
-    dataset = open_dataset(folder)
-    samples = NlosDataset(dataset, "all", weights.paradigm)  # type: ignore[arg-type]
-    images = infer(weights.network, samples.inputs, samples.position_m, samples.names)
+    samples = NlosDataset(dataset, "all", weights.modality)
+    images = weights.network.infer(samples.inputs, samples.position_m, samples.names)
     canvas, rows = dataset.sampling.canvas, dataset.sampling.scored
     truth = samples.truth.float()[:, rows]
     average = on_canvas(weights.confidence.mean, canvas, samples.position_m)

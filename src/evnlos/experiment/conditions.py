@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from evnlos.config import config_hash, write_atomically
-from evnlos.dataset import PARADIGMS, Simulation, network_input, simulate_object
-from evnlos.dataset.pool import run_in_order
+from evnlos.config import config_hash
+from evnlos.dataset import STANDARD_MODALITIES, Simulation, as_modality, simulate_object
+from evnlos.dataset.pool import processes, run_in_order
 from evnlos.evaluation.intervals import paired_difference
-from evnlos.experiment.study import Step
+from evnlos.files import write_atomically
 from evnlos.metrics import psnr
 from evnlos.model import fit_linear
+from evnlos.progress import Progress, Step, silent
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs
-from evnlos.transport import RadiometricTransport
-from evnlos.transport.rig import FAR_M
+from evnlos.setups import RadiometricSetup
+from evnlos.setups.presets import FAR_M
 
 FULL = 0.85
 """White levels of the brightest pixel: as if the exposure had been set so that nothing is clipped."""
@@ -56,7 +57,7 @@ class Finding:
         factor: What was changed.
         value: Its value.
         unit: Its unit.
-        psnr_db: Paradigm -> mean PSNR of the linear estimate on the test writer, dB.
+        psnr_db: str -> mean PSNR of the linear estimate on the test writer, dB.
         mean_db: PSNR of the mean picture, dB.
         gain_db: PSNR of events minus that of frames: mean, low and high end of the 95 % interval over objects.
         events_per_pixel: Events a pixel and pass.
@@ -85,7 +86,7 @@ def base_simulation(writers: int = 2) -> Simulation:
     return _lit(
         Simulation(
             glyphs=HandwritingGlyphs(characters=letters, writers=writers),
-            transport=RadiometricTransport(cell_m=0.005),
+            setup=RadiometricSetup(cell_m=0.005),
             validation=0.0,
         ),
         0.1,
@@ -106,16 +107,20 @@ def conditions(base: Simulation) -> list[Condition]:
     found = [Condition("base", 1.0, "", base)]
     found += [Condition("ambient", r, "of the signal", _lit(base, r)) for r in (0.0, 0.5, 2.0, 8.0)]
     for share in (0.3, 0.1, 0.03):
-        light = replace(
-            base.transport, gain=base.transport.gain * share, ambient=base.transport.ambient * share
-        )
-        found.append(Condition("light", share, "of the base", replace(base, transport=light)))
+        light = replace(base.setup, gain=base.setup.gain * share, ambient=base.setup.ambient * share)
+        found.append(Condition("light", share, "of the base", replace(base, setup=light)))
     for noise in (30.0, 100.0, 300.0):
         camera = replace(base.frame_camera, read_noise_e=noise)
-        found.append(Condition("read noise", noise, "electrons", replace(base, frame_camera=camera)))
+        found.append(
+            Condition(
+                "read noise", noise, "electrons", replace(base, setup=replace(base.setup, frame_camera=camera))
+            )
+        )
     for exposure in (0.03, 0.1, 0.3):
         camera = replace(base.frame_camera, exposure_s=exposure)
-        found.append(Condition("exposure", exposure, "s", replace(base, frame_camera=camera)))
+        found.append(
+            Condition("exposure", exposure, "s", replace(base, setup=replace(base.setup, frame_camera=camera)))
+        )
     length = base.motion.speed_m_s * base.duration_s
     for speed in (0.005, 0.08, 0.32):
         # The time constant follows the time in which the target moves by a stroke.
@@ -127,24 +132,23 @@ def conditions(base: Simulation) -> list[Condition]:
             sampling=replace(base.sampling, tau_s=tau_s),
         )
         found.append(Condition("speed", speed, "m/s", moved))
-    rig = base.transport
-    assert isinstance(rig, RadiometricTransport)
+    rig: Any = base.setup  # a radiometric one, see `base_simulation`
     for roughness in (0.02, 0.1, 0.2):
         wall = replace(rig, roughness=roughness)
-        found.append(Condition("roughness", roughness, "of the wall", replace(base, transport=wall)))
+        found.append(Condition("roughness", roughness, "of the wall", replace(base, setup=wall)))
     matte = replace(rig, wall_material="lambert")
-    found.append(Condition("albedo", matte.albedo, "of a matte wall", replace(base, transport=matte)))
+    found.append(Condition("albedo", matte.albedo, "of a matte wall", replace(base, setup=matte)))
     far = replace(rig, distance_m=FAR_M)
-    found.append(Condition("distance", FAR_M, "m", replace(base, transport=far)))
+    found.append(Condition("distance", FAR_M, "m", replace(base, setup=far)))
     return found
 
 
 def map_conditions(
-    chosen: list[Condition], out: Path, workers: int = 0, rank: int = 192
-) -> Iterator[tuple[Step, Finding]]:
-    """Measure each condition, yielding its finding; what is done is read back.
+    chosen: list[Condition], out: Path, workers: int = 0, rank: int = 192, progress: Progress = silent
+) -> list[Finding]:
+    """Measure each condition and return the findings; what is done is read back.
 
-    All paradigms get the same estimator, the linear one that is best for each, fitted anew to each condition:
+    All modalities get the same estimator, the linear one that is best for each, fitted anew to each condition:
     a network would add its own luck to every difference.
 
     Args:
@@ -152,8 +156,11 @@ def map_conditions(
         out: Folder for one JSON file a condition.
         workers: Processes; 0 is one for each core.
         rank: Components of the linear estimate.
+        progress: Called when the work begins and of a condition and when it is done.
     """
+    processes(workers, 1)
     out.mkdir(parents=True, exist_ok=True)
+    findings = list[Finding]()
     for k, condition in enumerate(chosen):
         path = out / f"{config_hash(condition.simulation)}.json"
         if path.is_file():
@@ -162,8 +169,10 @@ def map_conditions(
         else:
             finding = measure(condition, workers, rank)
             write_atomically(path, json.dumps(asdict(finding), indent=1).encode())
+        findings.append(finding)
         what = f"{condition.factor} {condition.value:g} {condition.unit}".strip()
-        yield Step(f"conditions ({what})", k + 1, len(chosen)), finding
+        progress(Step(f"conditions ({what})", k + 1, len(chosen), "conditions", finding))
+    return findings
 
 
 def measure(condition: Condition, workers: int = 0, rank: int = 192) -> Finding:
@@ -183,13 +192,12 @@ def measure(condition: Condition, workers: int = 0, rank: int = 192) -> Finding:
     truth = torch.cat([p.truth for p in tested])[:, rows]
     names = np.concatenate([[p.name] * len(p.truth) for p in tested])
     scores: dict[str, np.ndarray] = {}
-    for paradigm in PARADIGMS:
-        seen, known = (
-            [network_input(p.frame, p.surface, paradigm) for p in part] for part in (learned, tested)
-        )
+    for modality in map(as_modality, STANDARD_MODALITIES):
+        seen, known = ([modality.inputs(p.frame, p.surface) for p in part] for part in (learned, tested))
         owners = np.concatenate([[p.name] * len(p.truth) for p in learned])
-        estimate = fit_linear(torch.cat(seen), torch.cat([p.truth for p in learned]), owners, rank)
-        scores[paradigm] = psnr(estimate(torch.cat(known))[:, rows], truth).numpy()
+        truths = torch.cat([p.truth for p in learned])
+        estimate = fit_linear(torch.cat(seen), truths, owners, rank, modality=modality)
+        scores[modality.name] = psnr(estimate(torch.cat(known))[:, rows], truth).numpy()
     blank = torch.cat([p.truth for p in learned]).mean(dim=0)[rows].expand_as(truth)
     gain = paired_difference(scores["event"], scores["frame"], names)
     pixels = config.sensor.height * config.sensor.width
@@ -217,7 +225,7 @@ def conditions_table(findings: list[Finding]) -> str:
     for f in findings:
         what = "base" if f.factor == "base" else f"{f.factor} {f.value:g} {f.unit}"
         mean, low, high = f.gain_db
-        scores = " | ".join(f"{f.psnr_db[p]:.2f}" for p in PARADIGMS)
+        scores = " | ".join(f"{f.psnr_db[p]:.2f}" for p in STANDARD_MODALITIES)
         lines.append(
             f"| {what} | {scores} | {f.mean_db:.2f} | {mean:+.2f} [{low:+.2f}, {high:+.2f}] | "
             f"{f.events_per_pixel:.1f} | {f.event_bytes_s / 1e3:.0f} | {f.frame_bytes_s / 1e3:.0f} |"
@@ -244,4 +252,4 @@ def _pass(task: tuple[Simulation, str]) -> _Pass:
 def _lit(config: Simulation, ratio: float) -> Simulation:
     """Return the simulation with ambient light of `ratio` times the largest signal, both within the range."""
     gain = FULL / (1 + ratio)
-    return replace(config, transport=replace(config.transport, gain=gain, ambient=gain * ratio))
+    return replace(config, setup=replace(config.setup, gain=gain, ambient=gain * ratio))

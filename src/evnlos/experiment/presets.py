@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from evnlos.config import from_dict, to_dict
 from evnlos.dataset import Sampling
 from evnlos.errors import ConfigError
 from evnlos.experiment.study import Arm, Study
-from evnlos.model import UNetConfig
+from evnlos.model import SequenceConfig, UNetConfig
 from evnlos.training import Training, paper_finetuning, paper_pretraining
 
 PRETRAINING = Training(epochs=2)
 """Pre-training of our own experiments; `--pretrain-epochs` changes the number of epochs."""
-FINETUNING = Training(epochs=3, learning_rate=2e-4, restandardise=False)
+FINETUNING = Training(epochs=3, learning_rate=2e-4, keep_normalization=True)
 """Fine-tuning after a calibrated simulation, whose scale stays; chosen on validation characters."""
-UNCALIBRATED = replace(FINETUNING, epochs=10, learning_rate=1e-3, restandardise=True)
+UNCALIBRATED = replace(FINETUNING, epochs=10, learning_rate=1e-3, keep_normalization=False)
 """Fine-tuning after a simulation of another rig: longer, in larger steps, with the scale of the captures."""
 END_TO_END = Training(epochs=12)
 """End-to-end training; validation characters gain nothing after half of it."""
@@ -102,7 +103,9 @@ def thresholds(rig: str) -> Study:
     """Return the ablation of the simulated event thresholds: right, and wrong by factors; events alone."""
     arms = []
     for factor in (0.5, 0.75, 1.0, 1.5, 2.0):
-        ranges = {f"pixel.threshold_{p}": (0.2 * factor * 0.95, 0.2 * factor * 1.05) for p in ("on", "off")}
+        ranges = {
+            f"setup.pixel.threshold_{p}": (0.2 * factor * 0.95, 0.2 * factor * 1.05) for p in ("on", "off")
+        }
         arms.append(replace(_EPNP, name=f"thresholds {0.2 * factor:.2f}", vary=ranges))
     return Study("thresholds", rig, tuple(arms), ("event",))
 
@@ -143,36 +146,32 @@ def embedding(rig: str) -> Study:
     return Study("embedding", rig, tuple(arms))
 
 
-_JOINT = Training(
-    joint=True,
-    epochs=6,
-    batch_size=16,
-    network=UNetConfig(rank=512, strengths=(0.001, 0.01, 0.1, 1.0)),
-)
-_JOINT_FINETUNING = replace(FINETUNING, epochs=8, batch_size=16)
+_SEQUENCE_NETWORK = SequenceConfig(rank=512, strengths=(0.001, 0.01, 0.1, 1.0))
+_SEQUENCE = Training(epochs=6, batch_size=16, network=_SEQUENCE_NETWORK)
+_SEQUENCE_FINETUNING = replace(FINETUNING, epochs=8, batch_size=16)
 
 
-def joint(rig: str) -> Study:
-    """Return the comparison of E2E and EPNP where all positions of a pass are seen together.
+def sequence(rig: str) -> Study:
+    """Return the comparison of E2E and EPNP where all time steps of a sequence are seen together.
 
-    A pass is one sample: the simulation has four times the writers of the other studies.
+    A sequence is one sample: the simulation has four times the writers of the other studies.
     """
     arms = (
-        Arm("E2E joint", "none", None, replace(_JOINT, epochs=60)),
-        Arm("simulation only joint", "calibrated", _JOINT, None),
-        Arm("EPNP joint", "calibrated", _JOINT, _JOINT_FINETUNING),
+        Arm("E2E sequence", "none", None, replace(_SEQUENCE, epochs=60)),
+        Arm("simulation only sequence", "calibrated", _SEQUENCE, None),
+        Arm("EPNP sequence", "calibrated", _SEQUENCE, _SEQUENCE_FINETUNING),
     )
-    return Study("joint", rig, arms, writers=44)
+    return Study("sequence", rig, arms, writers=44)
 
 
-def jointly(study: Study) -> Study:
-    """Return a study of single positions with joint networks instead: a whole pass is one sample.
+def on_sequences(study: Study) -> Study:
+    """Return a study of single time steps with sequence networks instead: a whole sequence is one sample.
 
-    A pass is worth less training than forty positions: pre-training and end-to-end training make more epochs,
-    as many as bring the validation to rest, and so does fine-tuning.
+    A sequence is worth less training than forty time steps: pre-training and end-to-end training make more
+    epochs, as many as bring the validation to rest, and so does fine-tuning.
 
     Args:
-        study: Any study; its joint arms stay as they are.
+        study: Any study; its arms on sequences stay as they are.
 
     Raises:
         ConfigError: An arm has no linear embedding that could be pooled.
@@ -182,37 +181,39 @@ def jointly(study: Study) -> Study:
         pre, fine = arm.pretraining, arm.finetuning
         if pre is not None:
             pre = _of_passes(pre, 6, arm.name)
-            fine = fine and replace(fine, epochs=round(fine.epochs * 8 / 3), batch_size=_JOINT.batch_size)
+            fine = fine and replace(fine, epochs=round(fine.epochs * 8 / 3), batch_size=_SEQUENCE.batch_size)
         elif fine is not None:
             fine = _of_passes(fine, 5, arm.name)
         arms.append(replace(arm, pretraining=pre, finetuning=fine))
-    return replace(study, name=f"{study.name}-joint", arms=tuple(arms))
+    return replace(study, name=f"{study.name}-sequence", arms=tuple(arms))
 
 
 def _of_passes(single: Training, longer: int, arm: str) -> Training:
-    """Return the settings of a first training on whole passes, in place of one on single positions."""
-    if single.joint:
+    """Return the settings of a first training on whole sequences, in place of one on single time steps."""
+    if single.network.kind != UNetConfig.kind:
         return single
-    if not single.network.rank:
-        raise ConfigError(f"arm {arm!r} has no linear embedding to pool over a pass; leave it out with --arms")
-    network = replace(single.network, rank=_JOINT.network.rank)
-    if network.strengths == UNetConfig().strengths:
-        network = replace(network, strengths=_JOINT.network.strengths)
-    return replace(
-        single, joint=True, epochs=longer * single.epochs, batch_size=_JOINT.batch_size, network=network
-    )
+    values = to_dict(single.network)
+    if not values["rank"]:
+        raise ConfigError(
+            f"arm {arm!r} has no linear embedding to pool over a sequence; leave it out with --arms"
+        )
+    values |= {"kind": _SEQUENCE_NETWORK.kind, "rank": _SEQUENCE_NETWORK.rank}
+    if values["strengths"] == list(UNetConfig().strengths):
+        values["strengths"] = list(_SEQUENCE_NETWORK.strengths)
+    network = from_dict(SequenceConfig, values)
+    return replace(single, epochs=longer * single.epochs, batch_size=_SEQUENCE.batch_size, network=network)
 
 
 def objects(rig: str) -> Study:
-    """Return the ablation of the number of simulated objects, of joint networks.
+    """Return the ablation of the number of simulated objects, of sequence networks.
 
     With 396 objects the validation no longer gains after 12 epochs; with more there is time for fewer.
     """
     arms = []
     for writers, epochs in ((3, 12), (11, 12), (44, 6)):
-        before, words = replace(_JOINT, epochs=epochs), f"{36 * writers} objects"
+        before, words = replace(_SEQUENCE, epochs=epochs), f"{36 * writers} objects"
         arms.append(Arm(f"simulation only, {words}", "calibrated", before, None, writers=writers))
-        arms.append(Arm(f"EPNP, {words}", "calibrated", before, _JOINT_FINETUNING, writers=writers))
+        arms.append(Arm(f"EPNP, {words}", "calibrated", before, _SEQUENCE_FINETUNING, writers=writers))
     return Study("objects", rig, tuple(arms))
 
 
@@ -226,7 +227,7 @@ STUDIES: dict[str, Callable[[str], Study]] = {
     "loss": loss,
     "width": width,
     "embedding": embedding,
-    "joint": joint,
+    "sequence": sequence,
     "objects": objects,
 }
 """Experiments on captures by name."""

@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from evnlos.config import to_dict, write_atomically
+from evnlos.config import to_dict
 from evnlos.errors import DataError
 from evnlos.evaluation import Evaluation, Scores
-from evnlos.experiment.study import Record, Step
+from evnlos.experiment.study import Record
+from evnlos.files import write_atomically
+from evnlos.migrate import migrate
+from evnlos.progress import Progress, Step
 
 
 def scores_of(evaluation: Evaluation) -> tuple[dict, dict, dict]:
@@ -31,12 +34,13 @@ def scores_of(evaluation: Evaluation) -> tuple[dict, dict, dict]:
     return table(evaluation.scores), positions, baselines
 
 
-def keep_scores(blank: Record, evaluation: Evaluation, folder: Path) -> Step:
-    """Fill a record with an evaluation's scores, write it, and return the step that brought it."""
+def keep_scores(blank: Record, evaluation: Evaluation, folder: Path, progress: Progress) -> Record:
+    """Fill a record with an evaluation's scores, write it, tell of it, and return it."""
     scores, positions, baselines = scores_of(evaluation)
     record = replace(blank, scores=scores, positions=positions, baselines=baselines, checks=evaluation.checks)
     write_record(record, folder)
-    return Step(f"score {record.name}", 1, 1, record)
+    progress(Step(f"score {record.name}", 1, 1, "networks", record))
+    return record
 
 
 def names_there(folder: Path) -> set[str]:
@@ -64,7 +68,7 @@ def read_records(folder: str | Path) -> list[Record]:
     records = []
     for path in paths:
         try:
-            records.append(Record(**json.loads(path.read_text())))
+            records.append(Record(**migrate("Record", json.loads(path.read_text()))))
         except (ValueError, TypeError) as error:
             raise DataError(f"{path} is no record of an experiment: {error}") from None
     return records

@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from evnlos.calibration import fit_rig, rows_of, write_rig
+from evnlos.calibration import RigFit, fit_rig, rows_of, write_rig
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.dataset import (
     Dataset,
-    Paradigm,
     Simulation,
     import_captures,
     load_pattern,
-    open_dataset,
+    simulate,
 )
 from evnlos.dataset.importer import character_of
 from evnlos.dataset.presets import default
-from evnlos.errors import CalibrationError, DataError
-from evnlos.experiment.making import simulated_steps
+from evnlos.errors import CalibrationError, DataError, MissingDependencyError
 from evnlos.experiment.scoring import score_arm
-from evnlos.experiment.study import Arm, Place, Step, Study, slug
+from evnlos.experiment.study import Arm, Place, Record, Study, slug
 from evnlos.experiment.trainings import Run, train_one, train_together
+from evnlos.progress import Progress, Step, silent
 from evnlos.scene import HandwritingGlyphs
 from evnlos.seeds import derive_seed
 
 
-def run_study(study: Study, place: Place) -> Iterator[Step]:
-    """Run what is not done yet of a study, yielding each step; run it again to go on.
+def run_study(study: Study, place: Place, progress: Progress = silent) -> list[Record]:
+    """Run what is not done yet of a study, and return the records that are new; run it again to go on.
 
     Rigs, datasets and runs have names that hold a hash of what decides them, so arms and studies share what
     they have in common.
@@ -39,37 +38,51 @@ def run_study(study: Study, place: Place) -> Iterator[Step]:
     Args:
         study: What to compare.
         place: Where captures and results are.
+        progress: Called with each step of calibration, simulation, import, training and scoring.
 
     Raises:
+        DataError: Fewer captures than an arm learns from.
         CalibrationError: Captures that no rig fits, or whose targets are unknown.
     """
+    for arm in study.arms:
+        _chosen(study, arm, place)
     rig = place.out / "rigs" / study.rig
     needs_rig = study.correct_pattern or any(arm.source == "calibrated" for arm in study.arms)
     if needs_rig and not (rig / "rig.yaml").is_file():
         settings = replace(study.calibration, exclude=(*study.calibration.exclude, *study.test))
-        yield Step(f"calibrate {study.rig}", 0, 1)
+        progress(Step(f"calibrate {study.rig}", 0, 1, "setups"))
         try:
             fit = fit_rig(place.captures, settings)
             write_rig(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), rig)
+            _draw(fit, rig / "check.png")
         except DataError as error:
             raise CalibrationError(str(error)) from None
-        yield Step(f"calibrate {study.rig}", 1, 1)
-    networks = []
+        progress(Step(f"calibrate {study.rig}", 1, 1, "setups"))
+    networks, records = [], list[Record]()
     for arm in study.arms:
-        shots = yield from _import(study, arm, list(place.captures), place)
-        made = yield from _simulate(study, arm, place)
-        for paradigm in study.paradigms:
-            plans = [_planned(study, arm, paradigm, seed, made, shots, place) for seed in study.seeds]
-            networks.append((arm, shots, made, paradigm, plans))
+        shots = _import(study, arm, place, progress)
+        made = _simulate(study, arm, place, progress)
+        for modality in study.modalities:
+            plans = [_planned(study, arm, modality, seed, made, shots, place) for seed in study.seeds]
+            networks.append((arm, shots, made, modality, plans))
     if place.trainings != 1:
         every = [run for *_, plans in networks for runs, _ in plans for run in runs]
-        yield from train_together(every, place.trainings)
-    for arm, shots, made, paradigm, plans in networks:
+        train_together(every, place.trainings, progress)
+    for arm, shots, made, modality, plans in networks:
         for runs, _ in plans:
             for run in runs:
-                yield from train_one(run)
+                train_one(run, progress)
         last = [(runs[-1].out, decided) for runs, decided in plans]
-        yield from score_arm(study, arm, paradigm, last, made, shots, place)
+        records += score_arm(study, arm, modality, last, made, shots, place, progress)
+    return records
+
+
+def _draw(fit: RigFit, path: Path) -> None:
+    """Draw held-out captures beside the fit, where matplotlib is installed."""
+    from evnlos.plot.calibration import draw_calibration  # matplotlib loads slowly
+
+    with suppress(MissingDependencyError):
+        draw_calibration(fit, path)
 
 
 def captures_of(root: Path, rig: str) -> list[Path]:
@@ -97,20 +110,23 @@ def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     return replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
 
 
-def _simulate(study: Study, arm: Arm, place: Place) -> Generator[Step, None, Dataset | None]:
+def _simulate(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset | None:
     if arm.source == "none":
         return None
     config = simulation_of(study, arm, place)
     folder = place.out / "simulations" / f"{arm.source}-{study.rig}-{config_hash(config)[:8]}"
-    yield from simulated_steps(config, folder, place.workers)
-    return open_dataset(folder)
+    return simulate(config, folder, place.workers, progress=progress)
 
 
-def _import(study: Study, arm: Arm, folders: list[Path], place: Place) -> Generator[Step, None, Dataset]:
+def _chosen(study: Study, arm: Arm, place: Place) -> list[Path]:
+    """Return the captures that an arm learns from and is scored on."""
+    chosen = [f for f in place.captures if not (study.validation and character_of(f.name) in study.test)]
+    return chosen if arm.shots is None else _few(chosen, arm.shots, (*study.test, *study.validation))
+
+
+def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset:
     held = study.test if not study.validation else ()
-    chosen = [f for f in folders if not (study.validation and character_of(f.name) in study.test)]
-    if arm.shots is not None:
-        chosen = _few(chosen, arm.shots, (*study.test, *study.validation))
+    chosen = _chosen(study, arm, place)
     pattern = load_pattern(place.out / "rigs" / study.rig) if study.correct_pattern else None
     key = config_hash(
         {
@@ -122,10 +138,8 @@ def _import(study: Study, arm: Arm, folders: list[Path], place: Place) -> Genera
         }
     )
     out = place.out / "shots" / f"{study.rig}-{key[:8]}"
-    made = import_captures(chosen, out, arm.sampling, test=held, validation=study.validation, pattern=pattern)
-    for k, _ in enumerate(made):
-        yield Step(f"import {out.name}", k + 1, len(chosen))
-    return open_dataset(out)
+    split = {"test": held, "validation": study.validation}
+    return import_captures(chosen, out, arm.sampling, **split, pattern=pattern, progress=progress)
 
 
 def _few(folders: list[Path], shots: int, held_out: tuple[str, ...]) -> list[Path]:
@@ -139,24 +153,26 @@ def _few(folders: list[Path], shots: int, held_out: tuple[str, ...]) -> list[Pat
 
 
 def _planned(
-    study: Study, arm: Arm, paradigm: Paradigm, seed: int, made: Dataset | None, shots: Dataset, place: Place
+    study: Study, arm: Arm, modality: str, seed: int, made: Dataset | None, shots: Dataset, place: Place
 ) -> tuple[list[Run], dict[str, Any]]:
     """Return the trainings of an arm's network, each from the one before it, and what decided them."""
     runs: list[Run] = []
     decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": shots.folder.name}
     if arm.pretraining is not None:
         assert made is not None
-        settings = replace(arm.pretraining, paradigm=paradigm, seed=seed)
+        settings = replace(arm.pretraining, modality=modality, seed=seed)
         key = config_hash({"data": made.config_hash, "settings": to_dict(settings)})[:8]
-        out = place.out / "runs" / f"{study.rig}-pretrained-{paradigm}-seed{seed}-{key}"
+        out = place.out / "runs" / f"{study.rig}-pretrained-{modality}-seed{seed}-{key}"
         runs.append(Run(made, settings, out))
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
-        settings = replace(arm.finetuning, paradigm=paradigm, seed=seed)
+        settings = replace(arm.finetuning, modality=modality, seed=seed)
+        others = tuple(replace(other, modality=modality, seed=seed) for other in arm.alternatives)
         start = runs[-1].out if runs else None
-        key = config_hash(
-            {"data": shots.folder.name, "settings": to_dict(settings), "from": start.name if start else None}
-        )[:8]
-        out = place.out / "runs" / f"{study.rig}-{slug(arm.name)}-{paradigm}-seed{seed}-{key}"
-        runs.append(Run(shots, settings, out, start))
+        decides = {"data": shots.folder.name, "settings": to_dict(settings), "from": start and start.name}
+        if others:
+            decides["alternatives"] = [to_dict(other) for other in others]
+        key = config_hash(decides)[:8]
+        out = place.out / "runs" / f"{study.rig}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
+        runs.append(Run(shots, settings, out, start, others))
     return runs, decided

@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 from evnlos.calibration import RIG_FILE
-from evnlos.config import load_yaml
-from evnlos.dataset import Dataset, NlosDataset, Paradigm, Sampling, Simulation, read_shard
+from evnlos.dataset import Dataset, NlosDataset, Sampling, as_modality, read_shard
 from evnlos.evaluation import assess, available_lpips, check_sampling
 from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.experiment.records import keep_scores, names_there
-from evnlos.experiment.study import Arm, Place, Record, Step, Study
-from evnlos.model import fit_linear, infer, load_weights
+from evnlos.experiment.study import Arm, Place, Record, Study
+from evnlos.model import fit_linear, load_weights
+from evnlos.progress import Progress
+from evnlos.setups import load_setup
 
 TRUST = 1.0
 """How far the frames may move the pictures of `+ consistency`: the variance that a probability itself has."""
@@ -29,67 +30,73 @@ ENSEMBLE = -1
 def score_arm(
     study: Study,
     arm: Arm,
-    paradigm: Paradigm,
+    modality: str,
     runs: list[tuple[Path, dict[str, Any]]],
     made: Dataset | None,
     shots: Dataset,
     place: Place,
-) -> Iterator[Step]:
-    """Score what an arm gave, yielding a step with each new record; records that are there are kept.
+    progress: Progress,
+) -> list[Record]:
+    """Score what an arm gave, and return the new records; records that are there are kept.
 
     Args:
         study: The study.
         arm: The arm.
-        paradigm: What its networks see.
+        modality: What its networks see.
         runs: Each seed's run and what decided it.
         made: The simulated dataset of the pre-training, where there is one.
         shots: The captures.
         place: Where records are kept.
+        progress: Called with each new record.
     """
     folder = place.out / "records" / study.name
-    there = names_there(folder)
-    samples = NlosDataset(shots, study.split, paradigm)
-    means = NlosDataset(shots, "train", paradigm).truth.float().mean(dim=0)
-    refined = study.refine and study.correct_pattern and paradigm != "event" and arm.source == "calibrated"
+    there, new = names_there(folder), list[Record]()
+    samples = NlosDataset(shots, study.split, modality)
+    means = NlosDataset(shots, "train", modality).truth.float().mean(dim=0)
+    refined = (
+        study.refine
+        and study.correct_pattern
+        and "frame" in as_modality(modality).slices
+        and arm.source == "calibrated"
+    )
 
     def record(name: str, seed: int, settings: dict[str, Any]) -> Record:
-        return Record(study.name, study.rig, name, paradigm, seed, study.split, {}, {}, {}, {}, settings)
+        return Record(study.name, study.rig, name, modality, seed, study.split, {}, {}, {}, {}, settings)
 
-    def scored(blank: Record, images: Tensor, mean_image: Tensor | None) -> Step:
-        found = assess(images, samples, shots, study.split, paradigm, mean_image, available_lpips())
-        return keep_scores(blank, found, folder)
+    def score(blank: Record, images: Tensor, mean_image: Tensor | None) -> None:
+        found = assess(images, samples, shots, study.split, mean_image, available_lpips())
+        new.append(keep_scores(blank, found, folder, progress))
 
-    def variants(
-        images: Tensor, seed: int, settings: dict[str, Any], mean_image: Tensor | None
-    ) -> Iterator[Step]:
+    def score_variants(images: Tensor, seed: int, settings: dict[str, Any], mean_image: Tensor | None) -> None:
         plain = record(arm.name, seed, settings)
         if plain.name not in there:
-            yield scored(plain, images, mean_image)
+            score(plain, images, mean_image)
         moved = record(f"{arm.name} + consistency", seed, settings)
         if refined and moved.name not in there:
-            yield scored(moved, _consistent(study, arm, shots, place, images), mean_image)
+            score(moved, _consistent(study, arm, shots, place, images), mean_image)
 
     pictures = []
     for (run, settings), seed in zip(runs, study.seeds, strict=True):
         weights = load_weights(run)
         check_sampling(weights, shots.sampling)
-        pictures.append(infer(weights.network, samples.inputs, samples.position_m, samples.names))
-        yield from variants(pictures[-1], seed, settings | {"run": run.name}, weights.mean_image)
+        pictures.append(weights.network.infer(samples.inputs, samples.position_m, samples.names))
+        score_variants(pictures[-1], seed, settings | {"run": run.name}, weights.mean_image)
     if len(runs) > 1:
         together = torch.stack(pictures).mean(dim=0)
-        yield from variants(together, ENSEMBLE, {"runs": [run.name for run, _ in runs]}, means)
+        score_variants(together, ENSEMBLE, {"runs": [run.name for run, _ in runs]}, means)
     if study.name != "captures":
-        return
-    for name, make in _without_network(study, arm, paradigm, samples, means, made, shots, place):
+        return new
+    for name, make in _without_network(study, arm, modality, samples, means, made, shots, place):
         blank = record(name, 0, {"captures": shots.folder.name})
         if blank.name not in there:
-            yield scored(blank, make(), means)
+            score(blank, make(), means)
+    return new
 
 
 def _without_network(
     study: Study,
     arm: Arm,
-    paradigm: Paradigm,
+    modality: str,
     samples: NlosDataset,
     mean_image: Tensor,
     made: Dataset | None,
@@ -98,17 +105,17 @@ def _without_network(
 ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
     """Yield the baselines that belong to an arm, each with what makes its pictures: linear, classical."""
     if arm.pretraining is None:
-        yield "linear, captures", lambda: _linear(shots, paradigm, samples)
+        yield "linear, captures", lambda: _linear(shots, modality, samples)
     if arm.finetuning is None and made is not None:
-        yield "linear, simulation", lambda: _linear(made, paradigm, samples)
-        if paradigm == "frame":
+        yield "linear, simulation", lambda: _linear(made, modality, samples)
+        if modality == "frame":
             start = mean_image.expand(len(samples), -1, -1)
             yield "classical inversion", lambda: _consistent(study, arm, shots, place, start)
 
 
-def _linear(data: Dataset, paradigm: Paradigm, samples: NlosDataset) -> Tensor:
-    known = NlosDataset(data, "train", paradigm)
-    return fit_linear(known.inputs, known.truth, known.names)(samples.inputs)
+def _linear(data: Dataset, modality: str, samples: NlosDataset) -> Tensor:
+    known = NlosDataset(data, "train", modality)
+    return fit_linear(known.inputs, known.truth, known.names, modality=known.modality)(samples.inputs)
 
 
 def _consistent(study: Study, arm: Arm, shots: Dataset, place: Place, images: Tensor) -> Tensor:
@@ -121,4 +128,4 @@ def _consistent(study: Study, arm: Arm, shots: Dataset, place: Place, images: Te
 
 @lru_cache(maxsize=2)
 def _operator(rig: Path, sampling: Sampling) -> FrameOperator:
-    return FrameOperator(load_yaml(Simulation, rig), sampling)
+    return FrameOperator(load_setup(rig), sampling)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from evnlos.config import config_hash, to_dict
-from evnlos.dataset import PARADIGMS, Dataset, Paradigm, SensorSize, Simulation, open_dataset
+from evnlos.dataset import STANDARD_MODALITIES, Simulation, simulate
 from evnlos.dataset.presets import paper
 from evnlos.evaluation import available_lpips, evaluate
-from evnlos.experiment.making import simulated_steps
 from evnlos.experiment.records import keep_scores, names_there
-from evnlos.experiment.study import Record, Step
+from evnlos.experiment.study import Record
 from evnlos.experiment.trainings import Run, train_one
 from evnlos.model import load_weights
+from evnlos.progress import Progress, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
+from evnlos.setups import SensorSize
 from evnlos.training import Training
 
 NAME = "simulation"
@@ -39,7 +39,7 @@ class Simulated:
     """Fine-tuning on Comic characters."""
     end_to_end: Training = field(default_factory=lambda: Training(epochs=24))
     """Training on Comic characters alone."""
-    paradigms: tuple[Paradigm, ...] = PARADIGMS
+    modalities: tuple[str, ...] = STANDARD_MODALITIES
     """What the networks see."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of initial weights and order of the samples."""
@@ -51,7 +51,7 @@ class Simulated:
 
 def simulations(settings: Simulated) -> dict[str, Simulation]:
     """Return the three sets: handwriting to train on, a hand held out, and Comic letters and digits."""
-    base = replace(paper(), sensor=settings.sensor)
+    base = replace(paper(), setup=replace(paper().setup, sensor=settings.sensor))
     unseen = HandwritingGlyphs(writers=1, first_writer=TRAIN_WRITERS)
     comic = FontGlyphs(characters=UPPER_CASE + DIGITS)
     return {
@@ -61,21 +61,21 @@ def simulations(settings: Simulated) -> dict[str, Simulation]:
     }
 
 
-def run_simulated(settings: Simulated) -> Iterator[Step]:
-    """Run what is not done yet, yielding each step.
+def run_simulated(settings: Simulated, progress: Progress = silent) -> list[Record]:
+    """Run what is not done yet, and return the records that are new.
 
     Three arms: "pre-trained" (handwriting alone), "EPNP" (then fine-tuned on Comic), "E2E" (Comic alone). The
     first is scored on the hand held out and on Comic, the others on the Comic characters held out.
 
     Args:
         settings: What to run, and where.
+        progress: Called with each step of simulation, training and scoring.
     """
-    data = {}
+    data, records = {}, list[Record]()
     for name, config in simulations(settings).items():
         folder = settings.out / "simulations" / f"paper-{name}-{config_hash(config)[:8]}"
-        yield from simulated_steps(config, folder, settings.workers)
-        data[name] = open_dataset(folder)
-    for paradigm in settings.paradigms:
+        data[name] = simulate(config, folder, settings.workers, progress=progress)
+    for modality in settings.modalities:
         for seed in settings.seeds:
             plans = [
                 ("pre-trained", settings.pretraining, "train", False),
@@ -84,7 +84,7 @@ def run_simulated(settings: Simulated) -> Iterator[Step]:
             ]
             first: Path | None = None
             for arm, plan, source, goes_on in plans:
-                plan = replace(plan, paradigm=paradigm, seed=seed)
+                plan = replace(plan, modality=modality, seed=seed)
                 start = first if goes_on else None
                 decided = {
                     "settings": to_dict(plan),
@@ -92,25 +92,19 @@ def run_simulated(settings: Simulated) -> Iterator[Step]:
                     "from": start.name if start else None,
                 }
                 key = config_hash(decided)[:8]
-                run = settings.out / "runs" / f"paper-{arm.lower()}-{paradigm}-seed{seed}-{key}"
-                yield from train_one(Run(data[source], plan, run, start))
+                run = settings.out / "runs" / f"paper-{arm.lower()}-{modality}-seed{seed}-{key}"
+                train_one(Run(data[source], plan, run, start), progress)
                 first = first or run
                 sets = ("nist", "comic") if arm == "pre-trained" else ("comic",)
                 for tested in sets:
-                    yield from _score(settings, arm, paradigm, seed, run, tested, data[tested], decided)
+                    record = _record(arm, modality, seed, run, tested, decided)
+                    folder = settings.out / "records" / NAME
+                    if record.name not in names_there(folder):
+                        found = evaluate(load_weights(run), data[tested], "test", available_lpips())
+                        records.append(keep_scores(record, found, folder, progress))
+    return records
 
 
-def _score(
-    settings: Simulated,
-    arm: str,
-    paradigm: Paradigm,
-    seed: int,
-    run: Path,
-    tested: str,
-    data: Dataset,
-    decided: dict[str, Any],
-) -> Iterator[Step]:
-    folder = settings.out / "records" / NAME
-    record = Record(NAME, tested, arm, paradigm, seed, "test", {}, {}, {}, {}, decided | {"run": run.name})
-    if record.name not in names_there(folder):
-        yield keep_scores(record, evaluate(load_weights(run), data, "test", available_lpips()), folder)
+def _record(arm: str, modality: str, seed: int, run: Path, tested: str, decided: dict[str, Any]) -> Record:
+    """Return a record without its scores."""
+    return Record(NAME, tested, arm, modality, seed, "test", {}, {}, {}, {}, decided | {"run": run.name})

@@ -1,4 +1,4 @@
-"""What an experiment is: arms that are compared on the same captures, paradigms, and seeds."""
+"""What an experiment is: arms that are compared on the same captures, modalities, and seeds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from evnlos.calibration import Calibration
-from evnlos.dataset import PARADIGMS, Paradigm, Sampling, Simulation
+from evnlos.dataset import STANDARD_MODALITIES, Sampling, Simulation
 from evnlos.errors import ConfigError
 from evnlos.training import Training
 
@@ -18,7 +18,7 @@ Source = Literal["calibrated", "uncalibrated", "none"]
 class Arm:
     """One way from data to weights.
 
-    Pre-training and fine-tuning take paradigm and seed from the study; without fine-tuning the weights have
+    Pre-training and fine-tuning take modality and seed from the study; without fine-tuning the weights have
     seen no capture (simulation only), without pre-training they have seen nothing else (E2E).
     """
 
@@ -30,6 +30,8 @@ class Arm:
     """Settings of the pre-training."""
     finetuning: Training | None = None
     """Settings of the fine-tuning, or of the end-to-end training where there is no pre-training."""
+    alternatives: tuple[Training, ...] = ()
+    """Further settings of the fine-tuning: the best of all, or none, is chosen on captures held out of it."""
     writers: int | None = None
     """Writers of the simulated characters; None is as many as the study says."""
     shots: int | None = None
@@ -46,6 +48,8 @@ class Arm:
             )
         if self.pretraining is None and self.finetuning is None:
             raise ConfigError(f"arm {self.name!r} trains nothing; give pre-training, fine-tuning or both")
+        if self.alternatives and (self.pretraining is None or self.finetuning is None):
+            raise ConfigError(f"arm {self.name!r}: alternatives choose a fine-tuning; give both trainings")
         if self.shots is not None and self.shots < 1:
             raise ConfigError(
                 f"arm {self.name!r}: shots is {self.shots}; give at least 1, or leave out fine-tuning"
@@ -62,7 +66,7 @@ class Study:
     """Name of the rig; the calibrated rig and all that follows from it are kept under this name."""
     arms: tuple[Arm, ...] = ()
     """What is compared."""
-    paradigms: tuple[Paradigm, ...] = PARADIGMS
+    modalities: tuple[str, ...] = STANDARD_MODALITIES
     """What the networks see."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of initial weights and of the order of the samples."""
@@ -85,8 +89,8 @@ class Study:
     """Take the frame camera's fixed pattern, as the calibration found it, from all frames."""
 
     def __post_init__(self) -> None:
-        if not self.arms or not self.paradigms or not self.seeds:
-            raise ConfigError(f"the study {self.name!r} has no arm, no paradigm or no seed")
+        if not self.arms or not self.modalities or not self.seeds:
+            raise ConfigError(f"the study {self.name!r} has no arm, no modality or no seed")
         names = [arm.name for arm in self.arms]
         if len(set(names)) != len(names):
             raise ConfigError(f"the study {self.name!r} has two arms of one name among {', '.join(names)}")
@@ -132,7 +136,7 @@ class Record:
         study: Name of the study.
         rig: Rig of the captures.
         arm: Name of the arm.
-        paradigm: What the network saw.
+        modality: What the network saw.
         seed: Its seed; -1 for an ensemble over the seeds.
         split: What was scored.
         scores: Metric -> object -> mean over its positions.
@@ -145,7 +149,7 @@ class Record:
     study: str
     rig: str
     arm: str
-    paradigm: str
+    modality: str
     seed: int
     split: str
     scores: dict[str, dict[str, float]]
@@ -158,24 +162,7 @@ class Record:
     def name(self) -> str:
         """File name of the record."""
         seed = "ensemble" if self.seed < 0 else f"seed{self.seed}"
-        return f"{self.rig}-{self.split}-{slug(self.arm)}-{self.paradigm}-{seed}"
-
-
-@dataclass(frozen=True)
-class Step:
-    """One piece of work that is done, for a progress display.
-
-    Args:
-        what: What was done.
-        part: Steps done of this piece.
-        total: Steps of this piece.
-        record: The scores, where this step brought some.
-    """
-
-    what: str
-    part: int
-    total: int
-    record: Record | None = None
+        return f"{self.rig}-{self.split}-{slug(self.arm)}-{self.modality}-{seed}"
 
 
 def slug(text: str) -> str:

@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from evnlos.dataset import PARADIGMS, character_of
+from evnlos.dataset import character_of, modality_order
 from evnlos.errors import DataError
 from evnlos.evaluation import BASELINES
 from evnlos.evaluation.intervals import Interval, paired_difference
@@ -16,15 +16,15 @@ _PLACES = {"psnr_db": 2, "psnr_box_db": 2}
 
 
 def means_of(records: list[Record], metric: str = "psnr_db") -> dict[tuple[str, str], list[float]]:
-    """Return (arm, paradigm) -> the mean over all characters of each seed; ensembles stand by themselves."""
+    """Return (arm, modality) -> the mean over all characters of each seed; ensembles stand by themselves."""
     found: dict[tuple[str, str], list[float]] = defaultdict(list)
     for record in records:
         name = record.arm if record.seed >= 0 else f"{record.arm}, ensemble"
-        found[name, record.paradigm].append(float(np.mean(list(record.scores[metric].values()))))
+        found[name, record.modality].append(float(np.mean(list(record.scores[metric].values()))))
     return dict(found)
 
 
-def difference(records: list[Record], arm: str, other: str, paradigm: str) -> Interval:
+def difference(records: list[Record], arm: str, other: str, modality: str) -> Interval:
     """Return PSNR of an arm minus that of another, dB, seeds averaged, with an interval over characters.
 
     Raises:
@@ -32,9 +32,9 @@ def difference(records: list[Record], arm: str, other: str, paradigm: str) -> In
     """
     stacks, objects = [], None
     for name in (arm, other):
-        chosen = [r for r in records if r.arm == name and r.paradigm == paradigm and r.seed >= 0]
+        chosen = [r for r in records if r.arm == name and r.modality == modality and r.seed >= 0]
         if not chosen:
-            raise DataError(f"no record of {name!r} on {paradigm}; run the experiment first")
+            raise DataError(f"no record of {name!r} on {modality}; run the experiment first")
         objects = [key for key, values in chosen[0].positions.items() for _ in values]
         stacks.append([np.concatenate(list(record.positions.values())) for record in chosen])
     assert objects is not None
@@ -42,39 +42,40 @@ def difference(records: list[Record], arm: str, other: str, paradigm: str) -> In
 
 
 def summary_table(records: list[Record], metric: str = "psnr_db") -> str:
-    """Return Markdown: a row an arm, a column a paradigm; mean over characters and seeds, +- over the seeds."""
+    """Return Markdown: a row an arm, a column a modality; mean over characters and seeds, +- over the seeds."""
     means = means_of(records, metric)
-    paradigms = [p for p in PARADIGMS if any(key[1] == p for key in means)]
+    modalities = sorted({key[1] for key in means}, key=modality_order)
     digits = _PLACES.get(metric, 3)
-    lines = [f"| {metric} | {' | '.join(paradigms)} |", "|---|" + "---|" * len(paradigms)]
+    lines = [f"| {metric} | {' | '.join(modalities)} |", "|---|" + "---|" * len(modalities)]
     for name, title in BASELINES.items():
         cells = []
-        for paradigm in paradigms:
+        for modality in modalities:
             values = [
-                r.baselines[name][metric] for r in records if r.paradigm == paradigm and name in r.baselines
+                r.baselines[name][metric] for r in records if r.modality == modality and name in r.baselines
             ]
             cells.append(
                 f"{np.mean([np.mean(list(v.values())) for v in values[-1:]]):.{digits}f}" if values else ""
             )
         lines.append(f"| {title} | {' | '.join(cells)} |")
     for arm in dict.fromkeys(key[0] for key in means):
-        cells = [_cell(means.get((arm, paradigm)), digits) for paradigm in paradigms]
+        cells = [_cell(means.get((arm, modality)), digits) for modality in modalities]
         lines.append(f"| {arm} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def character_table(records: list[Record], arms: tuple[str, ...], metric: str = "psnr_db") -> str:
-    """Return Markdown in the paper's layout: a row a character, a column for each arm and paradigm."""
+    """Return Markdown in the paper's layout: a row a character, a column for each arm and modality."""
     chosen = [r for r in records if r.arm in arms and r.seed >= 0]
-    columns = [(a, p) for a in arms for p in PARADIGMS if any(r.arm == a and r.paradigm == p for r in chosen)]
+    seen = sorted({r.modality for r in chosen}, key=modality_order)
+    columns = [(a, p) for a in arms for p in seen if any(r.arm == a and r.modality == p for r in chosen)]
     digits = _PLACES.get(metric, 3)
     lines = [
-        f"| {metric} | {' | '.join(f'{arm} {paradigm}' for arm, paradigm in columns)} |",
+        f"| {metric} | {' | '.join(f'{arm} {modality}' for arm, modality in columns)} |",
         "|---|" + "---|" * len(columns),
     ]
     for name in dict.fromkeys(name for record in chosen for name in record.scores[metric]):
         values = [
-            np.mean([r.scores[metric][name] for r in chosen if (r.arm, r.paradigm) == column])
+            np.mean([r.scores[metric][name] for r in chosen if (r.arm, r.modality) == column])
             for column in columns
         ]
         best = max(values)
@@ -85,9 +86,9 @@ def character_table(records: list[Record], arms: tuple[str, ...], metric: str = 
 
 def gain_table(records: list[Record], arm: str = "EPNP", other: str = "E2E") -> str:
     """Return Markdown: what one arm gains over another, dB with a 95 % interval over the characters."""
-    paradigms = [p for p in PARADIGMS if any(r.paradigm == p and r.arm == arm for r in records)]
+    modalities = sorted({r.modality for r in records if r.arm == arm}, key=modality_order)
     lines = [f"| {arm} - {other} | dB, 95 % interval |", "|---|---|"]
-    lines += [f"| {p} | {difference(records, arm, other, p)} |" for p in paradigms]
+    lines += [f"| {p} | {difference(records, arm, other, p)} |" for p in modalities]
     return "\n".join(lines)
 
 
@@ -96,17 +97,17 @@ def checks_table(records: list[Record]) -> str:
     found: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
     for record in records:
         name = record.arm if record.seed >= 0 else f"{record.arm}, ensemble"
-        found[name, record.paradigm].append(record.checks)
+        found[name, record.modality].append(record.checks)
     lines = [
         "| | read rightly | of the true pictures | nearer to the truth than to any shot |",
         "|---|---|---|---|",
     ]
-    for (arm, paradigm), checks in found.items():
+    for (arm, modality), checks in found.items():
         cells = []
         for key in ("read", "read_truth", "nearer_to_truth"):
             values = [c[key] for c in checks if key in c]
             cells.append(f"{100 * np.mean(values):.0f} %" if values else "")
-        lines.append(f"| {arm} {paradigm} | {' | '.join(cells)} |")
+        lines.append(f"| {arm} {modality} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import DataError
 from evnlos.interop.mitsuba import trace
-from evnlos.transport import RadiometricTransport, light_transport_matrix
+from evnlos.setups import RadiometricSetup
+from evnlos.transport import light_transport_matrix
 from evnlos.types import Plane
 
 
@@ -110,7 +111,7 @@ def pattern() -> NDArray[np.float64]:
 
 
 def wall_image(
-    rig: RadiometricTransport,
+    rig: RadiometricSetup,
     shape: tuple[int, int],
     brightness: NDArray[np.float64],
     points: tuple[int, int] | None = None,
@@ -132,7 +133,7 @@ def wall_image(
 
 
 def trace_rig(
-    rig: RadiometricTransport, shape: tuple[int, int], brightness: NDArray[np.float64], samples: int = 128
+    rig: RadiometricSetup, shape: tuple[int, int], brightness: NDArray[np.float64], samples: int = 128
 ) -> NDArray[np.float64]:
     """Return 16 renders of a pattern on the cells of `PATTERN`, [16, H, W]; see `trace`."""
     place = {"offset_m": rig.offset_m(), "occluders": rig.occluders()}
@@ -140,13 +141,13 @@ def trace_rig(
 
 
 WALLS = {
-    "Lambert": RadiometricTransport(wall_material="lambert"),
-    "GGX 0.3": RadiometricTransport(roughness=0.3),
-    "GGX 0.05": RadiometricTransport(roughness=0.05),
-    "GGX 0.05, far": RadiometricTransport(roughness=0.05, distance_m=0.5),
-    "brushed 0.05 x 0.2": RadiometricTransport(roughness=0.05, roughness_y=0.2),
-    "Lambert, post": RadiometricTransport(wall_material="lambert", post_width_m=0.016),
-    "GGX 0.3, post": RadiometricTransport(roughness=0.3, post_width_m=0.016),
+    "Lambert": RadiometricSetup(wall_material="lambert"),
+    "GGX 0.3": RadiometricSetup(roughness=0.3),
+    "GGX 0.05": RadiometricSetup(roughness=0.05),
+    "GGX 0.05, far": RadiometricSetup(roughness=0.05, distance_m=0.5),
+    "brushed 0.05 x 0.2": RadiometricSetup(roughness=0.05, roughness_y=0.2),
+    "Lambert, post": RadiometricSetup(wall_material="lambert", post_width_m=0.016),
+    "GGX 0.3, post": RadiometricSetup(roughness=0.3, post_width_m=0.016),
 }
 """The rigs that are rendered both ways."""
 

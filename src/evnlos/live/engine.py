@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
-from evnlos.evaluation.reconstructor import Reconstructor
+from evnlos.evaluation.streaming import StreamingReconstructor
 from evnlos.live.chunk import UNKNOWN_US, Chunk
 from evnlos.live.clock import Clock, SystemClock
 from evnlos.live.reduction import AreaReduction
@@ -66,22 +66,24 @@ class Picture:
 
 
 class Engine:
-    """Turns chunks into pictures, with weights of any paradigm.
+    """Turns chunks into pictures, with weights of any modality.
 
-    An event network sees the surface at the instant that the stream has reached. A fusion network sees the
-    newest frame beside it; a frame network makes one picture a frame.
+    A network that sees events gets the surface at the instant that the stream has reached, and beside it the
+    newest frame, where it sees frames too; one that sees frames alone makes one image per frame.
 
     Args:
-        weights: Network, paradigm and sampling.
+        weights: Network, modality and sampling.
         clock: The clock that it goes by.
 
     Raises:
         ConfigError: The weights were trained on another surface than "sae".
 
     Example:
-        >>> from evnlos.model import ResidualUNet, UNetConfig
-        >>> network = ResidualUNet(2, UNetConfig(width=4, depth=1, rank=0)).eval()
-        >>> engine = Engine(Weights(network, "event", {"height": 16, "width": 24, "scored_rows": 12}, []))
+        >>> from evnlos.dataset import Sampling
+        >>> from evnlos.model import UNetConfig
+        >>> sampling = Sampling(height=16, width=24, scored_rows=12)
+        >>> network = UNetConfig(width=4, depth=1, rank=0).build("event", sampling)
+        >>> engine = Engine(Weights(network))
         >>> events = Events([3, 9], [1, 30], [2, 20], [True, False], width=48, height=32)
         >>> picture = engine.see([Chunk(events, 9, 0.0, 0.0)])
         >>> picture.image.shape, picture.t_us, picture.events
@@ -89,8 +91,8 @@ class Engine:
     """
 
     def __init__(self, weights: Weights, clock: Clock | None = None) -> None:
-        self._see = Reconstructor(weights)
-        self.paradigm, self.sampling = weights.paradigm, self._see.sampling
+        self._see = StreamingReconstructor(weights)
+        self.modality, self.sampling = weights.modality, self._see.sampling
         if self.sampling.surface != "sae":
             raise ConfigError(
                 f"the weights take the surface {self.sampling.surface!r}; live reconstruction makes 'sae': "
@@ -105,7 +107,7 @@ class Engine:
     @property
     def needs_frames(self) -> bool:
         """Whether the network sees frames."""
-        return self.paradigm != "event"
+        return self.modality.needs_frames
 
     def _forget(self) -> None:
         self._surface: RunningSurface | None = None
@@ -133,10 +135,10 @@ class Engine:
         new_frame = False
         for chunk in chunks:
             is_new = chunk.frame is not None
-            if len(chunk.events) if self.paradigm != "frame" else is_new:
+            if len(chunk.events) if self.modality.needs_events else is_new:
                 oldest_s = chunk.first_s if np.isnan(oldest_s) else oldest_s
                 newest_s = chunk.last_s
-            if self.paradigm == "frame" and is_new:
+            if not self.modality.needs_events and is_new:
                 oldest_s = newest_s = chunk.last_s  # a frame comes at the end of its chunk
             new_frame |= is_new
             self._take(chunk)
@@ -144,7 +146,7 @@ class Engine:
             return None
         if self.needs_frames and self._frame is None:
             return None
-        if self.paradigm == "frame" and not new_frame:
+        if not self.modality.needs_events and not new_frame:
             return None
         surface = self._reduce(self._surface.at(self._until_us))
         mapped_s = self._clock.now()

@@ -7,7 +7,7 @@
 | 5 | flags: bit 0 = the stream ends with this packet, the other bits 0 |
 | 6-7 | number of events in the packet, uint16 |
 | 8-11 | sequence number, uint32, one more each packet; 0 begins a new stream |
-| 12-15 | sensor width and height, pixels, uint16 each, 1 to 32768 |
+| 12-15 | sensor width and height, pixels, uint16 each, 1 to 32768, together at most 4194304 pixels |
 | 16-23 | time base, microseconds, int64 |
 
 An event is its time after the base (uint32, microseconds, non-decreasing), its column (uint16), and its row
@@ -35,6 +35,8 @@ MOST_EVENTS = 8_000
 USUAL_EVENTS = 180
 """Events that fit into a packet that no network has to split (1500 bytes with the network's own headers)."""
 MAX_SIDE = 32_768
+MAX_PIXELS = 1 << 22
+"""Pixels of the largest sensor: state is kept for each, and one packet may claim any size."""
 _HEADER = struct.Struct("<4sBBHIHHq")
 _EVENT = np.dtype([("dt", "<u4"), ("x", "<u2"), ("y", "<u2")])
 _WORD = np.dtype("<u8")  # an event as one number
@@ -75,8 +77,11 @@ def pack(packet: Packet) -> bytes:
     events = packet.events
     if len(events) > MOST_EVENTS:
         raise DataError(f"a packet of {len(events)} events; give at most {MOST_EVENTS}")
-    if max(events.width, events.height) > MAX_SIDE:
-        raise DataError(f"a sensor of {events.width} x {events.height}; packets take sides to {MAX_SIDE}")
+    if max(events.width, events.height) > MAX_SIDE or events.width * events.height > MAX_PIXELS:
+        raise DataError(
+            f"a sensor of {events.width} x {events.height}; packets take sides to {MAX_SIDE} "
+            f"and {MAX_PIXELS} pixels"
+        )
     if events.duration_us >= 1 << 32:
         raise DataError(f"a packet of {events.duration_us} us; give events within 4294 seconds")
     base = int(events.t_us[0]) if len(events) else 0
@@ -152,7 +157,8 @@ def _heading(data: bytes) -> Heading:
         raise PacketError(f"a packet that starts with {data[:6].hex(' ')}; EVNL, version {VERSION} is read")
     if len(data) != _HEADER.size + count * _EVENT.itemsize:
         raise PacketError(f"a packet of {len(data)} bytes that announces {count} events")
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and -_FAR_US < base < _FAR_US):
+    is_sensor = 1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width * height <= MAX_PIXELS
+    if not (is_sensor and -_FAR_US < base < _FAR_US):
         raise PacketError(f"a packet of a sensor of {width} x {height} from {base} us")
     return Heading(sequence, count, width, height, base, bool(flags & LAST))
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any
@@ -20,6 +20,7 @@ from evnlos.report.pictures import data_uri, png
 _HOST = "127.0.0.1"
 _MOST_VIEWERS = 8
 _LEAST_S = 0.033  # between two pictures of a page: faster than eyes follow would cost the network's time
+_SILENT_S = 10.0  # in which a request must be whole, and a viewer take what is sent
 _BEAT_S = 1.0  # longest time without a message, by which a viewer that left is noticed
 _POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
@@ -41,6 +42,7 @@ class Page:
     Attributes:
         url: Address of the page.
         seen: Set when the first viewer has come.
+        viewers: Places for viewers; a request that finds none is answered with 503.
 
     Raises:
         ConfigError: The port can't be used.
@@ -53,10 +55,10 @@ class Page:
         self._message: tuple[int, bytes] = (-1, b"")
         self._encoding = threading.Lock()
         self._ended = False
-        self._viewers = threading.BoundedSemaphore(_MOST_VIEWERS)
+        self.viewers = threading.BoundedSemaphore(_MOST_VIEWERS)
         self.seen = threading.Event()
         try:
-            self._server = ThreadingHTTPServer((_HOST, port), _handler(self))
+            self._server = _Server((_HOST, port), _handler(self))
         except (OSError, OverflowError) as error:
             raise ConfigError(
                 f"port {port} can't be used ({error}); give another one, or 0 for a free one"
@@ -102,24 +104,19 @@ class Page:
 
     def stream(self, write: Callable[[bytes], object]) -> None:
         """Write messages until the run ends or the viewer leaves: each picture, or a sign of life."""
-        if not self._viewers.acquire(blocking=False):
-            return
-        try:
-            shown, ended, beat_s = -1, False, 0.0  # the first message comes at once
-            while not ended:
-                began_s = time.monotonic()
-                with self._changed:
-                    self._changed.wait_for(lambda shown=shown: self._ended or self._number() > shown, beat_s)
-                    picture, ended = self._picture, self._ended
-                if picture is not None and picture.number > shown:
-                    write(b"event: picture\ndata: " + self._encoded(picture) + b"\n\n")
-                    shown = picture.number
-                write(b"event: state\ndata: " + json.dumps(self.state()).encode() + b"\n\n")
-                self.seen.set()
-                beat_s = _BEAT_S
-                time.sleep(max(0.0, _LEAST_S - (time.monotonic() - began_s)))
-        finally:
-            self._viewers.release()
+        shown, ended, beat_s = -1, False, 0.0  # the first message comes at once
+        while not ended:
+            began_s = time.monotonic()
+            with self._changed:
+                self._changed.wait_for(lambda shown=shown: self._ended or self._number() > shown, beat_s)
+                picture, ended = self._picture, self._ended
+            if picture is not None and picture.number > shown:
+                write(b"event: picture\ndata: " + self._encoded(picture) + b"\n\n")
+                shown = picture.number
+            write(b"event: state\ndata: " + json.dumps(self.state()).encode() + b"\n\n")
+            self.seen.set()
+            beat_s = _BEAT_S
+            time.sleep(max(0.0, _LEAST_S - (time.monotonic() - began_s)))
 
     def _number(self) -> int:
         return -1 if self._picture is None else self._picture.number
@@ -139,9 +136,18 @@ class Page:
             return self._message[1]
 
 
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of viewers that left or fell silent."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
+
 def _handler(page: Page) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         """Three addresses: the page, its stream, and the state as JSON."""
+
+        timeout = _SILENT_S
 
         def do_GET(self) -> None:
             """Answer a request of this machine."""
@@ -152,9 +158,14 @@ def _handler(page: Page) -> type[BaseHTTPRequestHandler]:
             elif self.path == "/state.json":
                 self._send("application/json", json.dumps(page.state()).encode())
             elif self.path == "/stream":
-                self._head("text/event-stream")
-                with suppress(OSError):  # the viewer left
+                if not page.viewers.acquire(blocking=False):
+                    self.send_error(503, "All places for viewers are taken; close another tab")
+                    return
+                try:
+                    self._head("text/event-stream")
                     page.stream(self._write)
+                finally:
+                    page.viewers.release()
             else:
                 self.send_error(404)
 

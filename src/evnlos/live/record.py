@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from evnlos.claim import check_folder
 from evnlos.errors import DataError
+from evnlos.files import check_folder, new_file
 from evnlos.live.engine import Picture
 from evnlos.live.panels import side_by_side
 
@@ -113,23 +113,23 @@ class _Movie:
     """An mp4 file with a time stamp of its own for each picture."""
 
     def __init__(self, path: Path, av: Any) -> None:
-        self._av, self._path, self._temporary = av, path, path.with_name(f".{path.name}.part")
+        self._av, self._file = av, new_file(path)
         self._container: Any = None
         self._stream: Any = None
         self._last_ms = -1
 
     def add(self, sheet: NDArray[np.uint8], time_ms: int) -> bool:
         if self._container is None:
-            self._begin(sheet.shape[1], sheet.shape[0])
+            self._begin(self._file.__enter__(), sheet.shape[1], sheet.shape[0])
         self._last_ms = max(time_ms, self._last_ms + 1)
         frame = self._av.VideoFrame.from_ndarray(sheet, format="rgb24")
         frame.pts, frame.time_base = self._last_ms, Fraction(1, 1000)
         self._container.mux(self._stream.encode(frame))  # pyright: ignore[reportOptionalMemberAccess]
         return True
 
-    def _begin(self, width: int, height: int) -> None:
+    def _begin(self, temporary: Path, width: int, height: int) -> None:
         has_h264 = "libx264" in self._av.codecs_available
-        self._container = self._av.open(str(self._temporary), "w", format="mp4")
+        self._container = self._av.open(str(temporary), "w", format="mp4")
         options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "18"} if has_h264 else {}
         stream = self._container.add_stream("libx264" if has_h264 else "mpeg4", rate=1000, options=options)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
@@ -140,9 +140,10 @@ class _Movie:
     def finish(self) -> None:
         if self._container is None:
             return
-        self._container.mux(self._stream.encode())
-        self._container.close()
-        self._temporary.replace(self._path)
+        with ExitStack() as leaving:
+            leaving.push(self._file)  # at the end: the file gets its name, or goes
+            leaving.callback(self._container.close)
+            self._container.mux(self._stream.encode())
 
 
 class _Animation:
@@ -165,7 +166,6 @@ class _Animation:
         if not self._images:
             return
         pauses = [max(int(p), 1) for p in np.diff([*self._times_ms, self._times_ms[-1] + _LAST_MS])]
-        temporary = self._path.with_name(f".{self._path.name}.part")
         first, *others = self._images
-        first.save(temporary, "PNG", save_all=True, append_images=others, duration=pauses, loop=0)
-        temporary.replace(self._path)
+        with new_file(self._path) as temporary:
+            first.save(temporary, "PNG", save_all=True, append_images=others, duration=pauses, loop=0)

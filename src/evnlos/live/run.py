@@ -64,8 +64,8 @@ class Run:
     def __init__(self, source: Source, engine: Engine, pace: Pace = Pace(), clock: Clock | None = None) -> None:
         if engine.needs_frames and not source.has_frames:
             raise DataError(
-                f"weights of the paradigm {engine.paradigm!r} see frames and {source.name} has none; give the "
-                "folder of a capture, or weights of the paradigm 'event'"
+                f"weights of the modality {engine.modality.name!r} see frames and {source.name} has none; give "
+                "the folder of a capture, or weights of the modality 'event'"
             )
         self._source, self._engine, self._pace = source, engine, pace
         self._clock = clock or SystemClock()

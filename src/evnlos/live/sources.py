@@ -30,7 +30,8 @@ class Listening:
     speed: float = 1.0
     """Speed of a replay: 1 = as it happened, 10 = ten times faster."""
     idle: float = 10.0
-    """End when a growing file or UDP brought nothing for so many seconds; 0 = wait for ever."""
+    """End when a growing file or, after the first packet, UDP brought nothing for so many seconds; 0 = wait for
+    ever."""
     width: int | None = None
     """Sensor width, pixels, where a file does not say; give both or neither."""
     height: int | None = None

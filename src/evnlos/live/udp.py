@@ -7,6 +7,7 @@ import socket
 from collections import Counter
 from collections.abc import Callable, Iterator
 from types import TracebackType
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.events.io.columns import cut, trusted_events
 from evnlos.live.chunk import UNKNOWN_US, Chunk
 from evnlos.live.clock import Clock, SystemClock
-from evnlos.live.packet import USUAL_EVENTS, Batch, Packet, pack, unpack, unpack_all
+from evnlos.live.packet import USUAL_EVENTS, Batch, Heading, Packet, pack, unpack, unpack_all
 from evnlos.types import Events
 
 _BUFFER_BYTES = 1 << 22  # asked of the system, which may give less
@@ -23,18 +24,23 @@ _GATHER_S = 0.001  # packets are gathered so long: a chunk each would cost more 
 _NAP_S = 0.05
 _TURN = 1 << 32
 _LATE = 1 << 31
+_AGREEING = (
+    100  # packets in a row that are left out and follow each other: a fifth of a second of a calm stream
+)
+_FAULTS = ("malformed packets", "lost packets", "late packets", "streams taken up anew")
 
 
 class UdpSource:
     """A source that listens for packets (`evnlos.live.packet`).
 
     A malformed packet, one of another sensor, and one that comes after its successor are left out and counted;
-    so are packets that never came, by the gaps in the sequence. A packet with the number 0 begins a new stream.
+    so are packets that never came, by the gaps in the sequence. A packet with the number 0 begins a new stream;
+    so does the last of 100 that were left out in a row and follow each other: then the stream was wrong.
 
     Args:
         host: Address to listen at; 127.0.0.1 takes packets of this machine only.
         port: Port; 0 takes a free one.
-        idle_s: End after so many seconds without a packet; None = never.
+        idle_s: End after so many seconds without a packet, counted from the first one; None = never.
         clock: The clock that arrivals are told by.
 
     Attributes:
@@ -62,13 +68,12 @@ class UdpSource:
         self.name, self.has_frames, self.waits = f"udp://{host}:{self.port}", False, False
         self._clock, self._idle_s = clock or SystemClock(), idle_s
         self._faults: Counter[str] = Counter()
-        self._next: int | None = None
-        self._newest: int | None = None
-        self._size: tuple[int, int] | None = None
+        self._stream: _Stream | None = None
+        self._other: _Stream | None = None  # what packets that were left out agree on
 
     def faults(self) -> dict[str, int]:
-        """Return how many packets were malformed, lost and late."""
-        return {name: self._faults[name] for name in ("malformed packets", "lost packets", "late packets")}
+        """Return how many packets were malformed, lost and late, and how often a stuck stream was taken up."""
+        return {name: self._faults[name] for name in _FAULTS}
 
     def close(self) -> None:
         """Stop listening."""
@@ -76,13 +81,14 @@ class UdpSource:
 
     def chunks(self, stop: Callable[[], bool]) -> Iterator[Chunk]:
         """Yield what arrived since the chunk before, until a packet says that it is the last one."""
-        heard_s, ended = self._clock.now(), False
+        heard_s: float | None = None
+        ended = False
         try:
             while not (stop() or ended):
                 datagrams, first_s = self._receive()
                 last_s = self._clock.now()
                 if not datagrams:
-                    if self._idle_s is not None and last_s - heard_s > self._idle_s:
+                    if self._idle_s is not None and heard_s is not None and last_s - heard_s > self._idle_s:
                         return
                     continue
                 heard_s = last_s
@@ -90,8 +96,8 @@ class UdpSource:
                 self._faults["malformed packets"] += malformed
                 if batch is None:
                     continue
-                for first, last in self._runs(batch):
-                    yield _chunk(batch, first, last, first_s, last_s)
+                for first, last, begins in self._runs(batch):
+                    yield _chunk(batch, first, last, begins, first_s, last_s)
                     ended = ended or any(heading.is_last for heading in batch.headings[first:last])
         finally:
             self.close()
@@ -111,49 +117,76 @@ class UdpSource:
                 continue
         return found, first_s
 
-    def _runs(self, batch: Batch) -> Iterator[tuple[int, int]]:
-        """Yield (first, last + 1) of packets that follow each other in one stream; count what is left out."""
-        first = 0
-        for number, heading in enumerate(batch.headings):
-            is_next = self._is_next(batch, number)
-            if (not is_next or heading.sequence == 0) and number > first:
-                yield first, number
-            if not is_next:
-                first = number + 1
-            elif heading.sequence == 0:  # another stream: not to be joined with the one before
-                first = number
+    def _runs(self, batch: Batch) -> Iterator[tuple[int, int, bool]]:
+        """Yield (first, last + 1) of packets that follow each other in a stream, and whether they begin it."""
+        first, begins = 0, False
+        for number in range(len(batch.headings)):
+            place = self._place(batch, number)
+            if place != "next" and number > first:
+                yield first, number, begins
+            if place != "next":
+                first = number + (place == "left out")
+                begins = place == "first"
         if first < len(batch.headings):
-            yield first, len(batch.headings)
+            yield first, len(batch.headings), begins
 
-    def _is_next(self, batch: Batch, number: int) -> bool:
-        """Return whether a packet's place in the stream allows it, and count what is wrong."""
-        heading = batch.headings[number]
-        size = heading.height, heading.width
-        if heading.sequence == 0:
-            self._next, self._newest, self._size = None, None, size
-        self._size = self._size or size
-        if size != self._size:
-            self._faults["malformed packets"] += 1
-            return False
-        times = batch.columns["t_us"]
-        gap = 0 if self._next is None else (heading.sequence - self._next) % _TURN
-        backwards = (
-            heading.length > 0 and self._newest is not None and int(times[batch.edges[number]]) < self._newest
-        )
-        if gap >= _LATE or backwards:
-            self._faults["late packets"] += 1
-            return False
-        self._faults["lost packets"] += gap
-        self._next = (heading.sequence + 1) % _TURN
+    def _place(self, batch: Batch, number: int) -> Literal["first", "next", "left out"]:
+        """Return a packet's place in the stream, and count what is wrong."""
+        heading, times = batch.headings[number], batch.columns["t_us"]
+        span = None
         if heading.length:
-            self._newest = int(times[batch.edges[number + 1] - 1])
-        return True
+            span = int(times[batch.edges[number]]), int(times[batch.edges[number + 1] - 1])
+        if heading.sequence == 0 or self._stream is None:
+            self._stream, self._other = _Stream.after(heading, span), None
+            return "first" if heading.sequence == 0 else "next"
+        fault, gap = self._stream.fault(heading, span)
+        if fault is None:
+            self._faults["lost packets"] += gap
+            self._stream, self._other = _Stream.after(heading, span, self._stream), None
+            return "next"
+        # One forged or broken packet from far ahead would stop the stream for good: who goes on is believed.
+        agrees = self._other is not None and self._other.fault(heading, span)[0] is None
+        self._other = _Stream.after(heading, span, self._other if agrees else None)
+        if self._other.packets >= _AGREEING:
+            self._faults["streams taken up anew"] += 1
+            self._stream, self._other = self._other, None
+            return "first"
+        self._faults[fault] += 1
+        return "left out"
 
 
-def _chunk(batch: Batch, first: int, last: int, first_s: float, last_s: float) -> Chunk:
+class _Stream(NamedTuple):
+    """What is expected of the packets of a stream."""
+
+    following: int
+    """Number of the next packet."""
+    newest_us: int | None
+    """Time of the newest event."""
+    size: tuple[int, int]
+    """Width and height of the sensor."""
+    packets: int
+    """Packets of it so far that followed each other."""
+
+    @staticmethod
+    def after(heading: Heading, span: tuple[int, int] | None, before: _Stream | None = None) -> _Stream:
+        """Return the stream after a packet, whose events are from `span[0]` to `span[1]`."""
+        newest = span[1] if span is not None else None if before is None else before.newest_us
+        count = 1 + (0 if before is None else before.packets)
+        return _Stream((heading.sequence + 1) % _TURN, newest, (heading.width, heading.height), count)
+
+    def fault(self, heading: Heading, span: tuple[int, int] | None) -> tuple[str | None, int]:
+        """Return what is wrong with a packet if it is of the stream, and how many before it are missing."""
+        if (heading.width, heading.height) != self.size:
+            return "malformed packets", 0
+        gap = (heading.sequence - self.following) % _TURN
+        is_earlier = span is not None and self.newest_us is not None and span[0] < self.newest_us
+        return ("late packets" if gap >= _LATE or is_earlier else None), gap
+
+
+def _chunk(batch: Batch, first: int, last: int, begins: bool, first_s: float, last_s: float) -> Chunk:
     events = batch.events(first, last)
     until = int(events.t_us[-1]) if len(events) else UNKNOWN_US
-    return Chunk(events, until, first_s, last_s, restart=batch.headings[first].sequence == 0)
+    return Chunk(events, until, first_s, last_s, restart=begins)
 
 
 class UdpSender:

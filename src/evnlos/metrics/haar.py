@@ -9,6 +9,8 @@ from evnlos.errors import DataError
 from evnlos.metrics.pixelwise import checked
 
 _C, _ALPHA = 30.0, 4.2
+HAAR_LEAST_SIDE = 16
+"""Smallest side of an image, pixels: three scales of a picture halved once."""
 
 
 def haarpsi(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> torch.Tensor:
@@ -36,8 +38,8 @@ def haarpsi(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> t
     """
     image, truth = checked(image, truth)
     height, width = image.shape[-2:]
-    if min(height, width) < 16:
-        raise DataError(f"haarpsi: image is {height} x {width}; give at least 16 pixels a side")
+    if min(height, width) < HAAR_LEAST_SIDE:
+        raise DataError(f"haarpsi: image is {height} x {width}; give at least {HAAR_LEAST_SIDE} pixels a side")
     x, y = (_coefficients(part.reshape(-1, 1, height, width) * (255 / peak)) for part in (image, truth))
     likeness = (2 * x * y + _C**2) / (x * x + y * y + _C**2)  # [N, scale, orientation, H, W]
     local = torch.sigmoid(_ALPHA * likeness[:, :2].mean(dim=1))

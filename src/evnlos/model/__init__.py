@@ -1,32 +1,39 @@
-"""Networks, one page each, and their weights on disk."""
+"""Reconstructors, their closed-form parts, what their images are worth, and their weights on disk."""
 
 from evnlos.model.confidence import Confidence, Judgement, halves_of
-from evnlos.model.infer import infer
-from evnlos.model.joint import JointNetwork, new_network
 from evnlos.model.linear import LinearEstimate, fit_linear
 from evnlos.model.plates import plates
 from evnlos.model.published import published, published_for, published_rig, published_single
-from evnlos.model.unet import ResidualUNet, UNetConfig
-from evnlos.model.weights import Weights, load_weights, save_weights, with_rank
+from evnlos.model.reconstructor import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
+from evnlos.model.sequence import SequenceConfig, SequenceReconstructor
+from evnlos.model.tensor_file import read_sealed, sealed_bytes
+from evnlos.model.unet import ResidualUNet, UNetConfig, UNetReconstructor
+from evnlos.model.weights import Weights, describe_network, load_weights, save_weights, with_rank
 
 __all__ = [
+    "RECONSTRUCTORS",
     "Confidence",
-    "JointNetwork",
     "Judgement",
     "LinearEstimate",
+    "Reconstructor",
+    "ReconstructorSettings",
     "ResidualUNet",
+    "SequenceConfig",
+    "SequenceReconstructor",
     "UNetConfig",
+    "UNetReconstructor",
     "Weights",
+    "describe_network",
     "fit_linear",
     "halves_of",
-    "infer",
     "load_weights",
-    "new_network",
     "plates",
     "published",
     "published_for",
     "published_rig",
     "published_single",
+    "read_sealed",
     "save_weights",
+    "sealed_bytes",
     "with_rank",
 ]

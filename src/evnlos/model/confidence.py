@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.errors import DataError
-from evnlos.model.infer import infer
-from evnlos.model.joint import JointNetwork
 from evnlos.model.plates import SIDE, plates
-from evnlos.model.unet import ResidualUNet
+from evnlos.model.reconstructor import Reconstructor
 from evnlos.types import Plane
 
 COVERAGE = 0.9
@@ -162,9 +160,7 @@ class Confidence:
 
 
 @torch.inference_mode()
-def halves_of(
-    network: ResidualUNet | JointNetwork, inputs: Tensor, position_m: NDArray, canvas: Plane
-) -> Tensor:
+def halves_of(network: Reconstructor, inputs: Tensor, position_m: NDArray, canvas: Plane) -> Tensor:
     """Return what the first and the second half of a pass show of the plate, each on its own, [2, 32, 32].
 
     The object is the same in both halves and everything else is not: the noise, and where plate, wall and
@@ -189,7 +185,7 @@ def halves_of(
     parts = np.array_split(np.arange(len(inputs)), 2)
     return torch.stack(
         [
-            plates(infer(network, inputs[torch.from_numpy(part)], position_m[part]), canvas, position_m[part])
+            plates(network.infer(inputs[torch.from_numpy(part)], position_m[part]), canvas, position_m[part])
             .mean(dim=0)[0]
             .cpu()
             for part in parts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -9,36 +10,40 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from evnlos.dataset import Modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.model.linear import LinearEstimate, fit_linear, rank_of_events
+from evnlos.model.linear import LinearEstimate, fit_linear
 
 Scaling = Literal["dataset", "picture"]
+
+MOST_SAMPLES = 16_384
+"""Samples that the linear embedding is fitted to, at most."""
 
 _SMALLEST = 1e-3
 
 
-class Standardise(nn.Module):
-    """Bring inputs [B, C, H, W] to mean 0 and size 1.
+class InputNormalization(nn.Module):
+    """Bring inputs [B, C, H, W] to mean 0 and size 1, each group of channels on its own.
 
-    A frame loses its mean and is divided by its standard deviation; the two maps of events keep 0 = "no event",
-    and are divided by the root mean square of both. With the scaling "dataset" these numbers are those of a
-    whole dataset, so that the brightness of one picture against another still counts; with "picture" they are
-    each picture's own, and gain and a constant ambient light drop out.
+    A group that is centred (a frame) loses its mean and is divided by its standard deviation; one whose 0 means
+    "nothing here" (events) keeps it, and is divided by the root mean square of all its channels. With the
+    scaling "dataset" these numbers are those of a whole dataset, so that the brightness of one image against
+    another still counts; with "picture" they are each image's own, and gain and a constant ambient light drop
+    out.
 
     Args:
-        channels: 1 (frame), 2 (event) or 3 (fusion, the frame first).
+        modality: What is seen.
         scaling: Whose mean and size.
     """
 
     mean: Tensor
     size: Tensor
 
-    def __init__(self, channels: int, scaling: Scaling) -> None:
+    def __init__(self, modality: Modality, scaling: Scaling) -> None:
         super().__init__()
-        self.scaling = scaling
-        self.frames = channels % 2
-        self.register_buffer("mean", torch.zeros(channels))
-        self.register_buffer("size", torch.ones(channels))
+        self.modality, self.scaling = modality, scaling
+        self.register_buffer("mean", torch.zeros(modality.channels))
+        self.register_buffer("size", torch.ones(modality.channels))
 
     def fit(self, inputs: Tensor) -> None:
         """Take mean and size from the inputs of a dataset, [N, C, H, W]."""
@@ -47,25 +52,40 @@ class Standardise(nn.Module):
         self.size.copy_(size[0, :, 0, 0])
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [B, C, H, W] to standardised [B, C, H, W]."""
+        """Map [B, C, H, W] to normalized [B, C, H, W]."""
         if self.scaling == "picture":
             mean, size = self._measured(x, dims=(1, 2, 3))
             return (x - mean) / size
         return (x - self.mean[:, None, None]) / self.size[:, None, None]
 
     def _measured(self, x: Tensor, dims: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-        """Return mean and size over `dims`, [B or 1, C, 1, 1] each, frame and events apart."""
+        """Return mean and size over `dims`, [B or 1, C, 1, 1] each, of every group of channels."""
         means, sizes = [], []
-        for part in (x[:, : self.frames], x[:, self.frames :]):
-            if not part.shape[1]:
-                continue
+        for group, own in zip(self.modality.groups, self.modality.slices.values(), strict=True):
+            part = x[:, own]
             mean = part.mean(dim=dims, keepdim=True, dtype=torch.float32)
-            if means or not self.frames:  # events
+            if not group.centred:
                 mean = torch.zeros_like(mean)
             size = (part - mean).square().mean(dim=dims, keepdim=True).sqrt().clamp_min(_SMALLEST)
             means.append(mean.expand(-1, part.shape[1], -1, -1))
             sizes.append(size.expand(-1, part.shape[1], -1, -1))
         return torch.cat(means, dim=1), torch.cat(sizes, dim=1)
+
+    @staticmethod
+    def today(name: str, modality: Modality) -> str:
+        """Return today's name of a tensor of an older file; embeddings had no groups where there was only one.
+
+        Args:
+            name: Its name in the file.
+            modality: What the network sees.
+        """
+        first, _, rest = name.partition(".")
+        if first == "standardise":
+            return f"normalization.{rest}"
+        if first != "embedding" or rest.startswith("groups."):
+            return name
+        only = f"{modality.groups[0].name}." if len(modality.groups) == 1 else ""
+        return f"embedding.groups.{only}{rest}"
 
 
 class LinearEmbedding(nn.Module):
@@ -106,12 +126,12 @@ class LinearEmbedding(nn.Module):
         return self.basis.shape[1]
 
     @property
-    def pictures(self) -> int:
-        """Pictures that come out for each input."""
+    def images(self) -> int:
+        """Images that come out for each input."""
         return len(self.strengths)
 
     def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
-        """Fit the linear estimate to standardised samples and take its numbers; arguments of `fit_linear`."""
+        """Fit the linear estimate to normalized samples and take its numbers; arguments of `fit_linear`."""
         self.take(fit_linear(seen, truth, objects, self.rank, seed))
 
     def take(self, estimate: LinearEstimate) -> None:
@@ -139,7 +159,7 @@ class LinearEmbedding(nn.Module):
         self.weights = self.weights[:rank].clone()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [B, C, H, W] to pictures [B, S, H, W], about 0..1; in float32 whatever surrounds it.
+        """Map [B, C, H, W] to images [B, S, H, W], about 0..1; in float32 whatever surrounds it.
 
         Raises:
             DataError: The input has another size than this embedding was made for.
@@ -148,74 +168,122 @@ class LinearEmbedding(nn.Module):
             raise DataError(f"input is {tuple(x.shape)}; this network's embedding takes [B, {self._wanted}]")
         with torch.autocast(x.device.type, enabled=False):
             code = (x.float().flatten(1) - self.mean_in) @ self.basis  # [B, R]
-            pictures = (code[:, None] * self.shrinkage) @ self.weights + self.mean_out
-        return pictures.unflatten(2, self.shape[1:])
+            images = (code[:, None] * self.shrinkage) @ self.weights + self.mean_out
+        return images.unflatten(2, self.shape[1:])
 
     @property
     def _wanted(self) -> str:
         return ", ".join(str(side) for side in self.shape)
 
 
-class FusionEmbedding(nn.Module):
-    """Frame and events undone each by its own ridges: [B, 3, H, W] -> [B, 2 S, H, W], the frame's first.
+class LinearEmbeddings(nn.Module):
+    """Each group of channels undone by its own ridges: [B, C, H, W] -> [B, G S, H, W], the first group's first.
 
-    One regression on both would mix them by their noise in the samples that it was fitted to; apart, the
-    network behind weighs them, picture by picture and place by place.
+    One regression on all would mix them by their noise in the samples that it was fitted to; apart, the
+    network behind weighs them, image by image and place by place.
 
     Args:
+        modality: What is seen; each of its G groups has an embedding.
         size: Height and width of the input, pixels.
-        rank: Most components of frame and events together, at least 2.
-        strengths: As in `LinearEmbedding`.
+        rank: Most components of all groups together, at least one for each.
+        strengths: As in `LinearEmbedding`, S of them.
 
     Raises:
-        ConfigError: The rank is 1.
+        ConfigError: The rank is less than the number of groups.
     """
 
-    def __init__(self, size: tuple[int, int], rank: int, strengths: tuple[float, ...]) -> None:
+    def __init__(
+        self, modality: Modality, size: tuple[int, int], rank: int, strengths: tuple[float, ...]
+    ) -> None:
         super().__init__()
-        if rank < 2:
-            raise ConfigError(f"the rank is {rank}; frame and events need one component each: give 2 or more")
-        self.frame = LinearEmbedding(1, size, rank - rank_of_events(rank), strengths)
-        self.events = LinearEmbedding(2, size, rank_of_events(rank), strengths)
-        self.shape = (3, *size)
+        self.modality = modality
+        self.groups = nn.ModuleDict(
+            {
+                group.name: LinearEmbedding(group.channels, size, part, strengths)
+                for group, part in zip(modality.groups, modality.ranks(rank), strict=True)
+            }
+        )
+        self.shape = (modality.channels, *size)
+
+    @property
+    def _parts(self) -> list[tuple[slice, LinearEmbedding]]:
+        return [(own, self.groups[name]) for name, own in self.modality.slices.items()]  # type: ignore[misc]
 
     @property
     def rank(self) -> int:
-        """Most components of frame and events together."""
-        return self.frame.rank + self.events.rank
+        """Most components of all groups together."""
+        return sum(part.rank for _, part in self._parts)
 
     @property
-    def pictures(self) -> int:
-        """Pictures that come out for each input."""
-        return self.frame.pictures + self.events.pictures
+    def images(self) -> int:
+        """Images that come out for each input."""
+        return sum(part.images for _, part in self._parts)
 
     def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
-        """Fit both to standardised samples [N, 3, H, W]; arguments as in `fit_linear`."""
-        self.frame.fit(seen[:, :1], truth, objects, seed)
-        self.events.fit(seen[:, 1:], truth, objects, seed)
+        """Fit each group to normalized samples [N, C, H, W]; arguments as in `fit_linear`."""
+        for own, part in self._parts:
+            part.fit(seen[:, own], truth, objects, seed)
 
     def keep(self, rank: int) -> None:
-        """Forget all but the strongest components; `rank` of frame and events together.
+        """Forget all but the strongest components; `rank` of all groups together.
+
+        Args:
+            rank: Components to keep.
 
         Raises:
-            ConfigError: There are not as many, or there would not be one of each.
+            ConfigError: There are not as many, or a group would have none.
         """
-        if not 2 <= rank <= self.rank:
+        least = len(self._parts)
+        if not least <= rank <= self.rank:
             raise ConfigError(
-                f"the rank is to be {rank}; this embedding has {self.rank}: give 2 to {self.rank}"
+                f"the rank is to be {rank}; this embedding has {self.rank}: give {least} to {self.rank}"
             )
-        self.frame.keep(rank - rank_of_events(rank))
-        self.events.keep(rank_of_events(rank))
+        for (_, part), own in zip(self._parts, self.modality.ranks(rank), strict=True):
+            part.keep(own)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [B, 3, H, W] to pictures [B, 2 S, H, W]."""
-        return torch.cat([self.frame(x[:, :1]), self.events(x[:, 1:])], dim=1)
+        """Map [B, C, H, W] to images [B, G S, H, W].
+
+        Raises:
+            DataError: The input has another size than this embedding was made for.
+        """
+        if tuple(x.shape[1:]) != self.shape:
+            wanted = ", ".join(str(side) for side in self.shape)
+            raise DataError(f"input is {tuple(x.shape)}; this network's embedding takes [B, {wanted}]")
+        return torch.cat([part(x[:, own]) for own, part in self._parts], dim=1)
 
 
-def embedding_for(
-    channels: int, size: tuple[int, int], rank: int, strengths: tuple[float, ...]
-) -> LinearEmbedding | FusionEmbedding:
-    """Return an empty embedding for what a network sees: of frame (1), events (2) or both (3 channels)."""
-    if channels == 3:
-        return FusionEmbedding(size, rank, strengths)
-    return LinearEmbedding(channels, size, rank, strengths)
+@torch.inference_mode()
+def fit_input(
+    normalization: InputNormalization,
+    embedding: LinearEmbeddings | None,
+    some: Callable[[int], tuple[Tensor, Tensor, NDArray[np.str_]]],
+    seed: int,
+    *,
+    is_new: bool,
+    keep_normalization: bool,
+) -> None:
+    """Give a new network the scale of the data and its linear embedding; one with weights, at most the scale.
+
+    Args:
+        normalization: Changed in place; it need not be on the CPU.
+        embedding: Changed in place where the network is new.
+        some: Returns at most so many samples: inputs, true images, objects.
+        seed: Seed of the embedding's basis.
+        is_new: Whether the network has random weights.
+        keep_normalization: Whether a network with weights keeps the scale that it has.
+    """
+    measures = normalization.scaling == "dataset" and (is_new or not keep_normalization)
+    embeds = is_new and embedding is not None
+    if not measures and not embeds:
+        return
+    inputs, truth, names = some(MOST_SAMPLES)
+    device = normalization.mean.device
+    if measures:
+        normalization.fit(inputs.float().to(device))
+    if embeds:
+        assert embedding is not None
+        if len(np.unique(names)) < 2:  # one object: its time steps stand for objects
+            names = np.arange(len(names)).astype(str)
+        seen = torch.cat([normalization(part.float().to(device)).cpu() for part in inputs.split(256)])
+        embedding.fit(seen, truth, names, seed)

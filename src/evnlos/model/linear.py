@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from evnlos.dataset import Modality
 from evnlos.errors import DataError
 from evnlos.seeds import derive_seed
 
@@ -16,7 +17,6 @@ _LAMBDAS = tuple(10.0 ** (k / 2) for k in range(-12, 5))  # in units of the mean
 _FOLDS = 5
 _EXTRA = 20  # columns of the random probe beyond the rank
 _POWERS = 2
-_EVENT_SHARE = 0.375
 _TINY = 1e-30
 
 
@@ -56,13 +56,18 @@ class LinearEstimate:
 
 
 def fit_linear(
-    inputs: Tensor, truth: Tensor, objects: NDArray[np.str_], rank: int = 256, seed: int = 0
+    inputs: Tensor,
+    truth: Tensor,
+    objects: NDArray[np.str_],
+    rank: int = 256,
+    seed: int = 0,
+    modality: Modality | None = None,
 ) -> LinearEstimate:
     """Fit the linear estimate with the least mean squared error on unseen objects.
 
     The basis comes from a randomised singular value decomposition (Halko, Martinsson and Tropp, SIAM Review
-    53, 2011); the ridge is the best of a grid when one fold of the objects at a time is left out. Frame and
-    events (three channels) have a basis each, in units of their own noise.
+    53, 2011); the ridge is the best of a grid when one fold of the objects at a time is left out. The
+    groups of channels of a modality have a basis each, in units of their own noise.
 
     Args:
         inputs: What the network would see, [N, C, H, W].
@@ -70,6 +75,7 @@ def fit_linear(
         objects: Object of each sample, [N].
         rank: Most components of the input.
         seed: Seed of the random probe and of the folds.
+        modality: Which channels belong together; None: all do.
 
     Raises:
         DataError: The lengths differ, or there are fewer than two objects.
@@ -84,7 +90,9 @@ def fit_linear(
     folds = torch.tensor([int(fold_of[name]) for name in objects])
     y = truth.float().flatten(1)  # [N, H W]
     mean_out = y.mean(dim=0)
-    parts = _parts(inputs.shape[1], rank)
+    parts = [(slice(None), rank)]
+    if modality is not None:
+        parts = list(zip(modality.slices.values(), modality.ranks(rank), strict=True))
     found = [_fit(inputs[:, own].float().flatten(1), y - mean_out, folds, r, seed) for own, r in parts]
     shape = tuple(truth.shape[1:])
     if len(found) == 1:
@@ -104,19 +112,6 @@ def fit_linear(
     ]
     turned, powers, weights, lam = _regress(torch.cat(codes, dim=1), y - mean_out, folds)
     return LinearEstimate(mean_in, basis @ turned, powers, weights, mean_out.unflatten(0, shape), lam)
-
-
-def rank_of_events(rank: int) -> int:
-    """Return the events' part of the rank of frame and events together; of 2 or more both have one."""
-    return round(_EVENT_SHARE * rank)
-
-
-def _parts(channels: int, rank: int) -> list[tuple[slice, int]]:
-    """Return the channels of the frame and of the events, each with its share of the rank."""
-    if channels != 3:
-        return [(slice(0, channels), rank)]
-    events = rank_of_events(rank)
-    return [(slice(0, 1), rank - events), (slice(1, 3), events)]
 
 
 def _fit(

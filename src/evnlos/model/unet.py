@@ -1,22 +1,36 @@
-"""The reconstruction network on one page: a U-Net of residual blocks behind the light path undone linearly."""
+"""The U-Net of residual blocks, and the reconstructor of single time steps that stands on it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from evnlos.dataset import Modality, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.model.embedding import FusionEmbedding, LinearEmbedding, Scaling, Standardise, embedding_for
+from evnlos.model.embedding import InputNormalization, LinearEmbeddings, Scaling, fit_input
+from evnlos.model.reconstructor import RECONSTRUCTORS, Drawn, Reconstructor, ReconstructorSettings
+
+PARTS = {
+    "encoder": ("unet.stem", "unet.encoder", "unet.down"),
+    "latent": ("unet.latent",),
+    "decoder": ("unet.up", "unet.decoder", "unet.head"),
+}
+"""Parts of a U-Net that a fine-tuning may keep."""
 
 
+@RECONSTRUCTORS.register
 @dataclass(frozen=True)
-class UNetConfig:
-    """Size of a `ResidualUNet`."""
+class UNetConfig(ReconstructorSettings):
+    """A U-Net of single time steps behind a linear embedding: kind `unet`."""
 
+    kind: str = "unet"
+    """Kind of the reconstructor."""
     width: int = 48
     """Channels at the finest level; they double at each level down, up to 8 times."""
     depth: int = 2
@@ -32,10 +46,12 @@ class UNetConfig:
     rank: int = 256
     """Components of the linear embedding in front of the U-Net (0 = none: the U-Net sees the maps)."""
     strengths: tuple[float, ...] = (0.03, 1.0, 30.0)
-    """Ridges of the linear embedding, in units of the best one; each gives the U-Net one picture, or one of the
-    frame and one of the events."""
+    """Ridges of the linear embedding, in units of the best one; each gives the U-Net one image for each
+    group of channels."""
 
     def __post_init__(self) -> None:
+        if self.kind != type(self).kind:
+            raise ConfigError(f"kind is {self.kind!r}; these are the settings of kind {type(self).kind!r}")
         for name in ("width", "depth", "blocks", "shuffle", "groups"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"UNetConfig.{name} is {getattr(self, name)}; give at least 1")
@@ -45,6 +61,15 @@ class UNetConfig:
             raise ConfigError(f"UNetConfig.strengths is {self.strengths}; give one positive number or several")
         if self.width % self.groups:
             raise ConfigError(f"UNetConfig.groups is {self.groups}; give a divisor of the width {self.width}")
+
+    @property
+    def least_tensors(self) -> int:
+        """Each block has more than one tensor."""
+        return self.depth * self.blocks
+
+    def build(self, modality: str | Modality, sampling: Sampling) -> Reconstructor:
+        """Return a reconstructor of single time steps with random weights."""
+        return UNetReconstructor(as_modality(modality), self, sampling)
 
 
 class ResidualBlock(nn.Module):
@@ -71,40 +96,25 @@ class ResidualBlock(nn.Module):
 
 
 class ResidualUNet(nn.Module):
-    """U-Net of residual blocks with skip connections: what the camera saw [B, C, H, W] -> picture [B, 1, H, W].
+    """U-Net of residual blocks with skip connections: maps [B, C, H, W] -> image [B, 1, H, W], 0..1 (sigmoid).
 
-    The inputs are standardised and, where `config.rank` is not 0, turned into pictures by the linear embedding;
-    both hold numbers of the training's dataset. The output is in 0..1 (a sigmoid). The network pads by
-    repeating the border up to a multiple of shuffle * 2^depth and crops its output; without embedding it takes
+    It pads by repeating the border up to a multiple of shuffle * 2^depth and crops its output, so that it takes
     sides of any length. After Ronneberger, Fischer and Brox, MICCAI 2015 (U-Net) and He et al., ECCV 2016
     (pre-activation residual block).
 
     Args:
-        channels: Channels of the input: frame 1, event 2, fusion 3.
-        config: Width, depth, blocks, embedding.
-        size: Height and width of the input, pixels; the embedding needs them.
-
-    Raises:
-        ConfigError: There is to be an embedding, and the size is missing.
+        channels: Channels of the input.
+        config: Width, depth, blocks, shuffle and groups; the rest is for what stands in front of it.
 
     Example:
-        >>> net = ResidualUNet(3, UNetConfig(width=8), size=(50, 75))
-        >>> net(torch.zeros(1, 3, 50, 75)).shape
+        >>> net = ResidualUNet(5, UNetConfig(width=8))
+        >>> net(torch.zeros(1, 5, 50, 75)).shape
         torch.Size([1, 1, 50, 75])
     """
 
-    def __init__(
-        self, channels: int, config: UNetConfig = UNetConfig(), size: tuple[int, int] | None = None
-    ) -> None:
+    def __init__(self, channels: int, config: UNetConfig = UNetConfig()) -> None:
         super().__init__()
         self.channels, self.config = channels, config
-        self.standardise = Standardise(channels, config.scaling)
-        self.embedding: LinearEmbedding | FusionEmbedding | None = None
-        if config.rank:
-            if size is None:
-                raise ConfigError(f"UNetConfig.rank is {config.rank}; give the size of the inputs, or rank=0")
-            self.embedding = embedding_for(channels, size, config.rank, config.strengths)
-            channels = self.embedding.pictures
         cell, groups, blocks = config.shuffle**2, config.groups, config.blocks
         widths = [config.width * min(2**level, 8) for level in range(config.depth + 1)]
 
@@ -119,7 +129,7 @@ class ResidualUNet(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairwise(widths))
         self.decoder = nn.ModuleList(stage(2 * w, w) for w in widths[:-1])
         self.head = nn.Conv2d(widths[0], cell, 3, padding=1)
-        # A picture is dark except for a few per cent of its pixels: start there.
+        # An image is dark except for a few per cent of its pixels: start there.
         nn.init.constant_(self.head.bias, -2.0)  # type: ignore[arg-type]
 
     @property
@@ -136,9 +146,6 @@ class ResidualUNet(nn.Module):
         if x.ndim != 4 or x.shape[1] != self.channels:
             raise DataError(f"input is {tuple(x.shape)}; this network takes [B, {self.channels}, H, W]")
         height, width = x.shape[-2:]
-        x = self.standardise(x)
-        if self.embedding is not None:
-            x = self.embedding(x)  # [B, pictures, H, W]
         x = F.pad(x, (0, -width % self.multiple, 0, -height % self.multiple), mode="replicate")
         x = self.stem(F.pixel_unshuffle(x, self.config.shuffle))  # [B, width, H/s, W/s]
         skips = []
@@ -152,3 +159,73 @@ class ResidualUNet(nn.Module):
             x = decode(torch.cat([x, skip], dim=1))
         x = F.pixel_shuffle(self.head(x), self.config.shuffle)  # [B, 1, H, W]
         return torch.sigmoid(x[..., :height, :width].float())
+
+
+class UNetReconstructor(Reconstructor):
+    """One time step -> one image: normalization, linear embedding (where `settings.rank` is not 0), U-Net.
+
+    Normalization and embedding hold numbers of the training's dataset, fitted in closed form; the U-Net is
+    trained by gradients. Without an embedding, inputs of any size are taken.
+
+    Args:
+        modality: What it sees.
+        settings: U-Net and embedding.
+        sampling: Size of the samples, which the embedding is made for.
+
+    Example:
+        >>> sampling = Sampling(height=50, width=75, scored_rows=40)
+        >>> network = UNetConfig(width=8).build("fusion", sampling)
+        >>> network(torch.zeros(1, 3, 50, 75)).shape
+        torch.Size([1, 1, 50, 75])
+    """
+
+    parts = PARTS
+
+    def __init__(self, modality: Modality, settings: UNetConfig, sampling: Sampling) -> None:
+        super().__init__(modality, settings, sampling)
+        self.settings: UNetConfig = settings
+        self.normalization = InputNormalization(modality, settings.scaling)
+        self.embedding: LinearEmbeddings | None = None
+        channels = modality.channels
+        if settings.rank:
+            size = (sampling.height, sampling.width)
+            self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.strengths)
+            channels = self.embedding.images
+        self.unet = ResidualUNet(channels, settings)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to [B, 1, H, W] in 0..1.
+
+        Raises:
+            DataError: The input does not have the modality's channels, or not the size of the embedding.
+        """
+        if x.ndim != 4 or x.shape[1] != self.modality.channels:
+            raise DataError(
+                f"input is {tuple(x.shape)}; this network takes [B, {self.modality.channels}, H, W]"
+            )
+        x = self.normalization(x)
+        return self.unet(x if self.embedding is None else self.embedding(x))
+
+    def fit(self, some: Callable[[int], Drawn], seed: int, *, is_new: bool, keep_normalization: bool) -> None:
+        """Fit the normalization and, where the weights are random, the linear embedding."""
+        fit_input(
+            self.normalization, self.embedding, some, seed, is_new=is_new, keep_normalization=keep_normalization
+        )
+
+    def reduced(self, rank: int) -> Reconstructor:
+        """Return a copy whose linear embedding has fewer components, the strongest."""
+        if self.embedding is None:
+            return super().reduced(rank)
+        copy = deepcopy(self)
+        assert copy.embedding is not None
+        copy.embedding.keep(rank)
+        copy.settings = replace(copy.settings, rank=rank)
+        return copy
+
+    @classmethod
+    def today(cls, name: str, modality: Modality) -> str:
+        """Return today's name of a tensor; before, the layers of the U-Net stood beside the embedding."""
+        first = name.split(".")[0]
+        if first in ("stem", "encoder", "down", "latent", "up", "decoder", "head"):
+            return f"unet.{name}"
+        return InputNormalization.today(name, modality)

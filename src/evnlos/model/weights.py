@@ -1,54 +1,61 @@
-"""Weights on disk: safetensors with the network's config in the metadata; nothing is unpickled."""
+"""Weights on disk: safetensors with the network's settings in the metadata; nothing is unpickled."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
-from evnlos.config import from_dict, to_dict, write_atomically
-from evnlos.dataset import CHANNELS
+from evnlos.config import from_dict, to_dict
+from evnlos.dataset import MODALITIES, Modality, Sampling
 from evnlos.errors import ConfigError, DataError
+from evnlos.files import write_atomically
+from evnlos.migrate import migrate
 from evnlos.model.confidence import Confidence
-from evnlos.model.joint import JointNetwork, new_network
-from evnlos.model.published import published
-from evnlos.model.unet import ResidualUNet, UNetConfig
+from evnlos.model.published import is_as_published, no_weights, published
+from evnlos.model.reconstructor import Reconstructor, ReconstructorSettings
+from evnlos.model.tensor_file import check_floats, read_sealed, sealed_bytes
 
-_FORMAT = "evnlos-weights-3"
+_FORMAT = "evnlos-weights-4"
 _MEAN = "baseline.mean_image"
 _CONFIDENCE = "confidence."
 
 
 @dataclass(frozen=True)
 class Weights:
-    """A network and what a user of it must know: its paradigm, its sampling, where it comes from.
+    """A network and what a user of it must know: where it comes from, how good it is.
 
     Args:
-        network: The network, in evaluation mode; of single positions, or a joint one of whole passes.
-        paradigm: What it sees: "frame", "event" or "fusion".
-        sampling: Resolution and representation of the samples that it was trained on.
+        network: The reconstructor, in evaluation mode; it knows its modality and its sampling.
         history: The trainings behind it, oldest first: settings, data, version.
-        mean_image: Mean of the true pictures of the last training, float32 [H, W]: the baseline to beat.
-        confidence: What its pictures are worth, learned from passes that no training saw; None where there
+        mean_image: Mean of the true images of the last training, float32 [H, W]: the baseline to beat.
+        confidence: What its images are worth, learned from sequences that no training saw; None where there
             were none.
         scores: How good it was found to be, for published weights: data, metrics, baselines.
+        is_sealed: Whether a digest vouches for the file that they were read from; not of earlier versions.
     """
 
-    network: ResidualUNet | JointNetwork
-    paradigm: str
-    sampling: dict[str, Any]
-    history: list[dict[str, Any]]
+    network: Reconstructor
+    history: list[dict[str, Any]] = field(default_factory=list)
     mean_image: torch.Tensor | None = None
     confidence: Confidence | None = None
     scores: dict[str, Any] = field(default_factory=dict)
+    is_sealed: bool = True
+
+    @property
+    def modality(self) -> Modality:
+        """What the network sees."""
+        return self.network.modality
+
+    @property
+    def sampling(self) -> Sampling:
+        """Resolution and representation of the samples that it was trained on."""
+        return self.network.sampling
 
 
 def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.float32) -> None:
@@ -58,6 +65,9 @@ def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.
         path: The file.
         weights: What to write.
         dtype: Precision on disk; `torch.float16` halves the file.
+
+    Raises:
+        DataError: A number is not finite, or does not fit the precision.
     """
     state = weights.network.state_dict()
     tensors = {name: value.detach().cpu().to(dtype).contiguous() for name, value in state.items()}
@@ -65,36 +75,40 @@ def save_weights(path: str | Path, weights: Weights, dtype: torch.dtype = torch.
         tensors[_MEAN] = weights.mean_image.contiguous()
     if weights.confidence is not None:
         tensors |= {f"{_CONFIDENCE}{name}": one for name, one in weights.confidence.tensors().items()}
-    about = {
-        "format": _FORMAT,
-        "paradigm": weights.paradigm,
-        "joint": isinstance(weights.network, JointNetwork),
-        "network": to_dict(weights.network.config),
-        "sampling": weights.sampling,
-        "history": weights.history,
-        "scores": weights.scores,
+    about = {"format": _FORMAT, **describe_network(weights.network)}
+    about |= {"history": weights.history, "scores": weights.scores}
+    try:
+        check_floats(tensors)
+    except ValueError as error:
+        raise DataError(f"the weights are not written to {path}: {error}") from None
+    write_atomically(path, sealed_bytes(tensors, json.dumps(about)))
+
+
+def describe_network(network: Reconstructor) -> dict[str, Any]:
+    """Return what a file says of a network, so that it can be built again: settings, modality, sampling.
+
+    Args:
+        network: The network.
+    """
+    return {
+        "network": to_dict(network.settings),
+        "modality": network.modality.name,
+        "channels": network.modality.layout,
+        "sampling": to_dict(network.sampling),
     }
-    write_atomically(path, save(tensors, metadata={"evnlos": json.dumps(about)}))
 
 
 def with_rank(weights: Weights, rank: int) -> Weights:
-    """Return a copy of weights whose linear embedding has fewer components, the strongest.
+    """Return a copy of weights whose closed-form part has fewer components, the strongest.
 
     Args:
         weights: The weights; unchanged.
         rank: Components to keep.
 
     Raises:
-        ConfigError: There is no embedding, or it has fewer components.
+        ConfigError: There is no such part, or it has fewer components.
     """
-    network = deepcopy(weights.network)
-    if network.embedding is None:
-        raise ConfigError(
-            f"the rank is to be {rank}, and these weights have no linear embedding; leave it away"
-        )
-    network.embedding.keep(rank)
-    network.config = replace(network.config, rank=rank)
-    return replace(weights, network=network)
+    return replace(weights, network=weights.network.reduced(rank))
 
 
 def load_weights(path: str | Path) -> Weights:
@@ -104,48 +118,51 @@ def load_weights(path: str | Path) -> Weights:
         path: A safetensors file, the folder of a run whose training has ended, or a name of `published`.
 
     Raises:
-        DataError: The file is missing, is not a weights file of this package, or does not fit its own config.
+        DataError: The file is missing, is not a weights file of this package, does not fit its own config or
+            its digest, or there are weights here that have a published name.
     """
     known = published()
-    path = Path(path) if Path(path).exists() else known.get(str(path), Path(path))
-    if path.is_dir():
-        path = path / "weights.safetensors"
+    given = Path(path)
+    path = given / "weights.safetensors" if given.is_dir() else given
+    if str(given) in known:
+        if path.is_file():
+            raise DataError(
+                f"{given} is a name of published weights and also lies in this folder; "
+                f"give {given.absolute()} for that, or rename it"
+            )
+        path = known[str(given)]
+    is_known = path in known.values()
     if not path.is_file():
-        names = f", or one of {', '.join(known)}" if known else ""
-        raise DataError(f"{path} does not exist; give a weights file, a run whose training has ended{names}")
+        raise no_weights(f"{path} does not exist")
     try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get("evnlos", "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        text, tensors, is_sealed = read_sealed(path)
+        about = json.loads(text)
+        check_floats(tensors)
+        if is_known and not is_sealed:
+            is_sealed = is_as_published(path)
+            if not is_sealed:
+                raise ValueError(
+                    "its SHA-256 is not the one in SHA256SUMS beside it; install the weights again"
+                )
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path} is not a readable safetensors file: {' '.join(str(error).split())}") from None
+    about = migrate("weights", about) if isinstance(about, dict) else about
     if not isinstance(about, dict) or about.get("format") != _FORMAT:
         found = about.get("format", "no format") if isinstance(about, dict) else about
         raise DataError(f"{path} holds {str(found)[:40]!r}; give weights of format {_FORMAT}")
-    paradigm, sampling, history = about.get("paradigm"), about.get("sampling", {}), about.get("history", [])
-    scores = about.get("scores", {})
-    if not isinstance(paradigm, str) or paradigm not in CHANNELS:
-        raise DataError(f"{path} names the paradigm {str(paradigm)[:40]!r}; give one of {', '.join(CHANNELS)}")
+    history, scores = about.get("history", []), about.get("scores", {})
     mean_image = tensors.pop(_MEAN, None)
     learned = [name for name in tensors if name.startswith(_CONFIDENCE)]
     confidence = _confidence({name.removeprefix(_CONFIDENCE): tensors.pop(name) for name in learned}, path)
     if not (
-        isinstance(sampling, dict)
-        and isinstance(history, list)
+        isinstance(history, list)
         and all(isinstance(step, dict) for step in history)
         and isinstance(scores, dict)
         and (mean_image is None or mean_image.ndim == 2)
     ):
-        raise DataError(
-            f"{path} garbles its sampling, its history, its scores or its mean picture; the file is damaged"
-        )
-    config = from_dict(UNetConfig, about.get("network"), source=str(path))  # type: ignore[arg-type]
-    size: Any = (sampling.get("height"), sampling.get("width"))
-    pitch_m: Any = sampling.get("pitch_m")
-    make = partial(new_network, CHANNELS[paradigm], config, size, pitch_m, joint=bool(about.get("joint")))
-    network = _matching_network(make, config, tensors, path)
-    network.load_state_dict({name: value.float() for name, value in tensors.items()})
-    return Weights(network.eval(), paradigm, sampling, history, mean_image, confidence, scores)
+        raise DataError(f"{path} garbles its history, its scores or its mean image; the file is damaged")
+    network = _network(about, tensors, path)
+    return Weights(network.eval(), history, mean_image, confidence, scores, is_sealed)
 
 
 def _confidence(tensors: dict[str, torch.Tensor], path: Path) -> Confidence | None:
@@ -162,25 +179,55 @@ def _confidence(tensors: dict[str, torch.Tensor], path: Path) -> Confidence | No
         raise DataError(f"{path} garbles its confidence ({error}); the file is damaged") from None
 
 
-def _matching_network(
-    make: Callable[[], ResidualUNet | JointNetwork],
-    config: UNetConfig,
-    tensors: dict[str, torch.Tensor],
-    path: Path,
-) -> ResidualUNet | JointNetwork:
-    """Return an empty network of the size that the tensors have; a stranger's config alone takes no memory.
+def _network(about: dict[str, Any], tensors: dict[str, torch.Tensor], path: Path) -> Reconstructor:
+    """Return the network that a file describes, with the tensors in it.
 
     Raises:
-        DataError: The config does not describe the tensors.
+        ConfigError: Its kind or its modality is unknown, or a setting is outside its range.
+        DataError: The description does not fit the tensors or the modality.
     """
-    wanted: dict[str, tuple[int, ...]] = {}
+    modality, sampling = about.get("modality"), about.get("sampling")
+    if not isinstance(modality, str) or modality not in MODALITIES:
+        raise DataError(
+            f"{path} names the modality {str(modality)[:40]!r}; give one of {', '.join(MODALITIES)}"
+        )
+    seen = MODALITIES[modality]
+    if about.get("channels", seen.layout) != seen.layout:
+        raise DataError(
+            f"{path} sees the channels {str(about['channels'])[:80]}; the modality {modality!r} has "
+            f"{seen.layout}: register the modality that it was trained with"
+        )
+    made_for: Sampling = from_dict(Sampling, sampling, source=f"{path}: sampling")  # type: ignore[arg-type]
+    values = about.get("network")
+    settings_class = ReconstructorSettings.class_for(values)
+    settings: ReconstructorSettings = from_dict(settings_class, values, source=str(path))  # type: ignore[arg-type]
+    network = _matching(partial(settings.build, seen, made_for), settings, tensors, path)
+    names = {network.today(name, seen): name for name in tensors}
+    network.load_state_dict({name: tensors[old].float() for name, old in names.items()})
+    return network
+
+
+def _matching(
+    build: Callable[[], Reconstructor],
+    settings: ReconstructorSettings,
+    tensors: dict[str, torch.Tensor],
+    path: Path,
+) -> Reconstructor:
+    """Return an empty network of the size that the tensors have; a stranger's settings alone take no memory.
+
+    Raises:
+        DataError: The settings do not describe the tensors.
+    """
+    fits = False
     try:
-        if config.depth * config.blocks <= len(tensors):  # each block has more than one tensor
+        if settings.least_tensors <= len(tensors):
             with torch.device("meta"):
-                wanted = {name: tuple(value.shape) for name, value in make().state_dict().items()}
+                empty = build()
+            wanted = {name: tuple(value.shape) for name, value in empty.state_dict().items()}
+            found = {empty.today(name, empty.modality): tuple(value.shape) for name, value in tensors.items()}
+            fits = wanted == found
     except (RuntimeError, OverflowError, MemoryError, TypeError, LookupError, ConfigError):
         pass
-    found = {name: tuple(value.shape) for name, value in tensors.items()}
-    if not wanted or wanted != found:
-        raise DataError(f"{path} does not fit its own config ({config}); the file is damaged")
-    return make()
+    if not fits:
+        raise DataError(f"{path} does not fit its own settings ({settings}); the file is damaged")
+    return build()

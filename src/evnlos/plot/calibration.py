@@ -6,10 +6,11 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from evnlos.calibration import RigFit
+from evnlos.files import write_atomically
 from evnlos.plot.figure import new_figure, signed_map
+from evnlos.untrusted import open_image
 
 
 def draw_calibration(fit: RigFit, path: str | Path) -> None:
@@ -49,5 +50,7 @@ def draw_calibration(fit: RigFit, path: str | Path) -> None:
     # Noise hardly compresses: fewer colours keep the picture small.
     drawn = BytesIO()
     figure.savefig(drawn, dpi=60, format="png")
-    with Image.open(drawn) as picture:
-        picture.convert("RGB").quantize(200).save(Path(path), optimize=True)
+    with open_image(drawn) as picture:
+        packed = BytesIO()
+        picture.convert("RGB").quantize(200).save(packed, "PNG", optimize=True)
+    write_atomically(path, packed.getvalue())

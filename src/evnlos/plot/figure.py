@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+from pathlib import Path
 from typing import Any, Literal
 
-from evnlos.errors import MissingDependencyError
+from evnlos.errors import DataError, MissingDependencyError
+from evnlos.files import write_atomically
 
 
 def new_figure(size: tuple[float, float]) -> Any:
@@ -18,6 +21,22 @@ def new_figure(size: tuple[float, float]) -> Any:
     except ImportError:
         raise MissingDependencyError("figures need matplotlib: pip install 'evnlos[plot]'") from None
     return Figure(size, layout="constrained")
+
+
+def save_figure(figure: Any, path: str | Path, *, dpi: int) -> Path:
+    """Write a figure whole or not at all, in the format of the path's suffix, PNG without one; return the path.
+
+    Raises:
+        DataError: There is no such format.
+    """
+    path, drawn = Path(path), io.BytesIO()
+    known = figure.canvas.get_supported_filetypes()
+    kind = path.suffix.lower().removeprefix(".") or "png"
+    if kind not in known:
+        raise DataError(f"{path} is no picture of a known format; end its name in .png, .svg or .pdf")
+    figure.savefig(drawn, dpi=dpi, format=kind)
+    write_atomically(path, drawn.getvalue())
+    return path
 
 
 def signed_map() -> Any:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evnlos.plot.figure import new_figure, signed_map
+from evnlos.plot.figure import new_figure, save_figure, signed_map
 
 if TYPE_CHECKING:
     from evnlos.evaluation.identify import Identification
@@ -53,7 +53,7 @@ def draw_identification(found: Identification, path: str | Path) -> Path:
         fontsize=9,
     )
     figure.suptitle(found.name)
-    return _saved(figure, path)
+    return save_figure(figure, path, dpi=100)
 
 
 def draw_rigs(found: Sequence[Identification], path: str | Path) -> Path:
@@ -68,7 +68,7 @@ def draw_rigs(found: Sequence[Identification], path: str | Path) -> Path:
     """
     figure = new_figure((8.0, 4.6))
     _singular_values(figure.add_subplot(), found)
-    return _saved(figure, path)
+    return save_figure(figure, path, dpi=100)
 
 
 def _singular_values(axes: Any, found: Sequence[Identification]) -> None:
@@ -103,9 +103,3 @@ def _picture(axes: Any, image: Any, title: str, cmap: Any = "gray", largest: flo
     axes.imshow(image.numpy(), cmap=cmap, vmin=low, vmax=high)
     axes.set_title(title, fontsize=8)
     axes.set_axis_off()
-
-
-def _saved(figure: Any, path: str | Path) -> Path:
-    path = Path(path)
-    figure.savefig(path, dpi=100)
-    return path

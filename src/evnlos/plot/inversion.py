@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.plot.figure import new_figure
+from evnlos.plot.figure import new_figure, save_figure
 
 
 def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]]) -> Path:
@@ -32,9 +32,7 @@ def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]])
         axes.imshow(as_picture(image), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
-    path = Path(path)
-    figure.savefig(path, dpi=100)
-    return path
+    return save_figure(figure, path, dpi=100)
 
 
 def as_picture(image: torch.Tensor) -> NDArray[np.float64]:

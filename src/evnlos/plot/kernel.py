@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.plot.figure import new_figure
+from evnlos.plot.figure import new_figure, save_figure
 from evnlos.scene import FontGlyphs
 from evnlos.transport import DiffuseReflection, tpsf_kernel, tpsf_profile
 from evnlos.types import Plane
@@ -76,6 +76,4 @@ def draw_kernel(path: str | Path, letter: str = "R") -> Path:
         picture.imshow(blurred(letter, path_length), cmap="gray", vmin=0, vmax=1)
         picture.set_title(f"t = 2, <l> = {path_length:g}", fontsize=10)
         picture.set_axis_off()
-    path = Path(path)
-    figure.savefig(path, dpi=110)
-    return path
+    return save_figure(figure, path, dpi=110)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evnlos.events.colours import OFF_HEX, ON_HEX
-from evnlos.plot.figure import new_figure
+from evnlos.plot.figure import new_figure, save_figure
 from evnlos.types import Events
 
 
@@ -68,6 +68,4 @@ def draw_time_stamps(
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("column, pixels")
     panels[-1].legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=2)
-    path = Path(path)
-    figure.savefig(path, dpi=110)
-    return path
+    return save_figure(figure, path, dpi=110)

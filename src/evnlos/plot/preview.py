@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, DataError
 from evnlos.events.colours import OFF_RGB, ON_RGB
 from evnlos.events.summary import Summary
 from evnlos.types import Events
+from evnlos.untrusted import MOST_SENSOR_PIXELS
 
 Style = Literal["polarity", "surface"]
 """Events of each window by sign, or the newest event of each pixel, fading."""
@@ -83,6 +84,11 @@ def preview_pictures(
         (2, (266, 480, 3), [226, 120, 0])
     """
     look = look or Look()
+    if summary.width * summary.height > MOST_SENSOR_PIXELS:
+        raise DataError(
+            f"a sensor of {summary.width} x {summary.height} pixels is too large to draw; give --width and "
+            "--height if the file is wrong, or cut a part out with --box"
+        )
     windows = _windows(summary, look)
     factor = max(1, round(max(summary.width, summary.height) / look.side_px))
     shape = -(-summary.height // factor), -(-summary.width // factor)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import html
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.transport import PaperTransport, RadiometricTransport
+from evnlos.setups import Setup
 
 _WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
 _LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # told apart with every common kind of colour blindness
@@ -32,25 +31,30 @@ class Drawing:
         return self.svg
 
 
-def rig_drawing(
-    rig: RadiometricTransport | PaperTransport, travel_m: float = 0.16, plate_m: float = 0.08
-) -> Drawing:
-    """Return the rig from above, to scale: wall, object and its way, cameras and their view, what is between.
+def setup_drawing(setup: Setup, travel_m: float = 0.16, plate_m: float = 0.08) -> Drawing | None:
+    """Return the setup from above, to scale: wall, object and its way, cameras and their view, what is between.
 
-    Where the paper's transport has no place of the camera, none is drawn. Occluders of the rig stand where they
-    are; what hides the object from the camera is in no rig's settings, so a dotted line sketches it.
+    Where the setup has no place of the camera, none is drawn. Occluders stand where they are; what hides the
+    object from the camera is in no setup, so a dotted line sketches it.
 
     Args:
-        rig: The rig.
+        setup: The setup.
         travel_m: Way of the object's middle, metres.
         plate_m: Side of the object's plate, metres.
 
+    Returns:
+        The drawing; None for a setup that does not know where its parts are.
+
     Example:
-        >>> rig_drawing(RadiometricTransport()).svg[:4]
+        >>> from evnlos.setups import load_setup
+        >>> setup_drawing(load_setup("main-near")).svg[:4]
         '<svg'
     """
+    layout = setup.layout()
+    if layout is None:
+        return None
     parts, around = [], []  # drawn in metres first: (kind, points, style or words)
-    middle, deep = _object(rig)
+    middle, deep = layout.target
     half = (travel_m + plate_m) / 2
     parts.append(
         ("line", [(middle - half, deep), (middle + half, deep)], f"stroke='{_LIGHT}' stroke-dasharray='2 3'")
@@ -65,18 +69,15 @@ def rig_drawing(
     parts.append(("text", [(middle, deep)], f"object {100 * plate_m:.3g} cm, way {100 * travel_m:.3g} cm"))
     reach = max(half + abs(middle) + 0.04, 0.2)
     around += [(middle - half, deep), (middle + half, deep)]
-    if isinstance(rig, RadiometricTransport):
-        angle, fov = math.radians(rig.camera_angle_deg), math.radians(rig.field_of_view_deg)
-        eye = (rig.camera_distance_m * math.sin(angle), rig.camera_distance_m * math.cos(angle))
-        seen = [(eye[0] - eye[1] * math.tan(angle + side * fov / 2), 0.0) for side in (1, -1)]
+    if layout.camera is not None:
+        eye = layout.camera
+        seen = [(x, 0.0) for x in layout.seen_m or ()]
         reach = max(reach, *(abs(x) + 0.02 for x, _ in seen))
         parts += [("line", [eye, one], f"stroke='{_SIGHT}' stroke-width='1'") for one in seen]
         parts.append(("disc", [eye], f"fill='{_SIGHT}'"))
-        parts.append(
-            ("text", [eye], f"cameras, {100 * rig.camera_distance_m:.3g} cm, {rig.camera_angle_deg:.3g} deg")
-        )
-        for occluder in rig.occluders():
-            corners = np.asarray(occluder.vertices_m)[:, [0, 2]]
+        parts.append(("text", [eye], f"cameras, {layout.camera_words}"))
+        for polygon in layout.occluders:
+            corners = np.asarray(polygon)
             parts.append(
                 ("line", [tuple(c) for c in (*corners, corners[0])], "stroke='currentColor' stroke-width='3'")
             )
@@ -86,8 +87,8 @@ def rig_drawing(
             dotted = "stroke='currentColor' stroke-width='3' stroke-dasharray='2 4' data-part='partition'"
             parts += [("line", list(hidden), dotted), ("text", [hidden[1]], PARTITION)]
             around += list(hidden)
-        if rig.lamp_m is not None:
-            lamp = (rig.lamp_m[0], rig.lamp_m[2])
+        if layout.lamp is not None:
+            lamp = layout.lamp
             parts += [("disc", [lamp], f"fill='{_LIGHT}'"), ("text", [lamp], "lamp")]
             around.append(lamp)
         parts.append(
@@ -100,7 +101,7 @@ def rig_drawing(
         around += [eye, *seen]
     parts.append(("line", [(-reach, 0.0), (reach, 0.0)], "stroke='currentColor' stroke-width='5'"))
     around += [(-reach, 0.0), (reach, 0.0)]
-    return Drawing(_svg(parts, np.array(around), _words(rig), deep))
+    return Drawing(_svg(parts, np.array(around), layout.wall, deep))
 
 
 def _partition(
@@ -126,21 +127,6 @@ def _partition(
     steepest = deep + (x - far) / (eye[0] - far) * (eye[1] - deep)  # where the line to the far end passes
     end = deep + 1.15 * (steepest - deep)
     return (x, deep), (x, end)
-
-
-def _object(rig: RadiometricTransport | PaperTransport) -> tuple[float, float]:
-    """Return where the middle of the object's way is, x and z, metres."""
-    return (rig.offset_m()[0] if isinstance(rig, RadiometricTransport) else 0.0), rig.distance_m
-
-
-def _words(rig: RadiometricTransport | PaperTransport) -> str:
-    if isinstance(rig, PaperTransport):
-        return f"relay wall (the paper's kernel, {1e3 * rig.tpsf_length_m:.3g} mm a unit of rho)"
-    return (
-        "relay wall, matte"
-        if rig.wall_material == "lambert"
-        else f"relay wall, metal of roughness {rig.roughness:.2g}"
-    )
 
 
 def _svg(parts: list, around: NDArray[np.float64], wall: str, deep: float) -> str:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from evnlos.plot.figure import new_figure
-from evnlos.transport.measured_file import Measurement
+from evnlos.plot.figure import new_figure, save_figure
+from evnlos.setups.measured_file import Measurement
 
 
 def draw_scan(path: str | Path, measurement: Measurement, raw: torch.Tensor | None = None) -> Path:
@@ -50,9 +50,7 @@ def draw_scan(path: str | Path, measurement: Measurement, raw: torch.Tensor | No
     last.set_title("singular values", fontsize=9)
     last.set_ylim(bottom=max(last.get_ylim()[0], 1e-6))
     last.legend(fontsize=7)
-    path = Path(path)
-    figure.savefig(path, dpi=90)
-    return path
+    return save_figure(figure, path, dpi=90)
 
 
 def _picture(figure: Any, axes: Any, image: torch.Tensor, title: str) -> None:

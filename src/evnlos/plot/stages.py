@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from evnlos.errors import DataError
 from evnlos.events.colours import OFF_HEX, ON_HEX
 from evnlos.plot.event_views import signed_pictures, time_slices
-from evnlos.plot.figure import new_figure, themed
+from evnlos.plot.figure import new_figure, save_figure, themed
 from evnlos.plot.film import Theme
 from evnlos.types import Events
 
@@ -52,7 +51,7 @@ def draw_wall(
             axes.set(title=f"{times[k]:.2f} s", xlabel="x, pixels")
         line[0].set_ylabel("y, pixels")
         figure.colorbar(shown, ax=list(line), label="digital number")
-        return _saved(figure, path)
+        return save_figure(figure, path, dpi=100)
 
 
 def draw_events(path: str | Path, events: Events, theme: Theme = "light") -> Path:
@@ -88,7 +87,7 @@ def draw_events(path: str | Path, events: Events, theme: Theme = "light") -> Pat
             axes = figure.add_subplot(grid[row, 1])
             axes.imshow(signed_pictures(one), aspect="auto", extent=(*span, side, 0), interpolation="nearest")
             axes.set(xlabel="time, s", ylabel=f"{name}, pixels")
-        return _saved(figure, path)
+        return save_figure(figure, path, dpi=100)
 
 
 def draw_surfaces(
@@ -124,7 +123,7 @@ def draw_surfaces(
         for row, name in enumerate(("ON", "OFF")):
             grid[row, 0].set_ylabel(f"{name}: y, pixels")
         figure.colorbar(shown, ax=list(grid.flat), label="time surface, 1 = just now")
-        return _saved(figure, path)
+        return save_figure(figure, path, dpi=100)
 
 
 def draw_comparison(
@@ -152,7 +151,7 @@ def draw_comparison(
             axes.imshow(picture, cmap="gray", vmin=0, vmax=1, extent=(-half_x, half_x, half_y, -half_y))
             axes.set(title=title, xlabel="x, cm")
         line[0].set_ylabel("y, cm (downwards)")
-        return _saved(figure, path)
+        return save_figure(figure, path, dpi=100)
 
 
 def _times(times_s: ArrayLike, count: int) -> NDArray[np.float64]:
@@ -164,9 +163,3 @@ def _times(times_s: ArrayLike, count: int) -> NDArray[np.float64]:
 
 def _spread(total: int, count: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, total - 1, max(1, min(count, total)) + 2)[1:-1].round().astype(np.int64))
-
-
-def _saved(figure: Any, path: str | Path) -> Path:
-    path = Path(path)
-    figure.savefig(path, dpi=100)
-    return path

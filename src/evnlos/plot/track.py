@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.plot.figure import new_figure
+from evnlos.plot.figure import new_figure, save_figure
 from evnlos.tracking import Track
 
 _HEADROOM = 1.1  # of the speed's axis over the largest speed, so that no line lies on the frame
@@ -71,6 +71,4 @@ def draw_track(
         size.plot(away.time_s, middle, color="C3")
         size.fill_between(away.time_s, middle - band, middle + band, color="C3", alpha=0.3)
         size.set(xlabel="time, s", ylabel=f"distance, {unit}", title="distance from the wall")
-    path = Path(path)
-    figure.savefig(path, dpi=80)
-    return path
+    return save_figure(figure, path, dpi=80)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evnlos.plot.figure import new_figure
+from evnlos.plot.figure import new_figure, save_figure
 
 if TYPE_CHECKING:
     from evnlos.evaluation.worth import PassWorth
@@ -59,5 +59,4 @@ def draw_worth(found: Mapping[str, Sequence[PassWorth]], path: str | Path) -> Pa
     cloud.set(xlabel="support: what was said", ylabel=f"skill: what was true ({_LEAST_SKILL} or less below)")
     cloud.set(xlim=(-0.03, 1.03), ylim=(_LEAST_SKILL - 0.1, 1.05))
     cloud.legend(frameon=False, fontsize=7, loc="lower right")
-    figure.savefig(path, dpi=100)
-    return Path(path)
+    return save_figure(figure, path, dpi=100)

@@ -8,8 +8,8 @@ from dataclasses import fields
 from typing import Any
 
 from evnlos.dataset import Dataset, Sampling
-from evnlos.evaluation.identify_source import Described
 from evnlos.report.gather import RunResult
+from evnlos.setups import NamedSetup
 
 _LIVE = "live"  # what a simulation is called that is made while the network trains
 
@@ -25,7 +25,7 @@ class Commands:
     """
 
     def __init__(
-        self, dataset: Dataset, results: list[RunResult], split: str, rig: Described | None = None
+        self, dataset: Dataset, results: list[RunResult], split: str, rig: NamedSetup | None = None
     ) -> None:
         self._dataset, self._results, self._split, self._rig = dataset, results, split, rig
         self._here = dataset.folder.resolve().name
@@ -38,7 +38,7 @@ class Commands:
         words = ["evnlos", "report", *(r.name for r in self._results), "--data", self._here]
         words += ["--split", self._split]
         if self._rig is not None:
-            words += ["--rig", self._rig.word]
+            words += ["--setup", self._rig.word]
         return list(dict.fromkeys([*lines, shlex.join([*words, "--out", "report.html"])]))
 
     def published(self) -> list[str]:

@@ -18,8 +18,11 @@ def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_lab
     xs = [x for points in series.values() for x, _ in points]
     ys = [y for points in series.values() for _, y in points]
     x0, x1 = min(xs), max(max(xs), min(xs) + 1)
-    ticks = _ticks(min(ys), max(ys))
-    y0, y1 = min(ticks[0], min(ys)), max(ticks[-1], max(ys))
+    low, high = min(ys), max(ys)
+    if high - low <= 1e-6 * max(abs(low), abs(high), 1.0):  # a run of one epoch
+        low, high = low - 0.5, high + 0.5
+    ticks = _ticks(low, high)
+    y0, y1 = min(ticks[0], low), max(ticks[-1], high)
     wide, high = _WIDTH - _LEFT - _PEN - _LETTER * max(map(len, series)), _HEIGHT - _TOP - _BOTTOM
 
     def place(x: float, y: float) -> tuple[float, float]:

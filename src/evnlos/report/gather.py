@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evnlos.dataset import PARADIGMS, Dataset, open_dataset
+from evnlos.dataset import Dataset, modality_order, open_dataset
 from evnlos.errors import DataError
 from evnlos.evaluation import Evaluation, available_lpips, evaluate
-from evnlos.model import JointNetwork, load_weights, published
+from evnlos.model import load_weights, published
 
 METHODS = ("simulation only", "E2E", "EPNP")
 
@@ -21,8 +21,8 @@ class RunResult:
 
     Args:
         name: The run's folder name, a weights file's stem, or the name of published weights.
-        paradigm: "frame", "event" or "fusion".
-        is_joint: Whether it sees whole passes.
+        modality: Name of what it sees.
+        sees_sequence: Whether it sees whole sequences.
         method: "simulation only" (pre-trained, no capture seen), "E2E" (captures alone) or "EPNP" (both).
         evaluation: Pictures and scores on the split.
         log: One record an epoch.
@@ -31,8 +31,8 @@ class RunResult:
     """
 
     name: str
-    paradigm: str
-    is_joint: bool
+    modality: str
+    sees_sequence: bool
     method: str
     evaluation: Evaluation
     log: list[dict[str, Any]]
@@ -41,12 +41,12 @@ class RunResult:
 
     @property
     def kind(self) -> str:
-        """What is compared with its like: the paradigm, and whether whole passes are seen."""
-        return f"joint {self.paradigm}" if self.is_joint else self.paradigm
+        """What is compared with its like: the modality, and whether whole sequences are seen."""
+        return f"sequence {self.modality}" if self.sees_sequence else self.modality
 
 
 def gather(runs: list[str | Path], data: str | Path, split: str = "test") -> tuple[Dataset, list[RunResult]]:
-    """Evaluate runs on one split of a dataset, ordered by method and paradigm.
+    """Evaluate runs on one split of a dataset, ordered by method and modality.
 
     Raises:
         DataError: No run is given, a run has not ended, or a run was trained on objects of the split.
@@ -61,9 +61,9 @@ def gather(runs: list[str | Path], data: str | Path, split: str = "test") -> tup
         lines = _log_of(run)
         refuse_seen(weights.history, dataset, split)
         evaluation = evaluate(weights, dataset, split, available_lpips())
-        kind = (weights.paradigm, isinstance(weights.network, JointNetwork), method_of(weights.history))
+        kind = (weights.modality.name, weights.network.sees_sequence, method_of(weights.history))
         results.append(RunResult(name, *kind, evaluation, lines, weights.history, is_published))
-    results.sort(key=lambda r: (METHODS.index(r.method), r.is_joint, PARADIGMS.index(r.paradigm)))  # type: ignore[arg-type]
+    results.sort(key=lambda r: (METHODS.index(r.method), r.sees_sequence, modality_order(r.modality)))
     return dataset, results
 
 
@@ -73,7 +73,27 @@ def _log_of(run: Path) -> list[dict[str, Any]]:
     log = folder / "metrics.jsonl"
     if not log.is_file() or not (run.is_dir() or run.stem == "weights"):
         return []
-    return [json.loads(line) for line in log.read_text().splitlines()]
+    try:
+        return [_record(json.loads(line)) for line in log.read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(
+            f"{log} is not a training log ({' '.join(str(error).split())[:160]}); delete it"
+        ) from None
+
+
+def _record(line: object) -> dict[str, Any]:
+    """Return one epoch of a training log.
+
+    Raises:
+        ValueError: It is none, or its epoch or a score is no finite number.
+    """
+    if not isinstance(line, dict) or "epoch" not in line:
+        raise ValueError("a line without an epoch")
+    for name in ("epoch", "loss", "learning_rate", "seconds", "psnr_db", "zero_db"):
+        value = line.get(name, 0)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e300:
+            raise ValueError(f"{name} is {str(value)[:40]!r}")
+    return line
 
 
 def named(run: Path) -> tuple[str, bool]:

@@ -19,10 +19,10 @@ _WORDS = {
         "fallen by a set share. It comes as a time surface, a map of how lately each pixel last reported.",
     ),
     "fusion": ("fusion", "the network sees both, frames and events, and joins them."),
-    "joint": (
-        "joint (whole pass)",
-        "the network sees all positions of one pass of the object together and draws the object once; without "
-        "the word it sees a single position. The motion of the object must be known.",
+    "sequence": (
+        "sequence",
+        "the network sees all time steps of one pass of the object together and draws the object once; without "
+        "the word it sees a single time step. The motion of the object must be known.",
     ),
     "psnr_db": (
         "PSNR",
@@ -76,7 +76,7 @@ class Glossary:
         return f"<a href='#word-{key}'>{shown}</a>"
 
     def label(self, words: str) -> str:
-        """Return a run's heading, such as "EPNP joint frame", with each word in it linked at its first use."""
+        """Return a run's heading, such as "EPNP sequence frame", with each word linked at its first use."""
         rest = words.replace("simulation only", "simulation", 1).split(" ")
         long = {"simulation": "simulation only"}
         return " ".join(self.link(one.lower(), long.get(one, one)) for one in rest)

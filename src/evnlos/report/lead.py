@@ -6,7 +6,7 @@ import html
 
 import numpy as np
 
-from evnlos.dataset import PARADIGMS
+from evnlos.dataset import modality_order
 from evnlos.evaluation import BASELINES
 from evnlos.evaluation.intervals import Interval, paired_difference
 from evnlos.report.gather import METHODS, RunResult
@@ -19,8 +19,8 @@ _WIDTH, _LEFT, _RIGHT, _BAR, _GAP, _GROUP = 760, 150, 60, 17, 3, 16
 def gains_of(results: list[RunResult]) -> dict[str, Interval]:
     """Return for each kind of network PSNR of EPNP minus E2E, dB, with a 95 % interval over the objects.
 
-    A kind is what a network sees: a paradigm, position by position or whole passes. Runs of one method and kind
-    (seeds) are averaged.
+    A kind is what a network sees: a modality, time step by time step or whole sequences. Runs of one method
+    and kind (seeds) are averaged.
     """
     found = {}
     for kind in _kinds(results):
@@ -49,7 +49,7 @@ def lead(results: list[RunResult]) -> str:
 
 def _kinds(results: list[RunResult]) -> list[str]:
     """Return the kinds of network that there are, single positions first."""
-    order = sorted(results, key=lambda r: (r.is_joint, PARADIGMS.index(r.paradigm)))  # type: ignore[arg-type]
+    order = sorted(results, key=lambda r: (r.sees_sequence, modality_order(r.modality)))
     return list(dict.fromkeys(r.kind for r in order))
 
 

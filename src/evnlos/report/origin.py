@@ -11,16 +11,18 @@ import torch
 import yaml
 
 from evnlos.dataset import Dataset
-from evnlos.evaluation.identify_source import Described
 from evnlos.report.commands import Commands
 from evnlos.report.gather import RunResult
+from evnlos.setups import NamedSetup
 from evnlos.version import __version__
 
 _MOST_NAMES = 60  # of objects that are listed one by one; a simulation has hundreds
 _PACKAGES = ("torch", "numpy", "numba", "h5py", "Pillow")
 
 
-def origin_section(dataset: Dataset, results: list[RunResult], split: str, rig: Described | None = None) -> str:
+def origin_section(
+    dataset: Dataset, results: list[RunResult], split: str, rig: NamedSetup | None = None
+) -> str:
     """Return the section of environment, commands and settings; `rig` is the one that was named."""
     commands = Commands(dataset, results, split, rig)
     parts = [

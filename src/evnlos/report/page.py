@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from evnlos.config import write_atomically
 from evnlos.dataset import Dataset, character_of, read_shard
 from evnlos.evaluation import CHECKS
 from evnlos.evaluation.identify import Identification
-from evnlos.evaluation.identify_source import Described
 from evnlos.events.colours import WORDS
+from evnlos.files import write_atomically
 from evnlos.report.belief import belief_section
 from evnlos.report.curves import curves_svg
 from evnlos.report.films import animations_section, failures_section, strips_section
@@ -32,6 +31,7 @@ from evnlos.report.tables import (
     rows_of,
     to_csv,
 )
+from evnlos.setups import NamedSetup
 from evnlos.version import __version__
 
 _STYLE = Path(__file__).parent / "style.css"
@@ -43,7 +43,7 @@ def write_report(
     results: list[RunResult],
     notes: list[str],
     split: str = "test",
-    rig: Described | None = None,
+    rig: NamedSetup | None = None,
     limits: Identification | None = None,
 ) -> Path:
     """Write the report and, beside it, its numbers as CSV.
@@ -69,7 +69,7 @@ def write_report(
             "<meta name=viewport content='width=device-width,initial-scale=1'>",
             f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
             _head(dataset, results, notes, split, words),
-            setup_section(rig.name if rig else "", rig.transport if rig else None),
+            setup_section(rig.name if rig else "", rig.setup if rig else None),
             lead(results),
             *(_table(results, metric, *about, words) for metric, about in metrics.items()),
             _checks(results),

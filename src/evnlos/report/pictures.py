@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from evnlos.config import write_atomically
 from evnlos.events.colours import OFF_RGB, ON_RGB
+from evnlos.files import write_atomically
 
 
 def grey(image: ArrayLike, low: float = 0.0, high: float = 1.0) -> NDArray[np.uint8]:

@@ -8,28 +8,29 @@ import numpy as np
 import torch
 
 from evnlos.evaluation.identify import Identification
-from evnlos.evaluation.identify_rig import AnyTransport
-from evnlos.plot.rig import PARTITION, rig_drawing
+from evnlos.plot.rig import PARTITION, setup_drawing
 from evnlos.report.curves import curves_svg
 from evnlos.report.pictures import data_uri, grey, png
-from evnlos.transport import MeasuredTransport
+from evnlos.setups import Setup
 
 _LOWEST = 1e-3
 
 
-def setup_section(name: str, rig: AnyTransport | None, travel_m: float = 0.16, plate_m: float = 0.08) -> str:
+def setup_section(name: str, rig: Setup | None, travel_m: float = 0.16, plate_m: float = 0.08) -> str:
     """Return the section that shows the rig; without one, how to have it shown."""
     head = "<h2>The set-up</h2>"
     if rig is None:
         said = "The rig is not known to this page; <code>evnlos report --rig RIG.yaml</code> draws it."
         return f"{head}<p class=dim>{said}</p>"
-    if isinstance(rig, MeasuredTransport):
-        return f"{head}<p>The rig {html.escape(name)} was measured cell by cell; it has no drawing.</p>"
+    drawing = setup_drawing(rig, travel_m, plate_m)
+    if drawing is None:
+        words = html.escape(f"{name}: {rig.describe()}")
+        return f"{head}<p>{words}. Where its parts stand is not known, so it has no drawing.</p>"
     told = (
         "An object moves around the corner. Its light falls on the relay wall, which scatters it; two cameras "
         "watch the wall and never see the object."
     )
-    drawn = rig_drawing(rig, travel_m, plate_m).svg
+    drawn = drawing.svg
     hides = (
         " What hides the object is not among the settings of the rig: the dotted line is a sketch."
         if PARTITION in drawn

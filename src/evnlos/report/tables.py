@@ -1,4 +1,4 @@
-"""The table in the shape of the paper's: objects x (near, far) x paradigm x (E2E, EPNP), as rows and as CSV."""
+"""The table in the shape of the paper's: objects x (near, far) x modality x (E2E, EPNP), as rows and as CSV."""
 
 from __future__ import annotations
 
@@ -62,8 +62,9 @@ def rows_of(results: list[RunResult], metric: str) -> list[tuple[str, str, list[
 
 def available_metrics(results: list[RunResult]) -> dict[str, tuple[str, str, int]]:
     """Return the metrics that every run has: name -> (title, unit, decimals)."""
-    with_lpips = all(r.evaluation.scores.lpips is not None for r in results)
-    return METRICS | ({"lpips": ("LPIPS (VGG)", "", 3)} if with_lpips else {})
+    every = METRICS | {"lpips": ("LPIPS (VGG)", "", 3)}
+    scores = [r.evaluation.scores for r in results]
+    return {name: about for name, about in every.items() if all(getattr(s, name) is not None for s in scores)}
 
 
 def to_csv(results: list[RunResult]) -> str:

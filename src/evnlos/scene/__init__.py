@@ -13,10 +13,10 @@ from evnlos.scene.glyph_sets import (
     ObjectId,
     Plate,
 )
-from evnlos.scene.glyphs import DIGITS, UPPER_CASE, fit_to_plate, render_glyph
+from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, fit_to_plate, render_glyph
 from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, Strokes, hand, held_out_writers, nist_like
 from evnlos.scene.ink import pen_width
-from evnlos.scene.motion import LineMotion, Motion, PathMotion
+from evnlos.scene.motion import LineMotion, Motion, PathMotion, Pose
 from evnlos.scene.nist_sd19 import Handwritten, list_sd19, read_sd19
 from evnlos.scene.scene import Scene
 from evnlos.scene.target import Target
@@ -40,9 +40,11 @@ __all__ = [
     "ObjectId",
     "PathMotion",
     "Plate",
+    "Pose",
     "Scene",
     "Strokes",
     "Target",
+    "character_name",
     "drawing",
     "find_font",
     "fit_to_plate",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,9 +11,26 @@ from numpy.typing import ArrayLike, NDArray
 from evnlos.errors import DataError
 
 
+class Pose(NamedTuple):
+    """Where a target is and how it is turned, at some times of shape [...]."""
+
+    x_m: NDArray[np.float64]
+    """To the right, metres, [...]."""
+    y_m: NDArray[np.float64]
+    """Downwards, metres, [...]."""
+    z_m: NDArray[np.float64]
+    """Distance from the wall, metres, [...]; NaN where the motion leaves it to the setup."""
+    rotation_rad: NDArray[np.float64]
+    """Turn about the wall's normal, clockwise as the camera's rows and columns run, radians, [...]."""
+
+
 @runtime_checkable
 class Motion(Protocol):
-    """Anything that knows where the plate's centre is at every instant."""
+    """Anything that knows where the plate's centre is at every instant.
+
+    The distance of the target and its pose belong to the scene: a motion that knows them has a method
+    `pose(t_s) -> Pose` too. Without one it stays upright in one plane, at the distance that is the setup's.
+    """
 
     def position_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """Return the centre (x, y) at times `t_s` (seconds, any shape [...]), metres, float64 [..., 2]."""
@@ -22,6 +39,27 @@ class Motion(Protocol):
     def speed_bound_m_s(self, start_s: float, stop_s: float) -> float:
         """Return an upper bound of the speed between two times (seconds), metres a second."""
         ...
+
+
+def pose_of(motion: Motion, t_s: ArrayLike) -> Pose:
+    """Return the pose of a motion at times `t_s`; one that knows no pose rests upright at the setup's distance.
+
+    Args:
+        motion: The motion.
+        t_s: Times, seconds, any shape [...].
+    """
+    pose: Any = getattr(motion, "pose", None)
+    return _upright(motion.position_m(t_s), None) if pose is None else pose(t_s)
+
+
+def _upright(position_m: NDArray[np.float64], z_m: float | None) -> Pose:
+    x, y = position_m[..., 0], position_m[..., 1]
+    return Pose(x, y, np.full(x.shape, np.nan if z_m is None else z_m), np.zeros(x.shape))
+
+
+def _check_distance(name: str, z_m: float | None) -> None:
+    if z_m is not None and not (np.isfinite(z_m) and z_m > 0):
+        raise DataError(f"{name}.z_m is {z_m}; give the metres from target to wall, above 0, or None")
 
 
 def _times(t_s: ArrayLike) -> NDArray[np.float64]:
@@ -44,6 +82,7 @@ class LineMotion:
         speed_m_s: Speed, metres a second, 0 or more.
         direction: Direction (x, y) of any length above 0.
         start_s: Time at which the centre is at `start_m`, seconds.
+        z_m: Distance from target to wall, metres, above 0; None is the setup's own.
 
     Raises:
         DataError: A value is not finite, the speed is negative or the direction has no length.
@@ -57,6 +96,7 @@ class LineMotion:
     speed_m_s: float = 0.02
     direction: tuple[float, float] = (1.0, 0.0)
     start_s: float = 0.0
+    z_m: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("start_m", "direction"):
@@ -70,6 +110,11 @@ class LineMotion:
             raise DataError("LineMotion.direction is (0, 0); give a direction with a length")
         if not np.isfinite(self.start_s):
             raise DataError(f"LineMotion.start_s is {self.start_s}; give finite seconds")
+        _check_distance("LineMotion", self.z_m)
+
+    def pose(self, t_s: ArrayLike) -> Pose:
+        """Return the pose at times `t_s` (seconds, any shape [...]): constant distance, no rotation."""
+        return _upright(self.position_m(t_s), self.z_m)
 
     def position_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """Return the centre (x, y) at times `t_s` (seconds, any shape [...]), metres, float64 [..., 2]."""
@@ -92,6 +137,7 @@ class PathMotion:
     Args:
         times_s: Times of the points, seconds, strictly increasing, two or more.
         points_m: Centres (x, y) at these times, metres, one pair a time.
+        z_m: Distance from target to wall, metres, above 0; None is the setup's own.
 
     Raises:
         DataError: Fewer than two points, unequal lengths, times that do not increase, or values not finite.
@@ -105,6 +151,7 @@ class PathMotion:
 
     times_s: tuple[float, ...]
     points_m: tuple[tuple[float, float], ...]
+    z_m: float | None = None
 
     def __post_init__(self) -> None:
         times = np.asarray(self.times_s, dtype=np.float64)
@@ -121,6 +168,11 @@ class PathMotion:
             raise DataError("PathMotion.times_s does not increase; give each time once, in order")
         object.__setattr__(self, "times_s", tuple(times.tolist()))
         object.__setattr__(self, "points_m", tuple((x, y) for x, y in points.tolist()))
+        _check_distance("PathMotion", self.z_m)
+
+    def pose(self, t_s: ArrayLike) -> Pose:
+        """Return the pose at times `t_s` (seconds, any shape [...]): constant distance, no rotation."""
+        return _upright(self.position_m(t_s), self.z_m)
 
     def position_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """Return the centre (x, y) at times `t_s` (seconds, any shape [...]), metres, float64 [..., 2]."""

@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from evnlos.errors import DataError
 from evnlos.scene.glyphs import DIGITS, UPPER_CASE
+from evnlos.untrusted import open_image
 
 _MAX_SIDE = 1024  # the official images have 128 pixels a side
 
@@ -87,7 +87,7 @@ def read_sd19_image(path: str | Path) -> NDArray[np.float32]:
         DataError: The file is no image, or larger than any of the database.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if max(image.size) > _MAX_SIDE:
                 raise DataError(
                     f"{path} is {image.size[0]} x {image.size[1]} pixels; NIST SD19 images are 128 x 128"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import DataError
-from evnlos.scene.motion import LineMotion, Motion
+from evnlos.scene.motion import LineMotion, Motion, Pose, pose_of
 from evnlos.scene.target import Target
 from evnlos.types import Plane
 
@@ -44,6 +44,10 @@ class Scene:
         if n < 1:
             raise DataError(f"n is {n}; ask for 1 position or more")
         return np.arange(1, n + 1) * self.duration_s / n
+
+    def pose(self, t_s: ArrayLike) -> Pose:
+        """Return x, y, z and rotation of the target at times `t_s` (seconds, any shape [...])."""
+        return pose_of(self.motion, t_s)
 
     def truth(self, plane: Plane, t_s: ArrayLike) -> NDArray[np.float32]:
         """Return the target at times `t_s` (seconds, [] or [N]) on a plane, float32 [H, W] or [N, H, W]."""

@@ -19,20 +19,13 @@ from evnlos.sensor._exact_pass import (
     respond,
 )
 from evnlos.sensor._exact_send import send_events
-
-
-@njit(cache=True, error_model="numpy")
-def _grown(column):
-    """Return a copy of a column with twice its length."""
-    longer = np.empty(2 * len(column), column.dtype)
-    longer[: len(column)] = column
-    return longer
+from evnlos.sensor._order import grown
 
 
 @njit(cache=True, error_model="numpy")
 def _run_tile(
     out, count, frames, origin, times, first, last, light, filtered, base, last_event, candidate, drawn, sent,
-    on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
+    on, off, leak, rate_on, rate_off, rate_hot, rate, curve, refractory, jitter, window, seed,
 ):  # fmt: skip
     """Run the pixels first..last - 1 through all steps of a block; see `run_tiles`."""
     out_time, out_pixel, out_on = out
@@ -44,6 +37,7 @@ def _run_tile(
     now[0], now[2], now[3] = light[first:last], filtered[first:last], base[first:last]
     log_row(now[0], now[1])
     gain = np.empty(size)
+    twice = 2.0 * curve.floor
     my_on, my_off, my_leak = on[first:last], off[first:last], leak[first:last]
     state = np.empty(3)
     soonest = np.inf
@@ -51,14 +45,14 @@ def _run_tile(
         soonest = candidate[first:last].min()
     for k in range(len(frames)):
         start, stop = times[k], times[k + 1]
-        copy_light(frames[k, first - origin : last - origin], then[0])
+        copy_light(frames[k, first - origin : last - origin], curve, then[0])
         log_row(then[0], then[1])
         fall(now[3], my_leak, stop - start, then[3])
         if rate > 0.0:
             half = 0.5 * rate * (stop - start)
-            gain_of(now[0], then[0], half, gain)
-            respond(now[0], then[0], now[1], then[1], gain, now[2], half, then[2])
-            flag_filtered(now, then, my_leak, half, stop - start, my_on, my_off, flags[:size])
+            gain_of(now[0], then[0], half, twice, gain)
+            respond(now[0], then[0], now[1], then[1], gain, now[2], half, twice, then[2])
+            flag_filtered(now, then, my_leak, half, twice, stop - start, my_on, my_off, flags[:size])
         else:
             then[2] = then[1]
             flag_direct(now, then, my_leak, stop - start, my_on, my_off, flags[:size])
@@ -69,11 +63,11 @@ def _run_tile(
         while at < size:
             count, at = send_events(
                 out_time, out_pixel, out_on, count, at, flag_words, flags, now, then, start, stop, first,
-                last_event, candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate,
+                last_event, candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, curve,
                 refractory, jitter, window, seed, state,
             )  # fmt: skip
             if at < size:
-                out_time, out_pixel, out_on = _grown(out_time), _grown(out_pixel), _grown(out_on)
+                out_time, out_pixel, out_on = grown(out_time), grown(out_pixel), grown(out_on)
         if soonest < stop:
             soonest = candidate[first:last].min()
         now, then = then, now
@@ -84,21 +78,22 @@ def _run_tile(
 @njit(cache=True, error_model="numpy", nogil=True)
 def run_tiles(
     frames, origin, times, first, last, tile_px, light, filtered, base, last_event, candidate, drawn, sent,
-    on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
+    on, off, leak, rate_on, rate_off, rate_hot, rate, curve, refractory, jitter, window, seed,
 ):  # fmt: skip
     """Run the pixels first..last - 1 through all steps of a block, tile by tile, and return what they sent.
 
     `frames` [T, M] light in DN of the pixels origin..origin + M - 1 at times[1:]; `times` [T + 1] seconds;
-    then [N] state (`light` DN, `filtered`, `base`, `last_event` s, next shot-noise `candidate` s, counters
-    `drawn`, `sent`) and constants of the pixels (thresholds, `leak` in log units/s, noise rates in hertz).
-    `rate` is 2 pi fc / 275, 0 = no filter. Returns three columns: time stamp in microseconds, pixel, polarity.
+    then [N] state (`light` on the scale of `curve`, `filtered`, `base`, `last_event` s, next shot-noise
+    `candidate` s, counters `drawn`, `sent`) and constants of the pixels (thresholds, `leak` in log units/s,
+    noise rates in hertz). `rate` is the filter's speed per unit of the kernels' light, 0 = no filter; `curve`
+    is a `Curve`. Returns three columns: time stamp in microseconds, pixel, polarity.
     """
     out = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_)
     count = 0
     for start in range(first, last, tile_px):
         out, count = _run_tile(
             out, count, frames, origin, times, start, min(start + tile_px, last), light, filtered, base,
-            last_event, candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, refractory,
-            jitter, window, seed,
+            last_event, candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, curve,
+            refractory, jitter, window, seed,
         )  # fmt: skip
     return out[0][:count], out[1][:count], out[2][:count]

@@ -19,9 +19,9 @@ LONGEST_TAU = 1.0
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def is_smooth(light_0, light_1, log_0, log_1, half):
+def is_smooth(light_0, light_1, log_0, log_1, half, twice):
     """Return whether the light of a step bends so little, and the step is so short, that a cubic will do."""
-    tau = half * (light_0 + light_1 + 40.0)
+    tau = half * (light_0 + light_1 + twice)
     return abs(log_1 - log_0) <= STRIDE and tau <= LONGEST_TAU and (light_0 < KNEE) == (light_1 < KNEE)
 
 

@@ -9,10 +9,32 @@ piece the bend of L is added to second order.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from numba import njit
 
 from evnlos.sensor._fast_math import fast_exp, fast_log
+
+
+class Curve(NamedTuple):
+    """How light I in DN becomes the kernels' light J = scale I + offset, and what depends on I itself.
+
+    The log light is ln J above J = 20 and a line below; J never is below 20 for a true logarithm, which is how
+    one set of kernels has both. The filter's speed is rate (J + floor), and J = stretch (I' + dark) with I' the
+    light at the pixel.
+    """
+
+    scale: float
+    """J per DN of the light."""
+    offset: float
+    """J in darkness."""
+    floor: float
+    """What the filter's speed adds to J."""
+    stretch: float
+    """J per DN at the pixel."""
+    dark: float
+    """Light in darkness, DN at the pixel."""
+
 
 KNEE = 20.0
 LOG_KNEE = math.log(KNEE)

@@ -24,10 +24,10 @@ def log_row(row, logs):
 
 
 @njit(cache=True, error_model="numpy")
-def copy_light(row, light):
-    """Take over a row of light in double precision."""
+def copy_light(row, curve, light):
+    """Take over a row of light in double precision, on the pixel's own scale."""
     for i in range(len(row)):
-        light[i] = np.float64(row[i])
+        light[i] = curve.scale * np.float64(row[i]) + curve.offset
 
 
 @njit(cache=True, error_model="numpy")
@@ -38,17 +38,17 @@ def fall(base, leak, length, base_1):
 
 
 @njit(cache=True, error_model="numpy")
-def gain_of(light_0, light_1, half, gain):
-    """Fill 1 - exp(-tau), tau being the step in the filter's own time."""
+def gain_of(light_0, light_1, half, twice, gain):
+    """Fill 1 - exp(-tau), tau being the step in the filter's own time; `twice` is twice the curve's floor."""
     for i in range(len(gain)):
-        gain[i] = 1.0 - fast_exp(-half * (light_0[i] + light_1[i] + 40.0))
+        gain[i] = 1.0 - fast_exp(-half * (light_0[i] + light_1[i] + twice))
 
 
 @njit(cache=True, error_model="numpy")
-def respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, filtered_1):
+def respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, twice, filtered_1):
     """Fill the filter's output after one step on which the log light is a line in the filter's own time."""
     for i in range(len(gain)):
-        tau = half * (light_0[i] + light_1[i] + 40.0)
+        tau = half * (light_0[i] + light_1[i] + twice)
         before = filtered_0[i]
         change = logs_1[i] - logs_0[i]
         inverse = 1.0 / tau
@@ -57,12 +57,12 @@ def respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, filtered_1
 
 
 @njit(cache=True, error_model="numpy")
-def flag_filtered(now, then, leak, half, length, on, off, flags):
+def flag_filtered(now, then, leak, half, twice, length, on, off, flags):
     """Flag the pixels that may have met a threshold, or whose light bent too much for one line."""
     light_0, logs_0, filtered_0, base = now[0], now[1], now[2], now[3]
     light_1, logs_1, filtered_1 = then[0], then[1], then[2]
     for i in range(len(leak)):
-        tau = half * (light_0[i] + light_1[i] + 40.0)
+        tau = half * (light_0[i] + light_1[i] + twice)
         drift = leak[i] * length
         slope_0 = tau * (logs_0[i] - filtered_0[i]) + drift
         slope_1 = tau * (logs_1[i] - filtered_1[i]) + drift

@@ -80,12 +80,12 @@ def _piece(
     `state` (reference, last event, next candidate of shot noise) is updated; returns the fill of the columns
     and the filter's output at the end of the piece.
     """
-    on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, seed = constants
+    on, off, leak, rate_on, rate_off, rate_hot, rate, curve, refractory, seed = constants
     gradient = (light_b - light_a) / length
-    speed, curve = rate * (light_a + 20.0), 0.5 * rate * gradient
+    speed, growth = rate * (light_a + curve.floor), 0.5 * rate * gradient
     arrival = log_b
     if rate > 0.0:
-        kind, end = LOW_PASS, length * (speed + curve * length)
+        kind, end = LOW_PASS, length * (speed + growth * length)
         per_tau = (log_b - log_a) / end
         a, b, c = log_a - per_tau, per_tau + leak * length / end, filtered - log_a + per_tau
         decay = fast_exp(-end)
@@ -111,11 +111,11 @@ def _piece(
             break  # as most pieces end after their one event
         limit = end
         if shot_due:
-            limit = max(now, candidate * (speed + curve * candidate) if kind == LOW_PASS else candidate)
+            limit = max(now, candidate * (speed + growth * candidate) if kind == LOW_PASS else candidate)
         if ready >= length:
             now = end
         elif ready > 0.0:
-            begin = ready * (speed + curve * ready) if kind == LOW_PASS else ready
+            begin = ready * (speed + growth * ready) if kind == LOW_PASS else ready
             if begin > now:
                 now, stale = begin, True
         x, sign = limit, 0
@@ -137,7 +137,7 @@ def _piece(
         if sign != 0:
             moment = x
             if kind == LOW_PASS:
-                moment = 2.0 * x / (speed + math.sqrt(max(speed * speed + 4.0 * curve * x, 0.0)))
+                moment = 2.0 * x / (speed + math.sqrt(max(speed * speed + 4.0 * growth * x, 0.0)))
             moment = min(moment, length)
             state[0] += on if sign > 0 else -off
             if x > now:
@@ -147,7 +147,7 @@ def _piece(
                 out_time, out_pixel, out_on, count, start + moment, pixel, sign > 0, jitter, window, seed, sent
             )
         elif shot_due:
-            light = light_a + gradient * candidate
+            light = (light_a + gradient * candidate) / curve.stretch - curve.dark
             choice = _shot(seed, pixel, drawn[pixel], light, rate_on, rate_off, rate_hot)
             drawn[pixel] += 1
             total = (rate_on + rate_off) * DIM_MAX + rate_hot
@@ -223,8 +223,8 @@ def _cubic(
 @_owns_nothing
 def send_events(
     out_time, out_pixel, out_on, count, begin, flag_words, flags, now, then, start, stop, first, last_event,
-    candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, refractory, jitter, window, seed,
-    state,
+    candidate, drawn, sent, on, off, leak, rate_on, rate_off, rate_hot, rate, curve, refractory, jitter, window,
+    seed, state,
 ):  # fmt: skip
     """Send the events of a tile's flagged pixels in one step, from pixel `begin` of the tile on.
 
@@ -246,12 +246,12 @@ def send_events(
             light_0, light_1, filtered_0, arrival = now[0, i], then[0, i], now[2, i], then[2, i]
             fall = leak[pixel] * length
             rise = arrival - filtered_0 + fall
-            slope_0 = pace * (light_0 + 20.0) * (now[1, i] - filtered_0) + fall
-            slope_1 = pace * (light_1 + 20.0) * (then[1, i] - arrival) + fall
+            slope_0 = pace * (light_0 + curve.floor) * (now[1, i] - filtered_0) + fall
+            slope_1 = pace * (light_1 + curve.floor) * (then[1, i] - arrival) + fall
             if (
                 plain
                 and state[2] >= stop
-                and is_smooth(light_0, light_1, now[1, i], then[1, i], 0.5 * pace)
+                and is_smooth(light_0, light_1, now[1, i], then[1, i], 0.5 * pace, 2.0 * curve.floor)
                 and is_monotone(rise, slope_0, slope_1)
             ):
                 filled = _cubic(
@@ -261,7 +261,7 @@ def send_events(
             else:
                 constants = (
                     on[pixel], off[pixel], leak[pixel], rate_on[pixel], rate_off[pixel], rate_hot[pixel],
-                    rate, refractory, seed,
+                    rate, curve, refractory, seed,
                 )  # fmt: skip
                 filled, arrival = _step(
                     out_time, out_pixel, out_on, count, pixel, start, stop, light_0, light_1, now[1, i],

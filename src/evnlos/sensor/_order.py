@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 _DENSE_LIMIT = 1 << 20
+
+
+@njit(cache=True, error_model="numpy")
+def grown(column: NDArray) -> NDArray:
+    """Return a copy of a column with twice its length."""
+    longer = np.empty(2 * len(column), column.dtype)
+    longer[: len(column)] = column
+    return longer
 
 
 @njit(cache=True, nogil=True)
@@ -144,6 +154,15 @@ def sort_times(time_us: NDArray, pixel: NDArray, on: NDArray) -> Columns:
         columns = time_us[rank], pixel[rank], on[rank]
     settle_ties(*columns)
     return columns
+
+
+def joined(tiles: Sequence[Columns]) -> Columns:
+    """Return the columns of several shares of pixels one after the other."""
+    return (
+        np.concatenate([tile[0] for tile in tiles]),
+        np.concatenate([tile[1] for tile in tiles]),
+        np.concatenate([tile[2] for tile in tiles]),
+    )
 
 
 def join(blocks: list[Columns]) -> Columns:

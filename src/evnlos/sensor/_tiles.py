@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -15,15 +15,39 @@ from numpy.typing import NDArray
 from evnlos.errors import ConfigError
 from evnlos.sensor._checks import check_threshold_maps
 from evnlos.sensor._random import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_ON, normal_field
-from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
+from evnlos.sensor.pixel import MIN_THRESHOLD
 from evnlos.threads import cores
 
 _T = TypeVar("_T")
 _SHARES = 8
 
 
+class ContrastSettings(Protocol):
+    """Settings of pixels with thresholds of their own."""
+
+    @property
+    def threshold_on(self) -> float:
+        """Mean threshold of ON events, log units."""
+        ...
+
+    @property
+    def threshold_off(self) -> float:
+        """Mean threshold of OFF events, log units."""
+        ...
+
+    @property
+    def threshold_sigma(self) -> float:
+        """Standard deviation of both over the pixels, log units."""
+        ...
+
+    @property
+    def pattern_seed(self) -> int | None:
+        """Seed of the sensor; None = that of the recording."""
+        ...
+
+
 def pixel_thresholds(
-    pixel: EventPixel, shape: tuple[int, int], seed: int, thresholds: object
+    pixel: ContrastSettings, shape: tuple[int, int], seed: int, thresholds: object
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return each pixel's thresholds (on, off), float64 [H * W], log units: given, or drawn and clamped."""
     if thresholds is not None:
@@ -37,10 +61,15 @@ def pixel_thresholds(
     ):
         field = np.full(count, float(nominal))
         if pixel.threshold_sigma > 0:
-            field += pixel.threshold_sigma * normal_field(np.uint64(seed), stream, count)
+            field += pixel.threshold_sigma * normal_field(pattern_key(pixel, seed), stream, count)
             np.maximum(field, MIN_THRESHOLD, out=field)
         drawn.append(field)
     return drawn[0], drawn[1]
+
+
+def pattern_key(pixel: ContrastSettings, seed: int) -> np.uint64:
+    """Return the seed of what belongs to the sensor: the pixel's own, or that of the recording."""
+    return np.uint64(seed if pixel.pattern_seed is None else pixel.pattern_seed)
 
 
 def check_tiling(tile_px: int, threads: int | None) -> tuple[int, int]:

@@ -15,7 +15,8 @@ from evnlos.sensor._checks import check_threshold_maps, check_times
 from evnlos.sensor._random import check_seed
 from evnlos.sensor._torch_light import Clips, check_range
 from evnlos.sensor._torch_v2e import Pixels, default_tile
-from evnlos.sensor.pixel import EventPixel
+from evnlos.sensor.event_model import PixelSettings
+from evnlos.sensor.pixel import EventPixel, V2ePixel, in_mode
 from evnlos.types import Events
 
 _GROUP_CPU, _GROUP_DEVICE = 1 << 20, 1 << 24
@@ -60,7 +61,7 @@ def check_seeds(seeds: int | Sequence[int], count: int) -> list[int]:
 def run_batch(
     clips: ArrayLike | Tensor,
     times_s: ArrayLike | Tensor,
-    pixel: EventPixel,
+    pixel: EventPixel | V2ePixel,
     seeds: int | Sequence[int],
     thresholds: tuple[ArrayLike, ArrayLike] | None,
     device: torch.device | str | None,
@@ -68,7 +69,7 @@ def run_batch(
     tile_px: int | None,
 ) -> list[Events]:
     """Return the events of each clip; see `simulate_batch`."""
-    check_pixel(pixel)
+    pixel = stepped(pixel)
     if dtype not in (torch.float32, torch.float64):
         raise ConfigError(f"dtype is {dtype}; give torch.float64 or torch.float32")
     light = check_clips(clips, device)
@@ -99,9 +100,8 @@ def run_batch(
     return events
 
 
-def check_pixel(pixel: EventPixel) -> None:
-    """Refuse a pixel that this mode has not."""
-    if not isinstance(pixel, EventPixel):
-        raise ConfigError(f"pixel is {type(pixel).__name__}; give an EventPixel")
-    if pixel.hot_pixel_fraction > 0 or pixel.jitter_s > 0:
-        raise ConfigError('mode="v2e" has no hot pixels and no jitter; set them to 0 or use mode="exact"')
+def stepped(pixel: PixelSettings) -> V2ePixel:
+    """Return the pixel that is stepped here, refusing one that v2e has not."""
+    found = in_mode(pixel, "v2e")
+    assert isinstance(found, V2ePixel)
+    return found

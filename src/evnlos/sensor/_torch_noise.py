@@ -27,16 +27,17 @@ class Leak:
 
     Args:
         seeds: Seed of each clip.
+        patterns: Seed of each clip's sensor.
         on: ON thresholds, float64 [clips, pixels].
         scales: Leak rate times duration of each step, float32 [clips, steps].
     """
 
-    def __init__(self, seeds: list[int], on: Tensor, scales: Tensor) -> None:
+    def __init__(self, seeds: list[int], patterns: list[int], on: Tensor, scales: Tensor) -> None:
         clips, self._pixels = on.shape
         device = on.device
         factor = torch.empty(clips, self._pixels, dtype=torch.float32, device=device)
         fill(
-            factor, "normal", seeds, STREAM_LEAK_RATE,
+            factor, "normal", patterns, STREAM_LEAK_RATE,
             lambda normal, clip, part: torch.pow(10.0, normal.mul_(0.1)).mul_(on[clip, part]),
         )  # fmt: skip
         self._factor = factor.view(-1)

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.sensor._random import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_ON
+from evnlos.sensor._tiles import pattern_key
 from evnlos.sensor._torch_light import Blocks, Filter, lin_log
 from evnlos.sensor._torch_noise import Leak, ShotNoise
 from evnlos.sensor._torch_order import Sent, events_in_order
 from evnlos.sensor._torch_random import fill
 from evnlos.sensor._torch_refractory import Refractory
 from evnlos.sensor.event_tensors import EventTensors
-from evnlos.sensor.pixel import MIN_THRESHOLD, EventPixel
+from evnlos.sensor.pixel import MIN_THRESHOLD, V2ePixel
 
 STEPS = 32
 _TILE_CPU, _TILE_DEVICE = 16_384, 1 << 22
@@ -54,7 +55,7 @@ class Pixels:
         self,
         light: Blocks,
         times_s: NDArray[np.float64],
-        kinds: Sequence[EventPixel],
+        kinds: Sequence[V2ePixel],
         seeds: list[int],
         thresholds: tuple[Tensor, Tensor] | None,
         dtype: torch.dtype,
@@ -65,12 +66,13 @@ class Pixels:
         pixels = height * width
         self.pixels, self._count = pixels, clips * pixels
         delta = np.diff(times_s)
+        patterns = [int(pattern_key(kind, seed)) for kind, seed in zip(kinds, seeds, strict=True)]
         filtered = kinds[0].cutoff_hz > 0
         dtype = dtype if filtered else torch.float32
         if thresholds is None:
-            each = list(zip(kinds, seeds, strict=True))
+            each = list(zip(kinds, patterns, strict=True))
             on, off = (
-                torch.cat([_thresholds(kind, sign, seed, pixels, device) for kind, seed in each])
+                torch.cat([_thresholds(kind, sign, key, pixels, device) for kind, key in each])
                 for sign in (True, False)
             )
         else:  # v2e keeps thresholds that differ in single precision, and equal ones as a double
@@ -81,7 +83,7 @@ class Pixels:
         shots = np.array([[kind.shot_noise_rate_hz] for kind in kinds])
         if leaks.any():
             scales = torch.from_numpy((leaks * delta).astype(np.float32)).to(device)
-            self.leak = Leak(seeds, on, scales)
+            self.leak = Leak(seeds, patterns, on, scales)
         if shots.any():
             nominal = np.array([(kind.threshold_on, kind.threshold_off) for kind in kinds], np.float64)
             self.shot = ShotNoise(seeds, nominal, on, off, 0.5 * shots * delta)
@@ -231,7 +233,7 @@ class Pixels:
         return hits
 
 
-def _thresholds(kind: EventPixel, on: bool, seed: int, pixels: int, device: torch.device) -> Tensor:
+def _thresholds(kind: V2ePixel, on: bool, seed: int, pixels: int, device: torch.device) -> Tensor:
     """Return a clip's thresholds, float64 [1, pixels]: equal, or drawn, clamped and rounded to float32."""
     nominal, sigma = kind.threshold_on if on else kind.threshold_off, kind.threshold_sigma
     stream = STREAM_THRESHOLD_ON if on else STREAM_THRESHOLD_OFF

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.errors import ConfigError
 from evnlos.sensor import _v2e
 from evnlos.sensor._order import Columns, expand, sort_events
 from evnlos.sensor._random import (
@@ -18,27 +17,26 @@ from evnlos.sensor._random import (
     jitter_table,
     normal_field,
 )
-from evnlos.sensor._tiles import check_tiling, map_shares, pixel_thresholds
+from evnlos.sensor._tiles import check_tiling, map_shares, pattern_key, pixel_thresholds
+from evnlos.sensor.event_model import EventModel
 from evnlos.sensor.light import Light
-from evnlos.sensor.pixel import EventPixel
+from evnlos.sensor.pixel import V2ePixel
 
 _DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
 
 
-class V2eArray:
+class V2eArray(EventModel):
     """Pixels that see the light at the instants of the frames only, as v2e does; `advance` them by frames."""
 
     def __init__(
         self,
-        pixel: EventPixel,
+        pixel: V2ePixel,
         shape: tuple[int, int],
         seed: int,
         thresholds: object = None,
         tile_px: int = 2048,
         threads: int | None = None,
     ) -> None:
-        if pixel.hot_pixel_fraction > 0 or pixel.jitter_s > 0:
-            raise ConfigError('mode="v2e" has no hot pixels and no jitter; set them to 0 or use mode="exact"')
         self.pixel, self.seed = pixel, np.uint64(seed)
         self._tile_px, self._threads = check_tiling(tile_px, threads)
         count = shape[0] * shape[1]
@@ -53,7 +51,7 @@ class V2eArray:
         self._most = float((self._ratio_on + self._ratio_off).max())
         self._leak = np.zeros(0, np.float32)
         if pixel.leak_rate_hz > 0:
-            factor = 10.0 ** (0.1 * normal_field(self.seed, STREAM_LEAK_RATE, count))
+            factor = 10.0 ** (0.1 * normal_field(pattern_key(pixel, seed), STREAM_LEAK_RATE, count))
             self._leak = (factor * on).astype(np.float32)
         self._hazard = np.zeros(0)
         if pixel.shot_noise_rate_hz > 0:

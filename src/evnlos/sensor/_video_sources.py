@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,6 +13,7 @@ from PIL import Image, UnidentifiedImageError
 
 from evnlos.errors import DataError, MissingDependencyError
 from evnlos.sensor._tone import Picture
+from evnlos.untrusted import open_container, open_image, open_regular
 
 
 class Source(Protocol):
@@ -60,16 +62,20 @@ class ContainerSource:
         self.size = first.shape[1], first.shape[0]
         self.white = float(np.iinfo(first.dtype).max)
 
-    def _opened(self) -> Any:
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
         av = _pyav()
-        try:
-            container = av.open(str(self.path))
-        except (av.error.FFmpegError, ValueError) as error:
-            raise DataError(f"{self.path}: not a video that FFmpeg reads ({_reason(error)})") from None
-        if not container.streams.video:
-            container.close()
-            raise DataError(f"{self.path}: a media file without a video stream; give another file")
-        return container
+        with ExitStack() as stack:
+            try:
+                container = stack.enter_context(open_container(self.path))
+            except (av.error.FFmpegError, OSError, ValueError) as error:
+                raise DataError(
+                    f"{self.path}: not a video that FFmpeg reads ({_reason(error)}); give MP4, MKV, AVI or "
+                    "another container that holds its pictures itself"
+                ) from None
+            if not container.streams.video:
+                raise DataError(f"{self.path}: a media file without a video stream; give another file")
+            yield container
 
     def pictures(self) -> Generator[tuple[float | None, Picture], None, None]:
         """Yield the presentation time and the picture, 16 bits deep where the video has more than 8."""
@@ -160,7 +166,8 @@ class ArraySource:
 
     def __init__(self, path: Path) -> None:
         try:
-            self._array = np.load(path, mmap_mode="r", allow_pickle=False)
+            with open_regular(path):  # a pipe would be waited for
+                self._array = np.load(path, mmap_mode="r", allow_pickle=False)
         except (ValueError, EOFError, OSError) as error:
             reason = " ".join(str(error).split())[:120]
             raise DataError(f"{path}: not a NumPy array ({reason}); save one with numpy.save") from None
@@ -182,11 +189,13 @@ def _white(pictures: NDArray) -> float | None:
     return float(np.iinfo(pictures.dtype).max) if pictures.dtype.kind == "u" else None
 
 
-def _image(path: Path) -> Image.Image:
+@contextmanager
+def _image(path: Path) -> Iterator[Image.Image]:
     try:
-        return Image.open(path)
+        with open_image(path) as image:
+            yield image
     except UnidentifiedImageError:
-        raise DataError(f"{path}: not a picture that Pillow reads; give PNG, TIFF, JPEG, GIF or WebP") from None
+        raise DataError(f"{path}: not a picture that is read; give PNG, TIFF, JPEG, GIF or WebP") from None
     except (OSError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: cannot be read ({error})") from None
 

@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.sensor._exact_math import log_light
+from evnlos.sensor.event_model import PixelSettings
 from evnlos.sensor.light import WHITE_DN, StripLight, Strips
-from evnlos.sensor.pixel import EventPixel
-from evnlos.sensor.stream import EventStream, Mode
+from evnlos.sensor.pixel import EventPixel, Mode, in_mode
+from evnlos.sensor.stream import EventStream
 from evnlos.types import Events
 
 _CHUNK_BYTES = 64 << 20
@@ -59,17 +60,17 @@ class EventCamera:
     what passes between two instants.
 
     Args:
-        pixel: Parameters of the pixels.
+        pixel: Settings of the pixels, of any event model.
         tolerance: Largest error of the interpolated log light, in thresholds, more than 0.
-        time_step_s: Fixed time step, seconds; None = chosen from the motion. `mode="v2e"` needs one.
+        time_step_s: Fixed time step, seconds; None = chosen from the motion. A `V2ePixel` needs one.
         mode: "exact" or "v2e", as in `simulate_events`.
 
     Raises:
-        ConfigError: A tolerance or a time step that is not positive, or `mode="v2e"` without a time step.
+        ConfigError: A tolerance or a time step that is not positive, or a `V2ePixel` without a time step.
     """
 
-    pixel: EventPixel = field(default_factory=EventPixel)
-    """Parameters of the pixels."""
+    pixel: PixelSettings = field(default_factory=EventPixel)
+    """Settings of the pixels."""
     tolerance: float = 0.01
     """Largest error of the interpolated log light, in thresholds."""
     time_step_s: float | None = None
@@ -85,8 +86,7 @@ class EventCamera:
         step = self.time_step_s
         if step is not None and not (math.isfinite(step) and step > 0):
             raise ConfigError(f"EventCamera.time_step_s is {step}; give a positive number of seconds, or None")
-        if self.mode == "v2e" and step is None:
-            raise ConfigError('EventCamera.mode "v2e" depends on the time step; give time_step_s, e.g. 0.001')
+        check_time_step(in_mode(self.pixel, self.mode), step)
 
     def record(self, wall: Wall, t0: float, t1: float, *, seed: int = 0, threads: int | None = None) -> Events:
         """Return the events of the time from t0 to t1; at t0 all pixels have settled to the light.
@@ -112,13 +112,22 @@ class EventCamera:
         stream = EventStream(self.pixel, (height, width), mode=self.mode, seed=seed, threads=threads)
         stream.push(_render(wall, np.array([t0]), np.empty((1, height, width), np.float32)), [t0])
         if self.time_step_s is not None:
-            steps = max(1, math.ceil((t1 - t0) / self.time_step_s - 1e-9))
-            times_s = np.append(t0 + self.time_step_s * np.arange(1, steps), t1).astype(np.float64)
-            _record_at(stream, wall, times_s)
+            _record_at(stream, wall, self.fixed_instants(t0, t1))
         else:
             for times_s, frames in self._chunks(wall, t0, t1, longest):
                 stream.push(frames, times_s)
         return stream.finish()
+
+    def fixed_instants(self, t0: float, t1: float) -> NDArray[np.float64]:
+        """Return the instants after t0, up to t1, at which a camera of fixed time step sees the light, seconds.
+
+        Raises:
+            ConfigError: The time step is chosen from the motion.
+        """
+        if self.time_step_s is None:
+            raise ConfigError("the event camera has no time_step_s; give one in seconds, e.g. 0.002")
+        steps = max(1, math.ceil((t1 - t0) / self.time_step_s - 1e-9))
+        return np.append(t0 + self.time_step_s * np.arange(1, steps), t1).astype(np.float64)
 
     def _chunks(
         self, wall: Wall, t0: float, t1: float, longest: float
@@ -129,7 +138,7 @@ class EventCamera:
         """
         height, width = wall.shape
         most = _most_steps(wall)
-        limit = self.tolerance * min(self.pixel.threshold_on, self.pixel.threshold_off)
+        limit, curve = self.tolerance * self.pixel.finest_threshold, self.pixel.log_curve
         step, now = longest, t0
         # the last frame of the chunk before, the chunk, and the probes
         frames = np.empty((1 + most + _PROBES, height, width), np.float32)
@@ -146,7 +155,7 @@ class EventCamera:
             error = 0.0
             rows = frames.reshape(len(frames), -1)
             for probe, middle in zip(probes, rows[1 + count : 1 + len(instants)], strict=True):
-                error = max(error, _worst_miss(rows[probe], rows[probe + 1], middle))
+                error = max(error, _worst_miss(rows[probe], rows[probe + 1], middle, curve))
             if error > limit and step > longest * 1e-3:
                 step *= max(0.25, 0.9 * math.sqrt(limit / error))
                 continue
@@ -154,6 +163,22 @@ class EventCamera:
             frames[0], now = frames[count], float(times[-1])
             if error < 0.5 * limit:
                 step = min(longest, step * min(1.5, 0.9 * math.sqrt(limit / max(error, 1e-12))))
+
+
+def check_time_step(pixel: PixelSettings, time_step_s: float | None) -> None:
+    """Refuse a model whose physics depends on the time step where none is stated.
+
+    Args:
+        pixel: Settings of the pixels.
+        time_step_s: Fixed time step, seconds; None = chosen from the motion.
+
+    Raises:
+        ConfigError: A stepped model without a time step.
+    """
+    if pixel.stepped and time_step_s is None:
+        raise ConfigError(
+            f"{type(pixel).__name__} (mode v2e) depends on the time step; give time_step_s, e.g. 0.001"
+        )
 
 
 def _record_at(stream: EventStream, wall: Wall, times_s: NDArray[np.float64]) -> None:
@@ -189,7 +214,8 @@ def _longest_step(wall: Wall, t0: float, t1: float) -> float:
         raise ConfigError(
             f"the wall's speed_px_s is {speed}; give a finite number of pixels a second, 0 or more"
         )
-    step = min((t1 - t0) / _FEWEST_STEPS, _LONGEST_SHIFT_PX / max(speed, 1e-12))
+    own = float(getattr(wall, "longest_step_s", math.inf))  # of light that changes without motion
+    step = min((t1 - t0) / _FEWEST_STEPS, _LONGEST_SHIFT_PX / max(speed, 1e-12), own)
     if (t1 - t0) / step > _MOST_STEPS:
         raise ConfigError(
             f"{t1 - t0:g} s at {speed:g} pixels/s need {(t1 - t0) / step:.0f} steps; record in parts"
@@ -214,22 +240,25 @@ def _render(wall: Wall, times_s: NDArray[np.float64], out: NDArray[np.float32]) 
 
 
 @njit(cache=True, error_model="numpy")
-def _misses(earlier, later, middle, out):
+def _misses(earlier, later, middle, curve, out):
     """Fill how far the log of the mean of two frames is from the log of the frame between them."""
     for i in range(len(out)):
         line = 0.5 * (np.float64(earlier[i]) + np.float64(later[i]))
-        out[i] = abs(log_light(line) - log_light(np.float64(middle[i])))
+        there = np.float64(middle[i])
+        out[i] = abs(
+            log_light(curve.scale * line + curve.offset) - log_light(curve.scale * there + curve.offset)
+        )
 
 
 @njit(cache=True, error_model="numpy")
-def _worst_miss(earlier, later, middle):
+def _worst_miss(earlier, later, middle, curve):
     """Return the largest of the misses; block by block, so that a compiler takes the logarithms in vectors."""
     worst = 0.0
     block = np.empty(_BLOCK)
     for start in range(0, len(middle), _BLOCK):
         stop = min(start + _BLOCK, len(middle))
         out = block[: stop - start]
-        _misses(earlier[start:stop], later[start:stop], middle[start:stop], out)
+        _misses(earlier[start:stop], later[start:stop], middle[start:stop], curve, out)
         for miss in out:
             if miss > worst:
                 worst = miss

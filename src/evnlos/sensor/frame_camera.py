@@ -38,6 +38,9 @@ class FrameCamera:
         bit_depth: Bits a pixel, 8 to 16.
         black_level: Digital number of darkness, DN.
         pattern_seed: Seed of the fixed pattern: one camera for all captures; None = a new one for each capture.
+        electrons_per_s: Electrons per second that white light makes: a pixel then collects
+            electrons_per_s exposure_s E, and holds full_well_e at most, so that a short exposure is a dim one.
+            None = the light is set so that white fills the well, whatever the exposure.
 
     Raises:
         ConfigError: A value outside its range.
@@ -66,6 +69,8 @@ class FrameCamera:
     """Digital number of darkness, DN."""
     pattern_seed: int | None = 0
     """Seed of the fixed pattern; None = a new pattern for each capture."""
+    electrons_per_s: float | None = None
+    """Electrons per second at white, collected over the exposure; None = white fills the well."""
 
     def __post_init__(self) -> None:
         for name, unit in (
@@ -86,6 +91,9 @@ class FrameCamera:
             )
         if self.pattern_seed is not None:
             check_seed(self.pattern_seed)
+        if self.electrons_per_s is not None:
+            self._require("electrons_per_s", 0.0, "electrons per second", strict=True)
+            self._require("exposure_s", 0.0, "seconds, as electrons are collected over it", strict=True)
 
     def _require(self, name: str, low: float, unit: str, *, strict: bool) -> None:
         value = getattr(self, name)
@@ -102,10 +110,11 @@ class FrameCamera:
     def capture(self, wall: Wall, times_s: ArrayLike, seed: int = 0) -> NDArray[np.uint8 | np.uint16]:
         """Return one frame for each instant: the wall, averaged over an exposure centred there.
 
-        The average is a Gauss-Legendre quadrature with 3 instants.
+        The average is a Gauss-Legendre quadrature with 3 instants, or the wall's own where its light changes
+        faster, as that of lamps does: `exposed(t_s, exposure_s)`, white levels [T, H, W].
 
         Args:
-            wall: The light: `shape` and `irradiance(t_s)`.
+            wall: The light: `shape` and `irradiance(t_s)`, and `exposed` where it has that.
             times_s: Middles of the exposures, [N], seconds.
             seed: Seed of the noise, 0 to 2**64 - 1.
 
@@ -122,10 +131,14 @@ class FrameCamera:
         frames = np.empty((len(times), height, width), np.uint8 if self.bit_depth == 8 else np.uint16)
         seed = check_seed(seed)
         pattern = self.fixed_pattern((height, width), seed)
+        averaged = getattr(wall, "exposed", None)
         for n, time in enumerate(times):
-            instants, weights = self.instants(time)
-            light = wall.irradiance(instants).detach().to("cpu", torch.float64)  # [Q, H, W]
-            mean = torch.einsum("q,qhw->hw", light.new_tensor(weights), light).numpy()
+            if averaged is not None:
+                mean = np.asarray(averaged([time], self.exposure_s)[0], np.float64)
+            else:
+                instants, weights = self.instants(time)
+                light = wall.irradiance(instants).detach().to("cpu", torch.float64)  # [Q, H, W]
+                mean = torch.einsum("q,qhw->hw", light.new_tensor(weights), light).numpy()
             frames[n] = self._frame(_checked(mean), seed, n, pattern)
         return frames
 
@@ -134,6 +147,13 @@ class FrameCamera:
         nodes = _GAUSS[3 if self.exposure_s > 0 else 1]
         instants = [time_s + 0.5 * self.exposure_s * offset for offset, _ in nodes]
         return np.array(instants), [weight for _, weight in nodes]
+
+    @property
+    def white_e(self) -> float:
+        """Mean number of electrons that a pixel collects at white, were its well deep enough."""
+        if self.electrons_per_s is None:
+            return self.full_well_e
+        return self.electrons_per_s * self.exposure_s
 
     @property
     def dn_per_electron(self) -> float:
@@ -178,7 +198,9 @@ class FrameCamera:
     ) -> NDArray[np.float64]:
         """Return the digital numbers of one frame, light [H, W], as whole float64."""
         sensitivity, offset_e = pattern
-        mean = self.full_well_e * sensitivity * image
+        mean = self.white_e * sensitivity * image
+        if self.electrons_per_s is not None:
+            np.minimum(mean, self.full_well_e, out=mean)
         levels = np.empty_like(mean)
         fill_electrons(
             mean.ravel(),

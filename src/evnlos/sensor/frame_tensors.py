@@ -47,6 +47,8 @@ def capture_tensors(camera: FrameCamera, wall: Wall, times_s: ArrayLike, seed: i
             own = seed if camera.pattern_seed is None else 0
             sensitivity, offset_e = _pattern(camera, wall.shape, own, mean.device)
             expected = (sensitivity * mean).flatten(1)
+            if camera.electrons_per_s is not None:
+                expected.clamp_(max=camera.full_well_e)
             levels = electrons(expected, offset_e.flatten(), camera.read_noise_e, seed, first)
             levels.mul_(camera.dn_per_electron).add_(camera.black_level).round_().clamp_(0, camera.white)
             made.append(levels.to(torch.float32).view(mean.shape))
@@ -67,4 +69,4 @@ def _exposed(camera: FrameCamera, wall: Wall, times_s: NDArray[np.float64]) -> T
 def _pattern(camera: FrameCamera, shape: tuple[int, int], seed: int, device: torch.device) -> Pattern:
     """Return electrons a unit of light, and the offset in electrons, float64 [H, W] each, on a device."""
     sensitivity, offset_e = (torch.from_numpy(part).to(device) for part in camera.fixed_pattern(shape, seed))
-    return camera.full_well_e * sensitivity, offset_e
+    return camera.white_e * sensitivity, offset_e

@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable
 
 from evnlos.errors import ConfigError
+from evnlos.sensor.brownian import BrownianPixel
 from evnlos.sensor.pixel import EventPixel
 
 
@@ -68,14 +69,34 @@ def celex_v() -> EventPixel:
     return EventPixel(_brighter(0.10), _darker(0.10), 0.03, 200.0, 0.2, 1.0, 5e-4)
 
 
-PRESETS: dict[str, Callable[[], EventPixel]] = {
+def voltmeter_dvs346() -> BrownianPixel:
+    """Return DVS-Voltmeter's DAVIS346 (Lin et al., ECCV 2022, published code): a Brownian pixel."""
+    return BrownianPixel.voltmeter(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5)
+
+
+def voltmeter_dvs240() -> BrownianPixel:
+    """Return DVS-Voltmeter's DAVIS240 (Lin et al., ECCV 2022, published code): a Brownian pixel."""
+    return BrownianPixel.voltmeter(4.4241, 23.0, 2e-4, 1e-7, 5e-8, 1e-5)
+
+
+PRESETS: dict[str, Callable[[], EventPixel | BrownianPixel]] = {
     preset.__name__: preset
-    for preset in (paper, v2e_clean, v2e_noisy, davis346, prophesee_gen3, prophesee_gen4, celex_v)
+    for preset in (
+        paper,
+        v2e_clean,
+        v2e_noisy,
+        davis346,
+        prophesee_gen3,
+        prophesee_gen4,
+        celex_v,
+        voltmeter_dvs346,
+        voltmeter_dvs240,
+    )
 }
 """All presets by name."""
 
 
-def pixel_preset(name: str) -> EventPixel:
+def pixel_preset(name: str) -> EventPixel | BrownianPixel:
     """Return the preset of this name.
 
     Raises:

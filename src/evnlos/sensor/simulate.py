@@ -10,8 +10,9 @@ import torch
 from numpy.typing import ArrayLike
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.sensor.pixel import EventPixel
-from evnlos.sensor.stream import EventStream, Mode
+from evnlos.sensor.event_model import PixelSettings
+from evnlos.sensor.pixel import EventPixel, Mode, V2ePixel, in_mode
+from evnlos.sensor.stream import EventStream
 from evnlos.types import Events
 
 Backend = Literal["numba", "torch"]
@@ -21,7 +22,7 @@ Backend = Literal["numba", "torch"]
 def simulate_events(
     frames: ArrayLike | torch.Tensor,
     times_s: ArrayLike | torch.Tensor,
-    pixel: EventPixel | None = None,
+    pixel: PixelSettings | None = None,
     mode: Mode = "exact",
     seed: int = 0,
     thresholds: tuple[ArrayLike, ArrayLike] | None = None,
@@ -41,7 +42,8 @@ def simulate_events(
         frames: Light in DN (255 = white; fractions and more than 255 allowed), [T, H, W], at least 0, numpy or
             torch; linear in time between the frames.
         times_s: Instants of the frames, [T], seconds, ascending; any spacing.
-        pixel: Parameters of the pixels; None = the paper's.
+        pixel: Settings of the pixels: an `EventPixel`, or those of another event model, which then says what
+            happens; None = the paper's.
         mode: "exact" solves for the instants in continuous time. "v2e" steps from frame to frame and gives the
             same multiset of events as v2e at commit cac6384 wherever no random number is involved.
         seed: Seed of mismatch and noise, 0 to 2**64 - 1: same seed, same bytes, for any threads and tiles.
@@ -72,10 +74,13 @@ def simulate_events(
     if backend not in get_args(Backend):
         raise ConfigError(f'backend is {backend!r}; give "numba" or "torch"')
     if backend == "torch":
-        if mode != "v2e":
+        stepped = in_mode(EventPixel() if pixel is None else pixel, mode)
+        if not isinstance(stepped, V2ePixel):
             raise ConfigError(f'mode is {mode!r}; the torch backend has "v2e" only, the numba backend has both')
         light = frames if isinstance(frames, torch.Tensor) else np.asarray(frames)
-        batch = simulate_batch(light[None], times_s, pixel, [seed], thresholds, device=device, tile_px=tile_px)
+        batch = simulate_batch(
+            light[None], times_s, stepped, [seed], thresholds, device=device, tile_px=tile_px
+        )
         return batch[0]
     if device is not None:
         raise ConfigError(f'device is {device}; the numba backend runs on the CPU, use backend="torch"')
@@ -95,7 +100,7 @@ def simulate_events(
 def simulate_batch(
     clips: ArrayLike | torch.Tensor,
     times_s: ArrayLike | torch.Tensor,
-    pixel: EventPixel | None = None,
+    pixel: EventPixel | V2ePixel | None = None,
     seeds: int | Sequence[int] = 0,
     thresholds: tuple[ArrayLike, ArrayLike] | None = None,
     *,

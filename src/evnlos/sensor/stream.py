@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -11,16 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.sensor._checks import check_light, check_times
-from evnlos.sensor._exact_array import ExactArray
 from evnlos.sensor._order import Columns, join, sort_times
 from evnlos.sensor._random import check_seed
-from evnlos.sensor._v2e_array import V2eArray
+from evnlos.sensor.event_model import PixelSettings
 from evnlos.sensor.light import Frames, Light
-from evnlos.sensor.pixel import EventPixel
+from evnlos.sensor.pixel import Mode, in_mode
 from evnlos.types import Events
-
-Mode = Literal["exact", "v2e"]
-"""How the pixel sees time: solved in continuous time, or stepped from frame to frame as v2e does."""
 
 _BLOCK_STEPS = 256
 
@@ -32,9 +27,10 @@ class EventStream:
     size of tile.
 
     Args:
-        pixel: Parameters of the pixels.
+        pixel: Settings of the pixels: an `EventPixel`, or those of any other event model.
         shape: Sensor size (height, width), pixels.
-        mode: "exact" solves for the instants of the events, "v2e" steps from frame to frame.
+        mode: "v2e" steps an `EventPixel` from frame to frame as v2e does; "exact" runs the model that the
+            settings name.
         seed: Seed of mismatch and noise, 0 to 2**64 - 1.
         thresholds: Thresholds (on, off) of each pixel, [H, W] each, log units; None draws them.
         threads: Number of threads; None = as many as torch uses.
@@ -44,6 +40,7 @@ class EventStream:
         ConfigError: Unknown mode, seed, thread count or threshold maps out of range.
 
     Example:
+        >>> from evnlos.sensor import EventPixel
         >>> stream = EventStream(EventPixel(leak_rate_hz=0, shot_noise_rate_hz=0), (2, 3))
         >>> stream.push(np.full((1, 2, 3), 50.0), [0.0])
         >>> stream.push(np.full((2, 2, 3), 50.0), [0.1, 0.2])
@@ -53,7 +50,7 @@ class EventStream:
 
     def __init__(
         self,
-        pixel: EventPixel,
+        pixel: PixelSettings,
         shape: tuple[int, int],
         *,
         mode: Mode = "exact",
@@ -62,16 +59,11 @@ class EventStream:
         threads: int | None = None,
         tile_px: int | None = None,
     ) -> None:
-        if mode not in get_args(Mode):
-            raise ConfigError(f'mode is {mode!r}; give "exact" or "v2e"')
-        if not isinstance(pixel, EventPixel):
-            raise ConfigError(f"pixel is {type(pixel).__name__}; give an EventPixel")
+        pixel = in_mode(pixel, mode)
         if len(shape) != 2 or min(shape) < 1:
             raise ConfigError(f"shape is {tuple(shape)}; give (height, width), at least 1 pixel each")
-        self.shape, self._jitter = shape, pixel.jitter_s > 0
-        kind = ExactArray if mode == "exact" else V2eArray
-        options = {} if tile_px is None else {"tile_px": tile_px}
-        self._array = kind(pixel, shape, check_seed(seed), thresholds, threads=threads, **options)
+        self.shape, self._disordered = shape, pixel.disorder_s > 0
+        self._array = pixel.model(shape, check_seed(seed), thresholds, tile_px=tile_px, threads=threads)
         self._blocks: list[Columns] = []
         self._last_s = -np.inf
 
@@ -116,7 +108,7 @@ class EventStream:
     def finish(self) -> Events:
         """Return all events since the last call, in order; the pixels keep their state."""
         time_us, where, on = join(self._blocks)
-        if self._jitter:
+        if self._disordered:
             time_us, where, on = sort_times(time_us, where, on)
         x, y = _coordinates(where, self.shape[1])
         return Events(time_us, x, y, on, self.shape[1], self.shape[0])

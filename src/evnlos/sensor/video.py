@@ -24,15 +24,17 @@ from evnlos.sensor._video_sources import (
     PicturesSource,
     Source,
 )
-from evnlos.sensor.pixel import EventPixel
-from evnlos.sensor.stream import EventStream, Mode
+from evnlos.sensor.event_model import PixelSettings
+from evnlos.sensor.pixel import EventPixel, Mode
+from evnlos.sensor.stream import EventStream
 from evnlos.types import Events
+from evnlos.untrusted import MOST_SENSOR_PIXELS
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 _ANIMATIONS = (".gif", ".png", ".apng", ".webp")
 _BLOCK_BYTES = 1 << 25
 _BLOCK_FRAMES = 64
-_MAX_JITTER = 9  # standard deviations that the random numbers can reach
+_LEAST, _MOST = 1e-3, 1e9  # of frame rate, slow motion and white
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ class Video:
                 raise DataError(f"{self.path}: {found}; give fps (--fps) in place of the file's times")
             before = time_s
             light = to_light(picture, self.tone, self.white)
+            if picture.dtype.kind == "f" and not np.isfinite(light).all():
+                raise DataError(f"{self.path}: frame {number} holds NaN or infinity; leave it out or mend it")
             yield time_s / self.slow_motion, _resized(light, self.width, self.height)
 
 
@@ -92,11 +96,11 @@ def open_video(
     Args:
         path: Video file (needs the extra `video`), animated GIF, PNG or WebP, folder, list or glob of pictures,
             NumPy file [T, H, W] or [T, H, W, 3]. Pictures are ordered by the numbers in their names.
-        fps: Frames a second; needed for pictures and arrays, otherwise it replaces the file's times. Above 0.
-        slow_motion: How many times slower than life the video plays, e.g. 8 for 240 Hz shown at 30 Hz. Above 0.
+        fps: Frames a second, 0.001 to 1e9; needed for pictures and arrays, else in place of the file's times.
+        slow_motion: How many times slower than life the video plays, 0.001 to 1e9; 8 for 240 Hz shown at 30 Hz.
         tone: "as-is" takes the numbers as light, as v2e does (luma of Rec. 601 for colour); "srgb" and "rec709"
             undo that curve first (luminance of Rec. 709); white stays white.
-        white: Value of white in the file, above 0; by default 255, or 65535 for 16 bits.
+        white: Value of white in the file, 0.001 to 1e9; by default 255, or 65535 for 16 bits.
         scale: Size to work at, "WIDTHxHEIGHT" or a factor such as "0.5"; by default that of the file.
 
     Raises:
@@ -114,8 +118,8 @@ def open_video(
     if tone not in get_args(Tone):
         raise ConfigError(f"tone is {tone!r}; give one of {', '.join(get_args(Tone))}")
     for name, value in (("fps", fps), ("slow_motion", slow_motion), ("white", white)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ConfigError(f"{name} is {value}; give a finite number above 0")
+        if value is not None and not _LEAST <= value <= _MOST:
+            raise ConfigError(f"{name} is {value}; give {_LEAST:g} to {_MOST:g}")
     shown, source = _find(path)
     if source.frames is not None and source.frames < 2:
         raise DataError(f"{shown}: {source.frames} frame; events need a video of at least two")
@@ -128,7 +132,7 @@ def open_video(
 
 def video_events(
     frames: Iterable[tuple[float, NDArray]],
-    pixel: EventPixel | None = None,
+    pixel: PixelSettings | None = None,
     mode: Mode = "exact",
     seed: int = 0,
 ) -> Iterator[Events]:
@@ -138,7 +142,7 @@ def video_events(
 
     Args:
         frames: Time in seconds and light [H, W] in DN of each frame, such as a `Video`; times ascend.
-        pixel: Parameters of the pixels; None = the paper's.
+        pixel: Settings of the pixels, of any kind; None = the paper's.
         mode: "exact" or "v2e", as in `simulate_events`.
         seed: Seed of mismatch and noise.
 
@@ -152,7 +156,7 @@ def video_events(
         16
     """
     pixel = EventPixel() if pixel is None else pixel
-    margin_us = math.ceil(_MAX_JITTER * pixel.jitter_s * 1e6)
+    margin_us = math.ceil(pixel.disorder_s * 1e6)
     stream: EventStream | None = None
     held: Events | None = None
     count = 0
@@ -235,6 +239,10 @@ def _working_size(scale: str | None, size: tuple[int, int]) -> tuple[int, int]:
             ) from None
     if not (1 <= width <= 16_384 and 1 <= height <= 16_384):
         raise ConfigError(f"scale {scale} makes {width} x {height} pixels; give sides of 1 to 16384")
+    if width * height > MOST_SENSOR_PIXELS:
+        raise ConfigError(
+            f"scale {scale} makes {width} x {height} pixels; at most {MOST_SENSOR_PIXELS:,} are simulated"
+        )
     return width, height
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,12 @@ import torch
 from evnlos.errors import ConfigError, DataError
 from evnlos.transport import Lambert, MatrixTransport, Occluder, Patches, light_transport_matrix
 from evnlos.types import Plane
+from evnlos.untrusted import check_memory, open_regular
 
+_NPZ_ERRORS = (
+    ValueError, EOFError, OSError, LookupError, RuntimeError, AttributeError, MemoryError, SyntaxError,
+    OverflowError, TypeError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 _FINEST = 48  # wall patches a side that carry what a matte wall knows
 _NEEDED = ("wall_x_m", "wall_z_m", "cell_x_m", "cell_z_m", "cell_size_m", "distance_m")
 
@@ -116,7 +123,26 @@ def read_photograph(path: str | Path, emission_exponent: tuple[float, float] | N
     Raises:
         DataError: A key is missing or its array has the wrong shape.
     """
-    data = _load(path)
+    try:
+        return _photograph(path, _load(path), emission_exponent)
+    except (ValueError, TypeError, IndexError, ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise DataError(
+            f"{path} garbles an array ({reason}); docs/inversion.md lists what it must hold"
+        ) from None
+
+
+def _photograph(
+    path: str | Path, data: dict[str, Any], emission_exponent: tuple[float, float] | None
+) -> Photograph:
+    """Return the photograph of the arrays of a file.
+
+    Raises:
+        DataError: An array is missing, misshapen, or holds no finite numbers.
+    """
+    for key, value in data.items():
+        if value.dtype.kind not in "fiu" or not np.isfinite(value).all():
+            raise DataError(f"{path}: {key[:80]} is no array of finite real numbers; see docs/inversion.md")
     missing = [key for key in _NEEDED if key not in data]
     if missing or not ({"wall", "wall_rgb"} & data.keys()):
         raise DataError(f"{path} lacks {', '.join(missing) or 'wall or wall_rgb'}; see docs/inversion.md")
@@ -159,9 +185,13 @@ def convex_occluders(polygons_m: np.ndarray, distance_m: float) -> tuple[Occlude
 
 def _load(path: str | Path) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_regular(path) as opened, np.load(opened, allow_pickle=False) as file:
+            sizes = {info.filename: info.file_size for info in file.zip.infolist()}  # type: ignore[union-attr]
+            check_memory(4 * sum(sizes.values()), f"{path}", "give a smaller photograph")
             return dict(file)
-    except (ValueError, EOFError):
+    except FileNotFoundError:
+        raise DataError(f"{path} does not exist; give an NPZ file") from None
+    except _NPZ_ERRORS:
         raise DataError(
             f"{path} is not an NPZ file of plain numbers; docs/inversion.md lists what it must hold"
         ) from None

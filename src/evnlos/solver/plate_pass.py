@@ -11,7 +11,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.transport import MatrixTransport, MeasuredTransport, RadiometricTransport
+from evnlos.setups.base import dense_matrix
+from evnlos.transport import LinearTransport, MatrixTransport
 from evnlos.types import Plane
 
 
@@ -149,25 +150,9 @@ def strip_of(positions_m: ArrayLike, plate: Plane) -> Plane:
     return Plane(height, width, plate.pitch_m, (middle_x, middle_y))
 
 
-def strip_transport(
-    rig: RadiometricTransport | MeasuredTransport,
-    sensor: tuple[int, int],
-    shape: tuple[int, int],
-    strip: Plane,
-) -> MatrixTransport:
-    """Return a rig's matrix from other cells to a smaller picture, in the same white levels, gain included.
-
-    Args:
-        rig: The rig; its gain is defined for a camera of `sensor` pixels.
-        sensor: Size (H, W) of the sensor, pixels.
-        shape: Size (h, w) of the picture, to which frames are reduced by area averaging.
-        strip: Cells in the coordinates of the target's motion.
-    """
-    matrix = rig.matrix(shape, strip)
-    # The rig's own cells at both sizes tell the scale: area averages keep the mean.
-    seen, own = rig.transport(sensor).matrix.mean(dim=0), rig.matrix(shape, rig.source(), torch.float32)
-    scale = rig.gain * float(seen.double().sum() / own.double().mean(dim=0).sum())
-    return MatrixTransport(matrix * scale, strip, shape)
+def matrix_of(operator: LinearTransport) -> MatrixTransport:
+    """Return a linear map by its matrix, float64: what a pass multiplies many times."""
+    return MatrixTransport(dense_matrix(operator), operator.source, operator.shape)
 
 
 def strip_gram_of(transport: MatrixTransport) -> torch.Tensor:

@@ -9,23 +9,22 @@ from numpy.typing import NDArray
 from evnlos.dataset.fixed_pattern import FixedPattern
 from evnlos.dataset.sampling import reduce_by_area
 from evnlos.errors import ConfigError
-from evnlos.transport import MeasuredTransport, RadiometricTransport
-from evnlos.transport.ambient import ambient_plane
+from evnlos.setups import Setup
 
 
 def object_light(
     frames: NDArray,
     peak: int,
-    rig: RadiometricTransport | MeasuredTransport,
+    setup: Setup,
     shape: tuple[int, int],
     pattern: FixedPattern | None = None,
 ) -> torch.Tensor:
-    """Return frames less the rig's ambient light, reduced by area averaging.
+    """Return frames less the setup's ambient light, reduced by area averaging.
 
     Args:
         frames: Digital numbers [N, H, W].
         peak: Largest digital number.
-        rig: The rig that says how much ambient light there is.
+        setup: The setup that says how much ambient light there is.
         shape: Size (h, w) of the result, pixels.
         pattern: The camera's fixed pattern, to be taken off first.
 
@@ -34,11 +33,7 @@ def object_light(
     """
     levels = frames / np.float32(peak) if pattern is None else pattern.correct(frames, peak)
     size = (frames.shape[-2], frames.shape[-1])
-    if isinstance(rig, MeasuredTransport):
-        ambient = rig.ambient_light(size)
-    else:
-        ambient = ambient_plane(rig.ambient, rig.ambient_gradient, size)
-    return torch.from_numpy(reduce_by_area(levels - ambient.numpy(), shape))
+    return torch.from_numpy(reduce_by_area(levels - setup.ambient_light(size).numpy(), shape))
 
 
 def position_subsets(count: int, positions: int, subsets: int) -> list[NDArray[np.int64]]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.errors import ConfigError
+from evnlos.setups import Setup
+from evnlos.transport import MatrixTransport
 from evnlos.types import Plane
 
 REACH = 0.3
@@ -27,25 +27,19 @@ class Depths:
     elsewhere: all four tell the distance.
 
     Args:
-        rig: The rig.
+        setup: The setup.
         own: Its matrix from the strip, whose scale those of other distances share.
     """
 
-    def __init__(self, rig: RadiometricTransport, own: MatrixTransport) -> None:
+    def __init__(self, setup: Setup, own: MatrixTransport) -> None:
         strip, shape = own.source, own.shape
         assert isinstance(strip, Plane)
-        fixed = replace(
-            rig,
-            target_offset_m=rig.offset_m(),
-            occluders_m=tuple(one.vertices_m for one in rig.occluders()),
-            post_width_m=0.0,
-        )
+        here_m = setup.default_distance_m
+        if here_m is None:
+            raise ConfigError(f"the setup {setup.kind!r} states no distance; follow without depth")
         self._strip, self._shape = strip, shape
         self._nodes = torch.stack(
-            [
-                replace(fixed, distance_m=rig.distance_m * float(np.exp(node))).matrix(shape, strip).float()
-                for node in _NODES
-            ]
+            [setup.at_distance(here_m * float(np.exp(node))).matrix(shape, strip).float() for node in _NODES]
         )  # [G, H W, cells]
         self._scale = float(own.matrix.sum() / self._nodes[len(_NODES) // 2].double().sum())
 

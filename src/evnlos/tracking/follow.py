@@ -12,6 +12,7 @@ from evnlos.dataset.capture import Capture
 from evnlos.dataset.fixed_pattern import FixedPattern
 from evnlos.dataset.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
+from evnlos.setups import Setup
 from evnlos.tracking.background import static_light, temporal_noise
 from evnlos.tracking.event_velocity import EventVelocity, event_velocity
 from evnlos.tracking.geometry import plane_map
@@ -19,7 +20,6 @@ from evnlos.tracking.registration import Registration, register
 from evnlos.tracking.rig_shift import rig_shift
 from evnlos.tracking.smoother import Measurements, most_likely_acceleration, smooth
 from evnlos.tracking.track import Distance, Track
-from evnlos.transport import RadiometricTransport
 from evnlos.types import Events
 
 _LEAST_FRAMES = 4
@@ -56,7 +56,7 @@ class Tracking:
 
 def track_capture(
     capture: Capture,
-    rig: RadiometricTransport | None = None,
+    rig: Setup | None = None,
     settings: Tracking | None = None,
     pattern: FixedPattern | None = None,
 ) -> Track:
@@ -81,7 +81,7 @@ def track_frames(
     frames: NDArray,
     times_s: NDArray[np.float64],
     events: Events | None = None,
-    rig: RadiometricTransport | None = None,
+    rig: Setup | None = None,
     settings: Tracking | None = None,
 ) -> Track:
     """Return the track of one moving object.
@@ -115,7 +115,7 @@ def track_frames(
     return _in_metres(found, by_events, times_s, small, rig, noise, settings)
 
 
-def track_doubts(capture: Capture, rig: RadiometricTransport | None, track: Track) -> list[str]:
+def track_doubts(capture: Capture, rig: Setup | None, track: Track) -> list[str]:
     """Return why a track in metres may be wrong by more than it states, a line each; none where nothing is odd.
 
     Args:
@@ -125,9 +125,10 @@ def track_doubts(capture: Capture, rig: RadiometricTransport | None, track: Trac
     """
     doubts = []
     stated = capture.distance_m
-    if rig is not None and stated is not None and abs(stated / rig.distance_m - 1) > _SAME_DISTANCE:
+    known_m = None if rig is None else rig.default_distance_m
+    if known_m is not None and stated is not None and abs(stated / known_m - 1) > _SAME_DISTANCE:
         doubts.append(
-            f"capture.yaml states a distance of {stated:g} m, the rig {rig.distance_m:g} m, more than "
+            f"capture.yaml states a distance of {stated:g} m, the rig {known_m:g} m, more than "
             f"{100 * _SAME_DISTANCE:.0f} % apart: lengths and their deviations are wrong; take the rig of that "
             "distance"
         )
@@ -153,7 +154,7 @@ def _in_metres(
     by_events: EventVelocity | None,
     times_s: NDArray[np.float64],
     small: NDArray,
-    rig: RadiometricTransport,
+    rig: Setup,
     noise: float,
     settings: Tracking,
 ) -> Track:
@@ -184,12 +185,12 @@ def _distance(
     log_distance: NDArray[np.float64],
     sigma: NDArray[np.float64],
     times_s: NDArray[np.float64],
-    rig: RadiometricTransport,
+    rig: Setup,
 ) -> Distance:
     blank = np.full(len(times_s), np.nan)
     measured = Measurements(times_s, log_distance, sigma**2, blank, blank)
     smoothed = smooth(measured, most_likely_acceleration([measured]))
-    near = rig.distance_m * np.exp(smoothed.mean[:, 0])
+    near = (rig.default_distance_m or 1.0) * np.exp(smoothed.mean[:, 0])
     spread = np.sqrt(np.diagonal(smoothed.covariance, axis1=1, axis2=2))  # [N, 2]
     return Distance(times_s, near, near * spread[:, 0], near * smoothed.mean[:, 1], near * spread[:, 1])
 

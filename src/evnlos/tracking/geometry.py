@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import DataError
+from evnlos.setups import Setup
 from evnlos.tracking.registration import middle_of_light
-from evnlos.transport import RadiometricTransport
 from evnlos.types import Plane
 
 _REACH_M = (0.40, 0.28)  # region of the target's plane that the map is fitted on, (x, y)
@@ -48,18 +48,18 @@ class PlaneMap:
         return (place_px - middle) / (self.shape[1] / 2)
 
 
-def plane_map(rig: RadiometricTransport, shape: tuple[int, int]) -> PlaneMap:
+def plane_map(setup: Setup, shape: tuple[int, int]) -> PlaneMap:
     """Fit the map to the pictures of small cells all over the target's plane.
 
     Args:
-        rig: The rig.
+        setup: The setup.
         shape: Size (H, W) of the picture, pixels.
 
     Raises:
         DataError: The middle of the light hardly moves with the cell: a matte wall shows no place that way.
     """
     cells = Plane(round(_REACH_M[1] / _CELL_M), round(_REACH_M[0] / _CELL_M), _CELL_M)
-    pictures = rig.matrix(shape, cells).mT.reshape(-1, *shape).numpy()
+    pictures = setup.matrix(shape, cells).mT.reshape(-1, *shape).numpy()
     light = pictures.sum(axis=(1, 2))
     border = np.concatenate([pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], axis=1)
     whole = border.max(axis=1) < 0.1 * pictures.max(axis=(1, 2))

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.setups import Setup
 from evnlos.solver import PlatePass
 from evnlos.solver.operators import Gradient, normal_matrix
-from evnlos.solver.plate_pass import mean_weight, strip_of, strip_transport
+from evnlos.solver.plate_pass import matrix_of, mean_weight, strip_of
 from evnlos.tracking.depth import REACH, Depths
 from evnlos.tracking.registration import middle_of_light
-from evnlos.transport import MatrixTransport, RadiometricTransport
+from evnlos.transport import MatrixTransport
 from evnlos.types import Plane
 
 _ROUNDS = 16
@@ -51,7 +52,7 @@ class RigShift:
 
 def rig_shift(
     light: torch.Tensor,
-    rig: RadiometricTransport,
+    setup: Setup,
     start_m: NDArray[np.float64],
     noise: float,
     plate_m: float,
@@ -68,7 +69,7 @@ def rig_shift(
 
     Args:
         light: Frames without ambient light, white levels, [N, h, w].
-        rig: The rig.
+        setup: The setup.
         start_m: First guess of the positions, [N, 2], metres.
         noise: Standard deviation of a sample's noise, white levels.
         plate_m: Side of a plate that surely holds the object, metres.
@@ -79,27 +80,28 @@ def rig_shift(
     shape = (int(light.shape[1]), int(light.shape[2]))
     reach = np.concatenate([start_m + _MARGIN_M, start_m - _MARGIN_M])
     # The gain's exact meaning does not matter for places.
-    transport = strip_transport(rig, shape, shape, strip_of(reach, plate))
-    depths = Depths(rig, transport) if depth else None
+    transport = matrix_of(setup.resized(shape).operator(strip_of(reach, plate)))
+    depths = Depths(setup, transport) if depth else None
     blank = torch.zeros(plate.shape, dtype=torch.float64)
     prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), blank)
+    distance_m = setup.default_distance_m or 1.0  # only a scale, where no depth is looked for
     state = np.zeros((len(start_m), 3 if depth else 2))  # x, y, and R ln(distance / R), metres
     state[:, :2] = start_m
     image, covariance, misfit = blank, np.zeros((len(state), state.shape[1], state.shape[1])), 1.0
     for _ in range(_ROUNDS):
-        fit = Fit(plate, transport, depths, state, rig.distance_m)
+        fit = Fit(plate, transport, depths, state, distance_m)
         image, step, covariance, misfit = fit.step(light.double(), prior, noise)
         state = state + step * min(1.0, _LONGEST_M / np.abs(step).max())
         # The place of the light's middle: the plate is drawn around it the next time.
         state[:, :2] += _middle(image.numpy()) * plate.pitch_m
         state[:, 2:] -= state[:, 2:].mean(axis=0)
-        state[:, 2:] = np.clip(state[:, 2:], -REACH * rig.distance_m, REACH * rig.distance_m)
+        state[:, 2:] = np.clip(state[:, 2:], -REACH * distance_m, REACH * distance_m)
         if (np.abs(step) < _ENOUGH * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).all():
             break
     if not depth:
         return RigShift(state, covariance, image, misfit=misfit)
-    sigma = np.sqrt(covariance[:, 2, 2]) / rig.distance_m
-    return RigShift(state[:, :2], covariance[:, :2, :2], image, state[:, 2] / rig.distance_m, sigma, misfit)
+    sigma = np.sqrt(covariance[:, 2, 2]) / distance_m
+    return RigShift(state[:, :2], covariance[:, :2, :2], image, state[:, 2] / distance_m, sigma, misfit)
 
 
 def _middle(image: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,16 +6,15 @@ import json
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
-from evnlos.config import write_atomically
 from evnlos.errors import DataError
+from evnlos.files import write_atomically
+from evnlos.model import Reconstructor, describe_network, read_sealed, sealed_bytes
 
 
 def save_checkpoint(
     path: str | Path,
-    network: torch.nn.Module,
+    network: Reconstructor,
     optimiser: torch.optim.Adam,
     epoch: int,
     log: list[dict],
@@ -27,12 +26,12 @@ def save_checkpoint(
         for name, value in state.items():
             tensors[f"optimiser.{index}.{name}"] = torch.as_tensor(value)
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    about = json.dumps({"epoch": epoch, "log": log, "key": key})
-    write_atomically(path, save(tensors, metadata={"evnlos": about}))
+    about = json.dumps({"epoch": epoch, "log": log, "key": key, **describe_network(network)})
+    write_atomically(path, sealed_bytes(tensors, about))
 
 
 def load_checkpoint(
-    path: str | Path, network: torch.nn.Module, optimiser: torch.optim.Adam, key: str
+    path: str | Path, network: Reconstructor, optimiser: torch.optim.Adam, key: str
 ) -> tuple[int, list[dict]]:
     """Restore a training in place; return the number of finished epochs and the log.
 
@@ -40,17 +39,21 @@ def load_checkpoint(
         DataError: The file is damaged, or belongs to a training with other settings.
     """
     try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads(file.metadata()["evnlos"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+        text, tensors, _ = read_sealed(path)
+        about = json.loads(text)
+        if any(value.is_complex() for value in tensors.values()):
+            raise ValueError("complex numbers belong to no training")
         epoch, log, their_key = int(about["epoch"]), [dict(line) for line in about["log"]], about["key"]
         if their_key == key:
-            weights = {name[8:]: value for name, value in tensors.items() if name.startswith("network.")}
+            weights = {
+                network.today(name[8:], network.modality): value
+                for name, value in tensors.items()
+                if name.startswith("network.")
+            }
             state = _optimiser_state(tensors, optimiser)
             network.load_state_dict(weights)
             optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
     except (
-        SafetensorError,
         OSError,
         ValueError,
         LookupError,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from evnlos.dataset import NlosDataset
 from evnlos.errors import DataError
-from evnlos.model import Confidence, JointNetwork, ResidualUNet, halves_of, infer, plates
+from evnlos.model import Confidence, Reconstructor, halves_of, plates
 from evnlos.model.confidence import COVERAGE, GROUPS, LEVELS
 from evnlos.seeds import derive_seed
 from evnlos.types import Plane
@@ -24,7 +24,7 @@ _MIXED = 60  # passes without an object
 
 
 @torch.inference_mode()
-def fit_confidence(network: ResidualUNet | JointNetwork, samples: NlosDataset, canvas: Plane) -> Confidence:
+def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) -> Confidence:
     """Learn what pictures of a network are worth from passes that it was not trained on.
 
     Agreement. With d what tells a plate from the network's empty answer (`Confidence.telling`), the agreement
@@ -32,7 +32,7 @@ def fit_confidence(network: ResidualUNet | JointNetwork, samples: NlosDataset, c
     answers with the expectation of the truth, whose empty answer is the mean plate, the law of total variance
     makes it the share of the objects' variance that the measurement explains; noise that the halves do not
     share cancels. Empty answer and threshold come from passes in which each position saw another object: a
-    joint network draws the same for all of them, and that is no sign of any object.
+    network of sequences draws the same for all of them, and that is no sign of any object.
 
     Intervals. The central 90 % of the true levels of a plate's pixels for each level that the network gave
     (split conformal, Mondrian by level and by agreement: Vovk et al., Algorithmic Learning in a Random World,
@@ -55,7 +55,7 @@ def fit_confidence(network: ResidualUNet | JointNetwork, samples: NlosDataset, c
         mine = np.flatnonzero(names == name)
         rows, at = torch.from_numpy(mine), position_m[mine]
         halves.append(halves_of(network, samples.inputs[rows], at, canvas))
-        shown.append(plates(infer(network, samples.inputs[rows], at), canvas, at)[:, 0])
+        shown.append(plates(network.infer(samples.inputs[rows], at), canvas, at)[:, 0])
         true.append(plates(samples.truth[rows].float(), canvas, at)[:, 0])
     objects_true = torch.stack([one.mean(dim=0) for one in true])
     mean = objects_true.mean(dim=0)

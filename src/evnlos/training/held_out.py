@@ -8,27 +8,27 @@ import numpy as np
 import torch
 from torch.utils.data import TensorDataset
 
-from evnlos.dataset import Dataset, LiveDataset, NlosDataset, Paradigm
+from evnlos.dataset import Dataset, LiveDataset, Modality, NlosDataset
 from evnlos.metrics import psnr
-from evnlos.model import Confidence, JointNetwork, ResidualUNet, Weights, infer
+from evnlos.model import Confidence, Reconstructor, Weights
 from evnlos.training.confidence import FEWEST, fit_confidence
 
 HeldOut = NlosDataset | TensorDataset
 
 
-def held_out_samples(dataset: Dataset, paradigm: Paradigm, device: torch.device) -> HeldOut | None:
+def held_out_samples(dataset: Dataset, modality: Modality, device: torch.device) -> HeldOut | None:
     """Return the samples to validate on, or None where the dataset holds none out."""
     if not dataset.split.get("validation"):
         return None
     if isinstance(dataset, LiveDataset):
-        made = dataset.stream(dataset.objects("validation"), 0, paradigm, device)
+        made = dataset.stream(dataset.objects("validation"), 0, modality, device)
         return TensorDataset(*(torch.cat(parts) for parts in zip(*made, strict=True)))
-    return NlosDataset(dataset, "validation", paradigm)
+    return NlosDataset(dataset, "validation", modality)
 
 
 @torch.inference_mode()
 def validate(
-    network: ResidualUNet | JointNetwork,
+    network: Reconstructor,
     held_out: HeldOut,
     dataset: Dataset,
     device: torch.device,
@@ -42,7 +42,7 @@ def validate(
         inputs, truth = held_out.tensors[0], held_out.tensors[1][:, 0].cpu()
         places = names = None
     with torch.autocast(device.type, torch.bfloat16, enabled=half):
-        images = infer(network, inputs.to(device), places, names).float().cpu()
+        images = network.infer(inputs.to(device), places, names).float().cpu()
     images, truth = (part[:, dataset.sampling.scored] for part in (images, truth))
     score, blank = psnr(images, truth).mean().item(), psnr(torch.zeros_like(truth), truth).mean().item()
     # A network that has collapsed answers the same to every input.
@@ -51,7 +51,7 @@ def validate(
 
 
 def confidence_of(
-    network: ResidualUNet | JointNetwork, held_out: HeldOut | None, dataset: Dataset, start: Weights | None
+    network: Reconstructor, held_out: HeldOut | None, dataset: Dataset, start: Weights | None
 ) -> Confidence | None:
     """Return what the pictures are worth: from the validation, or as the weights that this began from say."""
     if isinstance(held_out, NlosDataset):

@@ -6,19 +6,17 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from evnlos.dataset import Paradigm
+from evnlos.dataset import as_modality
 from evnlos.errors import ConfigError
-from evnlos.model import UNetConfig
+from evnlos.model import ReconstructorSettings, UNetConfig
 from evnlos.training.loss import LossName
-
-Part = Literal["encoder", "latent", "decoder"]
 
 
 @dataclass(frozen=True)
 class Training:
     """Settings of one training; the paper's own are in `evnlos.training.presets`."""
 
-    paradigm: Paradigm = "frame"
+    modality: str = "frame"
     """What the network sees."""
     epochs: int = 20
     """Passes over the training samples."""
@@ -34,25 +32,28 @@ class Training:
     """Factor of the schedule `step`."""
     loss: LossName = "balanced"
     """`balanced` (bounded, does not collapse to black) or `paper` (L1 + 2/SSIM)."""
-    joint: bool = False
-    """Train a joint network: all positions of a pass together give one picture of the plate."""
-    views: int = 3
-    """Joint training: views of each pass; all its positions, every other one, then random subsets."""
-    restandardise: bool = True
-    """Fine-tuning: take the inputs' mean and size from the new data, as an uncalibrated simulation needs it."""
-    freeze: tuple[Part, ...] = ()
-    """Parts of the network whose weights stay as they are."""
+    sequence_augmentations: int = 3
+    """Samples of each sequence, for networks that see it whole: all time steps, every other, random ones."""
+    mirror: bool = False
+    """Show half of the samples of each epoch upside down, input and picture: further captures at no cost where
+    the setup is symmetric about the height of the target; for networks that see single time steps."""
+    keep_normalization: bool = False
+    """Fine-tuning: keep the inputs' mean and size of the weights, as after a simulation of this very setup; by
+    default they are taken from the new data."""
+    freeze: tuple[str, ...] = ()
+    """Parts of the network whose weights stay as they are: encoder, latent, decoder."""
     precision: Literal["auto", "bf16", "float32"] = "auto"
     """Arithmetic of the convolutions; `auto` takes bf16 where the processor has it."""
     compile: bool = False
     """Let torch.compile fuse the network's operations: minutes at the start; for long trainings on a GPU."""
-    network: UNetConfig = field(default_factory=UNetConfig)
-    """Size of the network (fine-tuning keeps that of its weights)."""
+    network: ReconstructorSettings = field(default_factory=UNetConfig)
+    """The network: its kind and its size (fine-tuning keeps those of its weights)."""
     seed: int = 0
     """Seed of the initial weights and of the order of the samples."""
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size", "views"):
+        as_modality(self.modality)  # refuses an unknown one
+        for name in ("epochs", "batch_size", "sequence_augmentations"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"Training.{name} is {getattr(self, name)}; give at least 1")
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.data import DataLoader
 
-from evnlos.dataset import HeldSamples, LiveDataset, Paradigm
+from evnlos.dataset import HeldSamples, LiveDataset, Modality, NlosDataset
 from evnlos.errors import ConfigError
+from evnlos.model import Reconstructor
 from evnlos.seeds import derive_seed
+from evnlos.threads import cores
 from evnlos.training.team import Team
+
+_READERS = 4
+"""Processes that read samples from disk, at most."""
 
 
 class Batch(NamedTuple):
@@ -52,9 +58,17 @@ class Source(Protocol):
         """
         ...
 
+    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> Source:
+        """Return the source of what a network learns from, where these are single time steps.
+
+        Arguments as in `Reconstructor.training_samples`.
+        """
+        ...
+
 
 class Stored:
-    """The samples of a dataset on disk, in memory: the device's, where they fill at most half of what is free.
+    """The samples of a dataset on disk: in memory, the device's first, where they fill at most half of what is
+    free; else read batch by batch in processes of their own.
 
     A batch is cut into as many parts as there are processes; together they are the batch of one process.
 
@@ -68,29 +82,63 @@ class Stored:
     def __init__(self, samples: HeldSamples, batch_size: int, seed: int, team: Team) -> None:
         self.samples, self._batch_size, self._seed, self._team = samples, batch_size, seed, team
         self.steps = -(-len(samples) // batch_size)
+        self._reads = isinstance(samples, NlosDataset) and not samples.fits_in_memory()
+        if self._reads:
+            return
+        if isinstance(samples, NlosDataset):
+            samples.load()
         if team.device.type == "cuda" and samples.bytes() < torch.cuda.mem_get_info(team.device)[0] // 2:
             samples.to(team.device)
 
     def batches(self, epoch: int) -> Iterator[Batch]:
         """Yield this process's part of each batch; a process that has none is given a sample of share 0."""
         order = torch.Generator().manual_seed(derive_seed(self._seed, "order", epoch))
-        for batch in torch.randperm(len(self.samples), generator=order).split(self._batch_size):
-            mine = batch[self._team.rank :: self._team.size]
-            seen, truth = self.samples[mine if len(mine) else batch[:1]]
+        batches = torch.randperm(len(self.samples), generator=order).split(self._batch_size)
+        parts = [batch[self._team.rank :: self._team.size] for batch in batches]
+        chosen = [mine if len(mine) else batch[:1] for mine, batch in zip(parts, batches, strict=True)]
+        for batch, mine, (seen, truth) in zip(batches, parts, self._taken(chosen), strict=True):
             yield Batch(seen, truth, len(mine) / len(batch), len(batch) / len(self.samples))
+
+    def _taken(self, chosen: list[Tensor]) -> Iterable[tuple[Tensor, Tensor]]:
+        """Return inputs and true images of each batch, in order."""
+        if not self._reads:
+            return (self.samples[indices] for indices in chosen)
+        workers = min(_READERS, cores() - 1)
+        # A batch at a time is an item of its own, so that a shard is opened once for it.
+        return DataLoader(
+            self.samples,
+            batch_size=None,
+            sampler=chosen,  # type: ignore[arg-type]
+            num_workers=workers,
+            multiprocessing_context="spawn" if workers else None,
+        )
 
     def mean_image(self) -> Tensor:
         """Return the mean of the true pictures, float32 [H, W]."""
+        if self._reads:
+            every = torch.arange(len(self.samples)).split(self._batch_size)
+            total = sum(truth[:, 0].sum(dim=0, dtype=torch.float64) for _, truth in self._taken(list(every)))
+            return (total / len(self.samples)).float()  # type: ignore[union-attr]
         return self.samples.truth.float().mean(dim=0).cpu()
 
     def some(self, count: int) -> Samples:
         """Return at most `count` samples, chosen by the seed, on the CPU."""
         draw = torch.Generator().manual_seed(derive_seed(self._seed, "some"))
         chosen = torch.randperm(len(self.samples), generator=draw)[:count].sort().values
+        if self._reads:
+            inputs, truth = self.samples[chosen]
+            return inputs.half(), truth[:, 0].half(), self.samples.names[chosen.numpy()]
         inputs, truth = (
             part[chosen.to(part.device)].cpu() for part in (self.samples.inputs, self.samples.truth)
         )
         return inputs, truth, self.samples.names[chosen.numpy()]
+
+    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> Source:
+        """Return the source of what a network learns from."""
+        if not isinstance(self.samples, NlosDataset):
+            return self
+        samples = network.training_samples(self.samples, augmentations, self._seed, is_new=is_new)
+        return self if samples is self.samples else Stored(samples, self._batch_size, self._seed, self._team)
 
 
 class Live:
@@ -102,7 +150,7 @@ class Live:
 
     Args:
         dataset: The simulation.
-        paradigm: What the network sees.
+        modality: What the network sees.
         batch_size: Samples a step, of all processes together.
         seed: Seed of the order.
         team: The processes.
@@ -112,7 +160,7 @@ class Live:
     """
 
     def __init__(
-        self, dataset: LiveDataset, paradigm: Paradigm, batch_size: int, seed: int, team: Team
+        self, dataset: LiveDataset, modality: str | Modality, batch_size: int, seed: int, team: Team
     ) -> None:
         names = dataset.objects("train")
         if batch_size % team.size or len(names) < team.size:
@@ -121,7 +169,7 @@ class Live:
                 "give a batch_size that they divide, and no more processes than objects"
             )
         self._dataset, self._names, self._team = dataset, names, team
-        self._paradigm: Paradigm = paradigm
+        self._modality = modality
         self._size, self._seed = batch_size // team.size, seed
         self._objects = len(names) // team.size
         self.steps = -(-self._objects * dataset.simulation.positions // self._size)
@@ -131,7 +179,7 @@ class Live:
         order = torch.Generator().manual_seed(derive_seed(self._seed, "order", epoch))
         turn = torch.randperm(len(self._names), generator=order)[: self._objects * self._team.size]
         names = [self._names[i] for i in turn[self._team.rank :: self._team.size].tolist()]
-        made = self._dataset.stream(names, epoch, self._paradigm, self._team.device)
+        made = self._dataset.stream(names, epoch, self._modality, self._team.device)
         held: list[tuple[Tensor, Tensor]] = []
         for number, samples in enumerate(made, start=1):
             held.append(samples)
@@ -154,6 +202,38 @@ class Live:
         """Return the samples of the first objects of the first epoch, of as many as `count` allows."""
         objects = max(1, min(len(self._names), count // self._dataset.simulation.positions))
         names = self._names[:: max(1, len(self._names) // objects)][:objects]  # some of every hand
-        made = list(self._dataset.stream(names, 0, self._paradigm, self._team.device))
+        made = list(self._dataset.stream(names, 0, self._modality, self._team.device))
         inputs, truth = (torch.cat(parts).cpu() for parts in zip(*made, strict=True))
         return inputs, truth[:, 0], np.repeat(names, [len(seen) for seen, _ in made])
+
+    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> Source:
+        """Return this: a network of single time steps learns from them as they come."""
+        return self
+
+
+def half_mirrored(seen: Tensor, truth: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+    """Return a batch of which about half of the samples, drawn by the seed, are upside down.
+
+    Args:
+        seen: Input, [b, C, H, W].
+        truth: True pictures, [b, 1, h, w].
+        seed: Seed of the draw.
+    """
+    draw = torch.rand(len(seen), generator=torch.Generator().manual_seed(seed)) < 0.5
+    turned = draw.to(seen.device)[:, None, None, None]
+    return torch.where(turned, seen.flip(-2), seen), torch.where(turned, truth.flip(-2), truth)
+
+
+def with_mirrored(some: Callable[[int], Samples]) -> Callable[[int], Samples]:
+    """Return what draws samples as `some` does, half of them being the other half upside down.
+
+    Args:
+        some: Returns at most so many samples, as `Source.some`.
+    """
+
+    def both(count: int) -> Samples:
+        inputs, truth, names = some(max(1, count // 2))
+        both_inputs, both_truth = (torch.cat([part, part.flip(-2)]) for part in (inputs, truth))
+        return both_inputs, both_truth, np.concatenate([names, names])
+
+    return both

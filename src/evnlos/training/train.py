@@ -3,52 +3,72 @@
 from __future__ import annotations
 
 import json
+import logging
 import platform
 import time
-from collections.abc import Iterator
-from contextlib import nullcontext
-from dataclasses import replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from evnlos.claim import claim, is_empty
-from evnlos.config import config_hash, differing_keys, read_yaml, save_yaml, to_dict, write_atomically
-from evnlos.dataset import CHANNELS, Dataset, LiveDataset, NlosDataset, Sampling
+from evnlos.config import LONG_YAML, config_hash, differing_keys, read_yaml, save_yaml, to_dict
+from evnlos.dataset import Dataset, LiveDataset, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.model import (
-    JointNetwork,
-    ResidualUNet,
-    Weights,
-    load_weights,
-    new_network,
-    save_weights,
-)
+from evnlos.files import claim, is_empty, write_atomically
+from evnlos.migrate import migrate
+from evnlos.model import Reconstructor, Weights, load_weights, save_weights
+from evnlos.progress import Progress, Step, silent
 from evnlos.seeds import derive_seed
 from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
 from evnlos.training.held_out import confidence_of, held_out_samples, validate
 from evnlos.training.loss import LOSSES, light_of
-from evnlos.training.pooled import PooledSamples
-from evnlos.training.prepare import prepare
 from evnlos.training.settings import Training, step_size
-from evnlos.training.source import Live, Source, Stored
+from evnlos.training.source import Live, Source, Stored, half_mirrored, with_mirrored
 from evnlos.training.team import Team, team
 from evnlos.version import __version__
 
-_PARTS = {"encoder": ("stem", "encoder", "down"), "latent": ("latent",), "decoder": ("up", "decoder", "head")}
+_LOG = logging.getLogger("evnlos")
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingResult:
+    """A finished training.
+
+    Args:
+        folder: The run's folder.
+        records: One record per epoch: epoch, loss, learning_rate, seconds, and psnr_db, zero_db and collapsed
+            of the validation, which the first process does.
+    """
+
+    folder: Path
+    records: list[dict[str, Any]]
+
+    @property
+    def file(self) -> Path:
+        """The weights file."""
+        return self.folder / "weights.safetensors"
+
+    def load(self) -> Weights:
+        """Read the trained network and what belongs to it."""
+        return load_weights(self.file)
 
 
 def train(
-    dataset: Dataset, settings: Training, out: str | Path, weights: str | Path | None = None
-) -> Iterator[dict[str, Any]]:
-    """Train a network on a dataset's split `train`, yielding one record an epoch.
+    dataset: Dataset,
+    settings: Training,
+    out: str | Path,
+    weights: str | Path | None = None,
+    progress: Progress = silent,
+) -> TrainingResult:
+    """Train a network on a dataset's split `train`.
 
     From random weights this is pre-training (on simulation) or the end-to-end baseline (on captures);
     from `weights` it is fine-tuning. The run's folder holds `run.yaml` (settings, data, versions),
     `metrics.jsonl`, a checkpoint after each epoch, and in the end `weights.safetensors`. A run that was
-    killed goes on when it is started again, and ends with the same bytes. Processes that `torchrun` started
-    share each batch: the gradient is that of one process, up to the order of its sums.
+    killed goes on when it is started again, and ends with the same bytes if it has as many threads. Processes
+    that `torchrun` started share each batch: the gradient is that of one process, up to the order of its sums.
 
     Args:
         dataset: Where the samples are, or a simulation that makes them meanwhile; the split `validation` is
@@ -56,71 +76,79 @@ def train(
         settings: What decides the training.
         out: The run's folder; new, or begun with the same settings.
         weights: Weights (or a run) to start from.
+        progress: Called when the training begins and after each epoch, with its record.
 
-    Yields:
-        Records with epoch, loss, learning_rate, seconds, and psnr_db, zero_db and collapsed of the validation,
-        which the first process does.
+    Returns:
+        The run's folder and the record of each epoch.
 
     Raises:
+        ConfigError: Settings that the dataset or the processes cannot follow.
         DataError: The folder holds another run, another process is at work in it, a sample is damaged, or
             weights and data do not fit.
     """
     out = Path(out)
     start = load_weights(weights) if weights else None
     network, settings = _network(settings, start, dataset.sampling)
-    with team() as processes, claim(out) if processes.rank == 0 else nullcontext():
-        about = _about(dataset, settings, start, processes.device)
+    network.freeze(settings.freeze)
+    _check_data(dataset, network)
+    if settings.mirror and network.sees_sequence:
+        raise ConfigError(
+            f"mirror is on, and a reconstructor of kind {network.kind!r} sees whole sequences, which are not "
+            "mirrored; leave it off"
+        )
+    with team() as processes, ExitStack() as stack:
+        about = about_run(dataset, settings, start, processes.device)
         if processes.rank == 0:
-            _take_up(out, about)
+            stack.enter_context(claim(out, check=lambda: check_run(out, about)))
+            if (out / "run.yaml").is_file():
+                _tell_of_threads(out)
+            else:
+                save_yaml(about, out / "run.yaml")
         processes.wait()
         history = [*(start.history if start else []), about]
-        yield from _epochs(network, dataset, settings, out, history, processes, start)
+        records = _epochs(network, dataset, settings, out, history, processes, start, progress)
+    return TrainingResult(out, records)
 
 
 def _epochs(
-    network: ResidualUNet | JointNetwork,
+    network: Reconstructor,
     dataset: Dataset,
     settings: Training,
     out: Path,
     history: list[dict[str, Any]],
     processes: Team,
     start: Weights | None,
-) -> Iterator[dict[str, Any]]:
-    """Run the epochs that are left, and write the weights after the last."""
+    progress: Progress,
+) -> list[dict[str, Any]]:
+    """Run the epochs that are left, write the weights after the last, and return the records of all."""
     checkpoint, metrics = out / "checkpoint.safetensors", out / "metrics.jsonl"
+    what = f"train {out.name}"
     if (out / "weights.safetensors").is_file():
-        for line in metrics.read_text().splitlines():
-            yield json.loads(line)
-        return
+        log = [json.loads(line) for line in metrics.read_text().splitlines()]
+        progress(Step(what, len(log), settings.epochs, "epochs"))
+        return log
 
     device, leads = processes.device, processes.rank == 0
     network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    for part in settings.freeze:
-        for name in _PARTS[part]:
-            getattr(_unet(network), name).requires_grad_(False)
     trained = [p for p in network.parameters() if p.requires_grad]
-    if not trained:
-        raise DataError(f"freeze is {settings.freeze}; leave at least one part of the network to train")
     optimiser = torch.optim.Adam(trained, lr=settings.learning_rate)
     loss_of, half = LOSSES[settings.loss], _half(settings, device)
-    positions = source = _source(dataset, settings, processes)
-    held_out = held_out_samples(dataset, settings.paradigm, device) if leads else None
+    steps = _source(dataset, network, settings, processes)
+    held_out = held_out_samples(dataset, network.modality, device) if leads else None
 
-    done, log = 0, []
-    key = config_hash(settings)
+    done, log = 0, list[dict[str, Any]]()
+    # The hash is that of the settings as they were written, maybe by an older version.
+    key = config_hash(read_yaml(out / "run.yaml", LONG_YAML)["settings"])
     if checkpoint.is_file():
         done, log = load_checkpoint(checkpoint, network, optimiser, key)
         if leads:
             _write_log(metrics, log)
-        yield from log
     else:
-        prepare(network, positions, settings.seed, is_new=start is None, restandardise=settings.restandardise)
-    if isinstance(network, JointNetwork):
-        assert isinstance(positions, Stored) and isinstance(positions.samples, NlosDataset)  # see _source
-        passes = PooledSamples(positions.samples, network, settings.views, settings.seed)
-        if start is None and not done:
-            network.fit_scale(passes.inputs)
-        source = Stored(passes, settings.batch_size, settings.seed, processes)
+        keep, seed = settings.keep_normalization, settings.seed
+        some = with_mirrored(steps.some) if settings.mirror else steps.some
+        network.fit(some, seed, is_new=start is None, keep_normalization=keep)
+    source = steps.for_network(network, settings.sequence_augmentations, is_new=start is None and not done)
+    progress(Step(what, done, settings.epochs, "epochs"))
     processes.wait()  # nobody writes before all have read
     joined = processes.joined(network)
     run = torch.compile(joined) if settings.compile else joined
@@ -132,10 +160,13 @@ def _epochs(
             for group in optimiser.param_groups:
                 group["lr"] = rate
             seen, truth = (part.to(device, non_blocking=True) for part in (batch.seen, batch.truth))
+            if settings.mirror:
+                draw = derive_seed(settings.seed, "mirror", epoch, step, processes.rank)
+                seen, truth = half_mirrored(seen, truth, draw)
             light = processes.total(light_of(truth) * batch.share)
             with torch.autocast(device.type, torch.bfloat16, enabled=half):
                 image = run(seen.contiguous(memory_format=torch.channels_last))
-            loss = loss_of(image, truth, light) * batch.share
+            loss = loss_of(image.float(), truth, light) * batch.share  # losses are in float32
             optimiser.zero_grad(set_to_none=True)
             (loss * processes.size).backward()  # the mean over the processes is then the whole batch's gradient
             torch.nn.utils.clip_grad_norm_(trained, 1.0)
@@ -153,47 +184,53 @@ def _epochs(
         if leads:
             save_checkpoint(checkpoint, network, optimiser, epoch + 1, log, key)
             _write_log(metrics, log)
-        yield record
+        progress(Step(what, epoch + 1, settings.epochs, "epochs", record))
     if leads:
         network = network.cpu().eval()
         done_weights = Weights(
             network,
-            settings.paradigm,
-            to_dict(dataset.sampling),
             history,
-            positions.mean_image(),
+            steps.mean_image(),
             confidence_of(network, held_out, dataset, start),
         )
         save_weights(out / "weights.safetensors", done_weights)
         checkpoint.unlink(missing_ok=True)
     processes.wait()
+    return log
 
 
-def _network(
-    settings: Training, start: Weights | None, sampling: Sampling
-) -> tuple[ResidualUNet | JointNetwork, Training]:
-    """Return the network to train; fine-tuning takes kind, paradigm and size from its weights."""
+def _network(settings: Training, start: Weights | None, sampling: Sampling) -> tuple[Reconstructor, Training]:
+    """Return the network to train; fine-tuning takes kind, modality and size from its weights."""
     if start is None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(settings.seed, "weights"))
-            channels, size = CHANNELS[settings.paradigm], (sampling.height, sampling.width)
-            made = new_network(channels, settings.network, size, sampling.pitch_m, joint=settings.joint)
-            return made, settings
-    known = {"paradigm": start.paradigm, "joint": isinstance(start.network, JointNetwork)}
-    return start.network, replace(settings, network=start.network.config, **known)  # type: ignore[arg-type]
+            return settings.network.build(as_modality(settings.modality), sampling), settings
+    return start.network, replace(settings, network=start.network.settings, modality=start.modality.name)
 
 
-def _unet(network: ResidualUNet | JointNetwork) -> ResidualUNet:
-    return network.unet if isinstance(network, JointNetwork) else network
-
-
-def _source(dataset: Dataset, settings: Training, processes: Team) -> Source:
-    """Return where the training's batches come from."""
+def _check_data(dataset: Dataset, network: Reconstructor) -> None:
+    """Refuse, before anything is written, what a training could not end with."""
+    learned = dataset.objects("train")
     if isinstance(dataset, LiveDataset):
-        if settings.joint:
-            raise ConfigError("joint training pools passes on disk; write them with `evnlos simulate` first")
-        return Live(dataset, settings.paradigm, settings.batch_size, settings.seed, processes)
-    samples = NlosDataset(dataset, "train", settings.paradigm)
+        if network.sees_sequence:
+            raise ConfigError(
+                f"a reconstructor of kind {network.kind!r} learns from sequences on disk; write them with "
+                "`evnlos simulate` first"
+            )
+        return
+    lost = [n for n in (*learned, *dataset.split.get("validation", [])) if not dataset.shard(n).is_file()]
+    if lost:
+        raise DataError(
+            f"{dataset.folder} lacks {len(lost)} of its shards ({lost[0]} is the first); run the command that "
+            "made the dataset again"
+        )
+
+
+def _source(dataset: Dataset, network: Reconstructor, settings: Training, processes: Team) -> Source:
+    """Return where the samples of single time steps come from."""
+    if isinstance(dataset, LiveDataset):
+        return Live(dataset, network.modality, settings.batch_size, settings.seed, processes)
+    samples = NlosDataset(dataset, "train", network.modality)
     return Stored(samples, settings.batch_size, settings.seed, processes)
 
 
@@ -210,7 +247,17 @@ def _half(settings: Training, device: torch.device) -> bool:
     return torch.cpu._is_avx512_bf16_supported()
 
 
-def _about(dataset: Dataset, settings: Training, start: Weights | None, device: torch.device) -> dict[str, Any]:
+def about_run(
+    dataset: Dataset, settings: Training, start: Weights | None, device: torch.device | None = None
+) -> dict[str, Any]:
+    """Return what `run.yaml` and the history of the weights say of a training: settings, data, versions.
+
+    Args:
+        dataset: Where the samples are.
+        settings: What decides the training.
+        start: Weights that it begins with, if any.
+        device: Where it runs, for a simulation that runs beside it.
+    """
     return {
         "settings": to_dict(settings),
         "data": {
@@ -220,22 +267,43 @@ def _about(dataset: Dataset, settings: Training, start: Weights | None, device: 
             "optics": dataset.optics,
             "train": dataset.objects("train"),
             "validation": dataset.split.get("validation", []),
-            **(dataset.way(device) if isinstance(dataset, LiveDataset) else {}),
         },
         "from": start.history[-1]["data"]["name"] if start and start.history else None,
         "versions": {
             "evnlos": __version__,
             "torch": str(torch.__version__),
             "python": platform.python_version(),
+            "threads": torch.get_num_threads(),
         },
     }
 
 
-def _take_up(out: Path, about: dict[str, Any]) -> None:
-    """Make the run's folder, or take it up where settings and data are the same."""
+def _tell_of_threads(out: Path) -> None:
+    """Warn where a run is taken up with another number of threads: sums are then taken in another order."""
+    if (out / "weights.safetensors").is_file():
+        return
+    versions = read_yaml(out / "run.yaml", LONG_YAML).get("versions")
+    theirs, ours = versions.get("threads") if isinstance(versions, dict) else None, torch.get_num_threads()
+    if theirs not in (None, ours):
+        _LOG.warning(
+            "warning: %s was begun with %s threads and goes on with %d: the weights will not be the same "
+            "to the byte; set OMP_NUM_THREADS=%s for that",
+            out,
+            theirs,
+            ours,
+            theirs,
+        )
+
+
+def check_run(out: Path, about: dict[str, Any]) -> None:
+    """Refuse a folder that is neither new nor of a run with the same settings and data.
+
+    Raises:
+        DataError: It holds another run, or something else.
+    """
     path = out / "run.yaml"
     if path.is_file():
-        theirs = read_yaml(path)
+        theirs = migrate("run", read_yaml(path, LONG_YAML))
         differing = differing_keys(
             {key: about[key] for key in ("settings", "data")},
             {key: theirs.get(key) for key in ("settings", "data")},
@@ -247,4 +315,3 @@ def _take_up(out: Path, about: dict[str, Any]) -> None:
         return
     if not is_empty(out):
         raise DataError(f"{out} is not empty and holds no run; give a new folder")
-    save_yaml(about, path)

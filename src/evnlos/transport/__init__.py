@@ -12,14 +12,11 @@ from evnlos.transport.diffraction import Diffraction
 from evnlos.transport.lamp import lamp_radiance
 from evnlos.transport.light_transport import LightTransport
 from evnlos.transport.matrix_wall import MatrixWall
-from evnlos.transport.measured import MeasuredTransport
 from evnlos.transport.occluder import Occluder
 from evnlos.transport.operator import LinearTransport, MatrixTransport, Transport, compose
-from evnlos.transport.paper import PaperTransport
 from evnlos.transport.patches import Patches
 from evnlos.transport.radiometric import light_transport_matrix
 from evnlos.transport.reflection import DiffuseReflection
-from evnlos.transport.rig import RadiometricTransport, rig_preset
 from evnlos.transport.tpsf import tpsf_kernel, tpsf_profile, tpsf_truncation
 from evnlos.transport.view import View
 from evnlos.transport.viewing import Viewing
@@ -35,11 +32,8 @@ __all__ = [
     "LinearTransport",
     "MatrixTransport",
     "MatrixWall",
-    "MeasuredTransport",
     "Occluder",
-    "PaperTransport",
     "Patches",
-    "RadiometricTransport",
     "SlidingWall",
     "Transport",
     "View",
@@ -52,7 +46,6 @@ __all__ = [
     "lamp_radiance",
     "light_transport_matrix",
     "rayleigh_sommerfeld_sum",
-    "rig_preset",
     "sampling_limit_m",
     "tpsf_kernel",
     "tpsf_profile",

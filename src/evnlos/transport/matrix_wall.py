@@ -38,6 +38,7 @@ class MatrixWall:
         gain: White levels, 0 or more.
         ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
         keyframe_step_m: Distance between keyframes, metres; None is half a cell, 0 multiplies at every instant.
+        along: What else moves with the plate's centre and shines with it, and its own matrix.
 
     Raises:
         ConfigError: The gain, the ambient light or the step is negative or not finite.
@@ -54,6 +55,7 @@ class MatrixWall:
         gain: float = 1.0,
         ambient: float | ArrayLike | torch.Tensor = 0.0,
         keyframe_step_m: float | None = None,
+        along: tuple[MatrixTransport, Target] | None = None,
     ) -> None:
         check_gain(gain)
         strip = transport.source
@@ -68,6 +70,7 @@ class MatrixWall:
         self.motion = motion
         self.gain = float(gain)
         self.ambient = ambient_map(ambient, transport.shape).to(transport.matrix.device)
+        self._along = along
         self._magnification = magnification_px_m
         self._step = step
         self._keys: torch.Tensor | None = None
@@ -111,6 +114,21 @@ class MatrixWall:
         for start in range(0, len(positions), _CHUNK):
             drawn = self.target.rasterise(self._strip, positions[start : start + _CHUNK])
             image[start : start + _CHUNK] = self.transport(torch.as_tensor(drawn).to(matrix))
+        if self._along is not None:
+            image += self.light_along(positions)
+        return image
+
+    def light_along(self, positions_m: ArrayLike) -> torch.Tensor:
+        """Return the light of what moves along with the plate at positions (x, y) [T, 2], real [T, H, W]."""
+        positions = np.asarray(positions_m, dtype=np.float64)
+        image = self.transport.matrix.new_zeros((len(positions), *self.shape))
+        if self._along is None:
+            return image
+        carry, other = self._along
+        assert isinstance(carry.source, Plane)  # a moving picture needs square cells
+        for start in range(0, len(positions), _CHUNK):
+            drawn = other.rasterise(carry.source, positions[start : start + _CHUNK])
+            image[start : start + _CHUNK] = carry(torch.as_tensor(drawn).to(image))
         return image
 
     def _between_keys(self, positions: np.ndarray) -> torch.Tensor:

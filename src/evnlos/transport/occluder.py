@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from evnlos.errors import ConfigError
+from evnlos.transport.view import View
 
 Point3 = tuple[float, float, float]
 
@@ -109,3 +110,17 @@ def visibility(
             inside ^= crosses & (x_m < x0 + (y_m - y0) / level * (x1 - x0))
         open_way &= ~inside
     return open_way
+
+
+def check_sight(view: View, occluders: Sequence[Occluder]) -> None:
+    """Refuse occluders in the camera's line of sight: the matrix shades the way from target to wall only."""
+    assert view.eye_m is not None  # a setup's view is a pin-hole
+    x, y, z = (torch.tensor([value], dtype=torch.float64) for value in view.eye_m)
+    before = [one for one in occluders if max(corner[2] for corner in one.vertices_m) < float(z)]
+    hidden = ~visibility(view.wall_points_m().flatten(0, 1), x, y, float(z), before)
+    if bool(hidden.any()):
+        share = float(hidden.double().mean())
+        raise ConfigError(
+            f"an occluder hides the wall from {100 * share:.0f} % of the camera's pixels, which this model "
+            "leaves out; move it towards the target or turn the camera"
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from evnlos.config import load_yaml
 from evnlos.dataset.frame_sources import inside, read_image
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Plane
+from evnlos.untrusted import open_regular
 
 SCAN_FILE = "scan.yaml"
 DARK = "dark"
@@ -118,7 +120,7 @@ def read_shots(folder: str | Path, info: ScanInfo) -> list[Shot]:
     folder = Path(folder)
     path = inside(folder, info.frames, SCAN_FILE)
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with open_regular(path) as opened, TextIOWrapper(opened, encoding="utf-8", newline="") as file:
             rows = list(_bounded(csv.DictReader(file), path))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path} can't be read as a table: {error}") from None

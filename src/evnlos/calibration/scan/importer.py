@@ -16,8 +16,8 @@ from evnlos.calibration.scan.frames import Light, read_light
 from evnlos.calibration.scan.psf import PsfCheck, matrix_from_psf
 from evnlos.calibration.scan.repeats import Agreement, compare_repeats
 from evnlos.errors import ConfigError, DataError
-from evnlos.transport.measured import image_motion_px_m
-from evnlos.transport.measured_file import About, Measurement
+from evnlos.setups.measured import image_motion_px_m
+from evnlos.setups.measured_file import About, Measurement
 from evnlos.types import Plane
 
 _LEAST_SIGNAL = 3.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,9 +14,10 @@ from PIL import Image
 from evnlos.calibration.scan.estimate import ScanCamera, ScanEstimate, estimate_scan
 from evnlos.calibration.scan.folder import SCAN_FILE, ScanInfo, Shot, write_shots
 from evnlos.calibration.scan.patterns import Pattern, Patterns
-from evnlos.claim import is_empty
 from evnlos.config import save_yaml
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError
+from evnlos.files import new_folder
+from evnlos.progress import Progress, Step, silent
 from evnlos.types import Plane
 
 _CHECKS = 4
@@ -139,36 +139,46 @@ def spread_points(plane: Plane, count: int) -> tuple[tuple[int, int], ...]:
     return tuple((int(rows[k]), int(columns[k])) for k in chosen)
 
 
-def write_plan(plan: ScanPlan, folder: str | Path) -> Iterator[Path]:
-    """Write a scan's folder, yielding each file: scan.yaml, frames.csv, and places.csv or patterns/*.png.
+def write_plan(plan: ScanPlan, folder: str | Path, progress: Progress = silent) -> list[Path]:
+    """Write a scan's folder and return its files: scan.yaml, frames.csv, and places.csv or patterns/*.png.
+
+    The folder gets its name when the last is written.
 
     Args:
         plan: The plan.
         folder: A new or empty folder.
+        progress: Called when the work begins and after each file, with its path.
 
     Raises:
         DataError: The folder holds something already.
     """
     folder = Path(folder)
-    if not is_empty(folder):
-        raise DataError(f"{folder} is not empty; give a new folder for the scan")
-    (folder / "frames").mkdir(parents=True, exist_ok=True)
-    info = plan.info()
-    write_shots(folder / info.frames, plan.shots())
-    yield folder / info.frames
-    cells = measured_cells(info)
-    if plan.display is None and plan.pattern != "hadamard":
-        _write_places(folder / "places.csv", info.plane, cells)
-        yield folder / "places.csv"
-    else:
-        (folder / "patterns").mkdir()
-        _save(folder / "patterns" / "dark.png", plan, np.zeros(info.plane.shape, np.bool_))
-        for k in range(info.patterns.count):
-            path = folder / "patterns" / f"{k:05d}.png"
-            _save(path, plan, lit_cells(info, k))
-            yield path
-    save_yaml(info, folder / SCAN_FILE)  # last: a folder that has it is whole
-    yield folder / SCAN_FILE
+    info, shots = plan.info(), plan.shots()
+    shows_places = plan.display is None and plan.pattern != "hadamard"
+    total, written = 3 if shows_places else info.patterns.count + 2, list[Path]()
+
+    def wrote(path: Path) -> None:
+        written.append(path)
+        progress(Step("plan", len(written), total, "files", path))
+
+    progress(Step("plan", 0, total, "files"))
+    with new_folder(folder) as draft:
+        (draft / "frames").mkdir()
+        write_shots(draft / info.frames, shots)
+        wrote(folder / info.frames)
+        if shows_places:
+            _write_places(draft / "places.csv", info.plane, measured_cells(info))
+            wrote(folder / "places.csv")
+        else:
+            (draft / "patterns").mkdir()
+            _save(draft / "patterns" / "dark.png", plan, np.zeros(info.plane.shape, np.bool_))
+            for k in range(info.patterns.count):
+                name = f"patterns/{k:05d}.png"
+                _save(draft / name, plan, lit_cells(info, k))
+                wrote(folder / name)
+        save_yaml(info, draft / SCAN_FILE)
+        wrote(folder / SCAN_FILE)
+    return written
 
 
 def measured_cells(info: ScanInfo) -> NDArray[np.int64]:

@@ -18,9 +18,11 @@ def main(path: str, memory_bytes: int, seconds: int, kind: str) -> None:
     except ImportError:  # a system without limits
         pass
     else:
-        resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
-        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        wanted = {resource.RLIMIT_AS: memory_bytes, resource.RLIMIT_CPU: seconds, resource.RLIMIT_CORE: 0}
+        for kind_of_limit, most in wanted.items():
+            hard = resource.getrlimit(kind_of_limit)[1]  # that of this process may only be lowered
+            limit = most if hard == resource.RLIM_INFINITY else min(most, hard)
+            resource.setrlimit(kind_of_limit, (limit, limit))
     import aedat
 
     decoder = aedat.Decoder(path)

@@ -7,6 +7,7 @@ in the comments count from the start of the packet's size.
 from __future__ import annotations
 
 import struct
+from contextlib import closing
 from os import PathLike
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from evnlos.errors import DataError
 from evnlos.events.io.sink import FileSink
+from evnlos.files import new_file
 from evnlos.types import Events
 
 _SIGNATURE = b"#!AER-DAT4.0\r\n"
@@ -129,8 +131,7 @@ def write_aedat4(
         raise DataError(f"frames of shape {frames.shape} and type {frames.dtype}; give uint8 [T, H, W]")
     if times.shape != frames.shape[:1] or (np.diff(times) <= 0).any():
         raise DataError(f"{len(frames)} frames with times of shape {times.shape}; give one each, ascending")
-    sink = Aedat4Sink(Path(path), events, has_frames=True)
-    try:
+    with new_file(path) as temporary, closing(Aedat4Sink(temporary, events, has_frames=True)) as sink:
         done = 0
         for frame, t_us in zip(frames, times.tolist(), strict=True):
             until = int(np.searchsorted(events.t_us, t_us, side="right"))
@@ -138,5 +139,3 @@ def write_aedat4(
             sink.append_frame(frame, t_us)
             done = until
         sink.append(events[done:])
-    finally:
-        sink.close()

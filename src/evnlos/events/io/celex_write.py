@@ -15,6 +15,7 @@ from evnlos.events.io.celex_kernels import pack_lanes
 from evnlos.events.io.celex_options import clock_from_name, tick_divisor
 from evnlos.events.io.celex_state import HEIGHT, WIDTH
 from evnlos.events.io.sink import FileSink
+from evnlos.files import new_file
 from evnlos.types import Events
 
 _PAYLOAD = 357_000
@@ -172,21 +173,33 @@ class CelexSink(FileSink):
         self._header()
 
 
-def write_celex_frames(path: Path, frames: NDArray[np.uint8]) -> None:
-    """Write pictures [T, 800, 1280] of 8 bits as a recording of mode F, each with a time stamp of 0.
+def write_celex_frames(path: Path, frames: NDArray[np.uint8 | np.uint16]) -> None:
+    """Write pictures [T, 800, 1280] as a recording of mode F, each with a time stamp of 0.
+
+    Args:
+        path: The file.
+        frames: Pictures, brighter = greater: uint8, or uint16 of 12 bits.
 
     Raises:
-        DataError: Pictures of another size or type.
+        DataError: Pictures of another size or type, or of more than 12 bits.
     """
-    if frames.ndim != 3 or frames.shape[1:] != (HEIGHT, WIDTH) or frames.dtype != np.uint8:
+    if frames.ndim != 3 or frames.shape[1:] != (HEIGHT, WIDTH) or frames.dtype not in (np.uint8, np.uint16):
         raise DataError(
-            f"frames of shape {frames.shape} and type {frames.dtype}; give uint8 [T, {HEIGHT}, {WIDTH}]"
+            f"frames of shape {frames.shape} and type {frames.dtype}; give uint8 or uint16 "
+            f"[T, {HEIGHT}, {WIDTH}]"
         )
-    with Path(path).open("wb") as file:
+    if frames.size and frames.dtype == np.uint16 and int(frames.max()) > 4095:
+        raise DataError(f"frames holds {int(frames.max())}; CeleX-V has 12 bits, at most 4095")
+    with new_file(path) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<8BI", 2, 3, 255, 255, 1, 0, 0, 0, len(frames)))
         for frame in frames:
             groups = np.zeros((PICTURE_BYTES // 3, 3), np.uint8)
-            groups[:, :2] = 255 - frame.reshape(-1, 2)
+            if frame.dtype == np.uint8:
+                groups[:, :2] = 255 - frame.reshape(-1, 2)
+            else:
+                words = 4095 - frame.reshape(-1, 2)
+                groups[:, :2] = words >> 4
+                groups[:, 2] = (words[:, 0] & 0xF) | ((words[:, 1] & 0xF) << 4)
             file.write(
                 struct.pack("<I", PICTURE_BYTES + 1) + groups.tobytes() + b"\0" + struct.pack("<qI", 0, 0)
             )

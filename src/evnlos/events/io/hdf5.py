@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 
 from evnlos.events.io.columns import ColumnCheck, Columns
 from evnlos.events.io.report import ReadReport, unreadable
+from evnlos.untrusted import ElsewhereError, check_memory, open_hdf5, stored
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _MAX_RATIO = 1100  # deflate and lzf shrink a chunk at most that much
+_MOST_CHUNK_BYTES = 1 << 26
 _NAMES = {"t_us": "t", "x": "x", "y": "y", "p": "p"}
+_EVENT_BYTES = 26  # of an event as columns, and as what is stored
 _OPTIONAL = ("adc", "polarity_known")
 _H5_ERRORS = (
     OSError,
@@ -49,6 +52,8 @@ def _h5_errors(path: Path) -> Iterator[None]:
         found = " ".join(str(error).split())[:160]
         if "filter" in found.lower() and ("plugin" in found.lower() or "not available" in found.lower()):
             cure = "install hdf5plugin, or export it uncompressed (ECF: convert with the camera maker's tools)"
+        elif isinstance(error, ElsewhereError):
+            cure = "write the columns into the file itself"
         else:
             cure = _CURE
         raise unreadable(path, 0, f"HDF5 cannot read it ({found})", cure) from None
@@ -60,16 +65,16 @@ class Hdf5Source:
     def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
         self.path, self.report = path, report
         report.format = "HDF5"
-        with _h5_errors(path), h5py.File(path, "r") as file:
+        self._chunk_bytes = 0
+        with _h5_errors(path), open_hdf5(path) as file:
             self._count = self._check_layout(file)
             self._t_offset = self._offset(file)
             self._geometry(file, width, height)
 
     def _datasets(self, file: h5py.File) -> dict[str, h5py.Dataset]:
-        group = file.get("events")
+        group = stored(file, "events")
         if not isinstance(group, h5py.Group):
-            group = file.get("CD")
-            if isinstance(group, h5py.Group):
+            if isinstance(stored(file, "CD"), h5py.Group):
                 raise unreadable(
                     self.path,
                     0,
@@ -79,8 +84,8 @@ class Hdf5Source:
             raise unreadable(
                 self.path, 0, "an HDF5 file without a group 'events'", "DSEC columns events/{x,y,t,p} are read"
             )
-        datasets = {name: group.get(key) for name, key in _NAMES.items()}
-        datasets |= {name: group[name] for name in _OPTIONAL if name in group}
+        datasets = {name: stored(group, key) for name, key in _NAMES.items()}
+        datasets |= {name: stored(group, name) for name in _OPTIONAL if name in group}
         for name, dataset in datasets.items():
             if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.kind not in "iub":
                 raise unreadable(
@@ -95,6 +100,11 @@ class Hdf5Source:
             lengths[name] = int(dataset.shape[0])
             stored = dataset.id.get_storage_size()
             need = lengths[name] * dataset.dtype.itemsize
+            chunk = dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks is not None else 0
+            self._chunk_bytes = max(self._chunk_bytes, chunk)
+            if chunk > _MOST_CHUNK_BYTES:
+                found = f"events/{_NAMES.get(name, name)} has chunks of {chunk / 1e6:.0f} MB"
+                raise unreadable(self.path, 0, found, "write it in smaller ones (h5repack -l CHUNK=65536)")
             missing = (
                 dataset.chunks is not None and dataset.id.get_num_chunks() * dataset.chunks[0] < lengths[name]
             )
@@ -111,15 +121,18 @@ class Hdf5Source:
 
     def _offset(self, file: h5py.File) -> int:
         for place in ("t_offset", "events/t_offset"):
-            if place in file:
-                return int(file[place][()])  # type: ignore[index]
+            dataset = stored(file, place)
+            if isinstance(dataset, h5py.Dataset) and dataset.size == 1 and dataset.dtype.kind in "iu":
+                return int(dataset[()].item())
+            if dataset is not None:
+                raise unreadable(self.path, 0, f"{place} is no whole number", _CURE)
         return 0
 
     def _geometry(self, file: h5py.File, width: int | None, height: int | None) -> None:
         if width is not None:
             return self.report.set_geometry(width, height, "caller")
-        for holder in (file["events"], file):
-            if "width" in holder.attrs and "height" in holder.attrs:
+        for holder in (stored(file, "events"), file):
+            if holder is not None and "width" in holder.attrs and "height" in holder.attrs:
                 return self.report.set_geometry(holder.attrs["width"], holder.attrs["height"], "header")
         largest = {"x": 0, "y": 0}
         datasets = self._datasets(file)
@@ -169,7 +182,7 @@ class Hdf5Source:
 
     def blocks(self, size: int = 1 << 17) -> Iterator[Columns]:
         """Yield columns of at most `size` events."""
-        with _h5_errors(self.path), h5py.File(self.path, "r") as file:
+        with _h5_errors(self.path), open_hdf5(self.path, self._chunk_bytes) as file:
             datasets = self._datasets(file)
             check = ColumnCheck(self.report, lambda number: _stored_at(datasets["t_us"], number))
             for start in range(0, self._count, size):
@@ -180,6 +193,9 @@ class Hdf5Source:
 
     def read(self) -> Columns:
         """Return all events."""
+        check_memory(
+            _EVENT_BYTES * self._count, f"{self.path}: {self._count:,} events", "cut it with evnlos convert"
+        )
         return next(self.blocks(max(self._count, 1)), {})
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
@@ -15,6 +17,42 @@ _MAX_INDEX_MS = 1 << 24  # 4.7 hours; a longer index would be larger than the ev
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
+class _Storage:
+    """The file beneath HDF5, for which every write succeeds.
+
+    The library can't give up a file that it failed to write: it tries again at every close, at last when the
+    process ends, and crashes there. So the first failure is kept for the sink to raise, and no more is written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb+", buffering=0)
+        self.failure: OSError | None = None
+        self.read, self.readinto = self._file.read, self._file.readinto
+        self.seek, self.tell, self.flush = self._file.seek, self._file.tell, self._file.flush
+
+    def write(self, content: memoryview) -> int:
+        """Write all of it, or note why not."""
+        left = memoryview(content).cast("B")
+        try:
+            while len(left) and self.failure is None:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            self.failure = error
+        return len(content)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the file's size, or note why not."""
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+            return size or 0
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
 class Hdf5Sink:
     """An HDF5 file that grows: columns events/{x, y, t, p}, `ms_to_idx` and `t_offset`."""
 
@@ -23,7 +61,8 @@ class Hdf5Sink:
         self._wide = first.duration_us >= 2**32 or not -(2**62) < start < 2**62
         self._t_offset = 0 if self._wide else start
         self._events, self._last = 0, 0
-        self._file = h5py.File(path, "w", libver=("v110", "v110"))
+        self._storage = _Storage(path)
+        self._file = h5py.File(self._storage, "w", libver=("v110", "v110"))
         self._group = self._file.create_group("events")
         self._group.attrs["width"], self._group.attrs["height"] = first.width, first.height
         self._columns: dict[str, h5py.Dataset] = {}
@@ -31,6 +70,10 @@ class Hdf5Sink:
 
     def append(self, events: Events) -> None:
         """Write a piece; the first decides how large a chunk is."""
+        with self._told():
+            self._append(events)
+
+    def _append(self, events: Events) -> None:
         if len(events) and not self._wide and int(events.t_us[-1]) - self._t_offset >= 2**32:
             self._widen()
         # A difference of 64 bits: times that are far apart do not fit the narrow column, and are wide already.
@@ -78,6 +121,11 @@ class Hdf5Sink:
 
     def finish(self) -> None:
         """Complete the index and the offset."""
+        with self._told():
+            self._complete()
+            self._file.close()  # here: what the library cannot write is an error before the file gets its name
+
+    def _complete(self) -> None:
         if self._index is not None and self._last >= _MAX_INDEX_MS:
             del self._file["ms_to_idx"]
         elif not self._wide:
@@ -86,11 +134,20 @@ class Hdf5Sink:
             missing = self._last + 2 - len(self._index)
             _extend(self._index, np.full(missing, self._events, np.uint64))
         _put_compact(self._file, "t_offset", self._t_offset)
-        self.close()  # here: what the library cannot write is an error before the file gets its name
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+        self._storage.close()
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Raise what the storage noted, also where the library stumbles over what was not written."""
+        try:
+            yield
+        finally:
+            if self._storage.failure is not None:
+                raise self._storage.failure
 
 
 def _create(group: h5py.Group, name: str, dtype: np.dtype, expected: int) -> h5py.Dataset:

@@ -28,6 +28,7 @@ from evnlos.events.io.columns import Columns
 from evnlos.events.io.report import ReadReport, unreadable
 from evnlos.events.io.sink import Sink
 from evnlos.types import Events
+from evnlos.untrusted import open_regular
 
 _SNIFFED_BYTES = 65_536
 
@@ -132,7 +133,7 @@ def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format
     """
     if not path.is_file():
         raise EventFileError(f"{path}: no such file; check the path")
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         start = file.read(_SNIFFED_BYTES)
     if not start:
         raise unreadable(path, 0, "the file is empty", "record or copy it again")

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import glob
-import os
-import re
-import secrets
-import socket
 from collections.abc import Iterable
+from contextlib import ExitStack, suppress
 from os import PathLike
 from pathlib import Path
 
@@ -16,6 +12,7 @@ import numpy as np
 from evnlos.errors import DataError, EventFileError
 from evnlos.events.io.registry import format_to_write
 from evnlos.events.io.sink import Sink
+from evnlos.files import new_file
 from evnlos.types import Events
 
 _PIECE = 1 << 16  # smaller pieces are put together: they would cost a call and a chunk each
@@ -51,8 +48,8 @@ class EventWriter:
         self._format = format_to_write(self.path, format)
         if not self.path.parent.is_dir():
             raise EventFileError(f"{self.path}: no such folder {self.path.parent}; create it first")
-        _sweep(self.path)
-        self._temporary = self.path.with_name(f"{_prefix(self.path)}{os.getpid()}.{secrets.token_hex(4)}.part")
+        self._place = new_file(self.path)
+        self._temporary = self._place.__enter__()
         self._sink: Sink | None = None
         self._blank: Events | None = None  # states the sensor
         self._names: tuple[str, ...] = ()
@@ -63,16 +60,23 @@ class EventWriter:
     def __enter__(self) -> EventWriter:
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         try:
-            if kind is None:
+            with ExitStack() as leaving:
+                leaving.push(self._place)  # at the end: the file gets its name, or goes
+                leaving.callback(self._let_go)
+                if error is not None:
+                    raise error
                 self._finish()
-        except OSError as error:
-            raise self._failure(error) from None
-        finally:
-            if self._sink is not None:
+        except OSError as failure:
+            if failure is error:
+                raise
+            raise self._failure(failure) from None
+
+    def _let_go(self) -> None:
+        if self._sink is not None:
+            with suppress(OSError):  # what could not be written was told before, and the file goes
                 self._sink.close()
-            self._temporary.unlink(missing_ok=True)
 
     def write(self, events: Events) -> None:
         """Add a piece; one without events states the sensor size, for a stream that may have none."""
@@ -126,7 +130,6 @@ class EventWriter:
         assert self._sink is not None
         self._sink.finish()
         self._sink.close()
-        self._temporary.replace(self.path)
 
     def _failure(self, error: OSError) -> EventFileError:
         return EventFileError(f"{self.path}: writing failed ({error}); check the folder and the space on it")
@@ -160,30 +163,3 @@ def write_events(
     with EventWriter(path, format=format) as writer:
         for piece in [events] if isinstance(events, Events) else events:
             writer.write(piece)
-
-
-def _prefix(path: Path) -> str:
-    """Return how the unfinished files of a path begin that processes of this machine write."""
-    machine = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:40]
-    return f".{path.name[:80]}.{machine}."
-
-
-def _sweep(path: Path) -> None:
-    """Remove unfinished files of a path whose process was killed."""
-    if os.name != "posix":  # elsewhere asking whether a process lives may end it
-        return
-    start = _prefix(path)
-    for left in path.parent.glob(f"{glob.escape(start)}*.part"):
-        owner = left.name.removeprefix(start).split(".")[0]
-        if owner.isdigit() and not _is_alive(int(owner)):
-            left.unlink(missing_ok=True)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):  # another user's, or no number of a process of ours
-        pass
-    return True

@@ -1,0 +1,242 @@
+"""Which event model a sensor follows: each is fitted to the same figures, and captures held out decide.
+
+Pixels do not see each other, so every other row and column of the sensor tells as much about the model as all
+of them, at a quarter of the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.calibration.event_statistics import Recording, count_map, simulated
+from evnlos.calibration.frame_noise import local_square
+from evnlos.calibration.least_squares import levenberg_marquardt
+from evnlos.errors import ConfigError
+from evnlos.seeds import derive_seed
+from evnlos.sensor import PixelSettings
+from evnlos.sensor.brownian import BrownianPixel
+from evnlos.sensor.pixel import EventPixel
+from evnlos.types import Events
+
+Array = NDArray[np.float64]
+
+_LEVELS = 3  # classes of pixels by their mean light
+_MOVING = (0.15, 0.6)  # swings of the log light between pixels at rest, moving, and moving much
+_FLOOR = 0.05  # relative error of a figure that no model is held to
+_FEWEST = 1e-3  # events a pixel and second that count as none
+_BIN_S, _BLOCK_PX = 0.4, 5
+_SHARED = ("threshold_on", "threshold_off", "leak_rate_hz")
+_MARGIN = 0.1
+_EDGE = 0.02  # of a parameter's range
+
+
+@dataclass(frozen=True)
+class Free:
+    """A number of an event model that is fitted.
+
+    Args:
+        name: Its name.
+        low: Smallest value.
+        high: Largest value.
+        step: Step of the finite difference, relative where `log`.
+        log: Whether the search runs over its logarithm.
+    """
+
+    name: str
+    low: float
+    high: float
+    step: float
+    log: bool = True
+
+
+_THRESHOLDS = (
+    Free("threshold_on", 0.02, 3.0, 0.05),
+    Free("threshold_off", 0.02, 3.0, 0.05),
+    Free("threshold_sigma", 0.002, 0.5, 0.2),
+)
+MODELS: dict[str, tuple[PixelSettings, tuple[Free, ...]]] = {
+    "continuous, true logarithm": (
+        EventPixel(0.2, 0.2, 0.02, 80.0, 0.05, 0.2, 0.0, logarithm="true", dark_dn=1.0),
+        (
+            *_THRESHOLDS,
+            Free("shot_noise_rate_hz", 1e-4, 1e3, 0.1),
+            Free("leak_rate_hz", 0.0, 10.0, 0.03, log=False),
+            Free("dark_dn", 0.01, 60.0, 0.2),
+        ),
+    ),
+    "brownian": (
+        BrownianPixel(0.2, 0.2, 0.02, dark_dn=10.0, leak_rate_per_dn_hz=0.002),
+        (
+            *_THRESHOLDS,
+            Free("dark_dn", 0.1, 100.0, 0.2),
+            Free("leak_rate_hz", 0.0, 10.0, 0.03, log=False),
+            Free("leak_rate_per_dn_hz", 0.0, 1.0, 5e-4, log=False),
+            Free("photon_noise", 1e-3, 1.0, 0.1),
+        ),
+    ),
+}
+"""Event models beside v2e's continuous one: a start, and what is fitted."""
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """An event model that was fitted to recordings.
+
+    Args:
+        name: Name in `MODELS`.
+        pixel: The fitted pixel.
+        error: Standard error by name; infinite where the figures say nothing.
+        on_edge: Names of numbers that ended on the edge of their range.
+    """
+
+    name: str
+    pixel: PixelSettings
+    error: dict[str, float]
+    on_edge: tuple[str, ...]
+
+
+def thinned(recording: Recording, stride: int = 2) -> Recording:
+    """Return every n-th row and column of a recording."""
+    events = recording.events
+    kept = (events.x % stride == 0) & (events.y % stride == 0)
+    light = np.ascontiguousarray(recording.light[:, ::stride, ::stride])
+    few = Events(
+        events.t_us[kept],
+        events.x[kept] // stride,
+        events.y[kept] // stride,
+        events.p[kept],
+        light.shape[2],
+        light.shape[1],
+    )
+    return replace(recording, light=light, events=few)
+
+
+def figures_of(recordings: Sequence[Recording], events: Sequence[Events]) -> tuple[Array, Array]:
+    """Return figures of recordings and how many events stand behind each, [F] both.
+
+    Rates of ON and OFF events, hertz a pixel, in nine classes of pixels: by terciles of their mean light, and
+    by how much the light moves; and how much the counts of neighbours scatter where it moves.
+
+    Args:
+        recordings: Light, and the instants that count.
+        events: Recorded or simulated events of each.
+    """
+    total, pixels = np.zeros((_LEVELS, 3, 2)), np.zeros((_LEVELS, 3, 1))
+    scatter, where = np.zeros(2), 0.0
+    for recording, found in zip(recordings, events, strict=True):
+        light = np.log(np.maximum(recording.light, 1e-3))
+        level, swing = light.mean(axis=0), np.ptp(light, axis=0)
+        tercile = np.digitize(level, np.quantile(level, np.arange(1, _LEVELS) / _LEVELS))
+        moving = np.digitize(swing, _MOVING)
+        counts = [count_map(found, polarity, recording.settled_us) for polarity in (True, False)]
+        for k, count in enumerate(counts):
+            np.add.at(total[..., k], (tercile, moving), count)
+            scatter[k] += local_square(np.sqrt(count))[moving > 0].sum()
+        np.add.at(pixels[..., 0], (tercile, moving), recording.seconds)
+        where += float((moving > 0).sum()) * recording.seconds
+    rates = total / np.maximum(pixels, 1e-9)
+    behind = np.concatenate([total.ravel(), np.full(2, total.sum())])
+    return np.concatenate([rates.ravel(), scatter / max(where, 1e-9)]), behind
+
+
+def fit_model(
+    recordings: Sequence[Recording],
+    name: str,
+    near: PixelSettings,
+    *,
+    seed: int = 0,
+    iterations: int = 12,
+) -> ModelFit:
+    """Fit one of `MODELS` by the method of simulated moments: the logarithms of `figures_of` must agree.
+
+    Args:
+        recordings: Light and events.
+        name: Name of the model.
+        near: A pixel of another model that was fitted: the search starts at its thresholds and leak.
+        seed: Seed of the simulations; all trials draw the same noise.
+        iterations: Most steps.
+    """
+    chosen, free = MODELS[name]
+    start: Any = chosen
+    shared = {f.name: getattr(near, f.name) for f in free if f.name in _SHARED and hasattr(near, f.name)}
+    start = replace(start, **shared)
+    observed, behind = figures_of(recordings, [r.events for r in recordings])
+    weight = 1 / np.sqrt(1 / np.maximum(behind, 1) + _FLOOR**2)
+
+    def made(values: Array) -> PixelSettings:
+        return replace(start, **{f.name: _decoded(f, v) for f, v in zip(free, values, strict=True)})
+
+    def residual(values: Array) -> torch.Tensor:
+        try:
+            figures, _ = figures_of(recordings, simulated(recordings, made(values), seed))
+        except ConfigError:
+            return torch.full((len(observed),), 1e3, dtype=torch.float64)
+        return torch.from_numpy(weight * np.log((figures + _FEWEST) / (observed + _FEWEST)))
+
+    bounds = [(_encoded(f, f.low), _encoded(f, f.high)) for f in free]
+    first = [_encoded(f, min(max(getattr(start, f.name), f.low), f.high)) for f in free]
+    found = levenberg_marquardt(
+        residual, first, [f.step for f in free], bounds, iterations=iterations, tolerance=5e-3
+    )
+    pixel = made(found.values)
+    scale = [getattr(pixel, f.name) if f.log else 1.0 for f in free]
+    error = {f.name: float(e * s) for f, e, s in zip(free, found.error, scale, strict=True)}
+    edge = tuple(
+        f.name
+        for f, v, (low, high) in zip(free, found.values, bounds, strict=True)
+        if high - v < _EDGE * (high - low) or (f.name in _SHARED[:2] and v - low < _EDGE * (high - low))
+    )
+    return ModelFit(name, pixel, error, edge)
+
+
+def misfit(recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> Array:
+    """Return how far a pixel's events are from recorded ones, a number for each 0.4 s, [T].
+
+    Squared differences of counts, by polarity in blocks of 5 x 5 pixels, over the variance of two Poisson
+    counts; the mean of four simulations stands for the model.
+
+    Args:
+        recordings: Light and events.
+        pixel: The pixel.
+        seed: Seed of the simulations.
+    """
+    parts = []
+    draws = [simulated(recordings, pixel, derive_seed(seed, "misfit", k)) for k in range(4)]
+    for k, recording in enumerate(recordings):
+        seen = _volume(recording, recording.events)
+        model = sum((_volume(recording, draw[k]) for draw in draws), np.zeros(())) / len(draws)
+        parts.append(((seen - model) ** 2 / (seen + model + 1)).sum(axis=1))
+    return np.concatenate(parts)
+
+
+def is_better(before: Array, after: Array) -> bool:
+    """Return whether a model's misfit is lower by a tenth, and by more than thrice the difference's scatter."""
+    gain = before - after
+    return bool(gain.sum() > max(3 * math.sqrt(len(gain)) * gain.std(), _MARGIN * before.sum()))
+
+
+def _volume(recording: Recording, events: Events) -> Array:
+    """Return counts by stretch of time, polarity and block of the sensor, [T, 2 blocks]."""
+    rows, columns = (-(-n // _BLOCK_PX) for n in (events.height, events.width))
+    bins = max(1, math.ceil(recording.seconds / _BIN_S))
+    kept = events.t_us > recording.settled_us
+    when = ((events.t_us[kept] - recording.settled_us) * 1e-6 / _BIN_S).astype(np.int64)
+    block = (events.y[kept] // _BLOCK_PX).astype(np.int64) * columns + events.x[kept] // _BLOCK_PX
+    place = (np.minimum(when, bins - 1) * 2 + events.p[kept]) * rows * columns + block
+    counts = np.bincount(place, minlength=bins * 2 * rows * columns)
+    return counts.reshape(bins, -1).astype(np.float64)
+
+
+def _encoded(free: Free, value: float) -> float:
+    return math.log(value) if free.log else value
+
+
+def _decoded(free: Free, value: float) -> float:
+    return math.exp(value) if free.log else float(value)

@@ -1,0 +1,390 @@
+"""Fitting a wall of any kind: the facets' slopes, the camera's place and the wall's bend from known targets.
+
+The frames are y(p, n) = shared(p, place of n) + g(p) sum_q A(p, q; pose, slopes) x(q, n), with x the known
+pictures. What all captures share at a place is taken off both sides: ambient light, and anything else that
+moves along. The rest is least squares in the numbers of the pose, the logarithm of the slopes' density, a
+polynomial for the sensitivity g and a matte part, all at once (Gauss-Newton with damping; Marquardt 1963), with
+priors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.calibration.wall_data import Array, WallData
+from evnlos.errors import ConfigError
+from evnlos.transport.facets import (
+    MASKING,
+    Pose,
+    SlopeTable,
+    folded_columns,
+    second_differences,
+    seen_points,
+    target_cells,
+)
+from evnlos.transport.facets_kernel import carry_facets, carry_lobes, facet_slopes
+from evnlos.transport.radiometric_kernel import torchs_threads
+
+LOBES = np.array(
+    [(a, a * r) for a in (0.02, 0.035, 0.06, 0.10, 0.17, 0.3) for r in (0.6, 1.0, 1.6)], dtype=np.float64
+)
+"""Roughness along x and y of the GGX lobes that the search starts from."""
+EFFECTIVE = 600.0
+"""Independent numbers that the frames are worth: neighbouring pixels and places err alike."""
+_BEND = 0.3  # standard deviation of the second differences of the slopes' log density about its start
+_LEVEL = 2.0  # that of the log density itself
+_TILT = 0.15  # of the coefficients of the sensitivity's polynomial
+_MATTE = 10.0  # of the matte part, in units that count beside the facets
+_CHUNK = 400  # pixels whose derivatives are held at a time
+_TRIALS = 6
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """A number of the pose that the frames decide, with what is known before.
+
+    Args:
+        name: Name in `Pose`; `.0` for the first entry of a tuple.
+        unit: Its unit.
+        spread: Standard deviation of what is known before, in the unit, or relative where `log`.
+        step: Step of the finite difference, likewise.
+        log: Whether the search runs over its logarithm.
+    """
+
+    name: str
+    unit: str
+    spread: float
+    step: float
+    log: bool = False
+
+    def read(self, pose: Pose) -> float:
+        """Return the number in a pose."""
+        name, _, entry = self.name.partition(".")
+        value = getattr(pose, name)
+        return float(value[int(entry)] if entry else value)
+
+    def into(self, pose: Pose, value: float) -> Pose:
+        """Return the pose with another value."""
+        name, _, entry = self.name.partition(".")
+        if not entry:
+            return replace(pose, **{name: value})
+        both = list(getattr(pose, name))
+        both[int(entry)] = value
+        return replace(pose, **{name: tuple(both)})
+
+    def between(self, first: Pose, last: Pose) -> float:
+        """Return the step in the search's coordinate from one pose to another."""
+        low, high = self.read(first), self.read(last)
+        return math.log(high / low) if self.log else high - low
+
+    def moved(self, pose: Pose, by: float) -> Pose:
+        """Return the pose after a step in the search's coordinate."""
+        value = self.read(pose)
+        return self.into(pose, value * math.exp(by) if self.log else value + by)
+
+
+FREEDOMS = (
+    Freedom("camera_distance_m", "m", 0.5, 0.02, log=True),
+    Freedom("camera_angle_deg", "deg", 20.0, 0.5),
+    Freedom("camera_elevation_deg", "deg", 5.0, 0.5),
+    Freedom("camera_roll_deg", "deg", 2.0, 0.3),
+    Freedom("field_of_view_deg", "deg", 0.3, 0.01, log=True),
+    Freedom("target_offset_m.0", "m", 0.1, 0.002),
+    Freedom("target_offset_m.1", "m", 0.03, 0.002),
+    Freedom("distance_m", "m", 0.03, 0.01, log=True),
+    Freedom("curvature_per_m.0", "1/m", 0.7, 0.05),
+    Freedom("curvature_per_m.1", "1/m", 0.7, 0.05),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class WallState:
+    """A wall in the course of a fit.
+
+    Args:
+        pose: Camera, wall and target.
+        table: The facets' slopes, white levels included.
+        sensitivity: Logarithm of the pixels' sensitivity: coefficients of `WallData.monomials` [5].
+    """
+
+    pose: Pose
+    table: SlopeTable
+    sensitivity: Array = field(default_factory=lambda: np.zeros(5))
+
+    def place(self, data: WallData, pose: Pose | None = None) -> tuple[Array, Array, Array, Array, float]:
+        """Return wall points, their frames, directions to the eye, target cells and their area."""
+        pose = self.pose if pose is None else pose
+        seen = seen_points(pose, data.shape, data.columns, data.rows)
+        return seen.points, seen.frames, seen.eyes, target_cells(pose, data.plane), data.plane.pitch_m**2
+
+    def light(self, data: WallData, pose: Pose | None = None) -> Array:
+        """Return what the pixels see, without light that does not come from the targets, [P, N]."""
+        out = np.empty(data.seen.shape)
+        table = self.table
+        with torchs_threads():
+            carry_facets(
+                out, *self.place(data, pose), table.log_density, table.scale, table.step, table.matte, MASKING,
+                data.starts, data.index, data.light,
+            )  # fmt: skip
+        return out * np.exp(data.monomials() @ self.sensitivity)[:, None]
+
+    def residual(self, data: WallData) -> Array:
+        """Return the weighted residual [P, N] without what the captures share."""
+        left = data.shared_removed(data.seen - self.light(data))
+        return left * np.sqrt(data.weight)[:, None]
+
+
+def start_at(data: WallData, pose: Pose, lobes: Array = LOBES) -> tuple[WallState, float]:
+    """Return the wall of GGX lobes that fits best at a pose, and the share of the light that it leaves, 0..1.
+
+    Args:
+        data: Frames and targets.
+        pose: Camera, wall and target.
+        lobes: Roughness along x and y of the lobes [L, 2]; their weights are not negative.
+
+    Raises:
+        ConfigError: The camera of that pose does not see the wall.
+    """
+    from scipy.optimize import nnls  # scipy loads slowly
+
+    seen = seen_points(pose, data.shape, data.columns, data.rows)
+    cells = target_cells(pose, data.plane)
+    out = np.empty((*data.seen.shape, len(lobes) + 1))
+    with torchs_threads():
+        carry_lobes(
+            out, seen.points, seen.frames, seen.eyes, cells, data.plane.pitch_m**2, lobes, MASKING,
+            data.starts, data.index, data.light,
+        )  # fmt: skip
+    root = np.sqrt(data.weight)[:, None]
+    basis = (data.shared_removed(out) * root[..., None]).reshape(-1, len(lobes) + 1)
+    wanted = (data.shared_removed(data.seen) * root).ravel()
+    gram, right = basis.T @ basis, basis.T @ wanted
+    size = np.sqrt(np.diag(gram)) + 1e-300
+    normal = gram / np.outer(size, size) + 1e-6 * np.eye(len(size))
+    factor = np.linalg.cholesky(normal).T
+    solved, _ = nnls(factor, np.linalg.solve(factor.T, right / size))
+    weights = solved / size
+    power = float(wanted @ wanted)
+    left = (power - 2 * weights @ right + weights @ gram @ weights) / power
+    share = weights[:-1] * size[:-1]
+    if share.sum() <= 0:
+        weights = weights.copy()
+        weights[:-1] = 1e-6 / size[:-1]
+        share = weights[:-1] * size[:-1]
+    main = lobes[share > 0.05 * share.sum()].min()
+    scale = float(np.clip(main, 0.01, 0.2))
+    table = SlopeTable.of_lobes(lobes, weights[:-1], scale=scale, matte=float(weights[-1]))
+    return WallState(pose, table), float(left)
+
+
+@dataclass(frozen=True, eq=False)
+class Progress:
+    """Where a search stands.
+
+    Args:
+        state: The wall.
+        left: Share of what differs between captures that the wall leaves, 0..1.
+        evaluations: How often derivatives were computed.
+        prior: Misfit of what is known before, in squared standard deviations.
+    """
+
+    state: WallState
+    left: float
+    evaluations: int = 0
+    prior: float = 0.0
+
+    def cost(self) -> float:
+        """Return the misfit of the frames and of what is known, in squared standard deviations."""
+        return EFFECTIVE * math.log(self.left) + self.prior
+
+
+class _Unknowns:
+    """Where the numbers of a fit stand in its vector: pose, slopes, sensitivity, matte part.
+
+    Args:
+        freedoms: Numbers of the pose.
+        start: The state that the slopes' prior is about.
+        prior: Means of the pose's priors.
+    """
+
+    def __init__(self, freedoms: Sequence[Freedom], start: WallState, prior: Pose) -> None:
+        self.freedoms, self.prior_pose = tuple(freedoms), prior
+        nodes = start.table.nodes
+        self.column, self.count = folded_columns(nodes)
+        self.poses = len(self.freedoms)
+        self.size = self.poses + self.count + 6
+        self.matte = max(float(np.exp(start.table.log_density).max()) * 1e-3, start.table.matte)
+        self.first = self._folded(start.table.log_density)
+        known = np.array([f.spread for f in self.freedoms])
+        other = np.repeat([_LEVEL, _TILT, _MATTE], [self.count, 5, 1])
+        self.information = np.diag(1 / np.concatenate([known, other]) ** 2)
+        smooth = second_differences(nodes, self.column, self.count) / _BEND
+        slopes = slice(self.poses, self.poses + self.count)
+        self.information[slopes, slopes] += smooth.T @ smooth
+
+    def away(self, state: WallState) -> Array:
+        """Return the distance of a state from the priors' means, [size]."""
+        moved = [f.between(self.prior_pose, state.pose) for f in self.freedoms]
+        slopes = self._folded(state.table.log_density) - self.first
+        return np.concatenate([moved, slopes, state.sensitivity, [state.table.matte / self.matte]])
+
+    def stepped(self, state: WallState, step: Array) -> WallState:
+        """Return the state after a step [size]; no number of the pose goes further than its prior's spread."""
+        pose = state.pose
+        for freedom, by in zip(self.freedoms, step, strict=False):
+            pose = freedom.moved(pose, float(np.clip(by, -freedom.spread, freedom.spread)))
+        slopes = np.clip(step[self.poses : self.poses + self.count], -2, 2)[self.column]
+        matte = max(0.0, state.table.matte + float(step[-1]) * self.matte)
+        table = replace(state.table, log_density=state.table.log_density + slopes, matte=matte)
+        return WallState(pose, table, state.sensitivity + step[self.poses + self.count : -1])
+
+    def _folded(self, table: Array) -> Array:
+        total = np.bincount(self.column.ravel(), weights=table.ravel(), minlength=self.count)
+        return total / np.bincount(self.column.ravel(), minlength=self.count)
+
+
+def refine(
+    data: WallData,
+    state: WallState,
+    *,
+    prior: Pose,
+    freedoms: Sequence[Freedom] = FREEDOMS,
+    iterations: int = 10,
+    tolerance: float = 2e-3,
+) -> Progress:
+    """Fit pose, slopes and sensitivity together: Gauss-Newton with damping, smooth slopes, and what is known.
+
+    Args:
+        data: Frames and targets.
+        state: Start; the slopes stay near it, and smooth about it.
+        prior: What is known of the pose: the means of the freedoms' priors.
+        freedoms: Numbers of the pose that move.
+        iterations: Most steps.
+        tolerance: The search ends when a step lowers the cost by less than this fraction.
+    """
+    unknowns = _Unknowns(freedoms, state, prior)
+    power = float((data.shared_removed(data.seen) ** 2 * data.weight[:, None]).sum())
+    now, damping, evaluations = state.residual(data), 1e-2, 0
+    for _ in range(iterations):
+        temper = EFFECTIVE / float((now**2).sum())
+        away = unknowns.away(state)
+        cost = EFFECTIVE + away @ unknowns.information @ away
+        gram, right = normal_equations(data, state, unknowns, now)
+        evaluations += 1
+        hessian = gram * temper + unknowns.information
+        slope = right * temper - unknowns.information @ away
+        reached = cost
+        for _ in range(_TRIALS):
+            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
+            trial = unknowns.stepped(state, np.asarray(step, np.float64))
+            damping *= 8
+            try:
+                after = trial.residual(data)
+            except ConfigError:  # a camera that can't be: the search turns back
+                continue
+            far = unknowns.away(trial)
+            reached = float((after**2).sum()) * temper + far @ unknowns.information @ far
+            if reached < cost:
+                state, now, damping = trial, after, max(damping / 40, 1e-6)
+                break
+        if cost - reached < tolerance * cost:
+            break
+    away = unknowns.away(state)
+    return Progress(
+        state, float((now**2).sum()) / power, evaluations, float(away @ unknowns.information @ away)
+    )
+
+
+def uncertainty(
+    data: WallData, state: WallState, *, prior: Pose, freedoms: Sequence[Freedom] = FREEDOMS, blocks: int = 5
+) -> Array:
+    """Return standard errors of the pose's freedoms, in the search's coordinates, misfit included.
+
+    The gradients of whole captures and of whole blocks of the image scatter about zero as much as the errors of
+    model and noise let them (the sandwich estimator with two kinds of clusters; Cameron, Gelbach, Miller 2011).
+
+    Args:
+        data: Frames and targets.
+        state: The fit.
+        prior: See `refine`.
+        freedoms: Numbers of the pose that were fitted.
+        blocks: Blocks of the image along either axis.
+    """
+    unknowns = _Unknowns(freedoms, state, prior)
+    now, scores = state.residual(data), []
+    gram, _ = normal_equations(data, state, unknowns, now, scores)
+    temper = EFFECTIVE / float((now**2).sum())
+    inverse = np.linalg.inv(gram * temper + unknowns.information)
+    each = np.concatenate(scores)  # [P, C, M]
+    ends = [(v - v.min()) / (np.ptp(v) + 1e-9) * blocks for v in (data.rows, data.columns)]
+    row, column = (np.minimum(v, blocks - 1).astype(int) for v in ends)
+    block = row * blocks + column
+    by_block = np.stack([each[block == b].sum(axis=(0, 1)) for b in np.unique(block)])
+    by_capture = each.sum(axis=0)
+    scatter = temper**2 * (by_block.T @ by_block + by_capture.T @ by_capture) + unknowns.information
+    return np.sqrt(np.diag(inverse @ scatter @ inverse)[: unknowns.poses])
+
+
+def normal_equations(
+    data: WallData, state: WallState, unknowns: _Unknowns, now: Array, scores: list[Array] | None = None
+) -> tuple[Array, Array]:
+    """Return J^T W J [M, M] and J^T W r [M], with the rows free of what the captures share.
+
+    Args:
+        data: Frames and targets.
+        state: Where.
+        unknowns: What J derives by.
+        now: The weighted residual r there [P, N], as `WallState.residual` gives it.
+        scores: Where it is a list, each pixel's and capture's part of the latter is appended to it, [P, C, M].
+    """
+    poses, count, table = unknowns.poses, unknowns.count, state.table
+    light, moves = state.light(data), []
+    for freedom in unknowns.freedoms:
+        try:
+            moves.append((state.light(data, freedom.moved(state.pose, freedom.step)) - light) / freedom.step)
+        except ConfigError:
+            moves.append((light - state.light(data, freedom.moved(state.pose, -freedom.step))) / freedom.step)
+    points, frames, eyes, cells, area = state.place(data)
+    monomials, root = data.monomials(), np.sqrt(data.weight).astype(np.float32)
+    gain = np.exp(monomials @ state.sensitivity)
+    gram, right = np.zeros((unknowns.size, unknowns.size)), np.zeros(unknowns.size)
+    member = _members(data.group) / np.sqrt(np.bincount(data.group)).astype(np.float32)  # [N, G]
+    capture = torch.from_numpy(_members(data.capture))
+    for start in range(0, len(light), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        own = light[part]
+        slopes = np.empty((*own.shape, count + 1), np.float32)
+        with torchs_threads():
+            facet_slopes(
+                slopes, points[part], frames[part], eyes[part], cells, area, table.log_density, table.scale,
+                table.step, MASKING, unknowns.column, data.starts, data.index, data.light,
+            )  # fmt: skip
+        jac = np.empty((*own.shape, unknowns.size), np.float32)
+        for k, move in enumerate(moves):
+            jac[..., k] = move[part]
+        jac[..., poses : poses + count] = slopes[..., :-1] * gain[part, None, None]
+        jac[..., poses + count : -1] = own[..., None] * monomials[part, None, :]
+        jac[..., -1] = slopes[..., -1] * (gain[part, None] * unknowns.matte)
+        jac *= root[part, None, None]
+        every = torch.from_numpy(jac)
+        left = torch.from_numpy(now[part].astype(np.float32))
+        flat = every.flatten(0, 1)
+        gram += (flat.T @ flat).double().numpy()
+        right += (flat.T @ left.flatten()).double().numpy()
+        # Without the means m of the n frames of a group, sum J^T J falls by n m^T m.
+        means = (every.mT @ torch.from_numpy(member)).mT.flatten(0, 1)
+        gram -= (means.T @ means).double().numpy()
+        if scores is not None:
+            scores.append(((every * left[..., None]).mT @ capture).mT.double().numpy())
+    return gram, right
+
+
+def _members(numbers: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return 1 where a frame belongs to a group, [N, G]."""
+    return (numbers[:, None] == np.unique(numbers)).astype(np.float32)

@@ -1,0 +1,338 @@
+"""What pose and slopes leave: each pixel's sensitivity, light that travels along, a correction of the operator.
+
+Each is fitted to the captures of the fit and kept only where captures that the fit has not seen get better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.calibration.captures import Shots
+from evnlos.calibration.wall_data import WallData, wall_data
+from evnlos.calibration.wall_fit import WallState
+from evnlos.dataset.sampling import reduce_by_area
+from evnlos.setups.fitted_file import AboutWall, FittedWall
+from evnlos.transport.facets import MASKING, seen_points, target_cells
+from evnlos.transport.facets_kernel import fill_facets
+from evnlos.transport.radiometric_kernel import torchs_threads
+from evnlos.types import Plane
+
+Array = NDArray[np.float64]
+
+_COLUMNS = 160  # of the working pictures: finer texture is the fixed pattern's
+_COARSE = 64  # of those that the correction of the operator is estimated on
+_TEXTURE = 0.05  # standard deviation of a pixel's sensitivity about the smooth model
+_SMOOTH_PX = (2.0, 5.0)  # of the map of sensitivities, working pixels
+_AMBIENT_PX = 3.0
+_LENGTHS_M = (0.01, 0.025)
+_LEVELS = (1e-2, 3e-2, 1e-1, 3e-1)
+_RANK = 32
+_COMPANION = Plane(16, 16, 0.01)
+_BRIGHTEST = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class WallRest:
+    """A wall with what its pose and slopes leave, and how much each freedom explains.
+
+    Args:
+        wall: The fitted wall; its ambient light is divided by `ambient`.
+        ambient: Mean ambient light, white levels.
+        explained: By name of the freedom, the share of what was left on captures held out, beside their noise,
+            that it takes away; negative where it made things worse.
+        kept: The freedoms that are part of the wall.
+    """
+
+    wall: FittedWall
+    ambient: float
+    explained: dict[str, float]
+    kept: tuple[str, ...]
+
+
+def rest_of(fit: Shots, held: Shots, state: WallState, plane: Plane) -> WallRest:
+    """Return the wall with what its pose and slopes leave, as the held-out captures want.
+
+    Args:
+        fit: Captures to fit.
+        held: Captures to judge on.
+        state: Pose and slopes.
+        plane: Cells of the targets' pictures, over the whole travel.
+    """
+    from scipy.ndimage import gaussian_filter  # scipy loads slowly
+
+    data, other = _both(fit, held, _COLUMNS, plane, 1)
+    light, away = state.light(data), state.light(other)
+    explained: dict[str, float] = {}
+    kept: list[str] = []
+
+    texture, error = np.ones(len(light)), _judged(data, other, light, away)
+    floor, best, rough = _noise(other, away), error, pixel_sensitivity(data, light)
+    for smooth in _SMOOTH_PX:
+        name, trial = f"texture smooth over {smooth:g} pixels", _smoothed(data, *rough, smooth)[:, None]
+        after = _judged(data, other, light * trial, away * trial)
+        explained[name] = _share(error, after, floor)
+        if _better(best, after):
+            texture, best, kept = trial[:, 0], after, [name]
+    sensitivity = texture * np.exp(data.monomials() @ state.sensitivity)
+
+    coarse, behind = _both(fit, held, _COARSE, plane, 2)
+    factor = _resized(data.image(texture, 1.0), coarse.grid).ravel()
+    light, away = (state.light(d) * factor[d.pixel, None] for d in (coarse, behind))
+    error, floor = _judged(coarse, behind, light, away), _noise(behind, away)
+    left, right, after = correction_of(coarse, light, behind, away)
+    name = "correction of the operator"
+    explained[name] = _share(error, after, floor)
+    pictures = np.zeros((0, *coarse.grid))
+    if _better(error, after):
+        kept.append(name)
+        pictures = np.stack([coarse.image(column, 0.0) for column in left.T])
+        light, away = light + left @ (right @ _dense(coarse)), away + left @ (right @ _dense(behind))
+    else:
+        right = np.zeros((0, plane.height * plane.width))
+
+    shared, there = _means(coarse, coarse.seen - light), _means(behind, behind.seen - away)
+    picture, ambient = np.zeros(_COMPANION.shape), shared.mean(axis=1)
+    if coarse.group.max() > 0 and coarse.group.max() == behind.group.max():
+        places = np.stack(
+            [coarse.places[coarse.group == g].mean(axis=0) for g in range(coarse.group.max() + 1)]
+        )
+        own = factor[coarse.pixel] * np.exp(coarse.monomials() @ state.sensitivity)
+        found, carried = companion_of(coarse, state, shared, places, _COMPANION, own)
+        before = _moving(coarse, there)
+        after = _moving(coarse, there - carried)
+        noise = floor.sum() / behind.seen.shape[1] * (len(places) - 1) / len(np.unique(behind.capture))
+        name = "light that travels along"
+        explained[name] = _share(before, after, np.array([noise]))
+        if _better(before, after):
+            kept.append(name)
+            picture, ambient = found, (shared - carried).mean(axis=1)
+    ambient_map = gaussian_filter(coarse.image(ambient, float(ambient.mean())), _AMBIENT_PX, mode="nearest")
+    level = max(float(ambient_map.mean()), 0.0)
+    about = AboutWall(
+        state.table.scale,
+        state.table.step,
+        state.table.matte,
+        _COMPANION,
+        plane,
+        {"explained": {name: round(value, 4) for name, value in explained.items()}, "kept": kept},
+    )
+    wall = FittedWall(
+        state.table.log_density,
+        data.image(sensitivity, float(np.median(sensitivity))).astype(np.float32),
+        (np.maximum(ambient_map, 0) / level if level > 1e-6 else np.ones(coarse.grid)).astype(np.float32),
+        picture.astype(np.float32),
+        pictures.astype(np.float32),
+        right.astype(np.float32),
+        about,
+    )
+    return WallRest(wall, level, explained, tuple(kept))
+
+
+def _both(fit: Shots, held: Shots, columns: int, plane: Plane, every: int) -> tuple[WallData, WallData]:
+    """Return the data of two sets of captures over the same pixels."""
+    data, other = (wall_data(shots, columns, plane, every=every, first=every - 1) for shots in (fit, held))
+    return data.pixels(np.isin(data.pixel, other.pixel)), other.pixels(np.isin(other.pixel, data.pixel))
+
+
+def _resized(pictures: Array, grid: tuple[int, int]) -> Array:
+    """Return pictures [..., h, w] at another size."""
+    before = pictures.shape[:-2]
+    if pictures.shape[-2:] == grid or not pictures.size:
+        return pictures.reshape(*before, *grid)
+    flat = pictures.reshape(-1, *pictures.shape[-2:])
+    if grid[1] < pictures.shape[-1]:
+        return reduce_by_area(flat, grid).reshape(*before, *grid).astype(np.float64)
+    large = torch.nn.functional.interpolate(
+        torch.from_numpy(flat)[None], grid, mode="bilinear", align_corners=False
+    )
+    return large.numpy().reshape(*before, *grid)
+
+
+def _judged(data: WallData, other: WallData, light: Array, away: Array) -> Array:
+    """Return the weighted squares left on each capture held out, less what the fitted ones share, [C]."""
+    return _squares(other, other.seen - away - _expected(data, other, data.seen - light))
+
+
+def _expected(data: WallData, other: WallData, values: Array) -> Array:
+    """Return what the captures of the fit share, for the frames held out: [P, N] or [P, 1]."""
+    shared = _means(data, values)
+    return shared[:, other.group] if data.group.max() > 0 else shared
+
+
+def _squares(data: WallData, values: Array) -> Array:
+    """Return the weighted squares of each capture, [C]."""
+    each = (values**2 * data.weight[:, None]).sum(axis=0)
+    return np.bincount(data.capture, weights=each).astype(np.float64)
+
+
+def _noise(data: WallData, light: Array) -> Array:
+    """Return the weighted squares of the noise of each capture [C], from second differences in time."""
+    left = data.seen - light
+    inside = data.capture[2:] == data.capture[:-2]
+    each = ((left[:, 2:] - 2 * left[:, 1:-1] + left[:, :-2]) ** 2 * data.weight[:, None]).sum(axis=0) / 6
+    return np.bincount(data.capture).astype(np.float64) * float(each[inside].mean())
+
+
+def _share(before: Array, after: Array, noise: Array) -> float:
+    """Return the share of what was left beside the noise that a freedom takes away."""
+    total = float(before.sum() - noise.sum())
+    return float(before.sum() - after.sum()) / max(total, 1e-3 * float(before.sum()))
+
+
+def _better(before: Array, after: Array) -> bool:
+    """Return whether captures held out got better, by more than twice the scatter between them."""
+    gain = before - after
+    return bool(gain.sum() > 2 * np.sqrt(len(gain)) * gain.std() and gain.sum() > 5e-4 * before.sum())
+
+
+def _moving(data: WallData, shared: Array) -> Array:
+    """Return the weighted squares of what changes from place to place, by blocks of places, [4]."""
+    each = ((shared - shared.mean(axis=1, keepdims=True)) ** 2 * data.weight[:, None]).sum(axis=0)
+    return np.array([part.sum() for part in np.array_split(each, 4)])
+
+
+def _means(data: WallData, values: Array) -> Array:
+    """Return the means over the frames of each group, [P, G]."""
+    return np.stack([values[:, data.group == g].mean(axis=1) for g in range(data.group.max() + 1)], axis=1)
+
+
+def pixel_sensitivity(data: WallData, light: Array, spread: float = _TEXTURE) -> tuple[Array, Array]:
+    """Return each pixel's sensitivity beside the model's [P], and its precision over that of the prior [P].
+
+    Least squares of what differs between captures.
+
+    Args:
+        data: Frames.
+        light: The model's light [P, N].
+        spread: Standard deviation of the sensitivities about 1.
+    """
+    model, seen = data.shared_removed(light), data.shared_removed(data.seen)
+    power = (model * model).sum(axis=1)
+    noise = float(np.mean((seen - model) ** 2))
+    ratio = (model * seen).sum(axis=1) / np.maximum(power, 1e-12 * power.max())
+    return ratio, power * (spread**2 / noise)
+
+
+def _smoothed(data: WallData, ratio: Array, precision: Array, smooth: float) -> Array:
+    """Return the sensitivities averaged over neighbours by their precision, near 1 where nothing is known."""
+    from scipy.ndimage import gaussian_filter  # scipy loads slowly
+
+    # One pixel alone must not outweigh its neighbours: textures differ from pixel to pixel.
+    weight = precision / (1 + precision)
+    top, below = (gaussian_filter(data.image(v, 0.0), smooth) for v in (weight * (ratio - 1), weight))
+    return 1 + (top / (below + 0.02)).ravel()[data.pixel]
+
+
+def correction_of(data: WallData, light: Array, other: WallData, away: Array) -> tuple[Array, Array, Array]:
+    """Return the correction of the operator that predicts held-out captures best; the squares it leaves [C].
+
+    The correction is pictures of the camera image [P, R] times weights over target cells [R, Q].
+
+    A residual pixel is a linear function of the target's picture, with a Gaussian prior of smooth weights over
+    the plane (Gaussian process regression); strength and smoothness are chosen on the captures held out,
+    and the result is cut to its strongest singular vectors.
+
+    Args:
+        data: Frames of the fit.
+        light: The model's light of them [P, N].
+        other: Frames held out.
+        away: The model's light of them.
+    """
+    pictures = [_dense(data), _dense(other)]
+    means = np.stack(
+        [pictures[0][:, data.group == g].mean(axis=1) for g in range(data.group.max() + 1)], axis=1
+    )
+    x = pictures[0] - means[:, data.group]
+    xh = pictures[1] - (means[:, other.group] if data.group.max() > 0 else means)
+    wanted = data.shared_removed(data.seen - light)
+    left_out = other.seen - away - _expected(data, other, data.seen - light)
+    grid = np.stack(np.meshgrid(data.plane.y_m, data.plane.x_m, indexing="ij"), axis=-1).reshape(-1, 2)
+    distance = ((grid[:, None] - grid[None]) ** 2).sum(axis=-1)
+    best: tuple[Array, Array, Array] | None = None
+    for length in _LENGTHS_M:
+        kx = np.exp(-0.5 * distance / length**2) @ x  # [Q, N]
+        values, vectors = np.linalg.eigh(x.T @ kx)
+        turned, cross = wanted @ vectors, (xh.T @ kx) @ vectors
+        for level in _LEVELS:
+            gain = 1 / (np.maximum(values, 0) + level * values.max())
+            after = _squares(other, left_out - (turned * gain) @ cross.T)
+            if best is None or after.sum() < best[0].sum():
+                best = after, turned * gain, kx @ vectors
+    assert best is not None
+    u, s, v = np.linalg.svd(best[1] @ best[2].T, full_matrices=False)
+    rank = min(_RANK, int((s > 1e-3 * s[0]).sum()))
+    return u[:, :rank] * s[:rank], v[:rank], best[0]
+
+
+def companion_of(
+    data: WallData, state: WallState, shared: Array, places: Array, plane: Plane, sensitivity: Array
+) -> tuple[Array, Array]:
+    """Return the picture of what shines beside the target and moves along [h, w], and its light [P, S].
+
+    The light that all captures share at each place is ambient light, the same everywhere, and what a picture
+    without negative values makes, drawn to be dark and smooth (non-negative least squares).
+
+    Args:
+        data: The pixels.
+        state: The wall.
+        shared: Light that all captures share at each place [P, S].
+        places: These places (x, y) [S, 2], metres.
+        plane: Cells of the picture, about the target's middle.
+        sensitivity: Of each pixel [P].
+    """
+    from scipy.optimize import nnls  # scipy loads slowly
+
+    matrix = _moving_matrix(data, state, places, plane, sensitivity)
+    root = np.sqrt(data.weight)[:, None, None]
+    a = ((matrix - matrix.mean(axis=1, keepdims=True)) * root).reshape(-1, matrix.shape[2])
+    wanted = shared - shared.mean(axis=1, keepdims=True)
+    gram, right = a.T @ a, a.T @ (wanted * root[..., 0]).ravel()
+    level = 1e-3 * np.trace(gram) / len(right)
+    steps = _neighbours(plane)
+    normal = gram + level * (steps.T @ steps) + 0.1 * level * np.eye(len(right))
+    factor = np.linalg.cholesky(normal).T
+    picture = np.minimum(nnls(factor, np.linalg.solve(factor.T, right))[0], _BRIGHTEST)
+    return picture.reshape(plane.shape), matrix @ picture
+
+
+def _moving_matrix(data: WallData, state: WallState, places: Array, plane: Plane, sensitivity: Array) -> Array:
+    """Return what the pixels see of each cell of a picture at each place, [P, S, h w]."""
+    seen = seen_points(state.pose, data.shape, data.columns, data.rows)
+    table, here = state.table, target_cells(state.pose, plane)
+    out = np.empty((len(data.columns), len(places), plane.height * plane.width))
+    for k, (x, y) in enumerate(places):
+        part = np.empty((len(out), out.shape[2]))
+        cells = here + np.array([x, y, x * state.pose.travel_slope])
+        with torchs_threads():
+            fill_facets(
+                part, seen.points, seen.frames, seen.eyes, cells, plane.pitch_m**2, table.log_density,
+                table.scale, table.step, table.matte, MASKING,
+            )  # fmt: skip
+        out[:, k] = part * sensitivity[:, None]
+    return out
+
+
+def _neighbours(plane: Plane) -> Array:
+    """Return the differences between neighbouring cells, [R, h w]."""
+    index = np.arange(plane.height * plane.width).reshape(plane.shape)
+    pairs = np.concatenate(
+        [
+            np.stack([index[1:].ravel(), index[:-1].ravel()], axis=1),
+            np.stack([index[:, 1:].ravel(), index[:, :-1].ravel()], axis=1),
+        ]
+    )
+    rows = np.zeros((len(pairs), index.size))
+    rows[np.arange(len(pairs)), pairs[:, 0]], rows[np.arange(len(pairs)), pairs[:, 1]] = 1, -1
+    return rows
+
+
+def _dense(data: WallData) -> Array:
+    """Return the targets' pictures [Q, N]."""
+    out = np.zeros((data.plane.height * data.plane.width, len(data.starts) - 1))
+    frame = np.repeat(np.arange(out.shape[1]), np.diff(data.starts))
+    out[data.index, frame] = data.light
+    return out

@@ -1,0 +1,20 @@
+"""A second renderer, for captures that the simulator's own models of a rig do not describe."""
+
+from evnlos.lab.light_path import Optics, Rays, cast, fill_throughput, texture
+from evnlos.lab.reflection import Lobe, Reflection
+from evnlos.lab.room import Mount, RenderedWall, Torch, brightness, covered_plane
+
+__all__ = [
+    "Lobe",
+    "Mount",
+    "Optics",
+    "Rays",
+    "Reflection",
+    "RenderedWall",
+    "Torch",
+    "brightness",
+    "cast",
+    "covered_plane",
+    "fill_throughput",
+    "texture",
+]

@@ -1,0 +1,283 @@
+"""The light path of a real rig: lens -> curved, textured wall -> target plane, as a matrix of throughputs.
+
+Coordinates: x to the right, y downwards, z from the wall's middle into the room, metres. The wall is the
+paraboloid z = -(c_x x^2 + c_y y^2) / 2, the target's plane is z = distance. A pixel averages `samples` rays,
+each through another point of the pixel and of the lens: area, defocus and texture in one sum.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from evnlos.errors import ConfigError
+from evnlos.lab.reflection import add_density
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Where the rays of the pixels meet the wall, in which frame, and from where they are seen.
+
+    Args:
+        point: Points of the wall, [P, S, 3], metres.
+        frame: Tangents along x and y, and normal, [P, S, 3, 3].
+        eye: Unit vectors towards the lens, in that frame, [P, S, 3].
+        share: Weights of the rays, [P, S]: their share of the pixel, texture and vignetting.
+    """
+
+    point: Array
+    frame: Array
+    eye: Array
+    share: Array
+
+
+@dataclass(frozen=True)
+class Optics:
+    """A camera before a curved wall.
+
+    Args:
+        shape: Size (H, W) of the image, pixels.
+        distance_m: Distance from the lens to the wall's middle, metres.
+        azimuth: Angle between the optical axis and the wall's normal about the vertical, radians; positive puts
+            the camera at +x.
+        elevation: Angle of the lens above the wall's middle, radians.
+        roll: Turn of the camera about its axis, radians.
+        fov: Horizontal field of view, radians.
+        radial: Radial distortion of second and fourth power: share by which the corner's ray moves outwards.
+        aperture_m: Diameter of the lens's opening, metres; 0 is a pin-hole.
+        focus_m: Distance along the axis at which the camera is in focus, metres.
+        falloff: Loss of light in the corners beside the cosine's fourth power, 0..1.
+        curvature: Curvatures of the wall along x and y, 1/metre; positive bulges into the room.
+        samples: Rays a pixel.
+    """
+
+    shape: tuple[int, int]
+    distance_m: float
+    azimuth: float
+    elevation: float
+    roll: float
+    fov: float
+    radial: tuple[float, float]
+    aperture_m: float
+    focus_m: float
+    falloff: float
+    curvature: tuple[float, float]
+    samples: int
+
+
+def camera_axes(optics: Optics) -> tuple[Array, Array, Array, Array]:
+    """Return the lens's place and the camera's forward, right and down vectors, [3] each."""
+    sa, ca = math.sin(optics.azimuth), math.cos(optics.azimuth)
+    se, ce = math.sin(optics.elevation), math.cos(optics.elevation)
+    place = optics.distance_m * np.array([sa * ce, -se, ca * ce])
+    forward = -place / optics.distance_m
+    right = np.array([ca, 0.0, -sa])
+    down = np.array([sa * se, ce, ca * se])  # at right angles to both; y grows downwards
+    cr, sr = math.cos(optics.roll), math.sin(optics.roll)
+    return place, forward, cr * right + sr * down, cr * down - sr * right
+
+
+def cast(optics: Optics) -> Rays:
+    """Return the rays of all pixels, row by row, with vignetting but without texture.
+
+    Raises:
+        ConfigError: Part of the image does not see the wall.
+    """
+    height, width = optics.shape
+    pixel, lens = _spread(optics.samples)
+    place, forward, right, down = camera_axes(optics)
+    tangent = 2 * math.tan(optics.fov / 2) / width
+    rows, columns = np.divmod(np.arange(height * width), width)
+    p = (columns[:, None] - (width - 1) / 2 + pixel[:, 0]) * tangent  # [P, S]
+    q = (rows[:, None] - (height - 1) / 2 + pixel[:, 1]) * tangent
+    r2 = (p * p + q * q) / ((width**2 + height**2) / 4 * tangent**2)  # 1 in the corners
+    stretch = 1 + optics.radial[0] * r2 + optics.radial[1] * r2 * r2
+    p, q = p * stretch, q * stretch
+    straight = forward + p[..., None] * right + q[..., None] * down  # [P, S, 3], of length 1 along the axis
+    shift = optics.aperture_m / 2 * (lens[:, :1] * right + lens[:, 1:] * down)  # [S, 3]
+    origin = place + shift
+    ray = straight * optics.focus_m - shift
+    point = _meet(origin, ray, optics.curvature)
+    if not np.isfinite(point).all():
+        raise ConfigError(
+            "part of the image does not see the wall; turn the camera towards it or narrow its field of view"
+        )
+    cx, cy = optics.curvature
+    along_x = np.zeros_like(point)
+    along_x[..., 0], along_x[..., 2] = 1.0, -cx * point[..., 0]
+    normal = np.stack([cx * point[..., 0], cy * point[..., 1], np.ones(point.shape[:-1])], axis=-1)
+    along_x /= np.linalg.norm(along_x, axis=-1, keepdims=True)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    along_y = np.cross(normal, along_x)
+    frame = np.stack([along_x, along_y, normal], axis=-2)
+    eye = origin - point
+    eye /= np.linalg.norm(eye, axis=-1, keepdims=True)
+    cos4 = (1 + p * p + q * q) ** -2.0
+    share = cos4 * (1 - optics.falloff * r2) / optics.samples
+    return Rays(point, frame, np.einsum("psij,psj->psi", frame, eye), share)
+
+
+def _spread(samples: int) -> tuple[Array, Array]:
+    """Return points of a pixel (-0.5..0.5) and of the unit disc, [S, 2] each: an additive recurrence."""
+    k = np.arange(samples)[:, None]
+    root = 1.1673039782614187  # the real root of x^5 = x + 1: the four-dimensional golden ratio
+    steps = root ** -np.arange(1.0, 5.0)
+    u = (0.5 + k * steps) % 1.0 if samples > 1 else np.full((1, 4), 0.5)
+    radius, angle = (np.sqrt(u[:, 2]), 2 * np.pi * u[:, 3]) if samples > 1 else (np.zeros(1), np.zeros(1))
+    disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    pixel, disc = u[:, :2] - 0.5, disc
+    return pixel - pixel.mean(axis=0), disc - disc.mean(axis=0)
+
+
+def _meet(origin: Array, ray: Array, curvature: tuple[float, float]) -> Array:
+    """Return where rays [..., 3] from origins meet the paraboloid; not finite where they do not."""
+    cx, cy = curvature
+    a = (cx * ray[..., 0] ** 2 + cy * ray[..., 1] ** 2) / 2
+    b = ray[..., 2] + cx * origin[..., 0] * ray[..., 0] + cy * origin[..., 1] * ray[..., 1]
+    c = origin[..., 2] + (cx * origin[..., 0] ** 2 + cy * origin[..., 1] ** 2) / 2
+    inside = b * b - 4 * a * c
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = 2 * c / (-b + np.sqrt(inside))
+        return origin + t[..., None] * ray
+
+
+@njit(cache=True, fastmath=True)
+def _add_ray(
+    total: Array,
+    facet: Array,
+    matte: Array,
+    u: Array,
+    v: Array,
+    point: Array,
+    m: Array,
+    eye: Array,
+    share: float,
+    x_m: Array,
+    y_m: Array,
+    distance_m: float,
+    table: Array,
+    blockers: Array,
+) -> None:
+    """Add share f(i, o) cos i cos t / r^2 of one ray to `total`, cell by cell; the other [C] are scratch."""
+    last = table.shape[0] - 1
+    dz = distance_m - point[2]
+    px, py = point[0], point[1]
+    ox, oy, oz = eye[0], eye[1], eye[2]
+    ax, ay, az = m[0, 0], m[0, 1], m[0, 2] * dz
+    bx, by, bz = m[1, 0], m[1, 1], m[1, 2] * dz
+    nx, ny, nz = m[2, 0], m[2, 1], m[2, 2] * dz
+    f0, paint = table[last, 0], table[last, 1] / math.pi
+    for c in range(total.size):
+        dx, dy = x_m[c] - px, y_m[c] - py
+        r2 = dx * dx + dy * dy + dz * dz
+        inverse = 1.0 / math.sqrt(r2)
+        ix, iy = (ax * dx + ay * dy + az) * inverse, (bx * dx + by * dy + bz) * inverse
+        iz = max((nx * dx + ny * dy + nz) * inverse, 0.0)
+        geometry = share * dz * inverse / r2
+        hx, hy, hz = ix + ox, iy + oy, iz + oz
+        length = math.sqrt(hx * hx + hy * hy + hz * hz)
+        cos_h, cos_d = hz / length, 0.5 * length
+        miss = 1.0 - cos_d
+        fresnel = f0 + (1.0 - f0) * (miss * miss) * (miss * miss) * miss
+        masking = min(1.0, 2.0 * cos_h * min(iz, oz) / cos_d)
+        u[c], v[c] = hx / hz, hy / hz
+        facet[c] = geometry * fresnel * masking / (4.0 * oz * (cos_h * cos_h) * (cos_h * cos_h))
+        matte[c] = geometry * paint * iz
+    for k in range(blockers.shape[0]):
+        way = (blockers[k, 2] - point[2]) / dz
+        for c in range(total.size):
+            x = px + way * (x_m[c] - px) - blockers[k, 0]
+            y = py + way * (y_m[c] - py) - blockers[k, 1]
+            clear = 1.0 if x * x + y * y >= blockers[k, 3] * blockers[k, 3] else 0.0
+            facet[c] *= clear
+            matte[c] *= clear
+    for c in range(total.size):
+        total[c] += matte[c]
+    for k in range(last):
+        add_density(total, facet, u, v, table[k])
+
+
+@njit(cache=True, parallel=True)
+def fill_throughput(
+    out: NDArray[np.float32],
+    point: Array,
+    frame: Array,
+    eye: Array,
+    share: Array,
+    cells: Array,
+    emission: Array,
+    distance_m: float,
+    table: Array,
+    blockers: Array,
+) -> None:
+    """Fill out [P, C] with the pixels' radiance for cells of brightness 1, ray by ray and cell by cell.
+
+    out[p, c] = sum over rays s of share f(i, o) cos i cos t / r^2 emission; the cells' areas are in `emission`.
+
+    Args:
+        out: Overwritten.
+        point: Wall points [P, S, 3], metres.
+        frame: Tangents and normal [P, S, 3, 3].
+        eye: Directions to the lens in that frame [P, S, 3], before the wall.
+        share: Weights of the rays [P, S].
+        cells: Centres (x, y) of the cells [C, 2], metres.
+        emission: Radiance times area of each cell [C].
+        distance_m: z of the cells.
+        table: As `Reflection.table` makes it.
+        blockers: Opaque discs parallel to the wall [B, 4]: (x, y, z, radius), metres.
+    """
+    x_m, y_m = cells[:, 0].copy(), cells[:, 1].copy()
+    for p in prange(out.shape[0]):
+        total, facet, matte = np.zeros(out.shape[1]), np.empty(out.shape[1]), np.empty(out.shape[1])
+        u, v = np.empty(out.shape[1]), np.empty(out.shape[1])
+        for s in range(point.shape[1]):
+            _add_ray(
+                total,
+                facet,
+                matte,
+                u,
+                v,
+                point[p, s],
+                frame[p, s],
+                eye[p, s],
+                share[p, s],
+                x_m,
+                y_m,
+                distance_m,
+                table,
+                blockers,
+            )
+        for c in range(out.shape[1]):
+            out[p, c] = total[c] * emission[c]
+
+
+def texture(x_m: Array, y_m: Array, seed: int, smooth: float, fine: float, grain: float) -> Array:
+    """Return the wall's texture around 1 at points of any shape: a sum of random waves, the same everywhere.
+
+    Args:
+        x_m: x of the points, metres.
+        y_m: y of the points, metres.
+        seed: Seed of the waves.
+        smooth: Standard deviation of the smooth part (waves of 40 to 120 mm).
+        fine: Standard deviation of the fine part (waves of 4 to 12 mm).
+        grain: How many times longer the fine waves are along x (brushed) than along y.
+    """
+    draw = np.random.default_rng(seed)
+    value = np.ones(np.shape(x_m))
+    for waves, low, high, deviation, stretch in (
+        (12, 0.04, 0.12, smooth, 1.0),
+        (48, 0.004, 0.012, fine, grain),
+    ):
+        length = np.exp(draw.uniform(np.log(low), np.log(high), waves))
+        turn, phase = draw.uniform(0, 2 * np.pi, waves), draw.uniform(0, 2 * np.pi, waves)
+        for n in range(waves if deviation else 0):
+            kx = 2 * np.pi / length[n] * np.cos(turn[n]) / stretch
+            ky = 2 * np.pi / length[n] * np.sin(turn[n])
+            value += deviation * np.sqrt(2 / waves) * np.cos(kx * x_m + ky * y_m + phase[n])
+    return np.maximum(value, 0.05)

@@ -1,0 +1,41 @@
+"""Setups: wall, geometry, ambient light and cameras in one object, from names, files and measurements."""
+
+from evnlos.setups.base import Layout, OperatorNoise, Parameter, SensorSize, Setup, stated_distance_m
+from evnlos.setups.fitted import FittedSetup
+from evnlos.setups.load import (
+    CALIBRATED_FILE,
+    NamedSetup,
+    calibrated_file,
+    calibrated_folder,
+    load_setup,
+    named_setup,
+)
+from evnlos.setups.measured import MeasuredSetup
+from evnlos.setups.paper import PaperSetup
+from evnlos.setups.presets import setup_names, setup_preset
+from evnlos.setups.radiometric import RadiometricSetup
+from evnlos.setups.room import RoomSetup
+from evnlos.setups.rooms import ROOMS
+
+__all__ = [
+    "CALIBRATED_FILE",
+    "ROOMS",
+    "FittedSetup",
+    "Layout",
+    "MeasuredSetup",
+    "NamedSetup",
+    "OperatorNoise",
+    "PaperSetup",
+    "Parameter",
+    "RadiometricSetup",
+    "RoomSetup",
+    "SensorSize",
+    "Setup",
+    "calibrated_file",
+    "calibrated_folder",
+    "load_setup",
+    "named_setup",
+    "setup_names",
+    "setup_preset",
+    "stated_distance_m",
+]

@@ -1,0 +1,222 @@
+"""Opening files that may be a stranger's: plain files only, by lists of formats, and nothing beside the file.
+
+A picture named `.png` may be a program for Ghostscript, a video a playlist of films elsewhere, a column of an
+HDF5 file the bytes of another file, and a name in a folder a pipe that never ends: all are opened here.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
+
+from evnlos.errors import DataError
+
+if TYPE_CHECKING:  # they are slow to import, and not every command needs them
+    import h5py
+    from PIL import Image
+
+RASTER_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "WEBP", "PPM")
+"""Formats of pictures that are decoded, as Pillow names them; never PostScript, which is a program."""
+
+CONTAINER_FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2",
+    "matroska,webm",
+    "avi",
+    "mpeg",
+    "mpegts",
+    "mpegvideo",
+    "m4v",
+    "h264",
+    "hevc",
+    "obu",
+    "ivf",
+    "flv",
+    "asf",
+    "ogg",
+    "mxf",
+    "nut",
+    "dv",
+    "mjpeg",
+    "yuv4mpegpipe",
+)
+"""Video containers that are read, as FFmpeg names them; all hold their pictures themselves, no playlists."""
+
+
+MOST_IMAGE_PIXELS = 1 << 26
+"""Pixels of a picture, at most: a small file can claim any number."""
+MOST_SENSOR_PIXELS = 1 << 24
+"""Pixels of a sensor whose pixels all get memory, at most; the largest event cameras have a quarter."""
+
+
+_PILLOW_ERRORS = (
+    ValueError, SyntaxError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError, MemoryError,
+    struct.error, zlib.error,
+)  # fmt: skip
+"""What Pillow raises on damage, besides OSError."""
+
+
+class ElsewhereError(ValueError):
+    """A file's content lies, or may lie, in another file."""
+
+
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a plain file for reading; a pipe, device or folder is refused, and never waited for.
+
+    Args:
+        path: The file.
+
+    Raises:
+        OSError: It can't be opened, or is no plain file.
+    """
+    file = open(os.fspath(path), "rb", opener=_without_waiting)  # noqa: SIM115 - handed to the caller
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "no plain file but a pipe or a device", os.fspath(path))
+    return cast(BinaryIO, file)
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open without waiting for the other end of a pipe."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+@contextmanager
+def open_image(path: str | os.PathLike[str] | BinaryIO) -> Iterator[Image.Image]:
+    """Yield an open picture of one of `RASTER_FORMATS`, told by its content.
+
+    Args:
+        path: The file, or an open one.
+
+    Raises:
+        OSError: It can't be opened, is no plain file, no picture of these formats, or has too many pixels.
+    """
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit follows
+        with ExitStack() as stack:
+            file = stack.enter_context(open_regular(path)) if isinstance(path, (str, os.PathLike)) else path
+            try:
+                image = stack.enter_context(Image.open(file, formats=RASTER_FORMATS))
+                width, height = image.size
+                if width * height > MOST_IMAGE_PIXELS:
+                    most = f"at most {MOST_IMAGE_PIXELS:,} are read"
+                    raise OSError(f"it claims {width} x {height} pixels; {most}")
+                yield image
+            except _PILLOW_ERRORS as error:
+                reason = " ".join(str(error).split())[:120] or type(error).__name__
+                raise OSError(f"it is damaged, or larger than the memory ({reason})") from None
+
+
+@contextmanager
+def open_container(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """Yield an open video container (PyAV) of one of `CONTAINER_FORMATS`; FFmpeg opens no file by itself.
+
+    Args:
+        path: The file.
+
+    Raises:
+        OSError: It can't be opened, is no plain file, or no such container (`av.error.FFmpegError`).
+        ValueError: FFmpeg is handed something that it does not take.
+    """
+    import av
+
+    # Each of the three is enough today; should a later FFmpeg understand one otherwise, two are left.
+    options = {"format_whitelist": ",".join(CONTAINER_FORMATS), "protocol_whitelist": "none"}
+    with (
+        open_regular(path) as file,
+        av.open(file, container_options=options, io_open=_refuse_other) as container,
+    ):
+        yield container
+
+
+def _refuse_other(url: str, flags: int, options: dict[str, str]) -> Any:
+    raise PermissionError(errno.EACCES, "a video that names other files")
+
+
+@contextmanager
+def open_hdf5(path: str | os.PathLike[str], chunk_bytes: int = 1 << 20) -> Iterator[h5py.File]:
+    """Yield an HDF5 file, open for reading. What is in it is reached through `stored` alone.
+
+    Args:
+        path: The file.
+        chunk_bytes: Size of the largest chunk, bytes: it is unpacked once and not for every part of it.
+
+    Raises:
+        OSError: It can't be opened, is no plain file, or not HDF5.
+    """
+    import h5py
+
+    with open_regular(path):
+        pass
+    with h5py.File(path, "r", rdcc_nbytes=max(chunk_bytes, 1 << 20)) as file:
+        yield file
+
+
+def stored(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
+    """Return a group or dataset that lies in the file itself; None where there is none of that name.
+
+    Args:
+        group: Open file or group.
+        name: Name below it; "a/b" goes through groups.
+
+    Raises:
+        ElsewhereError: A link leads there, or its values are those of other files (external storage) or of
+            other datasets (virtual).
+    """
+    import h5py
+
+    node: Any = group
+    for part in name.split("/"):
+        link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
+        if link is None:
+            return None
+        if not isinstance(link, h5py.HardLink):
+            raise ElsewhereError(f"{name} is a link")
+        node = node[part]
+    if isinstance(node, h5py.Dataset) and (node.external or node.is_virtual):
+        raise ElsewhereError(f"the values of {name} lie in other files or datasets")
+    return node
+
+
+def memory_left() -> int:
+    """Return the bytes that this process can still take: what the machine has free and its limits leave."""
+    left = [1 << 40]
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:  # noqa: PTH123 - not of Linux: no such file
+            left += [int(line.split()[1]) << 10 for line in file if line.startswith("MemAvailable")]
+        with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
+            taken = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        left += [limit - taken] if limit != resource.RLIM_INFINITY else []
+    except (OSError, ValueError, ImportError):
+        pass  # another system: arrays that are too large raise MemoryError there
+    return max(min(left), 0)
+
+
+def check_memory(needed: int, what: str, cure: str, most: int | None = None) -> None:
+    """Refuse what would take more memory than there is, before anything is taken.
+
+    Args:
+        needed: Bytes.
+        what: What needs them, the beginning of a sentence.
+        cure: What to do about it.
+        most: Bytes that may be taken; None = half of `memory_left`.
+
+    Raises:
+        DataError: It needs more.
+    """
+    most = memory_left() // 2 if most is None else most
+    if needed > most:
+        raise DataError(
+            f"{what} needs {needed / 1e9:.1f} GB of memory; {most / 1e9:.1f} GB may be taken: {cure}"
+        )

@@ -1,0 +1,85 @@
+"""Which event model a sensor follows: chosen on recordings that the fit has not seen."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evnlos.calibration.event_fit import CONTINUOUS, choose_pixel, fit_pixel
+from evnlos.calibration.event_models import figures_of, is_better, misfit, thinned
+from evnlos.calibration.event_statistics import Recording
+from evnlos.sensor import BrownianPixel, EventPixel, simulate_events
+from evnlos.types import Events
+
+SHAPE = (60, 80)
+
+
+def recording(pixel, seed: int) -> Recording:
+    """Four seconds of a bright spot that crosses an uneven background."""
+    times = np.linspace(0.0, 4.0, 161)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    place = 4 + 18 * times[:, None, None]
+    spot = np.exp(-((x - place) ** 2 + (y - 15 - 10 * seed) ** 2) / 80)
+    light = (6 + 0.3 * x + 120 * spot).astype(np.float32)
+    return Recording(light, times, simulate_events(light, times, pixel, seed=seed))
+
+
+BROWNIAN = BrownianPixel(
+    0.15, 0.22, 0.01, dark_dn=8.0, leak_rate_hz=0.3, leak_rate_per_dn_hz=0.02, photon_noise=0.03
+)
+CONTINUOUS_PIXEL = EventPixel(0.18, 0.24, 0.02, 80.0, 0.05, 0.5, 0.0)
+
+
+@pytest.fixture(scope="module")
+def chosen() -> dict:
+    found = {}
+    for name, pixel in (("brownian", BROWNIAN), ("continuous", CONTINUOUS_PIXEL)):
+        fit, held = [recording(pixel, k) for k in (0, 1)], [recording(pixel, k) for k in (2, 3)]
+        first = fit_pixel(fit, EventPixel())
+        found[name] = first, choose_pixel(first, fit, held), held
+    return found
+
+
+def test_a_sensor_of_another_law_is_told_and_its_numbers_come_back(chosen) -> None:
+    first, found, held = chosen["brownian"]
+    assert isinstance(found.pixel, BrownianPixel) and found.cutoff_range_hz is None
+    assert found.pixel.threshold_on == pytest.approx(0.15, rel=0.2)
+    assert found.pixel.threshold_off == pytest.approx(0.22, rel=0.2)
+    few = [thinned(r) for r in held]
+    truth, wrong = (misfit(few, pixel, 1).sum() for pixel in (BROWNIAN, first.pixel))
+    assert misfit(few, found.pixel, 1).sum() < truth + 0.3 * (wrong - truth)
+    assert set(found.compared) == {CONTINUOUS, "continuous, true logarithm", "brownian"}
+
+
+def test_a_sensor_of_the_usual_law_keeps_it(chosen) -> None:
+    first, found, _ = chosen["continuous"]
+    assert replace(found, compared={}) == first
+
+
+def test_figures_are_rates_by_light_and_motion() -> None:
+    one = recording(CONTINUOUS_PIXEL, 0)
+    figures, behind = figures_of([one], [one.events])
+    kept = one.events.t_us > one.settled_us
+    # 3 levels x 3 motions x 2 polarities and two scatters; each event is in one class.
+    assert len(figures) == 20 and behind[:18].sum() == kept.sum()
+    empty = Events.empty(SHAPE[1], SHAPE[0])
+    assert not figures_of([one], [empty])[0].any()
+
+
+def test_thinning_keeps_light_and_events_of_the_same_pixels() -> None:
+    one = recording(CONTINUOUS_PIXEL, 0)
+    few = thinned(one)
+    assert few.light.shape == (161, 30, 40)
+    np.testing.assert_array_equal(few.light[:, 3, 5], one.light[:, 6, 10])
+    there = (one.events.x == 10) & (one.events.y == 6)
+    np.testing.assert_array_equal(
+        few.events.t_us[(few.events.x == 5) & (few.events.y == 3)], one.events.t_us[there]
+    )
+
+
+def test_a_model_must_be_better_by_more_than_chance() -> None:
+    before = np.full(20, 10.0)
+    assert is_better(before, before - 2) and not is_better(before, before - 0.5)
+    assert not is_better(before, before - 2 + 8 * np.random.default_rng(0).normal(size=20))
+    assert not is_better(before, before + 1) and math.isfinite(float(before.sum()))

@@ -1,0 +1,287 @@
+"""Walls whose facets have any density of slopes: geometry, compiled loops against slow references, files."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import LineMotion, Scene, Target
+from evnlos.setups import FittedSetup, SensorSize
+from evnlos.setups.fitted_file import AboutWall, FittedWall, read_fitted, write_fitted
+from evnlos.transport import GGX, View, light_transport_matrix
+from evnlos.transport.facets import MASKING, Pose, SlopeTable, facet_matrix, seen_points, target_cells
+from evnlos.transport.facets_kernel import carry_facets, carry_lobes, facet_slopes, fill_facets
+from evnlos.types import Plane
+
+POSE = Pose(
+    camera_distance_m=0.55,
+    camera_angle_deg=24.0,
+    camera_elevation_deg=4.0,
+    camera_roll_deg=3.0,
+    field_of_view_deg=33.0,
+    distortion=-0.05,
+    distance_m=0.35,
+    target_offset_m=(-0.14, 0.01),
+    travel_slope=0.05,
+    curvature_per_m=(0.7, -0.4),
+)
+SHAPE = (9, 14)
+PLANE = Plane(4, 7, 0.02)
+
+
+def pixels(shape=SHAPE):
+    rows, columns = np.meshgrid(
+        np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float), indexing="ij"
+    )
+    return columns.ravel(), rows.ravel()
+
+
+def table(seed=0, scale=0.05) -> SlopeTable:
+    """A lobe of two widths with a bumpy, lopsided density."""
+    first = SlopeTable.of_lobes(
+        np.array([[0.05, 0.12], [0.2, 0.15]]), np.array([1.0, 0.3]), scale=scale, matte=0.4
+    )
+    bumps = np.random.default_rng(seed).normal(0, 0.3, first.log_density.shape)
+    return replace(first, log_density=first.log_density + bumps)
+
+
+def slow_matrix(pose: Pose, wall: SlopeTable, shape, plane) -> np.ndarray:
+    """f cos_i cos_t / r^2 times the cell's area, pair by pair, from the definition."""
+    seen, cells = seen_points(pose, shape, *pixels(shape)), target_cells(pose, plane)
+    out = np.empty((len(seen.points), len(cells)))
+    for p, (point, frame, eye) in enumerate(zip(seen.points, seen.frames, seen.eyes, strict=True)):
+        away = cells - point
+        r = np.linalg.norm(away, axis=1)
+        light = (away / r[:, None]) @ frame.reshape(3, 3).T
+        half = light + eye
+        half /= np.linalg.norm(half, axis=1, keepdims=True)
+        density = wall.density(half[:, 0] / half[:, 2], half[:, 1] / half[:, 2])
+
+        def seen_share(cosine):
+            return 2 / (1 + np.sqrt(1 + MASKING**2 * (1 / cosine**2 - 1)))
+
+        facets = density / half[:, 2] ** 4 * seen_share(light[:, 2]) * seen_share(eye[2])
+        brdf = facets / (4 * light[:, 2] * eye[2]) + wall.matte / math.pi
+        out[p] = brdf * light[:, 2] * (away[:, 2] / r) / r**2 * plane.pitch_m**2
+    return out
+
+
+def sparse(pictures: np.ndarray) -> tuple[Any, Any, Any]:
+    frame, index = np.nonzero(pictures)
+    starts = np.searchsorted(frame, np.arange(len(pictures) + 1)).astype(np.int64)
+    return starts, index.astype(np.int64), pictures[frame, index]
+
+
+def parts(pose: Pose = POSE) -> tuple[Any, Any, Any, Any, float]:
+    seen = seen_points(pose, SHAPE, *pixels())
+    return seen.points, seen.frames, seen.eyes, target_cells(pose, PLANE), PLANE.pitch_m**2
+
+
+def test_a_plain_pose_sees_the_points_of_a_perspective_view():
+    pose = Pose(camera_distance_m=0.7, camera_angle_deg=-25.0, field_of_view_deg=28.0)
+    view = View.perspective(SHAPE, 0.7, math.radians(-25.0), math.radians(28.0))
+    seen = seen_points(pose, SHAPE, *pixels())
+    np.testing.assert_allclose(seen.points[:, :2], view.wall_points_m().reshape(-1, 2), atol=1e-12)
+    np.testing.assert_allclose(seen.points[:, 2], 0, atol=1e-12)
+    to_eye = np.array(view.eye_m) - seen.points
+    np.testing.assert_allclose(seen.eyes, to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True), atol=1e-12)
+
+
+def test_a_bent_wall_is_met_where_it_is_and_its_frames_stand_on_it():
+    seen = seen_points(POSE, SHAPE, *pixels())
+    x, y, z = seen.points.T
+    np.testing.assert_allclose(z, (0.7 * x**2 - 0.4 * y**2) / 2, atol=1e-12)
+    frames = seen.frames.reshape(-1, 3, 3)
+    np.testing.assert_allclose(
+        frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frames.shape), atol=1e-12
+    )
+    along_x = np.stack([np.ones_like(x), np.zeros_like(x), 0.7 * x], axis=1)
+    along_y = np.stack([np.zeros_like(x), np.ones_like(x), -0.4 * y], axis=1)
+    for tangent in (along_x, along_y):
+        np.testing.assert_allclose((tangent * frames[:, 2]).sum(axis=1), 0, atol=1e-12)
+    assert (np.linalg.det(frames) > 0).all()
+
+
+def test_a_camera_that_looks_past_the_wall_is_refused():
+    with pytest.raises(ConfigError, match="does not see the wall"):
+        seen_points(Pose(camera_angle_deg=80.0, field_of_view_deg=40.0), SHAPE, *pixels())
+
+
+def test_the_compiled_matrix_is_the_definition():
+    expected = slow_matrix(POSE, table(), SHAPE, PLANE)
+    np.testing.assert_allclose(facet_matrix(POSE, table(), SHAPE, PLANE, np.float64), expected, rtol=1e-9)
+
+
+def test_a_table_of_one_lobe_reflects_like_ggx():
+    # Fresnel's factor is left out of the table, and masking is that of one roughness: both are nearly constant.
+    pose = Pose(target_offset_m=(-0.17, 0.0))
+    lobe = SlopeTable.of_lobes(np.array([[0.1, 0.2]]), np.array([1.0]), scale=0.1, step=0.1)
+    view = View.perspective(SHAPE, 0.6, math.radians(30), math.radians(30))
+    wanted = light_transport_matrix(
+        view, PLANE, 0.3, GGX(0.1, 0.2), offset_m=(-0.17, 0.0), points=(1, 1)
+    ).numpy()
+    ratio = facet_matrix(pose, lobe, SHAPE, PLANE, np.float64) / wanted
+    assert ratio.std() / ratio.mean() < 0.02
+    assert ratio.mean() == pytest.approx(1 / 0.92, rel=0.02)  # aluminium's reflectance
+
+
+def test_carried_pictures_are_the_matrix_times_the_pictures():
+    rng = np.random.default_rng(1)
+    pictures = rng.uniform(0, 1, (5, 28)) * (rng.uniform(0, 1, (5, 28)) < 0.3)
+    wall, place = table(), parts()
+    matrix, out = np.empty((126, 28)), np.empty((126, 5))
+    fill_facets(matrix, *place, wall.log_density, wall.scale, wall.step, wall.matte, MASKING)
+    carry_facets(out, *place, wall.log_density, wall.scale, wall.step, wall.matte, MASKING, *sparse(pictures))
+    np.testing.assert_allclose(out, matrix @ pictures.T, rtol=1e-9)
+
+
+def test_derivatives_are_differences():
+    rng = np.random.default_rng(2)
+    pictures = rng.uniform(0, 1, (3, 28))
+    wall, place = table(), parts()
+    column = np.arange(wall.nodes**2).reshape(wall.nodes, wall.nodes)
+    column[-1, -1] = column[0, 0]  # two coefficients that are one number
+    out = np.empty((126, 3, wall.nodes**2 + 1))
+    facet_slopes(out, *place, wall.log_density, wall.scale, wall.step, MASKING, column, *sparse(pictures))
+
+    def light(log_density, matte):
+        made = np.empty((126, 3))
+        carry_facets(made, *place, log_density, wall.scale, wall.step, matte, MASKING, *sparse(pictures))
+        return made
+
+    step, middle = 1e-5, wall.nodes // 2
+    for i, j in ((middle, middle), (middle + 1, middle - 2), (middle - 2, middle)):
+        bump = np.zeros_like(wall.log_density)
+        bump[i, j] = step
+        slope = (light(wall.log_density + bump, wall.matte) - light(wall.log_density - bump, wall.matte)) / (
+            2 * step
+        )
+        np.testing.assert_allclose(out[..., column[i, j]], slope, rtol=1e-6, atol=1e-12)
+    slope = light(wall.log_density, wall.matte + 1) - light(wall.log_density, wall.matte)
+    np.testing.assert_allclose(out[..., -1], slope, rtol=1e-6)
+
+
+def test_lobes_are_tables_of_lobes():
+    pictures = np.random.default_rng(3).uniform(0, 1, (2, 28))
+    alphas, place = np.array([[0.1, 0.1], [0.1, 0.25]]), parts()
+    out = np.empty((126, 2, 3))
+    carry_lobes(out, *place, alphas, MASKING, *sparse(pictures))
+    for k in range(2):
+        fine = SlopeTable.of_lobes(alphas[k : k + 1], np.ones(1), scale=0.1, step=0.1)
+        made = np.empty((126, 2))
+        carry_facets(made, *place, fine.log_density, fine.scale, fine.step, 0.0, MASKING, *sparse(pictures))
+        np.testing.assert_allclose(out[..., k], made, rtol=0.02)
+
+
+def fitted(rank=2, companion=0.0) -> FittedWall:
+    rng = np.random.default_rng(4)
+    plane, wall = Plane(4, 12, 0.02), table()
+    picture = np.zeros((8, 8), np.float32)
+    picture[6, 4] = companion
+    return FittedWall(
+        wall.log_density,
+        rng.uniform(0.8, 1.2, SHAPE).astype(np.float32),
+        np.ones((3, 4), np.float32),
+        picture,
+        rng.normal(0, 1e-3, (rank, 5, 7)).astype(np.float32),
+        rng.normal(0, 1, (rank, 48)).astype(np.float32),
+        AboutWall(wall.scale, wall.step, wall.matte, Plane(8, 8, 0.02), plane, {"kept": ["texture"]}),
+    )
+
+
+def setup_of(path, wall: FittedWall, **changes) -> FittedSetup:
+    checksum = write_fitted(path, wall)
+    plain = Pose(target_offset_m=(-0.17, 0.0))
+    pose = {name: getattr(plain, name) for name in plain.__dataclass_fields__}
+    return FittedSetup(
+        file=str(path),
+        checksum=checksum,
+        ambient=0.1,
+        cell_m=0.02,
+        strip_m=(0.24, 0.08),
+        sensor=SensorSize(*SHAPE),
+        **(pose | changes),
+    )
+
+
+def test_a_fitted_wall_survives_its_file(tmp_path):
+    wall = fitted()
+    write_fitted(tmp_path / "wall.safetensors", wall)
+    back = read_fitted(tmp_path / "wall.safetensors")
+    for name in ("log_density", "sensitivity", "ambient", "companion", "left", "right"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(wall, name))
+    assert back.about == wall.about
+
+
+def test_damaged_files_and_arrays_that_do_not_fit_are_refused(tmp_path):
+    path = tmp_path / "wall.safetensors"
+    with pytest.raises(DataError, match="does not exist"):
+        read_fitted(path)
+    setup = setup_of(path, fitted())
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(DataError, match="not a readable safetensors"):
+        read_fitted(path)
+    with pytest.raises(ConfigError, match="checksum"):
+        setup.fitted()
+    with pytest.raises(DataError, match="companion is"):
+        replace(fitted(), companion=np.zeros((2, 2), np.float32))
+    with pytest.raises(DataError, match="NaN"):
+        replace(fitted(), sensitivity=np.full(SHAPE, np.nan, np.float32))
+    with pytest.raises(ConfigError, match="ends in"):
+        write_fitted(tmp_path / "wall.npz", fitted())
+    with pytest.raises(ConfigError, match="is empty"):
+        FittedSetup().fitted()
+
+
+def test_the_setup_is_facets_times_sensitivity_plus_correction(tmp_path):
+    setup = setup_of(tmp_path / "a.safetensors", fitted())
+    wall = setup.fitted()
+    facets = facet_matrix(setup.pose(), wall.table, SHAPE, setup.source(), np.float64)
+    left = wall.image("left", SHAPE).double().flatten(1)
+    expected = (
+        torch.from_numpy(facets * wall.sensitivity.reshape(-1, 1))
+        + left.T @ torch.from_numpy(wall.right).double()
+    )
+    torch.testing.assert_close(setup.matrix(SHAPE, setup.source()), expected)
+    # Cells that halve the fitted ones share their light.
+    fine = setup.matrix(SHAPE, Plane(8, 24, 0.01)).unflatten(1, (4, 2, 12, 2)).sum((2, 4)).flatten(1)
+    torch.testing.assert_close(fine, expected, rtol=0.05, atol=float(expected.max()) * 0.02)
+
+
+def test_larger_slopes_are_a_wider_lobe_of_as_much_light(tmp_path):
+    setup = setup_of(tmp_path / "a.safetensors", fitted(rank=0))
+    wide = replace(setup, slopes=2.0).table()
+    x = np.linspace(-0.1, 0.1, 7)
+    np.testing.assert_allclose(wide.density(2 * x, -x), setup.table().density(x, -x / 2) / 4, rtol=1e-9)
+
+
+def test_what_travels_along_is_seen_beside_the_plate(tmp_path):
+    plate = Target("plate", np.ones((4, 4), np.float32), 0.08)
+    scene = Scene(plate, LineMotion(start_m=(-0.04, 0.0), speed_m_s=0.02), 4.0)
+    dark = setup_of(tmp_path / "a.safetensors", fitted(rank=0)).observe(scene)
+    lit = setup_of(tmp_path / "b.safetensors", fitted(rank=0, companion=0.5)).observe(scene)
+    times = np.array([0.5, 2.0, 3.1])
+    added = (lit.irradiance(times) - dark.irradiance(times)).numpy()
+    # The cell (row 6, column 4) of 8 x 8 cells of 2 cm: 1 cm right of and 5 cm below the plate's middle.
+    spot = Target("spot", np.full((1, 1), 0.5, np.float32), 0.02)
+    cells = Plane(24, 40, 0.01)
+    setup = setup_of(tmp_path / "b.safetensors", fitted(rank=0))
+    matrix = setup.matrix(SHAPE, cells)
+    for k, t in enumerate(times):
+        drawn = spot.rasterise(cells, (-0.04 + 0.02 * t + 0.01, 0.05))
+        expected = (matrix @ torch.from_numpy(drawn).double().flatten()).reshape(SHAPE).numpy()
+        np.testing.assert_allclose(added[k], expected, rtol=0.02, atol=0.01 * expected.max())
+    gone = replace(setup_of(tmp_path / "c.safetensors", fitted(rank=0, companion=0.5)), companion=0.0).observe(
+        scene
+    )
+    torch.testing.assert_close(gone.irradiance(times), dark.irradiance(times))
+
+
+def test_a_plate_that_leaves_the_strip_is_refused(tmp_path):
+    plate = Target("plate", np.ones((4, 4), np.float32), 0.08)
+    with pytest.raises(ConfigError, match="strip_m to at least"):
+        setup_of(tmp_path / "a.safetensors", fitted()).observe(Scene(plate, LineMotion((-0.2, 0.0)), 1.0))

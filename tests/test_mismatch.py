@@ -1,0 +1,99 @@
+"""What a mismatch costs: rows from a demo's records and calibration, margins, and rigs that are refused."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from evnlos.calibration import FIGURES_FILE
+from evnlos.demo import Demo
+from evnlos.errors import CalibrationError, ConfigError
+from evnlos.experiment import Record
+from evnlos.experiment.records import write_record
+from evnlos.mismatch import finding, mismatch_table, run_mismatch
+
+LEFT = {
+    "frames fit": {"before": 0.5, "after": 0.04, "noise": 0.03},
+    "frames held out": {"before": 0.5, "after": 0.09, "noise": 0.03},
+    "frames held out, without pattern": {"before": 0.5, "after": 0.07, "noise": 0.035},
+    "surfaces fit": {"before": 0.9, "after": 0.3, "noise": 0.3},
+    "surfaces held out": {"before": 0.9, "after": 0.97, "noise": 0.36},
+}
+
+
+def keep(out: Path, seed: int, scores: dict[tuple[str, str], float], warnings: list[str]) -> None:
+    """Write a demo's folder as it would be with such scores."""
+    for (arm, modality), value in scores.items():
+        mean = {"mean": {"psnr_db": {"x_G": 13.0, "x_K": 14.0}}}
+        means = {"psnr_db": {"x_G": value - 1, "x_K": value + 1}}
+        record = Record("demo", "demo", arm, modality, seed, "test", means, {}, mean, {}, {})
+        write_record(record, out / "records" / "demo")
+    rig = out / "rigs" / "demo"
+    rig.mkdir(parents=True, exist_ok=True)
+    (rig / FIGURES_FILE).write_text(
+        json.dumps({"residuals": LEFT, "warnings": warnings, "expectation": "ahead"})
+    )
+
+
+def test_a_row_holds_residuals_the_strongest_e2e_and_the_lead_of_epnp(tmp_path):
+    scores = {
+        ("E2E", "frame"): 20.0,
+        ("E2E augmented", "frame"): 20.5,
+        ("simulation only", "frame"): 18.0,
+        ("EPNP", "frame"): 22.0,
+    }
+    keep(tmp_path / "a-seed0", 0, scores, ["the wall may be of another kind"])
+    keep(tmp_path / "a-seed1", 1, {key: value + 1 for key, value in scores.items()}, [])
+    found = finding("a", [tmp_path / "a-seed0", tmp_path / "a-seed1"])
+    assert found.best_e2e("frame") == pytest.approx(21.0)
+    assert found.of("EPNP", "frame") == pytest.approx(22.5)
+    assert math.isnan(found.of("EPNP", "event")) and math.isnan(found.best_e2e("event"))
+    assert found.left == {"frames": (0.07, 0.035), "surfaces": (0.97, 0.36)}
+    text = mismatch_table([found])
+    assert "| a | frame | 7.0 / 3.5 | 13.50 | 21.00 | 18.50 | 22.50 | +1.50 |" in text
+    assert "EPNP - E2E +1.50 dB in the mean, +1.50 at least (a); simulation only - mean image +5.00" in text
+    assert "warned of the wall may be of another kind" in text
+
+
+def test_the_least_lead_is_named(tmp_path):
+    for name, lead in (("one", 2.0), ("two", -0.5)):
+        scores = {("E2E", "event"): 16.0, ("simulation only", "event"): 15.0, ("EPNP", "event"): 16.0 + lead}
+        keep(tmp_path / name, 0, scores, [])
+    text = mismatch_table([finding(name, [tmp_path / name]) for name in ("one", "two")])
+    assert "EPNP - E2E +0.75 dB in the mean, -0.50 at least (two)" in text
+    assert "| two | event | 97.0 / 36.0 |" in text
+    assert "- two: the calibration warned of nothing; it expected: ahead." in text
+
+
+def test_each_rig_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
+    for rig in ("flat", "odd"):
+        for name in "AG":
+            (tmp_path / "captures" / rig / f"{rig}_{name}").mkdir(parents=True)
+            (tmp_path / "captures" / rig / f"{rig}_{name}" / "capture.yaml").write_text("x: 1")
+    ran = []
+
+    def demo(settings: Demo) -> None:
+        ran.append((settings.out.name, [folder.name for folder in settings.captures], settings.seed))
+        if settings.out.name.startswith("odd"):
+            raise CalibrationError("no rig fits")
+        keep(settings.out, settings.seed, {("E2E", "frame"): 1.0, ("EPNP", "frame"): 2.0}, [])
+
+    monkeypatch.setattr("evnlos.mismatch.run_demo", demo)
+    found = run_mismatch(Demo(out=tmp_path / "out"), (), tmp_path / "captures", seeds=(0, 3))
+    assert ran == [
+        ("flat-seed0", ["flat_A", "flat_G"], 0),
+        ("flat-seed3", ["flat_A", "flat_G"], 3),
+        ("odd-seed0", ["odd_A", "odd_G"], 0),
+        ("odd-seed3", ["odd_A", "odd_G"], 3),
+    ]
+    assert [one.rig for one in found] == ["flat", "odd"] and found[1].refused == "no rig fits"
+    written = (tmp_path / "out" / "mismatch.md").read_text()
+    assert "| odd | refused: no rig fits |" in written and "| flat | frame |" in written
+
+
+def test_unknown_rigs_and_empty_folders_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="rig 'flat' is unknown; give some of two-lobes"):
+        run_mismatch(Demo(out=tmp_path), ("flat",))
+    with pytest.raises(ConfigError, match="holds no folders of captures"):
+        run_mismatch(Demo(out=tmp_path), (), tmp_path)

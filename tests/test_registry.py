@@ -1,0 +1,98 @@
+"""Kinds that a registry holds, entry points among them, and settings of any kind from a mapping."""
+
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
+from typing import Literal
+
+import pytest
+
+from evnlos import registry as rooms
+from evnlos.config import from_dict, to_dict
+from evnlos.errors import ConfigError
+from evnlos.migrate import migrate
+from evnlos.registry import Kinded, Registry
+
+
+class Shape(Kinded):
+    registry = Registry("evnlos.test_shapes", "shape")
+    default_kind = "ball"
+
+
+@Shape.registry.register
+@dataclass(frozen=True)
+class Ball(Shape):
+    radius_m: float = 1.0
+    kind: Literal["ball"] = "ball"
+
+
+@Shape.registry.register
+@dataclass(frozen=True)
+class Box(Shape):
+    side_m: float = 2.0
+    kind: Literal["box"] = "box"
+
+
+@dataclass(frozen=True)
+class Room:
+    thing: Shape = field(default_factory=Ball)
+
+
+@pytest.mark.parametrize("room", [Room(), Room(Ball(3.0)), Room(Box(0.5))])
+def test_settings_of_every_kind_survive_the_round_trip(room) -> None:
+    assert from_dict(Room, to_dict(room)) == room
+
+
+def test_a_mapping_without_a_kind_is_of_the_default_kind() -> None:
+    assert from_dict(Room, {"thing": {"radius_m": 2}}) == Room(Ball(2.0))
+
+
+@pytest.mark.parametrize(
+    ("thing", "says"),
+    [
+        ({"kind": "bax"}, "did you mean 'box'"),
+        ({"kind": "sphere-like"}, "give one of ball, box"),
+        ({"kind": "box", "side": 1.0}, "thing.side; perhaps you meant 'side_m'"),
+        ({"kind": "box", "radius_m": 1.0}, "unknown setting thing.radius_m"),
+        ({"kind": "box", "side_m": "long"}, "thing.side_m = 'long'"),
+        (3, "mapping"),
+    ],
+)
+def test_what_fits_no_kind_is_refused(thing, says) -> None:
+    with pytest.raises(ConfigError) as caught:
+        from_dict(Room, {"thing": thing})
+    assert says in str(caught.value)
+
+
+def test_an_installed_package_brings_a_kind(monkeypatch) -> None:
+    point = EntryPoint("cone", "test_registry:Cone", "evnlos.test_shapes")
+
+    def offered(group: str, name: str | None = None) -> list[EntryPoint]:
+        return [point] if group == point.group and name in (None, point.name) else []
+
+    monkeypatch.setattr(rooms, "entry_points", offered)
+    assert "cone" in Shape.registry
+    assert from_dict(Room, {"thing": {"kind": "cone", "height_m": 4.0}}) == Room(Cone(4.0))
+    Shape.registry._classes.pop("cone")
+
+
+@dataclass(frozen=True)
+class Cone(Shape):
+    height_m: float = 1.0
+    kind: Literal["cone"] = "cone"
+
+
+def test_two_classes_cannot_have_one_kind() -> None:
+    @dataclass(frozen=True)
+    class Other(Shape):
+        kind: Literal["box"] = "box"
+
+    with pytest.raises(ConfigError):
+        Shape.registry.register(Other)
+    with pytest.raises(ConfigError):
+        Shape.registry.register(int)
+    assert Shape.registry.register(Box) is Box
+
+
+def test_values_of_today_are_not_touched() -> None:
+    values = {"setup": {"kind": "radiometric", "pixel": {"leak_rate_hz": 0.0}}}
+    assert migrate("Simulation", values) == values == migrate("Something", values)

@@ -1,0 +1,234 @@
+"""The fit of walls of any kind, on captures rendered by an independent light path."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evnlos.calibration.captures import Shots
+from evnlos.calibration.wall_data import grouped, wall_data
+from evnlos.calibration.wall_fit import FREEDOMS, WallState, _Unknowns, normal_equations, start_at
+from evnlos.calibration.wall_optics import fit_wall, travelled
+from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
+from evnlos.dataset.capture import Capture
+from evnlos.dataset.capture_info import CameraInfo, CaptureInfo, MotionInfo, TargetInfo
+from evnlos.errors import DataError
+from evnlos.lab import Lobe, Optics, Reflection, cast, fill_throughput
+from evnlos.scene import FontGlyphs
+from evnlos.setups import RadiometricSetup
+from evnlos.transport.facets import Pose, SlopeTable
+from evnlos.types import Events, Plane
+
+SHAPE = (30, 48)
+PLANE = Plane(32, 96, 0.0025)
+KNOWN = RadiometricSetup(distance_m=0.3)
+SHINING = 0.25  # brightness of a bar below the plate
+
+
+def operator(bent: float = 0.0) -> np.ndarray:
+    """What pixels see of cells of a wall with two lobes, by code that shares nothing with the fit, [P, C]."""
+    optics = Optics(
+        SHAPE, 0.62, math.radians(28), 0.0, 0.0, math.radians(31), (0, 0), 0.0, 0.6, 0.15, (bent, 0.0), 4
+    )
+    rays = cast(optics)
+    reflection = Reflection((Lobe("ggx", 0.6, 0.06, 0.06), Lobe("beckmann", 0.4, 0.08, 0.2)), matte=0.02)
+    y, x = np.meshgrid(WIDE.y_m, WIDE.x_m, indexing="ij")
+    cells = np.stack([x.ravel() - 0.165, y.ravel() + 0.004], axis=1)
+    out = np.zeros((SHAPE[0] * SHAPE[1], len(cells)), np.float32)
+    fill_throughput(
+        out, rays.point, rays.frame, rays.eye, rays.share, cells, np.full(len(cells), WIDE.pitch_m**2), 0.3,
+        reflection.table(), np.zeros((0, 4)),
+    )  # fmt: skip
+    return out
+
+
+WIDE = Plane(56, 96, 0.0025)  # taller than the plate: room for the bar
+
+
+def shots_of(characters: str, matrix: np.ndarray, shining: float = 0.0, seed: int = 0) -> Shots:
+    """Captures of 11 frames: the target, a bar that moves along, ambient light, noise, 8 bits."""
+    rng = np.random.default_rng(seed)
+    glyphs = FontGlyphs(family="kalam", characters=characters)
+    full = matrix @ np.ones(matrix.shape[1], np.float32)
+    gain = 3.0 / float(full.max())
+    captures = []
+    bar = np.zeros(WIDE.shape, np.float32)
+    for name in glyphs.objects():
+        target = glyphs.target(name, 0)
+        info = CaptureInfo(
+            CameraInfo(SHAPE[1], SHAPE[0], "rendered", 2.0, 0.01),
+            motion=MotionInfo((-0.05, 0.0), 0.02, (1.0, 0.0), 0),
+            target=TargetInfo(name, "target.png", 0.08),
+            rig={"distance_m": 0.3},
+        )
+        times = np.arange(11) * 500_000
+        empty = Events.empty(SHAPE[1], SHAPE[0])
+        capture = Capture(name, info, empty, np.zeros((11, *SHAPE), np.uint8), times, target)
+        motion = capture.motion
+        assert motion is not None
+        places = motion.position_m(times * 1e-6)
+        drawn = target.rasterise(WIDE, places)
+        for k, (x, _) in enumerate(places):
+            bar[:] = 0
+            bar[46:52, np.abs(WIDE.x_m - x) < 0.02] = shining
+            drawn[k] += bar
+        light = gain * drawn.reshape(11, -1) @ matrix.T + 0.05
+        noisy = np.clip(light + rng.normal(0, 0.004, light.shape), 0, 1)
+        captures.append(replace(capture, frames=np.round(255 * noisy).astype(np.uint8).reshape(11, *SHAPE)))
+    return Shots(tuple(captures), 0.08)
+
+
+@pytest.fixture(scope="module")
+def rendered():
+    matrix = operator(bent=0.8)
+    gain = 3.0 / float((matrix @ np.ones(matrix.shape[1], np.float32)).max())
+    return shots_of("ABDEHLOTX", matrix, SHINING), shots_of("KRZ4", matrix, SHINING, seed=1), gain * matrix
+
+
+@pytest.fixture(scope="module")
+def fitted(rendered):
+    return fit_wall(rendered[0], rendered[1], KNOWN, columns=48)
+
+
+def test_the_operator_comes_back(rendered, fitted):
+    # Two lobes, a bent wall, vignetting: what the fit says of any picture is what the camera would see.
+    truth = rendered[2].reshape(-1, *WIDE.shape)[:, 12:44].reshape(SHAPE[0] * SHAPE[1], -1)
+    setup = fitted.optics.setup
+    assert setup.source() == Plane(32, 72, 0.0025)
+    found = setup.matrix(SHAPE, PLANE).numpy()
+    reached = np.abs(PLANE.x_m) < 0.09  # where the targets were
+    away = (found - truth).reshape(-1, 32, 96)[..., reached]
+    assert np.linalg.norm(away) < 0.06 * np.linalg.norm(truth.reshape(-1, 32, 96)[..., reached])
+    start = fitted.optics.before.matrix(SHAPE, PLANE).numpy()
+    assert np.linalg.norm((start - truth).reshape(-1, 32, 96)[..., reached]) > 3 * np.linalg.norm(away)
+
+
+def test_what_moves_along_is_simulated(rendered, fitted):
+    assert "light that travels along" in fitted.rest.kept
+    places = np.stack([np.linspace(-0.04, 0.04, 9), np.zeros(9)], axis=1)
+    bars = np.zeros((9, *WIDE.shape))
+    for bar, (x, _) in zip(bars, places, strict=True):
+        bar[46:52, np.abs(WIDE.x_m - x) < 0.02] = SHINING
+    truth = bars.reshape(9, -1) @ rendered[2].T
+    scene = rendered[0].scenes[0]
+    found = fitted.optics.setup.observe(scene).light_along(places).flatten(1).numpy()
+    # Light that stays the same at all places can't be told from ambient light.
+    truth, found = truth - truth.mean(axis=0), found - found.mean(axis=0)
+    assert np.linalg.norm(found - truth) < 0.5 * np.linalg.norm(truth)
+
+
+def test_intervals_hold_the_truth(fitted):
+    truth = {"camera_distance_m": 0.62, "camera_angle_deg": 28.0, "field_of_view_deg": 31.0, "distance_m": 0.3}
+    for parameter, error in zip(fitted.optics.parameters, fitted.optics.error, strict=True):
+        if parameter.name in truth:
+            assert abs(getattr(fitted.optics.setup, parameter.name) - truth[parameter.name]) < 3 * error, (
+                parameter.name
+            )
+
+
+def test_mirrored_frames_are_refused(rendered):
+    fit, held, _ = rendered
+    turned = [
+        Shots(tuple(replace(c, frames=np.ascontiguousarray(c.frames[..., ::-1])) for c in shots.captures), 0.08)
+        for shots in (fit, held)
+    ]
+    with pytest.raises(DataError, match="the other way round"):
+        fit_wall(turned[0], turned[1], KNOWN, columns=24)
+
+
+def test_frames_that_do_not_follow_the_targets_are_refused(rendered):
+    fit, held, _ = rendered
+    names = [c.target for c in fit.captures]
+    noise = np.random.default_rng(5)
+    wrong = tuple(
+        replace(c, frames=noise.integers(20, 40, c.frames.shape).astype(np.uint8), target=t)
+        for c, t in zip(fit.captures, names, strict=True)
+    )
+    with pytest.raises(DataError, match="explain"):
+        fit_wall(Shots(wrong, 0.08), held, KNOWN, columns=24)
+
+
+def test_normal_equations_are_those_of_the_residual(rendered):
+    data = wall_data(rendered[0], 16, travelled(rendered[0], rendered[1], 0.01), every=4)
+    pose = Pose(target_offset_m=(-0.17, 0.0))
+    state, left = start_at(data, pose)
+    assert 0 < left < 0.5
+    unknowns = _Unknowns(FREEDOMS, state, pose)
+    column, count, size = unknowns.column, unknowns.count, unknowns.size
+    now = state.residual(data)
+    gram, right = normal_equations(data, state, unknowns, now)
+
+    def at(k: int, step: float) -> np.ndarray:
+        """Residual after a step of one unknown."""
+        if k < len(FREEDOMS):
+            return replace(state, pose=FREEDOMS[k].moved(pose, step)).residual(data)
+        k -= len(FREEDOMS)
+        if k < count:
+            log_density = state.table.log_density + step * (column == k)
+            return replace(state, table=replace(state.table, log_density=log_density)).residual(data)
+        k -= count
+        if k < 5:
+            return WallState(pose, state.table, step * np.eye(5)[k]).residual(data)
+        return replace(
+            state, table=replace(state.table, matte=state.table.matte + step * unknowns.matte)
+        ).residual(data)
+
+    middle = len(FREEDOMS) + column[state.table.nodes // 2, state.table.nodes // 2]
+    chosen = [0, 5, middle, middle - 1, size - 4, size - 1]
+    jac = np.stack([(now - at(k, 1e-4 if k >= 10 else FREEDOMS[k].step)).ravel() for k in chosen], axis=1)
+    jac /= np.array([1e-4 if k >= 10 else FREEDOMS[k].step for k in chosen])
+    size = np.linalg.norm(jac, axis=0)
+    found, expected = gram[np.ix_(chosen, chosen)], jac.T @ jac
+    assert np.abs((found - expected) / np.outer(size, size)).max() < 2e-3
+    assert np.abs((right[chosen] - jac.T @ now.ravel()) / size).max() < 5e-3 * np.linalg.norm(now)
+
+
+def test_light_that_all_captures_share_takes_no_part(rendered):
+    data = wall_data(rendered[0], 16, PLANE, every=2)
+    assert data.group.max() == 4  # five places, the same in all captures
+    lit = data.seen + np.random.default_rng(6).normal(0, 1, (len(data.seen), 5))[:, data.group]
+    np.testing.assert_allclose(data.shared_removed(lit), data.shared_removed(data.seen), atol=1e-12)
+
+
+def test_places_are_shared_only_where_most_captures_share_them():
+    places = np.tile(np.linspace(-0.05, 0.05, 6), 5)[:, None] * np.array([1.0, 0.0])
+    capture = np.repeat(np.arange(5), 6)
+    assert grouped(places, capture).max() == 5
+    assert grouped(places + np.random.default_rng(0).uniform(0, 0.02, places.shape), capture).max() == 0
+    assert grouped(places[:18], capture[:18]).max() == 0  # three captures tell too little
+
+
+def test_texture_and_operator_errors_are_told_from_noise(rendered):
+    data = wall_data(rendered[0], 16, PLANE, every=2)
+    state = WallState(
+        Pose(target_offset_m=(-0.17, 0.0)),
+        SlopeTable.of_lobes(np.array([[0.1, 0.1]]), np.array([2e3]), scale=0.1),
+    )
+    rng = np.random.default_rng(7)
+    light = state.light(data)
+    texture = rng.normal(1, 0.05, len(light))
+    noisy = replace(data, seen=light * texture[:, None] + rng.normal(0, 1e-4 * light.max(), light.shape))
+    ratio, precision = pixel_sensitivity(noisy, light)
+    bright = precision > 10
+    assert bright.sum() > 30
+    np.testing.assert_allclose(ratio[bright], texture[bright], atol=0.03)
+    # An error of the operator that is linear in the picture is found, and predicts other pictures.
+    weights = np.sin(40 * np.add.outer(PLANE.y_m, PLANE.x_m)).ravel() * 1e-3
+    pictures = [np.zeros((PLANE.height * PLANE.width, d.seen.shape[1])) for d in (data, data)]
+    for n in range(data.seen.shape[1]):
+        part = slice(data.starts[n], data.starts[n + 1])
+        pictures[0][data.index[part], n] = data.light[part]
+    wrong = light + np.linspace(0, 1, len(light))[:, None] * (weights @ pictures[0])
+    own = replace(data, seen=wrong)
+    left, right, after = correction_of(own, light, own, light)
+    before = ((own.shared_removed(wrong - light)) ** 2 * own.weight[:, None]).sum()
+    assert after.sum() < 0.02 * before
+    assert math.isfinite(float((left @ right).sum()))
+
+
+def test_a_setup_follows_its_files(fitted):
+    setup = fitted.optics.setup
+    assert Path(setup.file).is_file()
+    assert setup.fitted().about.notes["kept"] == list(fitted.rest.kept)
