@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 from threadpoolctl import ThreadpoolController
 
 from evnlos.errors import ConfigError, EvnlosError
+from evnlos.stopping import children_undisturbed
 from evnlos.threads import cores, one_thread
 
 Task = TypeVar("Task")
@@ -120,7 +121,7 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin)
     try:
         resource_tracker.ensure_running()  # it unblocks the signal when it starts
-        with _undisturbed():
+        with children_undisturbed():
             pool.submit(int)  # the first task starts all processes, and inherit what is blocked
         yield pool
         pool.shutdown()
@@ -135,32 +136,6 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
             if process.is_alive():
                 process.kill()
         raise
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Hold back Ctrl-C and SIGTERM from this process, and Ctrl-C for ever from those that it starts meanwhile.
-
-    A started process takes over which signals are blocked; one whose start breaks off tells it at length.
-    """
-    numbers, noted = (signal.SIGINT, signal.SIGTERM), list[int]()
-    handlers = {number: signal.getsignal(number) for number in numbers}
-    is_main = threading.current_thread() is threading.main_thread() and None not in handlers.values()
-    has_masks = hasattr(signal, "pthread_sigmask")  # not on Windows
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if has_masks else set()
-    try:
-        if is_main:  # another thread may hear a signal that is blocked here, and then it is handled here
-            for number in numbers:
-                signal.signal(number, lambda one, _: noted.append(one))
-        yield
-    finally:
-        if has_masks:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if is_main:
-            for number in numbers:
-                signal.signal(number, handlers[number])
-    for number in noted:
-        signal.raise_signal(number)
 
 
 def _begin() -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from evnlos.dataset.sampling import Samples
 from evnlos.errors import DataError
 from evnlos.files import write_atomically
+from evnlos.stopping import undisturbed
 from evnlos.types import Events
 from evnlos.untrusted import open_hdf5, stored
 
@@ -38,7 +39,7 @@ def write_shard(path: str | Path, samples: Samples, attributes: dict, events: Ev
         events: The whole recording, stored as `events/{x, y, t, p}` where given.
     """
     buffer = io.BytesIO()
-    with h5py.File(buffer, "w", libver=("v110", "v110"), track_order=True) as file:
+    with undisturbed(), h5py.File(buffer, "w", libver=("v110", "v110"), track_order=True) as file:
         for key, value in attributes.items():
             file.attrs[key] = value
         for name in _MAPS:

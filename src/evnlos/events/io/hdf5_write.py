@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from evnlos.stopping import undisturbed
 from evnlos.types import Events
 
 _CHUNK = 65_536
@@ -62,9 +63,10 @@ class Hdf5Sink:
         self._t_offset = 0 if self._wide else start
         self._events, self._last = 0, 0
         self._storage = _Storage(path)
-        self._file = h5py.File(self._storage, "w", libver=("v110", "v110"))
-        self._group = self._file.create_group("events")
-        self._group.attrs["width"], self._group.attrs["height"] = first.width, first.height
+        with undisturbed():
+            self._file = h5py.File(self._storage, "w", libver=("v110", "v110"))
+            self._group = self._file.create_group("events")
+            self._group.attrs["width"], self._group.attrs["height"] = first.width, first.height
         self._columns: dict[str, h5py.Dataset] = {}
         self._index: h5py.Dataset | None = None
 
@@ -137,14 +139,16 @@ class Hdf5Sink:
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        with undisturbed():
+            self._file.close()
         self._storage.close()
 
     @contextmanager
     def _told(self) -> Iterator[None]:
         """Raise what the storage noted, also where the library stumbles over what was not written."""
         try:
-            yield
+            with undisturbed():
+                yield
         finally:
             if self._storage.failure is not None:
                 raise self._storage.failure
