@@ -1,6 +1,8 @@
 """Files of strangers on the page: shown, or refused in one line, and nothing of them stays."""
 
 import stat
+import threading
+import time
 import warnings
 import zipfile
 from dataclasses import replace
@@ -10,7 +12,7 @@ import pytest
 
 from evnlos.app.networks import Networks
 from evnlos.app.unpack import MOST_FILES, unpack_zip
-from evnlos.app.upload import read_upload
+from evnlos.app.upload import read_upload, read_upload_apart
 from evnlos.app.work import uploaded
 from evnlos.errors import DataError
 from evnlos.events import write_events
@@ -166,3 +168,86 @@ def test_bad_uploads_are_one_line_without_this_machines_folders(
     write_events(tmp_path / "long.npz", app_pass.events)
     cut = read_upload(tmp_path / "long.npz", tmp_path, 10 * MB)
     assert len(cut.events) == 100 and "only the first 100" in cut.notes[-1]
+
+
+SLOW = """
+import runpy, sys, time
+if "slow" in sys.argv[1]:
+    time.sleep(1000)
+runpy.run_path({program!r}, run_name="__main__")
+"""
+
+
+def reader(tmp_path: Path, monkeypatch, text: str) -> None:
+    """Let another program read the uploads."""
+    from evnlos.app import upload
+
+    (tmp_path / "reader.py").write_text(text.format(program=str(upload._PROGRAM)))
+    monkeypatch.setattr(upload, "_PROGRAM", tmp_path / "reader.py")
+
+
+def test_what_a_process_of_its_own_reads_is_the_same(zipped_capture, app_pass, tmp_path) -> None:
+    write_events(tmp_path / "walk.raw", app_pass.events)
+    for path in (zipped_capture, tmp_path / "walk.raw"):
+        here, apart = read_upload(path, tmp_path, 10 * MB), read_upload_apart(path, tmp_path, 10 * MB)
+        assert here.events == apart.events and here.edges_us.tolist() == apart.edges_us.tolist()
+        assert (here.frames is None) == (apart.frames is None)
+        assert here.frames is None or (here.frames.tobytes(), here.frames.dtype) == (
+            apart.frames.tobytes(),
+            apart.frames.dtype,
+        )
+        for name in ("name", "peak", "motion", "target", "distance_m", "notes"):
+            assert getattr(here, name) == getattr(apart, name), name
+
+
+def test_an_upload_that_hangs_holds_nobody(app_pass, tmp_path, monkeypatch) -> None:
+    from evnlos.app import upload
+
+    reader(tmp_path, monkeypatch, SLOW)
+    for name in ("slow.raw", "walk.raw"):
+        write_events(tmp_path / name, app_pass.events)
+    monkeypatch.setattr(upload, "_CHILD_S", 15)
+    said: list[tuple[str, str]] = []
+    hangs = threading.Thread(
+        target=lambda: said.append(uploaded(str(tmp_path / "slow.raw"), tmp_path, MB, Networks()))
+    )
+    hangs.start()
+    began = time.monotonic()
+    pictures, _ = uploaded(str(tmp_path / "walk.raw"), tmp_path, MB, Networks())
+    assert pictures
+    assert hangs.is_alive(), f"the other was answered after {time.monotonic() - began:.0f} s only"
+    hangs.join(60)
+    assert said[0][0] == "" and "longer than" in said[0][1]
+    assert {one.name for one in tmp_path.iterdir()} == {"reader.py", "slow.raw", "walk.raw"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import os\nos.kill(os.getpid(), 9)",
+        "import os\nos.abort()",
+        "raise MemoryError",
+        "print('{{\"arrays\": [')",
+        "x = bytearray(1 << 20)\nprint('half a line', end='')",
+    ],
+)
+def test_a_reader_that_dies_is_one_line(text: str, app_pass, tmp_path, monkeypatch) -> None:
+    reader(tmp_path, monkeypatch, text)
+    write_events(tmp_path / "walk.raw", app_pass.events)
+    pictures, message = uploaded(str(tmp_path / "walk.raw"), tmp_path, MB, Networks())
+    assert pictures == "" and 'role="alert"' in message and str(tmp_path) not in message
+    with pytest.raises(DataError):
+        read_upload_apart(tmp_path / "walk.raw", tmp_path, MB)
+    assert {one.name for one in tmp_path.iterdir()} == {"reader.py", "walk.raw"}
+
+
+def test_an_upload_may_not_take_all_memory(app_pass, tmp_path, monkeypatch) -> None:
+    reader(
+        tmp_path,
+        monkeypatch,
+        "import sys\nfrom evnlos.untrusted import limit_this_process\n"
+        "limit_this_process(int(sys.argv[4]), int(sys.argv[5]))\nbytearray(4 << 30)",
+    )
+    write_events(tmp_path / "walk.raw", app_pass.events)
+    with pytest.raises(DataError, match="MemoryError"):
+        read_upload_apart(tmp_path / "walk.raw", tmp_path, MB)

@@ -7,16 +7,22 @@ HDF5 file the bytes of another file, and a name in a folder a pipe that never en
 from __future__ import annotations
 
 import errno
+import json
 import os
 import stat
 import struct
+import subprocess
+import sys
+import tempfile
+import threading
 import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
-from evnlos.errors import DataError
+from evnlos.errors import DataError, EvnlosError
 
 if TYPE_CHECKING:  # they are slow to import, and not every command needs them
     import h5py
@@ -192,15 +198,22 @@ def memory_left() -> int:
     try:
         with open("/proc/meminfo", encoding="ascii") as file:  # noqa: PTH123 - not of Linux: no such file
             left += [int(line.split()[1]) << 10 for line in file if line.startswith("MemAvailable")]
-        with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
-            taken = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        left += [limit - taken] if limit != resource.RLIM_INFINITY else []
+        left += [limit - _address_space()] if limit != resource.RLIM_INFINITY else []
     except (OSError, ValueError, ImportError):
         pass  # another system: arrays that are too large raise MemoryError there
     return max(min(left), 0)
+
+
+def _address_space() -> int:
+    """Return the bytes of address space that this process has; 0 on a system that does not say it."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
+            return int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
 
 
 def check_memory(needed: int, what: str, cure: str, most: int | None = None) -> None:
@@ -220,3 +233,109 @@ def check_memory(needed: int, what: str, cure: str, most: int | None = None) -> 
         raise DataError(
             f"{what} needs {needed / 1e9:.1f} GB of memory; {most / 1e9:.1f} GB may be taken: {cure}"
         )
+
+
+class Child:
+    """A program of ours that reads a stranger's file in a process of its own, and is ended with the block.
+
+    The program calls `limit_this_process` before it opens the file.
+
+    Args:
+        program: Its file.
+        words: Its arguments.
+        seconds: After so many it is ended, whatever it does; None = its own limits suffice.
+    """
+
+    def __init__(self, program: Path, words: list[str], seconds: float | None = None) -> None:
+        known = os.pathsep.join(place for place in sys.path if place)
+        threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed in __exit__
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(program), *words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env=os.environ | threads | {"PYTHONPATH": known, "RUST_BACKTRACE": "0"},
+        )
+        assert self._process.stdout is not None
+        self.stream = self._process.stdout
+        self._seconds = seconds
+        self._is_late = threading.Event()
+        self._clock = None if seconds is None else threading.Timer(seconds, self._end_late)
+        if self._clock is not None:
+            self._clock.daemon = True
+            self._clock.start()
+
+    def _end_late(self) -> None:
+        self._is_late.set()
+        self._process.kill()
+
+    def __enter__(self) -> Child:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._clock is not None:
+            self._clock.cancel()
+        self._process.kill()  # a reader may stop early
+        self.stream.close()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        self._process.wait()
+        self._errors.close()
+
+    def take(self, size: int) -> bytearray:
+        """Return the next `size` bytes of its output."""
+        data = bytearray(self.stream.read(size))
+        if len(data) < size:
+            raise self.failure(self._last_words())
+        return data
+
+    def take_json(self) -> Any:
+        """Return the next line of its output, read as JSON."""
+        line = self.stream.readline()
+        if not line.endswith(b"\n"):
+            raise self.failure(self._last_words())
+        try:
+            return json.loads(line)
+        except ValueError:
+            raise self.failure("it wrote no answer") from None
+
+    def failure(self, found: str) -> EvnlosError:
+        """Return the error of a program that ended too early, whose last words are `found`."""
+        return DataError(f"it could not be read ({found})")
+
+    def _last_words(self) -> str:
+        code = self._process.wait()
+        if self._is_late.is_set():
+            return f"it took longer than {self._seconds:.0f} s"
+        self._errors.seek(0)
+        lines = self._errors.read(1 << 16).decode("utf-8", "replace").strip().splitlines()
+        said = [line for line in lines if "Error" in line or "panicked" in line or "Exception" in line]
+        ended = f"it ended with code {code}" if code >= 0 else f"it was ended by signal {-code}"
+        return " ".join((said or lines or [ended])[-1].split())[:160]
+
+
+def limit_this_process(memory_bytes: int, seconds: int) -> None:
+    """Bound what this process takes from here on, and end it with the process that started it as a `Child`.
+
+    Args:
+        memory_bytes: Address space beyond what it has now.
+        seconds: Processor time in all.
+    """
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    try:
+        import resource
+    except ImportError:  # a system without limits
+        return
+    space = _address_space() + memory_bytes
+    wanted = {resource.RLIMIT_AS: space, resource.RLIMIT_CPU: seconds, resource.RLIMIT_CORE: 0}
+    for kind, most in wanted.items():
+        hard = resource.getrlimit(kind)[1]  # that of this process may only be lowered
+        limit = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (limit, limit))
+
+
+def _end_with_input() -> None:
+    while os.read(0, 1 << 10):
+        pass
+    os._exit(1)

@@ -11,7 +11,7 @@ from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
 from evnlos.app.networks import Networks
 from evnlos.app.sheet import message_box
 from evnlos.app.words import GLOSSARY, HEAD, PAPER
-from evnlos.app.work import opening_verdict, simulated, uploaded
+from evnlos.app.work import UPLOADS_AT_ONCE, opening_verdict, simulated, uploaded
 from evnlos.errors import EvnlosError
 
 _PICK, _DRAW = "Pick a character", "Draw one"
@@ -64,6 +64,7 @@ def build_page(
             show_progress="minimal",
             show_progress_on=message,
             api_visibility="private",
+            concurrency_limit=UPLOADS_AT_ONCE,
         )
     return page
 

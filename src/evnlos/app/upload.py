@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,9 @@ from evnlos.dataset.capture_info import read_capture_info
 from evnlos.dataset.frame_sources import inside
 from evnlos.errors import DataError
 from evnlos.events.recording import Recording
+from evnlos.scene import LineMotion, Target
 from evnlos.types import Events
+from evnlos.untrusted import Child
 
 MOST_EVENTS = 20_000_000
 """Events that are read, at most: 260 MB."""
@@ -24,6 +27,53 @@ _MOST_PIXELS = 2_100_000  # of a sensor whose pixels all get maps
 _MOST_MAP_BYTES = 1 << 30  # of all maps of a pass
 _MOST_FRAME_BYTES = 1 << 28  # of the frames of a capture
 _ZIP = b"PK\x03\x04"
+_PROGRAM = Path(__file__).with_name("_upload_child.py")
+_CHILD_BYTES = 3 << 30
+_CHILD_S = 60  # and a second more for every megabyte
+
+
+def read_upload_apart(path: str | Path, scratch: str | Path, limit_bytes: int) -> Recorded:
+    """Read an uploaded file as `read_upload` does, in a process of its own, under limits of memory and time.
+
+    Args:
+        path: The file.
+        scratch: Folder to unpack in.
+        limit_bytes: Largest file, and largest content of a zip, bytes.
+
+    Raises:
+        EvnlosError: As of `read_upload`, or reading took too much time or memory.
+    """
+    path = Path(path)
+    seconds = _CHILD_S + path.stat().st_size // 1_000_000
+    with tempfile.TemporaryDirectory(prefix="unpacked-", dir=scratch) as folder:
+        words = [str(path.absolute()), folder, str(limit_bytes), str(_CHILD_BYTES), str(seconds)]
+        with Child(_PROGRAM, words, seconds) as child:
+            return _taken(child)
+
+
+def _taken(child: Child) -> Recorded:
+    """Return what the program made of the file: a line of JSON, then the arrays that it names."""
+    about = child.take_json()
+    if "error" in about:
+        raise DataError(about["error"])
+    arrays: dict[str, Any] = {}
+    for name, kind, shape in about["arrays"]:
+        dtype = np.dtype(kind)
+        data = child.take(dtype.itemsize * int(np.prod(shape, dtype=np.int64)))
+        arrays[name] = np.frombuffer(data, dtype).reshape(shape)
+    columns = {name.removeprefix("events."): one for name, one in arrays.items() if name.startswith("events.")}
+    motion, target = about["motion"], about["target"]
+    return Recorded(
+        about["name"],
+        Events(**columns, width=about["width"], height=about["height"]),
+        arrays["edges_us"],
+        arrays.get("frames"),
+        about["peak"],
+        motion=None if motion is None else LineMotion(**motion),
+        target=None if target is None else Target(mask=arrays["mask"], **target),
+        distance_m=about["distance_m"],
+        notes=tuple(about["notes"]),
+    )
 
 
 def read_upload(path: str | Path, scratch: str | Path, limit_bytes: int) -> Recorded:

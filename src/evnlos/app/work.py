@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,11 +12,15 @@ from evnlos.app.networks import Networks
 from evnlos.app.recorded import Recorded, simulate_pass
 from evnlos.app.sheet import message_box, sheet, verdict_box, waiting_box
 from evnlos.app.solving import Reconstruction, from_each_frame, from_weights, from_whole_pass
-from evnlos.app.upload import read_upload
+from evnlos.app.upload import read_upload_apart
 from evnlos.app.verdict import verdict_on
 from evnlos.app.views import View, event_views, found_views, seen_views
 from evnlos.errors import EvnlosError
 from evnlos.scene import Target
+
+UPLOADS_AT_ONCE = 4
+"""Uploads that are read at the same time, each in a process of its own."""
+_drawing = threading.Lock()  # what was read and checked takes seconds, and the cores are the page's
 
 
 def simulated(controls: Controls, target: Target, networks: Networks) -> Iterator[tuple[str, str]]:
@@ -58,15 +63,16 @@ def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networ
     if not path:
         return "", message_box("no file yet: choose a recording, or a capture folder as a zip", wrong=False)
     try:
-        recorded = read_upload(path, scratch, limit_bytes)
+        recorded = read_upload_apart(path, scratch, limit_bytes)
         found, refused = [], []
-        known, wall = networks.of(recorded), networks.wall_of(recorded)
-        for name, one in known.items():
-            try:
-                found.append(from_weights(recorded, name, one, wall))
-            except EvnlosError as error:
-                refused.append(str(error))
-        pictures = _sheet(recorded, seen_views(recorded), found, event_views(recorded))
+        with _drawing:
+            known, wall = networks.of(recorded), networks.wall_of(recorded)
+            for name, one in known.items():
+                try:
+                    found.append(from_weights(recorded, name, one, wall))
+                except EvnlosError as error:
+                    refused.append(str(error))
+            pictures = _sheet(recorded, seen_views(recorded), found, event_views(recorded))
     except (EvnlosError, OSError, MemoryError) as error:
         return "", message_box(_without_folder(str(error) or "the file needs too much memory", path, scratch))
     notes = [*recorded.notes, *refused]
@@ -87,5 +93,5 @@ def _without_folder(text: str, path: str, scratch: Path) -> str:
     """Return a message without the folders of this machine."""
     folders = {scratch, scratch.resolve(), Path(path).parent, Path(path).resolve().parent}
     for folder in sorted(folders, key=lambda one: len(str(one)), reverse=True):  # the inner ones first
-        text = re.sub(re.escape(str(folder)) + r"/(unpacked-[^/]*/)?", "", text)
+        text = re.sub(re.escape(str(folder)) + r"/(unpacked-[^/]*/)*", "", text)
     return text

@@ -10,19 +10,12 @@ import json
 import struct
 import sys
 
+from evnlos.untrusted import limit_this_process
+
 
 def main(path: str, memory_bytes: int, seconds: int, kind: str) -> None:
     """Write the first stream of a kind in `path` to the standard output."""
-    try:
-        import resource
-    except ImportError:  # a system without limits
-        pass
-    else:
-        wanted = {resource.RLIMIT_AS: memory_bytes, resource.RLIMIT_CPU: seconds, resource.RLIMIT_CORE: 0}
-        for kind_of_limit, most in wanted.items():
-            hard = resource.getrlimit(kind_of_limit)[1]  # that of this process may only be lowered
-            limit = most if hard == resource.RLIM_INFINITY else min(most, hard)
-            resource.setrlimit(kind_of_limit, (limit, limit))
+    limit_this_process(memory_bytes, seconds)
     import aedat
 
     decoder = aedat.Decoder(path)

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import os
 import struct
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,9 +12,10 @@ from numpy.typing import NDArray
 from evnlos.errors import EventFileError, MissingDependencyError
 from evnlos.events.io.columns import ColumnCheck, Columns, join
 from evnlos.events.io.report import ReadReport, unreadable
+from evnlos.untrusted import Child
 
 SIGNATURE = b"#!AER-DAT4.0\r\n"
-_CHILD_BYTES = 2 << 30  # address space of an interpreter with numpy
+_CHILD_BYTES = 2 << 30  # address space of numpy and the package
 _MAX_RATIO = 300  # LZ4 expands at most 255 times
 _CURE = "the file is damaged or not complete: copy it again"
 
@@ -34,57 +30,22 @@ def _require_package() -> None:
         ) from None
 
 
-class _Decoder:
+class _Decoder(Child):
     """The package at work in a process of its own, whose memory and time grow with the file only."""
 
     def __init__(self, path: Path, kind: str) -> None:
         self._path = path
         size = path.stat().st_size
-        child = Path(__file__).with_name("_aedat4_child.py")
         limits = [str(_CHILD_BYTES + _MAX_RATIO * size), str(30 + size // 500_000)]
-        known = os.pathsep.join(place for place in sys.path if place)
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed in __exit__
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", str(child), str(path.absolute()), *limits, kind],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            env=os.environ | {"PYTHONPATH": known, "OPENBLAS_NUM_THREADS": "1", "RUST_BACKTRACE": "0"},
-        )
-        assert self._process.stdout is not None
-        self.stream = self._process.stdout
-
-    def __enter__(self) -> _Decoder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()  # a reader may stop early
-        self.stream.close()
-        self._process.wait()
-        self._errors.close()
-
-    def take(self, size: int) -> bytearray:
-        """Return the next `size` bytes of its output."""
-        data = bytearray(self.stream.read(size))
-        if len(data) < size:
-            raise self.failure()
-        return data
+        super().__init__(Path(__file__).with_name("_aedat4_child.py"), [str(path.absolute()), *limits, kind])
 
     def stream_size(self) -> tuple[int, int] | None:
         """Return width and height of the stream, None where there is none; the first thing to take."""
-        line = self.stream.readline()
-        if not line.endswith(b"\n"):
-            raise self.failure()
-        size = json.loads(line)
+        size = self.take_json()
         return None if size is None else (size[0], size[1])
 
-    def failure(self) -> EventFileError:
+    def failure(self, found: str) -> EventFileError:
         """Return the error of a decoder that stopped before the end of the file."""
-        code = self._process.wait()
-        self._errors.seek(0)
-        lines = self._errors.read(1 << 16).decode("utf-8", "replace").strip().splitlines()
-        said = [line for line in lines if "Error" in line or "panicked" in line or "Exception" in line]
-        found = " ".join((said or lines or [f"it ended with code {code}"])[-1].split())[:160]
         return unreadable(self._path, 0, f"AEDAT4 cannot be decoded ({found})", _CURE)
 
 
