@@ -42,6 +42,8 @@ LEAVES = {
     "metrics",
     "progress",
     "seeds",
+    "stopping",
+    "tensor_file",
     "threads",
     "untrusted",
     "version",

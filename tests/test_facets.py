@@ -11,7 +11,7 @@ import torch
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import FittedSetup, SensorSize
-from evnlos.setups.fitted_file import AboutWall, FittedWall, read_fitted, write_fitted
+from evnlos.setups.fitted_file import WALL, AboutWall, FittedWall, write_fitted
 from evnlos.transport import GGX, View, light_transport_matrix
 from evnlos.transport.facets import MASKING, Pose, SlopeTable, facet_matrix, seen_points, target_cells
 from evnlos.transport.facets_kernel import carry_facets, carry_lobes, facet_slopes, fill_facets
@@ -211,7 +211,7 @@ def setup_of(path, wall: FittedWall, **changes) -> FittedSetup:
 def test_a_fitted_wall_survives_its_file(tmp_path):
     wall = fitted()
     write_fitted(tmp_path / "wall.safetensors", wall)
-    back = read_fitted(tmp_path / "wall.safetensors")
+    back = WALL.read(tmp_path / "wall.safetensors")
     for name in ("log_density", "sensitivity", "ambient", "companion", "left", "right"):
         np.testing.assert_array_equal(getattr(back, name), getattr(wall, name))
     assert back.about == wall.about
@@ -220,11 +220,11 @@ def test_a_fitted_wall_survives_its_file(tmp_path):
 def test_damaged_files_and_arrays_that_do_not_fit_are_refused(tmp_path):
     path = tmp_path / "wall.safetensors"
     with pytest.raises(DataError, match="does not exist"):
-        read_fitted(path)
+        WALL.read(path)
     setup = setup_of(path, fitted())
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(DataError, match="not a readable safetensors"):
-        read_fitted(path)
+        WALL.read(path)
     with pytest.raises(ConfigError, match="checksum"):
         setup.fitted()
     with pytest.raises(DataError, match="companion is"):

@@ -38,7 +38,7 @@ from evnlos.scene import HandwritingGlyphs, LineMotion, Scene, Target
 from evnlos.scene.glyph_sets import Plate
 from evnlos.sensor import FrameCamera
 from evnlos.setups import MeasuredSetup, RadiometricSetup
-from evnlos.setups.measured_file import About, Measurement, read_measurement, write_measurement
+from evnlos.setups.measured_file import MEASUREMENT, About, Measurement, write_measurement
 from evnlos.solver import read_photograph
 from evnlos.solver.inversion import Inversion, chosen_degree
 from evnlos.transport import MatrixTransport
@@ -429,7 +429,7 @@ def small_measurement(**changes) -> Measurement:
 def test_strange_files_are_refused(tmp_path) -> None:
     path = tmp_path / "t.safetensors"
     checksum = write_measurement(path, small_measurement())
-    read = read_measurement(path)
+    read = MEASUREMENT.read(path)
     assert read.about == small_measurement().about
     assert MeasuredSetup(file=str(path), checksum=checksum).source() == Plane(2, 3, 0.01)
     with pytest.raises(ConfigError, match="has the checksum"):
@@ -439,7 +439,7 @@ def test_strange_files_are_refused(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"ends in '\.h5'"):
         write_measurement(tmp_path / "t.h5", small_measurement())
     with pytest.raises(DataError, match="does not exist"):
-        read_measurement(tmp_path / "none.safetensors")
+        MEASUREMENT.read(tmp_path / "none.safetensors")
     for changes in (
         {"matrix": torch.rand(20, 7)},
         {"noise": -torch.ones(4, 5)},
@@ -456,7 +456,7 @@ def test_strange_files_are_refused(tmp_path) -> None:
             spoiled[place] = draw.integers(256)
         path.write_bytes(bytes(spoiled))
         try:
-            read_measurement(path)
+            MEASUREMENT.read(path)
         except EvnlosError as error:
             assert "\n" not in str(error)
             refused += 1
@@ -465,8 +465,8 @@ def test_strange_files_are_refused(tmp_path) -> None:
     about = {"plane": {"height": 10**9, "width": 10**9, "pitch_m": 0.01}, "height": 4, "width": 5}
     text = json.dumps({"format": "evnlos-transport-1", "about": about | {"magnification_px_m": 1.0}})
     path.write_bytes(save(tensors, metadata={"evnlos": text}))
-    with pytest.raises(DataError, match="garbles its geometry"):
-        read_measurement(path)
+    with pytest.raises(DataError, match="garbles its description"):
+        MEASUREMENT.read(path)
 
 
 def test_identify_tells_the_scan_s_own_noise(noisy, clean, tmp_path) -> None:

@@ -22,12 +22,16 @@ from safetensors.torch import save
 import evnlos
 from evnlos import EvnlosError, UNetConfig, load_weights, read_events
 from evnlos.cli.main import main
-from evnlos.dataset import Sampling, read_capture
+from evnlos.dataset import FixedPattern, Sampling, load_pattern, read_capture, save_pattern
 from evnlos.events import read_triggers
 from evnlos.model import Weights, save_weights
 from evnlos.scene.nist_sd19 import read_sd19_image
 from evnlos.sensor.video import open_video
+from evnlos.setups.fitted_file import WALL, AboutWall, FittedWall, write_fitted
+from evnlos.setups.measured_file import MEASUREMENT, About, Measurement, write_measurement
+from evnlos.tensor_file import sealed_bytes
 from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
+from evnlos.types import Plane
 from evnlos.untrusted import open_image, open_regular
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 72 48\n%%EndComments\n0 0 moveto showpage\n"
@@ -494,7 +498,60 @@ def test_weights_of_ones_own_do_not_hide_published_ones(sealed, tmp_path, monkey
 
 
 def test_the_same_tensors_are_the_same_bytes() -> None:
-    from evnlos.model.tensor_file import sealed_bytes
-
     tensors = {"b": torch.arange(3.0), "a": torch.ones(2, 2)}
     assert len({sealed_bytes(tensors, '{"some": "thing"}') for _ in range(20)}) == 1
+
+
+def _rig_files(folder: Path) -> dict[str, tuple[Path, Callable[[Path], tuple[Any, ...]]]]:
+    """Write a measured transport, a fitted wall and a fixed pattern; return each with what reads it."""
+    draw = np.random.default_rng(0)
+    picture = draw.random((3, 4)).astype(np.float32)
+    about = About(Plane(2, 3, 0.01), 4, 5, 100.0, notes={"checks": [1, 2]})
+    measured = Measurement(torch.rand(20, 6), torch.ones(4, 5), torch.zeros(4, 5), about)
+    write_measurement(folder / "t.safetensors", measured)
+    plane = Plane(4, 3, 0.02)
+    wall = FittedWall(
+        draw.random((5, 5)), picture, picture, draw.random((8, 8)).astype(np.float32),
+        draw.random((2, 3, 4)).astype(np.float32), draw.random((2, 12)).astype(np.float32),
+        AboutWall(0.01, 0.1, 0.5, Plane(8, 8, 0.02), plane),
+    )  # fmt: skip
+    write_fitted(folder / "w.safetensors", wall)
+    save_pattern(FixedPattern(picture, picture / 2), folder / "p.safetensors")
+
+    def measurement(path: Path) -> tuple[Any, ...]:
+        found = MEASUREMENT.read(path)
+        return (found.about, *(one.numpy().tobytes() for one in (found.matrix, found.noise, found.dark)))
+
+    def fitted(path: Path) -> tuple[Any, ...]:
+        found = WALL.read(path)
+        return (found.about, *(getattr(found, name).tobytes() for name in WALL.names))
+
+    return {
+        "measured transport": (folder / "t.safetensors", measurement),
+        "fitted wall": (folder / "w.safetensors", fitted),
+        "fixed pattern": (folder / "p.safetensors", lambda path: (load_pattern(path).digest,)),
+    }
+
+
+@pytest.mark.parametrize("kind", ["measured transport", "fitted wall", "fixed pattern"])
+def test_no_flipped_byte_of_a_rig_s_file_goes_unseen(kind: str, tmp_path) -> None:
+    path, read = _rig_files(tmp_path)[kind]
+    whole, expected, draw = path.read_bytes(), read(path), random.Random(kind)
+    places = [*range(len(whole)), *(draw.randrange(len(whole)) for _ in range(200))]
+    noticed = 0
+    for place in places:
+        changed = bytearray(whole)
+        changed[place] ^= 1 << draw.randrange(8)
+        path.write_bytes(changed)
+        try:
+            assert read(path) == expected, place
+        except EvnlosError as error:
+            assert "\n" not in str(error)
+            noticed += 1
+    assert noticed > 0.9 * len(places)
+
+
+@pytest.mark.parametrize("kind", ["measured transport", "fitted wall", "fixed pattern"])
+def test_a_rig_s_file_without_a_digest_still_loads(kind: str, tmp_path) -> None:
+    path, read = _rig_files(tmp_path)[kind]
+    assert read(unsealed(path)) == read(path)

@@ -70,7 +70,8 @@ class Command:
         from evnlos.calibration.scan import import_scan
         from evnlos.errors import MissingDependencyError
         from evnlos.plot.scan import draw_scan
-        from evnlos.setups.measured_file import SUFFIX, write_measurement
+        from evnlos.setups.measured_file import write_measurement
+        from evnlos.tensor_file import SUFFIX
 
         torch.set_num_threads(1)
         out = self.folder / f"transport{SUFFIX}" if self.out is None else self.out

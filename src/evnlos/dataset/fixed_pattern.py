@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from evnlos.errors import DataError
 from evnlos.files import write_atomically
+from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
 
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less
 
@@ -55,8 +55,8 @@ class FixedPattern:
 def save_pattern(pattern: FixedPattern, path: str | Path) -> None:
     """Write a fixed pattern as a safetensors file, atomically."""
     tensors = {"sensitivity": pattern.sensitivity, "offset": pattern.offset}
-    tensors = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in tensors.items()}
-    write_atomically(Path(path), save(tensors, metadata={"evnlos": "fixed pattern"}))
+    content = {name: torch.tensor(value, dtype=torch.float32) for name, value in tensors.items()}
+    write_atomically(Path(path), sealed_bytes(content, "fixed pattern"))
 
 
 def load_pattern(path: str | Path) -> FixedPattern:
@@ -74,17 +74,16 @@ def load_pattern(path: str | Path) -> FixedPattern:
     if not path.is_file():
         raise DataError(f"{path} does not exist; `evnlos calibrate` writes the fixed pattern of a rig's camera")
     try:
-        with safe_open(path, framework="numpy") as file:
-            sensitivity, offset = file.get_tensor("sensitivity"), file.get_tensor("offset")
-    except (SafetensorError, OSError, ValueError) as error:
+        _, tensors, _ = read_sealed(path)
+        check_floats(tensors)
+        sensitivity, offset = (tensors[name].float().numpy() for name in ("sensitivity", "offset"))
+    except (OSError, ValueError, LookupError) as error:
         raise DataError(f"{path} holds no fixed pattern: {' '.join(str(error).split())}") from None
     if sensitivity.ndim != 2 or sensitivity.shape != offset.shape:
         raise DataError(
             f"{path}: sensitivity {sensitivity.shape} and offset {offset.shape} are no pictures of one size"
         )
-    if not (np.isfinite(sensitivity).all() and np.isfinite(offset).all()):
-        raise DataError(f"{path} holds numbers that are not finite; calibrate again")
-    return FixedPattern(sensitivity.astype(np.float32), offset.astype(np.float32))
+    return FixedPattern(sensitivity, offset)
 
 
 PATTERN_FILE = "pattern.safetensors"

@@ -6,7 +6,6 @@ from evnlos.model.plates import plates
 from evnlos.model.published import published, published_for, published_rig, published_single
 from evnlos.model.reconstructor import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
 from evnlos.model.sequence import SequenceConfig, SequenceReconstructor
-from evnlos.model.tensor_file import read_sealed, sealed_bytes
 from evnlos.model.unet import ResidualUNet, UNetConfig, UNetReconstructor
 from evnlos.model.weights import Weights, describe_network, load_weights, save_weights, with_rank
 
@@ -32,8 +31,6 @@ __all__ = [
     "published_for",
     "published_rig",
     "published_single",
-    "read_sealed",
     "save_weights",
-    "sealed_bytes",
     "with_rank",
 ]

@@ -19,7 +19,7 @@ from evnlos.migrate import migrate
 from evnlos.model.confidence import Confidence
 from evnlos.model.published import is_as_published, no_weights, published
 from evnlos.model.reconstructor import Reconstructor, ReconstructorSettings
-from evnlos.model.tensor_file import check_floats, read_sealed, sealed_bytes
+from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
 
 _FORMAT = "evnlos-weights-4"
 _MEAN = "baseline.mean_image"

@@ -12,12 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError
 from evnlos.scene import Scene, Target
 from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
-from evnlos.setups.fitted_file import FittedWall, read_fitted
+from evnlos.setups.fitted_file import WALL, FittedWall
 from evnlos.setups.measured import covered
-from evnlos.setups.measured_file import file_checksum
 from evnlos.transport import MatrixTransport, MatrixWall
 from evnlos.transport.ambient import ambient_map, ambient_plane
 from evnlos.transport.angular_spectrum import check_lengths
@@ -89,13 +88,7 @@ class FittedSetup(Setup):
         """
         if not self.file:
             raise ConfigError("setup.file is empty; give the .safetensors file of `evnlos calibrate`")
-        path = Path(self.file)
-        if not path.is_file():
-            raise DataError(
-                f"{path} does not exist; give the file that `evnlos calibrate` wrote beside rig.yaml"
-            )
-        state = path.stat()
-        return _fitted(str(path.resolve()), state.st_mtime_ns, state.st_size, self.checksum)
+        return WALL.load(self.file, self.checksum)
 
     def pose(self) -> Pose:
         """Return where camera, wall and target are."""
@@ -323,13 +316,6 @@ class FittedSetup(Setup):
                     f"the plate reaches {needed:.3f} m from the middle of a strip of {name} {side} m; "
                     f"set strip_m to at least {2 * needed:.3f} m there"
                 )
-
-
-@lru_cache(maxsize=2)
-def _fitted(path: str, changed_ns: int, size: int, checksum: str) -> FittedWall:
-    if checksum and (found := file_checksum(path)) != checksum:
-        raise ConfigError(f"{path} has the checksum {found}, the settings say {checksum}; name the file meant")
-    return read_fitted(path)
 
 
 @lru_cache(maxsize=4)

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
-from evnlos.config import from_dict, to_dict
 from evnlos.errors import ConfigError, DataError
-from evnlos.files import write_atomically
+from evnlos.tensor_file import TensorFile, check_floats
 from evnlos.transport.facets import SlopeTable
 from evnlos.types import Plane
 
-FORMAT = "evnlos-wall-1"
-SUFFIX = ".safetensors"
 _ARRAYS = ("log_density", "sensitivity", "ambient", "companion", "left", "right")
 _LARGEST = 4096
 
@@ -114,44 +107,28 @@ class FittedWall:
         return resized.reshape(*picture.shape[:-2], *shape)
 
 
+def _wall(about: AboutWall, **tensors: torch.Tensor) -> FittedWall:
+    check_floats(tensors)
+    log_density = tensors.pop("log_density").double().numpy()
+    return FittedWall(log_density, about=about, **{name: one.float().numpy() for name, one in tensors.items()})
+
+
+WALL = TensorFile(
+    "evnlos-wall-1",
+    _ARRAYS,
+    AboutWall,
+    _wall,
+    "a fitted wall",
+    "the file that `evnlos calibrate` wrote beside rig.yaml",
+)
+"""Fitted walls on disk."""
+
+
 def write_fitted(path: str | Path, wall: FittedWall) -> str:
     """Write a fitted wall as one safetensors file, atomically, and return its checksum.
 
     Raises:
         ConfigError: The name does not end in .safetensors.
     """
-    path = Path(path)
-    if path.suffix != SUFFIX:
-        raise ConfigError(f"{path} ends in {path.suffix or 'nothing'!r}; give a name that ends in {SUFFIX}")
-    arrays = {name: np.ascontiguousarray(getattr(wall, name)) for name in _ARRAYS}
-    content = save(arrays, metadata={"evnlos": json.dumps({"format": FORMAT, "about": to_dict(wall.about)})})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, content)
-    return hashlib.sha256(content).hexdigest()[:16]
-
-
-def read_fitted(path: str | Path) -> FittedWall:
-    """Read a fitted wall; nothing is unpickled, and no size is taken on trust.
-
-    Raises:
-        DataError: The file is missing, is not such a file, or does not fit its own geometry.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(f"{path} does not exist; give the file that `evnlos calibrate` wrote beside rig.yaml")
-    try:
-        with safe_open(path, framework="np") as file:
-            found = json.loads((file.metadata() or {}).get("evnlos", "{}"))
-            names = set(file.keys())
-            arrays = {name: file.get_tensor(name) for name in _ARRAYS if name in names}
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path} is not a readable safetensors file: {' '.join(str(error).split())}") from None
-    if not isinstance(found, dict) or found.get("format") != FORMAT or len(arrays) != len(_ARRAYS):
-        stated = found.get("format", "no format") if isinstance(found, dict) else found
-        raise DataError(f"{path} holds {str(stated)[:40]!r}; give a fitted wall of format {FORMAT}")
-    try:
-        about = from_dict(AboutWall, found.get("about"), source=str(path))  # type: ignore[arg-type]
-        arrays["log_density"] = arrays["log_density"].astype(np.float64)
-        return FittedWall(about=about, **arrays)
-    except (ConfigError, DataError) as error:
-        raise DataError(f"{path} garbles its geometry: {error}") from None
+    arrays = {name: torch.tensor(getattr(wall, name)) for name in _ARRAYS}
+    return WALL.write(path, arrays, wall.about)

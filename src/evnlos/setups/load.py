@@ -13,8 +13,8 @@ from evnlos.errors import ConfigError
 from evnlos.migrate import migrate
 from evnlos.setups.base import CAMERA_FIELDS, SensorSize, Setup
 from evnlos.setups.measured import MeasuredSetup
-from evnlos.setups.measured_file import SUFFIX
 from evnlos.setups.presets import NAMED, setup_names, setup_preset
+from evnlos.tensor_file import SUFFIX
 
 CALIBRATED_FILE = "rig.yaml"
 """The simulation that `evnlos calibrate` fits, in its folder."""

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError
 from evnlos.scene import Scene
 from evnlos.setups.base import OperatorNoise, Setup, stated_distance_m
-from evnlos.setups.measured_file import Measurement, file_checksum, read_measurement
+from evnlos.setups.measured_file import MEASUREMENT, Measurement
 from evnlos.transport import MatrixTransport, MatrixWall
 from evnlos.transport.ambient import ambient_plane
 from evnlos.types import Plane
@@ -50,11 +50,7 @@ class MeasuredSetup(Setup):
         """
         if not self.file:
             raise ConfigError("setup.file is empty; give the .safetensors file of `evnlos scan import`")
-        path = Path(self.file)
-        if not path.is_file():
-            raise DataError(f"{path} does not exist; give the file that `evnlos scan import` wrote")
-        state = path.stat()
-        return _measurement(str(path.resolve()), state.st_mtime_ns, state.st_size, self.checksum)
+        return MEASUREMENT.load(self.file, self.checksum)
 
     def target_cells(self) -> Plane:
         """Return the scanned cells, in the coordinates of the target's motion."""
@@ -210,13 +206,6 @@ class MeasuredSetup(Setup):
                     "m; "
                     f"scan at least {2 * reach:.3f} m there, or shorten the travel"
                 )
-
-
-@lru_cache(maxsize=2)
-def _measurement(path: str, changed_ns: int, size: int, checksum: str) -> Measurement:
-    if checksum and (found := file_checksum(path)) != checksum:
-        raise ConfigError(f"{path} has the checksum {found}, the settings say {checksum}; name the file meant")
-    return read_measurement(path)
 
 
 @lru_cache(maxsize=2)

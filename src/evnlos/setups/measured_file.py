@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
-from evnlos.config import from_dict, to_dict
 from evnlos.errors import ConfigError, DataError
-from evnlos.files import write_atomically
+from evnlos.tensor_file import TensorFile
 from evnlos.types import Plane
-
-FORMAT = "evnlos-transport-1"
-SUFFIX = ".safetensors"
 
 
 @dataclass(frozen=True)
@@ -102,50 +94,22 @@ class Measurement:
         return torch.isinf(self.noise)
 
 
+MEASUREMENT = TensorFile(
+    "evnlos-transport-1",
+    ("matrix", "noise", "dark"),
+    About,
+    Measurement,
+    "a measured transport",
+    "the file that `evnlos scan import` wrote",
+)
+"""Measured matrices on disk."""
+
+
 def write_measurement(path: str | Path, measurement: Measurement) -> str:
     """Write a measured matrix as one safetensors file, atomically, and return its checksum.
 
     Raises:
         ConfigError: The name does not end in .safetensors.
     """
-    path = Path(path)
-    if path.suffix != SUFFIX:
-        raise ConfigError(f"{path} ends in {path.suffix or 'nothing'!r}; give a name that ends in {SUFFIX}")
-    tensors = {name: getattr(measurement, name).contiguous() for name in ("matrix", "noise", "dark")}
-    about = {"format": FORMAT, "about": to_dict(measurement.about)}
-    content = save(tensors, metadata={"evnlos": json.dumps(about)})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, content)
-    return hashlib.sha256(content).hexdigest()[:16]
-
-
-def read_measurement(path: str | Path) -> Measurement:
-    """Read a measured matrix; nothing is unpickled, and no size is taken on trust.
-
-    Raises:
-        DataError: The file is missing, is not such a file, or does not fit its own geometry.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(f"{path} does not exist; give the file that `evnlos scan import` wrote")
-    try:
-        with safe_open(path, framework="pt") as file:
-            found = json.loads((file.metadata() or {}).get("evnlos", "{}"))
-            names = set(file.keys())
-            tensors = {name: file.get_tensor(name) for name in ("matrix", "noise", "dark") if name in names}
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path} is not a readable safetensors file: {' '.join(str(error).split())}") from None
-    if not isinstance(found, dict) or found.get("format") != FORMAT or len(tensors) != 3:
-        stated = found.get("format", "no format") if isinstance(found, dict) else found
-        raise DataError(f"{path} holds {str(stated)[:40]!r}; give a measured transport of format {FORMAT}")
-    try:
-        about = from_dict(About, found.get("about"), source=str(path))  # type: ignore[arg-type]
-        return Measurement(about=about, **tensors)
-    except (ConfigError, DataError) as error:
-        raise DataError(f"{path} garbles its geometry: {error}") from None
-
-
-def file_checksum(path: str | Path) -> str:
-    """Return the first 16 hexadecimal digits of a file's SHA-256."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+    tensors = {name: getattr(measurement, name) for name in MEASUREMENT.names}
+    return MEASUREMENT.write(path, tensors, measurement.about)

@@ -9,7 +9,8 @@ import torch
 
 from evnlos.errors import DataError
 from evnlos.files import write_atomically
-from evnlos.model import Reconstructor, describe_network, read_sealed, sealed_bytes
+from evnlos.model import Reconstructor, describe_network
+from evnlos.tensor_file import read_sealed, sealed_bytes
 
 
 def save_checkpoint(
