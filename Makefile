@@ -15,8 +15,8 @@ test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
 check: $(READY)
-	$(BIN)/ruff format --check src tests benchmarks examples
-	$(BIN)/ruff check src tests benchmarks examples
+	$(BIN)/ruff format --check src tests benchmarks examples tools
+	$(BIN)/ruff check src tests benchmarks examples tools
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/python -m pytest -q tests/test_architecture.py
@@ -39,7 +39,7 @@ dist: $(READY)
 
 clean:
 	rm -rf $(DEMO) build dist packages/*/build src/*.egg-info packages/*/src/*.egg-info .pytest_cache .ruff_cache .hypothesis
-	find src tests benchmarks examples -name __pycache__ -prune -exec rm -rf {} +
+	find src tests benchmarks examples tools -name __pycache__ -prune -exec rm -rf {} +
 
 # PyTorch first: its CPU build where the package index has one, else whatever build the index gives.
 $(READY): pyproject.toml packages/evnlos-weights/pyproject.toml constraints.txt

@@ -12,13 +12,13 @@ from scipy.ndimage import map_coordinates
 from evnlos import EvnlosError
 from evnlos.dataset import Dataset, NlosDataset, Sampling, import_captures, read_shard, simulate
 from evnlos.evaluation.classifier import CHARACTERS, load_reader, read_characters
-from evnlos.evaluation.classifier_training import train_reader
 from evnlos.evaluation.intervals import paired_difference
 from evnlos.evaluation.memory import compare_with_training
 from evnlos.metrics import psnr
 from evnlos.model import plates
 from evnlos.scene import FontGlyphs, find_font
 from evnlos.types import Plane
+from train_classifier import train_reader
 
 CANVAS = Plane(64, 96, 0.0025)
 

@@ -9,7 +9,7 @@ from evnlos.errors import DataError, MissingDependencyError
 from evnlos.interop.deepinv import as_physics
 from evnlos.solver import tikhonov
 from evnlos.transport import MatrixTransport
-from evnlos.transport.registry import EXAMPLES
+from transports import EXAMPLES
 
 
 @pytest.fixture

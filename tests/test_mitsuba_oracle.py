@@ -8,7 +8,10 @@ import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.interop.mitsuba import trace, triangulate, usable_variant
-from evnlos.interop.mitsuba_oracle import (
+from evnlos.setups import RadiometricSetup
+from evnlos.transport import GGX, Lambert, Occluder, View, light_transport_matrix
+from evnlos.types import Plane
+from mitsuba_oracle import (
     PATTERN,
     SHADOW_POINTS,
     WALLS,
@@ -18,9 +21,6 @@ from evnlos.interop.mitsuba_oracle import (
     trace_rig,
     wall_image,
 )
-from evnlos.setups import RadiometricSetup
-from evnlos.transport import GGX, Lambert, Occluder, View, light_transport_matrix
-from evnlos.types import Plane
 
 SHAPE = (8, 12)
 RENDERS: dict[str, np.ndarray] = {}

@@ -12,8 +12,8 @@ from evnlos.transport import (
     Transport,
     compose,
 )
-from evnlos.transport.registry import EXAMPLES
 from evnlos.types import Plane
+from transports import EXAMPLES
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 

@@ -19,8 +19,8 @@ from evnlos.events import (
     time_surface,
     voxel_grid,
 )
-from evnlos.events.surface_reference import time_surface_reference
 from evnlos.types import Events
+from surface_reference import time_surface_reference
 
 
 def random_events(seed: int, count: int = 300, width: int = 9, height: int = 7, span_us: int = 1000) -> Events:

@@ -24,8 +24,8 @@ from evnlos.solver import (
 )
 from evnlos.solver.spectrum import Spectrum
 from evnlos.transport import LinearTransport, MatrixTransport
-from evnlos.transport.registry import EXAMPLES
 from evnlos.types import Events, Plane
+from transports import EXAMPLES
 
 LINEAR = [name for name, make in EXAMPLES.items() if isinstance(make(), LinearTransport)]
 

@@ -40,7 +40,7 @@ class CharacterReader(nn.Module):
 
 @lru_cache(maxsize=1)
 def load_reader(path: str | Path = _FILE) -> CharacterReader:
-    """Return the trained reader; `python -m evnlos.evaluation.classifier_training` made the one in the package.
+    """Return the trained reader; `python tools/train_classifier.py` made the one in the package.
 
     Raises:
         DataError: The file is missing or of another network.

@@ -134,6 +134,7 @@ def walk(out, count, pixel, start, length, x, drift, noise, on, off, seed, drawn
 
 @njit(cache=True, error_model="numpy")
 def log_row(light, dark, logs):
+    """Fill the logarithm of the light and the dark current."""
     for i in range(len(light)):
         logs[i] = fast_log(light[i] + dark)
 
@@ -160,18 +161,21 @@ def variance_row(light, light_1, variance, law, length, variance_1):
 
 @njit(cache=True, error_model="numpy")
 def mean_row(mean, change, mean_1):
+    """Fill the mean at the end of a step."""
     for i in range(len(mean)):
         mean_1[i] = mean[i] + change[i]
 
 
 @njit(cache=True, error_model="numpy")
 def lowest_row(low, mean_1, low_1):
+    """Fill the lowest mean so far."""
     for i in range(len(low)):
         low_1[i] = min(low[i], mean_1[i])
 
 
 @njit(cache=True, error_model="numpy")
 def highest_row(high, mean_1, high_1):
+    """Fill the highest mean so far."""
     for i in range(len(high)):
         high_1[i] = max(high[i], mean_1[i])
 

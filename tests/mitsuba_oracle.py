@@ -1,6 +1,6 @@
 """The light-transport matrix and a path tracer side by side.
 
-`python -m evnlos.interop.mitsuba_oracle` renders small rigs both ways and prints how far they are apart.
+`python tests/mitsuba_oracle.py` renders small rigs both ways and prints how far they are apart.
 """
 
 from __future__ import annotations

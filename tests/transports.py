@@ -10,17 +10,23 @@ from collections.abc import Callable
 
 import torch
 
-from evnlos.transport.brdf import GGX, Brdf, Lambert
-from evnlos.transport.diffraction import Diffraction
-from evnlos.transport.lamp import lamp_radiance
-from evnlos.transport.light_transport import LightTransport
-from evnlos.transport.occluder import Occluder
-from evnlos.transport.operator import MatrixTransport, Transport, compose
-from evnlos.transport.radiometric import light_transport_matrix
-from evnlos.transport.reflection import DiffuseReflection
-from evnlos.transport.tpsf import tpsf_kernel
-from evnlos.transport.view import View
-from evnlos.transport.viewing import Viewing
+from evnlos.transport import (
+    GGX,
+    Brdf,
+    Diffraction,
+    DiffuseReflection,
+    Lambert,
+    LightTransport,
+    MatrixTransport,
+    Occluder,
+    Transport,
+    View,
+    Viewing,
+    compose,
+    lamp_radiance,
+    light_transport_matrix,
+    tpsf_kernel,
+)
 from evnlos.types import Plane
 
 _SCENE = Plane(7, 10, 0.01)

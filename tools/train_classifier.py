@@ -1,6 +1,6 @@
 """Train the character reader on clean glyphs of many hands, degraded at random.
 
-    python -m evnlos.evaluation.classifier_training classifier.safetensors
+    python tools/train_classifier.py classifier.safetensors
 
 It never sees a reconstruction, nor the typeface of the standard captures: what it says of a reconstruction is
 independent of how that was made.
