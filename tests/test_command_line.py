@@ -16,7 +16,7 @@ from evnlos import Events, doctor, write_events
 from evnlos.cli import VERBS, main
 from evnlos.cli.completion import script
 from evnlos.cli.notes import say
-from evnlos.cli.verbs import module_of
+from evnlos.cli.verbs import command_of
 
 SOURCE = Path(evnlos.__file__).parent
 PAGE = (SOURCE.parent.parent / "docs" / "command_line.md").read_text()
@@ -114,7 +114,7 @@ def test_json_is_one_object(recording, tmp_path, capsys) -> None:
 
 
 def test_the_page_lists_the_commands_with_json() -> None:
-    with_json = {verb for verb in VERBS if "json" in module_of(verb).Command.__dataclass_fields__}
+    with_json = {verb for verb in VERBS if "json" in command_of(verb).__dataclass_fields__}
     sentence = re.search(r"`--json` is there(.*?)`experiment`", PAGE, re.DOTALL)
     assert sentence and set(re.findall(r"`(\w+)`", sentence[1])) == with_json
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.cli.invert import Command, correlation, to_text
+from evnlos.cli.invert import InvertCommand, correlation, to_text
 from evnlos.errors import ConfigError, DataError
 from evnlos.solver import prepare_inversion, read_photograph
 from evnlos.solver.photograph import convex_occluders
@@ -87,22 +87,22 @@ def test_corners_are_put_in_order(made):
 
 def test_command(made, tmp_path, capsys):
     out = tmp_path / "picture.png"
-    Command((made,), out=out, json=True).run()
+    InvertCommand((made,), out=out, json=True).run()
     found = json.loads(capsys.readouterr().out)
     assert set(found["solutions"]) == {"tikhonov", "tv", "without occluder"}
     assert out.stat().st_size > 1000
     assert np.load(out.with_suffix(".npz"))["tv"].shape == (1, 10, 12)
     assert "without occluder" in to_text(found)
-    Command(
+    InvertCommand(
         (made,), solver="tikhonov", lam="1e-4", background_degree=2, no_occluder=True, out=out, json=True
     ).run()
     found = json.loads(capsys.readouterr().out)
     assert list(found["solutions"]) == ["tikhonov"]
     assert found["solutions"]["tikhonov"]["lam"] == 1e-4
     with pytest.raises(ConfigError, match="--lam is 'x'"):
-        Command((made,), lam="x", out=out).run()
+        InvertCommand((made,), lam="x", out=out).run()
     with pytest.raises(ConfigError, match="tikhonov only"):
-        Command((made,), lam="gcv", out=out).run()
+        InvertCommand((made,), lam="gcv", out=out).run()
 
 
 @pytest.mark.parametrize(

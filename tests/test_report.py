@@ -12,7 +12,7 @@ import torch
 
 from chromium import Chromium, missing
 from evnlos.cli.main import main
-from evnlos.cli.verbs import module_of
+from evnlos.cli.verbs import command_of
 from evnlos.config import save_yaml
 from evnlos.dataset import Sampling, Simulation
 from evnlos.dataset.sampling import Samples
@@ -232,9 +232,8 @@ def _cross(one, other) -> bool:
 def _parsed(line: str, monkeypatch: pytest.MonkeyPatch):
     """Return the command that a line is read as, without running it; settings are those of the default."""
     program, verb, *rest = shlex.split(line)
-    module = module_of(verb)
     parsed = []
-    monkeypatch.setattr(module.Command, "run", lambda command: parsed.append(command))
+    monkeypatch.setattr(command_of(verb), "run", lambda command: parsed.append(command))
     monkeypatch.setattr("evnlos.config.load_yaml", lambda kind, _: kind())
     main([verb, *rest])
     assert program == "evnlos" and len(parsed) == 1 and not any(word in ("", ".") for word in rest)

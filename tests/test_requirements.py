@@ -11,7 +11,7 @@ import pytest
 
 import evnlos
 from evnlos.cli import VERBS, main
-from evnlos.cli.verbs import module_of, summary_of
+from evnlos.cli.verbs import command_of, summary_of
 from evnlos.requirements import REQUIRED, faults
 
 ROOT = Path(evnlos.__file__).parent.parent.parent
@@ -122,7 +122,7 @@ def test_a_broken_package_is_named(error: str, tmp_path, monkeypatch, capsys) ->
     kind, text = error.rstrip("')").split("('")
     assert fault.name == "h5py" and fault.found == f"broken ({kind}: {text})"
     assert fault.cure == "pip install --force-reinstall 'h5py>=3.11'"
-    monkeypatch.setattr(sys.modules["evnlos.cli.main"], "module_of", lambda _: __import__("h5py"))
+    monkeypatch.setattr(sys.modules["evnlos.cli.main"], "command_of", lambda _: __import__("h5py"))
     with pytest.raises(SystemExit) as stop:
         main(["info"])
     assert stop.value.code == 2 and "error: h5py is broken" in capsys.readouterr().err
@@ -130,4 +130,4 @@ def test_a_broken_package_is_named(error: str, tmp_path, monkeypatch, capsys) ->
 
 def test_the_overview_says_what_each_command_says() -> None:
     for verb in VERBS:
-        assert summary_of(verb) == module_of(verb).Command.__doc__.splitlines()[0]
+        assert summary_of(verb) == command_of(verb).__doc__.splitlines()[0]

@@ -10,7 +10,7 @@ from evnlos.cli.console import Flat
 
 
 @dataclass(frozen=True)
-class Command:
+class AppCommand:
     """A page to play with: hide something, choose wall and cameras, watch what can be seen; uploads too."""
 
     weights: tuple[Path, ...] = ()

@@ -5,23 +5,19 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 from evnlos.calibration.settings import PRESETS, Calibration
-from evnlos.cli.console import Flat, Folders
+from evnlos.cli.console import Flat, Folders, Presets
 from evnlos.cli.notes import say
 from evnlos.setups import load_setup
 
-__all__ = ["PRESETS", "Command"]
-
-
-def with_setup(settings: Calibration, word: str) -> Calibration:
-    """Return the calibration that starts from the setup of `--setup`."""
-    return replace(settings, start=replace(settings.start, setup=load_setup(word)))
-
 
 @dataclass(frozen=True)
-class Command:
+class CalibrateCommand:
     """Fit the simulator to captures with known targets; check it on captures held out; write a rig file."""
+
+    PRESETS: ClassVar[Presets[Calibration]] = PRESETS
 
     captures: Folders
     """Capture folders of one rig and one camera."""
@@ -39,6 +35,11 @@ class Command:
     json: bool = False
     """Print one JSON object instead of tables."""
     settings: Flat[Calibration] = field(default_factory=Calibration)
+
+    @staticmethod
+    def with_setup(settings: Calibration, word: str) -> Calibration:
+        """Return the calibration that starts from the setup of `--setup`."""
+        return replace(settings, start=replace(settings.start, setup=load_setup(word)))
 
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""

@@ -13,7 +13,7 @@ _MARKS = {"good": "  good   ", "doubtful": "? look   ", "bad": "! BAD    "}
 
 
 @dataclass(frozen=True)
-class Command:
+class CaptureCommand:
     """Begin a capture folder with a commented capture.yaml (init), or say what a recording is worth (check)."""
 
     action: Annotated[Literal["init", "check"], tyro.conf.Positional]

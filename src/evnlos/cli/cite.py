@@ -11,7 +11,7 @@ import tyro
 
 
 @dataclass(frozen=True)
-class Command:
+class CiteCommand:
     """Print BibTeX for exactly what a settings file, a dataset or a run uses; for everything without one."""
 
     used: Annotated[Path | None, tyro.conf.Positional] = None

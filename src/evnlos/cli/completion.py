@@ -13,7 +13,7 @@ Shell = Literal["bash", "zsh", "fish"]
 
 
 @dataclass(frozen=True)
-class Command:
+class CompletionCommand:
     """Print a script that completes commands, flags and choices: evnlos completion bash >> ~/.bashrc."""
 
     shell: Annotated[Shell, tyro.conf.Positional] = "bash"
@@ -26,9 +26,9 @@ class Command:
 
 def script(shell: Shell) -> str:
     """Return the completion script of all commands for a shell."""
-    from evnlos.cli.verbs import VERBS, module_of
+    from evnlos.cli.verbs import VERBS, command_of
 
-    commands = {verb: module_of(verb).Command for verb in VERBS}
+    commands = {verb: command_of(verb) for verb in VERBS}
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         tyro.extras.subcommand_cli_from_dict(

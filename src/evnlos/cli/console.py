@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -14,6 +14,8 @@ Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
 """One or more folders, given without a flag."""
 Flat = Annotated[T, tyro.conf.arg(name="")]
 """Settings whose flags carry no prefix."""
+Presets = Mapping[str, Callable[[], T]]
+"""Settings by the name that `--preset` gives."""
 
 
 def result(as_json: bool, values: Mapping[str, Any], text: str) -> None:

@@ -17,7 +17,7 @@ from evnlos.events.io.report import OnError
 
 
 @dataclass(frozen=True)
-class Command:
+class ConvertCommand:
     """Convert an event file, block by block: the new file appears when it is complete."""
 
     file: EventFile

@@ -9,7 +9,7 @@ from evnlos.demo import Demo, run_demo
 
 
 @dataclass(frozen=True)
-class Command:
+class DemoCommand:
     """The main job, small: simulate, pre-train, fine-tune on captures, train end to end, evaluate, report."""
 
     settings: Flat[Demo] = field(default_factory=Demo)

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 
 @dataclass(frozen=True)
-class Command:
+class DoctorCommand:
     """Check the installation (torch, numba, HDF5, fonts, disk, optional parts), with a cure for each fault."""
 
     json: bool = False

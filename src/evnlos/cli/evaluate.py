@@ -15,7 +15,7 @@ from evnlos.model.confidence import COVERAGE
 
 
 @dataclass(frozen=True)
-class Command:
+class EvaluateCommand:
     """Score a network on a split of a dataset, with the baselines beside it."""
 
     weights: Path

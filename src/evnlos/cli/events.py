@@ -81,7 +81,7 @@ class PixelChanges:
 
 
 @dataclass(frozen=True)
-class Command:
+class EventsCommand:
     """Turn any video into the events that an event camera would send: files, animations, pictures, arrays."""
 
     video: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
@@ -166,7 +166,7 @@ def _pixel(name: str) -> PixelSettings:
 
 
 def _found(
-    command: Command, video: Video, pixel: PixelSettings, clock: _Clock, events: int, on: int
+    command: EventsCommand, video: Video, pixel: PixelSettings, clock: _Clock, events: int, on: int
 ) -> dict[str, Any]:
     pixels = video.width * video.height
     return {

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Command:
+class ExperimentCommand:
     """Run an experiment on captures: calibrate, simulate, pre-train, fine-tune, compare; resumable."""
 
     name: Annotated[str, tyro.conf.Positional]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
-from evnlos.cli.console import Flat, result
+from evnlos.cli.console import Flat, Presets, result
 from evnlos.cli.train import fit
 from evnlos.dataset import open_dataset
 from evnlos.progress import ProgressBars
@@ -18,16 +19,16 @@ from evnlos.training import (
     read_choice,
 )
 
-PRESETS = {"default": finetuning, "paper": paper_finetuning}
-
 
 @dataclass(frozen=True)
-class Command:
+class FinetuneCommand:
     """Fine-tune weights on few captures (EPNP): modality and network are those of the weights.
 
     After a simulation that was fitted to the setup, less is better: --epochs 3 --learning-rate 2e-4
     --keep-normalization. With --choose captures that are held out decide, and fine-tuning cannot lose much.
     """
+
+    PRESETS: ClassVar[Presets[Training]] = {"default": finetuning, "paper": paper_finetuning}
 
     weights: Path
     """Weights file, or the run to start from."""

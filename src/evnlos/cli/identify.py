@@ -17,7 +17,7 @@ from evnlos.files import write_atomically
 
 
 @dataclass(frozen=True)
-class Command:
+class IdentifyCommand:
     """Say what a setup can show at all: modes above the noise, finest stroke, best linear picture, in words."""
 
     setups: Annotated[tuple[str, ...], tyro.conf.Positional] = ()

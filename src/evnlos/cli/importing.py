@@ -16,7 +16,7 @@ from evnlos.progress import ProgressBars
 
 
 @dataclass(frozen=True)
-class Command:
+class ImportCommand:
     """Turn captures (folders with capture.yaml, events and frames) into a dataset to train and test on."""
 
     captures: Folders

@@ -23,7 +23,7 @@ _SOURCES = {
 
 
 @dataclass(frozen=True)
-class Command:
+class InfoCommand:
     """Show what an event file holds: sensor, rates, polarity, silences. Damage is shown, not refused."""
 
     file: EventFile

@@ -20,7 +20,7 @@ LAM_TIKHONOV, LAM_TV = 4.0, 0.3  # best on eight characters of one rig, docs/inv
 
 
 @dataclass(frozen=True)
-class Command:
+class InvertCommand:
     """Invert a photograph of a matte wall, or whole passes of captures, by the operator alone."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]

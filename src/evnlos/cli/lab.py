@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
-from evnlos.cli.console import Flat
+from evnlos.cli.console import Flat, Presets
 from evnlos.cli.notes import say
 from evnlos.dataset.lab import Lab, lab_of, render_captures
 from evnlos.progress import ProgressBars
 
-PRESETS: dict[str, Callable[[], Lab]] = {"default": Lab}
-
-
-def with_setup(settings: Lab, word: str) -> Lab:
-    """Return the lab with the setup of `--setup`."""
-    return lab_of(word, settings)
-
 
 @dataclass(frozen=True)
-class Command:
+class LabCommand:
     """Render pseudo-real captures: a wall of metal or paint, other cameras than the training simulator's."""
+
+    PRESETS: ClassVar[Presets[Lab]] = {"default": Lab}
 
     out: Path
     """Folder for the capture folders; a capture that is there is done."""
@@ -35,6 +30,11 @@ class Command:
     workers: int = 1
     """Processes; 0 = one for each core. The captures are the same for any number."""
     settings: Flat[Lab] = field(default_factory=Lab)
+
+    @staticmethod
+    def with_setup(settings: Lab, word: str) -> Lab:
+        """Return the lab with the setup of `--setup`."""
+        return lab_of(word, settings)
 
     def run(self) -> None:
         """Render, with a progress bar over the captures."""

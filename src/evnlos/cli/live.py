@@ -19,7 +19,7 @@ from evnlos.live.sources import Listening, open_live
 
 
 @dataclass(frozen=True)
-class Command:
+class LiveCommand:
     """Reconstruct while events come in: a replay, a file that grows, or UDP packets."""
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]

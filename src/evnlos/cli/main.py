@@ -8,12 +8,11 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import MISSING, fields, is_dataclass, replace
-from types import ModuleType
 from typing import Any, TextIO, cast
 
 from evnlos.cli.notes import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen
 from evnlos.cli.parsing import parse, todays_words
-from evnlos.cli.verbs import VERBS, module_of, summary_of
+from evnlos.cli.verbs import VERBS, command_of, summary_of
 from evnlos.errors import ConfigError, EvnlosError, printable
 from evnlos.registry import Kinded, kind_of
 from evnlos.requirements import fault_behind
@@ -98,15 +97,15 @@ def _terminable() -> Iterator[None]:
 
 def _command(verb: str, rest: list[str]) -> Any:
     """Return the command that the words ask for."""
-    module = module_of(verb)
+    command = command_of(verb)
     if verb == "doctor" and set(rest) <= {"--json"}:  # the parser itself may be what is missing
-        return module.Command(json="--json" in rest)
-    return parse(module.Command, rest, verb, _defaults(module, rest))
+        return command(json="--json" in rest)
+    return parse(command, rest, verb, _defaults(command, rest))
 
 
-def _defaults(module: ModuleType, rest: list[str]) -> Any:
+def _defaults(command: type[Any], rest: list[str]) -> Any:
     """Return the command with the settings of --preset, --config and --setup as defaults of the flags."""
-    presets = getattr(module, "PRESETS", None)
+    presets = getattr(command, "PRESETS", None)
     if presets is None:
         return None
     import tyro
@@ -120,15 +119,15 @@ def _defaults(module: ModuleType, rest: list[str]) -> Any:
     if config is not None:
         settings = load_yaml(type(settings), config)
     word = _flag(rest, "--setup")
-    if word is not None and hasattr(module, "with_setup"):
-        settings = module.with_setup(settings, word)
+    if word is not None and hasattr(command, "with_setup"):
+        settings = command.with_setup(settings, word)
     settings = _of_kinds(settings, rest)
     required = {
         item.name: tyro.MISSING
-        for item in fields(module.Command)
+        for item in fields(command)
         if item.default is MISSING and item.default_factory is MISSING
     }
-    return module.Command(**required | {"settings": settings})
+    return command(**required | {"settings": settings})
 
 
 def _of_kinds(settings: Any, words: list[str], prefix: str = "--") -> Any:

@@ -18,7 +18,7 @@ _COLUMNS = 4
 
 
 @dataclass(frozen=True)
-class Command:
+class PreviewCommand:
     """Show an event file as an animation (.gif) or as a sheet of pictures (.png)."""
 
     file: EventFile

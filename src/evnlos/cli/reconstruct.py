@@ -13,7 +13,7 @@ from evnlos.cli.notes import say
 
 
 @dataclass(frozen=True)
-class Command:
+class ReconstructCommand:
     """Reconstruct all positions of a capture: pictures, a film strip and an animation."""
 
     capture: Annotated[Path, tyro.conf.Positional]

@@ -10,7 +10,7 @@ from evnlos.cli.console import Folders, result
 
 
 @dataclass(frozen=True)
-class Command:
+class ReportCommand:
     """Score runs on the same captures and write one self-contained HTML page, with a CSV beside it."""
 
     runs: Folders

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Command:
+class ScanCommand:
     """Measure a rig's own light transport with a display or a moving LED: plan it, import what was recorded."""
 
     action: Annotated[Literal["plan", "import"], tyro.conf.Positional]

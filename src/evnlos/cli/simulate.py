@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
-from evnlos.cli.console import Flat, result
+from evnlos.cli.console import Flat, Presets, result
 from evnlos.cli.notes import say
 from evnlos.dataset import Simulation, simulate
 from evnlos.dataset.cluster import run_on_dask
@@ -20,23 +20,12 @@ from evnlos.setups import load_setup
 from evnlos.setups.base import is_camera
 from evnlos.setups.load import is_name
 
-__all__ = ["PRESETS", "Command"]
-
-
-def with_setup(settings: Simulation, word: str) -> Simulation:
-    """Return the simulation with the setup of `--setup`, without the ranges over the wall that it had."""
-    setup = load_setup(word)
-    if is_name(word):
-        setup = setup.with_cameras_of(settings.setup)
-    over_cameras = {
-        path: ends for path, ends in settings.vary.items() if not path.startswith("setup.") or is_camera(path)
-    }
-    return replace(settings, setup=setup, vary=over_cameras)
-
 
 @dataclass(frozen=True)
-class Command:
+class SimulateCommand:
     """Simulate a dataset: one shard a hidden object. Run it again to go on after an interruption."""
+
+    PRESETS: ClassVar[Presets[Simulation]] = PRESETS
 
     out: Path
     """Folder of the dataset; new, or begun with the same settings."""
@@ -64,6 +53,19 @@ class Command:
     json: bool = False
     """Print one JSON object."""
     settings: Flat[Simulation] = field(default_factory=Simulation)
+
+    @staticmethod
+    def with_setup(settings: Simulation, word: str) -> Simulation:
+        """Return the simulation with the setup of `--setup`, without the ranges over the wall that it had."""
+        setup = load_setup(word)
+        if is_name(word):
+            setup = setup.with_cameras_of(settings.setup)
+        over_cameras = {
+            path: ends
+            for path, ends in settings.vary.items()
+            if not path.startswith("setup.") or is_camera(path)
+        }
+        return replace(settings, setup=setup, vary=over_cameras)
 
     def run(self) -> None:
         """Simulate, with a progress bar over the objects."""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Command:
+class TrackCommand:
     """Follow the hidden object of a capture: position, speed and direction over time, with errors."""
 
     capture: Annotated[Path, tyro.conf.Positional]

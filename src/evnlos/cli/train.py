@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
-from evnlos.cli.console import Flat, result
+from evnlos.cli.console import Flat, Presets, result
 from evnlos.cli.notes import say
 from evnlos.config import load_yaml
 from evnlos.dataset import Dataset, Simulation, live_dataset, open_dataset
@@ -17,12 +18,12 @@ from evnlos.errors import ConfigError
 from evnlos.progress import ProgressBars
 from evnlos.training import Training, paper_pretraining, train
 
-PRESETS = {"default": Training, "paper": paper_pretraining}
-
 
 @dataclass(frozen=True)
-class Command:
+class TrainCommand:
     """Train a network from random weights: pre-training on a simulation, or end to end (E2E) on captures."""
+
+    PRESETS: ClassVar[Presets[Training]] = {"default": Training, "paper": paper_pretraining}
 
     out: Path
     """Folder of the run; new, or begun with the same settings."""

@@ -5,48 +5,52 @@ from __future__ import annotations
 import ast
 import importlib
 from importlib.resources import files
-from types import ModuleType
+from typing import Any
 
 VERBS: dict[str, str] = {
-    "demo": "demo",
-    "simulate": "simulate",
-    "capture": "capture",
-    "import": "importing",
-    "verify": "verify",
-    "lab": "lab",
-    "calibrate": "calibrate",
-    "scan": "scan",
-    "train": "train",
-    "finetune": "finetune",
-    "weights": "weights",
-    "evaluate": "evaluate",
-    "experiment": "experiment",
-    "identify": "identify",
-    "reconstruct": "reconstruct",
-    "live": "live",
-    "invert": "invert",
-    "track": "track",
-    "report": "report",
-    "events": "events",
-    "info": "info",
-    "convert": "convert",
-    "preview": "preview",
-    "app": "app",
-    "cite": "cite",
-    "doctor": "doctor",
-    "completion": "completion",
+    "demo": "demo.DemoCommand",
+    "simulate": "simulate.SimulateCommand",
+    "capture": "capture.CaptureCommand",
+    "import": "importing.ImportCommand",
+    "verify": "verify.VerifyCommand",
+    "lab": "lab.LabCommand",
+    "calibrate": "calibrate.CalibrateCommand",
+    "scan": "scan.ScanCommand",
+    "train": "train.TrainCommand",
+    "finetune": "finetune.FinetuneCommand",
+    "weights": "weights.WeightsCommand",
+    "evaluate": "evaluate.EvaluateCommand",
+    "experiment": "experiment.ExperimentCommand",
+    "identify": "identify.IdentifyCommand",
+    "reconstruct": "reconstruct.ReconstructCommand",
+    "live": "live.LiveCommand",
+    "invert": "invert.InvertCommand",
+    "track": "track.TrackCommand",
+    "report": "report.ReportCommand",
+    "events": "events.EventsCommand",
+    "info": "info.InfoCommand",
+    "convert": "convert.ConvertCommand",
+    "preview": "preview.PreviewCommand",
+    "app": "app.AppCommand",
+    "cite": "cite.CiteCommand",
+    "doctor": "doctor.DoctorCommand",
+    "completion": "completion.CompletionCommand",
 }
-"""The module of each verb in `evnlos.cli`; it holds `Command`, and `PRESETS` where settings have presets."""
+"""The command of each verb, as module in `evnlos.cli` and class. A class whose settings have presets names them
+in `PRESETS`; one whose settings have a setup says in `with_setup` where it goes."""
 
 
-def module_of(verb: str) -> ModuleType:
-    """Return the module of a verb."""
-    return importlib.import_module(f"evnlos.cli.{VERBS[verb]}")
+def command_of(verb: str) -> type[Any]:
+    """Return the command of a verb."""
+    module, _, name = VERBS[verb].partition(".")
+    return getattr(importlib.import_module(f"evnlos.cli.{module}"), name)
 
 
 def summary_of(verb: str) -> str:
     """Return the first line of a command's description, without importing what the command needs."""
-    source = (files("evnlos.cli") / f"{VERBS[verb]}.py").read_text(encoding="utf-8")
-    classes = [node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
-    command = next(node for node in classes if node.name == "Command")
+    module, _, name = VERBS[verb].partition(".")
+    source = (files("evnlos.cli") / f"{module}.py").read_text(encoding="utf-8")
+    command = next(
+        node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == name
+    )
     return (ast.get_docstring(command) or "").partition("\n")[0]

@@ -18,7 +18,7 @@ from evnlos.progress import ProgressBars
 
 
 @dataclass(frozen=True)
-class Command:
+class VerifyCommand:
     """Check every shard of a dataset against its checksums, its name and its settings."""
 
     dataset: Annotated[Path, tyro.conf.Positional]

@@ -17,7 +17,7 @@ _MOST_NAMED = 8  # of more objects, the worst and the best are named
 
 
 @dataclass(frozen=True)
-class Command:
+class WeightsCommand:
     """Show what weights see, how they were trained and on what, or list those that come with the package."""
 
     weights: Annotated[Path | None, tyro.conf.Positional] = None

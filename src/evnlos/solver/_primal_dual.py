@@ -16,7 +16,7 @@ _GRADIENT_NORM = math.sqrt(8.0)
 
 
 def solve_primal_dual(problem: Problem, lam: float, settings: Settings, start: torch.Tensor | None) -> Solution:
-    """Return the solution by the primal-dual method, from `start` or a blank image, with its gap as tolerance."""
+    """Return the solution by the primal-dual method, from `start` or a blank image."""
     low, high = settings.box
     gradient, b = settings.gradient, problem.target
     norm = max(_MARGIN * operator_norm(problem, problem.blank), torch.finfo(b.dtype).tiny)
