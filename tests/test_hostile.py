@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -468,6 +469,114 @@ def test_a_simulation_beyond_the_memory_is_refused_first(settings, tmp_path, cap
     words = ["simulate", "--config", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "d")]
     fails([*words, "--log-level", "error"], capsys, "memory")
     assert not (tmp_path / "d").exists()
+
+
+LARGE = "setup: {kind: radiometric, cell_m: 0.001, sensor: {height: 2000, width: 2000}}"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "--simulate", "s.yaml", "--out", "d"],
+        ["lab", "--config", "s.yaml", "--out", "d"],
+        [
+            "events",
+            "v.npy",
+            "--fps",
+            "1",
+            "--pixel.leak-rate-hz",
+            "1e6",
+            "--scale",
+            "2000x2000",
+            "--out",
+            "d.h5",
+        ],
+    ],
+    ids=lambda words: words[0],
+)
+def test_every_simulation_is_estimated_first(words: list[str], tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("s.yaml").write_text(LARGE)
+    np.save("v.npy", np.zeros((3, 4, 4), np.uint8))
+    fails([*words, "--log-level", "error"], capsys, "GB of memory")
+    assert {path.name for path in tmp_path.iterdir()} == {"s.yaml", "v.npy"}
+
+
+def test_more_processes_need_more_memory(tmp_path, monkeypatch) -> None:
+    from evnlos.dataset import simulate
+    from evnlos.dataset.lab import Lab, render_captures
+
+    monkeypatch.setattr("evnlos.untrusted.memory_left", lambda: 4 * object_bytes(Simulation()))
+    with pytest.raises(EvnlosError, match="fewer --workers"):
+        simulate(Simulation(), tmp_path / "d", workers=3)
+    monkeypatch.setattr("evnlos.untrusted.memory_left", lambda: 1000)
+    with pytest.raises(EvnlosError, match="GB of memory"):
+        render_captures(Lab(), tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+    assert render_captures(Lab(), tmp_path / "d", names=[], force=True) == []
+
+
+def test_a_video_of_too_many_pixels_is_refused_before_it_is_read(tmp_path, capsys) -> None:
+    path = tmp_path / "v.npy"
+    with path.open("wb") as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": (2, 60_000, 60_000)}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.truncate(file.tell() + 2 * 60_000**2)  # a sparse file: nothing is on the disk
+    words = ["events", str(path), "--fps", "9", "--out", str(tmp_path / "e.h5")]
+    fails(words, capsys, "at most 67,108,864")
+    np.save(path, np.zeros((2, 4100, 4100), np.uint8))
+    fails(words, capsys, "at most 16,777,216")
+    assert {one.name for one in tmp_path.iterdir()} == {"v.npy"}
+
+
+def test_a_film_of_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, monkeypatch) -> None:
+    av = pytest.importorskip("av")
+    from evnlos.sensor.video import open_video
+
+    with av.open(tmp_path / "v.avi", "w") as film:
+        stream = film.add_stream("mjpeg", rate=5, width=64, height=48, pix_fmt="yuvj420p")
+        for _ in range(3):
+            film.mux(stream.encode(av.VideoFrame(64, 48, "yuvj420p")))
+        film.mux(stream.encode(None))
+    assert open_video(tmp_path / "v.avi").width == 64
+    monkeypatch.setattr("evnlos.sensor._video_sources.MOST_IMAGE_PIXELS", 1000)
+    with pytest.raises(EvnlosError, match="at most 1,000"):
+        open_video(tmp_path / "v.avi")
+
+
+def _npz(path: Path, count: int, header: bytes | None = None) -> Path:
+    """Write an event file whose columns are zeros, one of them perhaps under another header."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, dtype in (("t_us", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "|b1")):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                if header is not None and name == "p":
+                    member.write(header)
+                    for _ in range(256):
+                        member.write(b" " * (1 << 20))
+                    continue
+                about = {"descr": dtype, "fortran_order": False, "shape": (count,)}
+                np.lib.format.write_array_header_1_0(member, about)
+                member.write(bytes(count * np.dtype(dtype).itemsize))
+    return path
+
+
+def test_events_of_an_archive_beyond_the_memory_are_refused_before_they_are_read(tmp_path, monkeypatch) -> None:
+    path = _npz(tmp_path / "e.npz", 3_000_000)
+    assert path.stat().st_size < 100_000
+    monkeypatch.setattr("evnlos.untrusted.memory_left", lambda: 100_000_000)
+    began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(EvnlosError, match="3,000,000 events"):
+        read_events(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - began < 30_000
+    assert sum(len(piece) for piece in Recording(path).pieces()) == 3_000_000
+
+
+def test_a_header_of_megabytes_in_an_archive_is_not_read(tmp_path) -> None:
+    path = _npz(tmp_path / "e.npz", 10, b"\x93NUMPY\x02\x00" + (256 << 20).to_bytes(4, "little"))
+    began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(EvnlosError, match="NPY version"):
+        read_events(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - began < 30_000
 
 
 def photograph(**changes: Any) -> dict[str, Any]:

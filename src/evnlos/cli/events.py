@@ -22,7 +22,7 @@ from evnlos.events.recording import Cut, Recording
 from evnlos.sensor.event_model import Phase, PixelSettings
 from evnlos.sensor.pixel import EventPixel, Logarithm, Mode
 from evnlos.sensor.presets import pixel_preset
-from evnlos.sensor.video import Tone, Video, open_video, video_events
+from evnlos.sensor.video import Tone, Video, check_video, open_video, video_events
 from evnlos.types import Events
 
 
@@ -112,7 +112,7 @@ class EventsCommand:
     preview: Path | None = None
     """Also show the events: an animation (.gif) or a sheet of pictures (.png)."""
     force: bool = False
-    """Replace the file where it exists."""
+    """Replace the file where it exists, and begin although the machine's memory will hardly do."""
     json: bool = False
     """Print one JSON object."""
 
@@ -132,6 +132,8 @@ class EventsCommand:
             white=self.white,
             scale=self.scale,
         )
+        if not self.force:
+            check_video(video, pixel)
         on = 0
         clock = _Clock()
         with writer:

@@ -29,6 +29,8 @@ class LabCommand:
     """YAML file with settings of the laboratory."""
     workers: int = 1
     """Processes; 0 = one for each core. The captures are the same for any number."""
+    force: bool = False
+    """Begin although the machine's memory will hardly do."""
     settings: Flat[Lab] = field(default_factory=Lab)
 
     @staticmethod
@@ -41,5 +43,7 @@ class LabCommand:
         for note in self.settings.glyphs.notes():
             say(note)
         with ProgressBars() as progress:
-            rendered = render_captures(self.settings, self.out, workers=self.workers, progress=progress)
+            rendered = render_captures(
+                self.settings, self.out, workers=self.workers, progress=progress, force=self.force
+            )
         print(f"{self.out}: {len(rendered)} captures; settings and the drawn sensor in {self.out / 'lab.yaml'}")

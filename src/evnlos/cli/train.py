@@ -37,6 +37,8 @@ class TrainCommand:
     simulate_on: Place = "device"
     """Where --simulate works beside a GPU: `device` = on it, where the event model can (v2e, with a time step);
     `cpu` = in --workers processes, of which it then wants several. The physics is the same."""
+    force: bool = False
+    """Begin --simulate although the machine's memory will hardly do."""
     preset: str = "default"
     """`default`, or `paper` for the paper's 200 epochs, step sizes and loss."""
     config: Path | None = None
@@ -53,7 +55,8 @@ class TrainCommand:
             fit(open_dataset(self.data), self.settings, self.out, None, self.json)
         else:
             assert self.simulate is not None
-            dataset = live_dataset(load_yaml(Simulation, self.simulate), self.workers, self.simulate_on)
+            settings = load_yaml(Simulation, self.simulate)
+            dataset = live_dataset(settings, self.workers, self.simulate_on, self.force)
             if note := dataset.note(torch.device("cuda" if torch.cuda.is_available() else "cpu")):
                 say(f"note: {note}")
             fit(dataset, self.settings, self.out, None, self.json)

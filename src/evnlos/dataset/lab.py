@@ -14,6 +14,7 @@ from PIL import Image
 from evnlos.config import differing_keys, read_yaml, save_yaml, to_dict
 from evnlos.dataset.lab_sensor import SENSOR_SPREAD
 from evnlos.dataset.pool import processes, run_tasks
+from evnlos.dataset.simulate import check_passes, pass_bytes
 from evnlos.dataset.variation import check_ranges, varied
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
@@ -150,6 +151,7 @@ def render_captures(
     names: list[str] | None = None,
     workers: int = 1,
     progress: Progress = silent,
+    force: bool = False,
 ) -> list[Path]:
     """Render one capture folder per object, and `lab.yaml` beside them.
 
@@ -162,20 +164,25 @@ def render_captures(
         names: Objects of `lab.glyphs`; all by default.
         workers: Processes; 0 means one for each core.
         progress: Called when the work begins and as each capture is in place, with its folder.
+        force: Whether to begin although the machine's memory will hardly do.
 
     Returns:
         The capture folders, in the order of `names`.
 
     Raises:
-        DataError: `out` is a file, or was begun with other settings, or holds a folder in a capture's place.
+        DataError: `out` is a file, or was begun with other settings, or holds a folder in a capture's place, or
+            the captures that are rendered at a time take more memory than there is.
         ConfigError: The rig can't be.
     """
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise DataError(f"{out} is a file; give a folder for the captures")
-    processes(workers, 1)
     drawn = lab.drawn()
     names = lab.glyphs.objects() if names is None else names
+    at_once = processes(workers, max(len(names), 1))
+    if not force:
+        frames = round(lab.duration_s * lab.frame_rate_hz) + 1
+        check_passes(pass_bytes(drawn.setup, lab.glyphs.plate.size_m, lab.duration_s, frames), at_once)
     folders = {name: out / _folder_name(lab, name) for name in names}
     for folder in folders.values():
         if folder.exists() and not (folder / "capture.yaml").is_file():

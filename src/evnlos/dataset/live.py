@@ -16,9 +16,17 @@ from torch import Tensor
 from evnlos.config import config_hash, to_dict
 from evnlos.dataset.modality import Modality, as_modality
 from evnlos.dataset.on_device import bytes_of_a_wall, no_backend, simulate_objects_on
-from evnlos.dataset.pool import run_in_order
+from evnlos.dataset.pool import processes, run_in_order
 from evnlos.dataset.sampling import Samples
-from evnlos.dataset.simulate import Simulation, drawn_for, scene_of, simulate_object, split_of
+from evnlos.dataset.simulate import (
+    Simulation,
+    check_passes,
+    drawn_for,
+    object_bytes,
+    scene_of,
+    simulate_object,
+    split_of,
+)
 from evnlos.dataset.store import Dataset
 from evnlos.errors import ConfigError
 from evnlos.seeds import derive_seed
@@ -94,7 +102,9 @@ class LiveDataset(Dataset):
         return scene.truth(config.sampling.canvas, scene.position_times_s(config.positions))
 
 
-def live_dataset(config: Simulation, workers: int = 1, where: Place = "device") -> LiveDataset:
+def live_dataset(
+    config: Simulation, workers: int = 1, where: Place = "device", force: bool = False
+) -> LiveDataset:
     """Return a simulation as a dataset to train on.
 
     Args:
@@ -102,10 +112,14 @@ def live_dataset(config: Simulation, workers: int = 1, where: Place = "device") 
         workers: Processes that simulate on the CPU; 0 means one for each core.
         where: "device" simulates where the network trains if the event model has a torch backend, "cpu" on the
             CPU also beside a GPU.
+        force: Whether to go on although the machine's memory will hardly do.
 
     Raises:
         ConfigError: No object is left to train on.
+        DataError: The objects that are simulated at a time take more memory than there is.
     """
+    if not force:
+        check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects())))
     split = split_of(config)
     if not split["train"]:
         raise ConfigError(

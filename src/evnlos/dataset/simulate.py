@@ -160,21 +160,49 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     ), events
 
 
+def pass_bytes(setup: Setup, plate_m: float, duration_s: float, frames: int, cells: int = 0) -> int:
+    """Return the memory that simulating one pass takes at least, bytes, without simulating anything.
+
+    Counted are the wall's matrix, the states of the sensor's pixels, its frames, the maps, and the events that
+    noise alone sends.
+
+    Args:
+        setup: Wall and cameras.
+        plate_m: Side of the target, metres.
+        duration_s: Length of the pass, seconds.
+        frames: Frames.
+        cells: Cells of the maps of each frame.
+    """
+    pixels = setup.sensor.height * setup.sensor.width
+    noise = pixels * duration_s * setup.pixel.noise_hz
+    wall = setup.bytes_of_a_scene(plate_m)
+    return int(wall + 100 * pixels + frames * (4 * pixels + 32 * cells) + 26 * noise)
+
+
 def object_bytes(config: Simulation) -> int:
     """Return the memory that simulating one object takes at least, bytes, without simulating anything.
-
-    Counted are the states of the sensor's pixels, its frames, the maps, and the events that noise alone sends.
 
     Args:
         config: The settings.
     """
-    pixels, cells = config.sensor.height * config.sensor.width, config.sampling.height * config.sampling.width
-    noise_hz = sum(getattr(config.pixel, name, 0.0) for name in ("leak_rate_hz", "shot_noise_rate_hz"))
-    noise_hz += getattr(config.pixel, "hot_pixel_fraction", 0.0) * getattr(
-        config.pixel, "hot_pixel_rate_hz", 0.0
-    )
-    noise = pixels * config.duration_s * noise_hz
-    return int(100 * pixels + config.positions * (4 * pixels + 32 * cells) + 26 * noise)
+    cells = config.sampling.height * config.sampling.width
+    return pass_bytes(config.setup, config.glyphs.plate.size_m, config.duration_s, config.positions, cells)
+
+
+def check_passes(needed: int, at_once: int) -> None:
+    """Refuse passes that take more memory together than there is.
+
+    Args:
+        needed: Bytes of each.
+        at_once: How many are simulated at a time.
+
+    Raises:
+        DataError: They need more.
+    """
+    what = "an object" if at_once < 2 else f"simulating {at_once} objects at a time"
+    fewer = "" if at_once < 2 else "use fewer --workers, or "
+    cure = f"{fewer}take a smaller sensor, fewer positions or less time; or force it"
+    check_memory(needed * at_once, what, cure)
 
 
 def split_of(config: Simulation) -> dict[str, list[str]]:
@@ -241,13 +269,8 @@ def simulate(
     first, stride = share
     if not 1 <= first <= stride:
         raise ConfigError(f"share {first} of {stride} is none; give i/n with i from 1 to n")
-    processes(workers, 1)
     if not force:
-        check_memory(
-            object_bytes(config),
-            "an object",
-            "take a smaller sensor, fewer positions or less time; or force it",
-        )
+        check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects()) // stride + 1))
     values = to_dict(config)
     dataset = Dataset(
         Path(folder),

@@ -13,6 +13,7 @@ import torch
 from evnlos.config import config_hash
 from evnlos.dataset import STANDARD_MODALITIES, Simulation, as_modality, simulate_object
 from evnlos.dataset.pool import processes, run_in_order
+from evnlos.dataset.simulate import check_passes, object_bytes
 from evnlos.evaluation.intervals import paired_difference
 from evnlos.files import write_atomically
 from evnlos.metrics import psnr
@@ -185,6 +186,7 @@ def measure(condition: Condition, workers: int = 0, rank: int = 192) -> Finding:
     """
     config = condition.simulation
     assert isinstance(config.glyphs, HandwritingGlyphs)
+    check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects())))
     unseen = replace(config, glyphs=replace(config.glyphs, writers=1, first_writer=TRAIN_WRITERS))
     learned = list(run_in_order(_pass, [(config, name) for name in config.glyphs.objects()], workers))
     tested = list(run_in_order(_pass, [(unseen, name) for name in unseen.glyphs.objects()], workers))

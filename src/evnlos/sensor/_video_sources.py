@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 
 from evnlos.errors import DataError, MissingDependencyError
 from evnlos.sensor._tone import Picture
-from evnlos.untrusted import open_container, open_image, open_regular
+from evnlos.untrusted import MOST_IMAGE_PIXELS, open_container, open_image, open_regular
 
 
 class Source(Protocol):
@@ -50,7 +50,11 @@ class ContainerSource:
     def __init__(self, path: Path) -> None:
         self.path, self.timed = path, True
         with self._opened() as container:
-            self.frames = container.streams.video[0].frames or None
+            stream = container.streams.video[0]
+            self.frames = stream.frames or None
+            if stream.width * stream.height > MOST_IMAGE_PIXELS:
+                claimed = f"it claims {stream.width} x {stream.height} pixels"
+                raise DataError(f"{path}: {claimed}; at most {MOST_IMAGE_PIXELS:,} are read: make it smaller")
         pictures = self.pictures()
         try:
             time_s, first = next(pictures)
@@ -83,6 +87,7 @@ class ContainerSource:
         count = 0
         with self._opened() as container:
             container.streams.video[0].thread_type = "AUTO"
+            container.streams.video[0].codec_context.options = {"max_pixels": f"{MOST_IMAGE_PIXELS}"}
             try:
                 for frame in container.decode(video=0):
                     deep = max(part.bits for part in frame.format.components) > 8
@@ -174,6 +179,8 @@ class ArraySource:
         shape, dtype = self._array.shape, self._array.dtype
         if len(shape) not in (3, 4) or (len(shape) == 4 and shape[3] != 3) or 0 in shape[1:]:
             raise DataError(f"{path}: an array of shape {shape}; give [T, H, W] or [T, H, W, 3]")
+        if shape[1] * shape[2] > MOST_IMAGE_PIXELS:
+            raise DataError(f"{path}: frames of {shape[2]} x {shape[1]}; at most {MOST_IMAGE_PIXELS:,} pixels")
         if dtype not in (np.uint8, np.uint16) and dtype.kind != "f":
             raise DataError(f"{path}: an array of {dtype}; give uint8, uint16 or floating point")
         self.frames, self.size = shape[0], (shape[2], shape[1])

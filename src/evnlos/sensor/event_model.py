@@ -120,6 +120,12 @@ class PixelSettings(Kinded):
         """By how much an event of later light may carry an earlier time stamp, seconds."""
         return 0.0
 
+    @property
+    def noise_hz(self) -> float:
+        """Events that a pixel sends without cause, about, hertz: leak, shot noise and hot pixels."""
+        hot = getattr(self, "hot_pixel_fraction", 0.0) * getattr(self, "hot_pixel_rate_hz", 0.0)
+        return hot + sum(getattr(self, name, 0.0) for name in ("leak_rate_hz", "shot_noise_rate_hz"))
+
     def can_run_together(self, others: Sequence[PixelSettings]) -> bool:
         """Return whether the torch backend runs clips with such pixels, one settings each, in one batch."""
         return False

@@ -28,12 +28,13 @@ from evnlos.sensor.event_model import PixelSettings
 from evnlos.sensor.pixel import EventPixel, Mode
 from evnlos.sensor.stream import EventStream
 from evnlos.types import Events
-from evnlos.untrusted import MOST_SENSOR_PIXELS
+from evnlos.untrusted import MOST_SENSOR_PIXELS, check_memory
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 _ANIMATIONS = (".gif", ".png", ".apng", ".webp")
 _BLOCK_BYTES = 1 << 25
 _BLOCK_FRAMES = 64
+_USUAL_FPS = 25.0
 _LEAST, _MOST = 1e-3, 1e9  # of frame rate, slow motion and white
 
 
@@ -174,6 +175,32 @@ def video_events(
         raise DataError(f"a video of {count} frame; events need at least two")
     assert held is not None
     yield held
+
+
+def check_video(video: Video, pixel: PixelSettings) -> None:
+    """Refuse a video whose simulation takes more memory than there is, before anything is simulated.
+
+    Counted are the states of the pixels, a block of frames, and the events of the noise in it.
+
+    Args:
+        video: The video.
+        pixel: Settings of the pixels.
+
+    Raises:
+        DataError: Its sensor is larger than any, or its simulation needs more memory than there is.
+    """
+    pixels = video.width * video.height
+    smaller = "give a smaller --scale"
+    if pixels > MOST_SENSOR_PIXELS:
+        raise DataError(
+            f"{video.path} has {video.width} x {video.height} pixels; at most {MOST_SENSOR_PIXELS:,} are "
+            f"simulated: {smaller}"
+        )
+    block_s = _BLOCK_FRAMES / (video.fps or _USUAL_FPS) / video.slow_motion
+    noise = pixels * block_s * pixel.noise_hz
+    what = f"a sensor of {video.width} x {video.height} pixels"
+    cure = f"{smaller}, less noise or more --fps; or force it"
+    check_memory(int(100 * pixels + 3 * _BLOCK_BYTES + 2 * 26 * noise), what, cure)
 
 
 def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Path, Source]:

@@ -17,6 +17,7 @@ import numpy as np
 from evnlos.events.io.columns import DTYPES, ColumnCheck, Columns
 from evnlos.events.io.report import ReadReport, unreadable
 from evnlos.types import Events
+from evnlos.untrusted import check_memory
 
 SIGNATURE = b"PK\x03\x04"
 _CURE = "the file is damaged or not complete: copy it again"
@@ -24,6 +25,7 @@ _REQUIRED = ("t_us", "x", "y", "p")
 _OPTIONAL = ("adc", "polarity_known")
 _ALIASES = {"t": "t_us"}
 _MAX_RATIO = 1100  # deflate
+_EVENT_BYTES = 39  # of an event as columns, as what is stored, and as bytes that are read
 
 
 @contextmanager
@@ -45,11 +47,9 @@ class _Member:
         self.path, self.name = path, info.filename.removesuffix(".npy")
         self._file: IO[bytes] = stack.enter_context(archive.open(info))
         version = np.lib.format.read_magic(self._file)
-        if version == (1, 0):
-            header = np.lib.format.read_array_header_1_0(self._file)
-        else:
-            header = np.lib.format.read_array_header_2_0(self._file)
-        self.shape, fortran, self.dtype = header
+        if version != (1, 0):  # headers of the others may be gigabytes long, and no column needs one
+            raise unreadable(path, info.header_offset, f"array {self.name} is of NPY version {version}", _CURE)
+        self.shape, fortran, self.dtype = np.lib.format.read_array_header_1_0(self._file)
         size = int(np.prod(self.shape, dtype=object)) * self.dtype.itemsize
         if self.dtype.hasobject or self.dtype.kind not in "iub" or (fortran and len(self.shape) > 1):
             raise unreadable(
@@ -148,7 +148,14 @@ class NpzSource:
                 yield check(block)
 
     def read(self) -> Columns:
-        """Return all events."""
+        """Return all events.
+
+        Raises:
+            DataError: They need more memory than there is.
+        """
+        check_memory(
+            _EVENT_BYTES * self._count, f"{self.path}: {self._count:,} events", "cut it with evnlos convert"
+        )
         return next(self.blocks(max(self._count, 1)), {})
 
 
