@@ -330,6 +330,34 @@ def test_other_sites_may_not_send_and_uploads_are_bounded(tmp_path) -> None:
     assert asked(2_000) == 507
 
 
+def test_what_a_request_says_of_a_proxy_is_not_believed() -> None:
+    pytest.importorskip("starlette")
+    seen: list[dict[bytes, bytes]] = []
+
+    async def page(scope, receive, send) -> None:
+        seen.append(dict(scope["headers"]))
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b""})
+
+    def asked(proxy: str, **headers: str) -> int:
+        app = page
+        for one in reversed(middleware("", "127.0.0.1", proxy=proxy)):
+            app = one.cls(app, *one.args, **one.kwargs)
+        given = {"host": "127.0.0.1", "content-length": "1", **headers}
+        raw = [(name.replace("_", "-").encode(), value.encode()) for name, value in given.items()]
+        return answered(app, headers=raw)
+
+    told = {"x_forwarded_host": "evil.example", "X_Forwarded_Proto": "https", "x_gradio_server": "http://evil"}
+    assert asked("", **told) == 200
+    assert set(seen[0]) == {b"host", b"content-length"}
+    assert asked("", origin="http://evil.example", x_forwarded_host="evil.example") == 403
+    assert asked("https://nlos.example.org", origin="https://nlos.example.org") == 200
+    assert asked("https://nlos.example.org", origin="https://evil.example") == 403
+    for wrong in ("nlos.example.org", "https://a b", "javascript:x", "https://a\n"):
+        with pytest.raises(ConfigError):
+            Server(proxy=wrong)
+
+
 def test_the_page_may_not_be_framed() -> None:
     pytest.importorskip("starlette")
     found = []

@@ -591,7 +591,7 @@ def recorded(folder: Path, capsys) -> dict:
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])
     table = json.loads((folder / "latency.json").read_text())
     assert printed == table | {"out": str(folder)}
-    assert sorted(p.name for p in folder.iterdir()) == ["latency.json", f"video.{video_kind()}"]
+    assert sorted(p.name for p in folder.iterdir()) == [".lock", "latency.json", f"video.{video_kind()}"]
     return table
 
 
@@ -643,7 +643,7 @@ def test_without_pyav_the_video_is_an_animated_png(engine: Engine, tmp_path: Pat
     assert (recorder.recorded, recorder.left_out) == (4, 2)
     with Image.open(tmp_path / "out" / "video.png") as animation:
         assert animation.n_frames == 4 and animation.size == (2 * 24 * 16 + 8, 256)
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["video.png"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [".lock", "video.png"]
     with pytest.raises(DataError, match="not an empty folder"):
         record.Recorder(tmp_path / "out")
 
@@ -673,6 +673,17 @@ def test_without_weights_published_ones_of_single_positions_are_taken(
     with pytest.raises(SystemExit) as stop:
         main(["live", str(tmp_path / "walk.raw"), "--weights", "near-event-pass", "--headless"])
     assert stop.value.code == 2 and "near-event or near-frame, which come with" in capsys.readouterr().err
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
+    with record.Recorder(tmp_path / "out"), pytest.raises(DataError, match="another process is at work"):
+        record.Recorder(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".draft.tmp").write_text("mine")
+    with pytest.raises(DataError, match="not an empty folder"):
+        record.Recorder(tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [".draft.tmp"]
 
 
 def test_a_run_without_a_picture_leaves_no_folder(engine: Engine, tmp_path: Path) -> None:

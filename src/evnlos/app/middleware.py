@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from evnlos.hosts import names_this_machine
 
@@ -17,9 +18,12 @@ _POLICY = (
 _MOST_WORDS = 4_000_000  # bytes of a request that is no upload: settings of controls, a small drawing
 _MOST_UPLOADS = 10  # times the largest file, in all files that wait in the scratch folder
 _END = b"</body>"
+_FORWARDED = (b"x-forwarded-host", b"x-forwarded-proto", b"x-gradio-server", b"forwarded")
 
 
-def middleware(scripts: str, own: str | None, scratch: Path | None = None, limit_bytes: int = 0) -> list[Any]:
+def middleware(
+    scripts: str, own: str | None, scratch: Path | None = None, limit_bytes: int = 0, proxy: str = ""
+) -> list[Any]:
     """Return the middleware of the page.
 
     Args:
@@ -29,12 +33,18 @@ def middleware(scripts: str, own: str | None, scratch: Path | None = None, limit
             foreign names are refused. None: it is open to the network, under whatever name that has for it.
         scratch: Folder of the uploads; None: they are not bounded.
         limit_bytes: Largest upload, bytes; all of them together may be ten times as large.
+        proxy: Address under which a proxy shows the page; empty: none does.
     """
     from starlette.middleware import Middleware
 
-    always = [Middleware(_Policy), Middleware(_Senders), Middleware(_Scripts, scripts=scripts)]
+    always = [
+        Middleware(_Policy),
+        Middleware(_Forwarded),
+        Middleware(_Senders, proxy=proxy),
+        Middleware(_Scripts, scripts=scripts),
+    ]
     if scratch is not None:
-        always.insert(2, Middleware(_Bounds, scratch=scratch, limit_bytes=limit_bytes))
+        always.insert(3, Middleware(_Bounds, scratch=scratch, limit_bytes=limit_bytes))
     return always if own is None else [Middleware(_Names, own=own), *always]
 
 
@@ -62,28 +72,42 @@ async def _refuse(send: Any, status: int, text: bytes) -> None:
     await send({"type": "http.response.body", "body": text})
 
 
-class _Senders:
-    """Refuses what the page of another site sends here: browsers let it, though it can't read the answer."""
+class _Forwarded:
+    """Takes away what a request says of a proxy: anybody can say it, and Gradio writes it into the page."""
 
     def __init__(self, app: Any) -> None:
         self.app = app
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if "headers" in scope:
+            kept = [pair for pair in scope["headers"] if pair[0].lower() not in _FORWARDED]
+            scope = {**scope, "headers": kept}
+        await self.app(scope, receive, send)
+
+
+class _Senders:
+    """Refuses what the page of another site sends here: browsers let it, though it can't read the answer."""
+
+    def __init__(self, app: Any, proxy: str = "") -> None:
+        self.app, self.proxy = app, proxy
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         is_sent = scope["type"] == "http" and scope.get("method") not in (None, "GET", "HEAD", "OPTIONS")
-        if is_sent and is_foreign({name.decode(): value.decode("latin-1") for name, value in scope["headers"]}):
+        headers = {name.decode(): value.decode("latin-1") for name, value in scope.get("headers", ())}
+        if is_sent and is_foreign(headers, self.proxy):
             await _refuse(send, 403, b"this page takes nothing from other sites")
         else:
             await self.app(scope, receive, send)
 
 
-def is_foreign(headers: Mapping[str, str]) -> bool:
+def is_foreign(headers: Mapping[str, str], proxy: str = "") -> bool:
     """Return whether a request comes from the page of another site, by what its browser says.
 
-    A program that is no browser says nothing, and is believed. Behind a proxy that changes the name of the
-    host, browsers of before 2023, which send no Sec-Fetch-Site, need X-Forwarded-Host.
+    A program that is no browser says nothing, and is believed.
 
     Args:
         headers: The request's headers, names in small letters.
+        proxy: Address under which a proxy shows the page.
 
     Example:
         >>> is_foreign({"host": "localhost:7860", "origin": "http://evil.example"})
@@ -95,7 +119,7 @@ def is_foreign(headers: Mapping[str, str]) -> bool:
     if site is not None:
         return site not in ("same-origin", "none")
     origin = headers.get("origin")
-    names = (headers.get("host"), headers.get("x-forwarded-host"))
+    names = [headers.get("host"), *([urlsplit(proxy).netloc] if proxy else [])]
     return origin is not None and origin.partition("://")[2] not in names
 
 

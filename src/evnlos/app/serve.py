@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
 import tempfile
 import threading
@@ -27,6 +28,7 @@ _QUIET = {
     "HF_HUB_OFFLINE": "1",
     "DO_NOT_TRACK": "1",
 }
+_ADDRESS = re.compile(r"https?://[A-Za-z0-9.-]+(:[0-9]{1,5})?(/[A-Za-z0-9._/-]*)?")
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Server:
     """Where and with what the page runs.
 
     Raises:
-        ConfigError: The port or the limit is out of range.
+        ConfigError: The port or the limit is out of range, or the proxy is no address.
     """
 
     host: str = "127.0.0.1"
@@ -47,12 +49,16 @@ class Server:
     """Columns of the simulated camera, pixels; time and memory grow with its square."""
     open: bool = False
     """Open the page in the browser."""
+    proxy: str = ""
+    """Address under which a proxy shows the page to others: https://nlos.example.org."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65_535:
             raise ConfigError(f"port is {self.port}; give 0 (a free one) to 65535")
         if not 0 < self.upload_mb <= 100_000:
             raise ConfigError(f"upload_mb is {self.upload_mb}; give more than 0 and at most 100000 MB")
+        if self.proxy and not _ADDRESS.fullmatch(self.proxy):
+            raise ConfigError(f"proxy is {self.proxy!r}; give an address such as https://nlos.example.org")
 
 
 def serve(server: Server, weights: tuple[Path, ...] = (), ready: Callable[[str], None] | None = None) -> None:
@@ -140,11 +146,12 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
                 ssr_mode=False,
                 pwa=False,
                 mcp_server=False,
+                root_path=server.proxy or None,
                 theme=theme(gradio),
                 css=(_HERE / "page.css").read_text(encoding="utf-8"),
                 app_kwargs={
                     "middleware": middleware(
-                        _script("page.js") + _script("opening.js"), own, Path(scratch), limit
+                        _script("page.js") + _script("opening.js"), own, Path(scratch), limit, server.proxy
                     ),
                     "docs_url": None,
                     "redoc_url": None,

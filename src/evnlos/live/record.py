@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from evnlos.errors import DataError
-from evnlos.files import check_folder, new_file
+from evnlos.files import LOCK, check_folder, claim, is_empty, new_file
 from evnlos.live.engine import Picture
 from evnlos.live.panels import side_by_side
 
@@ -45,12 +45,12 @@ class Recorder:
         left_out: Pictures that should be in it and are not.
 
     Raises:
-        DataError: The folder holds files already.
+        DataError: The folder holds files already, or another process is at work in it.
     """
 
     def __init__(self, folder: Path) -> None:
-        check_folder(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        self._held = ExitStack()
+        self._held.enter_context(claim(folder, check=lambda: check_folder(folder)))
         av = _pyav()
         self.path = folder / ("video.png" if av is None else "video.mp4")
         self.recorded = self.left_out = 0
@@ -68,8 +68,12 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         self._pictures.put(None)
         self._thread.join()
+        folder = self.path.parent
         with suppress(OSError):
-            self.path.parent.rmdir()  # nothing is left where nothing was recorded
+            if is_empty(folder):  # nothing is left where nothing was recorded
+                (folder / LOCK).unlink()
+                folder.rmdir()
+        self._held.close()
         if self._error is not None:
             raise DataError(f"{self.path}: the video could not be written ({self._error}); check the disk")
 

@@ -12,6 +12,7 @@ from PIL import Image
 from evnlos.calibration.scan.folder import Shot, read_scan_info, read_shots
 from evnlos.calibration.scan.plan import lit_cells
 from evnlos.errors import DataError
+from evnlos.files import new_file
 from evnlos.sensor import FrameCamera
 
 Change = Callable[[NDArray[np.float64], Shot], NDArray[np.float64]]
@@ -57,5 +58,6 @@ def rehearse_scan(
         light = light * (shot.exposure_s / info.exposure_s)
         path = folder / shot.file
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(camera.expose(light[None], seed=seed, first_frame=number)[0]).save(path)
+        with new_file(path) as draft:
+            Image.fromarray(camera.expose(light[None], seed=seed, first_frame=number)[0]).save(draft, "PNG")
     return len(shots)
