@@ -46,5 +46,5 @@ $(READY): pyproject.toml packages/evnlos-weights/pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0+cpu" \
 	  || $(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[aedat,app,cluster,lab,plot,video,dev]" -e packages/evnlos-weights
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[all,dev]" -e packages/evnlos-weights
 	touch $@

@@ -2,12 +2,13 @@
 
 import gzip
 import struct
+import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from evnlos import config
+from evnlos import config, doctor
 from evnlos.errors import ConfigError, DataError, EvnlosError, MissingDependencyError
 from evnlos.scene import (
     EmnistGlyphs,
@@ -74,6 +75,16 @@ def test_a_comic_font_that_is_not_installed_is_replaced_and_said(monkeypatch):
     with pytest.raises(MissingDependencyError, match="fonts-comic-neue"):
         find_font("Comic Neue Bold", strict=True)
     assert any("fonts-comic-neue" in line for line in FontGlyphs().notes())
+
+
+def test_without_the_open_families_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "fontpkg", None)
+    monkeypatch.setattr(fonts, "_system_fonts", lambda: iter(()))
+    monkeypatch.setattr(fonts, "installed_fonts", fonts.installed_fonts.__wrapped__)
+    with pytest.raises(MissingDependencyError, match=r"evnlos\[fonts\]"):
+        find_font("Caveat")
+    parts = [doctor._fonts(), doctor._comic()]
+    assert not any(part.there or part.needed for part in parts) and "[fonts]" in parts[0].cure
 
 
 def test_a_font_file_is_taken_as_it_is(tmp_path):

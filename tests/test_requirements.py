@@ -41,6 +41,7 @@ def test_what_the_package_imports_is_declared() -> None:
     of_extras = {
         "aedat",
         "av",
+        "fontpkg",
         "matplotlib",
         "mitsuba",
         "deepinv",

@@ -127,10 +127,10 @@ def _fonts() -> Part:
     try:
         missing = [name for name in FACES["both"] if find_font(name).substituted_for is not None]
     except EvnlosError as error:
-        return Part("fonts", False, str(error), "reinstall evnlos with its font packages", needed=True)
+        return Part("fonts", False, str(error).split(";")[0], "pip install evnlos[fonts]")
     found = f"{len(FACES['both']) - len(missing)} of {len(FACES['both'])} faces of the simulated characters"
-    cure = f"reinstall evnlos: {', '.join(missing)} is missing" if missing else ""
-    return Part("fonts", not missing, found, cure, needed=True)
+    cure = f"pip install evnlos[fonts]: {', '.join(missing)} is missing" if missing else ""
+    return Part("fonts", not missing, found, cure)
 
 
 def _reader() -> Part:
@@ -174,7 +174,10 @@ def _lpips() -> Part:
 def _comic() -> Part:
     from evnlos.scene.fonts import find_font
 
-    font = find_font("Comic Neue Bold")
+    try:
+        font = find_font("Comic Neue Bold")
+    except EvnlosError as error:
+        return Part("comic face", False, str(error).split(";")[0], "install fonts-comic-neue (Debian)")
     if font.substituted_for is None:
         return Part("comic face", True, f"{font.family} at weight {font.weight}: the paper's test face")
     return Part(

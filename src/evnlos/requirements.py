@@ -19,16 +19,6 @@ REQUIRED = {
     "tyro": "tyro>=1.0",
     "tqdm": "tqdm>=4.66",
     "threadpoolctl": "threadpoolctl>=3.5",
-    "fontpkg": "fontpkg>=0.2",
-    "fontpkg_caveat": "fontpkg-caveat",
-    "fontpkg_kalam": "fontpkg-kalam",
-    "fontpkg_indie_flower": "fontpkg-indie-flower",
-    "fontpkg_permanent_marker": "fontpkg-permanent-marker",
-    "fontpkg_shadows_into_light": "fontpkg-shadows-into-light",
-    "fontpkg_fredoka": "fontpkg-fredoka",
-    "fontpkg_nunito": "fontpkg-nunito",
-    "fontpkg_quicksand": "fontpkg-quicksand",
-    "fontpkg_varela_round": "fontpkg-varela-round",
 }
 """Requirement as pip takes it by the module to import, those that others need first."""
 

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
 from typing import Any
@@ -93,7 +94,8 @@ def find_font(name: str | os.PathLike[str], *, strict: bool = False) -> Font:
 
     Raises:
         ConfigError: The file is not there or no font, or no family has this name.
-        MissingDependencyError: `strict` is set and only a stand-in is there.
+        MissingDependencyError: `strict` is set and only a stand-in is there, or no family has this name and the
+            open families (`evnlos[fonts]`) are not installed.
     """
     text = os.fspath(name)
     if not text.strip():
@@ -108,6 +110,8 @@ def find_font(name: str | os.PathLike[str], *, strict: bool = False) -> Font:
         found = next((face for face in candidates if face is not None), None)
         found = _substitute(found, text) if found else None
     if found is None:
+        if find_spec("fontpkg") is None:
+            raise MissingDependencyError(f"{_unknown(text, faces)}; pip install evnlos[fonts] brings open ones")
         raise ConfigError(_unknown(text, faces))
     if strict and found.note:
         raise MissingDependencyError(found.note)
@@ -204,8 +208,10 @@ def _font_of_file(path: Path, index: int = 0) -> Font:
 
 def _packaged_fonts() -> Iterator[Font]:
     """Yield the faces of the installed `fontpkg-*` packages."""
-    import fontpkg  # lazily: it walks the metadata of all installed packages
-
+    try:
+        import fontpkg  # lazily: it walks the metadata of all installed packages
+    except ModuleNotFoundError:  # the extra `fonts` is not installed
+        return
     for family in fontpkg.families().values():
         for file in family.files:
             weight = file.weight if file.weight is not None else 400
