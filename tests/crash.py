@@ -2,11 +2,12 @@
 
     python tests/crash.py --instants 50 --seed 0     # a line an instant; exit code 1 where something was lost
 
-Each instant takes one command (simulate with one and two workers, train, import, convert, calibrate, report),
-runs it until the instant, and ends it by SIGKILL, SIGTERM, Ctrl-C or a full disk (a small tmpfs as root, else a
-limit on the size of files). Then: no process may live, nothing but whole files may stand under their final
-names, and the error is one line. The command is run again: it must end well, leave no unfinished file, and give
-the bytes of a run that nobody disturbed (of `train` without the seconds in metrics.jsonl).
+Each instant takes one command (simulate with one and two workers, train, import, convert, calibrate, an
+experiment that imports, simulates, trains and scores, report), runs it until the instant, and ends it by
+SIGKILL, SIGTERM, Ctrl-C or a full disk (a small tmpfs as root, else a limit on the size of files). Then: no
+process may live, nothing but whole files may stand under their final names, and the error is one line. The
+command is run again: it must end well, leave no unfinished file, and give the bytes of a run that nobody
+disturbed (of `train` without the seconds in metrics.jsonl).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,13 @@ class Command:
     name: str
     words: tuple[str, ...]
     result: str = "out"
+    given: Path | None = None
+    """What lies in its folder before it begins."""
+
+    def prepare(self, folder: Path) -> None:
+        """Put into a folder what is to be there."""
+        if self.given is not None:
+            shutil.copytree(self.given, folder / self.result)
 
     def line(self, folder: Path) -> list[str]:
         """Return the command line that writes into a folder."""
@@ -123,6 +131,7 @@ class Crashes:
         if command.name not in self.whole:
             place = self.folder / "whole" / command.name
             place.mkdir(parents=True)
+            command.prepare(place)
             began = time.monotonic()
             subprocess.run(command.line(place), check=True, capture_output=True)
             self.seconds[command.name] = time.monotonic() - began
@@ -136,8 +145,10 @@ class Crashes:
         size = sum(map(len, whole.values()))
         faults: list[str] = []
         if kind == "full disk":
-            limit = max(8192, int(size * share) // 4096 * 4096)
+            least = 0 if command.given is None else 2 * sum(map(len, contents(command.given).values()))
+            limit = max(8192, least, int(size * share) // 4096 * 4096)
             with small_disk(place, limit) as is_small:
+                command.prepare(place)
                 code = self._starved(command, place, None if is_small else limit, faults)
                 at = f"{limit} bytes" + ("" if is_small else " a file")
                 if is_small:
@@ -145,6 +156,7 @@ class Crashes:
                     subprocess.run(big, check=True)
                 self._judge(command, place, whole, faults)
         else:
+            command.prepare(place)
             at = f"{share * self.seconds[command.name]:.2f} s"
             code = self._hit(command, place, kind, share * self.seconds[command.name], faults)
             self._judge(command, place, whole, faults)
@@ -243,7 +255,7 @@ def quick_commands(folder: Path) -> list[Command]:
 def all_commands(folder: Path) -> list[Command]:
     """Return all commands, on inputs that are made in a folder."""
     from evnlos.config import save_yaml
-    from evnlos.dataset import Sampling, SensorSize, Simulation
+    from evnlos.dataset import FixedPattern, Sampling, SensorSize, Simulation, save_pattern
     from evnlos.dataset.lab import Lab, render_captures
     from evnlos.scene import FontGlyphs, HandwritingGlyphs
     from evnlos.setups import PaperSetup, RadiometricSetup
@@ -270,6 +282,16 @@ def all_commands(folder: Path) -> list[Command]:
     train = ("train", "--data", data, "--epochs", "3", *small, "--out")
     subprocess.run([*EVNLOS, "simulate", "--config", settings, "--out", data], check=True, capture_output=True)
     subprocess.run([*EVNLOS, *train, run], check=True, capture_output=True)
+    given = folder / "given"
+    (given / "rigs" / "lab").mkdir(parents=True)
+    rig = replace(simulation, setup=lab.setup, glyphs=HandwritingGlyphs(characters="AB"), held_out="", vary={})
+    for name in ("rig.yaml", "training.yaml"):
+        save_yaml(replace(rig, validation=0.0), given / "rigs" / "lab" / name)
+    flat = np.ones((sensor.height, sensor.width), np.float32)
+    save_pattern(FixedPattern(flat, 0 * flat), given / "rigs" / "lab" / "pattern.safetensors")
+    study = ("experiment", "captures", "--captures", str(folder / "lab"), "--captures-of", "lab", "--test", "4")
+    study += ("--arms", "E2E", "EPNP", "--seeds", "0", "--modalities", "frame", "--workers", "1")
+    study += ("--e2e-epochs", "1", "--pretrain-epochs", "1", "--finetune-epochs", "1", "--writers", "1")
     maps = ("--sampling.height", "32", "--sampling.width", "48", "--sampling.scored-rows", "24")
     return [
         Command("simulate 1", ("simulate", "--config", settings, "--workers", "1", "--out", "OUT")),
@@ -292,6 +314,7 @@ def all_commands(folder: Path) -> list[Command]:
                 "OUT",
             ),
         ),
+        Command("experiment", (*study, "--out", "OUT"), given=given),
         Command("report", ("report", run, "--data", data, "--out", "OUT"), "out.html"),
     ]
 

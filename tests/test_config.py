@@ -1,17 +1,22 @@
 """Settings: YAML round trips, unknown keys, wrong types, variation."""
 
 import dataclasses
+import math
+from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 
 from evnlos.config import config_hash, differing_keys, from_dict, load_yaml, save_yaml, to_dict
-from evnlos.dataset import Simulation
+from evnlos.dataset import Sampling, Simulation
 from evnlos.dataset.lab import Lab
 from evnlos.dataset.presets import PRESETS
 from evnlos.dataset.variation import varied
-from evnlos.errors import ConfigError
-from evnlos.sensor import EventPixel
-from evnlos.setups import RadiometricSetup
+from evnlos.errors import ConfigError, DataError
+from evnlos.model import ReconstructorSettings
+from evnlos.scene import LineMotion
+from evnlos.sensor import EventPixel, FrameCamera, PixelSettings
+from evnlos.setups import RadiometricSetup, Setup
 from evnlos.training import Training, paper_finetuning, paper_pretraining
 
 CONFIGS = [
@@ -106,3 +111,32 @@ def test_the_papers_settings() -> None:
 def test_differing_keys_are_named_with_both_values() -> None:
     ours, theirs = to_dict(Training(epochs=3)), to_dict(Training(epochs=4))
     assert differing_keys(ours, theirs) == ["epochs: 4 -> 3"]
+
+
+def _classes() -> list[type]:
+    """Return the settings classes that people build in Python, one of every kind."""
+    families = (PixelSettings.registry, Setup.registry, ReconstructorSettings.registry)
+    kinds = [family[kind] for family in families for kind in family]
+    return [Simulation, FrameCamera, LineMotion, Sampling, Lab, Training, *kinds]
+
+
+@pytest.mark.parametrize("cls", _classes(), ids=lambda cls: cls.__name__)
+def test_settings_that_are_built_in_python_have_their_ranges(cls: type) -> None:
+    whole = cls()
+    checked = 0
+    for item in fields(cls):
+        value = getattr(whole, item.name)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            continue
+        for wrong in (math.nan, math.inf, -math.inf, 1e300, -1e300, np.float32(np.nan)):
+            with pytest.raises((ConfigError, DataError)) as caught:
+                replace(whole, **{item.name: wrong})
+            assert "\n" not in str(caught.value)
+            checked += 1
+    assert checked
+
+
+@pytest.mark.parametrize("name", ["distance_m", "camera_distance_m", "cell_m", "albedo", "field_of_view_deg"])
+def test_lengths_are_never_negative(name: str) -> None:
+    with pytest.raises(ConfigError, match="0 or a positive"):
+        RadiometricSetup(**{name: -0.1})

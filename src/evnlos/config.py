@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import hashlib
 import json
+import numbers
 import types
 import typing
 from functools import lru_cache
@@ -36,11 +37,16 @@ RANGES = {
     "_ms": (1e-6, 1e10),
     "_s": (1e-9, 1e7),
     "_m": (1e-12, 1e4),
-    "_e": (1e-9, 1e9),
+    "_e": (1e-9, 1e12),
     "_mb": (1e-6, 1e6),
     "seed": (0, 2**63 - 1),
 }
 """Smallest and largest size of a number that is not 0, by the unit that its name ends in."""
+UNSIGNED = (
+    "distance_m", "pitch_m", "cell_m", "wavelength_m", "view_m", "view_deg", "duration_s", "roughness",
+    "albedo", "seed",
+)  # fmt: skip
+"""What the names of numbers end in that are never negative."""
 _NO_UNIT, _MOST_COUNT = (1e-30, 1e30), 2**63 - 1
 LONG_YAML = 1 << 26
 """Bytes of a YAML file that names every object of a dataset, at most."""
@@ -253,7 +259,21 @@ def _is_free(hint: Any) -> bool:
     return any(part is Any for part in typing.get_args(hint))
 
 
-def check_numbers(value: Any, what: str, name: str = "") -> None:
+def check_made(settings: Any) -> None:
+    """Refuse numbers in settings that are just being made; their `__post_init__` calls it.
+
+    Other than in a file, a number may be as small as it likes: an optimiser comes near 0.
+
+    Args:
+        settings: A dataclass.
+
+    Raises:
+        ConfigError: As of `check_numbers`.
+    """
+    check_numbers(settings, type(settings).__name__, may_be_tiny=True)
+
+
+def check_numbers(value: Any, what: str, name: str = "", *, may_be_tiny: bool = False) -> None:
     """Refuse numbers outside the range of their unit, which the end of their name says (docs/units.md).
 
     Settings check their own, narrower ranges besides.
@@ -262,30 +282,42 @@ def check_numbers(value: Any, what: str, name: str = "") -> None:
         value: A number, a dataclass, or a tuple, list or mapping of these; anything else is left alone.
         what: What to call it in an error.
         name: Name of the setting.
+        may_be_tiny: Leave the smallest size of the range out.
 
     Raises:
-        ConfigError: A number is NaN or infinite, or its size is outside the range.
+        ConfigError: A number is NaN or infinite, its size is outside the range, or it is negative and never is.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        hints = typing.get_type_hints(type(value))
-        for item in dataclasses.fields(value):
-            if not _is_free(hints[item.name]):
-                check_numbers(getattr(value, item.name), f"{what}.{item.name}".lstrip("."), item.name)
+        for field in _numbered_fields(type(value)):
+            inner, place = getattr(value, field), f"{what}.{field}".lstrip(".")
+            check_numbers(inner, place, field, may_be_tiny=may_be_tiny)
     elif isinstance(value, dict):
         for key, inner in value.items():
-            check_numbers(inner, f"{what}.{str(key)[:80]}", str(key).rpartition(".")[2])
+            last = str(key).rpartition(".")[2]
+            check_numbers(inner, f"{what}.{str(key)[:80]}", last, may_be_tiny=may_be_tiny)
     elif isinstance(value, (list, tuple)):
         for inner in value:
-            check_numbers(inner, what, name)
-    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            check_numbers(inner, what, name, may_be_tiny=may_be_tiny)
+    elif isinstance(value, numbers.Real) and not isinstance(value, bool):
         least, most = next((ends for unit, ends in RANGES.items() if name.endswith(unit)), _NO_UNIT)
-        if isinstance(value, int):
+        if may_be_tiny:
+            least = 0
+        if isinstance(value, numbers.Integral):
             least, most = 0, min(most, _MOST_COUNT)
-        if isinstance(value, float) and value == 0:
+        elif value == 0:
             return
+        if value < 0 and name.endswith(UNSIGNED):
+            raise ConfigError(f"{what} is {_shown(value)}; give 0 or a positive number")
         if not least <= abs(value) <= most:  # NaN, too
             ends = f"{least:g} to {most:g}, or 0" if least else f"at most {most:g}"
             raise ConfigError(f"{what} is {_shown(value)}; its size has to be {ends}")
+
+
+@lru_cache(maxsize=256)
+def _numbered_fields(cls: type) -> tuple[str, ...]:
+    """Return the fields of a dataclass that may hold numbers something is computed with."""
+    hints = typing.get_type_hints(cls)
+    return tuple(item.name for item in dataclasses.fields(cls) if not _is_free(hints[item.name]))
 
 
 def _dataclasses_in(cls: Any, values: Any) -> list[type]:

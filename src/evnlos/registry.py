@@ -108,6 +108,16 @@ class Kinded:
     default_kind: ClassVar[str] = ""
     """The kind of a mapping that names none."""
 
+    def __post_init__(self) -> None:
+        """Refuse numbers outside the range of their unit (docs/units.md).
+
+        Raises:
+            ConfigError: There is one.
+        """
+        from evnlos.config import check_made  # which needs this module
+
+        check_made(self)
+
     @classmethod
     def class_for(cls, values: object) -> type:
         """Return the settings class that a mapping describes.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from evnlos.config import differing_keys, read_yaml, save_yaml, to_dict
+from evnlos.config import check_made, differing_keys, read_yaml, save_yaml, to_dict
 from evnlos.dataset.lab_sensor import SENSOR_SPREAD
 from evnlos.dataset.pool import processes, run_tasks
 from evnlos.dataset.simulate import check_passes, pass_bytes
@@ -93,6 +93,7 @@ class Lab:
             )
         _ = self.setup.event_camera  # refuses a step that does not fit the model
         check_ranges(self, self.spread)
+        check_made(self)
 
     def drawn(self) -> Lab:
         """Return the lab with its sensor's settings drawn from `spread`: a function of the seed and the name.

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from evnlos.config import check_made
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
 from evnlos.scene import Motion, Target
@@ -42,6 +43,7 @@ class Sampling:
         for name in ("pitch_m", "tau_s"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"Sampling.{name} is {getattr(self, name)}; give a positive number")
+        check_made(self)
 
     @property
     def canvas(self) -> Plane:

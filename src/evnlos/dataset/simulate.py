@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from evnlos.config import config_hash, to_dict
+from evnlos.config import check_made, config_hash, to_dict
 from evnlos.dataset.pool import Engine, processes, run_tasks
 from evnlos.dataset.sampling import Samples, Sampling, edges_from, make_samples
 from evnlos.dataset.shard import write_shard
@@ -75,6 +75,7 @@ class Simulation:
             raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
         _ = self.setup.event_camera  # refuses a step that does not fit the model
         check_ranges(self, self.vary)
+        check_made(self)
 
     def optics(self) -> dict[str, float]:
         """Return what diffraction and the wall do to the picture: Fresnel number, blurs, sampling limit.

@@ -61,6 +61,7 @@ class UNetConfig(ReconstructorSettings):
             raise ConfigError(f"UNetConfig.strengths is {self.strengths}; give one positive number or several")
         if self.width % self.groups:
             raise ConfigError(f"UNetConfig.groups is {self.groups}; give a divisor of the width {self.width}")
+        super().__post_init__()
 
     @property
     def least_tensors(self) -> int:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from evnlos.config import check_made
 from evnlos.errors import DataError
 
 
@@ -111,6 +112,7 @@ class LineMotion:
         if not np.isfinite(self.start_s):
             raise DataError(f"LineMotion.start_s is {self.start_s}; give finite seconds")
         _check_distance("LineMotion", self.z_m)
+        check_made(self)
 
     def pose(self, t_s: ArrayLike) -> Pose:
         """Return the pose at times `t_s` (seconds, any shape [...]): constant distance, no rotation."""
@@ -169,6 +171,7 @@ class PathMotion:
         object.__setattr__(self, "times_s", tuple(times.tolist()))
         object.__setattr__(self, "points_m", tuple((x, y) for x, y in points.tolist()))
         _check_distance("PathMotion", self.z_m)
+        check_made(self)
 
     def pose(self, t_s: ArrayLike) -> Pose:
         """Return the pose at times `t_s` (seconds, any shape [...]): constant distance, no rotation."""

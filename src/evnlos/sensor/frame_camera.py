@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from evnlos.config import check_made
 from evnlos.errors import ConfigError, DataError
 from evnlos.sensor._photons import fill_electrons
 from evnlos.sensor._random import check_seed
@@ -94,6 +95,7 @@ class FrameCamera:
         if self.electrons_per_s is not None:
             self._require("electrons_per_s", 0.0, "electrons per second", strict=True)
             self._require("exposure_s", 0.0, "seconds, as electrons are collected over it", strict=True)
+        check_made(self)
 
     def _require(self, name: str, low: float, unit: str, *, strict: bool) -> None:
         value = getattr(self, name)

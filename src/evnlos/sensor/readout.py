@@ -107,6 +107,7 @@ class ReadoutPixel(PixelSettings):
         for name in ("hot_pixel_fraction", "dead_pixel_fraction"):
             require(self, name, 0.0, 1.0, "a fraction; 0 switches it off")
         check_pattern_seed(self.pattern_seed)
+        super().__post_init__()
 
     @property
     def finest_threshold(self) -> float:

@@ -128,6 +128,7 @@ class RoomSetup(Setup):
                 f"RoomSetup.lamp stands {self.lamp.place_m[2]:g} m from the wall; give a place between wall "
                 f"and target, which is {self.distance_m:g} m from it"
             )
+        super().__post_init__()
 
     def wall_description(self) -> str:
         """Return what the wall is, in a few words."""

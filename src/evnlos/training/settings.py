@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from evnlos.config import check_made
 from evnlos.dataset import as_modality
 from evnlos.errors import ConfigError
 from evnlos.model import ReconstructorSettings, UNetConfig
@@ -58,6 +59,7 @@ class Training:
                 raise ConfigError(f"Training.{name} is {getattr(self, name)}; give at least 1")
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
             raise ConfigError(f"Training.learning_rate is {self.learning_rate}; give a positive number")
+        check_made(self)
 
 
 def step_size(settings: Training, progress: float) -> float:
