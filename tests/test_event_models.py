@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from evnlos.calibration.event_fit import CONTINUOUS, choose_pixel, fit_pixel
-from evnlos.calibration.event_models import figures_of, is_better, misfit, thinned
-from evnlos.calibration.event_statistics import Recording
+from evnlos.calibration.event_models import figures_of, is_better, misfit
+from evnlos.calibration.event_statistics import Recording, thinned
 from evnlos.sensor import BrownianPixel, EventPixel, simulate_events
 from evnlos.types import Events
 
@@ -69,7 +69,7 @@ def test_figures_are_rates_by_light_and_motion() -> None:
 
 def test_thinning_keeps_light_and_events_of_the_same_pixels() -> None:
     one = recording(CONTINUOUS_PIXEL, 0)
-    few = thinned(one)
+    few = thinned(one, 1200)
     assert few.light.shape == (161, 30, 40)
     np.testing.assert_array_equal(few.light[:, 3, 5], one.light[:, 6, 10])
     there = (one.events.x == 10) & (one.events.y == 6)

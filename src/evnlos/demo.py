@@ -37,8 +37,10 @@ class Demo:
     """Capture folders; without any, pseudo-real ones are rendered."""
     test: tuple[str, ...] = _TEST
     """Characters of the captures that neither calibration nor training sees."""
-    writers: int = 2
+    writers: int = 8
     """Writers of the simulated characters, 36 objects each."""
+    parts: int = 4
+    """Each simulated object shows one of so many parts of the pass: more objects in the same time."""
     pretrain_epochs: int = 4
     """Passes over the simulated samples."""
     finetune_epochs: int = 4
@@ -140,6 +142,7 @@ def _study(settings: Demo, test: list[str]) -> Study:
         seeds=(settings.seed,),
         test=tuple(test),
         writers=settings.writers,
+        parts=settings.parts,
         simulation=dataclasses.replace(default(), seed=settings.seed),
         calibration=Calibration(event_captures=2, columns=48, seed=settings.seed),
         rigs=2,

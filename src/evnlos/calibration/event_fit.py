@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.event_models import MODELS, fit_model, is_better, misfit, thinned
+from evnlos.calibration.event_models import MODELS, fit_model, is_better, misfit
 from evnlos.calibration.event_statistics import (
     Recording,
     Regions,
     moments,
     regions_of,
     simulated,
+    thinned,
 )
 from evnlos.calibration.least_squares import forward_jacobian, levenberg_marquardt
 from evnlos.sensor import EventPixel, PixelSettings
@@ -30,6 +31,7 @@ _HIGHEST = (math.log(3.0), math.log(3.0), math.log(0.3), math.log(1e3), 10.0)
 _CUTOFFS_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
 CONTINUOUS = "continuous"
 """Name of v2e's event model."""
+_MOST_NOISE = 10.0  # times the events of pixels that see nothing
 _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
 
@@ -74,6 +76,8 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
     Raises:
         DataError: The light moves so little that no pixel tells a threshold.
     """
+    dead_time_s = shortest_interval_s([r.events for r in recordings])
+    recordings = [thinned(recording) for recording in recordings]
     regions = [regions_of(recording) for recording in recordings]
     observed = moments(recordings, regions, [r.events for r in recordings])
     first = replace(_first_guess(recordings, regions, observed, start), cutoff_hz=_CUTOFFS_HZ[5])
@@ -88,7 +92,7 @@ def fit_pixel(recordings: Sequence[Recording], start: EventPixel, *, seed: int =
     )
     if cutoff in (_CUTOFFS_HZ[0], _CUTOFFS_HZ[-1]) and allowed[0] == allowed[1]:
         edge = (*edge, "cutoff_hz")
-    return PixelFit(pixel, error, allowed, shortest_interval_s([r.events for r in recordings]), edge)
+    return PixelFit(pixel, error, allowed, dead_time_s, edge)
 
 
 def choose_pixel(
@@ -163,6 +167,8 @@ def _match(
         return _discrepancy(recordings, regions, observed, _with(pixel, values), seed)
 
     bounds = list(zip(_LOWEST, _HIGHEST, strict=True))
+    # Noise far above all that is seen explains nothing, and takes most of the time to simulate.
+    bounds[3] = (_LOWEST[3], math.log(max(_MOST_NOISE * float(observed[4] + observed[5]), 1.0)))
     found = levenberg_marquardt(residual, _values(pixel), _STEPS, bounds, iterations=iterations, tolerance=0.02)
     return _with(pixel, found.values), found.values
 

@@ -1,8 +1,4 @@
-"""Which event model a sensor follows: each is fitted to the same figures, and captures held out decide.
-
-Pixels do not see each other, so every other row and column of the sensor tells as much about the model as all
-of them, at a quarter of the time.
-"""
+"""Which event model a sensor follows: each is fitted to the same figures, and captures held out decide."""
 
 from __future__ import annotations
 
@@ -100,22 +96,6 @@ class ModelFit:
     pixel: PixelSettings
     error: dict[str, float]
     on_edge: tuple[str, ...]
-
-
-def thinned(recording: Recording, stride: int = 2) -> Recording:
-    """Return every n-th row and column of a recording."""
-    events = recording.events
-    kept = (events.x % stride == 0) & (events.y % stride == 0)
-    light = np.ascontiguousarray(recording.light[:, ::stride, ::stride])
-    few = Events(
-        events.t_us[kept],
-        events.x[kept] // stride,
-        events.y[kept] // stride,
-        events.p[kept],
-        light.shape[2],
-        light.shape[1],
-    )
-    return replace(recording, light=light, events=few)
 
 
 def figures_of(recordings: Sequence[Recording], events: Sequence[Events]) -> tuple[Array, Array]:

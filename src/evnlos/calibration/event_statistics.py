@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from evnlos.types import Events
 
 _STEP_PX = 0.2  # the light is linear in time between two rendered instants
 _MOST_BYTES = 1 << 30
+_ENOUGH_PX = 4000  # pixels that tell as much about a model as all do: they do not see each other
 _SETTLE = 0.05  # share of the recording in which the pixels' references forget their start
 _QUIET, _ACTIVE = 0.06, 0.5  # range of the log light of a pixel that sees nothing, and of one that sees much
 
@@ -85,6 +86,23 @@ def read_recordings(shots: Shots, setup: Setup, count: int) -> list[Recording]:
             "(--no-events) or record at a smaller size"
         )
     return recordings
+
+
+def thinned(recording: Recording, pixels: int = _ENOUGH_PX) -> Recording:
+    """Return every n-th row and column of a recording, so that about so many pixels are left."""
+    stride = max(1, round(math.sqrt(recording.light[0].size / pixels)))
+    events = recording.events
+    kept = (events.x % stride == 0) & (events.y % stride == 0)
+    light = np.ascontiguousarray(recording.light[:, ::stride, ::stride])
+    few = Events(
+        events.t_us[kept],
+        events.x[kept] // stride,
+        events.y[kept] // stride,
+        events.p[kept],
+        light.shape[2],
+        light.shape[1],
+    )
+    return replace(recording, light=light, events=few)
 
 
 def within(events: Events, first_s: float, last_s: float) -> Events:

@@ -107,7 +107,8 @@ def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     glyphs = config.glyphs
     assert isinstance(glyphs, HandwritingGlyphs)
     glyphs = replace(glyphs, writers=study.writers if arm.writers is None else arm.writers)
-    return replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
+    vary = config.vary | arm.vary
+    return replace(config, glyphs=glyphs, parts=study.parts, sampling=arm.sampling, vary=vary)
 
 
 def _simulate(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset | None:

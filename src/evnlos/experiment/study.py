@@ -77,6 +77,8 @@ class Study:
     characters are not even read."""
     writers: int = 11
     """Writers of the simulated characters, 36 objects each."""
+    parts: int = 1
+    """Parts of the pass, one of which each simulated object shows."""
     simulation: Simulation | None = None
     """What an uncalibrated arm is pre-trained on; None is the default simulation."""
     calibration: Calibration = field(default_factory=Calibration)

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.sensor.pixel import MIN_THRESHOLD
+from evnlos.sensor.event_model import MIN_THRESHOLD
 
 _LIGHT_DTYPES = (np.uint8, np.float32, np.float64)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from evnlos.errors import ConfigError
 from evnlos.sensor._checks import check_threshold_maps
 from evnlos.sensor._random import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_ON, normal_field
-from evnlos.sensor.pixel import MIN_THRESHOLD
+from evnlos.sensor.event_model import MIN_THRESHOLD
 from evnlos.threads import cores
 
 _T = TypeVar("_T")

@@ -24,8 +24,9 @@ from evnlos.sensor._torch_noise import Leak, ShotNoise
 from evnlos.sensor._torch_order import Sent, events_in_order
 from evnlos.sensor._torch_random import fill
 from evnlos.sensor._torch_refractory import Refractory
+from evnlos.sensor.event_model import MIN_THRESHOLD
 from evnlos.sensor.event_tensors import EventTensors
-from evnlos.sensor.pixel import MIN_THRESHOLD, V2ePixel
+from evnlos.sensor.pixel import V2ePixel
 
 STEPS = 32
 _TILE_CPU, _TILE_DEVICE = 16_384, 1 << 22

@@ -25,9 +25,17 @@ from evnlos.errors import ConfigError
 from evnlos.sensor._brownian import Law, State, run_tiles, settled
 from evnlos.sensor._order import Columns, joined, sort_times
 from evnlos.sensor._tiles import check_tiling, map_shares, pixel_thresholds
-from evnlos.sensor.event_model import EVENT_MODELS, EventModel, LogCurve, Phase, PixelSettings, require
+from evnlos.sensor.event_model import (
+    EVENT_MODELS,
+    EventModel,
+    LogCurve,
+    Phase,
+    ThresholdPixel,
+    check_pattern_seed,
+    check_phase,
+    require,
+)
 from evnlos.sensor.light import Light
-from evnlos.sensor.pixel import MIN_THRESHOLD, check_pattern_seed, check_phase
 
 _SAFE = 8.0
 """Standard deviations from a threshold at which a pixel cannot have met it: chance below 2e-15."""
@@ -37,7 +45,7 @@ _STRIDE = 0.2
 
 @EVENT_MODELS.register
 @dataclass(frozen=True)
-class BrownianPixel(PixelSettings):
+class BrownianPixel(ThresholdPixel):
     """A pixel with noise that grows in dim light and leak that grows with light; defaults are a DAVIS346's.
 
     Times of events jitter the more, the slower the light changes. The model has no bandwidth, no refractory
@@ -96,9 +104,7 @@ class BrownianPixel(PixelSettings):
     """The event model."""
 
     def __post_init__(self) -> None:
-        for name in ("threshold_on", "threshold_off"):
-            require(self, name, MIN_THRESHOLD, math.inf, "log units")
-        require(self, "threshold_sigma", 0.0, math.inf, "log units; 0 gives every pixel the same threshold")
+        super().__post_init__()
         for name in ("dark_dn", "exposure"):
             require(self, name, 1e-6, 1e9, "(DN, or DN per DN)")
         for name in ("leak_rate_hz", "leak_rate_per_dn_hz"):
@@ -136,11 +142,6 @@ class BrownianPixel(PixelSettings):
     ) -> EventModel:
         """Return an array of such pixels; arguments as in `PixelSettings.model`."""
         return BrownianArray(self, shape, seed, thresholds, 1024 if tile_px is None else tile_px, threads)
-
-    @property
-    def finest_threshold(self) -> float:
-        """The smaller of the two mean thresholds, log units."""
-        return min(self.threshold_on, self.threshold_off)
 
     @property
     def log_curve(self) -> LogCurve:

@@ -33,9 +33,17 @@ from evnlos.sensor._random import (
     uniform_field,
 )
 from evnlos.sensor._tiles import check_tiling, map_shares, pixel_thresholds
-from evnlos.sensor.event_model import EVENT_MODELS, EventModel, LogCurve, Phase, PixelSettings, require
+from evnlos.sensor.event_model import (
+    EVENT_MODELS,
+    EventModel,
+    LogCurve,
+    Phase,
+    ThresholdPixel,
+    check_pattern_seed,
+    check_phase,
+    require,
+)
 from evnlos.sensor.light import Light
-from evnlos.sensor.pixel import MIN_THRESHOLD, check_pattern_seed, check_phase
 
 _CHARGE, _THERMAL_V = 1.602176634e-19, 0.0258
 _RANGE = 3.0
@@ -46,7 +54,7 @@ _STEP_SHARE = 0.1
 
 @EVENT_MODELS.register
 @dataclass(frozen=True)
-class CircuitPixel(PixelSettings):
+class CircuitPixel(ThresholdPixel):
     """A pixel of a photodiode, an amplifier with feedback and a source follower, with the shot noise of each.
 
     Dim pixels are slow and noisy, bright ones fast and quiet, and one event of the noise is followed by one of
@@ -122,9 +130,7 @@ class CircuitPixel(PixelSettings):
     """The event model."""
 
     def __post_init__(self) -> None:
-        for name in ("threshold_on", "threshold_off"):
-            require(self, name, MIN_THRESHOLD, math.inf, "log units")
-        require(self, "threshold_sigma", 0.0, math.inf, "log units; 0 gives every pixel the same threshold")
+        super().__post_init__()
         for name in ("photocurrent_a_per_dn", "dark_current_a", "amplifier_a", "follower_a"):
             require(self, name, 1e-21, 1.0, "ampere")
         for name in ("photodiode_f", "feedback_f", "amplifier_f", "follower_f"):
@@ -193,11 +199,6 @@ class CircuitPixel(PixelSettings):
             middle = math.sqrt(low * high)
             low, high = (middle, high) if gain(middle) > math.sqrt(0.5) else (low, middle)
         return low
-
-    @property
-    def finest_threshold(self) -> float:
-        """The smaller of the two mean thresholds, log units."""
-        return min(self.threshold_on, self.threshold_off)
 
     @property
     def log_curve(self) -> LogCurve:

@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, get_args
 
 from numpy.typing import NDArray
 
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 
 Phase = Literal["random", "rest"]
 """State of the pixels before the first frame: anywhere between two events, or as if one had just been sent."""
+
+MIN_THRESHOLD = 0.01
+"""Smallest threshold that mismatch can leave a pixel with, log units."""
 
 EVENT_MODELS: Registry[type[PixelSettings]] = Registry("evnlos.event_models", "event model")
 """The event models by kind."""
@@ -135,6 +139,28 @@ class PixelSettings(Kinded):
         return None
 
 
+@dataclass(frozen=True)
+class ThresholdPixel(PixelSettings):
+    """Base of the pixels that send an event where log light, as they see it, has moved by a threshold."""
+
+    threshold_on: float = 0.15
+    """Mean contrast threshold of ON events, log units (e-fold)."""
+    threshold_off: float = 0.15
+    """Mean contrast threshold of OFF events, log units (e-fold)."""
+    threshold_sigma: float = 0.03
+    """Standard deviation of both thresholds over the pixels, log units; 0 = none."""
+
+    def __post_init__(self) -> None:
+        for name in ("threshold_on", "threshold_off"):
+            require(self, name, MIN_THRESHOLD, math.inf, "log units; the paper's value is 0.15")
+        require(self, "threshold_sigma", 0.0, math.inf, "log units; 0 gives every pixel the same threshold")
+
+    @property
+    def finest_threshold(self) -> float:
+        """The smaller of the two mean thresholds, log units."""
+        return min(self.threshold_on, self.threshold_off)
+
+
 def require(owner: object, name: str, low: float, high: float, unit: str) -> None:
     """Refuse a setting that is not a finite number in [low, high].
 
@@ -154,3 +180,23 @@ def require(owner: object, name: str, low: float, high: float, unit: str) -> Non
     if not (math.isfinite(value) and low <= value <= high):
         limit = f"at least {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
         raise ConfigError(f"{label} is {value:g}; give {limit} {unit}")
+
+
+def check_phase(phase: object) -> None:
+    """Refuse what is no first state.
+
+    Raises:
+        ConfigError: Neither "random" nor "rest".
+    """
+    if phase not in get_args(Phase):
+        raise ConfigError(f'initial_phase is {phase!r}; give "random" or "rest"')
+
+
+def check_pattern_seed(seed: object) -> None:
+    """Refuse what is no seed of a sensor.
+
+    Raises:
+        ConfigError: Neither None nor an integer from 0 to 2**64 - 1.
+    """
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**64):
+        raise ConfigError(f"pattern_seed is {seed!r}; give an integer from 0 to 2**64 - 1, or None")

@@ -8,14 +8,22 @@ from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Literal, get_args
 
 from evnlos.errors import ConfigError
-from evnlos.sensor.event_model import EVENT_MODELS, EventModel, LogCurve, Phase, PixelSettings, require
+from evnlos.sensor.event_model import (
+    EVENT_MODELS,
+    EventModel,
+    LogCurve,
+    Phase,
+    PixelSettings,
+    ThresholdPixel,
+    check_pattern_seed,
+    check_phase,
+    require,
+)
 
 if TYPE_CHECKING:
     from evnlos.sensor._exact_math import Curve
     from evnlos.sensor.event_tensors import EventTensors
 
-MIN_THRESHOLD = 0.01
-"""Smallest threshold that mismatch can leave a pixel with, log units."""
 MAX_JITTER = 9
 """Standard deviations that the normal random numbers can reach."""
 
@@ -26,15 +34,9 @@ Mode = Literal["exact", "v2e"]
 
 
 @dataclass(frozen=True)
-class _ContrastPixel(PixelSettings):
+class _ContrastPixel(ThresholdPixel):
     """What both ways to run v2e's pixel share."""
 
-    threshold_on: float = 0.15
-    """Mean contrast threshold of ON events, log units (e-fold)."""
-    threshold_off: float = 0.15
-    """Mean contrast threshold of OFF events, log units (e-fold)."""
-    threshold_sigma: float = 0.03
-    """Standard deviation of both thresholds over the pixels, log units; 0 = none."""
     cutoff_hz: float = 15.0
     """Corner frequency of the low-pass filter at white, hertz; 0 = no filter."""
     leak_rate_hz: float = 0.01
@@ -45,18 +47,11 @@ class _ContrastPixel(PixelSettings):
     """Dead time of a pixel after each of its events, seconds."""
 
     def __post_init__(self) -> None:
-        for name in ("threshold_on", "threshold_off"):
-            require(self, name, MIN_THRESHOLD, math.inf, "log units; the paper's value is 0.15")
-        require(self, "threshold_sigma", 0.0, math.inf, "log units; 0 gives every pixel the same threshold")
+        super().__post_init__()
         for name in ("cutoff_hz", "leak_rate_hz", "shot_noise_rate_hz"):
             require(self, name, 0.0, math.inf, "hertz; 0 switches it off")
         require(self, "refractory_s", 0.0, math.inf, "seconds; 0 switches it off")
         super().__post_init__()
-
-    @property
-    def finest_threshold(self) -> float:
-        """The smaller of the two mean thresholds, log units."""
-        return min(self.threshold_on, self.threshold_off)
 
 
 @EVENT_MODELS.register
@@ -288,23 +283,3 @@ def continuous(pixel: PixelSettings) -> EventPixel:
     if not isinstance(pixel, EventPixel):
         raise ConfigError(f"the pixel is of kind {getattr(pixel, 'kind', '?')!r}; this needs kind continuous")
     return pixel
-
-
-def check_phase(phase: object) -> None:
-    """Refuse what is no first state.
-
-    Raises:
-        ConfigError: Neither "random" nor "rest".
-    """
-    if phase not in get_args(Phase):
-        raise ConfigError(f'initial_phase is {phase!r}; give "random" or "rest"')
-
-
-def check_pattern_seed(seed: object) -> None:
-    """Refuse what is no seed of a sensor.
-
-    Raises:
-        ConfigError: Neither None nor an integer from 0 to 2**64 - 1.
-    """
-    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**64):
-        raise ConfigError(f"pattern_seed is {seed!r}; give an integer from 0 to 2**64 - 1, or None")

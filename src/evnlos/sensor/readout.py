@@ -27,9 +27,16 @@ from evnlos.sensor._random import (
 )
 from evnlos.sensor._readout import Bus, Waiting, arbitrate, ask_without_cause, jittered, thin
 from evnlos.sensor.event_camera import Wall
-from evnlos.sensor.event_model import EVENT_MODELS, EventModel, LogCurve, PixelSettings, require
+from evnlos.sensor.event_model import (
+    EVENT_MODELS,
+    EventModel,
+    LogCurve,
+    PixelSettings,
+    check_pattern_seed,
+    require,
+)
 from evnlos.sensor.light import Light
-from evnlos.sensor.pixel import MAX_JITTER, EventPixel, check_pattern_seed
+from evnlos.sensor.pixel import MAX_JITTER, EventPixel
 
 _WINDOW_US = 1000
 """Window in which the rate controller counts, microseconds."""

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.sensor._checks import check_times
-from evnlos.sensor.pixel import MIN_THRESHOLD
+from evnlos.sensor.event_model import MIN_THRESHOLD
 
 Parameter = float | Tensor
 """A number, or a tensor that broadcasts against [..., H, W], for gradients and for maps over the pixels."""

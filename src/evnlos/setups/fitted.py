@@ -10,14 +10,14 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError
 from evnlos.scene import Scene, Target
 from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
 from evnlos.setups.fitted_file import WALL, FittedWall
 from evnlos.setups.measured import covered
-from evnlos.transport import MatrixTransport, MatrixWall
+from evnlos.transport import MatrixTransport, MatrixWall, coarsest_keyframe_step_m
 from evnlos.transport.ambient import ambient_map, ambient_plane
 from evnlos.transport.angular_spectrum import check_lengths
 from evnlos.transport.facets import Pose, SlopeTable, facet_matrix, seen_points
@@ -209,7 +209,7 @@ class FittedSetup(Setup):
         distance_m = stated_distance_m(self, scene)
         if distance_m is not None and distance_m != self.distance_m:
             return self.at_distance(distance_m).observe(scene, device)
-        self._check_travel(scene)
+        x = self._check_travel(scene)[:, 0]
         return MatrixWall(
             self.transport(self.shape, device),
             scene.target,
@@ -218,6 +218,8 @@ class FittedSetup(Setup):
             gain=self.gain,
             ambient=self.ambient_light(),
             along=self._along(self.shape, torch.device(device)),
+            keyframe_step_m=_keyframe_step_m(self._key(), self.shape, scene.target.size_m),
+            travel_m=(float(x.min()) - self.cell_m, float(x.max()) + self.cell_m),  # exposures end later
         )
 
     def at_distance(self, distance_m: float) -> FittedSetup:
@@ -283,17 +285,7 @@ class FittedSetup(Setup):
 
     def magnification_px_m(self, shape: tuple[int, int]) -> float:
         """Return an upper bound of the image motion, pixels a metre of the target's."""
-        v, u = np.meshgrid(np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float), indexing="ij")
-        sides = []
-        for du, dv in ((0.5, 0.0), (0.0, 0.5)):
-            ends = [
-                seen_points(self.pose(), shape, u.ravel() + s * du, v.ravel() + s * dv).points[:, :2]
-                for s in (1, -1)
-            ]
-            sides.append(ends[0] - ends[1])
-        smallest = np.linalg.svd(np.stack(sides, axis=-1), compute_uv=False)[:, -1].min()
-        bent = any(self.curvature_per_m)
-        return float((_FASTER if bent else 1.0) / smallest)
+        return _magnification_px_m(self.pose(), shape)
 
     def _along(self, shape: tuple[int, int], device: torch.device) -> tuple[MatrixTransport, Target] | None:
         """Return matrix and picture of what moves along; None where nothing shines beside the target."""
@@ -307,7 +299,8 @@ class FittedSetup(Setup):
     def _key(self) -> FittedSetup:
         return replace(self.optics(), companion=1.0, misfit="")
 
-    def _check_travel(self, scene: Scene) -> None:
+    def _check_travel(self, scene: Scene) -> NDArray[np.float64]:
+        """Return centres along the motion [65, 2], metres; refuse those off the strip."""
         positions = scene.motion.position_m(np.linspace(0.0, scene.duration_s, 65))
         reach = np.abs(positions).max(axis=0) + scene.target.size_m / 2
         for name, needed, side in zip(("width", "height"), reach, self.strip_m, strict=True):
@@ -316,6 +309,7 @@ class FittedSetup(Setup):
                     f"the plate reaches {needed:.3f} m from the middle of a strip of {name} {side} m; "
                     f"set strip_m to at least {2 * needed:.3f} m there"
                 )
+        return positions
 
 
 @lru_cache(maxsize=4)
@@ -325,6 +319,23 @@ def _transport(rig: FittedSetup, shape: tuple[int, int], device: torch.device) -
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera receives no light from the target; calibrate again")
     return MatrixTransport(matrix, source, shape)
+
+
+@lru_cache(maxsize=8)
+def _magnification_px_m(pose: Pose, shape: tuple[int, int]) -> float:
+    v, u = np.meshgrid(np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float), indexing="ij")
+    sides = []
+    for du, dv in ((0.5, 0.0), (0.0, 0.5)):
+        ends = [seen_points(pose, shape, u.ravel() + s * du, v.ravel() + s * dv).points[:, :2] for s in (1, -1)]
+        sides.append(ends[0] - ends[1])
+    smallest = np.linalg.svd(np.stack(sides, axis=-1), compute_uv=False)[:, -1].min()
+    bent = any(pose.curvature_per_m)
+    return float((_FASTER if bent else 1.0) / smallest)
+
+
+@lru_cache(maxsize=8)
+def _keyframe_step_m(rig: FittedSetup, shape: tuple[int, int], size_m: float) -> float:
+    return coarsest_keyframe_step_m(_transport(rig, shape, torch.device("cpu")), size_m)
 
 
 @lru_cache(maxsize=4)

@@ -11,7 +11,7 @@ from evnlos.transport.brdf import GGX, Brdf, Lambert
 from evnlos.transport.diffraction import Diffraction
 from evnlos.transport.lamp import lamp_radiance
 from evnlos.transport.light_transport import LightTransport
-from evnlos.transport.matrix_wall import MatrixWall
+from evnlos.transport.matrix_wall import MatrixWall, coarsest_keyframe_step_m
 from evnlos.transport.occluder import Occluder
 from evnlos.transport.operator import LinearTransport, MatrixTransport, Transport, compose
 from evnlos.transport.patches import Patches
@@ -41,6 +41,7 @@ __all__ = [
     "Wall",
     "angular_spectrum",
     "blur_radius_px",
+    "coarsest_keyframe_step_m",
     "compose",
     "fresnel_number",
     "lamp_radiance",

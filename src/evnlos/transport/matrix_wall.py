@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from evnlos.errors import ConfigError
-from evnlos.scene import Motion, Target
+from evnlos.scene import LineMotion, Motion, Target
 from evnlos.transport.ambient import ambient_map
 from evnlos.transport.operator import MatrixTransport
 from evnlos.transport.spline import spline_coefficients, spline_weights
@@ -17,7 +17,9 @@ from evnlos.transport.wall import check_gain, checked_times
 from evnlos.types import Plane
 
 _CHUNK = 64  # positions drawn and carried over at a time
-_GUARD = 3  # keyframes beyond each end
+_KEYFRAME_ERROR = 1e-3  # of the light's standard deviation
+_GUARD = 3  # keyframes beyond each end of the strip
+_TAIL = 10  # keyframes beyond each end of a travel: the prefilter's tail, 0.268^n
 _PROBES_S = np.linspace(-100.0, 100.0, 2001)  # does the plate ever leave its row?
 
 
@@ -27,8 +29,7 @@ class MatrixWall:
     irradiance(t) = gain A s(t) + ambient, with s(t) the plate drawn on the strip's cells, each cell the exact
     mean of the mask over it, at any sub-cell position. For motion along the strip's rows the wall is known from
     keyframes: A s is computed at equally spaced positions once and a cubic spline runs between them (exact at
-        the keyframes, two
-    continuous derivatives in time); other motions multiply at every instant.
+    the keyframes, two continuous derivatives in time); other motions multiply at every instant.
 
     Args:
         transport: Matrix from the strip to the camera image, in white levels a unit of the mask at gain 1.
@@ -38,6 +39,8 @@ class MatrixWall:
         gain: White levels, 0 or more.
         ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
         keyframe_step_m: Distance between keyframes, metres; None is half a cell, 0 multiplies at every instant.
+        travel_m: Smallest and largest x of the centre that are asked for, metres: keyframes are made for these
+            alone, and other places multiplied out; None is wherever the plate touches the strip.
         along: What else moves with the plate's centre and shines with it, and its own matrix.
 
     Raises:
@@ -55,6 +58,7 @@ class MatrixWall:
         gain: float = 1.0,
         ambient: float | ArrayLike | torch.Tensor = 0.0,
         keyframe_step_m: float | None = None,
+        travel_m: tuple[float, float] | None = None,
         along: tuple[MatrixTransport, Target] | None = None,
     ) -> None:
         check_gain(gain)
@@ -76,6 +80,10 @@ class MatrixWall:
         self._keys: torch.Tensor | None = None
         probes = motion.position_m(_PROBES_S)[:, 1]
         self._height = float(probes[0]) if step > 0 and bool((probes == probes[0]).all()) else None
+        reach = strip.extent_m[1] / 2 + target.size_m / 2
+        everywhere = (strip.center_m[0] - reach, strip.center_m[0] + reach)
+        self._everywhere = travel_m is None
+        self._travel_m = everywhere if travel_m is None else travel_m
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -101,8 +109,7 @@ class MatrixWall:
         """
         times = checked_times(t_s)
         positions = self.motion.position_m(times).reshape(-1, 2)  # [T, 2]
-        along_rows = self._height is not None and bool((positions[:, 1] == self._height).all())
-        light = self._between_keys(positions) if along_rows else self.light(positions)
+        light = self._between_keys(positions) if self._has_keys(positions) else self.light(positions)
         image = (self.ambient + self.gain * light.clamp(min=0)).to(torch.float32)  # [T, H, W]
         return image[0] if times.ndim == 0 else image
 
@@ -131,6 +138,12 @@ class MatrixWall:
             image[start : start + _CHUNK] = carry(torch.as_tensor(drawn).to(image))
         return image
 
+    def _has_keys(self, positions: np.ndarray) -> bool:
+        """Return whether keyframes tell the light at all of these places: beyond a strip it is dark."""
+        low, high = self._travel_m
+        inside = self._everywhere or bool(((positions[:, 0] >= low) & (positions[:, 0] <= high)).all())
+        return self._height is not None and inside and bool((positions[:, 1] == self._height).all())
+
     def _between_keys(self, positions: np.ndarray) -> torch.Tensor:
         if self._keys is None:
             self._keys = self._make_keys()
@@ -144,11 +157,38 @@ class MatrixWall:
         return light
 
     def _make_keys(self) -> torch.Tensor:
-        """Return the spline's coefficients at keyframes over all places where the plate touches the strip."""
-        strip = self._strip
-        reach = strip.extent_m[1] / 2 + self.target.size_m / 2
-        steps = math.ceil(reach / self._step) + _GUARD
-        self._first_m = strip.center_m[0] - steps * self._step
+        """Return the spline's coefficients at keyframes over all places that are asked for."""
+        low, high = self._travel_m
+        guard = _GUARD if self._everywhere else _TAIL
+        steps = math.ceil((high - low) / 2 / self._step) + guard
+        self._first_m = (low + high) / 2 - steps * self._step
         x = self._first_m + np.arange(2 * steps + 1) * self._step
         frames = self.light(np.stack([x, np.full_like(x, self._height)], axis=-1))
-        return spline_coefficients(frames, axes=(0,))  # dark at both ends, so periodic will do
+        return spline_coefficients(frames, axes=(0,))  # periodic: both ends are dark, or far enough
+
+
+def coarsest_keyframe_step_m(transport: MatrixTransport, size_m: float) -> float:
+    """Return the largest distance between keyframes that a wall's blur allows, metres: 2, 1 or 1/2 cells.
+
+    Between keyframes, splines through the light of a plate of random squares, an eighth of its side each, may
+    be off by 1e-3 of what the light changes by (root mean square); cells bring about half of that themselves.
+
+    Args:
+        transport: Matrix from a strip of square cells to the camera image.
+        size_m: Side of the plate, metres.
+    """
+    strip = transport.source
+    assert isinstance(strip, Plane)
+    draw = np.random.default_rng(0)
+    squares = np.kron(draw.integers(0, 2, (8, 8)), np.ones((8, 8))).astype(np.float32)
+    probe = Target("squares", squares, size_m)
+    reach = max(0.0, (strip.extent_m[1] - size_m) / 2)
+    x = strip.center_m[0] + draw.uniform(-reach, reach, 8)
+    places = np.stack([x, np.full(8, strip.center_m[1])], axis=-1)
+    for step in (2 * strip.pitch_m, strip.pitch_m):
+        motion = LineMotion(start_m=(float(x[0]), strip.center_m[1]))
+        wall = MatrixWall(transport, probe, motion, magnification_px_m=1.0, keyframe_step_m=step)
+        direct = wall.light(places)
+        if float((wall._between_keys(places) - direct).std()) <= _KEYFRAME_ERROR * float(direct.std()):
+            return step
+    return strip.pitch_m / 2
