@@ -1,29 +1,37 @@
-"""Hostile inputs of many kinds: settings, YAML, captures, pictures, NPZ, HDF5, weights, uploads.
+"""Hostile inputs of many kinds: settings, YAML, captures, pictures, NPZ, HDF5, weights, packets, uploads.
 
     python tests/fuzz_inputs.py --count 2400 --seed 1
+    python tests/fuzz_inputs.py --guided 300 --seed 1     # seconds; keeps what reaches new branches
 
 Each input is made by a seeded generator, read as its kind is, and has to end in a result or one line of an
 `EvnlosError`, within ten seconds and two gigabytes. Nothing may be executed (a stand-in for Ghostscript is on
 the path), no file written or removed, and the bytes of a secret beside the input must not come out. Failures
 are printed with the kind and the number that make them again (`--only KIND:NUMBER`); the exit code is then 1.
+Guided, single files are mutated, in archives what is in them; a file that takes evnlos along a branch where
+none went before becomes a seed of others. `tests/corpus` holds small seeds and findings, which the suite reads
+again; `--keep FOLDER` writes those of a run, failures always.
 `fuzz_event_files.py` does the same for the bytes of event files.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import random
 import resource
 import shutil
 import signal
+import socket
+import struct
 import sys
 import tempfile
 import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -40,15 +48,21 @@ from safetensors.torch import load, save
 from evnlos import EvnlosError, Simulation, Training, UNetConfig, load_weights, read_events, write_events
 from evnlos.app.upload import read_upload
 from evnlos.config import load_yaml, read_yaml, to_dict
-from evnlos.dataset import Sampling, read_capture, read_shard
+from evnlos.dataset import Sampling, load_pattern, read_capture, read_shard
 from evnlos.dataset.lab import Lab
 from evnlos.events.recording import Recording
 from evnlos.events.summary import summarise
+from evnlos.live.engine import Engine
+from evnlos.live.packet import Packet, pack
+from evnlos.live.udp import UdpSource
 from evnlos.model import Weights, save_weights
 from evnlos.sensor.video import open_video
+from evnlos.setups.fitted_file import WALL
+from evnlos.setups.measured_file import MEASUREMENT
 from evnlos.solver.photograph import read_photograph
 from evnlos.types import Events
 
+CORPUS = Path(__file__).parent / "corpus"
 LIMIT_S, LIMIT_BYTES = 10, 2 << 30
 SECRET = b"root:x:0:0:SECRET-OF-THE-MACHINE"
 SCALARS = (
@@ -116,7 +130,7 @@ def flipped(content: bytes, draw: random.Random) -> bytes:
     """Return content that was cut, shifted or flipped somewhere, most often near its start."""
     changed, how = bytearray(content), draw.random()
     place = draw.randrange(max(len(content), 1))
-    if how < 0.2:
+    if how < 0.2 or not content:
         return content[:place]
     if how < 0.3:
         return content[:place] + draw.randbytes(draw.randrange(1, 64)) + content[place:]
@@ -377,9 +391,72 @@ def upload(draw: random.Random, at: Path, material: Material) -> Callable[[], ob
     return lambda: read_upload(path, at, 20_000_000)
 
 
+def datagrams_of(content: bytes) -> list[bytes]:
+    """Return the packets of a file that holds each after its length in two bytes."""
+    found, at = [], 0
+    while at + 2 <= len(content):
+        (size,) = struct.unpack_from("<H", content, at)
+        found.append(content[at + 2 : at + 2 + size])
+        at += 2 + size
+    return found
+
+
+def listen(datagrams: list[bytes]) -> object:
+    """Let `live` hear packets, and look at what it makes of them."""
+    network = UNetConfig(width=4, depth=1, shuffle=1, rank=0).build("event", Sampling(8, 8, 0.01, 8))
+    engine, source = Engine(Weights(network)), UdpSource(idle_s=0.02)
+    until = time.monotonic() + 0.5
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for data in datagrams:
+            sender.sendto(data[:60_000], ("127.0.0.1", source.port))
+    chunks = list(source.chunks(lambda: time.monotonic() > until))
+    faults = source.faults()
+    assert min(faults.values()) >= 0, faults
+    return engine.see(chunks) if chunks else None
+
+
+def packets(draw: random.Random, at: Path, _: Material) -> Callable[[], object]:
+    found, at_us = [], 0
+    for number in range(draw.choice((1, 3, 20))):
+        count = draw.choice((0, 1, 50))
+        times = np.sort(np.array([at_us + draw.randrange(1000) for _ in range(count)], np.int64))
+        at_us += draw.choice((1000, 1000, 2**40))
+        x, y = (np.array([draw.randrange(8) for _ in range(count)], np.uint16) for _ in range(2))
+        events = Events(times, x, y, np.zeros(count, np.bool_), 8, 8)
+        data = pack(Packet(draw.choice((number, number, 0, 2**31 - 1)), events, draw.random() < 0.1))
+        found.append(flipped(data, draw) if draw.random() < 0.5 else data)
+    (at / "p.udp").write_bytes(b"".join(struct.pack("<H", len(data)) + data for data in found))
+    return lambda: listen(datagrams_of((at / "p.udp").read_bytes()))
+
+
 KINDS: dict[str, Callable[[random.Random, Path, Material], Callable[[], object]]] = {
-    one.__name__: one for one in (settings, yaml_text, capture, picture, npz, hdf5, weights, upload)
+    one.__name__: one for one in (settings, yaml_text, capture, picture, npz, hdf5, weights, packets, upload)
 }
+
+
+def read_file(path: Path) -> object:
+    """Read a file in every way that its ending allows; an error of one way does not keep it from the others."""
+    ways: dict[str, list[Callable[[], object]]] = {
+        ".yaml": [lambda: read_yaml(path), lambda: load_yaml(Simulation, path), lambda: load_yaml(Lab, path)],
+        ".npz": [lambda: read_events(path), lambda: read_photograph(path)],
+        ".h5": [lambda: summarise(Recording(path, "salvage").pieces()), lambda: read_shard(path)],
+        ".safetensors": [
+            lambda: load_weights(path), lambda: WALL.read(path), lambda: MEASUREMENT.read(path),
+            lambda: load_pattern(path),
+        ],
+        ".zip": [lambda: read_upload(path, path.parent, 20_000_000)],
+        ".udp": [lambda: listen(datagrams_of(path.read_bytes()))],
+    }  # fmt: skip
+    pictures: list[Callable[[], object]] = [lambda: [None for _ in open_video(path, fps=10)]]
+    found, refused = [], None
+    for way in ways.get(path.suffix, pictures):
+        try:
+            found.append(way())
+        except EvnlosError as error:
+            refused = error
+    if refused is not None and not found:
+        raise refused
+    return found
 
 
 class _TooLongError(Exception):
@@ -390,15 +467,19 @@ def _late(*_: object) -> None:
     raise _TooLongError
 
 
-def outcome(kind: str, number: int, seed: int, material: Material, base: Path) -> tuple[str, float]:
-    """Make and read one input; return "read", "refused", or what went wrong, and the seconds it took."""
-    draw = random.Random(f"{seed} {kind} {number}")
+def outcome(make: Callable[[Path], Callable[[], object]], base: Path) -> tuple[str, float]:
+    """Make and read one input; return "read", "refused", or what went wrong, and the seconds it took.
+
+    Args:
+        make: Makes the input in a folder and returns what reads it.
+        base: Where that folder is made.
+    """
     with tempfile.TemporaryDirectory(dir=base) as folder:
         at = Path(folder)
         for name in ("secret", "secret.png"):
             (at / name).write_bytes(SECRET)
         os.mkfifo(at / "pipe")
-        read = KINDS[kind](draw, at, material)
+        read = make(at)
         before = sorted(str(one) for one in at.rglob("*"))
         signal.signal(signal.SIGALRM, _late)
         signal.setitimer(signal.ITIMER_REAL, 3 * LIMIT_S)
@@ -437,13 +518,14 @@ def _holds_secret(found: object) -> bool:
     return False
 
 
-def run(count: int, seed: int, only: str | None = None, base: Path | None = None) -> list[str]:
-    """Read `count` inputs, as many of each kind; return the failures, one line each."""
-    failures, tally = [], {"read": 0, "refused": 0}
+@contextmanager
+def bounded(base: Path | None, failures: list[str]) -> Iterator[tuple[Path, Material]]:
+    """Give a folder and whole files while memory is bounded and a stand-in for Ghostscript waits to be run."""
     with tempfile.TemporaryDirectory(dir=base) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         root = Path(folder)
         material = Material.made(root / "material")
+        listen([pack(Packet(0, Events([1], [1], [1], [True], 8, 8)))])  # imports and compiles
         ran = root / "ran"
         (root / "bin").mkdir()
         (root / "bin" / "gs").write_text(f"#!/bin/sh\ntouch {ran}\nexit 1\n")
@@ -454,21 +536,155 @@ def run(count: int, seed: int, only: str | None = None, base: Path | None = None
         limits = resource.getrlimit(resource.RLIMIT_AS)
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + LIMIT_BYTES, limits[1]))
         try:
-            for index in range(count):
-                kind, number = list(KINDS)[index % len(KINDS)], index // len(KINDS)
-                if only is not None and only != f"{kind}:{number}":
-                    continue
-                how, _ = outcome(kind, number, seed, material, root)
-                if how in tally:
-                    tally[how] += 1
-                else:
-                    failures.append(f"{kind}:{number}: {how}")
+            yield root, material
         finally:
             resource.setrlimit(resource.RLIMIT_AS, limits)
             os.environ["PATH"] = path
         if ran.exists():
             failures.append("Ghostscript was run")
+
+
+def run(count: int, seed: int, only: str | None = None, base: Path | None = None) -> list[str]:
+    """Read `count` inputs, as many of each kind; return the failures, one line each."""
+    failures: list[str] = []
+    tally = {"read": 0, "refused": 0}
+    with bounded(base, failures) as (root, material):
+        for index in range(count):
+            kind, number = list(KINDS)[index % len(KINDS)], index // len(KINDS)
+            if only is not None and only != f"{kind}:{number}":
+                continue
+            draw = random.Random(f"{seed} {kind} {number}")
+            how, _ = outcome(lambda at, kind=kind, draw=draw: KINDS[kind](draw, at, material), root)
+            if how in tally:
+                tally[how] += 1
+            else:
+                failures.append(f"{kind}:{number}: {how}")
     failures += [] if all(tally.values()) or only else [f"nothing to tell apart: {tally}"]
+    return failures
+
+
+class Tracer:
+    """Notes which branches of evnlos were taken: pairs of lines that ran one after the other."""
+
+    def __init__(self) -> None:
+        self.taken: set[tuple[str, int, int]] = set()
+        self._ours: dict[str, bool] = {}
+
+    def __call__(self, frame: Any, event: str, argument: object) -> Any:
+        name = frame.f_code.co_filename
+        if not self._ours.setdefault(name, f"{os.sep}evnlos{os.sep}" in name):
+            return None
+        last = 0
+
+        def line(frame: Any, event: str, argument: object) -> Any:
+            nonlocal last
+            if event == "line":
+                self.taken.add((name, last, frame.f_lineno))
+                last = frame.f_lineno
+            return line
+
+        return line
+
+
+def mutated(name: str, content: bytes, draw: random.Random) -> bytes:
+    """Return a changed file; of an archive most often one of the files in it is changed."""
+    if not name.endswith((".zip", ".npz")) or draw.random() < 0.2:
+        return flipped(content, draw)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            inside = {one.filename: archive.read(one) for one in archive.infolist()}
+        chosen = draw.choice(list(inside))
+        inside[chosen] = flipped(inside[chosen], draw)
+        made = io.BytesIO()
+        with warnings.catch_warnings(), zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+            warnings.simplefilter("ignore")
+            for one, data in inside.items():
+                archive.writestr(one, data)
+        return made.getvalue()
+    except Exception:  # an archive that is damaged already
+        return flipped(content, draw)
+
+
+def seeds(material: Material, root: Path) -> list[tuple[str, bytes]]:
+    """Return whole files of every kind and the corpus, each with its name."""
+    found = [(one.name, one.read_bytes()) for one in sorted(material.folder.iterdir()) if one.is_file()]
+    found += [(one.name, one.read_bytes()) for one in sorted(material.capture.iterdir())[:3]]
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for one in sorted(material.capture.iterdir()):
+            archive.write(one, f"shot/{one.name}")
+    found.append(("shot.zip", packed.getvalue()))
+    array = io.BytesIO()
+    np.save(array, np.zeros((3, 4, 5), np.uint8))
+    found.append(("a.npy", array.getvalue()))
+    found.append(("s.yaml", yaml.safe_dump(to_dict(Simulation())).encode()))
+    for kind in (picture, packets):
+        for number in range(4):
+            at = root / f"{kind.__name__}{number}"
+            at.mkdir()
+            kind(random.Random(number), at, material)
+            found += [(one.name, one.read_bytes()) for one in at.iterdir()]
+    corpus = [(one.name.partition("-")[2], one.read_bytes()) for one in sorted(CORPUS.iterdir())]
+    return [pair for pair in found if not pair[0].endswith((".csv", ".raw"))] + corpus
+
+
+def replay(base: Path | None = None) -> list[str]:
+    """Read the corpus; return the failures, one line each."""
+    failures: list[str] = []
+    with bounded(base, failures) as (root, _):
+        for path in sorted(CORPUS.iterdir()):
+
+            def make(at: Path, path: Path = path) -> Callable[[], object]:
+                copy = at / path.name.partition("-")[2]
+                shutil.copy(path, copy)
+                return lambda: read_file(copy)
+
+            how, _ = outcome(make, root)
+            failures += [] if how in ("read", "refused") else [f"{path.name}: {how}"]
+    return failures
+
+
+def guided(seconds: float, seed: int, keep: Path | None, most_bytes: int = 4000) -> list[str]:
+    """Mutate files for so many seconds, guided by the branches that they take; return the failures."""
+    failures, draw, tracer = list[str](), random.Random(seed), Tracer()
+    with bounded(None, failures) as (root, material):
+        known = seeds(material, root)
+        for name, content in known:  # what is imported and compiled on the way is no part of an input
+            (root / name).write_bytes(content)
+            with suppress(EvnlosError):
+                read_file(root / name)
+        waiting, tried, kept, end = list(known), 0, 0, time.monotonic() + seconds
+        while time.monotonic() < end:
+            is_seed = bool(waiting)
+            name, content = waiting.pop() if is_seed else draw.choice(known)
+            content = content if is_seed else mutated(name, content, draw)
+            before = len(tracer.taken)
+
+            def make(at: Path, name: str = name, content: bytes = content) -> Callable[[], object]:
+                (at / name).write_bytes(content)
+
+                def read() -> object:
+                    sys.settrace(tracer)
+                    try:
+                        return read_file(at / name)
+                    finally:
+                        sys.settrace(None)
+
+                return read
+
+            how, _ = outcome(make, root)
+            tried += 1
+            is_new, is_bad = len(tracer.taken) > before, how not in ("read", "refused")
+            if is_new and not is_seed:
+                known.append((name, content))
+                kept += 1
+            if is_bad:
+                failures.append(f"{name}, input {tried}: {how}")
+            if is_bad or (keep is not None and is_new and not is_seed and len(content) <= most_bytes):
+                folder = keep or Path("fuzz_failures")
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / f"{seed}_{tried:05d}-{name}").write_bytes(content)
+        print(f"{tried} files, {kept} kept, {len(tracer.taken)} branches")
     return failures
 
 
@@ -480,8 +696,14 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=2400)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", help="one input, as a failure names it")
+    parser.add_argument("--guided", type=float, help="seconds to mutate files, guided by what they reach")
+    parser.add_argument("--keep", type=Path, help="folder for the small files that reached something new")
     given = parser.parse_args()
     began = time.perf_counter()
+    if given.guided:
+        failures = guided(given.guided, given.seed, given.keep)
+        print("\n".join(failures) or "no failure", flush=True)
+        sys.exit(bool(failures))
     failures = run(given.count, given.seed, given.only)
     print("\n".join(failures) or "no failure", flush=True)
     print(f"{given.count} inputs in {time.perf_counter() - began:.0f} s, {len(failures)} failures")

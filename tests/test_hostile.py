@@ -632,6 +632,13 @@ def test_a_clock_beyond_64_bits_is_refused(offset: int, shot) -> None:
         read_capture(shot)
 
 
+def test_the_corpus_of_findings_ends_well(tmp_path) -> None:
+    """Files that once ended in a traceback, took too much, or reached what no other did."""
+    from fuzz_inputs import replay
+
+    assert replay(tmp_path) == []
+
+
 def test_hostile_inputs_of_every_kind_end_well(tmp_path) -> None:
     """A part of `python tests/fuzz_inputs.py`, whose list of 2,400 takes minutes."""
     from fuzz_inputs import run

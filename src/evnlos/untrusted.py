@@ -15,7 +15,9 @@ import subprocess
 import sys
 import tempfile
 import threading
+import tokenize
 import warnings
+import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -66,6 +68,14 @@ _PILLOW_ERRORS = (
     struct.error, zlib.error,
 )  # fmt: skip
 """What Pillow raises on damage, besides OSError."""
+
+
+NUMPY_ERRORS = (
+    OSError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError, RuntimeError,
+    MemoryError, SyntaxError, struct.error, tokenize.TokenError, zlib.error, zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+)  # fmt: skip
+"""What NumPy raises on damaged arrays and archives."""
 
 
 class ElsewhereError(ValueError):

@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 
 from evnlos.errors import DataError, MissingDependencyError
 from evnlos.sensor._tone import Picture
-from evnlos.untrusted import MOST_IMAGE_PIXELS, open_container, open_image, open_regular
+from evnlos.untrusted import MOST_IMAGE_PIXELS, NUMPY_ERRORS, open_container, open_image, open_regular
 
 
 class Source(Protocol):
@@ -173,7 +173,9 @@ class ArraySource:
         try:
             with open_regular(path):  # a pipe would be waited for
                 self._array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
+            if not isinstance(self._array, np.ndarray):
+                raise ValueError("an archive of arrays")
+        except NUMPY_ERRORS as error:
             reason = " ".join(str(error).split())[:120]
             raise DataError(f"{path}: not a NumPy array ({reason}); save one with numpy.save") from None
         shape, dtype = self._array.shape, self._array.dtype

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import zipfile
-import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,8 @@ import torch
 from evnlos.errors import ConfigError, DataError
 from evnlos.transport import Lambert, MatrixTransport, Occluder, Patches, light_transport_matrix
 from evnlos.types import Plane
-from evnlos.untrusted import check_memory, open_regular
+from evnlos.untrusted import NUMPY_ERRORS, check_memory, open_regular
 
-_NPZ_ERRORS = (
-    ValueError, EOFError, OSError, LookupError, RuntimeError, AttributeError, MemoryError, SyntaxError,
-    OverflowError, TypeError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
 _FINEST = 48  # wall patches a side that carry what a matte wall knows
 _NEEDED = ("wall_x_m", "wall_z_m", "cell_x_m", "cell_z_m", "cell_size_m", "distance_m")
 
@@ -191,7 +185,7 @@ def _load(path: str | Path) -> dict[str, Any]:
             return dict(file)
     except FileNotFoundError:
         raise DataError(f"{path} does not exist; give an NPZ file") from None
-    except _NPZ_ERRORS:
+    except NUMPY_ERRORS:
         raise DataError(
             f"{path} is not an NPZ file of plain numbers; docs/inversion.md lists what it must hold"
         ) from None

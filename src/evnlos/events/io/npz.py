@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shutil
-import struct
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -17,7 +15,7 @@ import numpy as np
 from evnlos.events.io.columns import DTYPES, ColumnCheck, Columns
 from evnlos.events.io.report import ReadReport, unreadable
 from evnlos.types import Events
-from evnlos.untrusted import check_memory
+from evnlos.untrusted import NUMPY_ERRORS, check_memory
 
 SIGNATURE = b"PK\x03\x04"
 _CURE = "the file is damaged or not complete: copy it again"
@@ -32,10 +30,7 @@ _EVENT_BYTES = 39  # of an event as columns, as what is stored, and as bytes tha
 def _zip_errors(path: Path) -> Iterator[None]:
     try:
         yield
-    except (
-        zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, OSError, ValueError, KeyError,
-        NotImplementedError, RuntimeError, struct.error, SyntaxError, TypeError, MemoryError, OverflowError,
-    ) as error:  # fmt: skip
+    except NUMPY_ERRORS as error:
         found = " ".join(str(error).split())[:160]
         raise unreadable(path, 0, f"NPZ cannot be read ({found})", _CURE) from None
 
