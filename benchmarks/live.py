@@ -4,6 +4,7 @@
     python benchmarks/live.py --threads 1 --sources replay --seconds 20
     python benchmarks/live.py --modalities event --weights RUN
     python benchmarks/live.py --write benchmarks/results/live.md
+    python benchmarks/live.py --sources udp --modalities event --rate 3e6 --seconds 600    # is each event counted?
 
 Random events, the worst case for the surface, in true time: from memory, an event being due at its own
 instant, or from another process by UDP in packets of 180 events. Latency is wall time to the picture as an
@@ -19,6 +20,7 @@ from __future__ import annotations
 import argparse
 import os
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -42,6 +44,7 @@ from machine import machine
 WIDTH, HEIGHT = 160, 100
 PIECE_US = 20_000
 FRAME_US = 200_000
+_NUMBER_AT, _BASE_AT = 8, 16  # of a packet, see docs/live.md
 COLUMNS = (
     "source", "modality", "pictures/s", "M events/s", "oldest p50, ms", "p90", "p99", "max", "newest p50, ms",
     "p99", "surface p50, ms", "network p50, ms", "surface / network / rest, %", "events dropped / lost",
@@ -71,28 +74,36 @@ def replay(rate_hz: float, seconds: float, with_frames: bool) -> Replay:
     return Replay(list(pieces(rate_hz, seconds)), frames)
 
 
-def send(port: int, rate_hz: float, seconds: float) -> None:
-    """Send the events by UDP in true time, in steps of 2 ms; what the other process does.
+def send(port: int, rate_hz: float, seconds: float) -> int:
+    """Send the events by UDP in true time and return their number; what the other process does.
 
-    They are packed beforehand: the sender stands for a camera, not for work on this machine.
+    One second is packed beforehand and sent again and again under new numbers and times: the sender stands for
+    a camera, not for work on this machine. Each packet is full, so that lost packets tell how many events were
+    lost.
     """
-    steps: list[tuple[int, list[bytes]]] = []
-    number = 0
-    for part in pieces(rate_hz, seconds):
-        for first in range(int(part.t_us[0]), int(part.t_us[0]) + PIECE_US, 2000):
-            events, packed = part.between(first, first + 2000), []
-            for start in range(0, len(events), USUAL_EVENTS):
-                packed.append(pack(Packet(number, events[start : start + USUAL_EVENTS])))
-                number += 1
-            steps.append((first + 2000, packed))
-    packed = [pack(Packet(number, Events.empty(WIDTH, HEIGHT), is_last=True))]
-    steps.append((steps[-1][0], packed))
+    second: list[tuple[int, bytearray]] = []
+    for part in pieces(rate_hz, 1.0):
+        for start in range(0, len(part) - USUAL_EVENTS + 1, USUAL_EVENTS):
+            full = part[start : start + USUAL_EVENTS]
+            second.append((int(full.t_us[-1]), bytearray(pack(Packet(0, full)))))
+    bases = [struct.unpack_from("<q", data, _BASE_AT)[0] for _, data in second]
+    number, passes = 0, max(1, round(seconds))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         start_s = time.perf_counter()
-        for until_us, packed in steps:
-            time.sleep(max(start_s + until_us / 1e6 - time.perf_counter(), 0.0))
-            for data in packed:
+        for turn in range(passes):
+            for (until_us, data), base_us in zip(second, bases, strict=True):
+                struct.pack_into("<I", data, _NUMBER_AT, number)
+                struct.pack_into("<q", data, _BASE_AT, base_us + turn * 1_000_000)
+                ahead_s = start_s + turn + until_us / 1e6 - time.perf_counter()
+                if ahead_s > 0.002:
+                    time.sleep(ahead_s)
                 sender.sendto(data, ("127.0.0.1", port))
+                number += 1
+        last = pack(Packet(number, Events.empty(WIDTH, HEIGHT), is_last=True))
+        for _ in range(3):  # the receiver's buffer may be full
+            time.sleep(0.3)
+            sender.sendto(last, ("127.0.0.1", port))
+    return number * USUAL_EVENTS
 
 
 def network_of(modality: str, path: str | None) -> Weights:
@@ -111,7 +122,7 @@ def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
         source: Source = UdpSource(idle_s=30)
         engine.begin()
         call = [sys.executable, __file__, "--send", str(source.port), "--rate-hz", str(rate_hz)]
-        other = subprocess.Popen([*call, "--seconds", str(seconds)])
+        other = subprocess.Popen([*call, "--seconds", str(seconds)], stdout=subprocess.PIPE, text=True)
     else:
         source = replay(rate_hz, seconds, weights.modality.needs_frames)
         engine.begin()
@@ -119,15 +130,26 @@ def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
     before = time.process_time()
     done = run.go().summary()
     cpu = (time.process_time() - before) / max(done["seconds"], 1e-9)
+    lost = (
+        done["dropped"]["events"],
+        USUAL_EVENTS * sum(done["faults"].get(f"{how} packets", 0) for how in ("lost", "late", "malformed")),
+    )
     if other is not None:
-        other.wait()
+        sent = int(other.communicate()[0])
+        short = sent - done["events"] - sum(lost)
+        print(
+            f"sent {sent:,} = pictured {done['events']:,} + dropped {lost[0]:,} + lost {lost[1]:,}; "
+            f"difference {short}",
+            flush=True,
+        )
+        if short:
+            raise SystemExit("events are missing that nothing counts")
     spread = done["latency_ms"]
     oldest, newest = spread["oldest_event"], spread["newest_event"]
     if oldest is None:
         return f"| {name} | {weights.modality.name} | no picture with an event |"
     parts = [spread[part]["mean"] for part in ("surface", "network", "wait")]
     shares = " / ".join(f"{100 * part / sum(parts):.0f}" for part in parts)
-    lost = done["dropped"]["events"], done["faults"].get("lost packets", 0) * 180
     cells = [name, weights.modality.name, f"{done['pictures_hz']:.0f}", f"{done['events_hz'] / 1e6:.2f}"]
     cells += [f"{oldest[q]:.1f}" for q in ("p50", "p90", "p99", "max")]
     cells += [f"{newest[q]:.1f}" for q in ("p50", "p99")]
@@ -147,7 +169,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sources", nargs="+", choices=("replay", "udp"), default=["replay", "udp"])
     parser.add_argument("--modalities", nargs="+", choices=STANDARD_MODALITIES, default=["event", "fusion"])
-    parser.add_argument("--rate-hz", type=float, default=1e6, help="events a second")
+    parser.add_argument("--rate-hz", "--rate", type=float, default=1e6, help="events a second")
     parser.add_argument("--pictures-hz", type=float, default=Pace.rate, help="most pictures a second")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--threads", type=int, default=2, help="threads of the network")
@@ -156,7 +178,8 @@ def main() -> None:
     parser.add_argument("--send", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.send is not None:
-        return send(arguments.send, arguments.rate_hz, arguments.seconds)
+        print(send(arguments.send, arguments.rate_hz, arguments.seconds))
+        return
     torch.set_num_threads(arguments.threads)
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     lines = [
@@ -180,7 +203,7 @@ def main() -> None:
             print(lines[-1], flush=True)
     if arguments.write:
         Path(arguments.write).write_text("\n".join(lines) + "\n")
-    return None
+    return
 
 
 if __name__ == "__main__":
