@@ -4,7 +4,7 @@
     python benchmarks/live.py --threads 1 --sources replay --seconds 20
     python benchmarks/live.py --modalities event --weights RUN
     python benchmarks/live.py --write benchmarks/results/live.md
-    python benchmarks/live.py --sources udp --modalities event --rate 3e6 --seconds 600    # is each event counted?
+    python benchmarks/live.py --sources udp --modalities event --rate 3e6 --seconds 600  # each event counted?
 
 Random events, the worst case for the surface, in true time: from memory, an event being due at its own
 instant, or from another process by UDP in packets of 180 events. Latency is wall time to the picture as an
