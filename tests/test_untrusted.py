@@ -5,7 +5,10 @@ import os
 import random
 import shutil
 import socket
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -555,3 +558,36 @@ def test_no_flipped_byte_of_a_rig_s_file_goes_unseen(kind: str, tmp_path) -> Non
 def test_a_rig_s_file_without_a_digest_still_loads(kind: str, tmp_path) -> None:
     path, read = _rig_files(tmp_path)[kind]
     assert read(unsealed(path)) == read(path)
+
+
+PARENT = """
+import sys
+from pathlib import Path
+from evnlos.untrusted import Child
+with Child(Path(sys.argv[1]), []) as child:
+    print(child.take_json(), flush=True)
+    child.take_json()
+"""
+SLEEPER = """
+import os, time
+from evnlos.untrusted import limit_this_process
+limit_this_process(1 << 30, 60)
+print(os.getpid(), flush=True)
+time.sleep(1000)
+"""
+
+
+def test_a_child_ends_with_its_parent(tmp_path) -> None:
+    (tmp_path / "sleeper.py").write_text(SLEEPER)
+    call = [sys.executable, "-c", PARENT, str(tmp_path / "sleeper.py")]
+    with subprocess.Popen(call, stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.kill()
+    until = time.monotonic() + 20
+    while Path(f"/proc/{child}").exists() and time.monotonic() < until:
+        if Path(f"/proc/{child}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z":
+            break
+        time.sleep(0.05)
+    else:
+        assert not Path(f"/proc/{child}").exists()
