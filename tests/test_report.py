@@ -126,7 +126,7 @@ def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypat
         commands = Commands(dataset, [run, file, come, live, other], "test", named_setup("hard-far"))
         lines = commands.again() + commands.published()
         parsed = [_parsed(line, monkeypatch) for line in lines if not line.startswith("#")]
-        assert [type(one).__module__.rsplit(".", 1)[1] for one in parsed].count("report") == 1
+        assert [type(one).__name__ for one in parsed].count("ReportCommand") == 1
     again = "\n".join(Commands(data, [run, file, come, live, other], "test").again())
     assert "evnlos report epnp mine near-frame-pass live-run 'of two words' --data near --split" in again
     assert "--out near-frame-pass" not in again and "--out near-frame-pass" in "\n".join(commands.published())
