@@ -308,7 +308,8 @@ def check_numbers(value: Any, what: str, name: str = "", *, may_be_tiny: bool = 
             return
         if value < 0 and name.endswith(UNSIGNED):
             raise ConfigError(f"{what} is {_shown(value)}; give 0 or a positive number")
-        if not least <= abs(value) <= most:  # NaN, too
+        size: Any = abs(value)
+        if not least <= size <= most:  # NaN, too
             ends = f"{least:g} to {most:g}, or 0" if least else f"at most {most:g}"
             raise ConfigError(f"{what} is {_shown(value)}; its size has to be {ends}")
 
