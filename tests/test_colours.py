@@ -79,3 +79,18 @@ def test_pages_and_modules_use_the_one_pair() -> None:
     assert not [path for path, text in texts.items() if "RdBu" in text]
     own = re.compile(r"\bred (brighter|is ON)|\b_?ON(_RGB)? = (\(|np)")
     assert len([path for path, text in texts.items() if own.search(text)]) == 1
+
+
+def test_a_calibration_is_drawn_with_the_signed_map(tmp_path) -> None:
+    pytest.importorskip("matplotlib")
+    from evnlos.calibration import Example
+    from evnlos.plot.calibration import draw_calibration
+
+    frame, draw = np.ones((8, 12)), np.random.default_rng(0)
+    surfaces = draw.random((2, 2, 8, 12))
+    example = Example("near_G", frame, 0.9 * frame, surfaces[0], surfaces[1])
+    draw_calibration(SimpleNamespace(example=(example,)), tmp_path / "check.png")  # type: ignore[arg-type]
+    with Image.open(tmp_path / "check.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+    below, above = np.array([8, 32, 96]), np.array([255, 222, 160])  # the ends of the map
+    assert all(np.abs(pixels.astype(int) - one).sum(axis=1).min() < 30 for one in (below, above))
