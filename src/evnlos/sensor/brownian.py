@@ -115,7 +115,6 @@ class BrownianPixel(ThresholdPixel):
         if self.increments not in ("log", "linear"):
             raise ConfigError(f'increments is {self.increments!r}; give "log" or "linear"')
         check_pattern_seed(self.pattern_seed)
-        super().__post_init__()
 
     @classmethod
     def voltmeter(cls, k1: float, k2: float, k3: float, k4: float, k5: float, k6: float) -> BrownianPixel:

@@ -142,7 +142,6 @@ class CircuitPixel(ThresholdPixel):
         require(self, "refractory_s", 0.0, math.inf, "seconds; 0 switches it off")
         check_phase(self.initial_phase)
         check_pattern_seed(self.pattern_seed)
-        super().__post_init__()
 
     def matrices(self, current_a: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
         """Return the equations x' = M (x - c ln(I / I_start)) + noise, voltages in log units of light.

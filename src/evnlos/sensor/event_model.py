@@ -154,6 +154,7 @@ class ThresholdPixel(PixelSettings):
         for name in ("threshold_on", "threshold_off"):
             require(self, name, MIN_THRESHOLD, math.inf, "log units; the paper's value is 0.15")
         require(self, "threshold_sigma", 0.0, math.inf, "log units; 0 gives every pixel the same threshold")
+        super().__post_init__()
 
     @property
     def finest_threshold(self) -> float:

@@ -51,7 +51,6 @@ class _ContrastPixel(ThresholdPixel):
         for name in ("cutoff_hz", "leak_rate_hz", "shot_noise_rate_hz"):
             require(self, name, 0.0, math.inf, "hertz; 0 switches it off")
         require(self, "refractory_s", 0.0, math.inf, "seconds; 0 switches it off")
-        super().__post_init__()
 
 
 @EVENT_MODELS.register
