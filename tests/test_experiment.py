@@ -229,7 +229,7 @@ def test_tables_say_what_the_records_say(tmp_path) -> None:
     assert "| G |" in character_table(again, ("E2E", "EPNP")) and "**23.10**" in character_table(
         again, ("E2E", "EPNP")
     )
-    assert f"| frame | {gain} |" in gain_table(again)
+    assert f"| frame | E2E | {gain} |" in gain_table(again)
     assert "| E2E frame | 50 % |" in checks_table(again)
 
 

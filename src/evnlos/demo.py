@@ -13,7 +13,7 @@ from evnlos.dataset.importer import character_of
 from evnlos.dataset.lab import Lab, render_captures
 from evnlos.dataset.presets import default
 from evnlos.errors import CalibrationError, ConfigError
-from evnlos.experiment import Arm, Place, Study, gain_table, read_records, run_study
+from evnlos.experiment import SEQUENCE, Arm, Place, Study, gain_table, read_records, run_study
 from evnlos.model import UNetConfig
 from evnlos.progress import ProgressBars
 from evnlos.report import gather, to_text, write_report
@@ -34,19 +34,21 @@ class Demo:
     out: Path = Path("demo")
     """Folder for everything that the demo makes; run it again to go on after an interruption."""
     captures: tuple[Path, ...] = ()
-    """Capture folders; without any, pseudo-real ones are rendered."""
+    """Capture folders, or the folder above them; without any, pseudo-real ones are rendered."""
     test: tuple[str, ...] = _TEST
     """Characters of the captures that neither calibration nor training sees."""
-    writers: int = 8
+    writers: int = 4
     """Writers of the simulated characters, 36 objects each."""
-    parts: int = 4
-    """Each simulated object shows one of so many parts of the pass: more objects in the same time."""
-    pretrain_epochs: int = 4
-    """Passes over the simulated samples."""
-    finetune_epochs: int = 4
-    """Passes over the captures when fine-tuning."""
-    e2e_epochs: int = 8
-    """Passes over the captures when training end to end."""
+    redrawn: int = 7
+    """How often each known target of the captures is drawn again and simulated."""
+    pretrain_epochs: int = 8
+    """Epochs on the simulated sequences."""
+    finetune_epochs: int = 12
+    """Epochs on the captures when fine-tuning."""
+    e2e_epochs: int = 60
+    """Epochs on the captures' sequences when training end to end."""
+    single_epochs: int = 8
+    """Epochs on the captures' single positions when training end to end."""
     width: int = 32
     """Channels of the network at its finest level."""
     workers: int = 0
@@ -67,13 +69,11 @@ def run_demo(settings: Demo) -> Path:
         CalibrationError: No rig fits the captures.
     """
     began, out = time.perf_counter(), settings.out
-    for folder in settings.captures:
-        if not (folder / "capture.yaml").is_file():
-            raise ConfigError(f"{folder} has no capture.yaml; give the capture folders themselves: {folder}/*")
+    captures = _captures_in(settings.captures)
     place = Place((), out, settings.workers, trainings=settings.workers)
     out.mkdir(parents=True, exist_ok=True)
     notes = []
-    folders = list(settings.captures)
+    folders = captures
     if not folders:
         lab = Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=settings.seed)
         notes.append(
@@ -111,6 +111,21 @@ def run_demo(settings: Demo) -> Path:
     return path
 
 
+def _captures_in(given: tuple[Path, ...]) -> list[Path]:
+    """Return the capture folders among some paths, and in folders among them; files are passed over."""
+    found = []
+    for path in given:
+        inside = (
+            [path] if (path / "capture.yaml").is_file() else [f.parent for f in path.glob("*/capture.yaml")]
+        )
+        if not inside and (path.is_dir() or not path.exists()):
+            raise ConfigError(f"{path} holds no capture.yaml; give capture folders, or the folder above them")
+        found += inside
+    if given and not found:
+        raise ConfigError(f"{given[0]} is no capture folder; give folders with a capture.yaml")
+    return sorted(found)
+
+
 def _of_calibration(rig: Path) -> list[str]:
     """Return what the calibration found, and what it warns of."""
     drawn = f" ({rig.parent.name}/{rig.name}/check.png)" if (rig / "check.png").is_file() else ""
@@ -122,13 +137,14 @@ def _of_calibration(rig: Path) -> list[str]:
 
 def _study(settings: Demo, test: list[str]) -> Study:
     """Return the comparison of E2E and EPNP, with one seed."""
-    plan = Training(network=UNetConfig(width=settings.width))
+    single = Training(network=UNetConfig(width=settings.width), epochs=settings.single_epochs)
+    plan = dataclasses.replace(SEQUENCE, network=dataclasses.replace(SEQUENCE.network, width=settings.width))
     before = dataclasses.replace(plan, epochs=settings.pretrain_epochs)
     # What forgets least comes first; captures that are held out of it choose among these, or nothing at all.
     after = dataclasses.replace(
         plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True
     )
-    quicker = dataclasses.replace(after, learning_rate=1e-3, keep_normalization=False)
+    quicker = dataclasses.replace(after, learning_rate=1e-3)
     alone = dataclasses.replace(plan, epochs=settings.e2e_epochs)
     source = "calibrated" if settings.calibrate else "uncalibrated"
     return Study(
@@ -136,13 +152,14 @@ def _study(settings: Demo, test: list[str]) -> Study:
         "demo",
         (
             Arm("simulation only", source, before, None),
+            Arm("E2E, single positions", "none", None, single),
             Arm("E2E", "none", None, alone),
             Arm("EPNP", source, before, after, (quicker,)),
         ),
         seeds=(settings.seed,),
         test=tuple(test),
         writers=settings.writers,
-        parts=settings.parts,
+        redrawn=settings.redrawn,
         simulation=dataclasses.replace(default(), seed=settings.seed),
         calibration=Calibration(event_captures=2, columns=48, seed=settings.seed),
         rigs=2,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -77,6 +77,7 @@ class RigFit:
         example: Held-out captures beside the fit.
         targets: Whether the captures' targets were known.
         mean_frame: Residual of the frames held out where the mean of the fitted frames stands for the model.
+        known: Masks of the known targets by capture, [S, S] each: pre-training draws them again.
     """
 
     simulation: Simulation
@@ -90,6 +91,7 @@ class RigFit:
     example: tuple[Example, ...]
     targets: Literal["known", "unknown"] = "known"
     mean_frame: float = math.inf
+    known: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
     @property
     def unexplained(self) -> Residual | None:
@@ -180,9 +182,12 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
             )
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
-    strokes = Strokes().pen
+    strokes, known = Strokes().pen, dict[str, NDArray[np.float32]]()
     if settings.targets == "known":
         strokes = pens_of([scene.target.mask for scene in fit.scenes])
+        seen_targets = [*zip(fit.names, fit.scenes, strict=True), *zip(held.names, held.scenes, strict=True)]
+        side = simulation.glyphs.plate.size_m
+        known = {name: scene.target.mask for name, scene in seen_targets if scene.target.size_m == side}
     training = training_simulation(simulation, noise, pixel, strokes)
     return RigFit(
         simulation,
@@ -196,6 +201,7 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
         examples,
         settings.targets,
         float(seen.relative((seen.frames - models["fit"].frames.mean(dim=0)) * seen.weight)),
+        known,
     )
 
 

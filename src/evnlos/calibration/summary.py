@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from PIL import Image
 
 from evnlos.calibration.fit import RigFit
 from evnlos.calibration.residual import Residual
@@ -17,10 +21,13 @@ from evnlos.dataset.fixed_pattern import PATTERN_FILE, save_pattern
 from evnlos.dataset.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
+from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import CALIBRATED_FILE, FittedSetup
 from evnlos.version import __version__
 
 RIG_FILE, TRAINING_FILE, FIGURES_FILE = CALIBRATED_FILE, "training.yaml", "calibration.json"
+TARGETS = "targets"
+"""Folder, beside the rig's file, of the known targets' pictures."""
 
 _MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25
 _GOOD, _FAIR, _POOR = 3.0, 6.0, 10.0  # per cent of the light beside the noise
@@ -247,7 +254,8 @@ def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> P
     """Write `calibration.json` and, where the fit stands on captures that it has not seen, the rig.
 
     The rig is `rig.yaml` (the simulation that matches it), `training.yaml` (that simulation, varied, to
-    pre-train on) and `pattern.safetensors` (the frame camera's fixed pattern, for `import --pattern`).
+    pre-train on), `targets` (the known targets, which it draws again) and `pattern.safetensors` (the frame
+    camera's fixed pattern, for `import --pattern`).
 
     Args:
         fit: The calibration.
@@ -279,7 +287,7 @@ def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> P
             f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
         )
     save_pattern(fit.noise.pattern, out / PATTERN_FILE)
-    save_yaml(_with_wall(fit, fit.training, out), out / TRAINING_FILE)
+    save_yaml(_with_targets(fit, _with_wall(fit, fit.training, out), out / TARGETS), out / TRAINING_FILE)
     save_yaml(_with_wall(fit, fit.simulation, out), out / RIG_FILE)
     return out / RIG_FILE
 
@@ -293,3 +301,17 @@ def _with_wall(fit: RigFit, simulation: Simulation, out: Path) -> Simulation:
     if Path(setup.file).resolve() != path:
         write_atomically(path, Path(setup.file).read_bytes())
     return simulation.with_setup(file=str(path), misfit="; ".join(warnings_of(fit)))
+
+
+def _with_targets(fit: RigFit, simulation: Simulation, folder: Path) -> Simulation:
+    """Return the simulation that draws the known targets again, about as many as those of its writers."""
+    glyphs = simulation.glyphs
+    if not fit.known or not isinstance(glyphs, HandwritingGlyphs):
+        return simulation
+    folder.mkdir(exist_ok=True)
+    for name, mask in fit.known.items():
+        picture = BytesIO()
+        Image.fromarray(np.round(255 * np.clip(mask, 0, 1)).astype(np.uint8)).save(picture, "PNG")
+        write_atomically(folder / f"{name}.png", picture.getvalue())
+    each = max(1, round(glyphs.writers * len(glyphs.characters) / len(fit.known)))
+    return replace(simulation, glyphs=replace(glyphs, known=str(folder.resolve()), redrawn=each))

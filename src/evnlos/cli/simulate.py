@@ -87,8 +87,8 @@ class SimulateCommand:
         engine = run_tasks if self.engine == "local" else partial(run_on_dask, scheduler=self.scheduler)
         with ProgressBars() as progress:
             missing = simulate(config, self.out, self.workers, share, engine, progress, self.force).missing()
-        about = {"out": str(self.out), "objects": total, "samples": total * config.positions_each}
-        text = f"{self.out}: {total} objects, {total * config.positions_each} samples, {len(missing)} missing"
+        about = {"out": str(self.out), "objects": total, "samples": total * config.positions}
+        text = f"{self.out}: {total} objects, {total * config.positions} samples, {len(missing)} missing"
         result(self.json, about | {"missing": missing}, text)
 
 

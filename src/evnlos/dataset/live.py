@@ -98,9 +98,8 @@ class LiveDataset(Dataset):
     def truth(self, name: str) -> NDArray[np.float32]:
         """Return the true pictures of an object in the first epoch, float32 [N, H, W], 0..1."""
         config = self.simulation
-        drawn = drawn_for(config, name)
-        scene = scene_of(config, drawn, name)
-        return scene.truth(config.sampling.canvas, scene.position_times_s(drawn.positions))
+        scene = scene_of(config, drawn_for(config, name), name)
+        return scene.truth(config.sampling.canvas, scene.position_times_s(config.positions))
 
 
 def live_dataset(

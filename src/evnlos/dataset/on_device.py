@@ -90,7 +90,7 @@ def _samples(
 ) -> DeviceSamples:
     """Return an object's maps, given its events."""
     sampling, device = config.sampling, events.t_us.device
-    times_s = scene.position_times_s(drawn.positions)
+    times_s = scene.position_times_s(config.positions)
     edges_us = edges_from(times_s)
     frames = capture_tensors(drawn.frame_camera, wall, times_s, derive_seed(config.seed, name, "frames"))
     surface = time_surface_tensors(

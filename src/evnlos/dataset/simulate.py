@@ -44,9 +44,6 @@ class Simulation:
     """Length of a pass, seconds."""
     positions: int = 40
     """Equidistant positions of an object, one sample each."""
-    parts: int = 1
-    """Each object shows one of so many parts of the pass, with its share of the positions, beginning anywhere:
-    more objects in the same time, for networks that see single positions."""
     setup: Setup = field(default_factory=PaperSetup)
     """Wall, geometry, ambient light and cameras: how the light becomes frames and events."""
     sampling: Sampling = field(default_factory=Sampling)
@@ -70,10 +67,6 @@ class Simulation:
             raise ConfigError(f"Simulation.duration_s is {self.duration_s}; give a positive number of seconds")
         if self.positions < 1:
             raise ConfigError(f"Simulation.positions is {self.positions}; give at least 1")
-        if not 1 <= self.parts <= self.positions:
-            raise ConfigError(
-                f"Simulation.parts is {self.parts}; give 1 to {self.positions}, the number of positions"
-            )
         if self.rigs < 0:
             raise ConfigError(
                 f"Simulation.rigs is {self.rigs}; give 0 (one for each object) or a number of rigs"
@@ -104,11 +97,6 @@ class Simulation:
         return replace(self, setup=replace(self.setup, **changes))
 
     @property
-    def positions_each(self) -> int:
-        """Positions of one object."""
-        return self.positions // self.parts
-
-    @property
     def frame_camera(self) -> FrameCamera:
         """The setup's frame camera."""
         return self.setup.frame_camera
@@ -127,26 +115,14 @@ class Simulation:
 def drawn_for(config: Simulation, name: str) -> Simulation:
     """Return the settings that `vary` draws for an object; those of the optics are shared by `rigs` groups.
 
-    Gain and ambient light cost nothing, so they are always the object's own. Where the object shows a part of
-    the pass, the drawn settings are those of this part: its motion, its length and its positions.
+    Gain and ambient light cost nothing, so they are always the object's own.
     """
     optics = {path: ends for path, ends in config.vary.items() if config.rigs and _needs_a_matrix(path)}
     others = {path: ends for path, ends in config.vary.items() if path not in optics}
     if optics:
         group = derive_seed(config.seed, name, "rig") % config.rigs
         config = varied(config, optics, config.seed, f"rig {group}")
-    return _part_of(varied(config, others, config.seed, name), name)
-
-
-def _part_of(config: Simulation, name: str) -> Simulation:
-    """Return the simulation of an object's part of the pass."""
-    if config.parts == 1:
-        return config
-    duration_s = config.duration_s * config.positions_each / config.positions
-    draw = np.random.default_rng(derive_seed(config.seed, name, "part"))
-    begin_s = draw.uniform(0.0, config.duration_s - duration_s)
-    motion = replace(config.motion, start_s=config.motion.start_s - begin_s)
-    return replace(config, motion=motion, duration_s=duration_s, positions=config.positions_each, parts=1)
+    return varied(config, others, config.seed, name)
 
 
 def _needs_a_matrix(path: str) -> bool:
@@ -174,7 +150,7 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     scene = scene_of(config, drawn, name)
     setup = drawn.setup
     wall = setup.observe(scene)
-    times_s = scene.position_times_s(drawn.positions)
+    times_s = scene.position_times_s(config.positions)
     seed = derive_seed(config.seed, name, "events")
     events = setup.event_camera.record(wall, 0.0, drawn.duration_s, seed=seed)
     frames = setup.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
@@ -211,9 +187,7 @@ def object_bytes(config: Simulation) -> int:
         config: The settings.
     """
     cells = config.sampling.height * config.sampling.width
-    return pass_bytes(
-        config.setup, config.glyphs.plate.size_m, config.duration_s / config.parts, config.positions_each, cells
-    )
+    return pass_bytes(config.setup, config.glyphs.plate.size_m, config.duration_s, config.positions, cells)
 
 
 def check_passes(needed: int, at_once: int) -> None:

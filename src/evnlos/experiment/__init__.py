@@ -9,7 +9,7 @@ from evnlos.experiment.conditions import (
     conditions_table,
     map_conditions,
 )
-from evnlos.experiment.presets import STUDIES, on_sequences
+from evnlos.experiment.presets import SEQUENCE, STUDIES, on_sequences
 from evnlos.experiment.records import read_records, write_record
 from evnlos.experiment.run import captures_of, run_study
 from evnlos.experiment.simulated import Simulated, run_simulated
@@ -24,6 +24,7 @@ from evnlos.experiment.table import (
 )
 
 __all__ = [
+    "SEQUENCE",
     "STUDIES",
     "Arm",
     "CarriedOver",

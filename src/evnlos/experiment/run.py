@@ -107,8 +107,9 @@ def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     glyphs = config.glyphs
     assert isinstance(glyphs, HandwritingGlyphs)
     glyphs = replace(glyphs, writers=study.writers if arm.writers is None else arm.writers)
-    vary = config.vary | arm.vary
-    return replace(config, glyphs=glyphs, parts=study.parts, sampling=arm.sampling, vary=vary)
+    if glyphs.known:
+        glyphs = replace(glyphs, redrawn=study.redrawn)
+    return replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
 
 
 def _simulate(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset | None:

@@ -77,8 +77,8 @@ class Study:
     characters are not even read."""
     writers: int = 11
     """Writers of the simulated characters, 36 objects each."""
-    parts: int = 1
-    """Parts of the pass, one of which each simulated object shows."""
+    redrawn: int = 0
+    """How often the calibrated simulation draws each known target of the captures again."""
     simulation: Simulation | None = None
     """What an uncalibrated arm is pre-trained on; None is the default simulation."""
     calibration: Calibration = field(default_factory=Calibration)

@@ -15,9 +15,10 @@ from evnlos.errors import ConfigError
 from evnlos.scene.emnist import list_emnist, read_emnist_images
 from evnlos.scene.fonts import FONT_SUFFIXES, Font, find_font
 from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, check_size, fit_to_plate, render_glyph
-from evnlos.scene.handwriting import Strokes, nist_like
+from evnlos.scene.handwriting import Strokes, nist_like, redrawn
 from evnlos.scene.nist_sd19 import list_sd19, read_sd19_image
 from evnlos.scene.target import Target
+from evnlos.untrusted import open_image
 
 ObjectId: TypeAlias = str
 """Name of an object, e.g. "writer03_A": unique, stable, and a file name on any file system."""
@@ -77,6 +78,9 @@ class HandwritingGlyphs:
         characters: Characters that each writer writes.
         strokes: Base faces and pens.
         plate: The plate that carries a character.
+        known: Folder with pictures of known targets of this plate's size, NAME.png; "" = none.
+        redrawn: How often each known target is drawn again, as by another hand (see `redrawn`); these objects
+            come after those of the writers.
     """
 
     kind: Literal["nist-like"] = "nist-like"
@@ -85,18 +89,28 @@ class HandwritingGlyphs:
     characters: str = UPPER_CASE
     strokes: Strokes = field(default_factory=Strokes)
     plate: Plate = field(default_factory=Plate)
+    known: str = ""
+    redrawn: int = 0
 
     def __post_init__(self) -> None:
         _check_characters(self.characters)
+        if self.redrawn < 0 or (self.redrawn and not self.known):
+            raise ConfigError(f"redrawn is {self.redrawn}; give 0, or a number and a folder of `known` targets")
         if self.writers < 1 or self.first_writer < 0:
             raise ConfigError(f"writers {self.first_writer} + {self.writers}; give 1 writer or more, from 0 on")
 
     def objects(self) -> list[ObjectId]:
-        """Return the names of all objects, writer by writer, e.g. "writer03_A"."""
-        return list(_handwriting_index(self))
+        """Return the names of all objects, writer by writer, e.g. "writer03_A", then e.g. "redrawn03_A"."""
+        known = _known_targets(self.known) if self.redrawn else {}
+        again = [f"redrawn{k:02d}_{name}" for k in range(self.redrawn) for name in known]
+        return [*_handwriting_index(self), *again]
 
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one writer's character; the seed fixes the population of writers."""
+        hand, _, name = object_id.partition("_")
+        if self.redrawn and hand.startswith("redrawn"):
+            drawing = _look_up(_known_targets(self.known), name)
+            return Target(object_id, redrawn(drawing, name, int(hand[7:]), seed), self.plate.size_m)
         writer, char = _look_up(_handwriting_index(self), object_id)
         mask = nist_like(writer, char, seed, self.plate.size_px, self.plate.fraction(char), self.strokes)
         return Target(object_id, mask, self.plate.size_m)
@@ -233,6 +247,20 @@ class EmnistGlyphs:
 def _handwriting_index(glyphs: HandwritingGlyphs) -> dict[ObjectId, tuple[int, str]]:
     writers = range(glyphs.first_writer, glyphs.first_writer + glyphs.writers)
     return {f"writer{w:02d}_{character_name(c)}": (w, c) for w in writers for c in glyphs.characters}
+
+
+@lru_cache(maxsize=4)
+def _known_targets(folder: str) -> dict[str, NDArray[np.float32]]:
+    found = {}
+    for path in sorted(Path(folder).glob("*.png")):
+        try:
+            with open_image(path) as image:
+                found[path.stem] = np.asarray(image.convert("L"), np.float32) / 255
+        except OSError as error:
+            raise ConfigError(f"{path}: {error}; give pictures of known targets") from None
+    if not found:
+        raise ConfigError(f"{folder} holds no pictures NAME.png of known targets; name the folder that does")
+    return found
 
 
 @lru_cache(maxsize=16)

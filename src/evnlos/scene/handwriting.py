@@ -34,6 +34,7 @@ PEN = (0.06, 0.18)
 """Pen width as a part of the glyph's longer side: from a ball-point pen to a marker."""
 
 _SLANT_DEG = (-18.0, 14.0)  # the base faces lean to the right themselves, by 0 to 10 degrees
+_REDRAWN_SLANT_DEG = (-14.0, 14.0)
 _ASPECT = (0.80, 1.25)
 _HEIGHT = (0.85, 1.0)
 _WAVES = 4  # cosines a direction and axis of the elastic deformation
@@ -183,6 +184,40 @@ def nist_like(
     thicken = max((pen - now) / 2, -0.22 * now)
     distance = signed_distance(drawn, reach=int(np.ceil(abs(thicken))) + 3)
     return _to_plate(np.clip(thicken - distance + 0.5, 0.0, 1.0), size_px, room)
+
+
+def redrawn(drawing: NDArray[np.float32], name: str, number: int, seed: int) -> NDArray[np.float32]:
+    """Draw a known drawing again as another hand might: other slant, proportions, bend and pen.
+
+    Args:
+        drawing: Bright ink on dark ground, square [S, S], 0..1.
+        name: Its name.
+        number: Number of the hand; the picture depends on (seed, name, number) and on the drawing alone.
+        seed: Seed of the population.
+
+    Returns:
+        float32 [S, S], 0..1, centred by its bounding box, at most as large as the drawing.
+
+    Raises:
+        DataError: The drawing has no ink.
+    """
+    rng = _random(seed, "redrawn", name, number)
+    page = Image.fromarray(np.asarray(drawing, np.float32)).resize((_WORK_PX, _WORK_PX))
+    base = np.asarray(page, dtype=np.float32)
+    slant = np.tan(np.radians(_between(_REDRAWN_SLANT_DEG, rng.random())))
+    tilt = np.radians(_between((-6.0, 6.0), rng.random()))
+    turn = np.array([[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]])
+    shape = turn @ np.array([[1.0, -slant], [0.0, 1.0]]) @ np.diag([_between(_ASPECT, rng.random()), 1.0])
+    waves = _waves(rng, _HAND_BEND)
+    left, top, right, bottom = ink_box(base)
+    room = max(right - left, bottom - top) * _between((0.88, 1.0), rng.random())
+    left, top, right, bottom = ink_box(_deform(base, 0.5 * shape, waves, (0.0, 0.0), _CANVAS_PX))
+    growth = 0.5 * room / max(right - left, bottom - top)
+    middle = 2 * growth * np.array([(left + right) / 2, (top + bottom) / 2])
+    drawn = _deform(base, growth * shape, waves, (-middle[0], -middle[1]), _CANVAS_PX)
+    thicken = pen_px(drawn) * _between((-0.12, 0.12), rng.random())
+    distance = signed_distance(drawn, reach=int(np.ceil(abs(thicken))) + 3)
+    return _to_plate(np.clip(thicken - distance + 0.5, 0.0, 1.0), len(drawing), room)
 
 
 def _to_plate(ink: NDArray[np.float32], size_px: int, room: float) -> NDArray[np.float32]:

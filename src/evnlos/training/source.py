@@ -172,7 +172,7 @@ class Live:
         self._modality = modality
         self._size, self._seed = batch_size // team.size, seed
         self._objects = len(names) // team.size
-        self.steps = -(-self._objects * dataset.simulation.positions_each // self._size)
+        self.steps = -(-self._objects * dataset.simulation.positions // self._size)
 
     def batches(self, epoch: int) -> Iterator[Batch]:
         """Yield the batches that this process makes in an epoch."""
@@ -189,7 +189,7 @@ class Live:
             shuffled = torch.randperm(len(inputs), generator=order).to(inputs.device)
             full = len(inputs) if number == len(names) else len(inputs) // self._size * self._size
             for mine in shuffled[:full].split(self._size):
-                weight = len(mine) / (self._objects * self._dataset.simulation.positions_each)
+                weight = len(mine) / (self._objects * self._dataset.simulation.positions)
                 yield Batch(inputs[mine], truth[mine], 1 / self._team.size, weight)
             held = [(inputs[shuffled[full:]], truth[shuffled[full:]])]
 
@@ -200,7 +200,7 @@ class Live:
 
     def some(self, count: int) -> Samples:
         """Return the samples of the first objects of the first epoch, of as many as `count` allows."""
-        objects = max(1, min(len(self._names), count // self._dataset.simulation.positions_each))
+        objects = max(1, min(len(self._names), count // self._dataset.simulation.positions))
         names = self._names[:: max(1, len(self._names) // objects)][:objects]  # some of every hand
         made = list(self._dataset.stream(names, 0, self._modality, self._team.device))
         inputs, truth = (torch.cat(parts).cpu() for parts in zip(*made, strict=True))
