@@ -29,9 +29,9 @@ dist: $(READY)
 	rm -rf dist build packages/*/build
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist . ./packages/evnlos-weights
 	$(BIN)/python -c "import glob, os, zipfile; names = set(zipfile.ZipFile(glob.glob('dist/evnlos-*.whl')[0]).namelist()); \
-	  lost = [n for n in ('evnlos/py.typed', 'evnlos/live/page.html', 'evnlos/app/page.css', 'evnlos/app/page.js', \
+	  lost = [n for n in ('evnlos/py.typed', 'evnlos/__init__.pyi', 'evnlos/live/page.html', 'evnlos/app/page.css', 'evnlos/app/page.js', \
 	  'evnlos/app/opening.js', \
-	  'evnlos/report/style.css', 'evnlos/evaluation/classifier.safetensors') if n not in names]; assert not lost, lost; \
+	  'evnlos/report/style.css', 'evnlos/analysis/classifier.safetensors') if n not in names]; assert not lost, lost; \
 	  size = os.path.getsize(glob.glob('dist/evnlos-*.whl')[0]); assert size < 10e6, f'the wheel has {size / 1e6:.1f} MB'; \
 	  names = set(zipfile.ZipFile(glob.glob('dist/evnlos_weights-*.whl')[0]).namelist()); \
 	  lost = [n for n in ('SHA256SUMS', 'near-frame.safetensors', 'near.yaml') if f'evnlos_weights/{n}' not in names]; assert not lost, lost"

@@ -19,7 +19,7 @@ from collections.abc import Callable
 
 import torch
 
-from evnlos.transport.angular_spectrum import angular_spectrum, transfer_function
+from evnlos.optics.angular_spectrum import angular_spectrum, transfer_function
 
 PITCH, WAVELENGTH, DISTANCE, WAIST = 10e-6, 500e-9, 0.4, 0.3e-3
 TITLES = (

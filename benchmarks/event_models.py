@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evnlos.sensor import BrownianPixel, CircuitPixel, EventPixel, ReadoutPixel, simulate_events
+from evnlos.cameras import BrownianPixel, CircuitPixel, EventPixel, ReadoutPixel, simulate_events
 from machine import machine
 
 HEIGHT, WIDTH, STEPS = 96, 128, 500

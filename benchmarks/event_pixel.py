@@ -30,13 +30,12 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from evnlos.dataset.presets import paper
+from evnlos.cameras import EventCamera, EventPixel, simulate_batch, simulate_events
+from evnlos.cameras.simulation import Mode
+from evnlos.data.simulations import paper
+from evnlos.optics import Wall as CameraWall
 from evnlos.scene import Scene
-from evnlos.seeds import derive_seed
-from evnlos.sensor import EventCamera, EventPixel, simulate_batch, simulate_events
-from evnlos.sensor.stream import Mode
-from evnlos.transport import Wall as CameraWall
-from evnlos.types import Events
+from evnlos.types import Events, derive_seed
 from machine import machine
 
 PAPER = EventPixel()

@@ -30,10 +30,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from evnlos.dataset import NlosDataset, open_dataset
-from evnlos.model import Confidence, Weights, halves_of, load_weights, plates
-from evnlos.model.confidence import COVERAGE
-from evnlos.training.confidence import fit_confidence
+from evnlos.data import NlosDataset, open_dataset
+from evnlos.models import Confidence, Weights, halves_of, load_weights, plates
+from evnlos.models.confidence import COVERAGE
+from evnlos.training.validation import fit_confidence
 
 _GAUSSIAN = 1.645  # standard deviations that hold nine tenths
 _FLOOR = 0.003  # of the variance of an unsure pixel, as data consistency has it

@@ -13,11 +13,11 @@ blocks of the wall; r is Pearson's correlation of the found change with the true
 import numpy as np
 import torch
 
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera
+from evnlos.inverse import Gradient, LogChange, log_change, tikhonov
+from evnlos.optics import MatrixTransport
 from evnlos.scene import HandwritingGlyphs, Scene
-from evnlos.sensor import EventCamera, EventPixel, FrameCamera
 from evnlos.setups import RadiometricSetup
-from evnlos.solver import Gradient, LogChange, log_change, tikhonov
-from evnlos.transport import MatrixTransport
 
 SHAPE = (30, 48)
 TIMES_S = (3.6, 4.4)

@@ -30,14 +30,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from evnlos.dataset import STANDARD_MODALITIES, Sampling
+from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.live.chunk import Source
 from evnlos.live.engine import Engine
 from evnlos.live.packet import USUAL_EVENTS, Packet, pack
-from evnlos.live.replay import Replay, TimedFrame
 from evnlos.live.run import Pace, Run
+from evnlos.live.sources import Replay, TimedFrame
 from evnlos.live.udp import UdpSource
-from evnlos.model import UNetConfig, Weights, load_weights
+from evnlos.models import UNetConfig, Weights, load_weights
 from evnlos.types import Events
 from machine import machine
 

@@ -22,16 +22,17 @@ from typing import Any
 
 import torch
 
-from evnlos.dataset import Simulation, live_dataset, on_device, open_dataset, simulate, simulate_object
+from evnlos.cameras import V2ePixel
+from evnlos.data import Simulation, live_dataset, open_dataset, simulate, simulate_object
+from evnlos.data import live as on_device
 from evnlos.scene import HandwritingGlyphs
-from evnlos.sensor import V2ePixel
 from evnlos.setups import PaperSetup
 from evnlos.training import Training, train
 from machine import machine
 
 STEP_S = 0.002
 STAGES = {
-    (import_module("evnlos.sensor.record_tensors"), "record_tensors"): "render, event pixels",
+    (import_module("evnlos.cameras.on_device"), "record_tensors"): "render, event pixels",
     (on_device, "capture_tensors"): "frames",
     (on_device, "time_surface_tensors"): "surfaces",
     (on_device, "_reduced"): "maps",

@@ -16,9 +16,9 @@ import torch
 
 from evnlos import FrameCamera
 from evnlos.calibration.scan import ScanPlan, import_scan, rehearse_scan, write_plan
-from evnlos.solver import read_photograph
-from evnlos.solver.inversion import Inversion, chosen_degree
-from evnlos.transport import MatrixTransport
+from evnlos.inverse import read_photograph
+from evnlos.inverse.inversion import Inversion, chosen_degree
+from evnlos.optics import MatrixTransport
 
 PITCH = 0.02
 torch.set_num_threads(1)

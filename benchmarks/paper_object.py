@@ -21,13 +21,13 @@ from pathlib import Path
 import torch
 from numpy.typing import ArrayLike
 
-from evnlos.dataset import Simulation, make_samples
-from evnlos.dataset.presets import paper
-from evnlos.dataset.sampling import edges_from
+from evnlos.cameras import EventCamera
+from evnlos.data import Simulation, make_samples
+from evnlos.data.sampling import edges_from
+from evnlos.data.simulations import paper
+from evnlos.optics import Wall
 from evnlos.scene import Scene
-from evnlos.sensor import EventCamera
 from evnlos.threads import one_thread
-from evnlos.transport import Wall
 from machine import machine
 
 PARTS = ("events", "frames", "maps")

@@ -18,10 +18,10 @@ import time
 import numpy as np
 import torch
 
-from evnlos.dataset import STANDARD_MODALITIES, Sampling
-from evnlos.dataset.sampling import make_samples
-from evnlos.evaluation import StreamingReconstructor, reconstruct
-from evnlos.model import UNetConfig, Weights, load_weights
+from evnlos.analysis import StreamingReconstructor, reconstruct
+from evnlos.data import STANDARD_MODALITIES, Sampling
+from evnlos.data.sampling import make_samples
+from evnlos.models import UNetConfig, Weights, load_weights
 from evnlos.scene import LineMotion
 from evnlos.types import Events
 from machine import machine

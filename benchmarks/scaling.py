@@ -24,11 +24,11 @@ from pathlib import Path
 
 import numpy as np
 
-from evnlos.dataset import SensorSize, Simulation, simulate, simulate_object
-from evnlos.dataset.presets import default, paper
-from evnlos.plot.figure import new_figure
+from evnlos.cameras import EventPixel
+from evnlos.data import SensorSize, Simulation, simulate, simulate_object
+from evnlos.data.simulations import default, paper
+from evnlos.plot.figures import new_figure
 from evnlos.scene import HandwritingGlyphs
-from evnlos.sensor import EventPixel
 from evnlos.setups import PaperSetup
 from evnlos.threads import one_thread
 from machine import machine

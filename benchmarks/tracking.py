@@ -15,10 +15,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.errors import EvnlosError
 from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion, Scene
-from evnlos.scene.distance import signed_distance
-from evnlos.sensor import EventCamera, EventPixel, FrameCamera
+from evnlos.scene.handwriting import signed_distance
 from evnlos.setups import RadiometricSetup
 from evnlos.tracking import Tracking, track_frames
 

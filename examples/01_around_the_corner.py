@@ -11,15 +11,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from evnlos import EventCamera, EventPixel, FrameCamera, Sampling, Scene, Target, psnr, time_surface
+from evnlos import EventCamera, EventPixel, FrameCamera, Scene, Target, psnr, time_surface
+from evnlos.data import Sampling
+from evnlos.inverse import JointProblem, PlatePass
+from evnlos.inverse.joint import strip_gram_of
+from evnlos.inverse.measurements import object_light
 from evnlos.plot.event_views import signed_pictures, slice_pictures
-from evnlos.plot.film import Column, film
+from evnlos.plot.figures import Column, film
 from evnlos.report.pictures import grey, save_animation
 from evnlos.scene import FontGlyphs
 from evnlos.setups import load_setup
-from evnlos.solver import JointProblem, PlatePass
-from evnlos.solver.plate_pass import strip_gram_of
-from evnlos.solver.recording import object_light
 from evnlos.types import Plane
 
 SHAPE, CANVAS = (40, 64), Sampling()

@@ -12,8 +12,8 @@ import sys
 import numpy as np
 import torch
 
-from evnlos.plot.kernel import CURVES, cosine_law, draw_kernel
-from evnlos.transport import tpsf_profile
+from evnlos.optics import tpsf_profile
+from evnlos.plot.setup import CURVES, cosine_law, draw_kernel
 
 rho = np.linspace(0, 2, 201)
 print("<l>/t   H(0)     half at rho/t   cos^3 at t - <l>: largest difference   best height   then")

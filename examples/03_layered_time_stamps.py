@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 from evnlos import EventPixel, simulate_events
-from evnlos.plot.layers import draw_time_stamps, share_on_frame_times
+from evnlos.plot.setup import draw_time_stamps, share_on_frame_times
 
 # Two soft spots pass by each other on a wall of 40 DN; a frame every millisecond, the paper's pixel, no noise.
 times_s = np.arange(121) * 1e-3

@@ -1,6 +1,6 @@
 """From events alone, find the thresholds and the cutoff of the pixel that sent them.
 
-The wall video is known, the pixel is not. The soft counts of `evnlos.sensor.surrogate` have gradients with
+The wall video is known, the pixel is not. The soft counts of `evnlos.cameras.surrogate` have gradients with
 respect to the pixel, so a few steps of L-BFGS fit them to the counted events, from a start that is wrong by a
 factor of two.
 """
@@ -8,8 +8,8 @@ factor of two.
 import numpy as np
 import torch
 
-from evnlos.sensor import EventPixel, simulate_events
-from evnlos.sensor.surrogate import soft_counts, soft_events
+from evnlos.cameras import EventPixel, simulate_events
+from evnlos.cameras.surrogate import soft_counts, soft_events
 
 STEP_S, BINS = 6e-3, 6
 TRUE = {"threshold_on": 0.17, "threshold_off": 0.13, "cutoff_hz": 25.0}

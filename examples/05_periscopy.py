@@ -11,9 +11,9 @@ import sys
 import numpy as np
 
 from evnlos.cli.invert import correlation
-from evnlos.plot.inversion import draw_inversion
-from evnlos.solver import Background, Gradient, Problem, prepare_inversion, read_photograph, tikhonov
-from evnlos.solver.spectrum import Spectrum
+from evnlos.inverse import Background, Gradient, Problem, prepare_inversion, read_photograph, tikhonov
+from evnlos.inverse.tikhonov import Spectrum
+from evnlos.plot.results import draw_inversion
 
 if len(sys.argv) < 2:
     print("nothing done: give an NPZ file with a photograph, its geometry and its truth, see docs/inversion.md")

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 from evnlos import EventPixel, simulate_events
-from evnlos.sensor import BrownianPixel, CircuitPixel, ReadoutPixel, V2ePixel
+from evnlos.cameras import BrownianPixel, CircuitPixel, ReadoutPixel, V2ePixel
 
 # A soft edge of contrast 3 runs over the rows at 400 px/s, then nothing happens; a frame every millisecond.
 times_s = np.arange(301) * 1e-3

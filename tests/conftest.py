@@ -45,7 +45,7 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def tiny():
     """Settings of a simulation that takes a second: 16 objects, 8 positions each, a small sensor."""
-    from evnlos.dataset import Sampling, SensorSize, Simulation
+    from evnlos.data import Sampling, SensorSize, Simulation
     from evnlos.scene import HandwritingGlyphs
     from evnlos.setups import PaperSetup
 
@@ -64,7 +64,7 @@ def tiny():
 @pytest.fixture(scope="session")
 def tiny_dataset(tiny, tmp_path_factory):
     """A simulated dataset on disk that tests only read."""
-    from evnlos.dataset import simulate
+    from evnlos.data import simulate
 
     return simulate(tiny, tmp_path_factory.mktemp("tiny") / "simulation")
 
@@ -72,8 +72,8 @@ def tiny_dataset(tiny, tmp_path_factory):
 @pytest.fixture(scope="session")
 def tiny_captures(tmp_path_factory) -> list[Path]:
     """Four rendered captures of a small sensor, without any installed font."""
-    from evnlos.dataset import SensorSize
-    from evnlos.dataset.lab import Lab, render_captures
+    from evnlos.data import SensorSize
+    from evnlos.data.lab import Lab, render_captures
     from evnlos.scene import FontGlyphs
     from evnlos.setups import RadiometricSetup
 
@@ -88,9 +88,7 @@ def tiny_captures(tmp_path_factory) -> list[Path]:
 @pytest.fixture(scope="session")
 def app_pass():
     """A pass that the page simulates, at the smallest size."""
-    from evnlos.app.controls import Controls
-    from evnlos.app.hidden import picked
-    from evnlos.app.recorded import simulate_pass
+    from evnlos.app.controls import Controls, picked, simulate_pass
 
     return simulate_pass(Controls(columns=24), picked("R"))
 
@@ -100,8 +98,8 @@ def app_weights(tmp_path_factory) -> dict[str, Path]:
     """Untrained weights of two modalities, for maps of the page's smallest size."""
     import torch
 
-    from evnlos.dataset import Sampling
-    from evnlos.model import UNetConfig, Weights, save_weights
+    from evnlos.data import Sampling
+    from evnlos.models import UNetConfig, Weights, save_weights
 
     folder = tmp_path_factory.mktemp("weights")
     sampling, found = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12), {}

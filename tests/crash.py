@@ -255,8 +255,8 @@ def quick_commands(folder: Path) -> list[Command]:
 def all_commands(folder: Path) -> list[Command]:
     """Return all commands, on inputs that are made in a folder."""
     from evnlos.config import save_yaml
-    from evnlos.dataset import FixedPattern, Sampling, SensorSize, Simulation, save_pattern
-    from evnlos.dataset.lab import Lab, render_captures
+    from evnlos.data import FixedPattern, Sampling, SensorSize, Simulation, save_pattern
+    from evnlos.data.lab import Lab, render_captures
     from evnlos.scene import FontGlyphs, HandwritingGlyphs
     from evnlos.setups import PaperSetup, RadiometricSetup
 

@@ -8,8 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.sensor._exact_send import DIM_MAX
-from evnlos.sensor._random import (
+from evnlos.cameras.pixel import EventPixel
+from evnlos.cameras.pixels.arrays import pixel_thresholds
+from evnlos.cameras.pixels.continuous import DIM_MAX
+from evnlos.cameras.random_numbers import (
     BLOCK,
     STREAM_LEAK_PHASE,
     STREAM_LEAK_RATE,
@@ -21,8 +23,6 @@ from evnlos.sensor._random import (
     random_normal,
     random_uniform,
 )
-from evnlos.sensor._tiles import pixel_thresholds
-from evnlos.sensor.pixel import EventPixel
 
 Event = tuple[float, int, int]
 """Time in seconds, flat pixel index, polarity +1 or -1."""

@@ -42,8 +42,8 @@ from evnlos.events import (
     write_aedat4,
     write_events,
 )
-from evnlos.events.io import aedat4
-from evnlos.events.io.report import ReadReport
+from evnlos.events.files import aedat4
+from evnlos.events.files.columns import ReadReport
 from evnlos.types import Events
 
 _SLOW_S = 10.0

@@ -45,21 +45,20 @@ import yaml
 from PIL import Image
 from safetensors.torch import load, save
 
-from evnlos import EvnlosError, Simulation, Training, UNetConfig, load_weights, read_events, write_events
+from evnlos import EvnlosError, read_events, write_events
 from evnlos.app.upload import read_upload
+from evnlos.cameras.video import open_video
 from evnlos.config import load_yaml, read_yaml, to_dict
-from evnlos.dataset import Sampling, load_pattern, read_capture, read_shard
-from evnlos.dataset.lab import Lab
-from evnlos.events.recording import Recording
-from evnlos.events.summary import summarise
+from evnlos.data import Sampling, Simulation, load_pattern, read_capture, read_shard
+from evnlos.data.lab import Lab
+from evnlos.events.recording import Recording, summarise
+from evnlos.inverse.inversion import read_photograph
 from evnlos.live.engine import Engine
 from evnlos.live.packet import Packet, pack
 from evnlos.live.udp import UdpSource
-from evnlos.model import Weights, save_weights
-from evnlos.sensor.video import open_video
-from evnlos.setups.fitted_file import WALL
-from evnlos.setups.measured_file import MEASUREMENT
-from evnlos.solver.photograph import read_photograph
+from evnlos.models import UNetConfig, Weights, load_weights, save_weights
+from evnlos.setups.files import MEASUREMENT, WALL
+from evnlos.training import Training
 from evnlos.types import Events
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -361,7 +360,7 @@ def weights(draw: random.Random, at: Path, material: Material) -> Callable[[], o
         path.write_bytes(save(tensors, metadata={"evnlos": json.dumps(about)}))
 
     def described() -> object:
-        from evnlos.cli.weights import describe, to_text
+        from evnlos.cli.learning import describe, to_text
 
         return to_text("w", describe(load_weights(path)))
 

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import DataError
-from evnlos.interop.mitsuba import trace
+from evnlos.interop import trace
+from evnlos.optics import light_transport_matrix
 from evnlos.setups import RadiometricSetup
-from evnlos.transport import light_transport_matrix
 from evnlos.types import Plane
 
 

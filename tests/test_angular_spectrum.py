@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from scipy.special import fresnel
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.transport import (
+from evnlos.optics import (
     angular_spectrum,
     blur_radius_px,
     fresnel_number,
     rayleigh_sommerfeld_sum,
     sampling_limit_m,
 )
-from evnlos.transport.angular_spectrum import transfer_function
+from evnlos.optics.angular_spectrum import transfer_function
 
 WAVELENGTH = 500e-9
 

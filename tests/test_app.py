@@ -21,20 +21,14 @@ import pytest
 
 import chromium
 from evnlos import Events, hosts
-from evnlos.app.controls import Controls
-from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
-from evnlos.app.middleware import middleware
-from evnlos.app.networks import Networks, own_networks
-from evnlos.app.recorded import simulate_pass
-from evnlos.app.serve import Server, running
-from evnlos.app.sheet import message_box
-from evnlos.app.solving import from_each_frame, from_weights, from_whole_pass
-from evnlos.app.verdict import verdict_on
-from evnlos.app.views import event_views, found_views, seen_views
-from evnlos.app.work import simulated
-from evnlos.dataset import Sampling
+from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, drawn, picked, simulate_pass
+from evnlos.app.page import simulated
+from evnlos.app.serve import Server, middleware, running
+from evnlos.app.solving import Networks, from_each_frame, from_weights, from_whole_pass, own_networks
+from evnlos.app.views import event_views, found_views, message_box, seen_views, verdict_on
+from evnlos.data import Sampling
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
-from evnlos.model import load_weights
+from evnlos.models import load_weights
 from evnlos.plot.event_views import CloudSize, cloud_pictures, signed_pictures, smaller, time_slices
 
 SMALL = Controls(columns=24)
@@ -376,7 +370,7 @@ def test_the_page_may_not_be_framed() -> None:
 
 
 def test_messages_name_no_folder_of_this_machine(tmp_path) -> None:
-    from evnlos.app.work import uploaded
+    from evnlos.app.page import uploaded
 
     folder = tmp_path / ("a" * 64)
     folder.mkdir()

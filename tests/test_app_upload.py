@@ -10,13 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from evnlos.app.networks import Networks
-from evnlos.app.unpack import MOST_FILES, unpack_zip
-from evnlos.app.upload import read_upload, read_upload_apart
-from evnlos.app.work import uploaded
+from evnlos.app.page import uploaded
+from evnlos.app.solving import Networks
+from evnlos.app.upload import MOST_FILES, read_upload, read_upload_apart, unpack_zip
 from evnlos.errors import DataError
 from evnlos.events import write_events
-from evnlos.model import load_weights
+from evnlos.models import load_weights
 
 MB = 1_000_000
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from evnlos.cameras import BrownianPixel, EventStream, simulate_events
 from evnlos.errors import ConfigError
-from evnlos.sensor import BrownianPixel, EventStream, simulate_events
 
 NOISY = BrownianPixel.voltmeter(1.0, 20.0, 0.01, 1e-15, 0.0, 0.001)
 """sigma = 1.833e-3 thresholds per sqrt(us) at 100 DN, practically no drift: 3.361 Hz."""

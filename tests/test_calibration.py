@@ -26,21 +26,18 @@ from evnlos.calibration import (
     warnings_of,
     write_rig,
 )
-from evnlos.calibration.event_check import _block_counts
 from evnlos.calibration.event_fit import shortest_interval_s
-from evnlos.calibration.event_statistics import count_map, read_recordings, within
-from evnlos.calibration.frame_model import FrameModel, working_shape
-from evnlos.calibration.frame_noise import fit_frame_noise
-from evnlos.calibration.least_squares import levenberg_marquardt
-from evnlos.calibration.transport_fit import values_of
+from evnlos.calibration.event_statistics import _block_counts, count_map, read_recordings, within
+from evnlos.calibration.frame_model import FrameModel, fit_frame_noise, working_shape
+from evnlos.calibration.transport_fit import levenberg_marquardt, values_of
+from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
-from evnlos.dataset import load_pattern
-from evnlos.dataset.lab import Lab, render_captures
-from evnlos.dataset.simulate import SensorSize, Simulation, simulate_object
+from evnlos.data import load_pattern
+from evnlos.data.lab import Lab, render_captures
+from evnlos.data.simulate import SensorSize, Simulation, simulate_object
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs, pen_width
-from evnlos.sensor import EventPixel, FrameCamera
 from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.types import Events
 

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
-from evnlos.dataset import capture_samples, character_of, read_shard, reduce_by_area
-from evnlos.dataset.sampling import Sampling
+from evnlos.data import capture_samples, character_of, read_shard, reduce_by_area
+from evnlos.data.sampling import Sampling
 from evnlos.errors import DataError
 from watching import Watch, stopped
 

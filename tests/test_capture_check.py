@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from evnlos.cli import main
-from evnlos.dataset import read_capture
-from evnlos.dataset.capture_check import check_capture
-from evnlos.dataset.capture_info import read_capture_info
-from evnlos.dataset.capture_template import begin_capture
-from evnlos.dataset.clock_check import expected_counts
-from evnlos.dataset.lab import Lab, render_captures
-from evnlos.dataset.simulate import SensorSize
+from evnlos.data import read_capture
+from evnlos.data.capture_check import check_capture
+from evnlos.data.capture_info import begin_capture, read_capture_info
+from evnlos.data.clocks import expected_counts
+from evnlos.data.lab import Lab, render_captures
+from evnlos.data.simulate import SensorSize
 from evnlos.errors import DataError
 from evnlos.scene import FontGlyphs
 from evnlos.setups import RadiometricSetup

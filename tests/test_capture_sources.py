@@ -9,8 +9,8 @@ import yaml
 from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
-from evnlos.dataset import check_picture, read_shard
-from evnlos.dataset.registration import homography_from_points
+from evnlos.data import check_picture, read_shard
+from evnlos.data.registration import homography_from_points
 from evnlos.events import write_aedat4, write_celex_frames, write_events
 from evnlos.types import Events
 
@@ -266,7 +266,7 @@ def test_what_does_not_fit_is_one_line(what, tmp_path):
 
 def test_the_example_of_the_manual_is_a_description():
     from evnlos.config import from_dict
-    from evnlos.dataset import CaptureInfo
+    from evnlos.data import CaptureInfo
 
     text = (Path(__file__).parent.parent / "docs" / "own_camera.md").read_text()
     info = from_dict(CaptureInfo, yaml.safe_load(text.split("```yaml")[1].split("```")[0]))

@@ -9,14 +9,14 @@ import torch
 
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import NlosDataset, Sampling, SensorSize, Simulation
+from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation
 from evnlos.errors import DataError
 from evnlos.experiment.carry_over import carry_over, sets
-from evnlos.model import UNetConfig, Weights, save_weights
+from evnlos.models import UNetConfig, Weights, save_weights
 from evnlos.scene import DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.training.confidence import fit_confidence
+from evnlos.training.validation import fit_confidence
 
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
 RIG = Simulation(

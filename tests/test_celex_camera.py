@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from evnlos.cameras import CelexCamera, EventPixel, ReadoutPixel
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import read_events, read_frames, write_celex_frames, write_events
-from evnlos.sensor import CelexCamera, EventPixel, ReadoutPixel
 
 PIXEL = EventPixel(0.1, 0.1, 0.0, 0.0, 0.0, 0.0, logarithm="true", dark_dn=0.01)
 CLEAN = CelexCamera(

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 
+from evnlos.cameras import BrownianPixel, CircuitPixel, simulate_events
 from evnlos.errors import ConfigError
-from evnlos.sensor import BrownianPixel, CircuitPixel, simulate_events
 
 PLAIN = CircuitPixel(threshold_sigma=0.0, leak_rate_hz=0.0)
 CURRENTS = (1e-15, 1e-14, 1e-13, 1e-12, 1e-11)

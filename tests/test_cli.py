@@ -13,7 +13,7 @@ from PIL import Image
 from evnlos import open_dataset
 from evnlos.cli import VERBS, main
 from evnlos.config import save_yaml
-from evnlos.model import published_for
+from evnlos.models import published_for
 
 NETWORK = ["--network.width", "8", "--network.depth", "2"]
 
@@ -260,7 +260,7 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp
 
 def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkeypatch) -> None:
     from evnlos import demo
-    from evnlos.dataset import SensorSize
+    from evnlos.data import SensorSize
     from evnlos.scene import HandwritingGlyphs
 
     few = replace(

@@ -9,14 +9,13 @@ import pytest
 from PIL import Image
 
 from evnlos import Events, read_events, write_events
+from evnlos.cameras import EventPixel, pixel_preset, simulate_events
+from evnlos.cameras.video import open_video
 from evnlos.cli.events import PixelChanges
 from evnlos.config import to_dict
 from evnlos.events import EventWriter, keep_known_polarity
-from evnlos.events.io.registry import FORMATS
-from evnlos.events.recording import Box, Cut, Recording
-from evnlos.events.summary import summarise
-from evnlos.sensor import EventPixel, pixel_preset, simulate_events
-from evnlos.sensor.video import open_video
+from evnlos.events.files.registry import FORMATS
+from evnlos.events.recording import Box, Cut, Recording, summarise
 from test_cli import call, fails
 from test_video import write_animation, write_container
 
@@ -361,7 +360,7 @@ def test_wrong_conversions_leave_nothing(tmp_path: Path, capsys, monkeypatch) ->
 def test_a_cut_does_not_depend_on_the_blocks(tmp_path: Path, size: int, monkeypatch) -> None:
     events = random_events(6000)
     write_events(tmp_path / "a.h5", events)
-    from evnlos.events.io.hdf5 import Hdf5Source
+    from evnlos.events.files.hdf5 import Hdf5Source
 
     blocks = Hdf5Source.blocks
     monkeypatch.setattr(Hdf5Source, "blocks", lambda self: blocks(self, size))

@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from evnlos import Training, UNetConfig, load_weights, train
+from evnlos import train
 from evnlos.cli import main
 from evnlos.errors import DataError
-from evnlos.model import published, published_for, save_weights
+from evnlos.models import UNetConfig, load_weights, published, published_for, save_weights
+from evnlos.training import Training
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import pytest
 from evnlos import EvnlosError
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import simulate
-from evnlos.dataset.cluster import run_on_dask
+from evnlos.data import simulate
+from evnlos.data.pool import run_on_dask
 from evnlos.progress import Step
 
 distributed = pytest.importorskip("distributed", reason='needs the extra "cluster"')

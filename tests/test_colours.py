@@ -10,8 +10,8 @@ from PIL import Image
 
 import evnlos
 from evnlos import Events
-from evnlos.events.colours import OFF_RGB, ON_HEX, ON_RGB, WORDS
-from evnlos.events.summary import summarise
+from evnlos.events.grids import OFF_RGB, ON_HEX, ON_RGB, WORDS
+from evnlos.events.recording import summarise
 from evnlos.plot.event_views import signed_pictures
 from evnlos.plot.preview import Look, preview_pictures
 from evnlos.report.pictures import polarity
@@ -64,7 +64,7 @@ def test_pictures_of_events_keep_the_grey_difference() -> None:
 
 def test_maps_of_either_sign_grow_lighter_all_the_way() -> None:
     pytest.importorskip("matplotlib")
-    from evnlos.plot.figure import signed_map
+    from evnlos.plot.figures import signed_map
 
     greys = [grey(255 * np.array(colour[:3])) for colour in signed_map()(np.linspace(0, 1, 41))]
     assert np.all(np.diff(greys) > 0)
@@ -84,7 +84,7 @@ def test_pages_and_modules_use_the_one_pair() -> None:
 def test_a_calibration_is_drawn_with_the_signed_map(tmp_path) -> None:
     pytest.importorskip("matplotlib")
     from evnlos.calibration import Example
-    from evnlos.plot.calibration import draw_calibration
+    from evnlos.plot.results import draw_calibration
 
     frame, draw = np.ones((8, 12)), np.random.default_rng(0)
     surfaces = draw.random((2, 2, 8, 12))

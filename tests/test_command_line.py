@@ -14,8 +14,8 @@ import pytest
 import evnlos
 from evnlos import Events, doctor, write_events
 from evnlos.cli import VERBS, main
-from evnlos.cli.completion import script
-from evnlos.cli.notes import say
+from evnlos.cli.about import script
+from evnlos.cli.parsing import say
 from evnlos.cli.verbs import command_of
 
 SOURCE = Path(evnlos.__file__).parent

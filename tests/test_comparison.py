@@ -10,12 +10,11 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from evnlos import EvnlosError
-from evnlos.dataset import Dataset, NlosDataset, Sampling, import_captures, read_shard, simulate
-from evnlos.evaluation.classifier import CHARACTERS, load_reader, read_characters
-from evnlos.evaluation.intervals import paired_difference
-from evnlos.evaluation.memory import compare_with_training
+from evnlos.analysis.evaluate import compare_with_training
+from evnlos.analysis.scores import CHARACTERS, load_reader, paired_difference, read_characters
+from evnlos.data import Dataset, NlosDataset, Sampling, import_captures, read_shard, simulate
 from evnlos.metrics import psnr
-from evnlos.model import plates
+from evnlos.models import plates
 from evnlos.scene import FontGlyphs, find_font
 from evnlos.types import Plane
 from train_classifier import train_reader
@@ -102,7 +101,7 @@ def stacked(images: torch.Tensor, samples: NlosDataset, dataset: Dataset) -> tup
 @pytest.mark.parametrize("together", [3, 128])
 def test_comparing_object_by_object_is_comparing_with_the_stack_of_all(together, tiny, tmp_path, monkeypatch):
     """Motions differ from object to object, so that images are moved by parts of a pixel."""
-    monkeypatch.setattr("evnlos.evaluation.memory._TOGETHER", together)
+    monkeypatch.setattr("evnlos.analysis.evaluate._TOGETHER", together)
     config = replace(tiny, validation=0.0, held_out="T", vary={"motion.speed_m_s": (0.015, 0.02)})
     dataset = simulate(config, tmp_path / "d")
     samples = NlosDataset(dataset, "test", "fusion")
@@ -131,8 +130,8 @@ def test_comparing_takes_memory_for_one_object_at_a_time(tmp_path) -> None:
 import resource, sys
 import numpy as np
 from pathlib import Path
-from evnlos.dataset import Dataset, NlosDataset, Sampling, Samples, write_shard
-from evnlos.evaluation.memory import compare_with_training
+from evnlos.data import Dataset, NlosDataset, Sampling, Samples, write_shard
+from evnlos.analysis.evaluate import compare_with_training
 folder, count = Path(sys.argv[1]), int(sys.argv[2])
 draw = np.random.default_rng(0)
 names = [f"o_{k:02d}" for k in range(count + 1)]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from evnlos.dataset import Sampling, SensorSize
+from evnlos.data import Sampling, SensorSize
 from evnlos.experiment import base_simulation, conditions, conditions_table, map_conditions
 from evnlos.experiment.conditions import FULL
 

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from evnlos.analysis import evaluate, reconstruct
+from evnlos.analysis.confidence import FrameOperator, explained, judgement_of, light_gain, risk_coverage
 from evnlos.cli import main
 from evnlos.config import load_yaml
-from evnlos.dataset import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate_object
+from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate_object
 from evnlos.errors import DataError
-from evnlos.evaluation import evaluate, reconstruct
-from evnlos.evaluation.consistency import FrameOperator
-from evnlos.evaluation.explained import explained, light_gain
-from evnlos.evaluation.worth import judgement_of, risk_coverage
-from evnlos.model import (
+from evnlos.models import (
     UNetConfig,
     UNetReconstructor,
     Weights,
@@ -24,11 +22,10 @@ from evnlos.model import (
     published_rig,
     save_weights,
 )
-from evnlos.model.confidence import COVERAGE
-from evnlos.model.plates import on_canvas
+from evnlos.models.confidence import COVERAGE, on_canvas
 from evnlos.report import reconstruct_capture
 from evnlos.setups import RadiometricSetup
-from evnlos.training.confidence import fit_confidence
+from evnlos.training.validation import fit_confidence
 from evnlos.types import Plane
 
 CANVAS = Plane(48, 96, 0.0025)

@@ -7,15 +7,15 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from evnlos.cameras import EventPixel, FrameCamera, PixelSettings
 from evnlos.config import config_hash, differing_keys, from_dict, load_yaml, save_yaml, to_dict
-from evnlos.dataset import Sampling, Simulation
-from evnlos.dataset.lab import Lab
-from evnlos.dataset.presets import PRESETS
-from evnlos.dataset.variation import varied
+from evnlos.data import Sampling, Simulation
+from evnlos.data.lab import Lab
+from evnlos.data.simulate import varied
+from evnlos.data.simulations import PRESETS
 from evnlos.errors import ConfigError, DataError
-from evnlos.model import ReconstructorSettings
+from evnlos.models import ReconstructorSettings
 from evnlos.scene import LineMotion
-from evnlos.sensor import EventPixel, FrameCamera, PixelSettings
 from evnlos.setups import RadiometricSetup, Setup
 from evnlos.training import Training, paper_finetuning, paper_pretraining
 

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from evnlos.dataset import Sampling, SensorSize, Simulation
+from evnlos.analysis.confidence import FrameOperator, consistent
+from evnlos.cameras import FrameCamera
+from evnlos.data import Sampling, SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
-from evnlos.evaluation.consistency import FrameOperator, consistent
 from evnlos.scene import Scene, Target
-from evnlos.sensor import FrameCamera
 from evnlos.setups import PaperSetup, RadiometricSetup
 
 SAMPLING = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12)
@@ -41,7 +41,7 @@ def test_the_operator_is_the_simulators_wall(operator) -> None:
     scene = Scene(Target("bar", mask.numpy(), 0.08), RIG.motion, 8.0)
     wall = RIG.setup.resized((20, 30)).observe(scene)
     light = wall.irradiance([4.0]).numpy()
-    from evnlos.dataset.sampling import reduce_by_area
+    from evnlos.data.sampling import reduce_by_area
 
     truth = torch.from_numpy(scene.target.rasterise(SAMPLING.canvas, scene.motion.position_m([4.0])))
     made = operator(truth)

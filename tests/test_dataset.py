@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
 from evnlos.config import save_yaml
-from evnlos.dataset import (
+from evnlos.data import (
     NlosDataset,
     Samples,
     Simulation,
@@ -29,13 +29,12 @@ from evnlos.dataset import (
     simulate,
     write_shard,
 )
-from evnlos.dataset.pool import run_tasks
-from evnlos.dataset.simulate import drawn_for, split_of
+from evnlos.data.pool import run_tasks
+from evnlos.data.simulate import drawn_for, split_of
 from evnlos.errors import ConfigError, DataError, EvnlosError
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
-from evnlos.training.source import Stored
-from evnlos.training.team import Team
+from evnlos.training.source import Stored, Team
 from watching import Watch, stopped
 
 
@@ -204,7 +203,7 @@ def test_memory_does_not_grow_with_the_dataset(tmp_path) -> None:
     code = """
 import resource, sys
 from pathlib import Path
-from evnlos.dataset import Dataset, NlosDataset, Sampling
+from evnlos.data import Dataset, NlosDataset, Sampling
 folder = Path(sys.argv[1])
 names = sorted(path.stem for path in folder.glob("*.h5"))
 data = Dataset(folder, "captures", Sampling(), {"train": names})
@@ -223,7 +222,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 def test_a_dataset_larger_than_the_memory_is_trained_on_from_disk(tiny_dataset, monkeypatch) -> None:
     team = Team(0, 1, torch.device("cpu"))
     held = Stored(NlosDataset(tiny_dataset, "train", "fusion"), 32, 5, team)
-    monkeypatch.setattr("evnlos.dataset.loader.free_memory", lambda: 1000)
+    monkeypatch.setattr("evnlos.data.loader.free_memory", lambda: 1000)
     samples = NlosDataset(tiny_dataset, "train", "fusion")
     read = Stored(samples, 32, 5, team)
     for one, other in zip(held.batches(3), read.batches(3), strict=True):

@@ -13,13 +13,13 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from evnlos import Training, UNetConfig, train
-from evnlos.dataset import NlosDataset, live_dataset
+from evnlos import train
+from evnlos.data import NlosDataset, live_dataset
 from evnlos.errors import ConfigError
-from evnlos.training import LOSSES
-from evnlos.training.loss import light_of
-from evnlos.training.source import Live, Stored
-from evnlos.training.team import Team, team
+from evnlos.models import UNetConfig
+from evnlos.training import LOSSES, Training
+from evnlos.training.settings import light_of
+from evnlos.training.source import Live, Stored, Team, team
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 SETTINGS = Training(

@@ -12,7 +12,7 @@ import pytest
 
 import evnlos
 from evnlos.cli import VERBS
-from evnlos.cli.completion import script
+from evnlos.cli.about import script
 
 SOURCE = Path(evnlos.__file__).parent
 ROOT = SOURCE.parent.parent

@@ -9,7 +9,7 @@ from evnlos import doctor
 from evnlos.cite import ENTRIES, entries_for
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import Simulation
+from evnlos.data import Simulation
 from evnlos.errors import DataError
 from evnlos.setups import RadiometricSetup
 

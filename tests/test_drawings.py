@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from evnlos.config import from_dict, to_dict
-from evnlos.dataset import Simulation, simulate_object
+from evnlos.data import Simulation, simulate_object
 from evnlos.errors import ConfigError
 from evnlos.scene import DrawingGlyphs, drawing
-from evnlos.scene.canvas import Canvas
-from evnlos.scene.drawings import KINDS
+from evnlos.scene.drawings import KINDS, Canvas
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos import EvnlosError, Training, UNetConfig, load_weights, train
-from evnlos.dataset import NlosDataset, Sampling, as_modality
+from evnlos import EvnlosError, train
+from evnlos.analysis import StreamingReconstructor
+from evnlos.data import NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError
-from evnlos.evaluation import StreamingReconstructor
-from evnlos.model import Weights, fit_linear, save_weights
-from evnlos.model.embedding import InputNormalization, LinearEmbedding, LinearEmbeddings
+from evnlos.models import UNetConfig, Weights, fit_linear, load_weights, save_weights
+from evnlos.models.embedding import InputNormalization, LinearEmbedding, LinearEmbeddings
+from evnlos.training import Training
 
 NET = UNetConfig(width=8, depth=1, rank=12, strengths=(0.1, 1.0, 10.0))
 

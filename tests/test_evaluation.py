@@ -8,15 +8,14 @@ import torch
 import torch.nn.functional as F
 
 from evnlos import EvnlosError
-from evnlos.dataset import STANDARD_MODALITIES, Sampling
+from evnlos.analysis import Evaluation, StreamingReconstructor, load_lpips, reconstruct, score
+from evnlos.analysis import scores as module
+from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.errors import DataError
-from evnlos.evaluation import Evaluation, StreamingReconstructor, load_lpips, reconstruct, score
-from evnlos.evaluation import lpips as module
-from evnlos.model import UNetConfig, Weights
-from evnlos.report.curves import curves_svg
-from evnlos.report.gather import RunResult, method_of
-from evnlos.report.lead import gains_of, lead
-from evnlos.report.tables import best_two
+from evnlos.models import UNetConfig, Weights
+from evnlos.report.pictures import curves_svg
+from evnlos.report.sections import gains_of, lead
+from evnlos.report.tables import RunResult, best_two, method_of
 
 CONVOLUTIONS = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]  # places in torchvision's vgg16.features
 SIDES = [(3, 64), (64, 64), (64, 128), (128, 128), (128, 256), (256, 256), (256, 256)]

@@ -9,8 +9,8 @@ import torch
 
 from evnlos import EventCamera, EventPixel, EvnlosError, simulate_events
 from evnlos.errors import DataError
+from evnlos.optics import SlidingWall, View
 from evnlos.scene import LineMotion
-from evnlos.transport import SlidingWall, View
 from evnlos.types import Plane
 
 CLEAN = EventPixel(0.15, 0.15, 0.0, 15.0, 0.0, 0.0, 0.0)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from evnlos.events.io import celex_state as slots
-from evnlos.events.io.celex_format_1 import CHUNK, SCRATCH, decode_format_1
-from evnlos.events.io.celex_kernels import pack_lanes
+from evnlos.events.files import celex_kernels as slots
+from evnlos.events.files.celex_kernels import CHUNK, SCRATCH, decode_format_1, pack_lanes
 
 WIDTH, HEIGHT = slots.WIDTH, slots.HEIGHT
 GROUPS = CHUNK + 1001  # a whole chunk and a part of one

@@ -7,7 +7,7 @@ import pytest
 
 from evnlos.errors import EventFileError
 from evnlos.events import iter_events, read_events, write_events
-from evnlos.events.io import words
+from evnlos.events.files import words
 from evnlos.types import Events
 
 FILES = [

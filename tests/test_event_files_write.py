@@ -18,7 +18,8 @@ from evnlos.events import (
     write_aedat4,
     write_events,
 )
-from evnlos.events.io import hdf5_write, write
+from evnlos.events.files import hdf5 as hdf5_write
+from evnlos.events.files import registry as write
 from evnlos.types import Events
 
 FILES = [
@@ -286,7 +287,7 @@ def test_triggers_of_every_raw_format(tmp_path):
 
 def test_triggers_across_blocks_and_of_real_files(shared_data, tmp_path, monkeypatch):
     from evnlos.events import read_events_report
-    from evnlos.events.io import words
+    from evnlos.events.files import words
 
     path = shared_data / "recordings" / "expelliarmus_evt2_sample.raw"
     assert len(read_triggers(path)) == read_events_report(path)[1].triggers

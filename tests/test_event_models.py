@@ -9,7 +9,7 @@ import pytest
 from evnlos.calibration.event_fit import CONTINUOUS, choose_pixel, fit_pixel
 from evnlos.calibration.event_models import figures_of, is_better, misfit
 from evnlos.calibration.event_statistics import Recording, thinned
-from evnlos.sensor import BrownianPixel, EventPixel, simulate_events
+from evnlos.cameras import BrownianPixel, EventPixel, simulate_events
 from evnlos.types import Events
 
 SHAPE = (60, 80)

@@ -8,11 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from event_pixel_reference import reference_exact
-from evnlos.sensor import EventPixel, EventStream, simulate_events
-from evnlos.sensor._exact_cubic import LONGEST_TAU, is_monotone, is_smooth, meet
-from evnlos.sensor._exact_math import LOG_LINE, LOW_PASS, first_crossing, response
-from evnlos.sensor._fast_math import cos_turns, fast_exp, fast_log
-from evnlos.sensor._order import sort_times
+from evnlos.cameras import EventPixel, EventStream, simulate_events
+from evnlos.cameras.event_order import sort_times
+from evnlos.cameras.pixels.continuous_math import (
+    LOG_LINE,
+    LONGEST_TAU,
+    LOW_PASS,
+    first_crossing,
+    is_monotone,
+    is_smooth,
+    meet,
+    response,
+)
+from evnlos.cameras.random_numbers import cos_turns, fast_exp, fast_log
 
 QUIET = {"threshold_sigma": 0.0, "leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0}
 

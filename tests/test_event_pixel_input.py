@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from evnlos.cameras import EventPixel, EventStream, simulate_events
 from evnlos.errors import ConfigError, DataError, EvnlosError
-from evnlos.sensor import EventPixel, EventStream, simulate_events
 
 GOOD = np.full((3, 4, 5), 60.0)
 TIMES = [0.0, 0.1, 0.2]

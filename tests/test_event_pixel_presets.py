@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from evnlos.cameras import EventPixel, pixel_preset, simulate_events
+from evnlos.cameras.sensors import PRESETS
 from evnlos.errors import ConfigError
-from evnlos.sensor import EventPixel, pixel_preset, simulate_events
-from evnlos.sensor.presets import PRESETS
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -11,7 +11,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from evnlos.sensor import EventPixel, simulate_events
+from evnlos.cameras import EventPixel, simulate_events
 
 # on, off, cutoff in Hz, period in s, v2e's events without a period, its ON and OFF events with it, their digest
 CASES = [

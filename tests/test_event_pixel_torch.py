@@ -8,11 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evnlos.cameras import EventPixel, simulate_batch, simulate_events
+from evnlos.cameras import on_device as _torch_batch
+from evnlos.cameras.pixels import torch_v2e as _torch_v2e
+from evnlos.cameras.pixels.torch_noise import fill, random_word, stream_word
+from evnlos.cameras.random_numbers import exponential_field, jitter_offset, normal_field
 from evnlos.errors import ConfigError, DataError
-from evnlos.seeds import derive_seed
-from evnlos.sensor import EventPixel, _torch_batch, _torch_v2e, simulate_batch, simulate_events
-from evnlos.sensor._random import exponential_field, jitter_offset, normal_field
-from evnlos.sensor._torch_random import fill, random_word, stream_word
+from evnlos.types import derive_seed
 from test_event_pixel_v2e import CLEAN, PIXELS, STORED, _case, _multiset, _video
 
 CPU = torch.device("cpu")

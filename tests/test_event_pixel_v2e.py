@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from event_pixel_reference import reference_v2e
-from evnlos.sensor import EventPixel, EventStream, simulate_events
+from evnlos.cameras import EventPixel, EventStream, simulate_events
 
 CLEAN = ["s_clean", "s_clean_nolp", "s_clean_asym", "s_dark_clean", "t_flash_clean", "t_flash_clean_nolp"]
 STORED = ["s_mismatch_seed1", "s_mismatch_seed2"]

@@ -8,10 +8,10 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from evnlos.cameras import EventPixel, simulate_events
+from evnlos.cameras.surrogate import filter_output, soft_counts, soft_events, soft_surface
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
-from evnlos.sensor import EventPixel, simulate_events
-from evnlos.sensor.surrogate import filter_output, soft_counts, soft_events, soft_surface
 
 HARD = 1e-7
 

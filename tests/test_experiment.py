@@ -10,8 +10,8 @@ import pytest
 
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import FixedPattern, Sampling, SensorSize, Simulation, open_dataset, save_pattern
-from evnlos.dataset.simulate import split_of
+from evnlos.data import FixedPattern, Sampling, SensorSize, Simulation, open_dataset, save_pattern
+from evnlos.data.simulate import split_of
 from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import (
     STUDIES,
@@ -31,7 +31,7 @@ from evnlos.experiment import (
     summary_table,
     write_record,
 )
-from evnlos.model import UNetConfig
+from evnlos.models import UNetConfig
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
 from evnlos.training import Training
@@ -256,8 +256,8 @@ def test_the_command_names_what_is_wrong(tmp_path, capsys) -> None:
 
 
 def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeypatch) -> None:
-    from evnlos.dataset.presets import paper
-    from evnlos.experiment import simulated
+    from evnlos.data.simulations import paper
+    from evnlos.experiment import run as simulated
 
     sets = simulated.simulations(simulated.Simulated(tmp_path))
     assert [len(c.glyphs.objects()) for c in sets.values()] == [39 * 26, 26, 36]

@@ -9,12 +9,22 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.optics import GGX, View, light_transport_matrix
+from evnlos.optics.facets import (
+    MASKING,
+    Pose,
+    SlopeTable,
+    carry_facets,
+    carry_lobes,
+    facet_matrix,
+    facet_slopes,
+    fill_facets,
+    seen_points,
+    target_cells,
+)
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import FittedSetup, SensorSize
-from evnlos.setups.fitted_file import WALL, AboutWall, FittedWall, write_fitted
-from evnlos.transport import GGX, View, light_transport_matrix
-from evnlos.transport.facets import MASKING, Pose, SlopeTable, facet_matrix, seen_points, target_cells
-from evnlos.transport.facets_kernel import carry_facets, carry_lobes, facet_slopes, fill_facets
+from evnlos.setups.files import WALL, AboutWall, FittedWall, write_fitted
 from evnlos.types import Plane
 
 POSE = Pose(

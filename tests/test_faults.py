@@ -18,8 +18,8 @@ import pytest
 from evnlos import Events, EvnlosError, open_dataset, write_events
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import simulate
-from evnlos.dataset.verify import find_faults
+from evnlos.data import simulate
+from evnlos.data.simulations import find_faults
 from evnlos.files import claim, is_empty
 from evnlos.progress import Step
 from watching import Watch, stopped

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.dataset import NlosDataset
+from evnlos.data import NlosDataset
 from evnlos.errors import ConfigError
 from evnlos.metrics import psnr
-from evnlos.model import UNetConfig, load_weights
+from evnlos.models import UNetConfig, load_weights
 from evnlos.training import Training, between, choose_and_finetune, read_choice, train
 
 SMALL = UNetConfig(width=8, depth=1, blocks=1, rank=8)

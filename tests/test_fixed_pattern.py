@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from evnlos.calibration.frame_noise import most_probable_pattern
-from evnlos.dataset import (
+from evnlos.calibration.frame_model import most_probable_pattern
+from evnlos.data import (
     FixedPattern,
     Sampling,
     import_captures,

@@ -8,8 +8,8 @@ import torch
 from scipy import stats
 
 from evnlos import EvnlosError, FrameCamera
+from evnlos.cameras.random_numbers import few_electrons, many_electrons
 from evnlos.errors import ConfigError
-from evnlos.sensor._photons import few_electrons, many_electrons
 
 QUIET = {"read_noise_e": 0.0, "prnu": 0.0, "dsnu_e": 0.0, "full_well_e": 1e10, "bit_depth": 16}
 

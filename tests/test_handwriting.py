@@ -19,7 +19,7 @@ from evnlos.scene import (
     pen_width,
     render_glyph,
 )
-from evnlos.scene.distance import signed_distance
+from evnlos.scene.handwriting import signed_distance
 
 STEMS = "BDEFHIKLPRT"  # letters whose upright strokes show the slant
 

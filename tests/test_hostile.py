@@ -21,17 +21,17 @@ import pytest
 import yaml
 from PIL import Image
 
-from evnlos import EvnlosError, Simulation, UNetConfig, read_events, write_events
+from evnlos import EvnlosError, read_events, write_events
 from evnlos.app.upload import read_upload
 from evnlos.cli.main import main
 from evnlos.config import config_hash, load_yaml, read_yaml, to_dict
-from evnlos.dataset import open_dataset, read_capture
-from evnlos.dataset.simulate import object_bytes
-from evnlos.dataset.verify import find_faults
+from evnlos.data import Simulation, open_dataset, read_capture
+from evnlos.data.simulate import object_bytes
+from evnlos.data.simulations import find_faults
 from evnlos.errors import ConfigError, printable
-from evnlos.events.recording import Recording
-from evnlos.events.summary import _Counts
-from evnlos.solver.photograph import read_photograph
+from evnlos.events.recording import Recording, _Counts
+from evnlos.inverse.inversion import read_photograph
+from evnlos.models import UNetConfig
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
@@ -183,8 +183,8 @@ def test_names_do_not_reach_the_terminal_raw(shot, tmp_path, capsys) -> None:
 
 
 def test_weights_with_control_codes_are_shown_plainly(tmp_path, capsys) -> None:
-    from evnlos.dataset import Sampling
-    from evnlos.model import Weights, save_weights
+    from evnlos.data import Sampling
+    from evnlos.models import Weights, save_weights
 
     history = [{"data": {"name": "\x1b]0;x\x07\nevil", "origin": "simulation"}}]
     sampling = Sampling(height=8, width=8, pitch_m=0.01, scored_rows=8)
@@ -223,7 +223,7 @@ def test_no_flipped_byte_of_a_page_goes_unseen(tiny_dataset, tmp_path) -> None:
             dataset = open_dataset(folder)
         except EvnlosError:
             continue
-        from evnlos.dataset.store import is_page_changed
+        from evnlos.data.store import is_page_changed
 
         assert is_page_changed(dataset) or yaml.safe_load(bytes(changed)) == expected, place
 
@@ -232,7 +232,7 @@ def test_no_flipped_byte_of_a_page_goes_unseen(tiny_dataset, tmp_path) -> None:
     "line", ['{"epoch": "one"}', '{"epoch": 1, "loss": NaN}', "[1]", "1", "{", '{"loss": 1}']
 )
 def test_a_garbled_log_of_a_training_is_one_line(line: str, tmp_path) -> None:
-    from evnlos.report.gather import _log_of
+    from evnlos.report.tables import _log_of
 
     (tmp_path / "metrics.jsonl").write_text(json.dumps({"epoch": 1, "loss": 0.5}) + f"\n{line}\n")
     with pytest.raises(EvnlosError, match="not a training log"):
@@ -242,7 +242,7 @@ def test_a_garbled_log_of_a_training_is_one_line(line: str, tmp_path) -> None:
 def test_small_pictures_are_scored_without_haarpsi() -> None:
     import torch
 
-    from evnlos.evaluation.score import score
+    from evnlos.analysis.scores import score
 
     pictures = torch.rand(3, 12, 24)
     found = score(pictures, pictures.clone())
@@ -503,8 +503,8 @@ def test_every_simulation_is_estimated_first(words: list[str], tmp_path, capsys,
 
 
 def test_more_processes_need_more_memory(tmp_path, monkeypatch) -> None:
-    from evnlos.dataset import simulate
-    from evnlos.dataset.lab import Lab, render_captures
+    from evnlos.data import simulate
+    from evnlos.data.lab import Lab, render_captures
 
     monkeypatch.setattr("evnlos.untrusted.memory_left", lambda: 4 * object_bytes(Simulation()))
     with pytest.raises(EvnlosError, match="fewer --workers"):
@@ -531,7 +531,7 @@ def test_a_video_of_too_many_pixels_is_refused_before_it_is_read(tmp_path, capsy
 
 def test_a_film_of_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, monkeypatch) -> None:
     av = pytest.importorskip("av")
-    from evnlos.sensor.video import open_video
+    from evnlos.cameras.video import open_video
 
     with av.open(tmp_path / "v.avi", "w") as film:
         stream = film.add_stream("mjpeg", rate=5, width=64, height=48, pix_fmt="yuvj420p")
@@ -539,7 +539,7 @@ def test_a_film_of_too_many_pixels_is_refused_before_it_is_decoded(tmp_path, mon
             film.mux(stream.encode(av.VideoFrame(64, 48, "yuvj420p")))
         film.mux(stream.encode(None))
     assert open_video(tmp_path / "v.avi").width == 64
-    monkeypatch.setattr("evnlos.sensor._video_sources.MOST_IMAGE_PIXELS", 1000)
+    monkeypatch.setattr("evnlos.cameras.video_files.MOST_IMAGE_PIXELS", 1000)
     with pytest.raises(EvnlosError, match="at most 1,000"):
         open_video(tmp_path / "v.avi")
 

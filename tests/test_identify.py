@@ -9,20 +9,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evnlos.analysis.identify import counted, identify, rig_table, singular_values, verdict
+from evnlos.analysis.linearized import Bench, LinearEstimator, bars, camera_variance, finest_bars, linearized
+from evnlos.cameras import FrameCamera
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import Simulation
-from evnlos.dataset.lab import Lab
+from evnlos.data import Simulation
+from evnlos.data.lab import Lab
 from evnlos.errors import ConfigError, DataError
-from evnlos.evaluation.identify import counted, identify, singular_values
-from evnlos.evaluation.identify_linear import LinearEstimator, bars, finest_bars
-from evnlos.evaluation.identify_rig import Bench, camera_variance, linearized
-from evnlos.evaluation.identify_table import rig_table
-from evnlos.evaluation.identify_words import verdict
+from evnlos.inverse.measurements import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_plates
 from evnlos.scene import LineMotion, Scene, Target
-from evnlos.sensor import FrameCamera
 from evnlos.setups import PaperSetup, RadiometricSetup, named_setup, setup_names, setup_preset
-from evnlos.solver.glyph_prior import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_plates
 
 SMALL = Bench(cells=8, height=12, width=20, writers=1)
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from evnlos.errors import DataError, MissingDependencyError
-from evnlos.interop.deepinv import as_physics
-from evnlos.solver import tikhonov
-from evnlos.transport import MatrixTransport
+from evnlos.interop import as_physics
+from evnlos.inverse import tikhonov
+from evnlos.optics import MatrixTransport
 from transports import EXAMPLES
 
 

@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse import Gradient, JointProblem, PlatePass, total_variation
+from evnlos.inverse.joint import matrix_of, strip_gram_of, strip_of
+from evnlos.inverse.measurements import position_subsets
+from evnlos.inverse.operators import normal_matrix
+from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import RadiometricSetup
-from evnlos.solver import Gradient, JointProblem, PlatePass, total_variation
-from evnlos.solver.operators import normal_matrix
-from evnlos.solver.plate_pass import matrix_of, strip_gram_of, strip_of
-from evnlos.solver.recording import position_subsets
-from evnlos.transport import MatrixTransport
 from evnlos.types import Plane
 
 PLATE = Plane(4, 4, 0.01)

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos import EvnlosError, Training, UNetConfig, evaluate, load_weights, train
+from evnlos import EvnlosError, evaluate, train
+from evnlos.analysis import StreamingReconstructor, curve_over_positions
+from evnlos.analysis.model import choices
 from evnlos.cli import main
-from evnlos.dataset import NlosDataset, Sampling, as_modality
+from evnlos.data import NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.evaluation import StreamingReconstructor, curve_over_positions
-from evnlos.evaluation.positions import choices
-from evnlos.model import SequenceConfig, SequenceReconstructor
+from evnlos.models import SequenceConfig, SequenceReconstructor, UNetConfig, load_weights
 from evnlos.scene import FontGlyphs
+from evnlos.training import Training
 from evnlos.types import Plane
 from watching import stopped
 

@@ -11,14 +11,13 @@ import torch
 import yaml
 
 from evnlos.config import from_dict, load_yaml, read_yaml, save_yaml
-from evnlos.dataset import SensorSize, read_capture
-from evnlos.dataset.lab import Lab, lab_preset, render_captures
-from evnlos.dataset.lab_sensor import SENSOR_SPREAD
-from evnlos.dataset.presets import default
+from evnlos.data import SensorSize, read_capture
+from evnlos.data.lab import SENSOR_SPREAD, Lab, lab_preset, render_captures
+from evnlos.data.simulations import default
 from evnlos.errors import ConfigError, DataError
+from evnlos.optics.angular_spectrum import Diffraction
 from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, Scene
 from evnlos.setups import PaperSetup, RadiometricSetup, setup_names, setup_preset
-from evnlos.transport.diffraction import Diffraction
 from evnlos.types import Plane
 from watching import stopped
 

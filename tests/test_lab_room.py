@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from evnlos.cameras import FrameCamera
 from evnlos.errors import ConfigError
 from evnlos.lab import Mount, RenderedWall, Torch, brightness, covered_plane
 from evnlos.scene import LineMotion, Scene, Target
-from evnlos.sensor import FrameCamera
 
 
 def scene() -> Scene:

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from evnlos.errors import DataError
-from evnlos.model import fit_linear
-from evnlos.model.linear import _LAMBDAS, _left_out
+from evnlos.models import fit_linear
+from evnlos.models.linear import _LAMBDAS, _left_out
 
 
 def world(noise: float, objects: int = 30, positions: int = 10, seed: int = 0):

@@ -18,28 +18,22 @@ import pytest
 import torch
 from PIL import Image
 
-from evnlos import EvnlosError, UNetConfig
+from evnlos import EvnlosError
+from evnlos.analysis import reconstruct
 from evnlos.cli import main
-from evnlos.dataset import STANDARD_MODALITIES, Sampling, capture_samples, read_capture, reduce_by_area
+from evnlos.data import STANDARD_MODALITIES, Sampling, capture_samples, read_capture, reduce_by_area
 from evnlos.errors import ConfigError, DataError, EventFileError
-from evnlos.evaluation import reconstruct
 from evnlos.events import read_events, time_surface, write_events
-from evnlos.live import record
-from evnlos.live.chunk import Chunk
-from evnlos.live.engine import Engine, Picture, Timing
-from evnlos.live.growing import GrowingFile
+from evnlos.live import display as record
+from evnlos.live.chunk import Chunk, ChunkQueue
+from evnlos.live.display import Page
+from evnlos.live.engine import AreaReduction, Engine, Picture, RunningSurface, Timing
+from evnlos.live.growing import GrowingFile, open_tail
 from evnlos.live.packet import Packet, PacketError, pack, unpack, unpack_all
-from evnlos.live.page import Page
-from evnlos.live.queue import ChunkQueue
-from evnlos.live.reduction import AreaReduction
-from evnlos.live.replay import Replay, TimedFrame
-from evnlos.live.run import Pace, Run
-from evnlos.live.sources import Listening, capture_replay, open_live
-from evnlos.live.surface import RunningSurface
-from evnlos.live.tail import open_tail
-from evnlos.live.tally import Tally, latency_table
+from evnlos.live.run import Pace, Run, Tally, latency_table
+from evnlos.live.sources import Listening, Replay, TimedFrame, capture_replay, open_live
 from evnlos.live.udp import UdpSender, UdpSource, send_timed
-from evnlos.model import Weights, save_weights
+from evnlos.models import UNetConfig, Weights, save_weights
 from evnlos.types import Events
 
 ABOUT = {"height": 16, "width": 24, "scored_rows": 12, "tau_s": 0.05}
@@ -793,7 +787,7 @@ def test_the_stream_brings_each_new_picture_and_the_end(page: Page, engine: Engi
 
 
 def test_a_ninth_viewer_is_told_and_silent_ones_are_let_go(engine: Engine, monkeypatch, capfd) -> None:
-    monkeypatch.setattr("evnlos.live.page._SILENT_S", 0.5)
+    monkeypatch.setattr("evnlos.live.display._SILENT_S", 0.5)
     with Page(Tally(Replay([]), ChunkQueue(10)).now) as page, contextlib.ExitStack() as open_ones:
         silent = open_ones.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
         for _ in range(8):

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos import EvnlosError, Training, UNetConfig, load_weights, train
+from evnlos import EvnlosError, train
+from evnlos.cameras import V2ePixel, simulate_batch
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import NlosDataset, live_dataset
-from evnlos.dataset.live import epoch_settings
-from evnlos.dataset.on_device import simulate_objects_on
-from evnlos.dataset.pool import run_in_order
-from evnlos.dataset.sampling import edges_from, make_samples
-from evnlos.dataset.simulate import drawn_for, scene_of
+from evnlos.data import NlosDataset, live_dataset
+from evnlos.data.live import epoch_settings, simulate_objects_on
+from evnlos.data.pool import run_in_order
+from evnlos.data.sampling import edges_from, make_samples
+from evnlos.data.simulate import drawn_for, scene_of
 from evnlos.errors import ConfigError
-from evnlos.seeds import derive_seed
-from evnlos.sensor import V2ePixel, simulate_batch
-from evnlos.training.source import Live
-from evnlos.training.team import Team
+from evnlos.models import UNetConfig, load_weights
+from evnlos.training import Training
+from evnlos.training.source import Live, Team
+from evnlos.types import derive_seed
 from watching import stopped
 
 CPU = torch.device("cpu")

@@ -11,6 +11,8 @@ import torch
 from PIL import Image
 from safetensors.torch import save
 
+from evnlos.analysis.identify import identify
+from evnlos.analysis.linearized import Bench
 from evnlos.calibration.scan import (
     Patterns,
     ScanCamera,
@@ -25,23 +27,21 @@ from evnlos.calibration.scan import (
 )
 from evnlos.calibration.scan.folder import read_scan_info
 from evnlos.calibration.scan.importer import fill_bad
+from evnlos.calibration.scan.matrix import moved
 from evnlos.calibration.scan.plan import spread_points
-from evnlos.calibration.scan.psf import moved
+from evnlos.cameras import FrameCamera
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.dataset import SensorSize, Simulation
-from evnlos.dataset.simulate import simulate_object
+from evnlos.data import SensorSize, Simulation
+from evnlos.data.simulate import simulate_object
 from evnlos.errors import ConfigError, DataError, EvnlosError
-from evnlos.evaluation.identify import identify
-from evnlos.evaluation.identify_rig import Bench
+from evnlos.inverse import read_photograph
+from evnlos.inverse.inversion import Inversion, chosen_degree
+from evnlos.optics import MatrixTransport
 from evnlos.scene import HandwritingGlyphs, LineMotion, Scene, Target
 from evnlos.scene.glyph_sets import Plate
-from evnlos.sensor import FrameCamera
 from evnlos.setups import MeasuredSetup, RadiometricSetup
-from evnlos.setups.measured_file import MEASUREMENT, About, Measurement, write_measurement
-from evnlos.solver import read_photograph
-from evnlos.solver.inversion import Inversion, chosen_degree
-from evnlos.transport import MatrixTransport
+from evnlos.setups.files import MEASUREMENT, About, Measurement, write_measurement
 from evnlos.types import Plane
 from pretend_device import PRETENDED, PretendedDevice
 

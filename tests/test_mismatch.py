@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 from evnlos.calibration import FIGURES_FILE
-from evnlos.demo import Demo
+from evnlos.demo import Demo, finding, mismatch_table, run_mismatch
 from evnlos.errors import CalibrationError, ConfigError
 from evnlos.experiment import Record
-from evnlos.experiment.records import write_record
-from evnlos.mismatch import finding, mismatch_table, run_mismatch
+from evnlos.experiment.study import write_record
 
 LEFT = {
     "frames fit": {"before": 0.5, "after": 0.04, "noise": 0.03},
@@ -79,7 +78,7 @@ def test_each_rig_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
             raise CalibrationError("no rig fits")
         keep(settings.out, settings.seed, {("E2E", "frame"): 1.0, ("EPNP", "frame"): 2.0}, [])
 
-    monkeypatch.setattr("evnlos.mismatch.run_demo", demo)
+    monkeypatch.setattr("evnlos.demo.run_demo", demo)
     found = run_mismatch(Demo(out=tmp_path / "out"), (), tmp_path / "captures", seeds=(0, 3))
     assert ran == [
         ("flat-seed0", ["flat_A", "flat_G"], 0),

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.interop.mitsuba import trace, triangulate, usable_variant
+from evnlos.interop import trace, triangulate, usable_variant
+from evnlos.optics import GGX, Lambert, Occluder, View, light_transport_matrix
 from evnlos.setups import RadiometricSetup
-from evnlos.transport import GGX, Lambert, Occluder, View, light_transport_matrix
 from evnlos.types import Plane
 from mitsuba_oracle import (
     PATTERN,

@@ -6,24 +6,22 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.dataset import Sampling, SensorSize, Simulation, live_dataset
-from evnlos.dataset.on_device import bytes_of_a_wall, simulate_objects_on
-from evnlos.dataset.simulate import simulate_object
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera, V2ePixel, simulate_batch
+from evnlos.cameras.event_order import EventTensors
+from evnlos.cameras.on_device import capture_tensors, record_tensors
+from evnlos.cameras.pixels.torch_noise import electrons
+from evnlos.cameras.random_numbers import fill_electrons
+from evnlos.data import Sampling, SensorSize, Simulation, live_dataset
+from evnlos.data.live import bytes_of_a_wall, simulate_objects_on
+from evnlos.data.simulate import simulate_object
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
 from evnlos.events.surface_tensors import time_surface_tensors
+from evnlos.optics import SlidingWall, View
+from evnlos.optics.wall import slide
 from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion
-from evnlos.sensor import EventCamera, EventPixel, FrameCamera, V2ePixel, simulate_batch
-from evnlos.sensor._photons import fill_electrons
-from evnlos.sensor._torch_photons import electrons
-from evnlos.sensor.event_tensors import EventTensors
-from evnlos.sensor.frame_tensors import capture_tensors
-from evnlos.sensor.record_tensors import record_tensors
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.training.source import Live
-from evnlos.training.team import Team
-from evnlos.transport import SlidingWall, View
-from evnlos.transport.slide import slide
+from evnlos.training.source import Live, Team
 from evnlos.types import Plane
 from pretend_device import PRETENDED, PretendedDevice
 from test_event_pixel_v2e import PIXELS, _video
@@ -129,7 +127,7 @@ def test_a_sliding_wall_renders_many_frames_as_it_renders_one(motion, monkeypatc
     frames = [
         wall._shifted(*place).clamp(min=0) * 0.7 + wall.ambient for place in motion.position_m(times_s).tolist()
     ]
-    monkeypatch.setattr("evnlos.transport.wall._TOGETHER_PX", 11 * 17 * 9)
+    monkeypatch.setattr("evnlos.optics.wall._TOGETHER_PX", 11 * 17 * 9)
     image = torch.empty(41, 11, 17)
     wall._slide(motion.position_m(times_s), image)
     torch.testing.assert_close(image, torch.stack(frames), rtol=1e-6, atol=1e-7)

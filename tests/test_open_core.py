@@ -13,15 +13,16 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from evnlos import Sampling, Simulation, Training, evaluate, simulate, train
+from evnlos import evaluate, simulate, train
+from evnlos.cameras import EVENT_MODELS, EventModel, PixelSettings
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
-from evnlos.dataset import as_modality, read_shard
-from evnlos.model import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
+from evnlos.data import Sampling, Simulation, as_modality, read_shard
+from evnlos.models import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
 from evnlos.report import gather, write_report
 from evnlos.scene import HandwritingGlyphs
-from evnlos.sensor import EVENT_MODELS, EventModel, PixelSettings
 from evnlos.setups import SensorSize, Setup, load_setup
+from evnlos.training import Training
 from evnlos.types import Plane
 
 

@@ -4,14 +4,7 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.transport import (
-    Diffraction,
-    DiffuseReflection,
-    LinearTransport,
-    MatrixTransport,
-    Transport,
-    compose,
-)
+from evnlos.optics import Diffraction, DiffuseReflection, LinearTransport, MatrixTransport, Transport, compose
 from evnlos.types import Plane
 from transports import EXAMPLES
 

@@ -8,8 +8,8 @@ import torch
 
 from evnlos.cli.invert import InvertCommand, correlation, to_text
 from evnlos.errors import ConfigError, DataError
-from evnlos.solver import prepare_inversion, read_photograph
-from evnlos.solver.photograph import convex_occluders
+from evnlos.inverse import prepare_inversion, read_photograph
+from evnlos.inverse.inversion import convex_occluders
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,7 @@ from PIL import Image
 
 from evnlos import Events
 from evnlos.errors import DataError
-from evnlos.plot.film import Column, film
-from evnlos.plot.stages import draw_comparison, draw_events, draw_surfaces, draw_wall
+from evnlos.plot.figures import Column, draw_comparison, draw_events, draw_surfaces, draw_wall, film
 from evnlos.report.pictures import save_animation
 
 pytest.importorskip("matplotlib")

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from evnlos import load_weights
 from evnlos.errors import ConfigError, DataError
-from evnlos.model import published, published_for, published_rig
+from evnlos.models import load_weights, published, published_for, published_rig
 
 ROOT = Path(__file__).resolve().parent.parent
 DISTRIBUTION = ROOT / "packages" / "evnlos-weights"
@@ -23,7 +22,7 @@ def nothing_installed(monkeypatch):
     """As on a machine without the weights: no entry point, no checkout, no variable."""
     import sys
 
-    module = sys.modules["evnlos.model.published"]
+    module = sys.modules["evnlos.models.weights"]
     monkeypatch.setattr(module, "_CHECKOUT", Path("none"))
     monkeypatch.setattr(module, "entry_points", lambda group: [])
     monkeypatch.delenv("EVNLOS_WEIGHTS", raising=False)

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
 from evnlos.errors import ConfigError
-from evnlos.setups import RadiometricSetup, setup_preset
-from evnlos.transport import (
+from evnlos.optics import (
     GGX,
     Lambert,
     LightTransport,
@@ -21,9 +20,10 @@ from evnlos.transport import (
     lamp_radiance,
     light_transport_matrix,
 )
-from evnlos.transport.brdf import conductor_fresnel
-from evnlos.transport.occluder import visibility
-from evnlos.transport.radiometric import pair_throughput, quadrature_points
+from evnlos.optics.occluder import visibility
+from evnlos.optics.radiometric import pair_throughput, quadrature_points
+from evnlos.optics.reflection import conductor_fresnel
+from evnlos.setups import RadiometricSetup, setup_preset
 from evnlos.types import Plane
 
 ANGLE = math.radians(30)

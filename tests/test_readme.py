@@ -10,7 +10,7 @@ import yaml
 
 from evnlos.cli import VERBS
 from evnlos.config import from_dict
-from evnlos.dataset import CaptureInfo, Simulation
+from evnlos.data import CaptureInfo, Simulation
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text()

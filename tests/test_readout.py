@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.errors import ConfigError
-from evnlos.sensor import (
+from evnlos.cameras import (
     BrownianPixel,
     EventCamera,
     EventPixel,
@@ -17,6 +16,7 @@ from evnlos.sensor import (
     V2ePixel,
     simulate_events,
 )
+from evnlos.errors import ConfigError
 
 QUIET = EventPixel(0.1, 0.1, 0.02, 0.0, 0.0, 0.0)
 TIMES_S = np.linspace(0.0, 0.02, 41)

@@ -10,23 +10,26 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save
 
-from evnlos import Training, UNetConfig, evaluate, load_model, load_weights, train
+from evnlos import evaluate, load_model, train
 from evnlos.cli import main
 from evnlos.config import from_dict, load_yaml, read_yaml, save_yaml, to_dict
-from evnlos.dataset import MODALITIES, ChannelGroup, Modality, Sampling, as_modality, read_capture
+from evnlos.data import MODALITIES, ChannelGroup, Modality, Sampling, as_modality, read_capture
 from evnlos.errors import ConfigError, DataError
 from evnlos.experiment import read_records
 from evnlos.migrate import migrate
-from evnlos.model import (
+from evnlos.models import (
     RECONSTRUCTORS,
     Reconstructor,
     ReconstructorSettings,
     SequenceConfig,
+    UNetConfig,
     Weights,
+    load_weights,
     published,
     save_weights,
 )
 from evnlos.report import gather, write_report
+from evnlos.training import Training
 
 RECORDS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "experiments"
 SMALL = {"width": 8, "depth": 1, "shuffle": 2, "rank": 24, "strengths": (0.1, 1.0)}

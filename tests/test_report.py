@@ -11,26 +11,23 @@ import pytest
 import torch
 
 from chromium import Chromium, missing
+from evnlos.analysis import Evaluation
+from evnlos.analysis.confidence import PassWorth
+from evnlos.analysis.identify import identify
+from evnlos.analysis.linearized import Bench
+from evnlos.analysis.scores import score
 from evnlos.cli.main import main
 from evnlos.cli.verbs import command_of
 from evnlos.config import save_yaml
-from evnlos.dataset import Sampling, Simulation
-from evnlos.dataset.sampling import Samples
-from evnlos.dataset.shard import write_shard
-from evnlos.dataset.store import Dataset, create_dataset
-from evnlos.evaluation import Evaluation
-from evnlos.evaluation.identify import identify
-from evnlos.evaluation.identify_rig import Bench
-from evnlos.evaluation.score import score
-from evnlos.evaluation.worth import PassWorth
-from evnlos.plot.rig import PARTITION, setup_drawing
+from evnlos.data import Sampling, Simulation
+from evnlos.data.sampling import Samples
+from evnlos.data.store import Dataset, create_dataset, write_shard
+from evnlos.plot.setup import PARTITION, setup_drawing
 from evnlos.report import RunResult, write_report
-from evnlos.report.commands import Commands
-from evnlos.report.curves import curves_svg
-from evnlos.report.films import _worst
-from evnlos.report.gather import named
-from evnlos.report.lead import gains_of
-from evnlos.report.setup import _points, setup_section
+from evnlos.report.origin import Commands
+from evnlos.report.pictures import curves_svg
+from evnlos.report.sections import _points, _worst, gains_of, setup_section
+from evnlos.report.tables import named
 from evnlos.setups import PaperSetup, RadiometricSetup, calibrated_folder, named_setup, setup_preset
 
 POSITIONS = 12

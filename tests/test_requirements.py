@@ -12,7 +12,7 @@ import pytest
 import evnlos
 from evnlos.cli import VERBS, main
 from evnlos.cli.verbs import command_of, summary_of
-from evnlos.requirements import REQUIRED, faults
+from evnlos.doctor import REQUIRED, faults
 
 ROOT = Path(evnlos.__file__).parent.parent.parent
 GONE = """

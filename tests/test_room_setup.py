@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from evnlos.cameras import FrameCamera
 from evnlos.config import from_dict, to_dict
 from evnlos.errors import ConfigError
 from evnlos.lab import Lobe, Mount, Reflection, Torch
 from evnlos.scene import LineMotion, Scene, Target
-from evnlos.sensor import FrameCamera
 from evnlos.setups import ROOMS, RadiometricSetup, RoomSetup, SensorSize, Setup, load_setup
 from evnlos.types import Plane
 

@@ -15,11 +15,11 @@ import torch
 from safetensors.torch import save
 
 import evnlos
-from evnlos import EvnlosError, UNetConfig, load_weights, open_dataset
+from evnlos import EvnlosError, open_dataset
 from evnlos.config import to_dict
-from evnlos.dataset import Sampling, read_capture, read_shard
-from evnlos.model import Reconstructor, Weights, save_weights
-from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
+from evnlos.data import Sampling, read_capture, read_shard
+from evnlos.models import Reconstructor, UNetConfig, Weights, load_weights, save_weights
+from evnlos.training.settings import load_checkpoint, save_checkpoint
 
 COUNTS = {"weights": 60, "checkpoint": 100, "shard": 120, "dataset": 50, "capture": 40}
 ROOM = 1 << 30

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.config import from_dict, load_yaml, save_yaml, to_dict
-from evnlos.dataset import Simulation, simulate_object
-from evnlos.dataset.lab import Lab, lab_of
+from evnlos.data import Simulation, simulate_object
+from evnlos.data.lab import Lab, lab_of
 from evnlos.errors import ConfigError, DataError
+from evnlos.optics.facets import SlopeTable
 from evnlos.scene import LineMotion, PathMotion, Pose, Scene, Target
-from evnlos.sensor import EventPixel, FrameCamera
 from evnlos.setups import (
     FittedSetup,
     MeasuredSetup,
@@ -28,9 +29,7 @@ from evnlos.setups import (
     named_setup,
     setup_names,
 )
-from evnlos.setups.fitted_file import AboutWall, FittedWall, write_fitted
-from evnlos.setups.measured_file import About, Measurement, write_measurement
-from evnlos.transport.facets import SlopeTable
+from evnlos.setups.files import About, AboutWall, FittedWall, Measurement, write_fitted, write_measurement
 from evnlos.types import Plane
 
 SHAPE = (10, 16)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.solver import (
+from evnlos.inverse import (
     Background,
     DenoiserTraining,
     Gradient,
@@ -22,8 +22,8 @@ from evnlos.solver import (
     total_variation,
     train_denoiser,
 )
-from evnlos.solver.spectrum import Spectrum
-from evnlos.transport import LinearTransport, MatrixTransport
+from evnlos.inverse.tikhonov import Spectrum
+from evnlos.optics import LinearTransport, MatrixTransport
 from evnlos.types import Events, Plane
 from transports import EXAMPLES
 
@@ -347,7 +347,7 @@ def test_log_change_is_the_derivative_of_the_logarithm():
 
 
 def test_log_change_counts_thresholds():
-    from evnlos.sensor import EventPixel
+    from evnlos.cameras import EventPixel
 
     events = Events([1, 2, 9], [0, 0, 1], [0, 0, 1], [True, True, False], 2, 2)
     found = log_change(events, [0, 5, 10], EventPixel(threshold_on=0.2, threshold_off=0.1))

@@ -9,7 +9,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from evnlos.dataset.pool import run_in_order, run_tasks
+from evnlos.data.pool import run_in_order, run_tasks
 from evnlos.errors import ConfigError
 from evnlos.threads import cores
 

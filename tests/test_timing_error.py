@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from evnlos.dataset.presets import paper
+from evnlos.cameras import EventCamera
+from evnlos.data.simulations import paper
 from evnlos.scene import Scene
-from evnlos.seeds import derive_seed
-from evnlos.sensor import EventCamera
-from evnlos.types import Events
+from evnlos.types import Events, derive_seed
 
 SHAPE = (8, 960)  # rows of the middle, pixels of the paper's size
 SPAN_S = (3.0, 5.0)

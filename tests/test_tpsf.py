@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evnlos.errors import ConfigError
-from evnlos.transport import tpsf_kernel, tpsf_profile, tpsf_truncation
+from evnlos.optics import tpsf_kernel, tpsf_profile, tpsf_truncation
 
 
 def brute_force(rho: float, t: float, mean_free_path: float, last: int) -> float:

@@ -9,22 +9,23 @@ import pytest
 import torch
 import yaml
 
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
-from evnlos.cli.invert_pass import linear_setup
+from evnlos.cli.invert_captures import linear_setup
 from evnlos.config import read_yaml, save_yaml
-from evnlos.dataset import FixedPattern, Sampling, read_capture
-from evnlos.dataset.fixed_pattern import save_pattern
-from evnlos.dataset.lab import Lab, render_captures
-from evnlos.dataset.simulate import SensorSize, Simulation
+from evnlos.data import FixedPattern, Sampling, read_capture
+from evnlos.data.cleaning import save_pattern
+from evnlos.data.lab import Lab, render_captures
+from evnlos.data.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
-from evnlos.model import SequenceConfig, Weights, save_weights
-from evnlos.plot.track import draw_track
+from evnlos.inverse import PlatePass
+from evnlos.inverse.joint import matrix_of, strip_of
+from evnlos.inverse.operators import Gradient, normal_matrix
+from evnlos.models import SequenceConfig, Weights, save_weights
+from evnlos.optics import SlidingWall, View
+from evnlos.plot.results import draw_track
 from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
-from evnlos.sensor import EventCamera, EventPixel, FrameCamera
 from evnlos.setups import RadiometricSetup
-from evnlos.solver import PlatePass
-from evnlos.solver.operators import Gradient, normal_matrix
-from evnlos.solver.plate_pass import matrix_of, strip_of
 from evnlos.tracking import (
     Measurements,
     Track,
@@ -41,10 +42,8 @@ from evnlos.tracking import (
     track_doubts,
     track_frames,
 )
-from evnlos.tracking.depth import Depths
 from evnlos.tracking.registration import explained_change
-from evnlos.tracking.rig_shift import Fit
-from evnlos.transport import SlidingWall, View
+from evnlos.tracking.rig_shift import Depths, Fit
 from evnlos.types import Events, Plane
 
 SHAPE = (24, 36)
@@ -474,7 +473,7 @@ def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, caps
     """Motion found gives a picture near that of motion stated, and the confidence that goes with it."""
     folder, rig = capture
     # The network is untrained, and its light anything: let the rig move its pictures all the same.
-    monkeypatch.setattr("evnlos.evaluation.model._SAME_LIGHT", (0.0, np.inf))
+    monkeypatch.setattr("evnlos.analysis.model._SAME_LIGHT", (0.0, np.inf))
     sampling = Sampling(height=24, width=36, scored_rows=18)
     torch.manual_seed(0)
     network = SequenceConfig(width=4, depth=1, rank=4).build("frame", sampling).eval()

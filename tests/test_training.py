@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos import EvnlosError, ResidualUNet, Training, UNetConfig, evaluate, load_weights, train
-from evnlos.dataset import NlosDataset
+from evnlos import EvnlosError, evaluate, train
+from evnlos.data import NlosDataset
 from evnlos.errors import ConfigError, DataError
-from evnlos.model import save_weights
-from evnlos.model.sequence import SequenceConfig
-from evnlos.training import LOSSES, balanced_loss, paper_loss, step_size
-from evnlos.training.held_out import validate
+from evnlos.models import ResidualUNet, UNetConfig, load_weights, save_weights
+from evnlos.models.sequence import SequenceConfig
+from evnlos.training import LOSSES, Training, balanced_loss, paper_loss, step_size
 from evnlos.training.source import half_mirrored, with_mirrored
+from evnlos.training.validation import validate
 
 SMALL = UNetConfig(width=8, depth=2, shuffle=1, rank=0)
 QUICK = Training(

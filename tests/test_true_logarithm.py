@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from event_pixel_reference import reference_exact
+from evnlos.cameras import EventCamera, EventPixel, simulate_events
 from evnlos.errors import ConfigError
-from evnlos.sensor import EventCamera, EventPixel, simulate_events
 
 QUIET = EventPixel(0.2, 0.2, 0.0, 0.0, 0.0, 0.0, logarithm="true")
 

@@ -9,11 +9,10 @@ from scipy.stats import multivariate_normal
 
 from evnlos.calibration import Calibration, fit_rig
 from evnlos.calibration.captures import read_shots
-from evnlos.calibration.evidence import WRITERS, MovingLight
-from evnlos.calibration.unlabelled import CELLS, fit_unlabelled
+from evnlos.calibration.unlabelled import CELLS, WRITERS, MovingLight, fit_unlabelled
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse.measurements import handwritten_plates
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.solver.glyph_prior import handwritten_plates
 
 RIG = RadiometricSetup(roughness=0.06)
 PLACES = np.stack([np.linspace(-0.06, 0.06, 7), np.zeros(7)], axis=1)

@@ -23,17 +23,25 @@ from safetensors import safe_open
 from safetensors.torch import save
 
 import evnlos
-from evnlos import EvnlosError, UNetConfig, load_weights, read_events
+from evnlos import EvnlosError, read_events
+from evnlos.cameras.video import open_video
 from evnlos.cli.main import main
-from evnlos.dataset import FixedPattern, Sampling, load_pattern, read_capture, save_pattern
+from evnlos.data import FixedPattern, Sampling, load_pattern, read_capture, save_pattern
 from evnlos.events import read_triggers
-from evnlos.model import Weights, save_weights
-from evnlos.scene.nist_sd19 import read_sd19_image
-from evnlos.sensor.video import open_video
-from evnlos.setups.fitted_file import WALL, AboutWall, FittedWall, write_fitted
-from evnlos.setups.measured_file import MEASUREMENT, About, Measurement, write_measurement
+from evnlos.models import UNetConfig, Weights, load_weights, save_weights
+from evnlos.scene.databases import read_sd19_image
+from evnlos.setups.files import (
+    MEASUREMENT,
+    WALL,
+    About,
+    AboutWall,
+    FittedWall,
+    Measurement,
+    write_fitted,
+    write_measurement,
+)
 from evnlos.tensor_file import sealed_bytes
-from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
+from evnlos.training.settings import load_checkpoint, save_checkpoint
 from evnlos.types import Plane
 from evnlos.untrusted import open_image, open_regular
 
@@ -342,7 +350,7 @@ def test_a_refused_folder_keeps_its_files(
 
 
 def test_only_half_written_files_of_its_own_are_swept(tiny, tiny_dataset, tmp_path) -> None:
-    from evnlos.dataset import simulate
+    from evnlos.data import simulate
 
     folder = tmp_path / "d"
     shutil.copytree(tiny_dataset.folder, folder)
@@ -359,7 +367,7 @@ def test_only_half_written_files_of_its_own_are_swept(tiny, tiny_dataset, tmp_pa
 
 
 def test_a_run_that_was_killed_at_its_first_file_goes_on(tiny, tmp_path) -> None:
-    from evnlos.dataset import simulate
+    from evnlos.data import simulate
 
     folder = tmp_path / "d"
     folder.mkdir()
@@ -476,8 +484,8 @@ def test_a_network_that_diverged_is_not_written(sealed, tmp_path) -> None:
 
 
 def test_published_weights_are_what_was_published(tmp_path, monkeypatch) -> None:
-    from evnlos.model import published
-    from evnlos.model import weights as module
+    from evnlos.models import published
+    from evnlos.models import weights as module
 
     assert all(load_weights(name).is_sealed for name in published())
     name, path = min(published().items(), key=lambda pair: pair[1].stat().st_size)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from evnlos.cameras import EventPixel, simulate_events
+from evnlos.cameras.video import open_video, to_light, video_events
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
-from evnlos.sensor import EventPixel, simulate_events
-from evnlos.sensor.video import open_video, to_light, video_events
 
 
 def greys(values: list[int], shape: tuple[int, int] = (48, 64)) -> list[np.ndarray]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError
-from evnlos.transport import View, Viewing
+from evnlos.optics import View, Viewing
 from evnlos.types import Plane
 
 OBLIQUE = View.perspective((60, 96), 0.6, math.radians(30), math.radians(30))

@@ -7,19 +7,11 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.optics import DiffuseReflection, MatrixTransport, MatrixWall, SlidingWall, View, Wall, tpsf_kernel
+from evnlos.optics.interpolation import spline_coefficients, spline_sample, spline_scattered, spline_weights
+from evnlos.optics.wall import ambient_plane
 from evnlos.scene import LineMotion, PathMotion, Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.transport import (
-    DiffuseReflection,
-    MatrixTransport,
-    MatrixWall,
-    SlidingWall,
-    View,
-    Wall,
-    tpsf_kernel,
-)
-from evnlos.transport.ambient import ambient_plane
-from evnlos.transport.spline import spline_coefficients, spline_sample, spline_scattered, spline_weights
 from evnlos.types import Plane
 
 SHAPE = (40, 64)

@@ -7,18 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evnlos.calibration.captures import Shots
-from evnlos.calibration.wall_data import grouped, wall_data
+from evnlos.calibration.captures import Shots, grouped, wall_data
 from evnlos.calibration.wall_fit import FREEDOMS, WallState, _Unknowns, normal_equations, start_at
-from evnlos.calibration.wall_optics import fit_wall, travelled
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
-from evnlos.dataset.capture import Capture
-from evnlos.dataset.capture_info import CameraInfo, CaptureInfo, MotionInfo, TargetInfo
+from evnlos.calibration.wall_search import fit_wall, travelled
+from evnlos.data.capture import Capture
+from evnlos.data.capture_info import CameraInfo, CaptureInfo, MotionInfo, TargetInfo
 from evnlos.errors import DataError
 from evnlos.lab import Lobe, Optics, Reflection, cast, fill_throughput
+from evnlos.optics.facets import Pose, SlopeTable
 from evnlos.scene import FontGlyphs
 from evnlos.setups import RadiometricSetup
-from evnlos.transport.facets import Pose, SlopeTable
 from evnlos.types import Events, Plane
 
 SHAPE = (30, 48)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import torch
 
-from evnlos.transport import (
+from evnlos.optics import (
     GGX,
     Brdf,
     Diffraction,

@@ -19,12 +19,11 @@ from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
-from evnlos.evaluation.classifier import CHARACTERS, CharacterReader
+from evnlos.analysis.scores import CHARACTERS, CharacterReader
 from evnlos.files import write_atomically
-from evnlos.model.plates import SIDE
+from evnlos.models.confidence import SIDE
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
-from evnlos.seeds import derive_seed
-from evnlos.types import Plane
+from evnlos.types import Plane, derive_seed
 
 FAMILIES = (
     "Caveat",

@@ -7,8 +7,7 @@ from typing import Any
 
 from evnlos.config import read_yaml
 from evnlos.errors import DataError
-from evnlos.migrate import migrate
-from evnlos.version import __version__
+from evnlos.migrate import __version__, migrate
 
 ENTRIES = {
     "evnlos": f"""@software{{evnlos,

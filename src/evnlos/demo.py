@@ -1,24 +1,31 @@
-"""The main job on one page: calibrate, simulate the rig, pre-train, fine-tune, train end to end, report."""
+"""The main job on one page: calibrate, simulate the rig, pre-train, fine-tune, train end to end, report.
+
+- What a mismatch costs: the demo's comparison on rigs that the simulator does not describe, in one table.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from evnlos.calibration import Calibration
-from evnlos.dataset.importer import character_of
-from evnlos.dataset.lab import Lab, render_captures
-from evnlos.dataset.presets import default
+import numpy as np
+
+from evnlos.calibration import FIGURES_FILE, Calibration
+from evnlos.config import write_atomically
+from evnlos.data import STANDARD_MODALITIES
+from evnlos.data.capture import character_of
+from evnlos.data.lab import Lab, lab_of, render_captures
+from evnlos.data.simulations import default
 from evnlos.errors import CalibrationError, ConfigError
-from evnlos.experiment import SEQUENCE, Arm, Place, Study, gain_table, read_records, run_study
-from evnlos.model import UNetConfig
-from evnlos.progress import ProgressBars
+from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
+from evnlos.models import SequenceConfig, UNetConfig
+from evnlos.progress import Progress, ProgressBars, silent
 from evnlos.report import gather, to_text, write_report
 from evnlos.scene import FontGlyphs
-from evnlos.setups import named_setup
+from evnlos.setups import ROOMS, named_setup
 from evnlos.training import Training
 
 LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
@@ -138,8 +145,10 @@ def _of_calibration(rig: Path) -> list[str]:
 def _study(settings: Demo, test: list[str]) -> Study:
     """Return the comparison of E2E and EPNP, with one seed."""
     single = Training(network=UNetConfig(width=settings.width), epochs=settings.single_epochs)
-    plan = dataclasses.replace(SEQUENCE, network=dataclasses.replace(SEQUENCE.network, width=settings.width))
-    before = dataclasses.replace(plan, epochs=settings.pretrain_epochs)
+    # Half the rank of the full experiments, two views of a sequence: half the time, as good on few objects.
+    network = SequenceConfig(width=settings.width, rank=256, strengths=(0.001, 0.01, 0.1, 1.0))
+    plan = Training(batch_size=16, network=network)
+    before = dataclasses.replace(plan, epochs=settings.pretrain_epochs, sequence_augmentations=2)
     # What forgets least comes first; captures that are held out of it choose among these, or nothing at all.
     after = dataclasses.replace(
         plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True
@@ -172,3 +181,180 @@ def _held_out(folders: list[Path], wanted: tuple[str, ...]) -> list[str]:
     """Return the characters to test on; every seventh where the captures have none of the wanted ones."""
     there = [character_of(folder.resolve().name) for folder in folders]
     return [c for c in wanted if c in there] or there[::7]
+
+
+_REFUSED = "refused.txt"
+_FRAMES, _EVENTS = "frames", "surfaces"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came of the demo on one rig.
+
+    Args:
+        rig: Name of the rig.
+        refused: Why the calibration refused the captures; empty where it did not.
+        warnings: What the calibration said against itself.
+        expected: What the calibration says that EPNP will bring; empty where it said nothing.
+        left: "frames" or "surfaces" (of events) -> (residual on held-out captures, what noise leaves), shares.
+        mean_image_db: Modality -> PSNR of the mean picture, dB.
+        psnr_db: (arm, modality) -> PSNR of each seed, dB.
+    """
+
+    rig: str
+    refused: str
+    warnings: tuple[str, ...]
+    expected: str
+    left: dict[str, tuple[float, float]]
+    mean_image_db: dict[str, float]
+    psnr_db: dict[tuple[str, str], list[float]]
+
+    def best_e2e(self, modality: str) -> float:
+        """Return the mean PSNR of the strongest end-to-end arm, dB; NaN where there is none."""
+        values = [np.mean(v) for (arm, p), v in self.psnr_db.items() if arm.startswith("E2E") and p == modality]
+        return float(max(values, default=np.nan))
+
+    def of(self, arm: str, modality: str) -> float:
+        """Return the mean PSNR of an arm over its seeds, dB; NaN where it was not run."""
+        return float(np.mean(self.psnr_db.get((arm, modality), [np.nan])))
+
+
+def run_mismatch(
+    base: Demo,
+    rigs: tuple[str, ...] = (),
+    captures: Path | None = None,
+    seeds: tuple[int, ...] = (0,),
+    progress: Progress = silent,
+) -> list[Finding]:
+    """Run the demo on each rig, one after the other, and return what came of it; run it again to go on.
+
+    Args:
+        base: Settings of the demo; `out` holds a folder for each rig and seed.
+        rigs: Names of rigs: of the rooms of `evnlos lab`, or of folders in `captures`; all by default.
+        captures: Folder that holds a folder of captures for each rig; None renders the rooms.
+        seeds: Seeds of the demo.
+        progress: Called as the captures are rendered.
+
+    Raises:
+        ConfigError: A rig is unknown, or its folder holds no captures.
+    """
+    known = tuple(ROOMS) if captures is None else _rigs_in(captures)
+    unknown = [name for name in rigs if name not in known]
+    if unknown:
+        raise ConfigError(f"rig {unknown[0]!r} is unknown; give some of {', '.join(known)}")
+    found = []
+    for name in rigs or known:
+        if captures is None:
+            lab = lab_of(name, Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS)))
+            folders = render_captures(
+                lab, base.out / "captures" / name, workers=base.workers, progress=progress
+            )
+        else:
+            folders = [file.parent for file in sorted((captures / name).glob("*/capture.yaml"))]
+        outs = []
+        for seed in seeds:
+            out = base.out / f"{name}-seed{seed}"
+            outs.append(out)
+            out.mkdir(parents=True, exist_ok=True)
+            try:
+                run_demo(replace(base, captures=tuple(folders), out=out, seed=seed))
+            except CalibrationError as error:
+                write_atomically(out / _REFUSED, str(error).encode())
+        found.append(finding(name, outs))
+        write_atomically(base.out / "mismatch.md", mismatch_table(found).encode())
+    return found
+
+
+def _rigs_in(captures: Path) -> tuple[str, ...]:
+    names = sorted({file.parent.parent.name for file in Path(captures).glob("*/*/capture.yaml")})
+    if not names:
+        raise ConfigError(f"{captures} holds no folders of captures; give the folder above them")
+    return tuple(names)
+
+
+def finding(rig: str, outs: list[Path]) -> Finding:
+    """Return what the demo left in its folders, one a seed.
+
+    Args:
+        rig: Name of the rig.
+        outs: The demo's folders.
+    """
+    refused = [out / _REFUSED for out in outs if (out / _REFUSED).is_file()]
+    figures = [json.loads(f.read_text()) for out in outs for f in (out / "rigs").glob(f"*/{FIGURES_FILE}")]
+    records: list[Record] = []
+    for out in outs:
+        if any((out / "records").rglob("*.json")):
+            records += read_records(out / "records")
+    left = {}
+    for kind in (_FRAMES, _EVENTS):
+        pairs = [_left(one["residuals"], kind) for one in figures]
+        pairs = [pair for pair in pairs if pair is not None]
+        if pairs:
+            left[kind] = (float(np.mean([p[0] for p in pairs])), float(np.mean([p[1] for p in pairs])))
+    mean_image = {
+        r.modality: float(np.mean(list(r.baselines["mean"]["psnr_db"].values())))
+        for r in records
+        if "mean" in r.baselines
+    }
+    warnings = dict.fromkeys(line for one in figures for line in one["warnings"])
+    words = refused[0].read_text() if refused else ""
+    expected = next((str(one["expectation"]) for one in figures if one.get("expectation")), "")
+    return Finding(rig, words, tuple(warnings), expected, left, mean_image, means_of(records))
+
+
+def _left(residuals: dict[str, dict[str, float]], kind: str) -> tuple[float, float] | None:
+    """Return residual and noise of held-out captures, without the frames' pattern where that is there."""
+    names = [name for name in residuals if name.startswith(kind) and "held out" in name]
+    names = [name for name in names if "without pattern" in name] or names
+    return (residuals[names[-1]]["after"], residuals[names[-1]]["noise"]) if names else None
+
+
+def mismatch_table(found: list[Finding]) -> str:
+    """Return Markdown: a row for each rig and modality, and the margins that matter below it."""
+    head = ["rig", "sees", "left / noise, %", "mean image", "E2E", "simulation only", "EPNP", "EPNP - E2E"]
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for one in found:
+        for modality in [p for p in STANDARD_MODALITIES if p in one.mean_image_db]:
+            kinds = {"frame": (_FRAMES,), "event": (_EVENTS,)}.get(modality, (_FRAMES, _EVENTS))
+            left = "; ".join(
+                f"{100 * a:.1f} / {100 * b:.1f}" for a, b in (one.left[k] for k in kinds if k in one.left)
+            )
+            e2e, epnp = one.best_e2e(modality), one.of("EPNP", modality)
+            numbers = (one.mean_image_db[modality], e2e, one.of("simulation only", modality), epnp)
+            cells = [one.rig, modality, left, *(f"{v:.2f}" for v in numbers), f"{epnp - e2e:+.2f}"]
+            lines.append(f"| {' | '.join(cells)} |")
+        if one.refused:
+            lines.append(f"| {one.rig} | refused: {one.refused} |" + " |" * (len(head) - 2))
+    return "\n".join([*lines, "", *_margins(found), "", *_said(found)]) + "\n"
+
+
+def _margins(found: list[Finding]) -> list[str]:
+    """Return a line for each modality: by how much EPNP leads, in the mean and where it leads least."""
+    lines = []
+    for modality in STANDARD_MODALITIES:
+        lead = {one.rig: one.of("EPNP", modality) - one.best_e2e(modality) for one in found}
+        above = {
+            one.rig: one.of("simulation only", modality) - one.mean_image_db[modality]
+            for one in found
+            if modality in one.mean_image_db
+        }
+        lead = {rig: value for rig, value in lead.items() if np.isfinite(value)}
+        if not lead:
+            continue
+        least, lowest = min(lead, key=lead.__getitem__), min(above, key=above.__getitem__)
+        lines.append(
+            f"- {modality}: EPNP - E2E {np.mean(list(lead.values())):+.2f} dB in the mean, "
+            f"{lead[least]:+.2f} at least ({least}); simulation only - mean image {above[lowest]:+.2f} dB at "
+            f"least ({lowest})."
+        )
+    return lines
+
+
+def _said(found: list[Finding]) -> list[str]:
+    """Return what the calibrations said against themselves, and what they expected of EPNP."""
+    lines = []
+    for one in found:
+        words = "; ".join(one.warnings) or one.refused or "nothing"
+        expected = f"; it expected: {one.expected}" if one.expected else ""
+        lines.append(f"- {one.rig}: the calibration warned of {words}{expected}.")
+    return lines

@@ -1,7 +1,12 @@
-"""Is this installation whole? Each part, what was found, and what to do where it is missing."""
+"""Is this installation whole? What the package needs, what was found, and how an installation gets it back.
+
+- What the package can't work without, and how an installation gets it back; needs none of it itself.
+- Is this installation whole? Each part, what was found, and what to do where it is missing.
+"""
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import importlib.util
 import os
@@ -14,8 +19,79 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evnlos.errors import EvnlosError
-from evnlos.requirements import REQUIRED, fault_behind, faults
-from evnlos.version import __version__
+from evnlos.migrate import __version__
+
+REQUIRED = {
+    "numpy": "numpy>=1.26",
+    "torch": "torch>=2.6",
+    "numba": "numba>=0.61",
+    "scipy": "scipy>=1.12",
+    "h5py": "h5py>=3.11",
+    "safetensors": "safetensors>=0.4.5",
+    "filelock": "filelock>=3.12",
+    "PIL": "Pillow>=10.4",
+    "yaml": "PyYAML>=6.0",
+    "pydantic": "pydantic>=2.9",
+    "tyro": "tyro>=1.0",
+    "tqdm": "tqdm>=4.66",
+    "threadpoolctl": "threadpoolctl>=3.5",
+    "lazy_loader": "lazy-loader>=0.6",
+}
+"""Requirement as pip takes it by the module to import, those that others need first."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A required package that can't be imported.
+
+    Args:
+        name: Its name for pip.
+        found: What is wrong with it, in one line.
+        cure: What to do.
+    """
+
+    name: str
+    found: str
+    cure: str
+
+
+def faults() -> list[Fault]:
+    """Import every required package, and return those that can't be."""
+    found: dict[str, Fault] = {}
+    for module in REQUIRED:
+        try:
+            importlib.import_module(module)
+        except Exception as error:
+            fault = fault_behind(error) or _broken(module, error)
+            found.setdefault(fault.name, fault)
+    return list(found.values())
+
+
+def fault_behind(error: BaseException) -> Fault | None:
+    """Return the required package whose import raised an error; None where it came from elsewhere."""
+    if isinstance(error, ModuleNotFoundError) and error.name in REQUIRED:
+        requirement = REQUIRED[error.name]
+        return Fault(_pip_name(error.name), "not installed", f"pip install '{requirement}'")
+    # An import runs the module's own code: the innermost required package that was at it is the broken one.
+    trace, culprit = error.__traceback__, None
+    while trace is not None:
+        module = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0]
+        if trace.tb_frame.f_code.co_name == "<module>" and module in REQUIRED:
+            culprit = module
+        trace = trace.tb_next
+    if culprit is None and isinstance(error, ImportError) and error.name:
+        culprit = error.name.partition(".")[0]
+    return _broken(culprit, error) if culprit in REQUIRED else None
+
+
+def _broken(module: str, error: BaseException) -> Fault:
+    lines = str(error).strip().splitlines() or [""]
+    cure = f"pip install --force-reinstall '{REQUIRED[module]}'"
+    return Fault(_pip_name(module), f"broken ({type(error).__name__}: {lines[0][:200]})", cure)
+
+
+def _pip_name(module: str) -> str:
+    return REQUIRED[module].partition(">")[0]
 
 
 @dataclass(frozen=True)
@@ -95,7 +171,7 @@ def _numba() -> Part:
     """Compile a small kernel and see that the folder where numba keeps those of the package can be written."""
     import numba
 
-    from evnlos.sensor import _order
+    from evnlos.cameras import event_order as _order
 
     compiled = numba.njit(lambda x: x + 1)(1) == 2
     cache = Path(next(kernel.stats.cache_path for kernel in vars(_order).values() if hasattr(kernel, "stats")))
@@ -135,7 +211,7 @@ def _fonts() -> Part:
 
 def _reader() -> Part:
     """Load the weights that the package brings: those of the reader of characters."""
-    from evnlos.evaluation.classifier import load_reader
+    from evnlos.analysis.scores import load_reader
 
     try:
         size = sum(values.numel() for values in load_reader().parameters())
@@ -161,7 +237,7 @@ def _gpu() -> Part:
 
 
 def _lpips() -> Part:
-    from evnlos.evaluation import load_lpips
+    from evnlos.analysis import load_lpips
 
     try:
         load_lpips(os.environ.get("EVNLOS_VGG16"))

@@ -1,4 +1,8 @@
-"""Settings and metadata of older versions in today's words: the one place that knows what names once were.
+"""Versions: the one of this package, and what older ones wrote in today's words.
+
+- The package's version, read from its metadata.
+
+Settings and metadata of older versions in today's words: the one place that knows what names once were.
 
 `from_dict` calls `migrate` for everything that it builds, so a YAML file of an older version loads like one of
 today. Add a function to `_STEPS` for each change of a name or of a meaning; it sees the plain mapping.
@@ -7,7 +11,14 @@ today. Add a function to `_STEPS` for each change of a name or of a meaning; it 
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
+
+try:
+    __version__ = version("evnlos")
+except PackageNotFoundError:  # a source tree that was never installed
+    __version__ = "0+unknown"
+
 
 Step = Callable[[dict[str, Any]], dict[str, Any]]
 

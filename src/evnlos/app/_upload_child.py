@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.app.recorded import Recorded
+from evnlos.app.controls import Recorded
 from evnlos.app.upload import read_upload
 from evnlos.errors import EvnlosError
 from evnlos.scene import LineMotion

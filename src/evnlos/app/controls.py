@@ -1,16 +1,29 @@
-"""What the page lets a visitor choose, as settings of a small simulation."""
+"""What a visitor chooses: controls, the hidden object, and the sequence that the cameras saw.
+
+- What the page lets a visitor choose, as settings of a small simulation.
+- The hidden object: a character picked, or a visitor's drawing.
+- One pass as the cameras saw it, whether it was simulated a moment ago or uploaded.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Literal
 
-from evnlos.dataset import Simulation
-from evnlos.dataset.presets import page
-from evnlos.errors import ConfigError
-from evnlos.sensor import EventPixel, FrameCamera
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera
+from evnlos.data import Samples, Sampling, Simulation, make_samples
+from evnlos.data.sampling import edges_from
+from evnlos.data.simulations import page
+from evnlos.errors import ConfigError, DataError
+from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, HandwritingGlyphs, Motion, Scene, Target
+from evnlos.scene.glyph_sets import Plate
 from evnlos.setups import RadiometricSetup, SensorSize
+from evnlos.types import Events, derive_seed
 
 _PAGE = page()  # what the package's networks learned from: rig and samples here are the same
 POSITIONS = _PAGE.positions
@@ -118,3 +131,131 @@ class Controls:
             sampling=COARSE,
             seed=self.seed,
         )
+
+
+CHARACTERS = UPPER_CASE + DIGITS
+"""What can be picked."""
+_SIDE = 128  # of a mask, pixels: 26 a cell
+INK_SIDE = 32
+"""Pixels a side of a drawing."""
+_LEAST_INK = 1e-3
+_EMPTY = "the drawing is empty; draw something, or pick a character"
+
+
+@lru_cache(maxsize=64)
+def picked(character: str) -> Target:
+    """Return a character in a hand that no training set holds, on the standard plate of 8 cm.
+
+    Raises:
+        ConfigError: It is none of `CHARACTERS`.
+    """
+    if len(character) != 1 or character not in CHARACTERS:
+        raise ConfigError(f"the hidden character is {character[:20]!r}; give one of {CHARACTERS}")
+    glyphs = HandwritingGlyphs(
+        characters=character, writers=1, first_writer=TRAIN_WRITERS, plate=Plate(size_px=_SIDE)
+    )
+    return glyphs.target(glyphs.objects()[0])
+
+
+def drawn(ink: str, size_m: float = 0.08) -> Target:
+    """Return a drawing as a plate that shines where there is ink.
+
+    Args:
+        ink: `INK_SIDE` rows of as many values, row 0 on top, two hexadecimal digits each: 00 nothing, ff full.
+        size_m: Side of the plate, metres.
+
+    Raises:
+        DataError: There is no ink, or the text is no drawing.
+
+    Example:
+        >>> drawn("00" * 512 + "ff" * 256 + "00" * 256).mask.mean()
+        np.float32(0.25)
+    """
+    if not ink:
+        raise DataError(_EMPTY)
+    wanted = 2 * INK_SIDE**2
+    if len(ink) != wanted or not set(ink) <= set("0123456789abcdef"):
+        raise DataError(f"the drawing is a text of {len(ink)} characters; give {wanted} hexadecimal digits")
+    values = np.frombuffer(bytes.fromhex(ink), np.uint8).reshape(INK_SIDE, INK_SIDE)
+    mask = values.astype(np.float32) / np.float32(255)
+    if mask.mean() < _LEAST_INK:
+        raise DataError(_EMPTY)
+    return Target("drawing", mask, size_m)
+
+
+_TOLERANCE = 0.03  # thresholds: the eye sees no difference to the default, which takes longer
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """One pass: events, the instants of its positions, and what else is known.
+
+    Args:
+        name: What to call it.
+        events: Its events.
+        edges_us: N + 1 ascending instants, int64, microseconds; position k has the events in
+            (edge k, edge k + 1].
+        frames: One frame a position, digital numbers, [N, H, W]; None where there were no frames.
+        peak: Largest digital number of a frame.
+        motion: The hidden object's motion on the events' clock; None where it is unknown.
+        target: The hidden object; None where it is unknown.
+        simulation: The rig, where it is known.
+        distance_m: From hidden object to wall, metres, where it is noted.
+        notes: What reading did, a line each.
+    """
+
+    name: str
+    events: Events
+    edges_us: NDArray[np.int64]
+    frames: NDArray | None = None
+    peak: int = 255
+    motion: Motion | None = None
+    target: Target | None = None
+    simulation: Simulation | None = None
+    distance_m: float | None = None
+    notes: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.edges_us) - 1
+
+    @property
+    def times_s(self) -> NDArray[np.float64]:
+        """Instant of each position, [N], seconds."""
+        return self.edges_us[1:].astype(np.float64) * 1e-6
+
+    def samples(self, sampling: Sampling) -> Samples:
+        """Return what a network sees at each position; frames are black where there are none."""
+        blank = np.zeros((len(self), *self.events.shape), np.uint8) if self.frames is None else self.frames
+        return make_samples(
+            blank, self.peak, self.events, self.edges_us, sampling, motion=self.motion, target=self.target
+        )
+
+    def truth(self, sampling: Sampling) -> NDArray[np.float32] | None:
+        """Return the hidden object on a canvas's scored rows, float32 [N, h, w], 0..1; None where unknown."""
+        if self.motion is None or self.target is None:
+            return None
+        places = self.motion.position_m(self.times_s)
+        return self.target.rasterise(sampling.canvas, places)[:, sampling.scored]
+
+
+def simulate_pass(controls: Controls, target: Target) -> Recorded:
+    """Simulate one pass of a hidden object.
+
+    Args:
+        controls: Rig and camera.
+        target: What is hidden.
+
+    Raises:
+        ConfigError: The rig can't be, or the camera gets no light.
+    """
+    simulation = controls.simulation()
+    scene = Scene(target, simulation.motion, simulation.duration_s)
+    wall = simulation.setup.observe(scene)
+    times_s = scene.position_times_s(simulation.positions)
+    camera: FrameCamera = simulation.frame_camera
+    events = EventCamera(simulation.pixel, _TOLERANCE, simulation.setup.time_step_s).record(
+        wall, 0.0, simulation.duration_s, seed=derive_seed(controls.seed, "events")
+    )
+    frames = camera.capture(wall, times_s, seed=derive_seed(controls.seed, "frames"))
+    edges_us = edges_from(times_s)
+    return Recorded(target.name, events, edges_us, frames, camera.white, scene.motion, target, simulation)

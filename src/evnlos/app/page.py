@@ -1,18 +1,147 @@
-"""The page in Gradio: controls on the left, pictures on the right; everything it shows comes from `work`."""
+"""The page in Gradio: texts, controls, and what happens when a control moves.
+
+- The texts of the page that stand still: its head, and its words explained.
+- What happens when a control moves or a file arrives: pictures and words as HTML, piece by piece.
+- The page in Gradio: controls on the left, pictures on the right.
+"""
 
 from __future__ import annotations
 
+import re
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from evnlos.app.controls import Controls
-from evnlos.app.hidden import CHARACTERS, INK_SIDE, drawn, picked
-from evnlos.app.networks import Networks
-from evnlos.app.sheet import message_box
-from evnlos.app.words import GLOSSARY, HEAD, PAPER
-from evnlos.app.work import UPLOADS_AT_ONCE, opening_verdict, simulated, uploaded
+from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, Recorded, drawn, picked, simulate_pass
+from evnlos.app.solving import Networks, Reconstruction, from_each_frame, from_weights, from_whole_pass
+from evnlos.app.upload import read_upload_apart
+from evnlos.app.views import (
+    View,
+    event_views,
+    found_views,
+    message_box,
+    seen_views,
+    sheet,
+    verdict_box,
+    verdict_on,
+    waiting_box,
+)
 from evnlos.errors import EvnlosError
+from evnlos.scene import Target
+
+HEAD = """<header class="ev-head"><h1>Seeing around a corner</h1>
+<p>Something moves behind a corner. Its light falls on a wall; a frame camera and an event camera see
+the wall alone. Choose what is hidden and how good the wall and the cameras are, and watch what can be made
+of it.</p></header>"""
+
+PAPER = """<div class="ev-paper"><canvas class="ev-pen" width="192" height="192" tabindex="0" role="img"
+aria-label="Drawing of the hidden object, 8 cm wide. Arrow keys move the pen, with Shift they draw."></canvas>
+<i class="ev-nib"></i><button type="button" class="ev-button" onclick="evnlosClear(this)">Clear</button>
+<small>8 cm x 8 cm. Draw with mouse or finger; arrow keys move the pen, with Shift they draw.</small></div>"""
+"""The paper of a drawing; `page.js` draws on it."""
+
+_WORDS = {
+    "wall roughness": "How far the wall throws light off the direction in which a mirror would. At 0.02 it is "
+    "polished metal, at 0.1 it is dull; matte paint throws light everywhere alike.",
+    "white level": "A light of 1 white level just fills a pixel of the frame camera.",
+    "event": "A pixel of an event camera sends no pictures. It reports when its light has changed by a "
+    "threshold, brighter or darker, at that instant.",
+    "threshold": "How much the natural logarithm of a pixel's light has to change for an event: 0.15 is 16 %.",
+    "time surface": "A picture made from events: each pixel shows how recent its newest event is.",
+    "least squares": "The picture that explains one frame best, kept dark where the frame says nothing.",
+    "whole pass": "The one picture that explains all frames of the pass together.",
+    "dB": "PSNR: ten decibels more are a tenth of the squared error. It means something only beside the value "
+    "of an all-black picture at the same instant.",
+    "verdict": "What wall and noise leave to be seen in one frame, whatever the method; a whole pass shows "
+    "more. Where they leave nothing, a network may still draw a letter: it remembers one.",
+}
+
+GLOSSARY = (
+    '<details class="ev-words"><summary>What the words mean</summary><dl>'
+    + "".join(f"<dt>{word}</dt><dd>{text}</dd>" for word, text in _WORDS.items())
+    + "</dl></details>"
+)
+
+
+UPLOADS_AT_ONCE = 4
+"""Uploads that are read at the same time, each in a process of its own."""
+_drawing = threading.Lock()  # what was read and checked takes seconds, and the cores are the page's
+
+
+def simulated(controls: Controls, target: Target, networks: Networks) -> Iterator[tuple[str, str]]:
+    """Yield (sheet, verdict) of a simulated pass three times: without networks, with them, with the verdict.
+
+    Args:
+        controls: Rig and camera.
+        target: What is hidden.
+        networks: The page's networks.
+
+    Raises:
+        EvnlosError: The settings can't be.
+    """
+    recorded = simulate_pass(controls, target)
+    before, after = seen_views(recorded), event_views(recorded)
+    found = [from_whole_pass(recorded), from_each_frame(recorded)]
+    assert recorded.simulation is not None  # it was simulated
+    yield _sheet(recorded, before, found, after), waiting_box()
+    wall = networks.wall_of(recorded)
+    found += [from_weights(recorded, name, one, wall) for name, one in networks.of(recorded).items()]
+    pictures = _sheet(recorded, before, found, after)
+    yield pictures, waiting_box()
+    yield pictures, verdict_box(verdict_on(recorded.simulation))
+
+
+def opening_verdict(controls: Controls) -> str:
+    """Return the verdict on the rig that the page opens with."""
+    return verdict_box(verdict_on(controls.simulation()))
+
+
+def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networks) -> tuple[str, str]:
+    """Return (sheet, message) of an uploaded file; whatever is wrong with it is a message of one line.
+
+    Args:
+        path: The file, or None where there is none.
+        scratch: Folder to unpack in.
+        limit_bytes: Largest file, bytes.
+        networks: The page's networks.
+    """
+    if not path:
+        return "", message_box("no file yet: choose a recording, or a capture folder as a zip", wrong=False)
+    try:
+        recorded = read_upload_apart(path, scratch, limit_bytes)
+        found, refused = [], []
+        with _drawing:
+            known, wall = networks.of(recorded), networks.wall_of(recorded)
+            for name, one in known.items():
+                try:
+                    found.append(from_weights(recorded, name, one, wall))
+                except EvnlosError as error:
+                    refused.append(str(error))
+            pictures = _sheet(recorded, seen_views(recorded), found, event_views(recorded))
+    except (EvnlosError, OSError, MemoryError) as error:
+        return "", message_box(_without_folder(str(error) or "the file needs too much memory", path, scratch))
+    notes = [*recorded.notes, *refused]
+    if not known:
+        notes.append(
+            "no network to reconstruct with: those of the package need a capture folder that states the "
+            "motion; or start the page with --weights"
+        )
+    return pictures, message_box("; ".join(notes), wrong=False)
+
+
+def _sheet(recorded: Recorded, before: list[View], found: list[Reconstruction], after: list[View]) -> str:
+    views = [*before, *found_views(found), *after]
+    return sheet(views, recorded.times_s - recorded.edges_us[0] * 1e-6, recorded.name)
+
+
+def _without_folder(text: str, path: str, scratch: Path) -> str:
+    """Return a message without the folders of this machine."""
+    folders = {scratch, scratch.resolve(), Path(path).parent, Path(path).resolve().parent}
+    for folder in sorted(folders, key=lambda one: len(str(one)), reverse=True):  # the inner ones first
+        text = re.sub(re.escape(str(folder)) + r"/(unpacked-[^/]*/)*", "", text)
+    return text
+
 
 _PICK, _DRAW = "Pick a character", "Draw one"
 _METAL, _MATTE = "rough metal", "matte white paint"

@@ -19,8 +19,8 @@ from evnlos.calibration.event_statistics import (
     simulated,
     thinned,
 )
-from evnlos.calibration.least_squares import forward_jacobian, levenberg_marquardt
-from evnlos.sensor import EventPixel, PixelSettings
+from evnlos.calibration.transport_fit import forward_jacobian, levenberg_marquardt
+from evnlos.cameras import EventPixel, PixelSettings
 from evnlos.types import Events
 
 _LOG_NAMES = ("threshold_on", "threshold_off", "threshold_sigma", "shot_noise_rate_hz")

@@ -12,14 +12,13 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.calibration.event_statistics import Recording, count_map, simulated
-from evnlos.calibration.frame_noise import local_square
-from evnlos.calibration.least_squares import levenberg_marquardt
+from evnlos.calibration.frame_model import local_square
+from evnlos.calibration.transport_fit import levenberg_marquardt
+from evnlos.cameras import PixelSettings
+from evnlos.cameras.pixel import EventPixel
+from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.errors import ConfigError
-from evnlos.seeds import derive_seed
-from evnlos.sensor import PixelSettings
-from evnlos.sensor.brownian import BrownianPixel
-from evnlos.sensor.pixel import EventPixel
-from evnlos.types import Events
+from evnlos.types import Events, derive_seed
 
 Array = NDArray[np.float64]
 

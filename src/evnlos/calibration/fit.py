@@ -13,22 +13,18 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Shots, read_shots
-from evnlos.calibration.event_check import event_residuals
 from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
-from evnlos.calibration.event_statistics import read_recordings
-from evnlos.calibration.frame_model import FrameModel
-from evnlos.calibration.frame_noise import FrameNoise, fit_frame_noise
-from evnlos.calibration.residual import Residual
-from evnlos.calibration.settings import Calibration
-from evnlos.calibration.training_set import pens_of, training_simulation
-from evnlos.calibration.transport_fit import TransportFit, fit_transport
+from evnlos.calibration.event_statistics import event_residuals, read_recordings
+from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
+from evnlos.calibration.settings import Calibration, pens_of, training_simulation
+from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
 from evnlos.calibration.unlabelled import fit_unlabelled
-from evnlos.calibration.wall_optics import fit_wall
-from evnlos.dataset.simulate import Simulation
+from evnlos.calibration.wall_search import fit_wall
+from evnlos.cameras import EventPixel
+from evnlos.cameras.pixel import continuous
+from evnlos.data.simulate import Simulation
 from evnlos.errors import DataError
 from evnlos.scene import LineMotion, Strokes
-from evnlos.sensor import EventPixel
-from evnlos.sensor.pixel import continuous
 from evnlos.setups import RadiometricSetup, SensorSize, Setup
 
 _EXAMPLES = 3

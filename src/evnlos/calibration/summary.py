@@ -13,17 +13,16 @@ import numpy as np
 from PIL import Image
 
 from evnlos.calibration.fit import RigFit
-from evnlos.calibration.residual import Residual
-from evnlos.calibration.transport_fit import values_of
-from evnlos.calibration.wall_optics import WALL_FILE
+from evnlos.calibration.transport_fit import Residual, values_of
+from evnlos.calibration.wall_search import WALL_FILE
 from evnlos.config import save_yaml
-from evnlos.dataset.fixed_pattern import PATTERN_FILE, save_pattern
-from evnlos.dataset.simulate import Simulation
+from evnlos.data.cleaning import PATTERN_FILE, save_pattern
+from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
+from evnlos.migrate import __version__
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import CALIBRATED_FILE, FittedSetup
-from evnlos.version import __version__
 
 RIG_FILE, TRAINING_FILE, FIGURES_FILE = CALIBRATED_FILE, "training.yaml", "calibration.json"
 TARGETS = "targets"

@@ -17,19 +17,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.wall_data import Array, WallData
+from evnlos.calibration.captures import Array, WallData
 from evnlos.errors import ConfigError
-from evnlos.transport.facets import (
+from evnlos.optics.facets import (
     MASKING,
     Pose,
     SlopeTable,
+    carry_facets,
+    carry_lobes,
+    facet_slopes,
     folded_columns,
     second_differences,
     seen_points,
     target_cells,
 )
-from evnlos.transport.facets_kernel import carry_facets, carry_lobes, facet_slopes
-from evnlos.transport.radiometric_kernel import torchs_threads
+from evnlos.optics.radiometric import torchs_threads
 
 LOBES = np.array(
     [(a, a * r) for a in (0.02, 0.035, 0.06, 0.10, 0.17, 0.3) for r in (0.6, 1.0, 1.6)], dtype=np.float64

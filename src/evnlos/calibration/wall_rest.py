@@ -11,14 +11,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Shots
-from evnlos.calibration.wall_data import WallData, wall_data
+from evnlos.calibration.captures import Shots, WallData, wall_data
 from evnlos.calibration.wall_fit import WallState
-from evnlos.dataset.sampling import reduce_by_area
-from evnlos.setups.fitted_file import AboutWall, FittedWall
-from evnlos.transport.facets import MASKING, seen_points, target_cells
-from evnlos.transport.facets_kernel import fill_facets
-from evnlos.transport.radiometric_kernel import torchs_threads
+from evnlos.data.sampling import reduce_by_area
+from evnlos.optics.facets import MASKING, fill_facets, seen_points, target_cells
+from evnlos.optics.radiometric import torchs_threads
+from evnlos.setups.files import AboutWall, FittedWall
 from evnlos.types import Plane
 
 Array = NDArray[np.float64]

@@ -12,17 +12,16 @@ import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from evnlos.cli.event_files import amount, refuse_existing
-from evnlos.cli.notes import say
-from evnlos.cli.preview import look_of, write_preview
+from evnlos.cameras.event_model import Phase, PixelSettings
+from evnlos.cameras.pixel import EventPixel, Logarithm, Mode
+from evnlos.cameras.sensors import pixel_preset
+from evnlos.cameras.video import Tone, Video, check_video, open_video, video_events
+from evnlos.cli.parsing import say
+from evnlos.cli.recordings import amount, look_of, refuse_existing, write_preview
 from evnlos.config import load_yaml, to_dict
 from evnlos.errors import ConfigError
 from evnlos.events import EventWriter
 from evnlos.events.recording import Cut, Recording
-from evnlos.sensor.event_model import Phase, PixelSettings
-from evnlos.sensor.pixel import EventPixel, Logarithm, Mode
-from evnlos.sensor.presets import pixel_preset
-from evnlos.sensor.video import Tone, Video, check_video, open_video, video_events
 from evnlos.types import Events
 
 

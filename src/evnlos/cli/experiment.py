@@ -1,21 +1,38 @@
-"""`evnlos experiment`: a named comparison in, records and tables out."""
+"""`evnlos demo` and `evnlos experiment`: named comparisons.
+
+- `evnlos demo`: the main job, small.
+- `evnlos experiment`: a named comparison in, records and tables out.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from evnlos.cli.notes import say
-from evnlos.dataset import STANDARD_MODALITIES
+from evnlos.cli.console import Flat
+from evnlos.cli.parsing import say
+from evnlos.data import STANDARD_MODALITIES
+from evnlos.demo import Demo, run_demo
 from evnlos.errors import ConfigError, MissingDependencyError
 from evnlos.files import write_atomically
 from evnlos.progress import ProgressBars
 
 if TYPE_CHECKING:
     from evnlos.experiment import Arm, Study
+
+
+@dataclass(frozen=True)
+class DemoCommand:
+    """The main job, small: simulate, pre-train, fine-tune on captures, train end to end, evaluate, report."""
+
+    settings: Flat[Demo] = field(default_factory=Demo)
+
+    def run(self) -> None:
+        """Run the demo and print the table and the path of the report."""
+        run_demo(self.settings)
 
 
 @dataclass(frozen=True)
@@ -166,7 +183,7 @@ class ExperimentCommand:
 
     def _carry_over(self) -> None:
         from evnlos.experiment import carried_table, carry_over, write_carried
-        from evnlos.plot.worth import draw_worth
+        from evnlos.plot.results import draw_worth
 
         weights = self.weights
         if weights is None:
@@ -185,8 +202,7 @@ class ExperimentCommand:
             say(f"no {name}.png: {error}")
 
     def _mismatch(self) -> None:
-        from evnlos.demo import Demo
-        from evnlos.mismatch import mismatch_table, run_mismatch
+        from evnlos.demo import Demo, mismatch_table, run_mismatch
 
         base = Demo(out=self.out, test=self.test, workers=self.workers)
         base = replace(

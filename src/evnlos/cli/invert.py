@@ -75,9 +75,9 @@ class InvertCommand:
             raise ConfigError(
                 f"{len(self.files)} paths without --setup; give one NPZ file, or capture folders and --setup"
             )
-        from evnlos.cli.invert_still import figures_of
-        from evnlos.plot.inversion import draw_inversion
-        from evnlos.solver import prepare_inversion, read_photograph
+        from evnlos.cli.invert_captures import figures_of
+        from evnlos.inverse import prepare_inversion, read_photograph
+        from evnlos.plot.results import draw_inversion
 
         lam, rule = _weight(self.lam)
         if self.solver == "all" and rule == "gcv" and lam is None:
@@ -119,8 +119,8 @@ class InvertCommand:
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_stills(self, path: Path) -> None:
-        from evnlos.cli.invert_still import StillOptions, invert_stills
-        from evnlos.plot.inversion import draw_inversion
+        from evnlos.cli.invert_captures import StillOptions, invert_stills
+        from evnlos.plot.results import draw_inversion
         from evnlos.setups import load_setup
 
         setup = load_setup(path)
@@ -145,8 +145,8 @@ class InvertCommand:
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, setup: Path) -> None:
-        from evnlos.cli.invert_pass import PassOptions, invert_captures, print_pass
-        from evnlos.plot.inversion import draw_inversion
+        from evnlos.cli.invert_captures import PassOptions, invert_captures, print_pass
+        from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
         lam: dict[str, float | None] = {"tikhonov": LAM_TIKHONOV, "tv": LAM_TV}

@@ -10,14 +10,13 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import MISSING, fields, is_dataclass, replace
 from typing import Any, TextIO, cast
 
-from evnlos.cli.notes import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen
-from evnlos.cli.parsing import parse, todays_words
+from evnlos.cli.parsing import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen, parse, todays_words
 from evnlos.cli.verbs import VERBS, command_of, summary_of
+from evnlos.doctor import fault_behind
 from evnlos.errors import ConfigError, EvnlosError, printable
+from evnlos.migrate import __version__
 from evnlos.registry import Kinded, kind_of
-from evnlos.requirements import fault_behind
 from evnlos.threads import sleep_while_waiting
-from evnlos.version import __version__
 
 # Nothing that may be missing is imported before a command is: help, version and doctor work in any case.
 

@@ -1,9 +1,7 @@
 """Event streams: files and representations."""
 
 from evnlos.events.batch import event_batch, events_from_tensors, events_to_tensors
-from evnlos.events.grids import edges_from_count, edges_from_rate, suggest_tau_us
-from evnlos.events.intensity import intensity_map
-from evnlos.events.io import (
+from evnlos.events.files import (
     CelexOptions,
     EventWriter,
     Frames,
@@ -19,9 +17,15 @@ from evnlos.events.io import (
     write_celex_frames,
     write_events,
 )
-from evnlos.events.polarity import keep_known_polarity
+from evnlos.events.grids import edges_from_count, edges_from_rate, keep_known_polarity, suggest_tau_us
 from evnlos.events.surface import normalise_surface, time_surface
-from evnlos.events.volume import event_frame, event_histogram, threshold_ordinal_surface, voxel_grid
+from evnlos.events.volume import (
+    event_frame,
+    event_histogram,
+    intensity_map,
+    threshold_ordinal_surface,
+    voxel_grid,
+)
 
 __all__ = [
     "CelexOptions",

@@ -9,9 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import DataError
-from evnlos.events.intensity import intensity_map
 from evnlos.events.surface import time_surface
-from evnlos.events.volume import event_frame, event_histogram, threshold_ordinal_surface, voxel_grid
+from evnlos.events.volume import (
+    event_frame,
+    event_histogram,
+    intensity_map,
+    threshold_ordinal_surface,
+    voxel_grid,
+)
 from evnlos.types import Events
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from evnlos.cameras.event_order import EventTensors
 from evnlos.events.grids import as_edges
 from evnlos.events.surface import Mode, check_surface
-from evnlos.sensor.event_tensors import EventTensors
 
 _NEVER = -(1 << 62)  # a time of which nothing is left
 _UNIT = 2.0**40

@@ -11,19 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evnlos.analysis.confidence import FrameOperator, PassWorth, consistent, risk_coverage, worth_of
 from evnlos.calibration import RIG_FILE
 from evnlos.calibration.transport_fit import values_of
 from evnlos.config import config_hash, load_yaml, to_dict
-from evnlos.dataset import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
-from evnlos.dataset.pool import processes
+from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
+from evnlos.data.pool import processes
 from evnlos.errors import DataError
-from evnlos.evaluation.consistency import FrameOperator, consistent
-from evnlos.evaluation.worth import PassWorth, risk_coverage, worth_of
-from evnlos.experiment.scoring import TRUST
+from evnlos.experiment.table import TRUST
 from evnlos.files import write_atomically
 from evnlos.metrics import psnr
-from evnlos.model import Weights, load_weights
-from evnlos.model.plates import on_canvas
+from evnlos.models import Weights, load_weights
+from evnlos.models.confidence import on_canvas
 from evnlos.progress import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 
+from evnlos.analysis.scores import paired_difference
 from evnlos.config import config_hash
-from evnlos.dataset import STANDARD_MODALITIES, Simulation, as_modality, simulate_object
-from evnlos.dataset.pool import processes, run_in_order
-from evnlos.dataset.simulate import check_passes, object_bytes
-from evnlos.evaluation.intervals import paired_difference
+from evnlos.data import STANDARD_MODALITIES, Simulation, as_modality, simulate_object
+from evnlos.data.pool import processes, run_in_order
+from evnlos.data.simulate import check_passes, object_bytes
 from evnlos.files import write_atomically
 from evnlos.metrics import psnr
-from evnlos.model import fit_linear
+from evnlos.models import fit_linear
 from evnlos.progress import Progress, Step, silent
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
-from evnlos.setups.presets import FAR_M
+from evnlos.setups.load import FAR_M
 
 FULL = 0.85
 """White levels of the brightest pixel: as if the exposure had been set so that nothing is clipped."""

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from evnlos.config import from_dict, to_dict
-from evnlos.dataset import Sampling
+from evnlos.data import Sampling
 from evnlos.errors import ConfigError
 from evnlos.experiment.study import Arm, Study
-from evnlos.model import SequenceConfig, UNetConfig
+from evnlos.models import SequenceConfig, UNetConfig
 from evnlos.training import Training, paper_finetuning, paper_pretraining
 
 PRETRAINING = Training(epochs=2)
@@ -147,8 +147,7 @@ def embedding(rig: str) -> Study:
 
 
 _SEQUENCE_NETWORK = SequenceConfig(rank=512, strengths=(0.001, 0.01, 0.1, 1.0))
-SEQUENCE = Training(epochs=6, batch_size=16, network=_SEQUENCE_NETWORK)
-"""Pre-training of a network that sees whole sequences."""
+_SEQUENCE = Training(epochs=6, batch_size=16, network=_SEQUENCE_NETWORK)
 _SEQUENCE_FINETUNING = replace(FINETUNING, epochs=8, batch_size=16)
 
 
@@ -158,9 +157,9 @@ def sequence(rig: str) -> Study:
     A sequence is one sample: the simulation has four times the writers of the other studies.
     """
     arms = (
-        Arm("E2E sequence", "none", None, replace(SEQUENCE, epochs=60)),
-        Arm("simulation only sequence", "calibrated", SEQUENCE, None),
-        Arm("EPNP sequence", "calibrated", SEQUENCE, _SEQUENCE_FINETUNING),
+        Arm("E2E sequence", "none", None, replace(_SEQUENCE, epochs=60)),
+        Arm("simulation only sequence", "calibrated", _SEQUENCE, None),
+        Arm("EPNP sequence", "calibrated", _SEQUENCE, _SEQUENCE_FINETUNING),
     )
     return Study("sequence", rig, arms, writers=44)
 
@@ -182,7 +181,7 @@ def on_sequences(study: Study) -> Study:
         pre, fine = arm.pretraining, arm.finetuning
         if pre is not None:
             pre = _of_passes(pre, 6, arm.name)
-            fine = fine and replace(fine, epochs=round(fine.epochs * 8 / 3), batch_size=SEQUENCE.batch_size)
+            fine = fine and replace(fine, epochs=round(fine.epochs * 8 / 3), batch_size=_SEQUENCE.batch_size)
         elif fine is not None:
             fine = _of_passes(fine, 5, arm.name)
         arms.append(replace(arm, pretraining=pre, finetuning=fine))
@@ -202,7 +201,7 @@ def _of_passes(single: Training, longer: int, arm: str) -> Training:
     if values["strengths"] == list(UNetConfig().strengths):
         values["strengths"] = list(_SEQUENCE_NETWORK.strengths)
     network = from_dict(SequenceConfig, values)
-    return replace(single, epochs=longer * single.epochs, batch_size=SEQUENCE.batch_size, network=network)
+    return replace(single, epochs=longer * single.epochs, batch_size=_SEQUENCE.batch_size, network=network)
 
 
 def objects(rig: str) -> Study:
@@ -212,7 +211,7 @@ def objects(rig: str) -> Study:
     """
     arms = []
     for writers, epochs in ((3, 12), (11, 12), (44, 6)):
-        before, words = replace(SEQUENCE, epochs=epochs), f"{36 * writers} objects"
+        before, words = replace(_SEQUENCE, epochs=epochs), f"{36 * writers} objects"
         arms.append(Arm(f"simulation only, {words}", "calibrated", before, None, writers=writers))
         arms.append(Arm(f"EPNP, {words}", "calibrated", before, _SEQUENCE_FINETUNING, writers=writers))
     return Study("objects", rig, tuple(arms))

@@ -1,32 +1,100 @@
-"""Experiments, flat and resumable: calibrate, simulate, import, pre-train, fine-tune, score, record."""
+"""Experiments, flat and resumable, on captures and on simulations alone.
+
+- The trainings of an experiment: one after the other, or several at a time on the cores of a CPU.
+- Experiments, flat and resumable: calibrate, simulate, import, pre-train, fine-tune, score, record.
+- The paper's experiment without captures: learn from handwriting, test on unseen hands, go over to Comic.
+"""
 
 from __future__ import annotations
 
-from contextlib import suppress
-from dataclasses import replace
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from evnlos.analysis import available_lpips, evaluate
 from evnlos.calibration import RigFit, fit_rig, rows_of, write_rig
 from evnlos.config import config_hash, load_yaml, to_dict
-from evnlos.dataset import (
-    Dataset,
-    Simulation,
-    import_captures,
-    load_pattern,
-    simulate,
-)
-from evnlos.dataset.importer import character_of
-from evnlos.dataset.presets import default
+from evnlos.data import STANDARD_MODALITIES, Dataset, Simulation, import_captures, load_pattern, simulate
+from evnlos.data.capture import character_of
+from evnlos.data.pool import processes, run_tasks
+from evnlos.data.simulations import default, paper
 from evnlos.errors import CalibrationError, DataError, MissingDependencyError
-from evnlos.experiment.scoring import score_arm
-from evnlos.experiment.study import Arm, Place, Record, Study, slug
-from evnlos.experiment.trainings import Run, train_one, train_together
+from evnlos.experiment.study import Arm, Place, Record, Study, keep_scores, names_there, slug
+from evnlos.experiment.table import score_arm
+from evnlos.models import load_weights
 from evnlos.progress import Progress, Step, silent
-from evnlos.scene import HandwritingGlyphs
-from evnlos.seeds import derive_seed
+from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
+from evnlos.setups import SensorSize
+from evnlos.training import Training, choose_and_finetune, train
+from evnlos.types import derive_seed
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training.
+
+    Args:
+        data: What it learns from.
+        settings: How.
+        out: Its folder.
+        start: Run whose weights it starts from; None: random ones.
+        alternatives: Further settings of a fine-tuning: captures held out choose the best of all, or none.
+    """
+
+    data: Dataset
+    settings: Training
+    out: Path
+    start: Path | None = None
+    alternatives: tuple[Training, ...] = ()
+
+
+def train_one(run: Run, progress: Progress = silent) -> None:
+    """Train what is not trained yet; `progress` is that of `train`."""
+    if run.alternatives and run.start is not None:
+        candidates = (run.settings, *run.alternatives)
+        choose_and_finetune(run.data, candidates, run.out, run.start, progress=progress)
+        return
+    train(run.data, run.settings, run.out, run.start, progress)
+
+
+def train_together(runs: list[Run], at_a_time: int, progress: Progress = silent) -> None:
+    """Train several networks at a time.
+
+    A network of this size gains little from a second core, so that as many trainings as there are cores, each
+    with its share of them, take less time than one after the other. On a GPU nothing is done here: there they
+    go one by one.
+
+    Args:
+        runs: The trainings; one that is named twice, or was done before, is done once.
+        at_a_time: Trainings at a time; 0 = one for each core.
+        progress: Called when the work begins and after each training, with its folder's name.
+    """
+    todo = {run.out: run for run in runs if not (run.out / "weights.safetensors").is_file()}
+    if torch.cuda.is_available() or not todo:
+        return
+    progress(Step("train networks", 0, len(todo), "networks"))
+    done = 0
+    # Pre-training and end-to-end training first: fine-tuning begins where they end.
+    for stage in (True, False):
+        some = [run for run in todo.values() if (run.start is None) == stage]
+        at_once = max(1, processes(at_a_time, len(some)))
+        tasks = [(run, max(1, torch.get_num_threads() // at_once)) for run in some]
+        with closing(run_tasks(_trained, tasks, at_once)) as finished:
+            for name in finished:
+                done += 1
+                progress(Step("train networks", done, len(todo), "networks", name))
+
+
+def _trained(task: tuple[Run, int]) -> str:
+    """Train one network to the end, with so many threads, and return its folder's name."""
+    run, threads = task
+    torch.set_num_threads(threads)
+    train_one(run)
+    return run.out.name
 
 
 def run_study(study: Study, place: Place, progress: Progress = silent) -> list[Record]:
@@ -79,7 +147,7 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
 
 def _draw(fit: RigFit, path: Path) -> None:
     """Draw held-out captures beside the fit, where matplotlib is installed."""
-    from evnlos.plot.calibration import draw_calibration  # matplotlib loads slowly
+    from evnlos.plot.results import draw_calibration  # matplotlib loads slowly
 
     with suppress(MissingDependencyError):
         draw_calibration(fit, path)
@@ -178,3 +246,94 @@ def _planned(
         out = place.out / "runs" / f"{study.rig}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
         runs.append(Run(shots, settings, out, start, others))
     return runs, decided
+
+
+NAME = "simulation"
+"""Name of the experiment."""
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Settings of the experiment."""
+
+    out: Path
+    """Folder for datasets, runs and records."""
+    sensor: SensorSize = field(default_factory=SensorSize)
+    """Sensor; the paper's has 960 x 600 pixels."""
+    writers: int = TRAIN_WRITERS
+    """Writers of the 26 letters to pre-train on; the paper has 39."""
+    pretraining: Training = field(default_factory=lambda: Training(epochs=4))
+    """Pre-training on handwriting."""
+    finetuning: Training = field(default_factory=lambda: Training(epochs=10, learning_rate=5e-4))
+    """Fine-tuning on Comic characters."""
+    end_to_end: Training = field(default_factory=lambda: Training(epochs=24))
+    """Training on Comic characters alone."""
+    modalities: tuple[str, ...] = STANDARD_MODALITIES
+    """What the networks see."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of initial weights and order of the samples."""
+    test: str = "GK49"
+    """Comic characters that no network is trained on."""
+    workers: int = 0
+    """Processes that simulate; 0 = one for each core."""
+
+
+def simulations(settings: Simulated) -> dict[str, Simulation]:
+    """Return the three sets: handwriting to train on, a hand held out, and Comic letters and digits."""
+    base = replace(paper(), setup=replace(paper().setup, sensor=settings.sensor))
+    unseen = HandwritingGlyphs(writers=1, first_writer=TRAIN_WRITERS)
+    comic = FontGlyphs(characters=UPPER_CASE + DIGITS)
+    return {
+        "train": replace(base, glyphs=HandwritingGlyphs(writers=settings.writers)),
+        "nist": replace(base, glyphs=unseen, validation=0.0, held_out=UPPER_CASE),
+        "comic": replace(base, glyphs=comic, validation=0.0, held_out=settings.test),
+    }
+
+
+def run_simulated(settings: Simulated, progress: Progress = silent) -> list[Record]:
+    """Run what is not done yet, and return the records that are new.
+
+    Three arms: "pre-trained" (handwriting alone), "EPNP" (then fine-tuned on Comic), "E2E" (Comic alone). The
+    first is scored on the hand held out and on Comic, the others on the Comic characters held out.
+
+    Args:
+        settings: What to run, and where.
+        progress: Called with each step of simulation, training and scoring.
+    """
+    data, records = {}, list[Record]()
+    for name, config in simulations(settings).items():
+        folder = settings.out / "simulations" / f"paper-{name}-{config_hash(config)[:8]}"
+        data[name] = simulate(config, folder, settings.workers, progress=progress)
+    for modality in settings.modalities:
+        for seed in settings.seeds:
+            plans = [
+                ("pre-trained", settings.pretraining, "train", False),
+                ("EPNP", settings.finetuning, "comic", True),
+                ("E2E", settings.end_to_end, "comic", False),
+            ]
+            first: Path | None = None
+            for arm, plan, source, goes_on in plans:
+                plan = replace(plan, modality=modality, seed=seed)
+                start = first if goes_on else None
+                decided = {
+                    "settings": to_dict(plan),
+                    "data": data[source].config_hash,
+                    "from": start.name if start else None,
+                }
+                key = config_hash(decided)[:8]
+                run = settings.out / "runs" / f"paper-{arm.lower()}-{modality}-seed{seed}-{key}"
+                train_one(Run(data[source], plan, run, start), progress)
+                first = first or run
+                sets = ("nist", "comic") if arm == "pre-trained" else ("comic",)
+                for tested in sets:
+                    record = _record(arm, modality, seed, run, tested, decided)
+                    folder = settings.out / "records" / NAME
+                    if record.name not in names_there(folder):
+                        found = evaluate(load_weights(run), data[tested], "test", available_lpips())
+                        records.append(keep_scores(record, found, folder, progress))
+    return records
+
+
+def _record(arm: str, modality: str, seed: int, run: Path, tested: str, decided: dict[str, Any]) -> Record:
+    """Return a record without its scores."""
+    return Record(NAME, tested, arm, modality, seed, "test", {}, {}, {}, {}, decided | {"run": run.name})

@@ -1,4 +1,9 @@
-"""From chunks to pictures: the running surface, its reduction, the network, and how long each took."""
+"""From chunks to images: the running surface, its reduction, the network.
+
+- Area averaging with what does not change worked out beforehand, for one picture after the other.
+- The time surface as a state that events change, in place of a map computed from all events anew.
+- From chunks to pictures: the running surface, its reduction, the network, and how long each took.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +11,155 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.errors import ConfigError
-from evnlos.evaluation.streaming import StreamingReconstructor
-from evnlos.live.chunk import UNKNOWN_US, Chunk
-from evnlos.live.clock import Clock, SystemClock
-from evnlos.live.reduction import AreaReduction
-from evnlos.live.surface import RunningSurface
-from evnlos.model import Weights
+from evnlos.analysis.model import StreamingReconstructor
+from evnlos.errors import ConfigError, DataError
+from evnlos.events import surface as kernels
+from evnlos.live.chunk import UNKNOWN_US, Chunk, Clock, SystemClock
+from evnlos.models import Weights
 from evnlos.types import Events
+
+
+@njit(cache=True)
+def _reduce(images, first_y, over_y, first_x, over_x, out):
+    """Fill `out` [N, h, w] from `images` [N, H, W]; an axis has each cell's first place and weights."""
+    width = images.shape[2]
+    line = np.empty(width, np.float32)
+    for number in range(images.shape[0]):
+        for row in range(out.shape[1]):
+            line[:] = np.float32(0)
+            for k in range(over_y.shape[1]):
+                share, source = over_y[row, k], images[number, first_y[row] + k]
+                for column in range(width):
+                    line[column] += share * source[column]
+            for column in range(out.shape[2]):
+                start, total = first_x[column], np.float32(0)
+                for k in range(over_x.shape[1]):
+                    total += over_x[column, k] * line[start + k]
+                out[number, row, column] = total
+
+
+def _cells(inside: int, outside: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return, for each of `outside` equal cells, the first of `inside` places covered, and their shares."""
+    cell = inside / outside
+    edges = np.arange(outside + 1) * cell
+    most = min(int(np.ceil(cell)) + 1, inside)
+    first = np.minimum(np.floor(edges[:-1]).astype(np.int64), inside - most)
+    places = first[:, None] + np.arange(most)
+    covered = np.minimum(edges[1:, None], places + 1) - np.maximum(edges[:-1, None], places)
+    return first, (np.maximum(covered, 0.0) / cell).astype(np.float32)
+
+
+class AreaReduction:
+    """`reduce_by_area` from one size to another, without its threads.
+
+    For small maps those cost more than the work.
+
+    Args:
+        inside: Height and width of the maps given, pixels.
+        outside: Height and width of those returned, pixels.
+
+    Example:
+        >>> AreaReduction((1, 6), (1, 4))(np.arange(6.0, dtype=np.float32).reshape(1, 1, 6)).round(2)
+        array([[[0.33, 1.67, 3.33, 4.67]]], dtype=float32)
+    """
+
+    def __init__(self, inside: tuple[int, int], outside: tuple[int, int]) -> None:
+        self.outside = outside
+        self._first_y, self._over_y = _cells(inside[0], outside[0])
+        self._first_x, self._over_x = _cells(inside[1], outside[1])
+
+    def __call__(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return maps [N, H, W] as maps [N, *outside]; each is the mean over its cell."""
+        out = np.empty((len(images), *self.outside), np.float32)
+        _reduce(images, self._first_y, self._over_y, self._first_x, self._over_x, out)
+        return out
+
+
+_NEVER = -1
+_NO_TIMES, _NO_PLACES, _NO_SIGNS = np.zeros(0, np.int64), np.zeros(0, np.uint16), np.zeros(0, np.bool_)
+_NO_STARTS = np.zeros(2, np.int64)
+
+
+@njit(cache=True)
+def _remember(t_us, x, y, p, origin, newest):
+    """Write the time of each event over that of its pixel and polarity; times ascend, so the last one stays."""
+    height, width = newest.shape[1], newest.shape[2]
+    flat = newest.reshape(-1)
+    off = np.uint32(height * width)
+    for index in range(len(t_us)):
+        pixel = np.uint32(y[index]) * np.uint32(width) + np.uint32(x[index])
+        flat[pixel + (np.uint32(0) if p[index] else off)] = t_us[index] - origin
+
+
+class RunningSurface:
+    """The surface of active events ("sae") of a stream so far, at any instant from its newest event on.
+
+    It equals `time_surface(all events, [begin, t_us], tau_us)` bit for bit; an event costs one write, a map one
+    exponential a pixel.
+
+    Args:
+        height: Sensor height, pixels.
+        width: Sensor width, pixels.
+        tau_us: Time constant, microseconds, above 0.
+
+    Raises:
+        DataError: The time constant is not positive.
+
+    Example:
+        >>> surface = RunningSurface(1, 2, tau_us=5.0)
+        >>> surface.add(Events([5, 10], [0, 1], [0, 0], [True, False], width=2, height=1))
+        >>> surface.at(10).round(3).tolist()
+        [[[0.36800000071525574, 0.0]], [[0.0, 1.0]]]
+    """
+
+    def __init__(self, height: int, width: int, tau_us: float) -> None:
+        if not (np.isfinite(tau_us) and tau_us > 0):
+            raise DataError(f"tau_us is {tau_us}; give a positive number of microseconds")
+        self.shape, self.tau_us = (height, width), float(tau_us)
+        self._times = np.full((2, height, width), _NEVER, np.int64)
+        self._origin: int | None = None
+        self._newest = 0
+
+    def add(self, events: Events) -> None:
+        """Take the next events of the stream.
+
+        Raises:
+            DataError: They are of another sensor, or begin before the newest event taken.
+        """
+        if events.shape != self.shape:
+            raise DataError(
+                f"events of {events.width} x {events.height} pixels after those of {self.shape[1]} x "
+                f"{self.shape[0]}; give one sensor a stream"
+            )
+        if not len(events):
+            return
+        first = int(events.t_us[0])
+        if self._origin is None:
+            self._origin = self._newest = first
+        if first < self._newest:
+            raise DataError(f"events from {first} us after one at {self._newest} us; give them in order")
+        _remember(events.t_us, events.x, events.y, events.p, self._origin, self._times)
+        self._newest = int(events.t_us[-1])
+
+    def at(self, t_us: int) -> NDArray[np.float32]:
+        """Return the surface at an instant, float32 [2, H, W], 0..1: ON, OFF.
+
+        Raises:
+            DataError: The instant is before the newest event taken.
+        """
+        out = np.zeros((1, 2, *self.shape), np.float32)
+        if self._origin is None:
+            return out[0]
+        if t_us < self._newest:
+            raise DataError(f"a surface at {t_us} us, with an event at {self._newest} us; ask for a later one")
+        edges = np.array([t_us, t_us], np.int64)
+        columns = (_NO_TIMES, _NO_PLACES, _NO_PLACES, _NO_SIGNS)
+        kernels.sae(*columns, edges, _NO_STARTS, self.tau_us, True, self._times, _NEVER, self._origin, out)
+        return out[0]
+
 
 _WARM = 8  # the graph is optimised in its first calls
 
@@ -79,8 +223,8 @@ class Engine:
         ConfigError: The weights were trained on another surface than "sae".
 
     Example:
-        >>> from evnlos.dataset import Sampling
-        >>> from evnlos.model import UNetConfig
+        >>> from evnlos.data import Sampling
+        >>> from evnlos.models import UNetConfig
         >>> sampling = Sampling(height=16, width=24, scored_rows=12)
         >>> network = UNetConfig(width=4, depth=1, rank=0).build("event", sampling)
         >>> engine = Engine(Weights(network))

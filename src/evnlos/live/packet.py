@@ -26,7 +26,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.errors import DataError
-from evnlos.events.io.columns import Columns, allocate, cut, trusted_events
+from evnlos.events.files.columns import Columns, allocate, cut, trusted_events
 from evnlos.types import Events
 
 MAGIC, VERSION, LAST = b"EVNL", 1, 1

@@ -1,22 +1,158 @@
-"""From the words of a command line to a source: a capture, a recording, a file that grows, or a port."""
+"""Sources of a live run: recordings replayed, growing files, packets.
+
+- A recording as if it happened now: its events and frames come when they are due.
+- From the words of a command line to a source: a capture, a recording, a file that grows, or a port.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
+from numpy.typing import NDArray
 
-from evnlos.dataset.capture import read_capture
-from evnlos.dataset.fixed_pattern import FixedPattern
+from evnlos.data.capture import read_capture
+from evnlos.data.cleaning import FixedPattern
 from evnlos.errors import ConfigError
+from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import Cut, Recording
-from evnlos.live.chunk import Source
-from evnlos.live.clock import Clock
+from evnlos.live.chunk import Chunk, Clock, Source, SystemClock
 from evnlos.live.growing import GrowingFile
-from evnlos.live.replay import Replay, TimedFrame
 from evnlos.live.udp import UdpSource
+from evnlos.types import Events
+
+_NAP_S = 0.05  # longest sleep before `stop` is asked again
+
+
+@dataclass(frozen=True, eq=False)
+class TimedFrame:
+    """A frame of the frame camera.
+
+    Args:
+        t_us: When it was taken, microseconds on the events' clock.
+        image: What it shows, float32 [H, W], 0..1.
+    """
+
+    t_us: int
+    image: NDArray[np.float32]
+
+
+class Replay:
+    """A source that replays a recording at true speed, or at a multiple of it.
+
+    A chunk is what falls into a step of time, cut where a frame was taken. Its instants are those at which the
+    events are due, so that the wait for the end of a step counts as latency.
+
+    Args:
+        pieces: Events in the order of time, such as `iter_events` yields.
+        frames: Frames in the order of time; none for events alone.
+        speed: How many times faster than life, 0.001 to 1000.
+        step_s: Length of a chunk, seconds of the clock.
+        clock: The clock that it goes by.
+        name: What it is, for a message.
+
+    Raises:
+        ConfigError: Speed or step are outside their range.
+    """
+
+    def __init__(
+        self,
+        pieces: Iterable[Events],
+        frames: Sequence[TimedFrame] = (),
+        *,
+        speed: float = 1.0,
+        step_s: float = 0.002,
+        clock: Clock | None = None,
+        name: str = "replay",
+    ) -> None:
+        if not 1e-3 <= speed <= 1e3:
+            raise ConfigError(f"speed is {speed}; give 0.001 to 1000 times true speed")
+        if not 0 < step_s <= 10:
+            raise ConfigError(f"step_s is {step_s}; give a step of up to 10 seconds")
+        self.name, self.has_frames, self.waits = name, bool(frames), True
+        self._pieces, self._frames, self._clock = pieces, list(frames), clock or SystemClock()
+        self._speed, self._step_us = speed, max(round(step_s * 1e6 * speed), 1)
+
+    def faults(self) -> dict[str, int]:
+        """Return nothing: a recording is checked when it is opened."""
+        return {}
+
+    def close(self) -> None:
+        """Do nothing: nothing is held."""
+
+    def chunks(self, stop: Callable[[], bool]) -> Iterator[Chunk]:
+        """Yield the chunks when they are due."""
+        reader, frames = _Reader(self._pieces), self._frames
+        starts = [t for t in (reader.next_us, frames[0].t_us if frames else None) if t is not None]
+        if not starts:
+            return
+        begin_us, start_s, shown = min(starts), self._clock.now(), 0
+        due_s: Callable[[int], float] = lambda t_us: start_s + (t_us - begin_us) / 1e6 / self._speed  # noqa: E731
+        step = begin_us
+        while reader.next_us is not None or shown < len(frames):
+            frame = frames[shown] if shown < len(frames) else None
+            until = step + self._step_us
+            if frame is not None and frame.t_us <= until:
+                until, shown = frame.t_us, shown + 1
+            else:
+                frame, step = None, until
+            events = reader.until(until)
+            if not self._wait(due_s(until), stop):
+                return
+            first, last = (int(events.t_us[0]), int(events.t_us[-1])) if len(events) else (until, until)
+            yield Chunk(events, until, due_s(first), due_s(last), None if frame is None else frame.image)
+
+    def _wait(self, until_s: float, stop: Callable[[], bool]) -> bool:
+        """Wait for an instant; return whether to go on."""
+        while not stop():
+            left = until_s - self._clock.now()
+            if left <= 0:
+                return True
+            self._clock.sleep(min(left, _NAP_S))
+        return False
+
+
+class _Reader:
+    """Pieces of a stream, taken up to one instant after the other."""
+
+    def __init__(self, pieces: Iterable[Events]) -> None:
+        self._pieces = iter(pieces)
+        self._held: Events | None = None
+        self._at = 0
+        self._size = 1, 1
+        self._advance()
+
+    def _advance(self) -> None:
+        self._held, self._at = next((piece for piece in self._pieces if len(piece)), None), 0
+        if self._held is not None:
+            self._size = self._held.width, self._held.height
+
+    @property
+    def next_us(self) -> int | None:
+        """Time of the next event; None at the end."""
+        return None if self._held is None else int(self._held.t_us[self._at])
+
+    def until(self, t_us: int) -> Events:
+        """Return the events up to and with an instant that no call before returned."""
+        parts = []
+        while self._held is not None:
+            stop = self._at + int(np.searchsorted(self._held.t_us[self._at :], t_us, "right"))
+            parts.append(cut(_plain(self._held), self._at, stop))
+            self._at = stop
+            if stop < len(self._held):
+                break
+            self._advance()
+        # Checked when they were read: a second check of every step would cost more than the surface.
+        return trusted_events(join(parts), *self._size)
+
+
+def _plain(events: Events) -> dict[str, NDArray]:
+    """Return the four columns that every stream has."""
+    return {"t_us": events.t_us, "x": events.x, "y": events.y, "p": events.p}
+
 
 _SCHEME = "udp://"
 

@@ -12,9 +12,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.events.io.columns import cut, trusted_events
-from evnlos.live.chunk import UNKNOWN_US, Chunk
-from evnlos.live.clock import Clock, SystemClock
+from evnlos.events.files.columns import cut, trusted_events
+from evnlos.live.chunk import UNKNOWN_US, Chunk, Clock, SystemClock
 from evnlos.live.packet import USUAL_EVENTS, Batch, Heading, Packet, pack, unpack, unpack_all
 from evnlos.types import Events
 

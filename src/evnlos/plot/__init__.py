@@ -1,8 +1,7 @@
-"""Figures, one file each; matplotlib is imported when a figure is drawn.
+"""Figures; matplotlib is imported when one is drawn.
 
-`stages` draws wall, events, surfaces and reconstructions; `film` puts them side by side over positions;
-`rig` draws the set-up to scale; `preview` and `event_views` show events without matplotlib; the others belong
-to one command each.
+`figures` draws wall, events, surfaces and reconstructions, and films of them over time; `setup` draws the setup
+to scale; `preview` and `event_views` show events without matplotlib; `results` belongs to the commands.
 """
 
 __all__: list[str] = []

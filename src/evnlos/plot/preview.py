@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.events.colours import OFF_RGB, ON_RGB
-from evnlos.events.summary import Summary
+from evnlos.events.grids import OFF_RGB, ON_RGB
+from evnlos.events.recording import Summary
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
@@ -77,7 +77,7 @@ def preview_pictures(
         look: How it looks; None = the defaults.
 
     Example:
-        >>> from evnlos.events.summary import summarise
+        >>> from evnlos.events.recording import summarise
         >>> events = Events([0, 900], [0, 3], [1, 1], [1, 0], width=4, height=2)
         >>> pictures = preview_pictures([events], summarise([events]), Look(frames=2))
         >>> len(pictures), pictures[0].shape, pictures[0][-30, 0].tolist()

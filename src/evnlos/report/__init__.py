@@ -1,9 +1,8 @@
 """Results for people: one HTML page with its numbers as CSV, and reconstructions as pictures."""
 
-from evnlos.report.gather import RunResult, gather, refuse_seen, seen_in_training
 from evnlos.report.page import write_report
-from evnlos.report.reconstruction import reconstruct_capture
-from evnlos.report.tables import to_csv, to_text
+from evnlos.report.pictures import reconstruct_capture
+from evnlos.report.tables import RunResult, gather, refuse_seen, seen_in_training, to_csv, to_text
 
 __all__ = [
     "RunResult",

@@ -1,20 +1,157 @@
-"""How a report was made: machine and versions, the commands that make it again, all settings."""
+"""How a report was made: commands, settings, machine and versions.
+
+- The commands that make a report again, and the files of settings that they read.
+- How a report was made: machine and versions, the commands that make it again, all settings.
+"""
 
 from __future__ import annotations
 
 import html
 import platform
+import shlex
+from collections.abc import Iterator
+from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import torch
 import yaml
 
-from evnlos.dataset import Dataset
-from evnlos.report.commands import Commands
-from evnlos.report.gather import RunResult
+from evnlos.data import Dataset, Sampling
+from evnlos.migrate import __version__
+from evnlos.report.tables import RunResult
 from evnlos.setups import NamedSetup
-from evnlos.version import __version__
+
+_LIVE = "live"  # what a simulation is called that is made while the network trains
+
+
+class Commands:
+    """What to type to make a report again.
+
+    Args:
+        dataset: What the runs were evaluated on.
+        results: The runs.
+        split: Name of the split.
+        rig: The rig that was named; None where none was.
+    """
+
+    def __init__(
+        self, dataset: Dataset, results: list[RunResult], split: str, rig: NamedSetup | None = None
+    ) -> None:
+        self._dataset, self._results, self._split, self._rig = dataset, results, split, rig
+        self._here = dataset.folder.resolve().name
+        self._names: dict[tuple[Any, ...], str] = {}
+
+    def again(self) -> list[str]:
+        """Return the commands from the captures to the report, each once; lines with # are remarks."""
+        own = [r for r in self._results if not r.is_published]
+        lines = [*self._data_here(), *(line for r in own for line in self._trainings(r))]
+        words = ["evnlos", "report", *(r.name for r in self._results), "--data", self._here]
+        words += ["--split", self._split]
+        if self._rig is not None:
+            words += ["--setup", self._rig.word]
+        return list(dict.fromkeys([*lines, shlex.join([*words, "--out", "report.html"])]))
+
+    def published(self) -> list[str]:
+        """Return the commands behind weights that come with the package, which the report needs not."""
+        come = [r for r in self._results if r.is_published]
+        return list(dict.fromkeys(line for r in come for line in self._trainings(r)))
+
+    def files(self) -> dict[str, Any]:
+        """Return the settings in each file that the commands read, as far as they are known."""
+        known = {f"{out}.yaml": step.get("settings", {}) for r in self._results for out, step in _steps(r)}
+        if self._dataset.origin == "simulation":
+            known[f"{self._here}.yaml"] = self._dataset.config
+        return known
+
+    def _data_here(self) -> list[str]:
+        """Return what makes the dataset that the report was scored on."""
+        if self._dataset.origin != "captures":
+            return [shlex.join(["evnlos", "simulate", "--config", f"{self._here}.yaml", "--out", self._here])]
+        split = self._dataset.split
+        held = [word for key in ("validation", "test") for word in _flag(key, split.get(key, []))]
+        if self._dataset.config.get("pattern"):
+            held += ["--pattern", "pattern.safetensors"]
+        return [self._imported(self._dataset.objects(), self._here, held)]
+
+    def _imported(self, captures: list[str], out: str, more: list[str]) -> str:
+        words = ["evnlos", "import", *captures, "--out", out, *more, *_sampling_flags(self._dataset.sampling)]
+        return shlex.join(words)
+
+    def _trainings(self, result: RunResult) -> Iterator[str]:
+        """Yield what makes the data of each training behind a run, and trains."""
+        before = None
+        for out, step in _steps(result):
+            name = self._name_of(step["data"])
+            if name == _LIVE:
+                yield _unknown_settings(name, step["data"])
+                source = ["--simulate", f"{name}.yaml"]
+            else:
+                yield from self._data_of(name, step["data"])
+                source = ["--data", name]
+            words = ["evnlos", "finetune" if before else "train", *source]
+            words += ["--weights", before] if before else []
+            yield shlex.join([*words, "--config", f"{out}.yaml", "--out", out])
+            before = out
+
+    def _data_of(self, name: str, data: dict[str, Any]) -> Iterator[str]:
+        """Yield what makes the data of a training, as its weights tell it; nothing for the report's own."""
+        if name == self._here:
+            return
+        if data["origin"] == "captures":
+            held = _flag("validation", data.get("validation", []))
+            if data.get("train"):
+                yield self._imported([*data["train"], *data.get("validation", [])], name, held)
+            return
+        yield _unknown_settings(name, data)
+        yield shlex.join(["evnlos", "simulate", "--config", f"{name}.yaml", "--out", name])
+
+    def _name_of(self, data: dict[str, Any]) -> str:
+        """Return a folder for the data of a training: their name, with a number where others have it."""
+        key = (data["origin"], data["name"], data.get("config_hash"), *data.get("train", []))
+        if key not in self._names:
+            taken = {*self._names.values()} | (set() if self._is_here(data) else {self._here})
+            name, number = data["name"], 1
+            while name in taken:
+                number += 1
+                name = f"{data['name']}-{number}"
+            self._names[key] = name
+        return self._names[key]
+
+    def _is_here(self, data: dict[str, Any]) -> bool:
+        """Return whether a training saw the dataset that the report was scored on."""
+        same = (data["name"], data["origin"]) == (self._here, self._dataset.origin)
+        known = data.get("config_hash") in (None, self._dataset.config_hash)
+        return same and known and set(data.get("train", [])) <= set(self._dataset.objects())
+
+
+def _steps(result: RunResult) -> list[tuple[str, dict[str, Any]]]:
+    """Return each training behind a run with the folder that it is to go to; the last is the run's own."""
+    last = len(result.history)
+    numbered = enumerate(result.history, start=1)
+    return [(result.name if k == last else f"{result.name}-{k}", step) for k, step in numbered]
+
+
+def _unknown_settings(name: str, data: dict[str, Any]) -> str:
+    """Return a remark on a simulation of which the weights know objects and hash, not its settings."""
+    count = len(data.get("train", [])) + len(data.get("validation", []))
+    hashed = f" of hash {data['config_hash']}" if data.get("config_hash") else ""
+    return f"# {name}.yaml: settings{hashed} of {count} simulated objects; weights keep no more of them"
+
+
+def _flag(name: str, values: list[str]) -> list[str]:
+    return [f"--{name}", *values] if values else []
+
+
+def _sampling_flags(sampling: Sampling) -> list[str]:
+    """Return the flags of what differs from the usual sampling."""
+    usual, words = Sampling(), []
+    for item in fields(Sampling):
+        value = getattr(sampling, item.name)
+        if value != getattr(usual, item.name):
+            words += [f"--sampling.{item.name.replace('_', '-')}", str(value)]
+    return words
+
 
 _MOST_NAMES = 60  # of objects that are listed one by one; a simulation has hundreds
 _PACKAGES = ("torch", "numpy", "numba", "h5py", "Pillow")

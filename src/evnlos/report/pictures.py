@@ -1,18 +1,90 @@
-"""Arrays as pictures: grey and signed maps, film strips, animations; Pillow alone."""
+"""Arrays as pictures and curves, and the reconstructions of a capture as files.
+
+- Curves as inline SVG: small, printable, with no requests.
+- Arrays as pictures: grey and signed maps, film strips, animations; Pillow alone.
+- The reconstructions of one capture as files: a picture a position, a film strip, an animation.
+"""
 
 from __future__ import annotations
 
 import base64
+import html
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from evnlos.events.colours import OFF_RGB, ON_RGB
-from evnlos.files import write_atomically
+from evnlos.analysis import load_model, score
+from evnlos.analysis.confidence import said
+from evnlos.analysis.model import setup_for_track
+from evnlos.data import FixedPattern, read_capture
+from evnlos.events.grids import OFF_RGB, ON_RGB
+from evnlos.files import check_folder, new_folder, write_atomically
+from evnlos.models import published_for
+from evnlos.setups import Setup
+
+_COLOURS = ("#0b5fa5", "#b23a12", "#2f7d32", "#7a3fa0", "#8a6d00", "#00788a", "#a02c5d", "#5b6470", "#3d4fc4")
+_WIDTH, _HEIGHT, _LEFT, _TOP, _BOTTOM = 980, 300, 60, 16, 40
+_PEN, _LETTER = 44, 7.0  # room for a line of the legend, and for each letter of its name
+
+
+def curves_svg(series: dict[str, list[tuple[float, float]]], x_label: str, y_label: str) -> str:
+    """Return named curves of (x, y) points as one SVG drawing with axes and legend; empty ones are left out."""
+    series = {name: points for name, points in series.items() if points}
+    if not series:
+        return ""
+    xs = [x for points in series.values() for x, _ in points]
+    ys = [y for points in series.values() for _, y in points]
+    x0, x1 = min(xs), max(max(xs), min(xs) + 1)
+    low, high = min(ys), max(ys)
+    if high - low <= 1e-6 * max(abs(low), abs(high), 1.0):  # a run of one epoch
+        low, high = low - 0.5, high + 0.5
+    ticks = _ticks(low, high)
+    y0, y1 = min(ticks[0], low), max(ticks[-1], high)
+    wide, high = _WIDTH - _LEFT - _PEN - _LETTER * max(map(len, series)), _HEIGHT - _TOP - _BOTTOM
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return _LEFT + (x - x0) / (x1 - x0) * wide, _TOP + (y1 - y) / (y1 - y0) * high
+
+    parts = [
+        f"<svg viewBox='0 0 {_WIDTH} {_HEIGHT}' role=img aria-label='{html.escape(y_label)}' font-size=12>"
+    ]
+    for tick in ticks:
+        y = place(x0, tick)[1]
+        parts.append(f"<path d='M{_LEFT} {y:.1f}H{_LEFT + wide:.1f}' stroke='currentColor' opacity='.15'/>")
+        parts.append(f"<text x={_LEFT - 6} y={y + 4:.1f} text-anchor=end fill=currentColor>{tick:g}</text>")
+    for tick in _ticks(x0, x1):
+        if x0 <= tick <= x1:
+            x = place(tick, y0)[0]
+            parts.append(
+                f"<text x={x:.1f} y={_TOP + high + 16} text-anchor=middle fill=currentColor>{tick:g}</text>"
+            )
+    below = f"x={_LEFT + wide:.1f} y={_HEIGHT - 6} text-anchor=end"
+    parts.append(f"<text {below} fill=currentColor>{html.escape(x_label)}</text>")
+    parts.append(f"<text x={_LEFT} y=11 fill=currentColor>{html.escape(y_label)}</text>")
+    for i, (name, points) in enumerate(series.items()):
+        colour, dash = _COLOURS[i % len(_COLOURS)], ("", "6 3", "2 3")[i // 3 % 3]
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*p) for p in points))
+        pen = f"stroke='{colour}' stroke-width=1.8 stroke-dasharray='{dash}'"
+        parts.append(f"<polyline points='{path}' fill=none {pen}/>")
+        y = _TOP + 14 + 17 * i
+        parts.append(f"<path d='M{_LEFT + wide + 12:.1f} {y - 4}h22' {pen}/>")
+        parts.append(f"<text x={_LEFT + wide + 40:.1f} y={y} fill=currentColor>{html.escape(name)}</text>")
+    return "".join(parts) + "</svg>"
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Return about five round numbers that span the range."""
+    span = max(high - low, 1e-9)
+    step = 10 ** math.floor(math.log10(span / 4))
+    step *= next(f for f in (1, 2, 5, 10) if span / (step * f) <= 5)
+    return [round(k * step, 10) for k in range(math.floor(low / step), math.ceil(high / step) + 1)]
 
 
 def grey(image: ArrayLike, low: float = 0.0, high: float = 1.0) -> NDArray[np.uint8]:
@@ -96,4 +168,100 @@ def _encoded(pictures: Sequence[NDArray[np.uint8]], kind: str, zoom: int, **opti
         images[0].save(buffer, kind, append_images=images[1:], **options)
     else:
         images[0].save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def reconstruct_capture(
+    capture: str | Path,
+    weights: str | Path | None,
+    out: str | Path,
+    zoom: int = 4,
+    pattern: FixedPattern | None = None,
+    setup: Setup | None = None,
+    track: bool = False,
+) -> dict[str, Any]:
+    """Reconstruct all positions of a capture and write them as pictures.
+
+    Writes `position_00.png` and on, `strip.png` (rows of positions), `animation.gif` (wall frame,
+    surface, reconstruction and, where known, truth, side by side) and `reconstruction.npy` (float32
+    [N, H, W], 0..1). Where the weights know what their pictures are worth and the motion is known, also
+    `interval.npy` (the ends of each pixel's interval, float32 [2, N, H, W]) and `unsure.png`, a strip of the
+    intervals' lengths (black is sure, white is anything).
+
+    Args:
+        capture: A capture folder; its target may be unknown.
+        weights: A weights file, a run's folder or a name of `published`; None: the published frame weights of
+            the rig whose distance is nearest, of whole passes where the motion is known or found.
+        out: The folder for the pictures; must not exist or be empty. It is there with all of them, or
+            not at all.
+        zoom: Size of a pixel in the pictures.
+        pattern: Fixed pattern of the frame camera, to be taken from the frames.
+        setup: The calibrated setup; the pictures are then moved to where the wall agrees with the frames, if
+            these are as bright as it makes them, and the confidence says how much of the frames they explain.
+            Without one, that is told by the rig of published weights, and the pictures stay.
+        track: Find the motion in the recording with the rig, also where it is stated; the truth, where it is
+            known, stays where the capture states it.
+
+    Returns:
+        Capture, weights, modality, number of positions; where the truth is known, the mean scores; where it can
+        be told, the confidence: support, threshold, measured, verdict and, where a rig is known, explained;
+        else no_confidence, which says why. With a rig also `light`, the capture's brightness in that of the
+        rig, and whether the pictures were moved; with `track` the warnings of the track.
+
+    Raises:
+        ConfigError: `track` without a setup.
+        DataError: The capture or the weights can't be used, the object can't be tracked, or `out` holds other
+            files.
+    """
+    out = Path(out)
+    if track:
+        setup_for_track(setup)  # before anything is read
+    shot = read_capture(capture)
+    if weights is None:
+        distance_m = shot.distance_m or (None if setup is None else setup.default_distance_m)
+        weights = published_for(distance_m, "frame", is_motion_known=track or shot.motion is not None)
+    model = load_model(weights)
+    sampling = model.weights.sampling
+    check_folder(out)
+    made = model.reconstruct(shot, setup, pattern, track)
+    images, samples, worth = made.images, made.samples, made.confidence
+    pictures = [grey(image) for image in images]
+    with new_folder(out) as draft:
+        for k, picture in enumerate(pictures):
+            save_png(draft / f"position_{k:02d}.png", picture, zoom)
+        save_png(draft / "strip.png", strip(pictures), 2)
+        shown = []
+        for k, picture in enumerate(pictures):
+            row = [stretched(samples.frame[k]), polarity(samples.surface[k]), picture]
+            if samples.truth is not None:
+                row.append(grey(samples.truth[k]))
+            shown.append(strip(row, columns=4))
+        rate_hz = 1e6 / float(np.median(np.diff(shot.frame_times_us)))
+        save_animation(draft / "animation.gif", shown, rate_hz, 2)
+        write_atomically(draft / "reconstruction.npy", _npy(images.numpy()))
+        found: dict[str, Any] = {
+            "capture": shot.name,
+            "weights": str(weights),
+            "modality": model.weights.modality.name,
+            "positions": len(pictures),
+        }
+        if made.light is not None:
+            found |= {"light": round(made.light, 4), "moved_by_the_rig": made.is_moved}
+        if worth is not None:
+            save_png(draft / "unsure.png", strip([grey(one) for one in worth.high - worth.low]), 2)
+            write_atomically(draft / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))
+            found["confidence"] = said(worth)
+        else:
+            found["no_confidence"] = made.no_confidence
+    if track:
+        found["warnings"] = made.warnings
+    if samples.truth is not None:
+        truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
+        found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
+    return found
+
+
+def _npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()

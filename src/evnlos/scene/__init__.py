@@ -1,12 +1,13 @@
 """What is hidden and how it moves."""
 
-from evnlos.scene.drawing_set import DrawingGlyphs, Glyphs
+from evnlos.scene.databases import Handwritten, list_emnist, list_sd19, read_emnist, read_sd19
 from evnlos.scene.drawings import drawing
-from evnlos.scene.emnist import list_emnist, read_emnist
 from evnlos.scene.fonts import Font, find_font
 from evnlos.scene.glyph_sets import (
+    DrawingGlyphs,
     EmnistGlyphs,
     FontGlyphs,
+    Glyphs,
     GlyphSet,
     HandwritingGlyphs,
     NistGlyphs,
@@ -14,12 +15,9 @@ from evnlos.scene.glyph_sets import (
     Plate,
 )
 from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, fit_to_plate, render_glyph
-from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, Strokes, hand, held_out_writers, nist_like
-from evnlos.scene.ink import pen_width
+from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, Strokes, hand, held_out_writers, nist_like, pen_width
 from evnlos.scene.motion import LineMotion, Motion, PathMotion, Pose
-from evnlos.scene.nist_sd19 import Handwritten, list_sd19, read_sd19
-from evnlos.scene.scene import Scene
-from evnlos.scene.target import Target
+from evnlos.scene.scene import Scene, Target
 
 __all__ = [
     "DIGITS",

@@ -1,4 +1,9 @@
-"""NIST-like handwriting: many writers, each with one consistent hand.
+"""Handwriting made up: strokes, their ink, and many writers, each with one consistent hand.
+
+- Signed distance to the edge of a mask: what makes a pen thicker or thinner.
+- Measures of a drawing: where its ink is, and how wide its strokes are.
+
+NIST-like handwriting: many writers, each with one consistent hand.
 
 A stand-in for scanned forms, made from openly licensed handwriting fonts; none of it comes from NIST. A hand is
 a base face, a slant, proportions, a pen and an elastic deformation; each glyph adds a little variation.
@@ -15,11 +20,73 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
-from evnlos.scene.distance import signed_distance
 from evnlos.scene.fonts import Font, find_font
 from evnlos.scene.glyphs import check_size, render_glyph
-from evnlos.scene.ink import ink_box, pen_px
-from evnlos.seeds import derive_seed
+from evnlos.types import derive_seed
+
+
+def signed_distance(mask: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
+    """Return the distance of each pixel to the mask's edge, negative inside, exact up to `reach`.
+
+    Args:
+        mask: Coverage, [H, W], 0..1; a pixel belongs to the mask from 0.5 on.
+        reach: Distances are cut at +-`reach`, pixels, 1 or more.
+
+    Returns:
+        float32 [H, W], pixels: centre of the pixel to the edge between pixels.
+
+    Example:
+        >>> signed_distance(np.array([[0, 0, 1, 1, 0]]), 3)
+        array([[ 1.5,  0.5, -0.5, -0.5,  0.5]], dtype=float32)
+    """
+    inside = np.asarray(mask) >= 0.5
+    outer = _distance_to(inside, reach)
+    inner = _distance_to(~inside, reach)
+    return np.where(inside, 0.5 - inner, outer - 0.5).astype(np.float32)
+
+
+def _distance_to(chosen: NDArray[np.bool_], reach: int) -> NDArray[np.float32]:
+    """Return the distance to the nearest chosen pixel's centre, cut at `reach`, float32 [H, W], pixels."""
+    height, width = chosen.shape
+    column = np.arange(width)
+    before = np.maximum.accumulate(np.where(chosen, column, -(reach + width)), axis=1)
+    after = np.minimum.accumulate(np.where(chosen, column, reach + 2 * width)[:, ::-1], axis=1)[:, ::-1]
+    along = np.minimum(np.minimum(column - before, after - column), reach).astype(np.float32) ** 2  # [H, W]
+    nearest = along.copy()
+    for step in range(1, min(reach, height - 1) + 1):
+        np.minimum(nearest[step:], along[:-step] + step * step, out=nearest[step:])
+        np.minimum(nearest[:-step], along[step:] + step * step, out=nearest[:-step])
+    return np.minimum(np.sqrt(nearest), reach)
+
+
+def pen_width(mask: NDArray[np.float32]) -> float:
+    """Return the mean width of a drawing's strokes as a part of the longer side of its ink, 0..1.
+
+    Args:
+        mask: Bright ink on dark ground, [H, W], 0..1.
+
+    Raises:
+        DataError: The picture has no ink.
+    """
+    left, top, right, bottom = ink_box(mask)
+    return pen_px(mask) / max(right - left, bottom - top)
+
+
+def pen_px(ink: NDArray[np.float32]) -> float:
+    """Return the mean width of the strokes, pixels: four times the mean distance of the ink to its edge."""
+    distance = signed_distance(ink, reach=40)
+    inside = distance < 0
+    return 4.0 * float(-distance[inside].mean()) if inside.any() else 1.0
+
+
+def ink_box(ink: NDArray[np.float32]) -> tuple[float, float, float, float]:
+    """Return left, top, right, bottom of the ink, pixels from the centre."""
+    rows, columns = np.flatnonzero((ink > 0.5).any(1)), np.flatnonzero((ink > 0.5).any(0))
+    if not len(rows):
+        raise DataError("a glyph has no ink (no pixel above 0.5); choose another base face or drawing")
+    half = len(ink) / 2
+    return columns[0] - half, rows[0] - half, columns[-1] + 1 - half, rows[-1] + 1 - half
+
 
 BASE_FACES = (
     "Caveat", "Kalam Light", "Shadows Into Light", "Indie Flower", "Kalam Bold", "Permanent Marker",

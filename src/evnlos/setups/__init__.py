@@ -4,18 +4,19 @@ from evnlos.setups.base import Layout, OperatorNoise, Parameter, SensorSize, Set
 from evnlos.setups.fitted import FittedSetup
 from evnlos.setups.load import (
     CALIBRATED_FILE,
+    ROOMS,
     NamedSetup,
     calibrated_file,
     calibrated_folder,
     load_setup,
     named_setup,
+    setup_names,
+    setup_preset,
 )
 from evnlos.setups.measured import MeasuredSetup
 from evnlos.setups.paper import PaperSetup
-from evnlos.setups.presets import setup_names, setup_preset
 from evnlos.setups.radiometric import RadiometricSetup
 from evnlos.setups.room import RoomSetup
-from evnlos.setups.rooms import ROOMS
 
 __all__ = [
     "CALIBRATED_FILE",

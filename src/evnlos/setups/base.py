@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
 from evnlos.errors import ConfigError
+from evnlos.optics import LinearTransport, MatrixTransport, Wall
+from evnlos.optics.wall import ambient_plane
 from evnlos.registry import Kinded, Registry
 from evnlos.scene import Scene
-from evnlos.sensor import EventCamera, EventPixel, FrameCamera, PixelSettings
-from evnlos.setups.measured_file import Measurement
-from evnlos.transport import LinearTransport, MatrixTransport, Wall
-from evnlos.transport.ambient import ambient_plane
+from evnlos.setups.files import Measurement
 from evnlos.types import Plane
 
 S = TypeVar("S", bound="Setup")

@@ -13,14 +13,14 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError
+from evnlos.optics import MatrixTransport, MatrixWall, coarsest_keyframe_step_m
+from evnlos.optics.angular_spectrum import check_lengths
+from evnlos.optics.facets import Pose, SlopeTable, facet_matrix, seen_points
+from evnlos.optics.wall import ambient_map, ambient_plane
 from evnlos.scene import Scene, Target
 from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
-from evnlos.setups.fitted_file import WALL, FittedWall
+from evnlos.setups.files import WALL, FittedWall
 from evnlos.setups.measured import covered
-from evnlos.transport import MatrixTransport, MatrixWall, coarsest_keyframe_step_m
-from evnlos.transport.ambient import ambient_map, ambient_plane
-from evnlos.transport.angular_spectrum import check_lengths
-from evnlos.transport.facets import Pose, SlopeTable, facet_matrix, seen_points
 from evnlos.types import Plane
 
 _COMPANION_CELL_M = 0.01

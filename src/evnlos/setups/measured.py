@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
+from evnlos.optics import MatrixTransport, MatrixWall
+from evnlos.optics.wall import ambient_plane
 from evnlos.scene import Scene
 from evnlos.setups.base import OperatorNoise, Setup, stated_distance_m
-from evnlos.setups.measured_file import MEASUREMENT, Measurement
-from evnlos.transport import MatrixTransport, MatrixWall
-from evnlos.transport.ambient import ambient_plane
+from evnlos.setups.files import MEASUREMENT, Measurement
 from evnlos.types import Plane
 
 

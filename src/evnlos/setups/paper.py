@@ -9,9 +9,7 @@ from typing import ClassVar, Literal
 import torch
 
 from evnlos.errors import ConfigError
-from evnlos.scene import Scene
-from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
-from evnlos.transport import (
+from evnlos.optics import (
     Diffraction,
     DiffuseReflection,
     LinearTransport,
@@ -24,7 +22,9 @@ from evnlos.transport import (
     sampling_limit_m,
     tpsf_kernel,
 )
-from evnlos.transport.angular_spectrum import check_lengths
+from evnlos.optics.angular_spectrum import check_lengths
+from evnlos.scene import Scene
+from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
 from evnlos.types import Plane
 
 _SAMPLES_PER_RHO = 4  # samples of the target to one unit of the tPSF's rho

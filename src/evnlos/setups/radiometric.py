@@ -12,9 +12,7 @@ import numpy as np
 import torch
 
 from evnlos.errors import ConfigError
-from evnlos.scene import Scene
-from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
-from evnlos.transport import (
+from evnlos.optics import (
     GGX,
     Brdf,
     Lambert,
@@ -25,8 +23,10 @@ from evnlos.transport import (
     lamp_radiance,
     light_transport_matrix,
 )
-from evnlos.transport.angular_spectrum import check_lengths
-from evnlos.transport.occluder import check_between, check_sight
+from evnlos.optics.angular_spectrum import check_lengths
+from evnlos.optics.occluder import check_between, check_sight
+from evnlos.scene import Scene
+from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
 from evnlos.types import Plane
 
 R = TypeVar("R", bound="RadiometricSetup")

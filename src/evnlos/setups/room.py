@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.cameras import EventCamera
 from evnlos.errors import ConfigError
 from evnlos.lab import (
     Mount,
@@ -25,10 +26,9 @@ from evnlos.lab import (
     fill_throughput,
     texture,
 )
+from evnlos.optics import MatrixTransport
 from evnlos.scene import Scene
-from evnlos.sensor import EventCamera
 from evnlos.setups.base import Setup, stated_distance_m
-from evnlos.transport import MatrixTransport
 from evnlos.types import Plane
 
 Array = NDArray[np.float64]

@@ -1,4 +1,9 @@
-"""A track: where the hidden object was at any time of a recording, how fast it went, and how sure that is."""
+"""Tracks: geometry from image to target, a smoother over positions and velocities, and its result.
+
+- From the picture's motion to the target's: where a camera sees light from a place behind the corner.
+- A Kalman smoother that fuses positions and velocities, and finds by itself how much the motion may change.
+- A track: where the hidden object was at any time of a recording, how fast it went, and how sure that is.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,188 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import DataError
+from evnlos.setups import Setup
+from evnlos.tracking.registration import middle_of_light
+from evnlos.types import Plane
+
+_REACH_M = (0.40, 0.28)  # region of the target's plane that the map is fitted on, (x, y)
+_CELL_M = 0.02
+_SEEN = 0.2  # of the brightest cell's light; darker cells lie partly outside the picture
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneMap:
+    """A smooth map from the middle of the light on the sensor to a place on the target's plane.
+
+    Args:
+        coefficients: Of 1, u, v, u^2, u v, v^2 for x and y, [6, 2], metres; u, v in half widths.
+        shape: Size (H, W) of the picture, pixels.
+        error_m: Root mean square misfit of the map over the region, metres.
+    """
+
+    coefficients: NDArray[np.float64]
+    shape: tuple[int, int]
+    error_m: float
+
+    def __call__(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return places (x, y), metres, [..., 2], of pixels [..., 2]."""
+        return _terms(self._scaled(place_px)) @ self.coefficients
+
+    def slope(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return d(x, y) / d(column, row), metres a pixel, [..., 2, 2]."""
+        half = 0.5
+        steps = half * np.eye(2)
+        return np.stack(
+            [(self(place_px + step) - self(place_px - step)) / (2 * half) for step in steps], axis=-1
+        )
+
+    def _scaled(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
+        middle = np.array([(self.shape[1] - 1) / 2, (self.shape[0] - 1) / 2])
+        return (place_px - middle) / (self.shape[1] / 2)
+
+
+def plane_map(setup: Setup, shape: tuple[int, int]) -> PlaneMap:
+    """Fit the map to the pictures of small cells all over the target's plane.
+
+    Args:
+        setup: The setup.
+        shape: Size (H, W) of the picture, pixels.
+
+    Raises:
+        DataError: The middle of the light hardly moves with the cell: a matte wall shows no place that way.
+    """
+    cells = Plane(round(_REACH_M[1] / _CELL_M), round(_REACH_M[0] / _CELL_M), _CELL_M)
+    pictures = setup.matrix(shape, cells).mT.reshape(-1, *shape).numpy()
+    light = pictures.sum(axis=(1, 2))
+    border = np.concatenate([pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], axis=1)
+    whole = border.max(axis=1) < 0.1 * pictures.max(axis=(1, 2))
+    used = (light > _SEEN * light.max()) & whole
+    if used.sum() < 12:
+        raise DataError(
+            f"{int(used.sum())} of {len(used)} places of the target's plane make a bounded picture, 12 are the "
+            "least: this wall does not show where its light comes from; track without the rig"
+        )
+    place = np.stack(np.meshgrid(cells.x_m, cells.y_m), axis=-1).reshape(-1, 2)[used]
+    blank = PlaneMap(np.zeros((6, 2)), shape, 0.0)
+    terms = _terms(blank._scaled(middle_of_light(pictures[used])))
+    coefficients = np.linalg.lstsq(terms, place, rcond=None)[0].astype(np.float64)
+    error = float(np.sqrt(np.mean(np.square(terms @ coefficients - place).sum(axis=1))))
+    return PlaneMap(coefficients, shape, error)
+
+
+def _terms(scaled: NDArray[np.float64]) -> NDArray[np.float64]:
+    u, v = scaled[..., 0], scaled[..., 1]
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+
+
+_LIKELY = np.logspace(-3, 3, 25)  # of (spread of the positions / duration^1.5)^2
+_WIDE = 1e3  # the first guess's standard deviation over the spread of the positions
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """One coordinate, measured at ascending instants: its value, its rate, or both.
+
+    Args:
+        time_s: Instants, [T], seconds.
+        position: Values [T]; NaN where none was measured.
+        position_variance: Their variances [T].
+        velocity: Rates [T], a second; NaN where none was measured.
+        velocity_variance: Their variances [T].
+    """
+
+    time_s: NDArray[np.float64]
+    position: NDArray[np.float64]
+    position_variance: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    velocity_variance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """Means [T, 2] and covariances [T, 2, 2] of value and rate, and the logarithm of the likelihood."""
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    log_likelihood: float
+
+
+def smooth(measured: Measurements, acceleration: float) -> Smoothed:
+    """Return value and rate given all measurements: Kalman (1960), and Rauch, Tung and Striebel (1965).
+
+    The rate is a random walk: d rate = sqrt(acceleration) dW, so that
+    Q(dt) = acceleration [[dt^3 / 3, dt^2 / 2], [dt^2 / 2, dt]].
+
+    Args:
+        measured: The measurements.
+        acceleration: Spectral density of the acceleration, squared unit a cubic second, above 0.
+
+    Raises:
+        DataError: The instants do not ascend, or fewer than two values were measured.
+
+    Example:
+        >>> t = np.arange(3.0)
+        >>> line = Measurements(t, 2 * t, np.full(3, 1e-4), np.full(3, np.nan), np.full(3, np.nan))
+        >>> smooth(line, 1e-6).mean[1].round(3)
+        array([2., 2.])
+    """
+    times, known = measured.time_s, np.isfinite(measured.position)
+    if known.sum() < 2 or not (np.diff(times) > 0).all():
+        raise DataError(
+            f"{int(known.sum())} positions at {len(times)} instants; give two or more, in ascending order"
+        )
+    wide = (
+        _WIDE
+        * max(float(np.ptp(measured.position[known])), float(measured.position_variance[known].max()) ** 0.5)
+    ) ** 2
+    mean = np.array([measured.position[known][0], 0.0])
+    covariance = np.diag([wide, wide / max(float(np.ptp(times)), 1e-12) ** 2])
+    predicted, updated = [], []
+    steps = np.concatenate([[0.0], np.diff(times)])
+    score = 0.0
+    for k, dt in enumerate(steps):
+        move = np.array([[1.0, dt], [0.0, 1.0]])
+        grown = acceleration * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        mean, covariance = move @ mean, move @ covariance @ move.T + grown
+        predicted.append((mean, covariance))
+        pairs = (
+            (0, measured.position[k], measured.position_variance[k]),
+            (1, measured.velocity[k], measured.velocity_variance[k]),
+        )
+        for axis, value, variance in pairs:
+            if np.isnan(value):
+                continue
+            spread = covariance[axis, axis] + variance
+            surprise = value - mean[axis]
+            gain = covariance[:, axis] / spread
+            mean = mean + gain * surprise
+            covariance = covariance - np.outer(gain, covariance[axis])
+            covariance = (covariance + covariance.T) / 2
+            score -= 0.5 * (surprise**2 / spread + np.log(2 * np.pi * spread))
+        updated.append((mean, covariance))
+    means, covariances = np.array([m for m, _ in updated]), np.array([c for _, c in updated])
+    for k in range(len(times) - 2, -1, -1):
+        dt = steps[k + 1]
+        move = np.array([[1.0, dt], [0.0, 1.0]])
+        ahead_mean, ahead = predicted[k + 1]
+        back = np.linalg.solve(ahead, move @ updated[k][1]).T
+        means[k] = updated[k][0] + back @ (means[k + 1] - ahead_mean)
+        covariances[k] = updated[k][1] + back @ (covariances[k + 1] - ahead) @ back.T
+    return Smoothed(means, covariances, float(score))
+
+
+def most_likely_acceleration(axes: list[Measurements]) -> float:
+    """Return the spectral density of the acceleration, one for all axes, that makes the measurements likeliest.
+
+    Args:
+        axes: The measurements of each coordinate.
+    """
+    spread = max(float(np.nanmax(one.position) - np.nanmin(one.position)) for one in axes)
+    noise = max(float(np.sqrt(np.nanmedian(one.position_variance))) for one in axes)
+    duration = max(float(np.ptp(one.time_s)) for one in axes)
+    unit = max(spread, noise) ** 2 / duration**3
+    scores = [sum(smooth(one, unit * factor).log_likelihood for one in axes) for factor in _LIKELY]
+    return float(unit * _LIKELY[int(np.argmax(scores))])
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,15 +14,15 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.config import save_yaml, to_dict, write_atomically
-from evnlos.dataset import Dataset, NlosDataset
+from evnlos.data import Dataset, NlosDataset
 from evnlos.errors import ConfigError
 from evnlos.files import claim
 from evnlos.metrics import psnr
-from evnlos.model import Reconstructor, Weights, load_weights, save_weights
+from evnlos.models import Reconstructor, Weights, load_weights, save_weights
 from evnlos.progress import Progress, Step, silent
-from evnlos.seeds import derive_seed
 from evnlos.training.settings import Training
 from evnlos.training.train import TrainingResult, about_run, check_run, train
+from evnlos.types import derive_seed
 
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Shares of the way from the pre-trained to the fine-tuned weights that are tried."""

@@ -14,20 +14,16 @@ from typing import Any
 import torch
 
 from evnlos.config import LONG_YAML, config_hash, differing_keys, read_yaml, save_yaml, to_dict
-from evnlos.dataset import Dataset, LiveDataset, NlosDataset, Sampling, as_modality
+from evnlos.data import Dataset, LiveDataset, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import claim, is_empty, write_atomically
-from evnlos.migrate import migrate
-from evnlos.model import Reconstructor, Weights, load_weights, save_weights
+from evnlos.migrate import __version__, migrate
+from evnlos.models import Reconstructor, Weights, load_weights, save_weights
 from evnlos.progress import Progress, Step, silent
-from evnlos.seeds import derive_seed
-from evnlos.training.checkpoint import load_checkpoint, save_checkpoint
-from evnlos.training.held_out import confidence_of, held_out_samples, validate
-from evnlos.training.loss import LOSSES, light_of
-from evnlos.training.settings import Training, step_size
-from evnlos.training.source import Live, Source, Stored, half_mirrored, with_mirrored
-from evnlos.training.team import Team, team
-from evnlos.version import __version__
+from evnlos.training.settings import LOSSES, Training, light_of, load_checkpoint, save_checkpoint, step_size
+from evnlos.training.source import Live, Source, Stored, Team, half_mirrored, team, with_mirrored
+from evnlos.training.validation import confidence_of, held_out_samples, validate
+from evnlos.types import derive_seed
 
 _LOG = logging.getLogger("evnlos")
 

@@ -10,14 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.scan.denoise import Denoising, choose_denoising, denoised
 from evnlos.calibration.scan.folder import ScanInfo, frame_reader, read_scan_info, read_shots
-from evnlos.calibration.scan.frames import Light, read_light
-from evnlos.calibration.scan.psf import PsfCheck, matrix_from_psf
-from evnlos.calibration.scan.repeats import Agreement, compare_repeats
+from evnlos.calibration.scan.frames import Agreement, Light, compare_repeats, read_light
+from evnlos.calibration.scan.matrix import Denoising, PsfCheck, choose_denoising, denoised, matrix_from_psf
 from evnlos.errors import ConfigError, DataError
+from evnlos.setups.files import About, Measurement
 from evnlos.setups.measured import image_motion_px_m
-from evnlos.setups.measured_file import About, Measurement
 from evnlos.types import Plane
 
 _LEAST_SIGNAL = 3.0

@@ -1,0 +1,377 @@
+"""Whether images agree with what the frames show, and whether their confidence can be trusted.
+
+- Test-time data consistency: move a network's picture to where the calibrated wall agrees with the frame.
+- How much of what the frames show the pictures explain: the light path run forward again.
+- Is the confidence right? Support against skill, and coverage of the intervals, pass by pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from evnlos.analysis.linearized import camera_variance
+from evnlos.data import NlosDataset, Samples, Sampling
+from evnlos.data.sampling import reduce_by_area
+from evnlos.errors import DataError
+from evnlos.models import Confidence, Judgement, Reconstructor, Weights, halves_of, plates
+from evnlos.models.confidence import on_canvas
+from evnlos.setups import Setup
+from evnlos.setups.base import dense_matrix
+from evnlos.types import Plane
+
+_TOLERANCE, _MOST_STEPS = 1e-3, 200
+
+
+class FrameOperator:
+    """What a calibrated setup makes of a picture on the canvas: frame = A x + ambient, at the samples' size.
+
+    Args:
+        setup: The calibrated setup (`load_setup` of the calibrated folder).
+        sampling: Size of samples and canvas.
+
+    Attributes:
+        matrix: A, float32 [h w, cells]: white levels a unit of brightness of a canvas cell.
+        ambient: Ambient light, float32 [h w], white levels.
+        rows: Rows of the canvas that hold cells; beyond them the target never is.
+        sigma: Standard deviation of the noise of a sample pixel, white levels.
+
+    Raises:
+        ConfigError: The setup is not linear.
+    """
+
+    def __init__(self, setup: Setup, sampling: Sampling) -> None:
+        self.size = (sampling.height, sampling.width)
+        self.matrix, source = _matrix(setup, sampling)
+        self.ambient = torch.from_numpy(reduce_by_area(setup.ambient_light().numpy(), self.size)).flatten()
+        first = (sampling.height - source.height) // 2
+        self.rows = slice(first, first + source.height)
+        self._camera, shape = setup.frame_camera, setup.shape
+        self._pixels = shape[0] * shape[1] / (self.size[0] * self.size[1])  # of the sensor, a sample pixel
+        self.sigma = float(self.variance(self.ambient.mean() + 0.1 * setup.gain).sqrt())
+
+    def __call__(self, pictures: Tensor) -> Tensor:
+        """Return the frames [N, h, w] that the rig makes of pictures [N, H, W]."""
+        light = pictures[:, self.rows].flatten(1) @ self.matrix.T + self.ambient  # [N, h w]
+        return light.unflatten(1, self.size)
+
+    def variance(self, level: Tensor) -> Tensor:
+        """Return the variance of a sample pixel at a level, white levels squared: light, reading, rounding."""
+        return camera_variance(level, self._camera) / self._pixels
+
+
+def consistent(
+    pictures: Tensor, frames: Tensor, operator: FrameOperator, trust: float = 1.0, floor: float = 0.003
+) -> Tensor:
+    """Return the most probable pictures, given the network's answer as a prior and the frames as data.
+
+    x = argmin |A x + b - y|^2 / sigma^2 + sum (x - p)^2 / v, with the variance v = trust (p (1 - p) + floor): a
+    network whose output p is the probability of a bright pixel is unsure where p is neither 0 nor 1, and there
+    the frame may move it. Conjugate gradients in units of sqrt(v); clipped to 0..1.
+
+    Args:
+        pictures: The network's pictures p, float32 [N, H, W], 0..1.
+        frames: Frames of the samples y, float32 [N, h, w], white levels, without fixed pattern.
+        operator: The rig.
+        trust: How much the frames may move the pictures, above 0; 0 returns the pictures.
+        floor: Smallest variance of a pixel at trust 1.
+
+    Raises:
+        DataError: Pictures and frames are not as many, or not of the operator's size.
+    """
+    if frames.shape[1:] != operator.size or len(frames) != len(pictures):
+        raise DataError(
+            f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a rig of "
+            f"{operator.size[1]} x {operator.size[0]} samples"
+        )
+    if trust <= 0:
+        return pictures
+    known = pictures[:, operator.rows].flatten(1)  # [N, cells]
+    spread = (trust * (known * (1 - known) + floor)).sqrt()
+    matrix = operator.matrix / operator.sigma
+    away = ((frames - operator(pictures)) / operator.sigma).flatten(1)  # [N, h w]
+
+    def normal(z: Tensor) -> Tensor:
+        pushed = ((spread * z.squeeze(-2)) @ matrix.T) @ matrix
+        return z + (spread * pushed).unsqueeze(-2)
+
+    right = (spread * (away @ matrix)).unsqueeze(-2)  # [N, 1, cells]
+    from evnlos.inverse.operators import conjugate_gradient
+
+    found = conjugate_gradient(normal, right, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS)
+    moved = pictures.clone()
+    move = (spread * found.image.squeeze(-2)).unflatten(1, (-1, pictures.shape[2]))
+    moved[:, operator.rows] += move
+    return moved.clamp(0, 1)
+
+
+def _matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
+    """Return the matrix from canvas cells to sample pixels, and the cells: rows that the target reaches."""
+    cells, height = setup.target_cells(), sampling.height
+    if cells is not None:
+        height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
+    plane = Plane(height, sampling.width, sampling.pitch_m)
+    matrix = dense_matrix(setup.operator(plane, dtype=torch.float32), torch.float32)
+    images = matrix.T.reshape(-1, *setup.shape).numpy()
+    small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(len(images), -1)
+    return torch.from_numpy(small).T.contiguous(), plane
+
+
+_BEYOND_NOISE = 0.05
+"""What the average object must leave above the noise, as a share of it, for a picture to be told from it."""
+_MAD = 0.6745  # of a normal distribution, in standard deviations
+
+
+def explained(
+    pictures: Tensor,
+    frames: Tensor,
+    position_m: NDArray,
+    average: Tensor,
+    operator: FrameOperator,
+    canvas: Plane,
+) -> float:
+    """Return the share of what the average object leaves unexplained in the frames that the pictures explain.
+
+    1 - (|m y - g m A x|^2 - n) / (|m y - g0 m A x0|^2 - n), with x the pictures, x0 the average plate where the
+    plate is, and n the noise. m takes what stands still away, each pixel's mean over the pass, and the gains g
+    and g0 are the best ones: neither ambient light nor the camera's fixed pattern nor how bright the object is
+    has to be known, only what the wall does. 1 = the frames are as the pictures make them; 0 = they are as good
+    as those of the average plate, or the frames do not tell objects from it, as before a matte wall; below 0 =
+    they are worse: the pictures are not what was in front of the wall, or the wall is another.
+
+    Args:
+        pictures: Pictures of the canvas, float32 [N, H, W], 0..1.
+        frames: Frames of the samples y, float32 [N, h, w].
+        position_m: The plate's centre in each, (x, y) in metres, [N, 2].
+        average: The average plate, [P, P].
+        operator: The rig.
+        canvas: Geometry of the pictures.
+
+    Raises:
+        DataError: Pictures and frames are not as many, or not of the operator's size.
+    """
+    if frames.shape != (len(pictures), *operator.size):
+        raise DataError(
+            f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a rig of "
+            f"{operator.size[1]} x {operator.size[0]} samples"
+        )
+    plain = on_canvas(average, canvas, position_m)
+    noise, seen = _noise(frames, operator), _moving(frames)
+    left, before = (_left(_moving(operator(shown)), seen) - noise for shown in (pictures, plain))
+    tiny = 1e-9 * seen.square().sum()  # rounding
+    if before <= _BEYOND_NOISE * noise + tiny:
+        return 0.0
+    return float(1 - left.clamp_min(0) / before)
+
+
+def light_gain(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> float:
+    """Return how much brighter the moving light of frames is than the rig makes it from pictures.
+
+    Args:
+        pictures: Pictures of the canvas, float32 [N, H, W], 0..1.
+        frames: Frames of the samples, float32 [N, h, w], white levels.
+        operator: The rig.
+    """
+    return _gain(_moving(operator(pictures)), _moving(frames))
+
+
+def _moving(frames: Tensor) -> Tensor:
+    """Return frames without what stands still, float64."""
+    frames = frames.double()
+    return frames - frames.mean(dim=0)
+
+
+def _gain(made: Tensor, seen: Tensor) -> float:
+    return float((made * seen).sum() / made.square().sum().clamp_min(torch.finfo(torch.float64).tiny))
+
+
+def _left(made: Tensor, seen: Tensor) -> Tensor:
+    """Return what moving light that was made leaves of the one seen at the best gain, squared and summed."""
+    return (seen - max(_gain(made, seen), 0.0) * made).square().sum()
+
+
+def _noise(frames: Tensor, operator: FrameOperator) -> Tensor:
+    """Return what noise adds to the moving light, squared and summed: from the scatter about the neighbours.
+
+    How the noise grows with the level is told by the rig's camera, how strong it is by the frames. The light
+    moves slowly and over few pixels; the median over the pixels is that of the others. In time alone:
+    `temporal_noise` also takes differences between neighbours, but samples share the sensor's pixels with
+    theirs, so that it finds a tenth too little here.
+    """
+    if len(frames) < 3:
+        return torch.zeros((), dtype=torch.float64)
+    frames = frames.double()
+    beside = 0.5 * (frames[2:] + frames[:-2])
+    spread = (frames[1:-1] - beside) / (1.5 * operator.variance(beside)).sqrt()
+    excess = (spread.flatten(1).abs().median(dim=1).values.median() / _MAD).square()
+    return excess * operator.variance(frames).sum() * (1 - 1 / len(frames))
+
+
+@torch.inference_mode()
+def judgement_of(
+    weights: Weights, samples: Samples, images: Tensor, operator: FrameOperator | None = None
+) -> Judgement | None:
+    """Return what the pictures of one pass are worth; None where the weights or the motion do not tell.
+
+    Args:
+        weights: The network, and what it learned of its pictures' worth.
+        samples: The pass.
+        images: The network's pictures, float32 [N, H, W].
+        operator: The calibrated rig, where it is known.
+    """
+    if why_unjudged(weights, samples) is not None:
+        return None
+    assert weights.confidence is not None and samples.position_m is not None  # see why_unjudged
+    seen = weights.modality.inputs(samples.frame, samples.surface)
+    frames = torch.from_numpy(samples.frame)
+    pass_ = (seen, frames, images, samples.position_m)
+    return _judged(weights.network, weights.confidence, *pass_, weights.sampling.canvas, operator)
+
+
+def why_unjudged(weights: Weights, samples: Samples) -> str | None:
+    """Return in one line why `judgement_of` can't tell anything, and the cure; None where it can.
+
+    Args:
+        weights: The network.
+        samples: The pass.
+    """
+    if samples.position_m is None:
+        why = "the motion is unknown; state it in capture.yaml, or give --rig and --track to find it"
+    elif len(samples) < 2:
+        why = f"{len(samples)} position, 2 are the least; record a pass"
+    elif weights.confidence is None:
+        why = "these weights never learned it; take those of a whole pass (`evnlos weights` lists them)"
+    else:
+        return None
+    return f"no confidence: {why}"
+
+
+def _judged(
+    network: Reconstructor,
+    confidence: Confidence,
+    inputs: Tensor,
+    frames: Tensor,
+    images: Tensor,
+    position_m: NDArray,
+    canvas: Plane,
+    operator: FrameOperator | None,
+) -> Judgement:
+    share = None
+    if operator is not None and bool(frames.any()):
+        # What the pass shows, at each position: what changes from picture to picture is not the object.
+        shown = on_canvas(plates(images, canvas, position_m).mean(dim=0)[0], canvas, position_m)
+        share = explained(shown, frames, position_m, confidence.mean, operator, canvas)
+    return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
+
+
+def said(worth: Judgement) -> dict[str, Any]:
+    """Return a judgement as plain values; `explained` is there only where the rig is known."""
+    numbers = {name: round(getattr(worth, name), 4) for name in ("support", "agreement", "threshold")}
+    if worth.explained is not None:
+        numbers["explained"] = round(worth.explained, 4)
+    return numbers | {"measured": worth.measured, "verdict": worth.verdict}
+
+
+@dataclass(frozen=True)
+class PassWorth:
+    """What the confidence said of one pass, and what was true.
+
+    Args:
+        name: Object of the pass.
+        support: What it said, in one number: how much of the picture the measurement supports, 0..1.
+        agreement: Share of what tells this object from others that both halves of the pass agree on.
+        explained: Share of the frames that the pictures explain (see `explained`); None without a rig.
+        measured: Whether it said that anything was.
+        skill: 1 - |x - t|^2 / |x0 - t|^2 over the plates, with x the pictures, t the truth, and x0 the average
+            plate: 1 is perfect, 0 is no better than the average object, below 0 is worse.
+        coverage: Share of the plates' pixels whose true level lies in its interval.
+        width: Mean length of these intervals, 0..1.
+    """
+
+    name: str
+    support: float
+    agreement: float
+    explained: float | None
+    measured: bool
+    skill: float
+    coverage: float
+    width: float
+
+
+@torch.inference_mode()
+def worth_of(
+    network: Reconstructor,
+    confidence: Confidence,
+    samples: NlosDataset,
+    images: Tensor,
+    canvas: Plane,
+    operator: FrameOperator | None = None,
+) -> list[PassWorth]:
+    """Compare what the confidence says of pictures with their truth, for each pass.
+
+    Args:
+        network: The network.
+        confidence: What it learned of its pictures' worth.
+        samples: The passes, all of known motion.
+        images: The network's pictures of all samples, float32 [N, H, W].
+        canvas: Their geometry.
+        operator: The rig that the network was trained for; the modality then has a group "frame".
+
+    Raises:
+        DataError: The motion of a pass is unknown.
+    """
+    found = []
+    for name in dict.fromkeys(samples.names.tolist()):
+        mine = np.flatnonzero(samples.names == name)
+        rows, at = torch.from_numpy(mine), samples.position_m[mine]
+        inputs = samples.inputs[rows]
+        pass_ = (inputs, _frames(samples, inputs), images[rows], at)
+        said = _judged(network, confidence, *pass_, canvas, operator)
+        true, shown = samples.truth[rows].float(), images[rows]
+        average = on_canvas(confidence.mean, canvas, at)
+        missed, blank = (plates((one - true).square(), canvas, at).sum() for one in (shown, average))
+        # Where the resampled truth is a rounding error beyond 0 or 1, it still is 0 or 1.
+        held = ((true >= said.low - 1e-3) & (true <= said.high + 1e-3)).float()
+        found.append(
+            PassWorth(
+                name,
+                said.support,
+                said.agreement,
+                said.explained,
+                said.measured,
+                float(1 - missed / blank),
+                float(plates(held, canvas, at).mean()),
+                float(plates(said.high - said.low, canvas, at).mean()),
+            )
+        )
+    return found
+
+
+def _frames(samples: NlosDataset, inputs: Tensor) -> Tensor:
+    """Return the frames in inputs, [n, H, W]; zeros where the modality has none."""
+    own = samples.modality.slices.get("frame")
+    return inputs[:, 0].float() * 0 if own is None else inputs[:, own][:, 0].float()
+
+
+def risk_coverage(support: ArrayLike, risk: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean risk of what is kept when only the most supported passes are, for each share kept.
+
+    Args:
+        support: What the confidence said of each pass, [N].
+        risk: What was wrong with it, such as 1 - skill, [N].
+
+    Returns:
+        Shares kept, ascending to 1, and the mean risk of each, [N] both (El-Yaniv and Wiener, JMLR 2010).
+
+    Example:
+        >>> risk_coverage([0.9, 0.1, 0.5], [0.0, 0.6, 0.3])[1].round(2).tolist()
+        [0.0, 0.15, 0.3]
+    """
+    order = np.argsort(-np.asarray(support, np.float64), kind="stable")
+    ranks = np.arange(1, len(order) + 1)
+    return ranks / len(order), np.cumsum(np.asarray(risk, np.float64)[order]) / ranks

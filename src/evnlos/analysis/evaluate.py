@@ -1,0 +1,322 @@
+"""Does a network see, or does it remember? Reconstructions beside what the objects of its training show.
+
+- A network on a dataset: metrics a character and overall, with the baselines beside them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evnlos.analysis.confidence import FrameOperator, PassWorth, worth_of
+from evnlos.analysis.scores import CHARACTERS, Perceptual, Scores, read_characters, score
+from evnlos.config import to_dict
+from evnlos.data import Dataset, Modality, NlosDataset, Sampling, character_of, read_shard, read_shard_index
+from evnlos.errors import DataError
+from evnlos.metrics import psnr
+from evnlos.models import Weights, plates
+from evnlos.setups import Setup
+from evnlos.types import Plane
+
+_TOGETHER = 128  # samples compared at a time
+_SMALLEST = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Reconstructions beside the training objects of their dataset.
+
+    Args:
+        nearest: For each sample the true image of the training object whose measurement is most like its own,
+            float32 [N, H, W]: the answer of pure memory, with no network and no physics.
+        nearer_to_truth: Whether each reconstruction is nearer to the truth than to every training image,
+            bool [N].
+    """
+
+    nearest: Tensor
+    nearer_to_truth: NDArray[np.bool_]
+
+
+def compare_with_training(
+    images: Tensor, samples: NlosDataset, dataset: Dataset, split: str
+) -> Comparison | None:
+    """Compare reconstructions with what each training object would have shown in their place.
+
+    Each training object is represented by its sample nearest along the path; its true image is moved by what
+    is left, in fractions of a pixel, and its input stays as it was measured. Measurements are compared by their
+    mean square difference, each group of channels in units of its own spread in the training data. The objects
+    are read one after the other, so that the memory does not depend on their number.
+
+    Args:
+        images: Reconstructions on the scored rows of the canvas, float32 [N, H, W], 0..1.
+        samples: The samples of the split, in the same order.
+        dataset: Where they are from.
+        split: Their split: "test" or "validation".
+
+    Returns:
+        The comparison, or None where the motion of an object is unknown.
+
+    Raises:
+        DataError: The dataset has no training objects, or a shard is damaged.
+    """
+    rows, pitch_m = dataset.sampling.scored, dataset.sampling.pitch_m
+    names = dataset.objects("train")
+    tested = [read_shard_index(dataset.shard(name)).position_m for name in dataset.objects(split)]
+    known = [read_shard_index(dataset.shard(name)).position_m for name in names]
+    if any(where is None for where in (*tested, *known)):
+        return None
+    at_m = np.concatenate([where for where in tested if where is not None])  # [N, 2]
+    nearest_of = [_nearest(where, at_m) for where in known if where is not None]
+    parts = [slice(first, first + _TOGETHER) for first in range(0, len(images), _TOGETHER)]
+    truth, spread = samples.truth[:, rows].float(), _Spread(samples.modality)
+    closest_db = torch.full((len(images),), -torch.inf)
+    difference = torch.empty(len(names), len(images), samples.modality.channels)  # mean squares, [G, N, C]
+    for number, (name, (step, away_m)) in enumerate(zip(names, nearest_of, strict=True)):
+        inputs, true = _read(dataset, name, samples.modality)
+        for part in parts:
+            seen = inputs[step[part]]
+            spread.add(seen)
+            difference[number, part] = (seen - samples.inputs[part].float()).square().mean(dim=(2, 3))
+            moved = _shifted(true[step[part]], away_m[part] / pitch_m)[:, rows]
+            closest_db[part] = torch.maximum(closest_db[part], psnr(images[part], moved))
+    owner = (difference / spread.per_channel().square()).sum(dim=2).argmin(dim=0)  # [N]
+    nearest = torch.empty_like(truth)
+    for number in owner.unique().tolist():
+        step, away_m = nearest_of[number]
+        _, true = _read(dataset, names[number], samples.modality)
+        for chosen in torch.nonzero(owner == number)[:, 0].split(_TOGETHER):
+            nearest[chosen] = _shifted(true[step[chosen]], away_m[chosen] / pitch_m)[:, rows]
+    return Comparison(nearest, (psnr(images, truth) > closest_db).numpy())
+
+
+class _Spread:
+    """Spread of the inputs in each group of channels, from parts: standard deviation, or root mean square."""
+
+    def __init__(self, modality: Modality) -> None:
+        self._modality, self._count = modality, 0
+        self._sum, self._squares = torch.zeros(2, modality.channels, dtype=torch.float64)
+
+    def add(self, inputs: Tensor) -> None:
+        """Take further inputs, [n, C, H, W]."""
+        self._count += inputs[:, 0].numel()
+        self._sum += inputs.sum(dim=(0, 2, 3), dtype=torch.float64)
+        self._squares += inputs.square().sum(dim=(0, 2, 3), dtype=torch.float64)
+
+    def per_channel(self) -> Tensor:
+        """Return the spread of each channel's group, float32 [C]."""
+        spread = torch.empty(self._modality.channels)
+        for group in self._modality.groups:
+            mine = self._modality.slices[group.name]
+            mean = self._sum[mine].sum() / (self._count * group.channels) if group.centred else 0.0
+            power = self._squares[mine].sum() / (self._count * group.channels)
+            spread[mine] = float((power - mean**2).clamp_min(0).sqrt())
+        return spread.clamp_min(_SMALLEST)
+
+
+def _nearest(known_m: NDArray[np.float64], at_m: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+    """Return the time step of a training object nearest to each place, [N], and the way left, metres [N, 2]."""
+    away = at_m[:, None] - known_m  # [N, K, 2]
+    step = np.square(away).sum(axis=2).argmin(axis=1)
+    return torch.from_numpy(step), torch.from_numpy(away[np.arange(len(step)), step])
+
+
+def _read(dataset: Dataset, name: str, modality: Modality) -> tuple[Tensor, Tensor]:
+    """Return inputs [K, C, H, W] and true images [K, H, W] of a training object, float32."""
+    samples, _ = read_shard(dataset.shard(name))
+    if samples.truth is None:
+        raise DataError(
+            f"{dataset.shard(name)} has no truth (unknown target or motion), and {name} is learned from"
+        )
+    return modality.inputs(samples.frame, samples.surface), torch.from_numpy(samples.truth)
+
+
+def _shifted(images: Tensor, shift_px: Tensor) -> Tensor:
+    """Move images [N, H, W] by (x, y) pixels [N, 2], bilinear, zero beyond the border."""
+    count, height, width = images.shape
+    moves = torch.eye(2, 3).repeat(count, 1, 1)
+    moves[:, :, 2] = -shift_px.float() * 2 / torch.tensor([width, height])
+    grid = F.affine_grid(moves, [count, 1, height, width], align_corners=False)
+    return F.grid_sample(images[:, None].float(), grid, align_corners=False)[:, 0]
+
+
+BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest shot"}
+"""Heading of each baseline."""
+
+CHECKS = {
+    "read": "characters that an independent reader names rightly",
+    "read_truth": "the same on the true pictures",
+    "nearer_to_truth": "pictures nearer to the truth than to any training picture",
+}
+"""Meaning of each check."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Scores and pictures of one network (or baseline) on one split.
+
+    Args:
+        images: Reconstructions on the scored canvas, float32 [N, H, W], 0..1.
+        truth: True pictures, the same shape.
+        names: Object of each picture, [N].
+        scores: Scores of each picture.
+        baselines: Scores of the all-black picture ("zero"), of the mean training picture ("mean"), and of the
+            true picture of the training object whose measurement is most like this one ("nearest").
+        checks: Shares of the pictures: "read", whose character the independent reader names rightly;
+            "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
+            the truth than to any training picture. Only what could be found out.
+        worth: What the network's confidence said of each pass, beside what was true; empty where it has none,
+            or a motion is unknown.
+    """
+
+    images: Tensor
+    truth: Tensor
+    names: np.ndarray
+    scores: Scores
+    baselines: dict[str, Scores]
+    checks: dict[str, float] = field(default_factory=dict)
+    worth: list[PassWorth] = field(default_factory=list)
+
+    def characters(self) -> list[str]:
+        """Return the objects in the order of the dataset."""
+        return list(dict.fromkeys(self.names.tolist()))
+
+    def summary(self) -> dict[str, Any]:
+        """Return metrics overall and an object, for network and baselines, as plain numbers."""
+
+        def table(scores: Scores) -> dict[str, Any]:
+            objects = {
+                name: {"character": character_of(name), **scores.mean(self.names == name)}
+                for name in self.characters()
+            }
+            return {"overall": scores.mean(), "characters": objects}
+
+        return {
+            "images": len(self.images),
+            **table(self.scores),
+            "baselines": {name: table(scores) for name, scores in self.baselines.items()},
+            "checks": self.checks,
+            "confidence": [to_dict(one) for one in self.worth],
+        }
+
+
+def evaluate(
+    weights: Weights,
+    dataset: Dataset,
+    split: str = "test",
+    perceptual: Perceptual | None = None,
+    setup: Setup | None = None,
+) -> Evaluation:
+    """Reconstruct a split of a dataset and score it.
+
+    The baseline "mean" is the mean of the true pictures that the network was trained on last.
+
+    Args:
+        weights: The network.
+        dataset: Where the samples are.
+        split: "train", "validation", "test" or "all".
+        perceptual: LPIPS, where its weights are at hand.
+        setup: The calibrated setup that the confidence asks how much of the frames the pictures explain;
+            weights of events alone see no frames, and are not asked.
+
+    Raises:
+        DataError: The split is empty, or its samples were made in another way than those of the training.
+    """
+    check_sampling(weights, dataset.sampling)
+    samples = NlosDataset(dataset, split, weights.modality)
+    images = weights.network.infer(samples.inputs, samples.position_m, samples.names)
+    found = assess(images, samples, dataset, split, weights.mean_image, perceptual)
+    if weights.confidence is None or np.isnan(samples.position_m).any():
+        return found
+    canvas = dataset.sampling.canvas
+    checks_frames = setup is not None and "frame" in weights.modality.slices
+    operator = FrameOperator(setup, dataset.sampling) if setup is not None and checks_frames else None
+    worth = worth_of(weights.network, weights.confidence, samples, images, canvas, operator)
+    return replace(found, worth=worth)
+
+
+def assess(
+    images: Tensor,
+    samples: NlosDataset,
+    dataset: Dataset,
+    split: str,
+    mean_image: Tensor | None = None,
+    perceptual: Perceptual | None = None,
+) -> Evaluation:
+    """Score any pictures of a split, whoever made them, beside the same baselines.
+
+    Args:
+        images: Reconstructions on the whole canvas, float32 [N, H, W], 0..1, in the order of `samples`.
+        samples: The samples of the split.
+        dataset: Where they are from.
+        split: "train", "validation", "test" or "all".
+        mean_image: The baseline "mean", [H, W]; None leaves it out.
+        perceptual: LPIPS, where its weights are at hand.
+    """
+    rows = dataset.sampling.scored
+    truth = samples.truth.float()[:, rows].contiguous()
+    images = images[:, rows].contiguous()
+    blank = {"zero": torch.zeros_like(truth)}
+    if mean_image is not None:
+        blank["mean"] = mean_image.float()[rows].expand_as(truth).contiguous()
+    checks = _reading(dataset, split, images, truth, samples.names)
+    learned = dataset.split.get("train") and split in ("test", "validation")
+    if learned and (found := compare_with_training(images, samples, dataset, split)) is not None:
+        blank["nearest"] = found.nearest
+        checks["nearer_to_truth"] = round(float(found.nearer_to_truth.mean()), 4)
+    baselines = {name: score(image, truth, perceptual) for name, image in blank.items()}
+    return Evaluation(images, truth, samples.names, score(images, truth, perceptual), baselines, checks)
+
+
+def _reading(
+    dataset: Dataset, split: str, images: Tensor, truth: Tensor, names: np.ndarray
+) -> dict[str, float]:
+    """Return how often the independent reader names the character, on reconstructions and on the truth."""
+    answers = [character_of(name) for name in names]
+    places = [read_shard(dataset.shard(name))[0].position_m for name in dataset.objects(split)]
+    if not set(answers) <= set(CHARACTERS) or any(place is None for place in places):
+        return {}
+    scored = Plane(dataset.sampling.scored_rows, dataset.sampling.width, dataset.sampling.pitch_m)
+    position = np.concatenate([place for place in places if place is not None])
+    found = {}
+    for key, pictures in (("read", images), ("read_truth", truth)):
+        read = read_characters(plates(pictures, scored, position))
+        found[key] = round(float(np.mean([a == b for a, b in zip(read, answers, strict=True)])), 4)
+    return found
+
+
+def reconstruct(
+    weights: Weights, frame: np.ndarray, surface: np.ndarray, position_m: np.ndarray | None = None
+) -> Tensor:
+    """Reconstruct samples, also those without a truth.
+
+    Args:
+        weights: The network.
+        frame: Frames, float32 [N, H, W], 0..1, as in `Samples`.
+        surface: Time surfaces, float32 [N, 2, H, W].
+        position_m: The target's centre, (x, y) in metres, [N, 2], which weights of whole sequences need.
+
+    Returns:
+        Pictures, float32 [N, H, W], 0..1.
+
+    Raises:
+        DataError: The weights see whole sequences, and the positions are unknown.
+    """
+    return weights.network.infer(weights.modality.inputs(frame, surface), position_m)
+
+
+def check_sampling(weights: Weights, sampling: Sampling) -> None:
+    """Refuse samples that were made in another way than those that a network was trained on.
+
+    Raises:
+        DataError: Names the settings that differ.
+    """
+    if weights.sampling != sampling:
+        raise DataError(
+            f"the weights were trained on samples of {weights.sampling}; these are {sampling}: make them alike"
+        )

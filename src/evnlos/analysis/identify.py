@@ -1,0 +1,346 @@
+"""What a setup can show at all.
+
+- What the figures of a rig mean, in words.
+- What a rig can show at all: singular values, patterns above the noise, finest stroke, best linear picture.
+- Rigs side by side, as a table in Markdown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from evnlos.analysis.linearized import (
+    Bench,
+    LinearEstimator,
+    LinearizedSetup,
+    camera_variance,
+    finest_bars,
+    linearized,
+    scan_notes,
+)
+from evnlos.setups import Setup
+from evnlos.types import derive_seed
+
+if TYPE_CHECKING:
+    from evnlos.inverse.measurements import Plates
+
+
+_SHAPE = 4  # bars of a quarter of the plate tell where a letter is filled and where it is open
+_EXTRA_MODES = 1.1
+
+
+def verdict(patterns: int, finest_m: tuple[float | None, float | None], stroke_m: float, plate_m: float) -> str:
+    """Return in a sentence what a reconstruction with this rig would be.
+
+    Strokes are measured where bars of their width are resolved in both directions; the rough shape where bars
+    of a quarter of the plate are.
+
+    Args:
+        patterns: Patterns in which handwritten plates differ by more than the noise.
+        finest_m: Width of the finest upright and lying bars that are resolved, metres; None where none are.
+        stroke_m: Typical stroke of the plates, metres.
+        plate_m: Side of the plate, metres.
+
+    Example:
+        >>> verdict(3, (None, None), 0.008, 0.08).split(": ")[1]
+        "a legible reconstruction will be the network's memory, not a measurement."
+    """
+    upright, lying = finest_m
+    resolved = [width for width in finest_m if width is not None]
+    if not resolved:
+        bars = "no bars at all"
+    elif len(resolved) == 1:
+        there, missing = ("upright", "lying") if lying is None else ("lying", "upright")
+        bars = f"{there} bars down to {1e3 * resolved[0]:.1f} mm, {missing} ones not at all"
+    else:
+        bars = f"bars down to {1e3 * max(resolved):.1f} mm"
+    finest = None if upright is None or lying is None else max(upright, lying)
+    if finest is not None and finest <= stroke_m:
+        meaning = f"strokes of {1e3 * stroke_m:.1f} mm are measured"
+    elif finest is not None and finest <= plate_m / _SHAPE:
+        fine = f"strokes of {1e3 * stroke_m:.1f} mm"
+        meaning = f"the rough shape is measured, {fine} are not: their detail will be memory"
+    else:
+        meaning = "a legible reconstruction will be the network's memory, not a measurement"
+    return f"With this wall and noise {patterns} patterns can be told apart, and {bars}: {meaning}."
+
+
+def artifact_note(setup: Setup, plain: Setup, cut: int, whole: int, level: float) -> str | None:
+    """Return a warning where what a setup's model adds to a real wall shows modes that the wall does not have.
+
+    Args:
+        setup: The setup.
+        plain: The same without that (`Setup.without_artifacts`), e.g. a tPSF without its hard edge.
+        cut: Singular values of the setup above `level`.
+        whole: The same without the artifact.
+        level: Share of the largest singular value.
+    """
+    if cut <= _EXTRA_MODES * whole:
+        return None
+    changed = [item.name for item in fields(setup) if getattr(setup, item.name) != getattr(plain, item.name)]
+    here, there = (", ".join(f"{name} {getattr(one, name):g}" for name in changed) for one in (setup, plain))
+    return (
+        f"{setup.wall_description()} with {here}: {cut} singular values lie above {level:g} of the largest, "
+        f"{whole} with {there}; {setup.artifact} makes the operator look better conditioned than a wall is"
+    )
+
+
+MODE_LEVEL = 1e-2
+"""Singular values above this share of the largest count as usable modes."""
+KINK_LEVEL = 1e-4
+"""Level at which the kink of a cut tPSF is told apart from what the wall shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class AtNoise:
+    """What is left of a rig at one noise; figures are expectations over the noise of one picture of the wall.
+
+    Args:
+        noise: Root mean square noise of a pixel, white levels.
+        patterns: Patterns in which handwritten plates differ by more than the noise.
+        psnr_db: Mean over unseen plates of the PSNR of the best linear picture, on the plate.
+        stroke_m: Width of the finest bars that are resolved, upright and lying, metres; None where none are.
+        spectrum: Singular values of the matrix in units of the noise, float64 [n], descending.
+        picard: Coefficient of the typical plate's picture on each mode, in units of the noise, float64 [n].
+        modes: The first modes as plates, float64 [8, h, w], unit norm.
+        picture: The best linear picture of the typical plate with one draw of the noise, float64 [h, w].
+    """
+
+    noise: float
+    patterns: int
+    psnr_db: float
+    stroke_m: tuple[float | None, float | None]
+    spectrum: torch.Tensor
+    picard: torch.Tensor
+    modes: torch.Tensor
+    picture: torch.Tensor
+
+    @property
+    def finest_m(self) -> float | None:
+        """Width of the finest bars that are resolved in both directions, metres."""
+        upright, lying = self.stroke_m
+        return None if upright is None or lying is None else max(upright, lying)
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What a rig can show at all.
+
+    Args:
+        name: Name of the rig.
+        setup: Its settings.
+        bench: How the question was put.
+        singular: Singular values over the largest, float64 [n], descending.
+        modes: How many of them lie above 1e-2.
+        zero_db: Mean PSNR of the all-black picture, on the plate.
+        mean_db: Mean PSNR of the mean training plate, on the plate.
+        stroke_m: Typical stroke of the plates, metres.
+        truth: The typical plate, float64 [h, w].
+        at_camera: At the frame camera's own noise.
+        at_fixed: At the fixed noise of the bench.
+        verdict: The same in words.
+        warnings: What makes the figures look better than they are.
+    """
+
+    name: str
+    setup: Setup
+    bench: Bench
+    singular: torch.Tensor
+    modes: int
+    zero_db: float
+    mean_db: float
+    stroke_m: float
+    truth: torch.Tensor
+    at_camera: AtNoise
+    at_fixed: AtNoise
+    verdict: str
+    warnings: tuple[str, ...] = ()
+
+    def summary(self, arrays: bool = False) -> dict[str, Any]:
+        """Return plain numbers and words; with `arrays` also singular values and Picard coefficients."""
+        found: dict[str, Any] = {
+            "setup": self.name,
+            "verdict": self.verdict,
+            "warnings": list(self.warnings),
+            "modes_above_1e-2": self.modes,
+            "psnr_zero_db": round(self.zero_db, 2),
+            "psnr_mean_db": round(self.mean_db, 2),
+            "typical_stroke_m": round(self.stroke_m, 5),
+            "bench": asdict(self.bench),
+            "settings": asdict(self.setup),
+        }
+        for name, one in (("camera_noise", self.at_camera), ("fixed_noise", self.at_fixed)):
+            found[name] = {
+                "rms_noise": round(one.noise, 6),
+                "patterns_above_noise": one.patterns,
+                "psnr_linear_db": round(one.psnr_db, 2),
+                "finest_upright_stroke_m": _rounded(one.stroke_m[0]),
+                "finest_lying_stroke_m": _rounded(one.stroke_m[1]),
+            }
+            if arrays:
+                found[name]["singular_values_over_noise"] = one.spectrum.tolist()
+                found[name]["picard_coefficients_over_noise"] = one.picard.tolist()
+        if arrays:
+            found["singular_values"] = self.singular.tolist()
+        return found
+
+
+def identify(
+    setup: Setup,
+    bench: Bench | None = None,
+    name: str = "setup",
+    seed: int = 0,
+) -> Identification:
+    """Say what one picture of the wall can show of a plate at a known place, whatever the method.
+
+    The linear map from the plate's cells to the camera's pixels is taken apart by its singular values; the
+    noise is the frame camera's at the light of the mean plate, and a fixed share of the brightest pixel. The
+    best linear picture uses mean and covariance of handwriting and is tested on characters and writers that it
+    never saw.
+
+    Args:
+        setup: The setup; its frame camera's noise is what counts.
+        bench: Cells, pixels and noise; None is the default, that of the table in docs/identifiability.md.
+        name: What to call the rig.
+        seed: Seed of the one picture that is drawn with noise.
+
+    Raises:
+        ConfigError: The setup is geometrically impossible, or the camera gets no light from the target.
+
+    Example:
+        >>> from evnlos.setups import load_setup
+        >>> found = identify(load_setup("matte-near"), bench=Bench(cells=8, height=12, width=20, writers=1))
+        >>> found.modes
+        3
+    """
+    bench = bench or Bench()
+    seen = linearized(setup, bench)
+    from evnlos.inverse.measurements import handwritten_plates
+
+    plates = handwritten_plates(bench.plate, bench.writers)
+    singular = singular_values(seen.matrix)
+    light = seen.ambient + seen.matrix @ plates.mean
+    own = camera_variance(light, setup.frame_camera, bench.frames, bench.known_pattern)
+    fixed = torch.full_like(own, (bench.fixed_noise * seen.white) ** 2 / bench.frames)
+    at_camera, at_fixed = (at_noise(seen, variance, plates, seed) for variance in (own, fixed))
+    warnings = []
+    plain = setup.without_artifacts()
+    if plain is not None:
+        wide = singular_values(linearized(plain, bench).matrix)
+        note = artifact_note(setup, plain, counted(singular, KINK_LEVEL), counted(wide, KINK_LEVEL), KINK_LEVEL)
+        warnings += [note] if note else []
+    noise = setup.resized(seen.shape).operator_noise(seen.plate)
+    if noise is not None:
+        warnings += scan_notes(noise, seen, singular, MODE_LEVEL)
+    zero_db, mean_db = (
+        _psnr((plates.test - blank).square().mean(dim=-1))
+        for blank in (torch.zeros_like(plates.mean), plates.mean)
+    )
+    return Identification(
+        name,
+        setup,
+        bench,
+        singular,
+        counted(singular, MODE_LEVEL),
+        zero_db,
+        mean_db,
+        plates.stroke_m,
+        plates.test[plates.typical].reshape(bench.plate.shape),
+        at_camera,
+        at_fixed,
+        verdict(at_camera.patterns, at_camera.stroke_m, plates.stroke_m, bench.plate_m),
+        tuple(warnings),
+    )
+
+
+def at_noise(seen: LinearizedSetup, variance: torch.Tensor, plates: Plates, seed: int = 0) -> AtNoise:
+    """Return what is left of a rig at independent noise of a given variance.
+
+    Args:
+        seen: The linear map.
+        variance: Variance of each pixel's noise, white levels squared, [H W], above 0.
+        plates: Prior and test.
+        seed: Seed of the one picture that is drawn with noise.
+    """
+    cells, shape = seen.plate.width, seen.plate.shape
+    whitened = seen.matrix / variance.sqrt()[:, None]
+    gram = whitened.mT @ whitened
+    power, axes = torch.linalg.eigh(gram)
+    power, axes = power.flip(0).clamp(min=0), axes.flip(1)
+    # The sign of a mode is free: the larger half is shown bright.
+    axes = axes * torch.where(axes.sum(dim=0) < 0, -1.0, 1.0)
+    typical = plates.test[plates.typical]
+    estimator = LinearEstimator.known(gram, plates.mean, plates.root)
+    shapeless = LinearEstimator.white(gram, power, axes)
+    generator = torch.Generator().manual_seed(derive_seed(seed, "identify"))
+    noise = torch.randn(len(variance), generator=generator, dtype=torch.float64)
+    backprojected = gram @ (typical - plates.mean) + whitened.mT @ noise
+    strokes = [finest_bars(shapeless, cells, upright) for upright in (True, False)]
+    upright, lying = (None if one is None else one * seen.plate.pitch_m for one in strokes)
+    return AtNoise(
+        float(variance.mean().sqrt()),
+        estimator.patterns_seen,
+        _psnr(estimator.expected_error(plates.test)),
+        (upright, lying),
+        power.sqrt(),
+        power.sqrt() * (axes.mT @ typical).abs(),
+        axes[:, :8].mT.reshape(8, *shape),
+        estimator.estimate(backprojected).reshape(shape),
+    )
+
+
+def singular_values(matrix: torch.Tensor) -> torch.Tensor:
+    """Return the singular values of a tall matrix over the largest one, float64 [n], descending."""
+    # The triangle of a QR decomposition has the same ones; a product A^T A would lose those below 1e-8.
+    values = torch.linalg.svdvals(torch.linalg.qr(matrix.double(), mode="r").R)
+    return values / values[0]
+
+
+def counted(singular: torch.Tensor, level: float) -> int:
+    """Return how many singular values lie above a share of the largest."""
+    return int((singular > level * singular[0]).sum())
+
+
+def _psnr(error: torch.Tensor) -> float:
+    """Return the mean PSNR of pictures with these mean squared errors, dB, peak 1."""
+    return float((-10 * torch.log10(error)).mean())
+
+
+def _rounded(length_m: float | None) -> float | None:
+    return None if length_m is None else round(length_m, 5)
+
+
+_HEAD = (
+    "| rig | modes > 1e-2 | patterns above noise: camera / 1 % | bars, upright x lying, mm: camera / 1 % "
+    "| best linear picture, dB: camera / 1 % |\n|---|---|---|---|---|"
+)
+
+
+def rig_table(found: Sequence[Identification]) -> str:
+    """Return one row a rig, and a line that says what holds for all of them.
+
+    Args:
+        found: The rigs, all on the same bench.
+    """
+    rows = [_HEAD]
+    for one in found:
+        camera, fixed = one.at_camera, one.at_fixed
+        rows.append(
+            f"| {one.name} | {one.modes} | {camera.patterns} / {fixed.patterns} "
+            f"| {_bars(camera)} / {_bars(fixed)} | {camera.psnr_db:.2f} / {fixed.psnr_db:.2f} |"
+        )
+    first, bench = found[0], found[0].bench
+    rows.append(
+        f"\nOn the plate of {1e3 * bench.plate_m:g} mm: all-black {first.zero_db:.2f} dB, mean training plate "
+        f"{first.mean_db:.2f} dB; typical stroke {1e3 * first.stroke_m:.1f} mm; "
+        f"{bench.cells} x {bench.cells} cells, {bench.height} x {bench.width} pixels."
+    )
+    return "\n".join(rows)
+
+
+def _bars(one: AtNoise) -> str:
+    return " x ".join("none" if width is None else f"{1e3 * width:.1f}" for width in one.stroke_m)

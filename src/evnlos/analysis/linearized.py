@@ -1,0 +1,306 @@
+"""A setup as a matrix with a noise, and the best linear estimate that it allows.
+
+- A setup as a matrix with a noise: what every question about its limits starts from.
+- The best linear estimate of a plate from one picture of the wall, and how wrong it is on average.
+- What a measured matrix can't say about a rig: its own noise and the size of its cells, in words.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from evnlos.cameras import FrameCamera
+from evnlos.errors import ConfigError, DataError
+from evnlos.setups import OperatorNoise, Setup
+from evnlos.setups.base import dense_matrix
+from evnlos.types import Plane
+
+
+@dataclass(frozen=True)
+class Bench:
+    """How the question is put: cells of the plate, pixels of the camera, noise."""
+
+    plate_m: float = 0.08
+    """Side of the plate, in the middle of its travel, metres."""
+    cells: int = 32
+    """Cells a side of the plate."""
+    height: int = 60
+    """Rows of the camera, pixels."""
+    width: int = 96
+    """Columns of the camera, pixels."""
+    fixed_noise: float = 0.01
+    """Standard deviation of the fixed noise, share of the brightest pixel while the whole plate shines."""
+    frames: int = 1
+    """Frames that are averaged, all of the plate in the same place."""
+    known_pattern: bool = True
+    """Whether the camera's fixed pattern was measured and taken off."""
+    writers: int = 6
+    """Writers whose characters are the linear estimator's prior."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("cells", 8), ("height", 4), ("width", 4), ("frames", 1), ("writers", 1)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"Bench.{name} is {getattr(self, name)}; give {least} or more")
+        if self.cells > 64:
+            raise ConfigError(f"Bench.cells is {self.cells}; give at most 64, the matrix grows with its square")
+        for name in ("plate_m", "fixed_noise"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"Bench.{name} is {value}; give a positive number")
+
+    @property
+    def plate(self) -> Plane:
+        """The cells of the plate."""
+        return Plane(self.cells, self.cells, self.plate_m / self.cells)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the camera image, pixels."""
+        return self.height, self.width
+
+
+@dataclass(frozen=True, eq=False)
+class LinearizedSetup:
+    """The linear map from the target's cells to the camera's pixels, and the light that is always there.
+
+    Args:
+        matrix: White levels of a pixel per unit of a cell's brightness, float64 [H W, n].
+        ambient: Ambient light, white levels, float64 [H W].
+        plate: The cells.
+        shape: Size (H, W) of the camera image, pixels.
+    """
+
+    matrix: torch.Tensor
+    ambient: torch.Tensor
+    plate: Plane
+    shape: tuple[int, int]
+
+    @property
+    def white(self) -> float:
+        """Light of the brightest pixel while the whole target shines, ambient light apart, white levels."""
+        return float(self.matrix.sum(dim=1).max())
+
+
+def linearized(setup: Setup, bench: Bench = Bench()) -> LinearizedSetup:
+    """Return the linear map of a setup for a target in the middle of its path.
+
+    Of a setup that is not linear it is the linear part (`Setup.linear_part`). A setup that has fewer pixels
+    than the bench asks for keeps its own.
+
+    Args:
+        setup: The setup.
+        bench: Cells and pixels.
+
+    Raises:
+        ConfigError: The setup is geometrically impossible, has no linear part, or gets no light.
+
+    Example:
+        >>> from evnlos.setups import PaperSetup
+        >>> seen = linearized(PaperSetup(gain=0.5), Bench(cells=8, height=12, width=20))
+        >>> seen.matrix.shape, 0.2 < seen.white < 0.5
+        (torch.Size([240, 64]), True)
+    """
+    setup = setup.resized(bench.shape)
+    matrix = dense_matrix(setup.linear_part(bench.plate))
+    if not float(matrix.max()) > 0:
+        raise ConfigError("the camera gets no light from the target; move the target or the camera")
+    return LinearizedSetup(matrix, setup.ambient_light().double().flatten(), bench.plate, setup.shape)
+
+
+def camera_variance(
+    light: torch.Tensor, camera: FrameCamera, frames: int = 1, known_pattern: bool = True
+) -> torch.Tensor:
+    """Return the variance of the frame camera's noise at a mean light: shot, read, rounding, fixed pattern.
+
+    var(E) = (E / N + (r / N)^2 + q^2) / frames + pattern, N the full well, r the read noise, q the rounding to
+    digital numbers over sqrt(12), in white levels; the pattern (sensitivity and offset) does not average out.
+
+    Args:
+        light: Mean light, white levels, [...].
+        camera: The camera.
+        frames: Frames that are averaged.
+        known_pattern: Whether the fixed pattern was measured and taken off.
+
+    Returns:
+        Variance, white levels squared, [...].
+
+    Example:
+        >>> camera = FrameCamera(full_well_e=10_000.0, read_noise_e=0.0, bit_depth=16)
+        >>> round(float(camera_variance(torch.tensor(0.25), camera)) ** 0.5, 4)
+        0.005
+    """
+    well = camera.full_well_e
+    rounding = 1 / ((camera.white - camera.black_level) * camera.gain) ** 2 / 12
+    variance = (light.clamp(min=0) / well + (camera.read_noise_e / well) ** 2 + rounding) / frames
+    if not known_pattern:
+        variance = variance + (camera.prnu * light) ** 2 + (camera.dsnu_e / well) ** 2
+    return variance
+
+
+_STEPS_AN_OCTAVE = 8
+_PHASES = 4
+RESOLVED = 0.5
+"""Bars count as resolved when the expected error is at most this share of an even grey's."""
+
+
+class LinearEstimator:
+    """The linear minimum mean-square error estimator of x from y = A x + noise (Wiener; LMMSE).
+
+    x^ = m + C A^T (A C A^T + D)^-1 (y - A m), with m and C the mean and the covariance of the plates and D that
+    of the noise. In the basis T of patterns in which C = T T^T and T^T A^T D^-1 A T = diag(snr), pattern k is
+    seen with a signal-to-noise ratio snr_k in power, and x^ = m + T (snr + 1)^-1 T^T A^T D^-1 (y - A m).
+
+    Args:
+        gram: A^T D^-1 A, [n, n]: the information that the picture carries.
+        mean: m, [n], 0..1.
+        patterns: T, [n, n].
+        snr: Signal-to-noise ratio of each pattern, [n], descending.
+    """
+
+    def __init__(
+        self, gram: torch.Tensor, mean: torch.Tensor, patterns: torch.Tensor, snr: torch.Tensor
+    ) -> None:
+        self.mean, self.snr = mean, snr
+        self._patterns = patterns
+        self._gain = patterns / (snr + 1)
+        self._kept = self._gain @ (patterns.mT @ gram)  # what the estimate keeps of x - m, [n, n]
+        share = snr / (snr + 1).square()
+        self.noise_error = float((share * patterns.square().sum(dim=0)).sum() / len(mean))
+
+    @classmethod
+    def known(cls, gram: torch.Tensor, mean: torch.Tensor, root: torch.Tensor) -> LinearEstimator:
+        """Return the estimator for plates of mean m and covariance C = R R^T.
+
+        Args:
+            gram: A^T D^-1 A, [n, n].
+            mean: m, [n].
+            root: R, [n, n].
+
+        Raises:
+            DataError: The sizes do not belong together.
+        """
+        count = len(mean)
+        if gram.shape != (count, count) or root.shape != (count, count):
+            raise DataError(
+                f"gram is {tuple(gram.shape)}, root {tuple(root.shape)}; both need {count} x {count} entries"
+            )
+        snr, turn = torch.linalg.eigh(root.mT @ gram @ root)
+        return cls(gram, mean, (root @ turn).flip(1), snr.flip(0).clamp(min=0))
+
+    @classmethod
+    def white(cls, gram: torch.Tensor, power: torch.Tensor, axes: torch.Tensor) -> LinearEstimator:
+        """Return the estimator that knows no shapes: cells are independent, as often bright as dark.
+
+        Args:
+            gram: A^T D^-1 A, [n, n].
+            power: Its eigenvalues, [n], descending.
+            axes: Its eigenvectors, [n, n].
+        """
+        mean = torch.full_like(power, 0.5)
+        return cls(gram, mean, axes / 2, power / 4)  # variance 1/4
+
+    @property
+    def patterns_seen(self) -> int:
+        """Number of patterns in which these plates differ by more than the noise: snr above 1."""
+        return int((self.snr > 1).sum())
+
+    def expected(self, plates: torch.Tensor) -> torch.Tensor:
+        """Return the estimate without its noise: its mean over many pictures of each plate [..., n]."""
+        return self.mean + (plates - self.mean) @ self._kept.mT
+
+    def expected_error(self, plates: torch.Tensor) -> torch.Tensor:
+        """Return the mean squared error a cell, over the noise, for given plates [..., n] -> [...]."""
+        return (self.expected(plates) - plates).square().mean(dim=-1) + self.noise_error
+
+    def estimate(self, backprojected: torch.Tensor) -> torch.Tensor:
+        """Return x^ from A^T D^-1 (y - A m), [..., n]."""
+        return self.mean + (backprojected @ self._patterns) @ self._gain.mT
+
+
+def bars(cells: int, width: float, phase: float, upright: bool = True) -> torch.Tensor:
+    """Return bright bars on a dark plate, each cell the exact mean over its area.
+
+    Args:
+        cells: Cells a side.
+        width: Width of a bar and of a gap, cells, above 0.
+        phase: Where the first bar begins, cells.
+        upright: Whether the bars run along y; they then follow each other along x.
+
+    Returns:
+        Brightness, float64 [cells, cells], 0..1.
+
+    Example:
+        >>> bars(4, 1.0, 0.5)[0]
+        tensor([0.5000, 0.5000, 0.5000, 0.5000], dtype=torch.float64)
+    """
+    edge = torch.arange(cells + 1, dtype=torch.float64) - phase
+    periods = torch.floor(edge / (2 * width))
+    filled = periods * width + (edge - 2 * width * periods).clamp(max=width)
+    profile = filled.diff()
+    return (profile if upright else profile[:, None]).expand(cells, cells).clone()
+
+
+def finest_bars(estimator: LinearEstimator, cells: int, upright: bool = True) -> float | None:
+    """Return the width of the finest bars that one picture resolves, in cells; None where none are.
+
+    Bars of full contrast fill the plate. They are resolved when the expected squared error of the estimate,
+    averaged over their phase, is at most half of what an even grey of their mean would have (a quarter of the
+    all-black picture's), and so are all wider bars. Widths go from half of the plate down to one cell in steps
+    of 9 %.
+
+    Args:
+        estimator: The estimator, `LinearEstimator.white` for one without any knowledge of shapes.
+        cells: Cells a side of the plate.
+        upright: Whether the bars run along y.
+    """
+    octaves = math.log2(cells / 2)
+    steps = round(_STEPS_AN_OCTAVE * octaves)
+    found = None
+    for step in range(steps + 1):
+        width = cells / 2 * 2 ** (-octaves * step / steps)
+        plates = torch.stack(
+            [bars(cells, width, 2 * width * k / _PHASES, upright).flatten() for k in range(_PHASES)]
+        ).to(estimator.mean)
+        grey = (plates - plates.mean(dim=-1, keepdim=True)).square().mean()
+        if float(estimator.expected_error(plates).mean()) > RESOLVED * float(grey):
+            break
+        found = width
+    return found
+
+
+def scan_notes(noise: OperatorNoise, seen: LinearizedSetup, singular: torch.Tensor, level: float) -> list[str]:
+    """Return what makes a measured setup look better or worse than it is.
+
+    The noise of the measurement has singular values of its own; those of the matrix that are not above its
+    largest can't be told from it, however well conditioned they look.
+
+    Args:
+        noise: One draw of the noise of the measured operator, and what is known of it.
+        seen: The linear map of the setup.
+        singular: Singular values of that map over the largest, descending.
+        level: Share of the largest above which a mode is called usable.
+    """
+    floor = float(torch.linalg.matrix_norm(noise.matrix, 2) / torch.linalg.matrix_norm(seen.matrix, 2))
+    above, usable = int((singular > floor).sum()), int((singular > level).sum())
+    found = []
+    if above < usable:
+        found.append(
+            f"the scan's own noise reaches {floor:.2g} of the largest singular value: {above} of the {usable} "
+            "modes "
+            f"above {level:g} are surely measured, the others may be noise; repeat the scan more often"
+        )
+    if not noise.is_independent:
+        found.append(
+            "the matrix was denoised or made from a point-spread function: its noise is not independent from "
+            "cell "
+            "to cell, and modes that were cut off count as absent"
+        )
+    if noise.pitch_m > 1.01 * seen.plate.pitch_m:
+        found.append(
+            f"the scan's cells are {1e3 * noise.pitch_m:.1f} mm: bars narrower than that were not measured, "
+            "whatever the wall"
+        )
+    return found

@@ -1,0 +1,301 @@
+"""Trained models at work: a recording at once, step by step, and with growing numbers of time steps.
+
+- One time step after the other, as fast as a CPU goes: the network as a graph with its constants folded in.
+- A pretrained or trained model: a recording in; images, how far to believe them, and warnings out.
+- How the image of a sequence network grows with the number of positions that it sees.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from evnlos.analysis.confidence import FrameOperator, consistent, judgement_of, light_gain, why_unjudged
+from evnlos.analysis.evaluate import check_sampling, reconstruct
+from evnlos.data import Capture, Dataset, FixedPattern, NlosDataset, Samples, capture_samples, read_capture
+from evnlos.errors import ConfigError, DataError
+from evnlos.metrics import psnr
+from evnlos.models import Judgement, Weights, load_weights, published_rig, published_single
+from evnlos.setups import Setup, load_setup
+
+
+class StreamingReconstructor:
+    """A network of single time steps: the same images as `reconstruct`, without Python between its layers.
+
+    The graph is traced at the first use (about a second), for the sampling that the weights were trained on.
+
+    Args:
+        weights: The network.
+
+    Raises:
+        DataError: The network sees whole sequences.
+
+    Example:
+        >>> from evnlos.data import Sampling
+        >>> from evnlos.models import UNetConfig
+        >>> sampling = Sampling(height=16, width=24, scored_rows=12)
+        >>> network = UNetConfig(width=4, depth=1, rank=0).build("frame", sampling)
+        >>> see = StreamingReconstructor(Weights(network))
+        >>> see(np.zeros((16, 24)), np.zeros((2, 16, 24))).shape
+        torch.Size([16, 24])
+    """
+
+    def __init__(self, weights: Weights) -> None:
+        self.modality, self.sampling = weights.modality, weights.sampling
+        if weights.network.sees_sequence:
+            names = " or ".join(published_single())
+            raise DataError(
+                f"these weights see whole sequences; give weights of single time steps: {names}, which come "
+                "with the package, or your own, trained with --network.kind unet"
+            )
+        shape = (1, self.modality.channels, self.sampling.height, self.sampling.width)
+        network = weights.network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        example = torch.zeros(shape).contiguous(memory_format=torch.channels_last)
+        with torch.inference_mode(), warnings.catch_warnings():
+            # The sizes are fixed here, which is what the tracer warns of.
+            warnings.simplefilter("ignore")
+            self._graph = torch.jit.freeze(torch.jit.trace(network, example))
+
+    @torch.inference_mode()
+    def __call__(self, frame: NDArray, surface: NDArray) -> Tensor:
+        """Return the image, float32 [H, W], 0..1, of one time step.
+
+        Args:
+            frame: What the frame camera saw, [H, W], as in `Samples`.
+            surface: Time surface, [2, H, W].
+
+        Raises:
+            DataError: The maps are not of the size that the network was trained on.
+        """
+        size = (self.sampling.height, self.sampling.width)
+        if np.shape(frame) != size or np.shape(surface) != (2, *size):
+            raise DataError(
+                f"frame {np.shape(frame)} and surface {np.shape(surface)} do not fit weights for {size}; bring "
+                "them to that size by `make_samples`"
+            )
+        seen = self.modality.inputs(np.asarray(frame)[None], np.asarray(surface)[None])
+        return self._graph(seen.contiguous(memory_format=torch.channels_last))[0, 0]
+
+
+_SAME_LIGHT = (0.75, 1.33)
+"""Range of a recording's brightness, in that of its calibrated setup, in which the setup's gain is its own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """What a model makes of a recording.
+
+    Args:
+        images: The hidden object on the canvas at each time step, float32 [N, H, W], 0..1.
+        samples: What the model saw; with the truth, where the recording states it.
+        confidence: How far to believe the images; None where that can't be told.
+        warnings: What is doubtful, one line each.
+        light: Brightness of the recording in that of the given setup; None without one.
+        no_confidence: Why there is no confidence, in one line; None where there is.
+    """
+
+    images: Tensor
+    samples: Samples
+    confidence: Judgement | None = None
+    warnings: list[str] = field(default_factory=list)
+    light: float | None = None
+    no_confidence: str | None = None
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether the images were moved to where the setup agrees with the frames."""
+        return self.light is not None and _SAME_LIGHT[0] < self.light < _SAME_LIGHT[1]
+
+
+class Model:
+    """A trained network with what is known about it; make it with `load_model`.
+
+    Args:
+        weights: The network, its history, its confidence.
+        known_setup: Settings of the calibrated setup that the network was trained for, a YAML file; None where
+            they are unknown.
+    """
+
+    def __init__(self, weights: Weights, known_setup: Path | None = None) -> None:
+        self.weights, self._known_setup = weights, known_setup
+
+    def reconstruct(
+        self,
+        recording: str | Path | Capture,
+        setup: Setup | None = None,
+        pattern: FixedPattern | None = None,
+        track: bool = False,
+    ) -> Reconstruction:
+        """Reconstruct all time steps of a recording.
+
+        Args:
+            recording: A capture folder, or one that was read; its target may be unknown.
+            setup: The calibrated setup of this very recording; the images are then moved to where its wall
+                agrees with the frames, if these are as bright as the setup makes them. Without one, the
+                confidence asks the setup that pretrained weights were trained for, and the images stay.
+            pattern: Fixed pattern of the frame camera, to be taken from the frames.
+            track: Find the motion in the recording with the setup, also where it is stated.
+
+        Raises:
+            ConfigError: `track` without a linear setup.
+            DataError: The recording can't be used, the object can't be tracked, or a network of whole
+                sequences is not told the motion.
+        """
+        tracked = setup_for_track(setup) if track else None
+        shot = recording if isinstance(recording, Capture) else read_capture(recording)
+        samples = capture_samples(shot, self.weights.sampling, pattern)
+        warnings: list[str] = []
+        if tracked is not None:
+            from evnlos.tracking import track_capture, track_doubts
+
+            path = track_capture(shot, tracked, pattern=pattern)
+            warnings = track_doubts(shot, tracked, path)
+            samples = replace(samples, position_m=path.at(samples.time_s))
+        images = reconstruct(self.weights, samples.frame, samples.surface, samples.position_m)
+        unjudged = why_unjudged(self.weights, samples)
+        judge = setup
+        if judge is None and unjudged is None and self._known_setup is not None:
+            judge = load_setup(self._known_setup)  # an operator takes a second to make
+        operator = None if judge is None else FrameOperator(judge, self.weights.sampling)
+        confidence = judgement_of(self.weights, samples, images, operator)
+        found = Reconstruction(images, samples, confidence, warnings, no_confidence=unjudged)
+        if setup is None or operator is None:
+            return found
+        frames = torch.from_numpy(samples.frame)
+        found = replace(found, light=light_gain(images, frames, operator))
+        if not found.is_moved:
+            return found
+        images = consistent(images, frames, operator)
+        if confidence is not None:  # where the frames moved a level out of its interval, the interval follows
+            low, high = confidence.low.minimum(images), confidence.high.maximum(images)
+            confidence = replace(confidence, low=low, high=high)
+        return replace(found, images=images, confidence=confidence)
+
+
+def load_model(weights: str | Path) -> Model:
+    """Return the model of a weights file, of a run, or of pretrained weights.
+
+    Args:
+        weights: A path, or a name such as "near-frame-pass" (`evnlos weights` lists them).
+
+    Raises:
+        DataError: There is no such file or name, or the file is damaged.
+
+    Example:
+        >>> load_model("near-frame").weights.modality.name
+        'frame'
+    """
+    return Model(load_weights(weights), published_rig(weights))
+
+
+def setup_for_track(setup: Setup | None) -> Setup:
+    """Return the setup with which motion can be found.
+
+    Args:
+        setup: The calibrated setup.
+
+    Raises:
+        ConfigError: There is none, or one that is not linear.
+    """
+    if setup is None:
+        raise ConfigError("--track without --setup; give the calibrated setup, which turns pixels into metres")
+    if not setup.is_linear:
+        raise ConfigError(
+            f"--track with a setup of kind {setup.kind}, which is not linear; calibrate one that is"
+        )
+    return setup
+
+
+_MOST_SUBSETS = 8
+
+
+@dataclass(frozen=True)
+class PositionsPoint:
+    """Scores of a sequence network that saw a part of each pass.
+
+    Args:
+        positions: Positions that it saw.
+        subsets: Choices of so many positions that the scores are a mean over, at most.
+        psnr_db: Mean PSNR over the pictures of all positions of the split, the scored canvas, dB.
+        objects: The same of each object, dB.
+    """
+
+    positions: int
+    subsets: int
+    psnr_db: float
+    objects: dict[str, float]
+
+
+@torch.inference_mode()
+def curve_over_positions(
+    weights: Weights, dataset: Dataset, split: str = "test", counts: tuple[int, ...] = (1, 2, 5, 10, 20, 40)
+) -> list[PositionsPoint]:
+    """Reconstruct each pass from some of its positions and score the picture at all of them.
+
+    The choices of n of N positions are equally spaced: begun at the first, the second and so on, up to 8
+    choices spread over the N // n that there are. What is scored is the same for every n: the picture drawn
+    at all N positions, whose places are known.
+
+    Args:
+        weights: Those of a network of whole sequences.
+        dataset: Where the samples are.
+        split: "train", "validation", "test" or "all".
+        counts: Numbers of positions, each from 1 to the positions of a pass.
+
+    Raises:
+        DataError: The network sees single time steps, the motion of an object is unknown, a count is more than
+            a pass has, or the samples were made in another way than those of the training.
+    """
+    network = weights.network
+    if not network.sees_sequence:
+        raise DataError(
+            "these weights see single time steps; give those of a network of whole sequences (train with "
+            "--network.kind sequence)"
+        )
+    check_sampling(weights, dataset.sampling)
+    samples = NlosDataset(dataset, split, weights.modality)
+    if np.isnan(samples.position_m).any():
+        raise DataError("the motion of an object is unknown; give it in capture.yaml (`evnlos track` finds it)")
+    passes = {name: np.flatnonzero(samples.names == name) for name in dict.fromkeys(samples.names.tolist())}
+    # All of them before the first reconstruction, so that a count that is too large costs no time.
+    chosen = {count: {name: choices(len(mine), count) for name, mine in passes.items()} for count in counts}
+    network.eval()
+    rows = dataset.sampling.scored
+    found = []
+    for count, parts_of in chosen.items():
+        means = {}
+        for name, mine in passes.items():
+            places = torch.from_numpy(samples.position_m[mine].astype(np.float32))
+            inputs, truth = (part[torch.from_numpy(mine)].float() for part in (samples.inputs, samples.truth))
+            decibel = []
+            for part in parts_of[name]:
+                some = torch.from_numpy(part)
+                drawn = network.draw(inputs[some], places[some], places)
+                decibel.append(psnr(drawn[:, rows].contiguous(), truth[:, rows].contiguous()).mean())
+            means[name] = float(torch.stack(decibel).mean())
+        subsets = max(len(parts) for parts in parts_of.values())
+        found.append(PositionsPoint(count, subsets, float(np.mean(list(means.values()))), means))
+    return found
+
+
+def choices(positions: int, count: int) -> list[np.ndarray]:
+    """Return up to 8 choices of `count` equally spaced ones of `positions`.
+
+    Raises:
+        DataError: There are not so many.
+
+    Example:
+        >>> [part.tolist() for part in choices(6, 3)]
+        [[0, 2, 4], [1, 3, 5]]
+    """
+    if not 1 <= count <= positions:
+        raise DataError(f"{count} positions are asked for; a pass has {positions}: give 1 to {positions}")
+    stride = positions // count
+    starts = np.unique(np.linspace(0, stride - 1, min(stride, _MOST_SUBSETS)).round().astype(int))
+    return [start + stride * np.arange(count) for start in starts]

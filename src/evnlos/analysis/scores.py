@@ -1,0 +1,291 @@
+"""Scores of images against the truth: metrics, intervals, a character classifier, LPIPS.
+
+- Scores of pictures against the truth: on the whole scored canvas and on the target's own box.
+- Intervals for differences between methods, by a paired bootstrap over objects.
+- An independent reader: a small network that names a character, trained on clean glyphs alone.
+- LPIPS with the VGG16 trunk: Zhang et al., CVPR 2018, version 0.1, from files that the user has.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import ArrayLike
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from evnlos.errors import DataError
+from evnlos.metrics import HAAR_LEAST_SIDE, gmsd, haarpsi, ms_ssim, psnr, ssim
+
+Perceptual = Callable[[Tensor, Tensor], Tensor]
+_MARGIN = 2  # pixels around the target's bounding box: the blur of its edge belongs to it
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of single images, in the order of the images; every array is float64 [N].
+
+    Args:
+        psnr_db: On the scored canvas, peak 1.
+        ssim: On the scored canvas.
+        psnr_box_db: On the smallest box that holds the target, grown by 2 pixels.
+        ms_ssim: On the scored canvas, as many scales as it holds.
+        haarpsi: On the scored canvas; None where a side has fewer than 16 pixels.
+        gmsd: On the scored canvas; smaller is better.
+        lpips: With the VGG trunk; None where it is not at hand.
+    """
+
+    psnr_db: np.ndarray
+    ssim: np.ndarray
+    psnr_box_db: np.ndarray
+    ms_ssim: np.ndarray
+    haarpsi: np.ndarray | None
+    gmsd: np.ndarray
+    lpips: np.ndarray | None = None
+
+    def mean(self, chosen: np.ndarray | slice = slice(None)) -> dict[str, float | None]:
+        """Return the mean over the chosen images, by name of the metric."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: None if v is None else round(float(v[chosen].mean()), 4) for name, v in values.items()}
+
+
+def score(images: Tensor, truth: Tensor, perceptual: Perceptual | None = None) -> Scores:
+    """Score pictures [N, H, W] in 0..1 against true ones, both already cut to the scored rows.
+
+    Args:
+        images: Reconstructions.
+        truth: True pictures.
+        perceptual: LPIPS of [N, 1, H, W] pairs, where its weights are at hand.
+    """
+    large = min(images.shape[-2:]) >= HAAR_LEAST_SIDE
+    boxes = [_box(picture) for picture in truth]
+    in_box = [psnr(image[box], picture[box]) for image, picture, box in zip(images, truth, boxes, strict=True)]
+    return Scores(
+        psnr_db=psnr(images, truth).double().numpy(),
+        ssim=ssim(images, truth).double().numpy(),
+        psnr_box_db=torch.stack(in_box).double().numpy(),
+        ms_ssim=ms_ssim(images, truth).double().numpy(),
+        haarpsi=haarpsi(images, truth).double().numpy() if large else None,
+        gmsd=gmsd(images, truth).double().numpy(),
+        lpips=perceptual(images[:, None], truth[:, None]).double().numpy() if perceptual else None,
+    )
+
+
+def _box(truth: Tensor) -> tuple[slice, slice]:
+    """Return the rows and columns of the target; the whole picture where there is none."""
+    rows, columns = (torch.nonzero(truth.amax(dim=axis) > 0).flatten() for axis in (1, 0))
+    if not len(rows):
+        return slice(None), slice(None)
+    first = (max(int(rows[0]) - _MARGIN, 0), max(int(columns[0]) - _MARGIN, 0))
+    return slice(first[0], int(rows[-1]) + 1 + _MARGIN), slice(first[1], int(columns[-1]) + 1 + _MARGIN)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean with its 95 % interval.
+
+    Args:
+        mean: The mean over all pictures.
+        low: 2.5 % point of the bootstrap.
+        high: 97.5 % point of the bootstrap.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:+.2f} [{self.low:+.2f}, {self.high:+.2f}]"
+
+
+def paired_difference(
+    a: ArrayLike, b: ArrayLike, objects: ArrayLike, *, draws: int = 10_000, seed: int = 0
+) -> Interval:
+    """Return the mean of a - b with a 95 % percentile interval, objects drawn with replacement.
+
+    The positions of one object are not independent, so whole objects are drawn, and both methods are always
+    compared on the same pictures. With few objects (4 characters) such an interval is coarse and, as a rule,
+    too narrow; it speaks of other objects like these, not of other rigs.
+
+    Args:
+        a: Scores of one method, [N], or [S, N] for S seeds, which are averaged.
+        b: Scores of the other, the same pictures in the same order.
+        objects: Object of each picture, [N].
+        draws: Number of bootstrap samples.
+        seed: Seed of the draws.
+
+    Raises:
+        DataError: The lengths disagree, or there is no picture.
+
+    Example:
+        >>> str(paired_difference([3.0, 4.0, 6.0], [1.0, 2.0, 3.0], ["A", "A", "B"]))
+        '+2.33 [+2.00, +3.00]'
+    """
+    difference = np.atleast_2d(np.asarray(a, np.float64)).mean(axis=0)
+    difference = difference - np.atleast_2d(np.asarray(b, np.float64)).mean(axis=0)
+    labels = np.asarray(objects)
+    if difference.shape != labels.shape or not len(labels):
+        raise DataError(f"{difference.shape} differences and {labels.shape} objects; give one object a picture")
+    _, group = np.unique(labels, return_inverse=True)
+    sums, counts = np.bincount(group, difference), np.bincount(group)
+    chosen = np.random.default_rng(seed).integers(0, len(sums), (draws, len(sums)))
+    means = sums[chosen].sum(axis=1) / counts[chosen].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return Interval(float(difference.mean()), float(low), float(high))
+
+
+CHARACTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
+"""What the reader knows; it always answers with one of these."""
+_FILE = Path(__file__).parent / "classifier.safetensors"
+
+
+class CharacterReader(nn.Module):
+    """Three strided convolutions and a mean: pictures of a plate [N, 1, 32, 32] in 0..1 -> scores [N, 36]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = (1, 24, 48, 96)
+        self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
+        self.norms = nn.ModuleList(nn.GroupNorm(4, b) for b in widths[1:])
+        self.head = nn.Linear(widths[-1] * 16, len(CHARACTERS))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return unnormalised scores; each picture is first brought to mean 0 and deviation 1."""
+        x = x - x.mean(dim=(1, 2, 3), keepdim=True)
+        x = x / x.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(1e-3)
+        for layer, norm in zip(self.layers, self.norms, strict=True):
+            x = F.silu(norm(layer(x)))
+        return self.head(x.flatten(1))  # [N, 96 * 4 * 4] -> [N, 36]
+
+
+@lru_cache(maxsize=1)
+def load_reader(path: str | Path = _FILE) -> CharacterReader:
+    """Return the trained reader; `python tools/train_classifier.py` made the one in the package.
+
+    Raises:
+        DataError: The file is missing or of another network.
+    """
+    path = Path(path)
+    reader = CharacterReader()
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads((file.metadata() or {}).get("evnlos", "{}"))
+            state = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - no mapping
+        reader.load_state_dict(state)
+    except (SafetensorError, OSError, RuntimeError) as error:
+        raise DataError(f"{path} is no character reader: {' '.join(str(error).split())[:160]}") from None
+    if about.get("characters") != CHARACTERS:
+        raise DataError(f"{path} knows {about.get('characters')!r}; this version reads {CHARACTERS!r}")
+    return reader.eval()
+
+
+@torch.inference_mode()
+def read_characters(pictures: Tensor) -> list[str]:
+    """Name the character on each plate [N, 1, 32, 32].
+
+    Example:
+        >>> import numpy as np
+        >>> from evnlos.scene import FontGlyphs
+        >>> from evnlos.types import Plane
+        >>> mask = FontGlyphs(characters="R").target("comic_neue_bold_R").rasterise(Plane(32, 32, 0.0025))
+        >>> read_characters(torch.from_numpy(mask)[None, None])
+        ['R']
+    """
+    return [CHARACTERS[i] for i in load_reader()(pictures.float()).argmax(dim=1).tolist()]
+
+
+# Layers of VGG16 (Simonyan and Zisserman, ICLR 2015): number of 3 x 3 convolutions in each block.
+_BLOCKS = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+_TRUNK_HASH = "397923af"  # the trunk's file name carries the head of its SHA-256
+_MEAN, _STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+
+
+def load_lpips(
+    trunk: str | Path | None = None, heads: str | Path | None = None
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return the metric: pairs of pictures [N, 1, H, W] in 0..1 -> LPIPS [N], 0 = the same.
+
+    Args:
+        trunk: torchvision's `vgg16-397923af.pth`; by default the torch hub cache is looked in.
+        heads: The five linear heads, `vgg.pth` of LPIPS v0.1; by default those of an installed `lpips`.
+
+    Raises:
+        DataError: A file is missing, or the trunk's SHA-256 is not that of the published weights (an
+            untrained trunk gives plausible but meaningless numbers).
+    """
+    trunk = Path(trunk) if trunk else Path(torch.hub.get_dir()) / "checkpoints" / f"vgg16-{_TRUNK_HASH}.pth"
+    heads = Path(heads) if heads else _installed_heads()
+    for path, what in ((trunk, "the VGG16 trunk"), (heads, "the LPIPS heads")):
+        if not path.is_file():
+            raise DataError(
+                f"LPIPS: not available: {what} is not at {path}; give its path with --vgg / --lpips-heads"
+            )
+    found = hashlib.sha256(trunk.read_bytes()).hexdigest()
+    if not found.startswith(_TRUNK_HASH):
+        raise DataError(
+            f"LPIPS: {trunk} has SHA-256 {found[:8]}..., not {_TRUNK_HASH}...; give the published trunk"
+        )
+    layers = _convolutions(torch.load(trunk, map_location="cpu", weights_only=True))
+    state = torch.load(heads, map_location="cpu", weights_only=True)
+    linear = [state[f"lin{i}.model.1.weight"] for i in range(5)]
+    return lambda image, truth: lpips(image, truth, layers, linear)
+
+
+def available_lpips() -> Callable[[Tensor, Tensor], Tensor] | None:
+    """Return the metric where its weights are in their default places, else None."""
+    try:
+        return load_lpips(os.environ.get("EVNLOS_VGG16"))
+    except DataError:
+        return None
+
+
+@torch.inference_mode()
+def lpips(image: Tensor, truth: Tensor, layers: list[tuple[Tensor, Tensor]], linear: list[Tensor]) -> Tensor:
+    """Return the LPIPS of pairs [N, 1 or 3, H, W] in 0..1 from the trunk's layers and the heads."""
+    distances = []
+    for a, b, head in zip(_features(image, layers), _features(truth, layers), linear, strict=True):
+        difference = (F.normalize(a, dim=1, eps=1e-10) - F.normalize(b, dim=1, eps=1e-10)).square()
+        distances.append(F.conv2d(difference, head).mean(dim=(1, 2, 3)))
+    return torch.stack(distances).sum(dim=0)
+
+
+def _features(image: Tensor, layers: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
+    """Return the activations behind the last convolution of each block."""
+    mean, std = (torch.tensor(v, dtype=image.dtype).reshape(1, 3, 1, 1) for v in (_MEAN, _STD))
+    x = (image.expand(-1, 3, -1, -1) * 2 - 1 - mean) / std
+    found, remaining = [], iter(layers)
+    for block, (_, count) in enumerate(_BLOCKS):
+        if block:
+            x = F.max_pool2d(x, 2)
+        for _ in range(count):
+            weight, bias = next(remaining)
+            x = F.relu(F.conv2d(x, weight, bias, padding=1))
+        found.append(x)
+    return found
+
+
+def _convolutions(state: dict[str, Tensor]) -> list[tuple[Tensor, Tensor]]:
+    """Return weight and bias of the thirteen convolutions, in order."""
+    names = sorted((k for k in state if k.startswith("features.") and k.endswith(".weight")), key=_index)
+    return [(state[name], state[name.replace(".weight", ".bias")]) for name in names]
+
+
+def _index(name: str) -> int:
+    return int(name.split(".")[1])
+
+
+def _installed_heads() -> Path:
+    found = importlib.util.find_spec("lpips")
+    folder = Path(found.origin).parent if found and found.origin else Path("lpips")
+    return folder / "weights" / "v0.1" / "vgg.pth"

@@ -1,0 +1,25 @@
+"""Names of `evnlos.calibration`; `__init__.py` reads this list."""
+
+from .captures import Shots as Shots
+from .captures import read_shots as read_shots
+from .event_fit import PixelFit as PixelFit
+from .event_fit import fit_pixel as fit_pixel
+from .fit import Example as Example
+from .fit import RigFit as RigFit
+from .fit import fit_rig as fit_rig
+from .frame_model import FrameModel as FrameModel
+from .frame_model import FrameNoise as FrameNoise
+from .frame_model import Light as Light
+from .frame_model import fit_frame_noise as fit_frame_noise
+from .settings import Calibration as Calibration
+from .summary import FIGURES_FILE as FIGURES_FILE
+from .summary import RIG_FILE as RIG_FILE
+from .summary import figures as figures
+from .summary import residual_table as residual_table
+from .summary import rows_of as rows_of
+from .summary import table as table
+from .summary import warnings_of as warnings_of
+from .summary import write_rig as write_rig
+from .transport_fit import Residual as Residual
+from .transport_fit import TransportFit as TransportFit
+from .transport_fit import fit_transport as fit_transport

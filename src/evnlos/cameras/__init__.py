@@ -1,0 +1,30 @@
+"""What a camera makes of the light on the wall: frames and events."""
+
+from evnlos.cameras.event_camera import EventCamera
+from evnlos.cameras.event_model import EVENT_MODELS, EventModel, PixelSettings
+from evnlos.cameras.frame_camera import FrameCamera
+from evnlos.cameras.pixel import EventPixel, V2ePixel
+from evnlos.cameras.pixels.brownian import BrownianPixel
+from evnlos.cameras.pixels.circuit import CircuitPixel
+from evnlos.cameras.pixels.readout import FlickeringWall, ReadoutPixel
+from evnlos.cameras.sensors import CelexCamera, pixel_preset
+from evnlos.cameras.simulation import EventStream, simulate_batch, simulate_events
+
+__all__ = [
+    "EVENT_MODELS",
+    "BrownianPixel",
+    "CelexCamera",
+    "CircuitPixel",
+    "EventCamera",
+    "EventModel",
+    "EventPixel",
+    "EventStream",
+    "FlickeringWall",
+    "FrameCamera",
+    "PixelSettings",
+    "ReadoutPixel",
+    "V2ePixel",
+    "pixel_preset",
+    "simulate_batch",
+    "simulate_events",
+]

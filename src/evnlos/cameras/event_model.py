@@ -1,0 +1,202 @@
+"""What an event model is: settings of a pixel, and an array of such pixels that light is fed to.
+
+An event model has two halves. Its settings are a frozen dataclass derived from `PixelSettings`, with units and
+a `kind`; they stand in a simulation's YAML file and decide the physics alone. Its array is an `EventModel`,
+made by `settings.model(...)`: it holds the pixels' state, takes the light from instant to instant and returns
+events. `EVENT_MODELS` knows the kinds; installed packages add theirs by an entry point of the group
+`evnlos.event_models`.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, get_args
+
+from numpy.typing import NDArray
+
+from evnlos.errors import ConfigError
+from evnlos.registry import Kinded, Registry
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from evnlos.cameras.event_order import Columns, EventTensors
+    from evnlos.cameras.light import Light
+
+Phase = Literal["random", "rest"]
+"""State of the pixels before the first frame: anywhere between two events, or as if one had just been sent."""
+
+MIN_THRESHOLD = 0.01
+"""Smallest threshold that mismatch can leave a pixel with, log units."""
+
+EVENT_MODELS: Registry[type[PixelSettings]] = Registry("evnlos.event_models", "event model")
+"""The event models by kind."""
+
+
+class EventModel(ABC):
+    """An array of event pixels with its state: `start` it with the first light, then `advance` it.
+
+    The events must not depend on how the light is divided into calls of `advance`, and every random draw must
+    be a function of the seed, the pixel and a count.
+    """
+
+    @abstractmethod
+    def start(self, frame: NDArray, time_s: float) -> None:
+        """Take the first light.
+
+        Args:
+            frame: Light of all pixels in DN (255 = white), [H * W].
+            time_s: Its instant, seconds.
+        """
+
+    @abstractmethod
+    def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
+        """Take further light and return the events of the time up to the last instant, in order.
+
+        Args:
+            light: Light in DN at `times_s`, linear in time between the instants.
+            times_s: Instants [T], seconds, ascending, after those before.
+
+        Returns:
+            Time stamps in microseconds, flat pixel indices, polarities; ordered by time, pixel, polarity.
+        """
+
+
+class LogCurve(NamedTuple):
+    """The logarithm that a pixel takes: of `scale * I + offset`, linear below `KNEE_DN` of that."""
+
+    scale: float
+    """Factor of the light in DN."""
+    offset: float
+    """What is added, DN."""
+
+
+class PixelSettings(Kinded):
+    """Base of the settings of all event models; derive a frozen dataclass, give it `kind`, register it.
+
+    Example:
+        >>> from evnlos.cameras import EventPixel
+        >>> EVENT_MODELS["continuous"] is EventPixel
+        True
+    """
+
+    registry = EVENT_MODELS
+    default_kind = "continuous"
+    stepped: ClassVar[bool] = False
+    """Whether the physics depends on the time step, which a simulation must then state."""
+
+    def model(
+        self,
+        shape: tuple[int, int],
+        seed: int = 0,
+        thresholds: object = None,
+        *,
+        tile_px: int | None = None,
+        threads: int | None = None,
+    ) -> EventModel:
+        """Return an array of such pixels.
+
+        Args:
+            shape: Sensor size (height, width), pixels.
+            seed: Seed of mismatch and noise, 0 to 2**64 - 1.
+            thresholds: Thresholds (on, off) of each pixel, [H, W] each, log units; None draws them.
+            tile_px: Pixels that run together; None = a size that fits the cache.
+            threads: Number of threads; None = as many as torch uses.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no array of pixels; define `model`")
+
+    @property
+    def finest_threshold(self) -> float:
+        """The smallest change of log light that matters, log units: a camera chooses its time steps by it."""
+        return 0.1
+
+    @property
+    def log_curve(self) -> LogCurve:
+        """The logarithm that the camera chooses its time steps by."""
+        return LogCurve(1.0, 0.0)
+
+    @property
+    def disorder_s(self) -> float:
+        """By how much an event of later light may carry an earlier time stamp, seconds."""
+        return 0.0
+
+    @property
+    def noise_hz(self) -> float:
+        """Events that a pixel sends without cause, about, hertz: leak, shot noise and hot pixels."""
+        hot = getattr(self, "hot_pixel_fraction", 0.0) * getattr(self, "hot_pixel_rate_hz", 0.0)
+        return hot + sum(getattr(self, name, 0.0) for name in ("leak_rate_hz", "shot_noise_rate_hz"))
+
+    def can_run_together(self, others: Sequence[PixelSettings]) -> bool:
+        """Return whether the torch backend runs clips with such pixels, one settings each, in one batch."""
+        return False
+
+    def torch_backend(self) -> Callable[..., list[EventTensors]] | None:
+        """Return what runs this model on a torch device, called as `record_tensors` is; None = nothing does."""
+        return None
+
+
+@dataclass(frozen=True)
+class ThresholdPixel(PixelSettings):
+    """Base of the pixels that send an event where log light, as they see it, has moved by a threshold."""
+
+    threshold_on: float = 0.15
+    """Mean contrast threshold of ON events, log units (e-fold)."""
+    threshold_off: float = 0.15
+    """Mean contrast threshold of OFF events, log units (e-fold)."""
+    threshold_sigma: float = 0.03
+    """Standard deviation of both thresholds over the pixels, log units; 0 = none."""
+
+    def __post_init__(self) -> None:
+        for name in ("threshold_on", "threshold_off"):
+            require(self, name, MIN_THRESHOLD, math.inf, "log units; the paper's value is 0.15")
+        require(self, "threshold_sigma", 0.0, math.inf, "log units; 0 gives every pixel the same threshold")
+        super().__post_init__()
+
+    @property
+    def finest_threshold(self) -> float:
+        """The smaller of the two mean thresholds, log units."""
+        return min(self.threshold_on, self.threshold_off)
+
+
+def require(owner: object, name: str, low: float, high: float, unit: str) -> None:
+    """Refuse a setting that is not a finite number in [low, high].
+
+    Args:
+        owner: The settings.
+        name: Name of the setting.
+        low: Its smallest value.
+        high: Its largest value; infinity = none.
+        unit: Unit, and what a special value means.
+
+    Raises:
+        ConfigError: The value is no number, or out of range.
+    """
+    value, label = getattr(owner, name), f"{type(owner).__name__}.{name}"
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ConfigError(f"{label} is {value!r}; give a number in {unit}")
+    if not (math.isfinite(value) and low <= value <= high):
+        limit = f"at least {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
+        raise ConfigError(f"{label} is {value:g}; give {limit} {unit}")
+
+
+def check_phase(phase: object) -> None:
+    """Refuse what is no first state.
+
+    Raises:
+        ConfigError: Neither "random" nor "rest".
+    """
+    if phase not in get_args(Phase):
+        raise ConfigError(f'initial_phase is {phase!r}; give "random" or "rest"')
+
+
+def check_pattern_seed(seed: object) -> None:
+    """Refuse what is no seed of a sensor.
+
+    Raises:
+        ConfigError: Neither None nor an integer from 0 to 2**64 - 1.
+    """
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**64):
+        raise ConfigError(f"pattern_seed is {seed!r}; give an integer from 0 to 2**64 - 1, or None")

@@ -1,0 +1,243 @@
+"""A frame camera: exposure, shot noise, read noise, fixed pattern, gain, quantisation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.cameras.event_camera import Wall
+from evnlos.cameras.random_numbers import check_seed, fill_electrons
+from evnlos.config import check_made
+from evnlos.errors import ConfigError, DataError
+
+_GAUSS = {1: [(0.0, 1.0)], 3: [(-math.sqrt(0.6), 5 / 18), (0.0, 8 / 18), (math.sqrt(0.6), 5 / 18)]}
+
+
+@dataclass(frozen=True)
+class FrameCamera:
+    """A linear frame camera in the terms of the EMVA 1288 standard.
+
+    A pixel under irradiance E (1.0 = white) collects a Poisson number of electrons with mean
+    full_well_e (1 + prnu g) E + dsnu_e h, g and h being the fixed pattern, normal; read noise is added, and
+
+        DN = black_level + (2^bit_depth - 1 - black_level) gain electrons / full_well_e,
+
+    rounded and clipped to 0..2^bit_depth - 1.
+
+    Args:
+        exposure_s: Exposure time, seconds; the light is averaged over it. 0 = an instant.
+        full_well_e: Electrons at white, more than 0.
+        read_noise_e: Standard deviation of the read noise, electrons.
+        prnu: Standard deviation of the pixels' sensitivity, fraction of the mean.
+        dsnu_e: Standard deviation of the pixels' offset, electrons.
+        gain: Amplification after the pixel, 1 = white fills the range.
+        bit_depth: Bits a pixel, 8 to 16.
+        black_level: Digital number of darkness, DN.
+        pattern_seed: Seed of the fixed pattern: one camera for all captures; None = a new one for each capture.
+        electrons_per_s: Electrons per second that white light makes: a pixel then collects
+            electrons_per_s exposure_s E, and holds full_well_e at most, so that a short exposure is a dim one.
+            None = the light is set so that white fills the well, whatever the exposure.
+
+    Raises:
+        ConfigError: A value outside its range.
+
+    Example:
+        >>> camera = FrameCamera(read_noise_e=0.0, prnu=0.0, dsnu_e=0.0, full_well_e=1e9)
+        >>> camera.expose(np.full((1, 1, 2), 0.25), seed=0)
+        array([[[64, 64]]], dtype=uint8)
+    """
+
+    exposure_s: float = 0.01
+    """Exposure time, seconds; the light is averaged over it."""
+    full_well_e: float = 15_000.0
+    """Electrons at white."""
+    read_noise_e: float = 6.0
+    """Standard deviation of the read noise, electrons."""
+    prnu: float = 0.01
+    """Standard deviation of the pixels' sensitivity, fraction."""
+    dsnu_e: float = 3.0
+    """Standard deviation of the pixels' offset, electrons."""
+    gain: float = 1.0
+    """Amplification after the pixel; 1 = white fills the range."""
+    bit_depth: int = 8
+    """Bits a pixel, 8 to 16."""
+    black_level: float = 0.0
+    """Digital number of darkness, DN."""
+    pattern_seed: int | None = 0
+    """Seed of the fixed pattern; None = a new pattern for each capture."""
+    electrons_per_s: float | None = None
+    """Electrons per second at white, collected over the exposure; None = white fills the well."""
+
+    def __post_init__(self) -> None:
+        for name, unit in (
+            ("exposure_s", "seconds"),
+            ("read_noise_e", "electrons"),
+            ("prnu", "a fraction"),
+            ("dsnu_e", "electrons"),
+            ("black_level", "DN"),
+        ):
+            self._require(name, 0.0, unit, strict=False)
+        self._require("full_well_e", 0.0, "electrons", strict=True)
+        self._require("gain", 0.0, "1 = white fills the range", strict=True)
+        if isinstance(self.bit_depth, bool) or self.bit_depth not in range(8, 17):
+            raise ConfigError(f"FrameCamera.bit_depth is {self.bit_depth!r}; give 8 to 16 bits")
+        if self.black_level >= self.white:
+            raise ConfigError(
+                f"FrameCamera.black_level is {self.black_level:g}; give less than white, {self.white} DN"
+            )
+        if self.pattern_seed is not None:
+            check_seed(self.pattern_seed)
+        if self.electrons_per_s is not None:
+            self._require("electrons_per_s", 0.0, "electrons per second", strict=True)
+            self._require("exposure_s", 0.0, "seconds, as electrons are collected over it", strict=True)
+        check_made(self)
+
+    def _require(self, name: str, low: float, unit: str, *, strict: bool) -> None:
+        value = getattr(self, name)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or value < low or (strict and value == low):
+            limit = f"more than {low:g}" if strict else f"at least {low:g}"
+            raise ConfigError(f"FrameCamera.{name} is {value!r}; give {limit} ({unit})")
+
+    @property
+    def white(self) -> int:
+        """Largest digital number, 2^bit_depth - 1."""
+        return 2**self.bit_depth - 1
+
+    def capture(self, wall: Wall, times_s: ArrayLike, seed: int = 0) -> NDArray[np.uint8 | np.uint16]:
+        """Return one frame for each instant: the wall, averaged over an exposure centred there.
+
+        The average is a Gauss-Legendre quadrature with 3 instants, or the wall's own where its light changes
+        faster, as that of lamps does: `exposed(t_s, exposure_s)`, white levels [T, H, W].
+
+        Args:
+            wall: The light: `shape` and `irradiance(t_s)`, and `exposed` where it has that.
+            times_s: Middles of the exposures, [N], seconds.
+            seed: Seed of the noise, 0 to 2**64 - 1.
+
+        Returns:
+            Digital numbers [N, H, W]; uint8 for 8 bits, uint16 above.
+
+        Raises:
+            DataError: Times that are not finite, or a wall with NaN or negative light.
+        """
+        times = np.asarray(times_s, dtype=np.float64)
+        if times.ndim != 1 or not np.isfinite(times).all():
+            raise DataError(f"times_s has shape {times.shape}; give a 1-D array of finite seconds")
+        height, width = wall.shape
+        frames = np.empty((len(times), height, width), np.uint8 if self.bit_depth == 8 else np.uint16)
+        seed = check_seed(seed)
+        pattern = self.fixed_pattern((height, width), seed)
+        averaged = getattr(wall, "exposed", None)
+        for n, time in enumerate(times):
+            if averaged is not None:
+                mean = np.asarray(averaged([time], self.exposure_s)[0], np.float64)
+            else:
+                instants, weights = self.instants(time)
+                light = wall.irradiance(instants).detach().to("cpu", torch.float64)  # [Q, H, W]
+                mean = torch.einsum("q,qhw->hw", light.new_tensor(weights), light).numpy()
+            frames[n] = self._frame(_checked(mean), seed, n, pattern)
+        return frames
+
+    def instants(self, time_s: float) -> tuple[NDArray[np.float64], list[float]]:
+        """Return instants [Q], seconds, and the weights [Q] of their light in the mean over an exposure."""
+        nodes = _GAUSS[3 if self.exposure_s > 0 else 1]
+        instants = [time_s + 0.5 * self.exposure_s * offset for offset, _ in nodes]
+        return np.array(instants), [weight for _, weight in nodes]
+
+    @property
+    def white_e(self) -> float:
+        """Mean number of electrons that a pixel collects at white, were its well deep enough."""
+        if self.electrons_per_s is None:
+            return self.full_well_e
+        return self.electrons_per_s * self.exposure_s
+
+    @property
+    def dn_per_electron(self) -> float:
+        """Digital numbers that an electron adds."""
+        return (self.white - self.black_level) * self.gain / self.full_well_e
+
+    def expose(
+        self, irradiance: ArrayLike | torch.Tensor, seed: int = 0, first_frame: int = 0
+    ) -> NDArray[np.uint8 | np.uint16]:
+        """Return digital numbers of light that is already averaged over the exposure.
+
+        Args:
+            irradiance: Light [N, H, W], 1.0 = white, at least 0.
+            seed: Seed of the noise, 0 to 2**64 - 1.
+            first_frame: Number of the first frame: frame n of a capture has its own noise, however it is split.
+
+        Returns:
+            Digital numbers [N, H, W]; uint8 for 8 bits, uint16 above.
+
+        Raises:
+            DataError: A wrong shape, NaN, or negative light.
+        """
+        if isinstance(irradiance, torch.Tensor):
+            irradiance = irradiance.detach().cpu().numpy()
+        light = np.asarray(irradiance, dtype=np.float64)
+        if light.ndim != 3:
+            raise DataError(f"irradiance has shape {light.shape}; give [N, H, W]")
+        _checked(light)
+        seed = check_seed(seed)
+        pattern = self.fixed_pattern(light.shape[1:], seed)  # type: ignore[arg-type]
+        frames = np.empty(light.shape, np.uint8 if self.bit_depth == 8 else np.uint16)
+        for n, image in enumerate(light):
+            frames[n] = self._frame(image, seed, first_frame + n, pattern)
+        return frames
+
+    def _frame(
+        self,
+        image: NDArray[np.float64],
+        seed: int,
+        number: int,
+        pattern: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Return the digital numbers of one frame, light [H, W], as whole float64."""
+        sensitivity, offset_e = pattern
+        mean = self.white_e * sensitivity * image
+        if self.electrons_per_s is not None:
+            np.minimum(mean, self.full_well_e, out=mean)
+        levels = np.empty_like(mean)
+        fill_electrons(
+            mean.ravel(),
+            offset_e.ravel(),
+            self.read_noise_e,
+            np.uint64(seed),
+            np.uint64(number),
+            levels.ravel(),
+        )
+        levels *= self.dn_per_electron
+        levels += self.black_level
+        return np.clip(np.rint(levels, out=levels), 0, self.white, out=levels)
+
+    def fixed_pattern(
+        self, shape: tuple[int, int], seed: int = 0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return this camera's fixed pattern: relative sensitivity and offset in electrons, [H, W] each.
+
+        Args:
+            shape: Sensor size (height, width), pixels.
+            seed: Seed of the capture; used when `pattern_seed` is None.
+        """
+        own = check_seed(seed) if self.pattern_seed is None else self.pattern_seed
+        draw = np.random.Generator(np.random.Philox(np.random.SeedSequence([own, 0])))
+        sensitivity = np.maximum(1.0 + self.prnu * draw.standard_normal(shape), 0.0)
+        return sensitivity, self.dsnu_e * draw.standard_normal(shape)
+
+
+def _checked(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return light, refusing what is none."""
+    if light.size:
+        check_extremes(light.min(), light.max())
+    return light
+
+
+def check_extremes(lowest: float, highest: float) -> None:
+    """Refuse light of which an extreme is not finite, or below 0."""
+    if not (lowest >= 0 and highest < math.inf):  # false for NaN, which an extreme keeps
+        raise DataError("irradiance holds NaN, infinity or negative light; give at least 0, 1.0 = white")

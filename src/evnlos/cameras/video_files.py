@@ -1,0 +1,284 @@
+"""Files of moving pictures, frame by frame as light.
+
+- Numbers of a picture as light: the tone curve undone, colours weighed.
+- The four kinds of moving pictures that are read: containers, animations, single pictures, arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from evnlos.errors import DataError, MissingDependencyError
+from evnlos.untrusted import MOST_IMAGE_PIXELS, NUMPY_ERRORS, open_container, open_image, open_regular
+
+Picture = NDArray
+"""Grey [H, W] or colour [H, W, 3]: uint8, uint16 or floating point."""
+Tone = Literal["as-is", "srgb", "rec709"]
+"""What the numbers of a picture mean: light as they are, or codes of a tone curve to undo."""
+
+_LUMA_601 = 299, 587, 114  # thousandths: of a grey pixel the sum is exactly its value
+_LUMINANCE_709 = 0.2126, 0.7152, 0.0722
+
+
+def to_light(picture: Picture, tone: Tone = "as-is", white: float = 255.0) -> NDArray[np.float32]:
+    """Return a picture as light in DN: 255 = white.
+
+    With the value v = picture / white, "as-is" gives 255 v; "srgb" gives 255 times v / 12.92 up to 0.04045 and
+    ((v + 0.055) / 1.055)^2.4 above (IEC 61966-2-1); "rec709" v / 4.5 up to 0.081 and
+    ((v + 0.099) / 1.099)^(1 / 0.45) above (ITU-R BT.709).
+
+    Args:
+        picture: Grey [H, W] or colour [H, W, 3]; uint8, uint16 or floating point.
+        tone: Curve to undo.
+        white: Value of white.
+
+    Example:
+        >>> to_light(np.array([[0, 188, 255]], np.uint8), "srgb").round(1)
+        array([[  0. , 128.2, 255. ]], dtype=float32)
+    """
+    if tone == "as-is":
+        if picture.ndim == 3:
+            weights = np.array(_LUMA_601, np.int32 if picture.dtype.kind == "u" else np.float64)
+            picture = (picture @ weights) / 1000.0  # [H, W]
+        return (picture * (255.0 / white)).astype(np.float32)
+    if picture.dtype.kind == "u":
+        codes = np.arange(np.iinfo(picture.dtype).max + 1) / white
+        linear = _decoded(codes, tone).astype(np.float32)[picture]
+    else:
+        linear = _decoded(picture / white, tone).astype(np.float32)
+    if linear.ndim == 3:
+        linear = linear @ np.array(_LUMINANCE_709, np.float32)
+    return 255.0 * linear
+
+
+def _decoded(codes: NDArray, tone: Tone) -> NDArray:
+    """Return light in fractions of white of codes in fractions of white."""
+    low, slope, offset, power = (
+        (0.04045, 12.92, 0.055, 2.4) if tone == "srgb" else (0.081, 4.5, 0.099, 1 / 0.45)
+    )
+    return np.where(
+        codes <= low, codes / slope, (np.maximum(codes, low) + offset) ** power / (1 + offset) ** power
+    )
+
+
+class Source(Protocol):
+    """Moving pictures on disk."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        ...
+
+    @property
+    def frames(self) -> int | None:
+        """Number of pictures, None where the file does not say."""
+        ...
+
+    @property
+    def white(self) -> float | None:
+        """Value of white where the type of the pictures says it; None for floating point."""
+        ...
+
+    @property
+    def timed(self) -> bool:
+        """Whether the file states the times of its pictures."""
+        ...
+
+    def pictures(self) -> Iterator[tuple[float | None, Picture]]:
+        """Yield the time in seconds, None where it is not stated, and the picture."""
+        ...
+
+
+class ContainerSource:
+    """A video file, through PyAV (FFmpeg); pictures are turned as the file's rotation says."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.timed = path, True
+        with self._opened() as container:
+            stream = container.streams.video[0]
+            self.frames = stream.frames or None
+            if stream.width * stream.height > MOST_IMAGE_PIXELS:
+                claimed = f"it claims {stream.width} x {stream.height} pixels"
+                raise DataError(f"{path}: {claimed}; at most {MOST_IMAGE_PIXELS:,} are read: make it smaller")
+        pictures = self.pictures()
+        try:
+            time_s, first = next(pictures)
+        except StopIteration:
+            raise DataError(f"{path}: a video without frames; give another file") from None
+        finally:
+            pictures.close()
+        self.timed = time_s is not None
+        self.size = first.shape[1], first.shape[0]
+        self.white = float(np.iinfo(first.dtype).max)
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        av = _pyav()
+        with ExitStack() as stack:
+            try:
+                container = stack.enter_context(open_container(self.path))
+            except (av.error.FFmpegError, OSError, ValueError) as error:
+                raise DataError(
+                    f"{self.path}: not a video that FFmpeg reads ({_reason(error)}); give MP4, MKV, AVI or "
+                    "another container that holds its pictures itself"
+                ) from None
+            if not container.streams.video:
+                raise DataError(f"{self.path}: a media file without a video stream; give another file")
+            yield container
+
+    def pictures(self) -> Generator[tuple[float | None, Picture], None, None]:
+        """Yield the presentation time and the picture, 16 bits deep where the video has more than 8."""
+        av = _pyav()
+        count = 0
+        with self._opened() as container:
+            container.streams.video[0].thread_type = "AUTO"
+            container.streams.video[0].codec_context.options = {"max_pixels": f"{MOST_IMAGE_PIXELS}"}
+            try:
+                for frame in container.decode(video=0):
+                    deep = max(part.bits for part in frame.format.components) > 8
+                    picture = frame.to_ndarray(format="rgb48le" if deep else "rgb24")  # [H, W, 3]
+                    yield frame.time, np.rot90(picture, round(frame.rotation / 90))
+                    count += 1
+            except av.error.FFmpegError as error:
+                raise DataError(
+                    f"{self.path}: decoding failed after frame {count} ({_reason(error)}); "
+                    "the file is damaged: copy or encode it again"
+                ) from None
+
+
+def _pyav() -> Any:
+    try:
+        import av
+    except ImportError:
+        raise MissingDependencyError(
+            'reading video files needs PyAV: pip install "evnlos[video]" (GIF, pictures and .npy go without)'
+        ) from None
+    av.logging.set_level(None)  # pyright: ignore[reportPrivateImportUsage]  # FFmpeg's own remarks are no use to a reader of one line
+    return av
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)
+
+
+class AnimationSource:
+    """An animated GIF, PNG or WebP, through Pillow."""
+
+    white, timed = 255.0, True
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _image(path) as image:
+            self.frames = int(getattr(image, "n_frames", 1))
+            self.size = image.size
+
+    def pictures(self) -> Iterator[tuple[float | None, Picture]]:
+        """Yield the sum of the durations before a picture, and the picture."""
+        shown_ms = 0.0
+        with _image(self.path) as image:
+            for number in range(self.frames):
+                picture = _seek(image, number, self.path)
+                yield shown_ms / 1000, picture
+                shown_ms += float(image.info.get("duration", 0))
+
+
+class PicturesSource:
+    """Single pictures in the order of their names; they carry no times."""
+
+    timed = False
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = paths
+        self.frames = len(paths)
+        with _image(paths[0]) as image:
+            self.size = image.size
+            first = _array(image, paths[0])
+        self._dtype, self.white = first.dtype, _white(first)
+
+    def pictures(self) -> Iterator[tuple[float | None, Picture]]:
+        """Yield the pictures without times."""
+        for path in self.paths:
+            with _image(path) as image:
+                if image.size != self.size:
+                    found, first = "{} x {}".format(*image.size), "{} x {}".format(*self.size)
+                    raise DataError(f"{path} is {found}, {self.paths[0]} is {first}; give pictures of one size")
+                picture = _array(image, path)
+            if picture.dtype != self._dtype:
+                kinds = f"{path} holds {picture.dtype}, {self.paths[0]} {self._dtype}"
+                raise DataError(f"{kinds}; give pictures of one depth")
+            yield None, picture
+
+
+class ArraySource:
+    """A NumPy file [T, H, W] or [T, H, W, 3], read through a memory map; it carries no times."""
+
+    timed = False
+
+    def __init__(self, path: Path) -> None:
+        try:
+            with open_regular(path):  # a pipe would be waited for
+                self._array = np.load(path, mmap_mode="r", allow_pickle=False)
+            if not isinstance(self._array, np.ndarray):
+                raise ValueError("an archive of arrays")
+        except NUMPY_ERRORS as error:
+            reason = " ".join(str(error).split())[:120]
+            raise DataError(f"{path}: not a NumPy array ({reason}); save one with numpy.save") from None
+        shape, dtype = self._array.shape, self._array.dtype
+        if len(shape) not in (3, 4) or (len(shape) == 4 and shape[3] != 3) or 0 in shape[1:]:
+            raise DataError(f"{path}: an array of shape {shape}; give [T, H, W] or [T, H, W, 3]")
+        if shape[1] * shape[2] > MOST_IMAGE_PIXELS:
+            raise DataError(f"{path}: frames of {shape[2]} x {shape[1]}; at most {MOST_IMAGE_PIXELS:,} pixels")
+        if dtype not in (np.uint8, np.uint16) and dtype.kind != "f":
+            raise DataError(f"{path}: an array of {dtype}; give uint8, uint16 or floating point")
+        self.frames, self.size = shape[0], (shape[2], shape[1])
+        self.white = _white(self._array)
+
+    def pictures(self) -> Iterator[tuple[float | None, Picture]]:
+        """Yield the pictures without times."""
+        for picture in self._array:
+            yield None, np.asarray(picture)
+
+
+def _white(pictures: NDArray) -> float | None:
+    return float(np.iinfo(pictures.dtype).max) if pictures.dtype.kind == "u" else None
+
+
+@contextmanager
+def _image(path: Path) -> Iterator[Image.Image]:
+    try:
+        with open_image(path) as image:
+            yield image
+    except UnidentifiedImageError:
+        raise DataError(f"{path}: not a picture that is read; give PNG, TIFF, JPEG, GIF or WebP") from None
+    except (OSError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: cannot be read ({error})") from None
+
+
+def _seek(image: Image.Image, number: int, path: Path) -> Picture:
+    try:
+        image.seek(number)
+    except (OSError, EOFError, SyntaxError) as error:
+        raise DataError(f"{path}: picture {number} cannot be read ({error}); copy the file again") from None
+    return _array(image, path)
+
+
+def _array(image: Image.Image, path: Path) -> Picture:
+    """Return the current picture: uint8, uint16 for 16-bit files, float32 for floating-point files."""
+    try:
+        if image.mode.startswith("I"):
+            numbers = np.asarray(image)
+            if numbers.min() < 0 or numbers.max() > 65_535:
+                raise DataError(f"{path}: a picture of more than 16 bits; save it as 16 bits or floating point")
+            return numbers.astype(np.uint16)
+        if image.mode in ("L", "RGB"):
+            return np.asarray(image)
+        return np.asarray(image if image.mode == "F" else image.convert("RGB"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: the picture cannot be decoded ({error}); copy the file again") from None

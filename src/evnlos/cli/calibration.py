@@ -1,0 +1,212 @@
+"""Commands that measure a setup: `calibrate` and `scan`.
+
+- `evnlos calibrate`: captures with known targets in, a simulation of their rig out.
+- `evnlos scan`: plan a measurement of a rig's own light transport, and import what was recorded.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import tyro
+
+from evnlos.calibration.scan.importer import ScanImport
+from evnlos.calibration.scan.plan import ScanPlan
+from evnlos.calibration.settings import PRESETS, Calibration
+from evnlos.cli.console import Flat, Folders, Presets
+from evnlos.cli.parsing import say
+from evnlos.config import to_dict
+from evnlos.progress import ProgressBars
+from evnlos.setups import load_setup
+
+if TYPE_CHECKING:
+    from evnlos.calibration.scan.importer import ScanResult
+
+
+@dataclass(frozen=True)
+class CalibrateCommand:
+    """Fit the simulator to captures with known targets; check it on captures held out; write a rig file."""
+
+    PRESETS: ClassVar[Presets[Calibration]] = PRESETS
+
+    captures: Folders
+    """Capture folders of one rig and one camera."""
+    out: Path
+    """Folder for rig.yaml, training.yaml, pattern.safetensors, calibration.json and check.png."""
+    preset: str = "default"
+    """Kind of wall: `default` is rough metal (GGX roughness, camera), `paper` the tPSF and an affine view."""
+    config: Path | None = None
+    """YAML file with settings that replace the preset's."""
+    setup: str | None = None
+    """Where the search starts, of the kind that is fitted: a name, a settings file, or a folder of
+    `calibrate`."""
+    force: bool = False
+    """Write the rig file also where the fit fails on the held-out captures, or where one exists."""
+    json: bool = False
+    """Print one JSON object instead of tables."""
+    settings: Flat[Calibration] = field(default_factory=Calibration)
+
+    @staticmethod
+    def with_setup(settings: Calibration, word: str) -> Calibration:
+        """Return the calibration that starts from the setup of `--setup`."""
+        return replace(settings, start=replace(settings.start, setup=load_setup(word)))
+
+    def run(self) -> None:
+        """Fit, print what was found before and after, and write the files."""
+        from evnlos.calibration import figures, fit_rig, residual_table, rows_of, table, warnings_of, write_rig
+        from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
+        from evnlos.errors import MissingDependencyError
+        from evnlos.plot.results import draw_calibration
+
+        check_out(self.out, self.force)
+        fit = fit_rig(self.captures, self.settings)
+        rows = rows_of(fit, self.settings.start.pixel, self.settings.start.frame_camera)
+        self.out.mkdir(parents=True, exist_ok=True)
+        if self.json:
+            print(json.dumps(figures(fit, rows)))
+        else:
+            print(f"fitted: {' '.join(fit.fitted)}\nheld out: {' '.join(fit.held_out)}\n")
+            print(f"{table(rows)}\n\n{residual_table(fit)}")
+        try:
+            draw_calibration(fit, self.out / "check.png")
+        except MissingDependencyError as error:
+            say(f"note: {error}")
+        for line in warnings_of(fit):
+            say(f"warning: {line}")
+        path = write_rig(fit, rows, self.out, self.force)
+        if not self.json:
+            print(
+                f"\nto pre-train on:   evnlos simulate --config {path.with_name(TRAINING_FILE)} --out DATASET"
+            )
+            print(f"captures alike:    evnlos import CAPTURE... --pattern {self.out} --out DATASET")
+            print(expectation(fit))
+
+
+@dataclass(frozen=True)
+class ScanCommand:
+    """Measure a rig's own light transport with a display or a moving LED: plan it, import what was recorded."""
+
+    action: Annotated[Literal["plan", "import"], tyro.conf.Positional]
+    """plan writes scan.yaml, the table of pictures and what to show; import makes a transport of them."""
+    folder: Annotated[Path, tyro.conf.Positional]
+    """The folder of the scan."""
+    out: Path | None = None
+    """import: the transport, a .safetensors file; by default transport.safetensors in the folder. A check
+    picture goes to the same name with .png."""
+    json: bool = False
+    """Print one JSON object."""
+    plan: Flat[ScanPlan] = field(default_factory=ScanPlan)
+    """plan: what to scan, and with what."""
+    settings: Flat[ScanImport] = field(default_factory=ScanImport)
+    """import: how the pictures become a matrix."""
+
+    def run(self) -> None:
+        """Write the plan, or import the scan."""
+        self._plan() if self.action == "plan" else self._import()
+
+    def _plan(self) -> None:
+        from evnlos.calibration.scan import write_plan
+
+        info, found = self.plan.info(), self.plan.estimate()
+        with ProgressBars(quiet=self.json) as progress:
+            files = len(write_plan(self.plan, self.folder, progress))
+        if self.json:
+            print(json.dumps({"folder": str(self.folder), "files": files, **asdict(found)}))
+            return
+        plane, minutes = info.plane, found.seconds / 60
+        print(
+            f"{self.folder}: {info.pattern}, {plane.height} x {plane.width} cells of {1e3 * plane.pitch_m:g} mm"
+        )
+        print(f"{found.shots} pictures in frames.csv, about {minutes:.1f} min at this exposure and overhead")
+        print(
+            f"expected noise of an entry, brightest pixel: {100 * found.noise:.2g} % of the brightest one "
+            f"({found.cell_level:.2g} white levels); with {found.other}: {100 * found.other_noise:.2g} %"
+        )
+        for note in found.notes:
+            say(f"note: {note}")
+        print(f"record the pictures as frames.csv names them, then: evnlos scan import {self.folder}")
+
+    def _import(self) -> None:
+        import torch
+
+        from evnlos.calibration.scan import import_scan
+        from evnlos.errors import MissingDependencyError
+        from evnlos.plot.results import draw_scan
+        from evnlos.setups.files import write_measurement
+        from evnlos.tensor_file import SUFFIX
+
+        torch.set_num_threads(1)
+        out = self.folder / f"transport{SUFFIX}" if self.out is None else self.out
+        result = import_scan(self.folder, self.settings)
+        checksum = write_measurement(out, result.measurement)
+        picture: Path | None = out.with_suffix(".png")
+        try:
+            draw_scan(picture, result.measurement, result.raw)  # type: ignore[arg-type]
+        except MissingDependencyError as error:
+            say(f"note: {error}")
+            picture = None
+        for warning in result.warnings:
+            say(f"warning: {warning}")
+        found = figures_of(result) | {
+            "transport": str(out),
+            "checksum": checksum,
+            "picture": None if picture is None else str(picture),
+        }
+        if self.json:
+            print(json.dumps(found))
+            return
+        print("\n".join(to_lines(result)))
+        print(f"setup: {{kind: measured, file: {out}, checksum: {checksum}}}")
+
+
+def figures_of(result: ScanResult) -> dict[str, Any]:
+    """Return the figures of an import as plain numbers and words."""
+    return {
+        "about": to_dict(result.measurement.about),
+        "denoising": asdict(result.denoising),
+        "agreement": None if result.agreement is None else asdict(result.agreement),
+        "linearity": result.linearity,
+        "psf": None if result.psf is None else asdict(result.psf),
+        "signal_to_noise": round(result.signal_to_noise, 3),
+        "bad_pixels": result.bad_pixels,
+        "warnings": list(result.warnings),
+    }
+
+
+def to_lines(result: ScanResult) -> list[str]:
+    """Return the figures of an import as lines for people."""
+    about, how = result.measurement.about, result.denoising
+    cells = f"{about.plane.height} x {about.plane.width} cells of {1e3 * about.plane.pitch_m:g} mm"
+    lines = [f"{cells} on {about.height} x {about.width} pixels, {about.repeats} x {about.pattern}"]
+    if result.agreement is not None:
+        one = result.agreement
+        lines.append(
+            f"repeats: moved {one.shift_px:.3f} pixels, light {100 * one.gain:+.2f} %, worst pattern "
+            f"{one.pattern} "
+            f"differs by {100 * one.difference:.1f} % beyond noise"
+        )
+    if result.linearity is not None:
+        lines.append(f"linearity: {result.linearity:.3f} (1 is linear)")
+    if result.psf is not None and result.psf.checked:
+        one = result.psf
+        lines.append(
+            f"shift-invariant: the moved column differs from {one.checked} measured ones by "
+            f"{100 * one.error:.0f} % "
+            f"(unmoved: {100 * one.unmoved_error:.0f} %)"
+        )
+    if how.applied:
+        rank = "all" if how.rank is None else how.rank
+        lines.append(
+            f"denoised: smoothing {how.smoothing_cells:g} cells, rank {rank}; {how.gain:.2f} times less "
+            "error, by "
+            "held-out repeats"
+        )
+    else:
+        lines.append(f"not denoised: {how.reason}")
+    lines.append(
+        f"an entry is {result.signal_to_noise:.1f} times its noise; {result.bad_pixels} pixels unusable"
+    )
+    return lines

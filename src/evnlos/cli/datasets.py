@@ -1,0 +1,296 @@
+"""Commands that make and check data: `simulate`, `lab`, `capture`, `import`, `verify`.
+
+- `evnlos simulate`: config in, dataset of shards out.
+- `evnlos lab`: a setup in, pseudo-real capture folders out.
+- `evnlos capture`: begin a capture folder, and check what was recorded into it.
+- `evnlos import`: capture folders in, dataset of shards out.
+- `evnlos verify`: a dataset in, the list of its faulty shards out, mended if asked.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import tyro
+from tqdm import tqdm
+
+from evnlos.cli.console import Flat, Folders, Presets, result
+from evnlos.cli.parsing import say
+from evnlos.data import (
+    Capture,
+    Sampling,
+    Simulation,
+    check_picture,
+    import_captures,
+    load_pattern,
+    open_dataset,
+    simulate,
+)
+from evnlos.data.lab import Lab, lab_of, render_captures
+from evnlos.data.pool import run_on_dask, run_tasks
+from evnlos.data.simulations import PRESETS, estimate, find_faults, repair
+from evnlos.data.store import PAGE
+from evnlos.errors import ConfigError, DataError
+from evnlos.files import write_atomically
+from evnlos.progress import ProgressBars
+from evnlos.setups import load_setup
+from evnlos.setups.base import is_camera
+from evnlos.setups.load import is_name
+
+
+@dataclass(frozen=True)
+class SimulateCommand:
+    """Simulate a dataset: one shard a hidden object. Run it again to go on after an interruption."""
+
+    PRESETS: ClassVar[Presets[Simulation]] = PRESETS
+
+    out: Path
+    """Folder of the dataset; new, or begun with the same settings."""
+    preset: str = "default"
+    """`default`; `paper` for the paper's training set; `paper-nist-test`, `paper-comic-letters` or
+    `paper-comic-digits` for its test sets."""
+    config: Path | None = None
+    """YAML file with settings that replace the preset's."""
+    setup: str | None = None
+    """The setup instead of the preset's: a name (main-near, matte-far, ...), a settings file, a folder that
+    `evnlos calibrate` wrote, or a file of `evnlos scan import`. A name leaves the cameras to the preset; ranges
+    over the preset's wall are dropped."""
+    workers: int = 0
+    """Processes; 0 = one for each core."""
+    shard: str = "1/1"
+    """Share of the objects to make here, i/n: run the shares 1/n to n/n anywhere, on one shared folder."""
+    engine: Literal["local", "dask"] = "local"
+    """Processes on this machine, or a Dask cluster (extra `cluster`) on a shared file system."""
+    scheduler: str | None = None
+    """Address of a running Dask scheduler, e.g. tcp://node1:8786; by default a cluster on this machine."""
+    force: bool = False
+    """Begin although the machine's memory will hardly do."""
+    dry_run: bool = False
+    """Only simulate one object and print what the whole would take: time, disk, memory."""
+    json: bool = False
+    """Print one JSON object."""
+    settings: Flat[Simulation] = field(default_factory=Simulation)
+
+    @staticmethod
+    def with_setup(settings: Simulation, word: str) -> Simulation:
+        """Return the simulation with the setup of `--setup`, without the ranges over the wall that it had."""
+        setup = load_setup(word)
+        if is_name(word):
+            setup = setup.with_cameras_of(settings.setup)
+        over_cameras = {
+            path: ends
+            for path, ends in settings.vary.items()
+            if not path.startswith("setup.") or is_camera(path)
+        }
+        return replace(settings, setup=setup, vary=over_cameras)
+
+    def run(self) -> None:
+        """Simulate, with a progress bar over the objects."""
+        config = self.settings
+        for note in config.glyphs.notes():
+            say(note)
+        for line in config.setup.warnings():
+            say(f"warning: {line}")
+        for name, value in config.optics().items():
+            say(f"{name} {value:.3g}")
+        share = _share(self.shard)
+        if self.scheduler and self.engine != "dask":
+            raise ConfigError(f"--scheduler {self.scheduler} needs --engine dask")
+        total = len(config.glyphs.objects())
+        if self.dry_run:
+            for line in estimate(config, self.workers, share).lines(self.out):
+                print(line)
+            return
+        engine = run_tasks if self.engine == "local" else partial(run_on_dask, scheduler=self.scheduler)
+        with ProgressBars() as progress:
+            missing = simulate(config, self.out, self.workers, share, engine, progress, self.force).missing()
+        about = {"out": str(self.out), "objects": total, "samples": total * config.positions}
+        text = f"{self.out}: {total} objects, {total * config.positions} samples, {len(missing)} missing"
+        result(self.json, about | {"missing": missing}, text)
+
+
+def _share(text: str) -> tuple[int, int]:
+    """Return (i, n) of "i/n"."""
+    first, _, stride = text.partition("/")
+    if not (first.isdigit() and stride.isdigit() and 1 <= int(first) <= int(stride)):
+        raise ConfigError(f"--shard is {text!r}; give i/n with i from 1 to n, e.g. 3/16")
+    return int(first), int(stride)
+
+
+@dataclass(frozen=True)
+class LabCommand:
+    """Render pseudo-real captures: a wall of metal or paint, other cameras than the training simulator's."""
+
+    PRESETS: ClassVar[Presets[Lab]] = {"default": Lab}
+
+    out: Path
+    """Folder for the capture folders; a capture that is there is done."""
+    setup: str | None = None
+    """The setup: a name (mirror, easy, main, hard, matte or aperture, with -near or -far), a room (two-lobes,
+    one-sided, curved, brushed, streaks, torch: outside the simulator's model), a settings file, or a folder
+    that `evnlos calibrate` wrote; by default main-near. A name but a room's leaves light and cameras to the
+    lab."""
+    config: Path | None = None
+    """YAML file with settings of the laboratory."""
+    workers: int = 1
+    """Processes; 0 = one for each core. The captures are the same for any number."""
+    force: bool = False
+    """Begin although the machine's memory will hardly do."""
+    settings: Flat[Lab] = field(default_factory=Lab)
+
+    @staticmethod
+    def with_setup(settings: Lab, word: str) -> Lab:
+        """Return the lab with the setup of `--setup`."""
+        return lab_of(word, settings)
+
+    def run(self) -> None:
+        """Render, with a progress bar over the captures."""
+        for note in self.settings.glyphs.notes():
+            say(note)
+        with ProgressBars() as progress:
+            rendered = render_captures(
+                self.settings, self.out, workers=self.workers, progress=progress, force=self.force
+            )
+        print(f"{self.out}: {len(rendered)} captures; settings and the drawn sensor in {self.out / 'lab.yaml'}")
+
+
+_MARKS = {"good": "  good   ", "doubtful": "? look   ", "bad": "! BAD    "}
+
+
+@dataclass(frozen=True)
+class CaptureCommand:
+    """Begin a capture folder with a commented capture.yaml (init), or say what a recording is worth (check)."""
+
+    action: Annotated[Literal["init", "check"], tyro.conf.Positional]
+    """init writes capture.yaml; check reads the recording and tells what is wrong and how to mend it."""
+    folder: Annotated[Path, tyro.conf.Positional]
+    """The folder of the shot."""
+    width: int = 1280
+    """init: columns of the event camera's sensor, pixels."""
+    height: int = 800
+    """init: rows of the event camera's sensor, pixels; the defaults are those of the CeleX-V."""
+    camera: str = "CeleX-V"
+    """init: maker and model."""
+    json: bool = False
+    """check: print one JSON object."""
+
+    def run(self) -> None:
+        """Write the file, or print the findings; exit code 1 where one of them is bad."""
+        if self.action == "init":
+            from evnlos.data.capture_info import begin_capture
+
+            path = begin_capture(self.folder, self.width, self.height, self.camera)
+            print(f"{path}: edit it, put the recordings beside it, then: evnlos capture check {self.folder}")
+            return
+        from evnlos.data import read_capture
+        from evnlos.data.capture_check import check_capture
+
+        capture = read_capture(self.folder)
+        found = check_capture(capture)
+        if self.json:
+            print(json.dumps({"capture": capture.name, "findings": [asdict(one) for one in found]}))
+        else:
+            print("\n".join(capture.notes))
+            for one in found:
+                print(f"{_MARKS[one.level]}{one.what}: {one.found}" + (f"; {one.cure}" if one.cure else ""))
+        if any(one.level == "bad" for one in found):
+            raise SystemExit(1)
+
+
+@dataclass(frozen=True)
+class ImportCommand:
+    """Turn captures (folders with capture.yaml, events and frames) into a dataset to train and test on."""
+
+    captures: Folders
+    """Capture folders."""
+    out: Path
+    """Folder of the dataset."""
+    test: tuple[str, ...] = ()
+    """Captures or characters that are held out for testing, e.g. G K 4 9."""
+    validation: tuple[str, ...] = ()
+    """Captures or characters that are held out for validation."""
+    pattern: Path | None = None
+    """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
+    check_pictures: bool = True
+    """Draw one picture a capture (frame, events, both, curves over time) into the folder checks of the
+    dataset."""
+    json: bool = False
+    """Print one JSON object."""
+    sampling: Sampling = field(default_factory=Sampling)
+    """Resolution and representation."""
+
+    def run(self) -> None:
+        """Import, with a progress bar over the captures."""
+        with ProgressBars() as progress:
+            dataset = import_captures(
+                self.captures,
+                self.out,
+                self.sampling,
+                test=self.test,
+                validation=self.validation,
+                pattern=load_pattern(self.pattern) if self.pattern else None,
+                look=self._look,
+                progress=progress,
+            )
+        counts = ", ".join(f"{len(names)} {split}" for split, names in dataset.split.items())
+        text = f"{self.out}: {len(dataset.objects())} captures ({counts})"
+        result(self.json, {"out": str(self.out), "split": dataset.split}, text)
+        if self.check_pictures and not self.json:
+            print(f"check pictures: {self.out / 'checks'}")
+
+    def _look(self, capture: Capture) -> None:
+        """Tell what was done to a capture, and draw it."""
+        tqdm.write(f"{capture.name}: {'; '.join(capture.notes)}", file=sys.stderr)
+        if self.check_pictures:
+            folder = self.out / "checks"
+            folder.mkdir(exist_ok=True)
+            drawn = io.BytesIO()
+            check_picture(capture).save(drawn, "PNG")
+            write_atomically(folder / f"{capture.name}.png", drawn.getvalue())
+
+
+@dataclass(frozen=True)
+class VerifyCommand:
+    """Check every shard of a dataset against its checksums, its name and its settings."""
+
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of the dataset."""
+    repair: bool = False
+    """Simulate faulty and missing objects again."""
+    workers: int = 0
+    """Processes for the repair; 0 = one for each core."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Check, report, and repair where asked."""
+        dataset = open_dataset(self.dataset)
+        total = len(dataset.objects())
+        with ProgressBars() as progress:
+            faults = find_faults(dataset, progress)
+        about = {"dataset": str(self.dataset), "objects": total, "faults": {f.name: f.reason for f in faults}}
+        if not self.json:
+            for fault in faults:
+                place = dataset.folder / PAGE if fault.name == PAGE else dataset.shard(fault.name)
+                print(f"{place}: {fault.reason}")
+        if not faults:
+            result(self.json, about | {"repaired": 0}, f"{self.dataset}: {total} objects, all whole")
+        elif not self.repair:
+            if self.json:
+                print(json.dumps(about | {"repaired": 0}))
+            shards = sum(fault.name != PAGE for fault in faults)
+            page = f" and {PAGE} is not as it was written" if shards < len(faults) else ""
+            raise DataError(
+                f"{self.dataset}: {shards} of {total} shards are faulty{page}; --repair makes shards again"
+            )
+        else:
+            with ProgressBars() as progress:
+                repair(dataset, faults, self.workers, progress)
+            text = f"{self.dataset}: {len(faults)} of {len(faults)} faulty shards made again"
+            result(self.json, about | {"repaired": len(faults)}, text)

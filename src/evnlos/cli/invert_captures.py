@@ -1,0 +1,271 @@
+"""What `evnlos invert` does with captures and with still pictures.
+
+- `evnlos invert CAPTURE... --setup SETUP`: one picture of each object from its whole pass.
+- `evnlos invert PICTURE... --setup transport.safetensors`: still pictures of the wall, a measured setup.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.calibration.scan.importer import fill_bad
+from evnlos.cli.parsing import say
+from evnlos.data import Capture, load_pattern, read_capture
+from evnlos.data.frame_sources import read_image
+from evnlos.data.sampling import Sampling
+from evnlos.errors import ConfigError
+from evnlos.inverse import JointProblem, PlatePass
+from evnlos.inverse.inversion import Inversion, chosen_degree
+from evnlos.inverse.joint import matrix_of, strip_gram_of, strip_of
+from evnlos.inverse.measurements import object_light, position_subsets
+from evnlos.inverse.operators import Solution
+from evnlos.inverse.tikhonov import Rule
+from evnlos.metrics import psnr
+from evnlos.optics import MatrixTransport
+from evnlos.scene import Target
+from evnlos.setups import Setup, load_setup
+from evnlos.setups.base import dense_matrix, linear_kinds
+from evnlos.setups.measured import averaged
+from evnlos.types import Plane
+
+
+@dataclass(frozen=True)
+class PassOptions:
+    """What `evnlos invert` was told about captures."""
+
+    setup: Path
+    positions: tuple[int, ...]
+    pattern: Path | None
+    track: bool
+    solvers: tuple[str, ...]
+    lam: dict[str, float | None]
+    cells: int
+    columns: int
+    static: float
+    subsets: int
+
+
+def linear_setup(word: Path | str) -> Setup:
+    """Return the setup of a word (see `load_setup`), which has to be linear.
+
+    Raises:
+        ConfigError: It is of another kind, or there is none.
+    """
+    setup = load_setup(word)
+    if not setup.is_linear:
+        raise ConfigError(
+            f"{word} holds a setup of kind {setup.kind}, which is not linear; give one of kind "
+            f"{' or '.join(linear_kinds())}"
+        )
+    return setup
+
+
+def invert_captures(
+    folders: Sequence[Path], options: PassOptions
+) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Return the figures, and the plates [cells, cells] by name, of every capture and solver."""
+    clock = time.perf_counter()
+    setup = linear_setup(options.setup)
+    captures = [read_capture(folder) for folder in folders]
+    pattern = None if options.pattern is None else load_pattern(options.pattern)
+    height, width = captures[0].frames.shape[1:]
+    if any(capture.frames.shape != captures[0].frames.shape for capture in captures):
+        raise ConfigError(
+            "the captures differ in the number or the size of their frames; invert them one by one"
+        )
+    columns = min(options.columns, width)
+    shape = (max(1, round(height * columns / width)), columns)
+    light = torch.stack([object_light(c.frames[1:], c.peak, setup, shape, pattern) for c in captures])
+    pictures: dict[str, torch.Tensor] = {}
+    rows: list[dict[str, Any]] = []
+    for motion, members in _by_motion(captures, options, setup):
+        size = _plate_m(captures[members[0]], _is_tracked(captures[members[0]], options))
+        plate = Plane(options.cells, options.cells, size / options.cells)
+        transport = matrix_of(setup.resized((height, width)).operator(strip_of(motion, plate), shape))
+        gram = strip_gram_of(transport)
+        for count in options.positions or (len(motion),):
+            for chosen in position_subsets(len(motion), count, options.subsets):
+                problem = JointProblem(PlatePass(transport, plate, motion[chosen]), options.static, gram)
+                images = light[members][:, chosen]
+                for solver in options.solvers:
+                    found = _solve(problem, images, solver, options.lam[solver])
+                    for member, image in zip(members, found, strict=True):
+                        name = captures[member].name
+                        db = _score(captures[member], image, size, motion)
+                        rows.append({"capture": name, "positions": count, "solver": solver, "psnr_db": db})
+                        pictures[f"{name}_{solver}_{count}"] = image
+    figures = {"setup": str(options.setup), "captures": [c.name for c in captures], "rows": rows}
+    figures["seconds"] = round(time.perf_counter() - clock, 1)
+    return figures, pictures
+
+
+def pass_table(rows: list[dict[str, Any]]) -> str:
+    """Return mean PSNR by number of positions and solver, over captures and subsets, as lines for people."""
+    solvers = list(dict.fromkeys(row["solver"] for row in rows))
+    lines = ["positions " + "".join(f"{s:>12}" for s in solvers)]
+    for count in dict.fromkeys(row["positions"] for row in rows):
+        values = []
+        for solver in solvers:
+            known = [r["psnr_db"] for r in rows if (r["positions"], r["solver"]) == (count, solver)]
+            db = [v for v in known if v is not None]
+            values.append(f"{np.mean(db):9.2f} dB" if db else f"{'-':>12}")
+        lines.append(f"{count:9d} " + "".join(values))
+    return "\n".join(lines)
+
+
+def pass_text(found: dict[str, Any]) -> str:
+    """Return the figures as lines for people."""
+    return f"{' '.join(found['captures'])}\n{pass_table(found['rows'])}\n{found['seconds']} s"
+
+
+def print_pass(found: dict[str, Any], as_json: bool) -> None:
+    """Print the figures."""
+    print(json.dumps(found) if as_json else pass_text(found))
+
+
+def _solve(problem: JointProblem, images: torch.Tensor, solver: str, factor: float | None) -> torch.Tensor:
+    first = problem.tikhonov(images)
+    if factor is None:
+        return first.image
+    lam = factor * first.noise_sigma**2
+    if solver == "tikhonov":
+        return problem.tikhonov(images, lam).image
+    found = problem.total_variation(images, lam, tolerance=1e-5)
+    if not found.converged:
+        say(f"warning: tv stopped after {found.iterations} iterations before it had converged")
+    return found.image
+
+
+def _by_motion(
+    captures: Sequence[Capture], options: PassOptions, setup: Setup
+) -> list[tuple[NDArray[np.float64], list[int]]]:
+    """Return each motion [N, 2], metres, of frames 1..N with the captures that share it."""
+    groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
+    for k, capture in enumerate(captures):
+        if _is_tracked(capture, options):
+            from evnlos.tracking import track_capture, track_doubts
+
+            found = track_capture(capture, setup)
+            for doubt in track_doubts(capture, setup, found):
+                say(f"warning: {capture.name}: {doubt}")
+            motion = found.at(capture.frame_times_us[1:] * 1e-6)
+        else:
+            assert capture.motion is not None  # else it would be tracked
+            motion = capture.motion.position_m(capture.frame_times_us[1:] * 1e-6)
+        groups.setdefault(motion.tobytes(), (motion, []))[1].append(k)
+    return list(groups.values())
+
+
+def _is_tracked(capture: Capture, options: PassOptions) -> bool:
+    return options.track or capture.motion is None
+
+
+def _plate_m(capture: Capture, tracked: bool) -> float:
+    # A tracked position is that of the light's middle, which need not be the plate's.
+    size = 0.08 if capture.info.target is None else capture.info.target.plate_m
+    return 1.25 * size if tracked else size
+
+
+def _score(capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]) -> float | None:
+    scene = capture.scene
+    if scene is None:
+        return None
+    sampling = Sampling()
+    plate = Target("found", image.clamp(0, 1).float().numpy(), size_m)
+    drawn = plate.rasterise(sampling.canvas, motion)
+    truth = scene.truth(sampling.canvas, capture.frame_times_us[1:] * 1e-6)
+    rows = sampling.scored
+    return round(float(psnr(torch.from_numpy(drawn[:, rows]), torch.from_numpy(truth[:, rows])).mean()), 3)
+
+
+_FINEST = 48  # pixels a side that a rough wall's light needs
+
+
+@dataclass(frozen=True)
+class StillOptions:
+    """What `evnlos invert` was told about still pictures."""
+
+    dark: Path | None
+    solvers: tuple[Literal["tikhonov", "tv"], ...]
+    lam: float | None
+    rule: Rule
+    noise_sigma: float | None
+    degree: int | None
+    bin: int | None
+
+
+def invert_stills(
+    files: Sequence[Path], setup: Setup, options: StillOptions
+) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Return the figures, and the pictures [files, h, w] on the scanned cells by solver.
+
+    The dark frame (the scan's own where none is given) is taken off, unusable pixels are filled in alike in
+    the pictures and in the matrix, both are reduced, and the operator is brought to norm 1.
+
+    Raises:
+        ConfigError: A picture does not have the scan's size or is one that the scan was not.
+        DataError: A picture can't be read.
+    """
+    clock = time.perf_counter()
+    measured = setup.measurement()
+    pictures = [read_image(path, measured.shape) for path in files]
+    peaks = {float(np.iinfo(picture.dtype).max) for picture in pictures}
+    if len(peaks) > 1:
+        raise ConfigError("the pictures have 8 and 16 bits; give pictures of one camera")
+    white = float(measured.about.white_dn or peaks.pop())
+    if (brightest := max(int(picture.max()) for picture in pictures)) > white:
+        raise ConfigError(f"a picture reaches {brightest} DN, the scan's white is {white:g}; save both alike")
+    light = torch.from_numpy(np.stack(pictures).astype(np.float32)) / white
+    if options.dark is None:
+        light = light - setup.ambient_light(measured.shape)
+    else:
+        light = light - torch.from_numpy(read_image(options.dark, measured.shape).astype(np.float32)) / white
+    filled = fill_bad(light.numpy(), measured.bad.numpy(), measured.shape)
+    shape = reduced(measured.shape, options.bin)
+    flat = averaged(torch.from_numpy(filled).flatten(1).mT, measured.shape, shape)
+    image = flat.mT.unflatten(1, shape).double()
+    image = image / image.abs().max().clamp(min=1e-12)
+    cells = measured.about.plane
+    matrix = dense_matrix(setup.operator(cells, shape))
+    operator = MatrixTransport(matrix / torch.linalg.matrix_norm(matrix, 2), cells, shape)
+    degree = chosen_degree(operator, image) if options.degree is None else options.degree
+    found: dict[str, Any] = {
+        "files": [str(path) for path in files],
+        "setup": setup.wall_description(),
+        "wall": list(shape),
+        "background_degree": degree,
+        "solutions": {},
+    }
+    images: dict[str, torch.Tensor] = {}
+    inversion = Inversion(operator, image, degree)
+    for name in options.solvers:
+        solution = inversion.solve(name, options.lam, options.rule, options.noise_sigma)
+        found["solutions"][name] = figures_of(name, solution)
+        images[name] = solution.image
+    found["seconds"] = round(time.perf_counter() - clock, 1)
+    return found, images
+
+
+def figures_of(name: str, solution: Solution) -> dict[str, Any]:
+    """Return the figures of a solution, with a warning where the solver gave up."""
+    if not solution.converged:
+        say(f"warning: {name} stopped after {solution.iterations} iterations before it had converged")
+    return {"lam": solution.lam, "misfit": solution.noise_sigma, "iterations": solution.iterations}
+
+
+def reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:
+    """Return the size (h, w) that pictures are reduced to: pixels binned, by default at most 48 a side."""
+    most = max(shape)
+    factor = most / min(most, _FINEST) if bin is None else bin
+    if not 1 <= factor <= min(shape):
+        raise ConfigError(f"the binning is {bin}; give 1 to {min(shape)} pixels")
+    return max(1, round(shape[0] / factor)), max(1, round(shape[1] / factor))

@@ -1,0 +1,343 @@
+"""Commands on networks: `train`, `finetune`, `evaluate`, `weights`.
+
+- `evnlos train`: dataset or simulation in, run out.
+- `evnlos finetune`: run and dataset in, run out.
+- `evnlos evaluate`: weights and dataset in, scores beside their baselines out.
+- `evnlos weights`: what a weights file is, where it comes from, and a smaller copy to hand on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import torch
+import tyro
+
+from evnlos.analysis import BASELINES, CHECKS
+from evnlos.cli.console import Flat, Presets, result
+from evnlos.cli.parsing import say
+from evnlos.config import load_yaml, to_dict
+from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
+from evnlos.data.live import Place
+from evnlos.errors import ConfigError, DataError, printable
+from evnlos.models import Weights, describe_network, load_weights, published, save_weights, with_rank
+from evnlos.models.confidence import COVERAGE
+from evnlos.progress import ProgressBars
+from evnlos.training import (
+    Training,
+    alternatives,
+    choose_and_finetune,
+    finetuning,
+    paper_finetuning,
+    paper_pretraining,
+    read_choice,
+    train,
+)
+
+
+@dataclass(frozen=True)
+class TrainCommand:
+    """Train a network from random weights: pre-training on a simulation, or end to end (E2E) on captures."""
+
+    PRESETS: ClassVar[Presets[Training]] = {"default": Training, "paper": paper_pretraining}
+
+    out: Path
+    """Folder of the run; new, or begun with the same settings."""
+    data: Path | None = None
+    """Folder of the dataset."""
+    simulate: Path | None = None
+    """YAML file with the settings of a simulation, instead of --data: samples are made while the network
+    trains, other ones in each epoch, and nothing is stored."""
+    workers: int = 1
+    """Processes that simulate beside the training on the CPU, for --simulate; 0 = one for each core."""
+    simulate_on: Place = "device"
+    """Where --simulate works beside a GPU: `device` = on it, where the event model can (v2e, with a time step);
+    `cpu` = in --workers processes, of which it then wants several. The physics is the same."""
+    force: bool = False
+    """Begin --simulate although the machine's memory will hardly do."""
+    preset: str = "default"
+    """`default`, or `paper` for the paper's 200 epochs, step sizes and loss."""
+    config: Path | None = None
+    """YAML file with settings."""
+    json: bool = False
+    """Print one JSON object."""
+    settings: Flat[Training] = field(default_factory=Training)
+
+    def run(self) -> None:
+        """Train, with a progress bar over the epochs."""
+        if (self.data is None) == (self.simulate is None):
+            raise ConfigError("give --data DATASET or --simulate SETTINGS.yaml, one of the two")
+        if self.data is not None:
+            fit(open_dataset(self.data), self.settings, self.out, None, self.json)
+        else:
+            assert self.simulate is not None
+            settings = load_yaml(Simulation, self.simulate)
+            dataset = live_dataset(settings, self.workers, self.simulate_on, self.force)
+            if note := dataset.note(torch.device("cuda" if torch.cuda.is_available() else "cpu")):
+                say(f"note: {note}")
+            fit(dataset, self.settings, self.out, None, self.json)
+
+
+def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, as_json: bool) -> None:
+    """Train with a progress bar over the epochs, and warn of a network that ignores its input.
+
+    Of several processes that `torchrun` started, only the first speaks.
+    """
+    quiet = int(os.environ.get("RANK", "0")) > 0
+    if not quiet and (misfit := dataset.config.get("setup", {}).get("misfit")):
+        say(f"warning: the simulation's setup does not fit its captures: {misfit}")
+    with ProgressBars(quiet) as progress:
+        trained = train(dataset, settings, out, weights, progress)
+    if quiet:
+        return
+    record = trained.records[-1]
+    if record.get("collapsed"):
+        say(
+            f"warning: the network answers the same to every input ({record['psnr_db']} dB; all-black has "
+            f"{record['zero_db']} dB): it has collapsed; use --loss balanced, or train for more epochs"
+        )
+    text = f"{out}: {record['epoch']} epochs, loss {record['loss']}, weights in {trained.file}"
+    result(as_json, {"run": str(out), "weights": str(trained.file), **record}, text)
+
+
+@dataclass(frozen=True)
+class FinetuneCommand:
+    """Fine-tune weights on few captures (EPNP): modality and network are those of the weights.
+
+    After a simulation that was fitted to the setup, less is better: --epochs 3 --learning-rate 2e-4
+    --keep-normalization. With --choose captures that are held out decide, and fine-tuning cannot lose much.
+    """
+
+    PRESETS: ClassVar[Presets[Training]] = {"default": finetuning, "paper": paper_finetuning}
+
+    weights: Path
+    """Weights file, or the run to start from."""
+    data: Path
+    """Folder of the dataset of captures."""
+    out: Path
+    """Folder of the run; new, or begun with the same settings."""
+    preset: str = "default"
+    """`default`, or `paper` for the paper's 100 epochs at 1e-5 with its loss."""
+    config: Path | None = None
+    """YAML file with settings."""
+    choose: bool = False
+    """Try these settings, a fifth and five times the learning rate, keeping the normalization and not, on two
+    halves of the training captures in turn; take the best, part of the way to it, or nothing."""
+    json: bool = False
+    """Print one JSON object."""
+    settings: Flat[Training] = field(default_factory=finetuning)
+
+    def run(self) -> None:
+        """Train, with a progress bar over the epochs."""
+        dataset = open_dataset(self.data)
+        if not self.choose:
+            fit(dataset, self.settings, self.out, self.weights, self.json)
+            return
+        candidates = alternatives(self.settings)
+        with ProgressBars() as progress:
+            trained = choose_and_finetune(dataset, candidates, self.out, self.weights, progress=progress)
+        choice = read_choice(self.out)
+        assert choice is not None
+        values = {"run": str(self.out), "weights": str(trained.file), **asdict(choice)}
+        result(self.json, values, f"{self.out}: {choice.sentence()}; weights in {trained.file}")
+
+
+@dataclass(frozen=True)
+class EvaluateCommand:
+    """Score a network on a split of a dataset, with the baselines beside it."""
+
+    weights: Path
+    """Weights file, or a run's folder."""
+    data: Path
+    """Folder of the dataset."""
+    split: str | None = None
+    """Split to score: test, validation, train or all; by default `test` where there is one, else `all`."""
+    vgg: Path | None = None
+    """torchvision's vgg16-397923af.pth for LPIPS; by default it is looked for in the torch hub cache."""
+    lpips_heads: Path | None = None
+    """The linear heads vgg.pth of LPIPS v0.1; by default those of an installed `lpips`."""
+    setup: Path | None = None
+    """The calibrated setup (the folder that `calibrate` wrote): the confidence then asks how much of the frames
+    the pictures explain. Without it published weights take the setup that they were trained for."""
+    positions: tuple[int, ...] = ()
+    """Numbers of positions, e.g. 1 2 5 10 20 40: also how the image of a sequence network grows with them."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> None:
+        """Evaluate and print."""
+        from evnlos.analysis import available_lpips, curve_over_positions, evaluate, load_lpips
+        from evnlos.models import load_weights, published_rig
+        from evnlos.report import refuse_seen, seen_in_training
+        from evnlos.setups import calibrated_folder, load_setup
+
+        dataset, weights = open_dataset(self.data), load_weights(self.weights)
+        split = self.split or ("test" if dataset.split.get("test") else "all")
+        refuse_seen(weights.history, dataset, split)
+        metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
+        curve = curve_over_positions(weights, dataset, split, self.positions) if self.positions else []
+        word = calibrated_folder(self.setup) if self.setup else published_rig(self.weights)
+        known = load_setup(word) if word else None
+        found = evaluate(weights, dataset, split, metric, known).summary()
+        about = {
+            "weights": str(self.weights),
+            "modality": weights.modality.name,
+            "data": str(self.data),
+            "split": split,
+        }
+        seen = seen_in_training(weights.history, dataset, split)
+        if self.json:
+            points = {"positions": [to_dict(point) for point in curve]} if curve else {}
+            print(json.dumps(about | {"seen_in_training": seen} | found | points))
+        else:
+            _print_summary(about, found)
+            if curve:
+                print("| positions | choices of them | PSNR, dB |\n|---|---|---|")
+                print("\n".join(f"| {p.positions} | {p.subsets} | {p.psnr_db:.2f} |" for p in curve))
+            if seen:
+                say(f"note: training saw {', '.join(seen)}; scores on them say nothing about unseen objects")
+
+
+def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
+    print(
+        f"{about['weights']} ({about['modality']}) on {about['data']}, split {about['split']}: "
+        f"{found['images']} pictures"
+    )
+    names = list(found["overall"])
+    rows = [["", *names]]
+    rows += [[name, *(_cell(v[key]) for key in names)] for name, v in found["characters"].items()]
+    rows.append(["all", *(_cell(found["overall"][key]) for key in names)])
+    rows += [
+        [BASELINES[n], *(_cell(v["overall"][key]) for key in names)] for n, v in found["baselines"].items()
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    print("\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows))
+    for name, share in found["checks"].items():
+        print(f"{CHECKS[name]}: {share:.0%}")
+    if worth := found["confidence"]:
+        said = ("support", "skill", "measured", "coverage", "width")
+        mean = {key: sum(one[key] for one in worth) / len(worth) for key in said}
+        print(
+            f"confidence: support {mean['support']:.0%} said, {mean['skill']:.0%} found; "
+            f"{mean['measured']:.0%} of {len(worth)} passes said to be measured; intervals of "
+            f"{COVERAGE:.0%} hold {mean['coverage']:.0%} of the pixels, mean length {mean['width']:.2f}"
+        )
+
+
+def _cell(value: float | None) -> str:
+    return "not available" if value is None else f"{value:.3f}"
+
+
+_MOST_NAMED = 8  # of more objects, the worst and the best are named
+
+
+@dataclass(frozen=True)
+class WeightsCommand:
+    """Show what weights see, how they were trained and on what, or list those that come with the package."""
+
+    weights: Annotated[Path | None, tyro.conf.Positional] = None
+    """Weights file, run's folder, or name of published weights; none lists the published ones."""
+    half: Path | None = None
+    """File for a copy in half precision, half as large; it must not exist."""
+    rank: int | None = None
+    """Components of the linear embedding that the copy keeps, the strongest; none keeps all."""
+    scores: Path | None = None
+    """What `evnlos evaluate --json` printed of these weights, to be kept in the copy."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Read the weights, print, and write the copy where one is asked for."""
+        if self.half is None and (self.rank is not None or self.scores is not None):
+            raise ConfigError("--rank and --scores are of a copy; give its file with --half")
+        if self.weights is None:
+            if self.half is not None:
+                raise ConfigError("--half copies one file of weights; say which")
+            self._list()
+            return
+        loaded = load_weights(self.weights)
+        if self.half is not None:
+            if self.half.exists():
+                raise DataError(f"{self.half} exists; give --half another name")
+            if self.rank is not None:
+                loaded = with_rank(loaded, self.rank)
+            loaded = replace(loaded, scores=_scores(self.scores) if self.scores else loaded.scores)
+            save_weights(self.half, loaded, torch.float16)
+        found = describe(loaded)
+        print(json.dumps(found) if self.json else to_text(str(self.weights), found))
+        if self.half is not None and not self.json:
+            print(f"{self.half}: half precision, {self.half.stat().st_size / 1e6:.1f} MB")
+
+    def _list(self) -> None:
+        found = {name: describe(load_weights(path)) for name, path in published().items()}
+        if self.json:
+            print(json.dumps(found))
+            return
+        print("\n".join(to_text(name, about) for name, about in found.items()) or "no weights are published")
+
+
+def _scores(path: Path) -> dict[str, Any]:
+    """Return what a reader of weights wants of an evaluation: on what, how good, and the baselines."""
+    try:
+        found = json.loads(path.read_text())
+        baselines = {name: one["overall"] for name, one in found["baselines"].items()}
+        objects = {one["character"]: one["psnr_db"] for one in found["characters"].values()}
+        kept = {name: found[name] for name in ("data", "split", "images", "overall", "checks")}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path} is not what `evnlos evaluate --json` prints: {error!r}"[:300]) from None
+    return kept | {"data": Path(kept["data"]).name, "psnr_db": objects, "baselines": baselines}
+
+
+def describe(weights: Weights) -> dict[str, Any]:
+    """Return what a user of the weights must know, as plain values."""
+    state = weights.network.state_dict().values()
+    return {
+        **describe_network(weights.network),
+        "sees_sequence": weights.network.sees_sequence,
+        "parameters": sum(p.numel() for p in weights.network.parameters()),
+        "numbers": sum(value.numel() for value in state),
+        "history": weights.history,
+        "confidence": weights.confidence is not None,
+        "scores": weights.scores,
+        "digest": weights.is_sealed,
+    }
+
+
+def to_text(name: str, found: dict[str, Any]) -> str:
+    """Return the description as lines for people."""
+    sees = "whole sequences" if found["sees_sequence"] else "one time step at a time"
+    sampling = found["sampling"]
+    lines = [
+        f"{name}: {found['modality']}, {found['network']['kind']}: {sees}; {found['parameters']:,} trained "
+        f"parameters, {found['numbers'] - found['parameters']:,} numbers in closed form",
+        f"  maps {sampling.get('width')} x {sampling.get('height')}, pitch {sampling.get('pitch_m')} m, "
+        f"surface {sampling.get('surface')}, tau {sampling.get('tau_s')} s",
+    ]
+    for number, step in enumerate(found["history"], start=1):
+        data, plan = step.get("data", {}), step.get("settings", {})
+        lines.append(
+            f"  {number}. {data.get('origin')} {data.get('name')}: {len(data.get('train', []))} objects, "
+            f"{plan.get('epochs')} epochs at {plan.get('learning_rate')}, seed {plan.get('seed')}"
+        )
+    if not found["digest"]:
+        lines.append("  without a digest, as earlier versions wrote them: damage to the numbers goes unseen")
+    if found["scores"]:
+        lines.append(_score_line(found["scores"]))
+    return "\n".join(map(printable, lines))
+
+
+def _score_line(scores: dict[str, Any]) -> str:
+    """Return one line on how good the weights were found to be; a stranger's file may say anything there."""
+    try:
+        named, between = list(scores["psnr_db"].items()), ", "
+        if len(named) > _MOST_NAMED:
+            ranked = sorted(named, key=lambda pair: pair[1])
+            named, between = [ranked[0], ranked[-1]], " to "
+        each = between.join(f"{name} {value:.2f}" for name, value in named)
+        return f"  {scores['overall']['psnr_db']:.2f} dB on {scores['data']}, {scores['split']}: {each}"
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return "  its scores are not what this version writes"

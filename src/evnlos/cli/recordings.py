@@ -1,0 +1,334 @@
+"""Commands on event files: `convert`, `info`, `preview`, and what all that read such files share.
+
+- What the commands on event files share: how a file is read, what is taken of it, numbers in words.
+- `evnlos convert`: an event file in, an event file of another format out.
+- `evnlos info`: what an event file holds, and what is wrong with it.
+- `evnlos preview`: an event file in, an animation or a sheet of pictures out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tqdm import tqdm
+
+from evnlos.cli.console import Flat, result
+from evnlos.cli.parsing import say
+from evnlos.errors import ConfigError, DataError, printable
+from evnlos.events import CelexOptions, EventWriter, ReadReport
+from evnlos.events.files.columns import OnError
+from evnlos.events.recording import WINDOW_US, Box, Cut, Recording, Summary, summarise
+from evnlos.plot.preview import Background, Look, Style, preview_pictures
+from evnlos.types import Events
+
+EventFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+"""An event file, given without a flag."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a file does not say about itself."""
+
+    width: int | None = None
+    """Sensor width, pixels, where the file does not say or is wrong; give both or neither."""
+    height: int | None = None
+    """Sensor height, pixels."""
+    celex: CelexOptions = field(default_factory=CelexOptions)
+    """What a CeleX-V recording does not say."""
+
+    def open(self, path: Path, on_error: OnError) -> Recording:
+        """Return the recording, its start checked."""
+        celex = None if self.celex == CelexOptions() else self.celex
+        return Recording(path, on_error, width=self.width, height=self.height, celex=celex)
+
+
+@dataclass(frozen=True)
+class Taking:
+    """Which events are taken."""
+
+    start: float = 0.0
+    """Begin, seconds after the first event."""
+    stop: float | None = None
+    """End, seconds after the first event; by default the last event."""
+    box: tuple[int, int, int, int] | None = None
+    """Part of the sensor: X Y WIDTH HEIGHT, pixels; its corner becomes pixel (0, 0)."""
+
+    def cut(self, known_polarity: bool = False) -> Cut:
+        """Return the cut."""
+        return Cut(self.start, self.stop, Box(*self.box) if self.box else None, known_polarity)
+
+
+def refuse_existing(path: Path, force: bool) -> None:
+    """Raise where a file would be replaced without --force."""
+    if path.exists() and not force:
+        raise ConfigError(f"{path} exists; give another name, or --force to replace it")
+
+
+def counted(pieces: Iterable[Events], name: str, total: int | None = None) -> Iterator[Events]:
+    """Yield the pieces under a progress bar that counts their events and is gone when they are through."""
+    bar = tqdm(desc=name, total=total, unit=" events", unit_scale=True, delay=0.5, leave=False)
+    with bar:
+        for piece in pieces:
+            yield piece
+            bar.update(len(piece))
+
+
+def amount(value: float, unit: str) -> str:
+    """Return a number with a prefix: 12.3 kev/s.
+
+    Example:
+        >>> amount(12_345.0, "ev/s"), amount(999.99, "B")
+        ('12.3 kev/s', '1000 B')
+    """
+    for prefix in ("", "k", "M", "G"):
+        if abs(value) < 1000 or prefix == "G":
+            break
+        value /= 1000
+    return f"{value:.3g} {prefix}{unit}" if value < 999.5 else f"{value:.0f} {prefix}{unit}"
+
+
+@dataclass(frozen=True)
+class ConvertCommand:
+    """Convert an event file, block by block: the new file appears when it is complete."""
+
+    file: EventFile
+    """Event file of any format that is read; it may be larger than memory."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """The file to write; its ending says the format: .h5, .npz, .raw (EVT3), .aedat4, .csv, ..._100M.bin."""
+    format: str | None = None
+    """Format to write where the ending does not say, e.g. EVT2 or EVT21 for .raw."""
+    on_error: OnError = "strict"
+    """strict: damage ends the conversion, and nothing is written; salvage: damage is left out and told."""
+    reading: Flat[Reading] = field(default_factory=Reading)
+    taking: Flat[Taking] = field(default_factory=Taking)
+    keep_known_polarity: bool = False
+    """Leave out events whose polarity the camera did not give; RAW formats cannot hold them."""
+    force: bool = False
+    """Replace the file where it exists."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Convert, with a progress bar over the events."""
+        refuse_existing(self.out, self.force)
+        if self.out.exists() and self.file.exists() and self.out.samefile(self.file):
+            raise ConfigError(f"{self.out} is the file that is read; give another name")
+        recording = self.reading.open(self.file, self.on_error)
+        cut = self.taking.cut(self.keep_known_polarity)
+        with EventWriter(self.out, format=self.format) as writer:
+            for piece in counted(recording.pieces(cut), self.out.name):
+                writer.write(piece)
+            if not writer.events:
+                writer.write(recording.blank(cut))
+        report = recording.report
+        if not report.clean:
+            say(f"note: {report}")
+        if report.geometry_from in ("assumed", "events"):
+            say(f"note: the sensor size {report.width} x {report.height} is a guess; give --width and --height")
+        size = self.out.stat().st_size
+        about = {"out": str(self.out), "events": writer.events, "bytes": size, "faults": dict(report.faults)}
+        about |= {"width": report.width, "height": report.height, "geometry_from": report.geometry_from}
+        result(self.json, about, f"{self.out}: {writer.events:,} events, {amount(size, 'B')}")
+
+
+_SOURCES = {
+    "caller": "as given",
+    "header": "from the file",
+    "camera": "from the camera that the file names",
+    "format": "of this format's only sensor",
+    "events": "from the largest coordinates: the sensor may be larger",
+    "assumed": "assumed, the file does not say: give --width and --height",
+}
+
+
+@dataclass(frozen=True)
+class InfoCommand:
+    """Show what an event file holds: sensor, rates, polarity, silences. Damage is shown, not refused."""
+
+    file: EventFile
+    """Event file of any format that is read; it may be larger than memory."""
+    reading: Flat[Reading] = field(default_factory=Reading)
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Read the file once and print."""
+        recording = self.reading.open(self.file, "salvage")
+        summary = summarise(counted(recording.pieces(), self.file.name))
+        found = describe(self.file.stat().st_size, recording.report, summary)
+        print(json.dumps(found) if self.json else to_text(str(self.file), found))
+
+
+def describe(size: int, report: ReadReport, summary: Summary) -> dict[str, Any]:
+    """Return everything that is shown, as plain values.
+
+    Args:
+        size: Length of the file, bytes.
+        report: What reading it found.
+        summary: What it holds.
+    """
+    known = summary.events - summary.unknown
+    busiest = summary.busiest
+    return {
+        "file": str(report.path),
+        "format": report.format,
+        "bytes": size,
+        "width": report.width,
+        "height": report.height,
+        "geometry_from": report.geometry_from,
+        "events": summary.events,
+        "first_us": summary.first_us,
+        "last_us": summary.last_us,
+        "duration_us": summary.duration_us,
+        "rate_hz": round(summary.rate_hz, 3),
+        "peak_10ms_hz": summary.peak_hz,
+        "peak_at_us": summary.peak_us,
+        "on_fraction": round(summary.on / known, 6) if known else None,
+        "polarity_known_fraction": round(known / summary.events, 6) if summary.events else None,
+        "active_pixel_fraction": round(summary.active_pixels / max(summary.width * summary.height, 1), 6),
+        "busiest_pixel": {"x": busiest[0], "y": busiest[1], "events": busiest[2]} if busiest else None,
+        "longest_silence_us": summary.longest_silence.length_us,
+        "longest_silence_at_us": summary.longest_silence.start_us,
+        "silences_over_10ms": summary.silences,
+        "columns": list(summary.columns),
+        "triggers": report.triggers,
+        "skipped": report.skipped,
+        "memory_bytes": summary.memory_bytes,
+        "faults": dict(report.faults),
+        "first_faults": list(report.first.values()),
+        "bytes_left_over": report.bytes_left_over,
+    }
+
+
+def to_text(name: str, found: dict[str, Any]) -> str:
+    """Return the found values as lines for people."""
+    rows = [("sensor", f"{found['width']} x {found['height']} ({_SOURCES[found['geometry_from']]})")]
+    if not found["events"]:
+        rows.append(("events", "none"))
+    else:
+        rows += _event_rows(found)
+    if found["triggers"]:
+        rows.append(("triggers", f"{found['triggers']:,} edges"))
+    if found["skipped"]:
+        rows.append(("skipped", f"{found['skipped']:,} events before the first row or time: no fault"))
+    rows.append(("memory", f"{amount(found['memory_bytes'], 'B')} as arrays"))
+    tally = ", ".join(f"{count:,} {kind.replace('_', ' ')}" for kind, count in found["faults"].items())
+    left = f"; {found['bytes_left_over']:,} bytes of no use" if found["bytes_left_over"] else ""
+    rows.append(("faults", tally + left if tally else "none"))
+    rows += [
+        ("", f"first at {line.removeprefix(f'{name}: ').split('; ')[0]}") for line in found["first_faults"]
+    ]
+    lines = [f"{name}: {found['format']}, {amount(found['bytes'], 'B')}"]
+    return "\n".join(map(printable, lines + [f"  {title:<10}{text}" for title, text in rows]))
+
+
+def _event_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
+    first, length = found["first_us"] / 1e6, found["duration_us"] / 1e6
+    busiest, window_ms = found["busiest_pixel"], WINDOW_US // 1000
+    rate = f"{amount(found['rate_hz'], 'ev/s')} on average"
+    if found["duration_us"] > WINDOW_US:
+        peak = amount(found["peak_10ms_hz"], "ev/s")
+        rate += f", {peak} in the busiest {window_ms} ms (from {_at(found['peak_at_us'])})"
+    share = 100 * busiest["events"] / found["events"]
+    silence = (
+        f"the longest {found['longest_silence_us'] / 1e3:.3g} ms, from {_at(found['longest_silence_at_us'])}"
+    )
+    rows = [
+        ("events", f"{found['events']:,} in {length:.6g} s, from {first:.6f} s on the file's clock"),
+        ("rate", rate),
+        ("polarity", _polarity(found)),
+        (
+            "pixels",
+            f"{100 * found['active_pixel_fraction']:.3g} % sent events; the busiest is x {busiest['x']}, "
+            f"y {busiest['y']}: {busiest['events']:,} events ({share:.2g} %)",
+        ),
+        ("silence", f"{silence}; {found['silences_over_10ms']:,} of more than {window_ms} ms"),
+    ]
+    extra = [name for name in found["columns"] if name not in ("t_us", "x", "y", "p")]
+    return rows + ([("columns", f"also {', '.join(extra)}")] if extra else [])
+
+
+def _at(time_us: int) -> str:
+    return f"{time_us / 1e6:.6g} s"
+
+
+def _polarity(found: dict[str, Any]) -> str:
+    on, known = found["on_fraction"], found["polarity_known_fraction"]
+    if on is None:
+        return "unknown: the file gives none"
+    part = f"{100 * on:.1f} % ON, {100 * (1 - on):.1f} % OFF"
+    return part if known == 1 else f"{part} of the {100 * known:.1f} % of events whose polarity is known"
+
+
+_RATE_HZ = 12.5  # pictures a second of an animation
+_FRAMES = {".gif": 40, ".png": 8}
+_COLUMNS = 4
+
+
+@dataclass(frozen=True)
+class PreviewCommand:
+    """Show an event file as an animation (.gif) or as a sheet of pictures (.png)."""
+
+    file: EventFile
+    """Event file of any format that is read; it may be larger than memory. Damage is left out."""
+    out: Path | None = None
+    """The picture, .gif or .png; by default the file's name with .gif, in the current folder."""
+    style: Style = "polarity"
+    """polarity: the events of each window by sign; surface: each pixel's newest event, fading."""
+    frames: int | None = None
+    """Number of windows, spread evenly over the recording; by default 40 (.gif) or 8 (.png)."""
+    window_ms: float | None = None
+    """Length of a window, milliseconds; by default as long as it takes to show something."""
+    background: Background = "dark"
+    """dark or light."""
+    side: int = 480
+    """About the longest side of a picture, pixels; larger sensors are added up, smaller ones magnified."""
+    reading: Flat[Reading] = field(default_factory=Reading)
+    taking: Flat[Taking] = field(default_factory=Taking)
+
+    def run(self) -> None:
+        """Read the file twice, to see how much it holds and to draw it, and write the picture."""
+        out = self.out or Path(self.file.name).with_suffix(".gif")
+        look = look_of(out, self.style, self.background, self.frames, self.window_ms, self.side)
+        recording = self.reading.open(self.file, "salvage")
+        size = write_preview(recording, self.taking.cut(), out, look)
+        print(f"{out}: {look.frames} pictures, {amount(size, 'B')}")
+
+
+def look_of(
+    out: Path,
+    style: Style = "polarity",
+    background: Background = "dark",
+    frames: int | None = None,
+    window_ms: float | None = None,
+    side_px: int = 480,
+) -> Look:
+    """Return the look of a preview, checked against the ending of its file."""
+    if out.suffix.lower() not in _FRAMES:
+        raise ConfigError(f"{out}: a preview ends in {' or '.join(_FRAMES)}; give such a name")
+    if not out.parent.is_dir():
+        raise ConfigError(f"{out}: no such folder {out.parent}; create it first")
+    return Look(
+        style, background, _FRAMES[out.suffix.lower()] if frames is None else frames, window_ms, side_px
+    )
+
+
+def write_preview(recording: Recording, cut: Cut, out: Path, look: Look) -> int:
+    """Write the preview of a recording and return the size of the file, bytes."""
+    from evnlos.report.pictures import save_animation, save_png, strip
+
+    summary = summarise(counted(recording.pieces(cut), out.name))
+    if not summary.events:
+        raise DataError(f"{recording.path}: no events to show; see evnlos info {recording.path}")
+    pieces = counted(recording.pieces(cut), out.name, summary.events)
+    pictures = preview_pictures(pieces, summary, look)
+    if out.suffix.lower() == ".gif":
+        save_animation(out, pictures, _RATE_HZ)
+    else:
+        save_png(out, strip(pictures, _COLUMNS))
+    return out.stat().st_size

@@ -1,0 +1,308 @@
+"""Commands that show results: `reconstruct`, `track`, `identify`, `report`.
+
+- `evnlos reconstruct`: capture and weights in, pictures out.
+- `evnlos track`: a capture in, the path and the speed of the hidden object out.
+- `evnlos identify`: a setup in, what it can show at all out.
+- `evnlos report`: runs in, one HTML page out.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+from evnlos.analysis.linearized import Bench
+from evnlos.cli.console import Flat, Folders, result
+from evnlos.cli.parsing import say
+from evnlos.errors import ConfigError
+from evnlos.files import write_atomically
+from evnlos.tracking import Tracking
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from evnlos.data import Capture
+    from evnlos.tracking import Track
+
+
+@dataclass(frozen=True)
+class ReconstructCommand:
+    """Reconstruct all positions of a capture: pictures, a film strip and an animation."""
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Capture folder; its target may be unknown."""
+    weights: Path | None = None
+    """Weights file, run's folder, or name of published weights (`evnlos weights` lists them); none takes the
+    published ones for frames of the setup with the nearest distance, of whole passes if the motion is known or
+    found (--track)."""
+    out: Path = Path("reconstruction")
+    """Folder for the pictures; new or empty."""
+    pattern: Path | None = None
+    """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
+    setup: Path | None = None
+    """The calibrated setup: the folder that `calibrate` wrote, or the settings file in it. Its fixed pattern is
+    taken from the frames, the pictures are moved to where its wall agrees with the frames, and it is printed
+    how much of the frames they explain. No name such as main-near: that needs the light and the camera of this
+    very setup. Without it, published weights explain the frames by the setup that they were trained for."""
+    track: bool = False
+    """Find the motion in the recording, as `evnlos track` does, also where capture.yaml states it; needs
+    --setup, and takes about a minute."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Reconstruct and print where the pictures are."""
+        from evnlos.data import load_pattern
+        from evnlos.report import reconstruct_capture
+        from evnlos.setups import calibrated_folder, load_setup
+
+        folder = calibrated_folder(self.setup) if self.setup else None
+        source = self.pattern or folder
+        pattern = load_pattern(source) if source else None
+        setup = load_setup(folder) if folder else None
+        found = reconstruct_capture(
+            self.capture, self.weights, self.out, pattern=pattern, setup=setup, track=self.track
+        )
+        for warning in found.get("warnings", []):
+            say(f"warning: {warning}")
+        if self.json:
+            print(json.dumps(found | {"out": str(self.out)}))
+            return
+        print(f"{self.out}: {found['positions']} positions of {found['capture']} by {found['weights']}")
+        if not found.get("moved_by_the_rig", True):
+            print(
+                f"the light is {found['light']:.2f} x that of the setup: its gain is not this capture's, the "
+                "pictures stay as the network draws them; calibrate at this exposure, on known targets"
+            )
+        print(_said(found["confidence"]) if "confidence" in found else found["no_confidence"])
+        if "scores" in found:
+            print("  ".join(f"{name} {value}" for name, value in found["scores"].items() if value is not None))
+
+
+def _said(confidence: dict[str, Any]) -> str:
+    """Return what there is to say of the pictures' worth, in one line."""
+    words = [confidence["verdict"]]
+    if "explained" not in confidence:
+        words.append("not checked against the frames: give the calibrated --setup")
+    elif confidence["measured"]:
+        share = 100 * confidence["explained"]
+        words.append(f"of what the average object leaves unexplained in the frames they explain {share:.0f} %")
+    return "; ".join(words)
+
+
+@dataclass(frozen=True)
+class TrackCommand:
+    """Follow the hidden object of a capture: position, speed and direction over time, with errors."""
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """Capture folder; what it says of the motion serves for comparison only."""
+    setup: Path | None = None
+    """Setup of the capture (a file, or the folder that `evnlos calibrate` wrote): positions in metres; without
+    it they are in image pixels."""
+    pattern: Path | None = None
+    """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated rig."""
+    out: Path = Path("track.png")
+    """The picture; the numbers go to the same name with .json."""
+    json: bool = False
+    """Print one JSON object."""
+    settings: Flat[Tracking] = field(default_factory=Tracking)
+
+    def run(self) -> None:
+        """Follow, print, write the picture."""
+        from evnlos.cli.invert_captures import linear_setup
+        from evnlos.data import load_pattern, read_capture
+        from evnlos.plot.results import draw_track
+        from evnlos.tracking import track_capture, track_doubts
+
+        capture = read_capture(self.capture)
+        setup = None if self.setup is None else linear_setup(self.setup)
+        pattern = None if self.pattern is None else load_pattern(self.pattern)
+        track = track_capture(capture, setup, self.settings, pattern)
+        truth = true_path(capture, track.time_s) if track.unit == "m" else None
+        found = figures(capture, track, truth)
+        found["warnings"] = track_doubts(capture, setup, track)
+        found["picture"] = str(draw_track(track, self.out, truth, capture.name))
+        text = json.dumps({**found, "track": track.summary()})
+        write_atomically(self.out.with_suffix(".json"), text.encode())
+        print(json.dumps(found) if self.json else to_text(found))
+        for doubt in found["warnings"]:
+            say(f"warning: {doubt}")
+
+
+def true_path(capture: Capture, t_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the middle of the target's light, [T, 2], metres; None where target or motion is unknown."""
+    scene = capture.scene
+    if scene is None:
+        return None
+    mask = scene.target.mask.astype(np.float64)
+    along = ((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * scene.target.size_m
+    middle = np.array([mask.sum(axis=0) @ along, mask.sum(axis=1) @ along]) / mask.sum()
+    return scene.motion.position_m(t_s) + middle
+
+
+def figures(capture: Capture, track: Track, truth: NDArray[np.float64] | None) -> dict[str, Any]:
+    """Return what the command prints: means, and errors where the truth is known."""
+    step = track.position[-1] - track.position[0]
+    found: dict[str, Any] = {
+        "capture": capture.name,
+        "unit": track.unit,
+        "frames": len(track.frame_time_s),
+        "event_windows": track.event_windows,
+        "travel": float(np.hypot(*step)),
+        "direction_deg": float(np.degrees(np.arctan2(step[1], step[0]))),
+        "mean_speed": float(track.speed.mean()),
+        "position_sigma": float(track.position_sigma.mean()),
+        "speed_sigma": float(track.speed_sigma.mean()),
+        "size_change": float(track.size[-1] / track.size[0]),
+    }
+    if track.misfit is not None:
+        found["misfit"] = track.misfit
+    if track.distance is not None:
+        away = track.distance
+        found["distance"] = [float(away.distance_m[0]), float(away.distance_m[-1])]
+        found["distance_sigma"] = float(away.distance_sigma.mean())
+        found["retreat"] = float((away.distance_m[-1] - away.distance_m[0]) / np.ptp(away.time_s))
+        found["distance_spread"] = float(away.distance_m.std())
+    if truth is not None:
+        error = track.position - truth
+        rate = np.gradient(truth, track.time_s, axis=0)
+        speed = np.hypot(rate[:, 0], rate[:, 1])
+        found["position_offset"] = error.mean(axis=0).tolist()
+        found["position_error"] = float(np.sqrt(np.square(error - error.mean(axis=0)).sum(axis=1).mean()))
+        found["speed_error_percent"] = float(
+            100 * np.sqrt(np.mean(np.square(track.speed - speed))) / np.sqrt(np.mean(np.square(speed)))
+        )
+    return found
+
+
+def to_text(found: dict[str, Any]) -> str:
+    """Return the figures as lines for people."""
+    scale, unit = (1000.0, "mm") if found["unit"] == "m" else (1.0, "px")
+    lines = [
+        f"{found['capture']}: {found['frames']} frames, {found['event_windows']} windows of events",
+        f"travel      {scale * found['travel']:8.2f} {unit}, direction {found['direction_deg']:.1f} deg"
+        + ("" if unit == "mm" else "; image pixels: give --setup for metres"),
+        f"mean speed  {scale * found['mean_speed']:8.3f} {unit}/s, "
+        f"+- {scale * found['speed_sigma']:.3f} at an instant",
+        f"position    {scale * found['position_sigma']:8.3f} {unit} standard deviation"
+        + (" by the noise; the rig's own errors come on top" if unit == "mm" else ""),
+        f"size        {found['size_change']:8.3f} at the end over the start",
+    ]
+    if "misfit" in found:
+        lines.append(
+            f"misfit      {found['misfit']:8.2f} times the noise is left in the frames by plate and rig"
+        )
+    if "distance" in found:
+        first, last = (scale * v for v in found["distance"])
+        lines.append(
+            f"distance    {first:8.2f} {unit} at the start, {last:.2f} {unit} at the end, "
+            f"+- {scale * found['distance_sigma']:.2f} {unit}; "
+            f"{scale * found['distance_spread']:.2f} {unit} rms about its mean, which is the rig's"
+        )
+    if "position_error" in found:
+        x, y = (scale * v for v in found["position_offset"])
+        lines.append(
+            f"error       {scale * found['position_error']:8.3f} {unit} rms about an offset of "
+            f"({x:.2f}, {y:.2f}) {unit}; speed {found['speed_error_percent']:.2f} % rms"
+        )
+    return "\n".join([*lines, found["picture"]])
+
+
+@dataclass(frozen=True)
+class IdentifyCommand:
+    """Say what a setup can show at all: modes above the noise, finest stroke, best linear picture, in words."""
+
+    setups: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names (main-near, matte-far, ..., simulate-paper), settings files, folders of `calibrate`, files of
+    `scan import`."""
+    setup: tuple[str, ...] = ()
+    """The same, as in the other commands."""
+    all: bool = False
+    """All named walls, as a table."""
+    out: Path | None = None
+    """Folder for a figure of each setup and identify.json with all curves."""
+    json: bool = False
+    """Print one JSON object, or a list where several setups are asked for."""
+    seed: int = 0
+    """Seed of the one noisy picture of the figure."""
+    bench: Flat[Bench] = field(default_factory=Bench)
+
+    def run(self) -> None:
+        """Identify and print."""
+        from tqdm import tqdm
+
+        from evnlos.analysis.identify import identify, rig_table
+        from evnlos.plot.results import draw_identification, draw_rigs
+        from evnlos.setups import named_setup, setup_names
+
+        names = [*self.setups, *self.setup, *(setup_names() if self.all else [])]
+        if not names:
+            raise ConfigError(
+                f"no setup given; give a settings file, --all, or names: {', '.join(setup_names())}"
+            )
+        setups = [named_setup(name) for name in names]
+        found = [
+            identify(one.setup, self.bench, one.name, self.seed)
+            for one in tqdm(setups, desc="identify", unit=" setups", disable=len(setups) == 1)
+        ]
+        if self.out is not None:
+            self.out.mkdir(parents=True, exist_ok=True)
+            for one in found:
+                draw_identification(one, self.out / f"identify_{one.name}.png")
+            if len(found) > 1:
+                draw_rigs(found, self.out / "identify_rigs.png")
+            curves = json.dumps([one.summary(arrays=True) for one in found], indent=1)
+            write_atomically(self.out / "identify.json", curves.encode())
+        if self.json:
+            plain = [one.summary() for one in found]
+            print(json.dumps(plain if len(plain) > 1 else plain[0]))
+            return
+        print(rig_table(found))
+        for one in found:
+            print(f"{one.name}: {one.verdict}")
+            for warning in one.warnings:
+                say(f"warning: {one.name}: {warning}")
+        if self.out is not None:
+            print(f"{self.out}: figures and identify.json")
+
+
+@dataclass(frozen=True)
+class ReportCommand:
+    """Score runs on the same captures and write one self-contained HTML page, with a CSV beside it."""
+
+    runs: Folders
+    """Folders of the runs."""
+    data: Path
+    """Folder of the dataset to score on."""
+    split: str = "test"
+    """Split to score."""
+    setup: str | None = None
+    """The setup: a name, a settings file, or the folder that `calibrate` wrote, as `identify` takes it: it is
+    drawn, and what it can show stands beside the results. The setup of a simulated dataset is known."""
+    out: Path = Path("report.html")
+    """The page."""
+    json: bool = False
+    """Print one JSON object: mean scores of each run and baseline."""
+
+    def run(self) -> None:
+        """Evaluate the runs and write the page."""
+        from evnlos.analysis.identify import identify
+        from evnlos.report import gather, to_text, write_report
+        from evnlos.report.tables import baselines_of
+        from evnlos.setups import named_setup
+
+        dataset, results = gather(list(self.runs), self.data, self.split)
+        setup = None if self.setup is None else named_setup(self.setup)
+        limits = None if setup is None else identify(setup.setup, name=setup.name)
+        if setup is None and dataset.origin == "simulation":
+            setup = named_setup(self.data / "dataset.yaml")
+        path = write_report(self.out, dataset, results, [], self.split, setup, limits)
+        about: dict[str, Any] = {"report": str(path), "csv": str(path.with_suffix(".csv"))}
+        about["runs"] = {r.name: r.evaluation.scores.mean() for r in results}
+        about["baselines"] = {name: scores.mean() for name, scores in baselines_of(results).items()}
+        result(self.json, about, f"{to_text(results)}\nreport: {path}")

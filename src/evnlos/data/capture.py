@@ -1,0 +1,371 @@
+"""A capture: one real (or pseudo-real) shot as a folder of frames, events and what is known about them.
+
+- Real recordings become the same kind of dataset as simulated ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.config import config_hash, to_dict
+from evnlos.data.capture_info import CaptureInfo, RegistrationInfo, TargetInfo, read_capture_info
+from evnlos.data.cleaning import (
+    FixedPattern,
+    check_rectangle,
+    correct_frames,
+    crop_events,
+    find_hot_pixels,
+    keep_supported,
+    without_pixels,
+)
+from evnlos.data.clocks import find_offset
+from evnlos.data.frame_sources import FrameSeries, inside, read_frame_series, read_image
+from evnlos.data.registration import find_dots, homography_from_points, registration_error, warp_frames
+from evnlos.data.sampling import Samples, Sampling, make_samples
+from evnlos.data.store import Dataset, claim_dataset, write_shard
+from evnlos.errors import DataError, printable
+from evnlos.events import CelexOptions, event_histogram, keep_known_polarity, read_events, read_triggers
+from evnlos.progress import Progress, Step, silent
+from evnlos.scene import LineMotion, Scene, Target
+from evnlos.types import Events
+from evnlos.untrusted import check_memory
+
+_MOST_US = 2**62  # of a time stamp: differences of two fit into 64 bits
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """One shot, read and checked: frames and events on the same pixels and the same clock.
+
+    Args:
+        name: Name of the capture, that of its folder.
+        info: What `capture.yaml` says.
+        events: The event stream.
+        frames: Frames, uint8 or uint16 [N, H, W], digital numbers.
+        frame_times_us: Time of each frame, int64 [N], microseconds, on the events' clock.
+        target: The hidden plate, or None where it is unknown.
+        notes: What reading did to the recordings, a line each.
+    """
+
+    name: str
+    info: CaptureInfo
+    events: Events
+    frames: NDArray[np.uint8] | NDArray[np.uint16]
+    frame_times_us: NDArray[np.int64]
+    target: Target | None
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def peak(self) -> int:
+        """Largest digital number that a frame can hold."""
+        return int(np.iinfo(self.frames.dtype).max)
+
+    @property
+    def distance_m(self) -> float | None:
+        """From hidden object to wall, metres, as noted in `rig`; None where it is not, or is no length."""
+        noted = self.info.rig.get("distance_m")
+        if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not 0 < noted < float("inf"):
+            return None
+        return float(noted)
+
+    @property
+    def motion(self) -> LineMotion | None:
+        """The target's motion on the events' clock; None where it is unknown."""
+        motion = self.info.motion
+        if motion is None:
+            return None
+        direction = np.asarray(motion.direction, dtype=float)
+        start = motion.start_m
+        if not isinstance(start, tuple):
+            along = start * direction / np.hypot(*direction)
+            start = (float(along[0]), float(along[1]))
+        return LineMotion(start, motion.speed_m_s, motion.direction, motion.start_us * 1e-6)
+
+    @property
+    def scene(self) -> Scene | None:
+        """The target and its motion on the events' clock; None where either is unknown."""
+        motion = self.motion
+        if self.target is None or motion is None:
+            return None
+        return Scene(self.target, motion, duration_s=max(float(self.frame_times_us[-1]) * 1e-6, 1e-6))
+
+
+def read_capture(folder: str | Path, most_frame_bytes: int | None = None) -> Capture:
+    """Read a capture folder: `capture.yaml`, the event file, the frames and the target's mask.
+
+    The order is: dark frame and flat field, registration, filters of the events, clock, region of interest.
+
+    Args:
+        folder: The folder of one shot.
+        most_frame_bytes: Memory that its frames may take, bytes; None = a quarter of what is free, up to 2 GiB.
+
+    Raises:
+        DataError: A file is missing, a frame has another size than the camera, or clock or pixels do not fit.
+        ConfigError: `capture.yaml` has an unknown key or a wrong type.
+        EventFileError: The event file is damaged.
+        MissingDependencyError: A file needs an optional package.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError(f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)")
+    info = read_capture_info(folder)
+    series = read_frame_series(folder, info, most_frame_bytes)
+    notes = [f"{len(series.images)} frames from {series.what}"]
+    events, told = _read_events(folder, info)
+    notes += told
+    frames, told = _prepare_frames(folder, info, series)
+    notes += told
+    times_us, told = _place_in_time(folder, info, events, frames, series.times_us)
+    notes += told
+    roi = info.roi
+    if roi is not None:
+        check_rectangle(events.shape, roi.x, roi.y, roi.width, roi.height)
+        events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
+        frames = frames[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width]
+        notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
+    if not len(events):
+        raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
+    target = _read_target(folder, info.target)
+    return Capture(
+        folder.name, info, events, np.ascontiguousarray(frames), times_us, target, tuple(map(printable, notes))
+    )
+
+
+def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
+    path, camera = inside(folder, info.events), info.camera
+    options = CelexOptions(clock_mhz=camera.clock_mhz) if camera.clock_mhz is not None else None
+    events = read_events(path, width=camera.width, height=camera.height, celex=options)
+    if not len(events):
+        raise DataError(f"{path} holds no event; check the camera's thresholds and the recording")
+    notes = [f"{len(events):,} events from {path.name}"]
+    if events.polarity_known is not None and not events.polarity_known.any():
+        notes.append("the camera gave no polarity: all events count as darker")
+        events = replace(events, polarity_known=None)
+    elif events.polarity_known is not None:
+        count = len(events)
+        events = keep_known_polarity(events)
+        notes.append(f"{count - len(events):,} events without polarity left out")
+    filters = info.filters
+    if filters.hot_pixel_factor is not None:
+        hot, count = find_hot_pixels(events, filters.hot_pixel_factor), len(events)
+        events = without_pixels(events, hot)
+        notes.append(f"{int(hot.sum())} hot pixels with {count - len(events):,} events left out")
+    if filters.background_us is not None:
+        count = len(events)
+        events = keep_supported(events, filters.background_us)
+        notes.append(
+            f"{count - len(events):,} events without a neighbour in {filters.background_us} us left out"
+        )
+    if not len(events):
+        raise DataError(f"{path}: no event is left; check the filters in capture.yaml")
+    return events, notes
+
+
+def _prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[NDArray, list[str]]:
+    """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
+    frames, notes = series.images, []
+    size = frames.shape[1:]
+    peak = float(np.iinfo(frames.dtype).max)
+    changed = None
+    if info.dark is not None or info.flat is not None:
+        dark, flat = (
+            read_image(inside(folder, name), size) if name else None for name in (info.dark, info.flat)
+        )
+        changed = correct_frames(frames, peak, dark, flat)
+        notes.append(f"frames corrected by {' and '.join(name for name in (info.dark, info.flat) if name)}")
+    if info.frames_turned:
+        frames = frames[:, ::-1, ::-1]
+        changed = None if changed is None else changed[:, ::-1, ::-1]
+        notes.append("frames turned by 180 degrees")
+    if info.registration is not None:
+        matrix, how = _homography(folder, info.registration, info)
+        shape = (info.camera.height, info.camera.width)
+        check_memory(
+            16 * len(frames) * shape[0] * shape[1], f"{folder}: registering its frames", "leave frames out"
+        )
+        changed, covered = warp_frames(frames / np.float32(peak) if changed is None else changed, matrix, shape)
+        notes.append(
+            f"frames registered by {how}; they cover {100 * float(covered.mean()):.0f} % of the events' view"
+        )
+    if changed is None:
+        return frames, notes
+    return np.round(changed * 65_535).astype(np.uint16), notes
+
+
+def _homography(folder: Path, info: RegistrationInfo, capture: CaptureInfo) -> tuple[NDArray[np.float64], str]:
+    """Return the matrix from frame to event pixels, and how it was found."""
+    if info.homography is not None:
+        return np.array(info.homography), "the homography stated"
+    if info.points is not None:
+        pairs = np.array(info.points, float).reshape(-1, 4)
+        frame, event, how = pairs[:, :2], pairs[:, 2:], f"{len(pairs)} points"
+    else:
+        dots = info.dots
+        assert dots is not None
+        picture = read_image(inside(folder, dots.frame))
+        if capture.frames_turned:
+            picture = picture[::-1, ::-1]
+        seen = read_events(
+            inside(folder, dots.events), width=capture.camera.width, height=capture.camera.height
+        )
+        frame = find_dots(picture, dots.rows, dots.columns)
+        event = find_dots(event_histogram(seen)[0].sum(axis=0), dots.rows, dots.columns)
+        how = f"{dots.rows} x {dots.columns} dots"
+    matrix = homography_from_points(frame, event)
+    return matrix, f"{how} (rms error {registration_error(matrix, frame, event):.2f} pixels)"
+
+
+def _place_in_time(
+    folder: Path, info: CaptureInfo, events: Events, frames: NDArray, times_us: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], list[str]]:
+    """Return the frames' times on the events' clock."""
+    alignment = info.alignment
+    if alignment.trigger_channel is not None:
+        triggers = read_triggers(inside(folder, info.events))
+        chosen = triggers.t_us[triggers.rising & (triggers.channel == alignment.trigger_channel)]
+        if len(chosen) != len(frames):
+            raise DataError(
+                f"{folder / info.events}: {len(chosen)} rising edges on channel {alignment.trigger_channel} "
+                f"for {len(frames)} frames; check the channel, or leave out frames without an edge"
+            )
+        if len(chosen) and max(abs(int(chosen[0])), abs(int(chosen[-1]))) > _MOST_US // 2:
+            raise DataError(f"{folder / info.events}: its triggers are later than {_MOST_US // 2} us")
+        return chosen + int(alignment.offset_us), [
+            f"frame times from trigger channel {alignment.trigger_channel}"
+        ]
+    if alignment.offset_us != "auto":
+        offset = int(alignment.offset_us)
+        if abs(int(times_us[0]) + offset) > _MOST_US or abs(int(times_us[-1]) + offset) > _MOST_US:
+            raise DataError(f"{folder}: frames shifted by {offset} us leave +-{_MOST_US} us; check offset_us")
+        return times_us + offset, [f"frames' clock shifted by {offset} us"] if offset else []
+    try:
+        found = find_offset(
+            events, frames, times_us, search_us=round(alignment.search_s * 1e6), blocks=alignment.blocks
+        )
+    except DataError as error:
+        raise DataError(f"{folder}: {error}") from None
+    return times_us + found.offset_us, [
+        f"frames' clock shifted by {found.offset_us} us, found: correlation {found.correlation:.2f}, "
+        f"{found.ratio:.1f} times the next best, lobe {found.lobe_us / 1000:.0f} ms wide"
+    ]
+
+
+def _read_target(folder: Path, info: TargetInfo | None) -> Target | None:
+    if info is None or info.mask is None:
+        return None
+    mask = read_image(inside(folder, info.mask))
+    return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.plate_m)
+
+
+def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern | None = None) -> Samples:
+    """Return one sample for each frame but the first: the frame, and the events since the frame before.
+
+    Args:
+        capture: The shot.
+        sampling: Resolution and representation.
+        pattern: Fixed pattern to take from the frames.
+
+    Raises:
+        DataError: The capture has fewer than two frames.
+    """
+    if len(capture.frames) < 2:
+        raise DataError(
+            f"{capture.name} has {len(capture.frames)} frame(s); a sample needs two, with events between"
+        )
+    frames, peak = capture.frames[1:], float(capture.peak)
+    if pattern is not None:
+        frames, peak = pattern.correct(frames, peak), 1.0
+    known = {"motion": capture.motion, "target": capture.target}
+    return make_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
+
+
+def import_captures(
+    folders: Iterable[str | Path],
+    out: str | Path,
+    sampling: Sampling = Sampling(),
+    *,
+    test: Iterable[str] = (),
+    validation: Iterable[str] = (),
+    pattern: FixedPattern | None = None,
+    look: Callable[[Capture], None] | None = None,
+    progress: Progress = silent,
+) -> Dataset:
+    """Import capture folders as a dataset, or what is missing of it, and return it.
+
+    Args:
+        folders: Capture folders; the folder's name becomes the object's name, the part behind the last
+            underscore its character (`near_R` -> R).
+        out: The dataset's folder; new, or begun with the same captures and settings.
+        sampling: Resolution and representation.
+        test: Names of captures, or characters, that are held out for testing.
+        validation: The same for validation.
+        pattern: Fixed pattern of the frame camera, to be taken from all frames.
+        look: Called with each capture that was read, before its samples are made: to tell of it, or to draw it.
+        progress: Called when the work begins and as each shard is in place, with the capture's name.
+
+    Returns:
+        The dataset.
+
+    Raises:
+        DataError: No folder, two captures of one name, or a held-out name that no capture has.
+    """
+    given = [Path(folder).resolve() for folder in folders]
+    paths = {path.name: path for path in given}
+    if not paths:
+        raise DataError("no captures given; name at least one capture folder")
+    if len(paths) != len(given):
+        raise DataError(f"{len(given)} folders have {len(paths)} different names; rename those that share one")
+    split = _split(list(paths), list(test), list(validation))
+    # Read every description first: a wrong folder is an error before anything is written.
+    for path in paths.values():
+        if not (path / "capture.yaml").is_file():
+            raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
+    described = {name: config_hash(read_capture_info(path)) for name, path in sorted(paths.items())}
+    config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
+    dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
+    first = next(iter(paths.values()))
+    captures: dict[str, Capture] = {first.name: read_capture(first)}
+    with claim_dataset(dataset):
+        what, total, missing = f"import {dataset.folder.name}", len(paths), dataset.missing()
+        progress(Step(what, total - len(missing), total, "captures"))
+        for done, name in enumerate(missing, start=total - len(missing) + 1):
+            capture = captures.pop(name, None) or read_capture(paths[name])
+            if look is not None:
+                look(capture)
+            samples = capture_samples(capture, sampling, pattern)
+            camera = capture.info.camera.name
+            attributes = {"object": name, "config_hash": dataset.config_hash, "camera": camera}
+            write_shard(dataset.shard(name), samples, attributes)
+            progress(Step(what, done, total, "captures", name))
+    return dataset
+
+
+def character_of(name: str) -> str:
+    """Return what an object shows, from its name: the part behind the last underscore.
+
+    Example:
+        >>> character_of("near_R"), character_of("writer03_A")
+        ('R', 'A')
+    """
+    return name.rsplit("_", 1)[-1]
+
+
+def _split(names: list[str], test: list[str], validation: list[str]) -> dict[str, list[str]]:
+    split: dict[str, list[str]] = {"train": [], "validation": [], "test": []}
+    for wanted in (*test, *validation):
+        if not any(wanted in (name, character_of(name)) for name in names):
+            raise DataError(
+                f"no capture is named {wanted} or shows it; held-out names must be among the captures"
+            )
+    for name in names:
+        keys = {name, character_of(name)}
+        in_test, in_validation = bool(keys & set(test)), bool(keys & set(validation))
+        if in_test and in_validation:
+            raise DataError(f"{name} is held out for testing and for validation; choose one")
+        split["test" if in_test else "validation" if in_validation else "train"].append(name)
+    return split

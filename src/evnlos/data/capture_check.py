@@ -1,0 +1,366 @@
+"""Is a shot worth a day of recordings? What was recorded, in plain words, and how to mend it.
+
+- One picture a capture, for the eye: do frames and events show the same thing at the same time?
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from evnlos.data.capture import Capture
+from evnlos.data.cleaning import find_hot_pixels
+from evnlos.data.clocks import LEAST_AGREEMENT, find_lag
+from evnlos.data.sampling import reduce_by_area
+from evnlos.events import event_histogram
+from evnlos.events.grids import OFF_RGB, ON_RGB
+from evnlos.types import Events
+
+Level = Literal["good", "doubtful", "bad"]
+
+_DARK_DN, _BORDER = 3, 0.08
+_BLOCK = 6  # pixels: single ones tell nothing of the light
+_FLICKER_HZ = ((99.0, 101.0), (119.0, 121.0))  # twice the mains' frequency
+_FLICKER_BIN_S = 0.001
+_FEWEST_EVENTS = 2_000
+_FEWEST_S = 0.5  # a shorter recording tells no line in its spectrum
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Args:
+        what: Name of the check.
+        level: "good", "doubtful" (look at it) or "bad" (a reconstruction will suffer).
+        found: What was measured, with its unit and the limit.
+        cure: What to do; empty where nothing is to do.
+    """
+
+    what: str
+    level: Level
+    found: str
+    cure: str = ""
+
+
+def check_capture(capture: Capture) -> list[Finding]:
+    """Return what a capture is worth, check by check: light, contrast, movement, place, events, clock.
+
+    Args:
+        capture: A capture that could be read.
+    """
+    return [
+        *_light(capture),
+        *_movement(capture),
+        *_events(capture),
+        *_flicker(capture),
+        *_clock(capture),
+        *_offset(capture),
+    ]
+
+
+def _judged(what: str, good: bool, bearable: bool, found: str, cure: str) -> Finding:
+    """Return a finding with its level; the cure stands only where something is to do."""
+    if good:
+        return Finding(what, "good", found)
+    return Finding(what, "doubtful" if bearable else "bad", found, cure)
+
+
+def _light(capture: Capture) -> Iterator[Finding]:
+    frames, peak = capture.frames, capture.peak
+    clipped = float((frames >= peak).mean())
+    yield _judged(
+        "saturation",
+        clipped < 1e-3,
+        clipped < 0.02,
+        f"{100 * clipped:.2f} % of the frames' pixels are clipped",
+        "shorten the exposure, close the aperture, or dim the ambient light",
+    )
+    share = float(np.median(frames) / peak)
+    dark = float((frames <= _DARK_DN).mean())
+    yield _judged(
+        "brightness",
+        dark < 0.05,
+        dark < 0.5,
+        f"the middle pixel is at {100 * share:.0f} % of the range; {100 * dark:.0f} % are darker than "
+        f"{_DARK_DN + 1} digital numbers",
+        "lengthen the exposure, open the aperture, or bring the wall nearer",
+    )
+
+
+def _movement(capture: Capture) -> Iterator[Finding]:
+    """Look at what changes in the frames beyond their noise, and where."""
+    frames = capture.frames.astype(np.float32)
+    if len(frames) < 5:
+        yield Finding("movement", "doubtful", f"{len(frames)} frames tell nothing of a movement", "record more")
+        return
+    noise = float(np.sqrt(np.mean((frames[2:] - 2 * frames[1:-1] + frames[:-2]) ** 2) / 6))
+    height, width = (max(1, round(side / _BLOCK)) for side in frames.shape[1:])
+    variance = reduce_by_area(frames.var(axis=0, ddof=1), (height, width))
+    # Of noise alone the block's variance is this sure, as a fraction; three times that is no movement.
+    sure = np.sqrt(2 / ((len(frames) - 1) * frames[0].size / (height * width)))
+    moved = np.sqrt(np.maximum(variance - noise**2 * (1 + 3 * sure), 0.0))
+    largest = float(np.quantile(moved, 0.95))
+    ratio = largest / max(noise, 1e-6)
+    yield _judged(
+        "movement",
+        ratio > 1.0,
+        ratio > 0.25,
+        f"the wall's light changes by {ratio:.2f} times the frames' noise (1 is safe)",
+        "check that the target moved and is lit, dim the ambient light, roughen less",
+    )
+    contrast = largest / max(float(np.median(frames)), 1.0)
+    yield _judged(
+        "wall contrast",
+        contrast > 0.05,
+        contrast > 0.01,
+        f"the light that moves is {contrast:.2f} times the wall's own (0.05 is safe)",
+        "dim the ambient light, light the target more, take a shinier wall",
+    )
+    if ratio <= 0.25:
+        return
+    v, u = max(1, round(_BORDER * height)), max(1, round(_BORDER * width))
+    if height < 3 * v or width < 3 * u:
+        return
+    inner = moved[v:-v, u:-u]
+    edge = np.concatenate([moved[:v].ravel(), moved[-v:].ravel(), moved[:, :u].ravel(), moved[:, -u:].ravel()])
+    outside = float(edge.mean() / max(inner.mean(), 1e-6))
+    yield _judged(
+        "region",
+        outside < 0.7,
+        outside < 1.2,
+        f"the border changes {outside:.2f} times as much as the inside (below 0.7 is safe)",
+        "turn the camera to where the light moves, or take a wider lens or region",
+    )
+
+
+def _events(capture: Capture) -> Iterator[Finding]:
+    events = capture.events
+    span_s = max(float(events.t_us[-1] - events.t_us[0]) * 1e-6, 1e-6)
+    pixels = events.width * events.height
+    rate = len(events) / span_s / pixels
+    yield _judged(
+        "event rate",
+        0.05 <= rate <= 50,
+        0.01 <= rate <= 200,
+        f"{rate:.2f} events a pixel and second (0.05 to 50 is safe)",
+        "lower the thresholds, dim the ambient light, light the target more, or move it faster"
+        if rate < 0.05
+        else "raise the thresholds, or look for flicker and a camera that shakes",
+    )
+    on = float(events.p.mean())
+    yield _judged(
+        "polarity balance",
+        0.25 < on < 0.75,
+        0.1 < on < 0.9,
+        f"{100 * on:.0f} % of the events are ON (25 to 75 % is safe)",
+        "set the thresholds of both polarities alike; a leak makes ON events alone",
+    )
+    counts = np.bincount(events.y.astype(np.int64) * events.width + events.x, minlength=pixels)
+    silent = float((counts == 0).mean())
+    yield _judged(
+        "silent pixels",
+        silent < 0.5,
+        silent < 0.9,
+        f"{100 * silent:.0f} % of the pixels sent nothing (below 50 % is safe)",
+        "lower the thresholds; a linear map of so few events shows little",
+    )
+    hot = find_hot_pixels(events)
+    share = float(counts.reshape(events.shape)[hot].sum() / len(events))
+    yield _judged(
+        "hot pixels",
+        share < 0.02,
+        share < 0.2,
+        f"{int(hot.sum())} pixels send {100 * share:.1f} % of the events (2 % is safe)",
+        "set filters: {hot_pixel_factor: 10} in capture.yaml",
+    )
+
+
+def _flicker(capture: Capture) -> Iterator[Finding]:
+    """Look for a line at twice the mains' frequency in the rate of events."""
+    t_s = (capture.events.t_us - capture.events.t_us[0]) * 1e-6
+    bins = int(t_s[-1] / _FLICKER_BIN_S)
+    if len(t_s) < _FEWEST_EVENTS or bins * _FLICKER_BIN_S < _FEWEST_S:
+        yield Finding("flicker", "doubtful", f"{len(t_s)} events are too few to tell", "record longer")
+        return
+    counts, _ = np.histogram(t_s, bins, (0.0, bins * _FLICKER_BIN_S))
+    power = np.abs(np.fft.rfft(counts - counts.mean())) ** 2
+    frequency = np.fft.rfftfreq(bins, _FLICKER_BIN_S)
+    around = np.median(power[(frequency > 80) & (frequency < 140)])
+    found = {}
+    for low, high in _FLICKER_HZ:
+        line = power[(frequency >= low) & (frequency <= high)].max(initial=0.0)
+        found[round((low + high) / 2)] = float(line / max(around, 1e-12))
+    worst = max(found, key=lambda hertz: found[hertz])
+    # The power of noise is exponential: a line 30 times its median has a chance of 1e-9 a bin.
+    yield _judged(
+        "flicker",
+        found[worst] < 30,
+        found[worst] < 300,
+        f"the rate's line at {worst} Hz is {found[worst]:.0f} times its surroundings (30 is safe)",
+        "light with direct current, or with daylight; mains lamps flicker",
+    )
+
+
+def _clock(capture: Capture) -> Iterator[Finding]:
+    frames, events = capture.frame_times_us, capture.events.t_us
+    both = min(frames[-1], events[-1]) - max(frames[0], events[0])
+    share = float(max(both, 0) / max(frames[-1] - frames[0], 1))
+    yield _judged(
+        "clock",
+        share > 0.95,
+        share > 0.5,
+        f"events cover {100 * share:.0f} % of the frames' time (95 % is safe)",
+        "check alignment in capture.yaml: offset_us, auto, or a trigger_channel",
+    )
+    steps = np.diff(frames)
+    uneven = float(np.abs(steps - np.median(steps)).max() / max(float(np.median(steps)), 1.0))
+    yield _judged(
+        "frame times",
+        uneven < 0.2,
+        True,
+        f"the most uneven step is off by {100 * uneven:.0f} % (20 % is safe)",
+        "frames were dropped or the rate changed; a position is as long as its step",
+    )
+
+
+def _offset(capture: Capture) -> Iterator[Finding]:
+    """Compare the course of the light in the frames with the events: offset, and order of the frames."""
+    lag = find_lag(capture.events, capture.frames, capture.frame_times_us)
+    if lag is None:
+        return
+    if lag.reversed:
+        yield Finding(
+            "clock offset",
+            "bad",
+            f"the events fit the frames in reversed order: correlation {lag.backwards:.2f}, forwards "
+            f"{lag.agreement:.2f}",
+            "put the frames' files into the order in which they were taken",
+        )
+        return
+    if not lag.told:
+        yield Finding(
+            "clock offset",
+            "doubtful",
+            f"frames and events share too little to tell: correlation {lag.agreement:.2f} "
+            f"({LEAST_AGREEMENT:g} is needed), frames reversed {lag.backwards:.2f}",
+            "record a blink of the light, or a trigger_channel",
+        )
+        return
+    way = "late" if lag.lag_us < 0 else "early"
+    yield _judged(
+        "clock offset",
+        abs(lag.lag_us) <= lag.limit_us,
+        False,
+        f"the frames' times are {abs(lag.lag_us) * 1e-6:.2f} s too {way} for the events (up to "
+        f"{lag.limit_us * 1e-6:.2f} s can't be told from none)",
+        _offset_cure(capture, lag.lag_us),
+    )
+
+
+def _offset_cure(capture: Capture, lag_us: int) -> str:
+    stated = capture.info.alignment.offset_us
+    if stated == "auto":
+        return f"auto went astray: state offset_us in capture.yaml, what auto found {lag_us:+d}"
+    return f"state alignment: {{offset_us: {stated + lag_us}}} in capture.yaml, or wire a trigger_channel"
+
+
+_PANEL_PX, _GAP_PX, _CAPTION_PX, _PLOT_PX = 320, 12, 24, 150
+_INK, _PAPER, _LINE = (40, 42, 48), (255, 255, 255), (210, 212, 216)
+_BINS = 200
+
+
+def check_picture(capture: Capture) -> Image.Image:
+    """Return the frame at the busiest moment, the events of its interval, both overlaid, and curves over time.
+
+    The curves are the events a second and the mean change of the frames, each on its own scale: peaks of the
+    one should stand above peaks of the other.
+
+    Args:
+        capture: A capture that was read.
+    """
+    times = capture.frame_times_us
+    rates, centres_s = _event_rate(capture.events, times)
+    changes = _frame_changes(capture.frames, capture.peak)
+    edges = np.searchsorted(capture.events.t_us, times, side="right")
+    chosen = int(np.argmax(np.diff(edges))) + 1 if len(times) > 1 else 0
+    start, stop = (int(edges[chosen - 1]), int(edges[chosen])) if chosen else (0, len(capture.events))
+    grey = _stretched(capture.frames[chosen].astype(np.float32))  # [H, W], 0..1
+    tint = _events_tint(capture.events[start:stop])  # [H, W, 3], and how strong
+    white, strength = np.full((*grey.shape, 3), 255.0), tint[1][..., None]
+    pictures = [
+        (f"frame {chosen} at {times[chosen] / 1e6:.3f} s", np.repeat(255 * grey[..., None], 3, axis=2)),
+        (f"{stop - start:,} events before it", white * (1 - strength) + tint[0] * strength),
+        ("overlay", 255 * grey[..., None] * (1 - strength) + tint[0] * strength),
+    ]
+    scale = _PANEL_PX / grey.shape[1]
+    high = max(1, round(grey.shape[0] * scale))
+    width = 3 * _PANEL_PX + 4 * _GAP_PX
+    plot_top = 2 * _CAPTION_PX + high + 2 * _GAP_PX
+    sheet = Image.new("RGB", (width, plot_top + _PLOT_PX + 2 * _CAPTION_PX), _PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
+    draw.text((_GAP_PX, 5), f"{capture.name}: {capture.info.camera.name}", _INK, font)
+    how = Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX
+    for k, (caption, picture) in enumerate(pictures):
+        left = _GAP_PX + k * (_PANEL_PX + _GAP_PX)
+        panel = Image.fromarray(np.round(picture).astype(np.uint8)).resize((_PANEL_PX, high), how)
+        sheet.paste(panel, (left, 2 * _CAPTION_PX))
+        draw.text((left, _CAPTION_PX + 4), caption, _INK, font)
+    box = (_GAP_PX, plot_top, width - _GAP_PX, plot_top + _PLOT_PX)
+    draw.rectangle(box, outline=_LINE)
+    middles_s = (times[1:] + times[:-1]) / 2e6
+    span = float(min(centres_s[0], times[0] / 1e6)), float(max(centres_s[-1], times[-1] / 1e6))
+    _curve(draw, box, span, centres_s, rates, ON_RGB)
+    _curve(draw, box, span, middles_s, changes, OFF_RGB)
+    at = box[0] + (times[chosen] / 1e6 - span[0]) / max(span[1] - span[0], 1e-9) * (box[2] - box[0])
+    draw.line((at, box[1], at, box[3]), _LINE)
+    below = box[3] + 5
+    draw.text((box[0], below), f"events a second, up to {rates.max():,.0f}", ON_RGB, font)
+    peak = f"{100 * changes.max():.2f}" if len(changes) else "0"
+    draw.text((box[0] + 260, below), f"change from frame to frame, up to {peak} % of white", OFF_RGB, font)
+    draw.text((box[2] - 170, below), f"{span[0]:.2f} s to {span[1]:.2f} s", _INK, font)
+    return sheet
+
+
+def _event_rate(events: Events, times_us: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
+    """Return events a second in equal bins over events and frames, and the bins' middles in seconds."""
+    low, high = min(events.t_us[0], times_us[0]), max(events.t_us[-1], times_us[-1]) + 1
+    counts, edges = np.histogram(events.t_us, _BINS, (float(low), float(high)))
+    return counts / (np.diff(edges) * 1e-6), (edges[1:] + edges[:-1]) / 2e6
+
+
+def _frame_changes(frames: NDArray, peak: float) -> NDArray[np.float64]:
+    """Return the mean absolute change from frame to frame, [N - 1], in parts of white.
+
+    Of blocks of 8 x 8 pixels: noise that is independent from pixel to pixel would hide the rest.
+    """
+    small = reduce_by_area(frames, (max(1, frames.shape[1] // 8), max(1, frames.shape[2] // 8)))
+    return np.abs(np.diff(small, axis=0)).mean(axis=(1, 2), dtype=np.float64) / peak
+
+
+def _stretched(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    low, high = np.percentile(picture, [1, 99.5])
+    return np.clip((picture - low) / max(high - low, 1e-6), 0, 1)
+
+
+def _events_tint(events: Events) -> tuple[NDArray, NDArray]:
+    """Return the colour of each pixel's prevailing sign, [H, W, 3], and its strength, [H, W], 0..1."""
+    on, off = event_histogram(events)[0]
+    both = on + off
+    full = np.percentile(both[both > 0], 95) if both.any() else 1.0
+    colour = np.where((on > off)[..., None], ON_RGB, OFF_RGB).astype(float)
+    return colour, np.clip(both / full, 0, 1)
+
+
+def _curve(draw: ImageDraw.ImageDraw, box, span, x: NDArray, y: NDArray, colour) -> None:
+    if len(x) < 2 or not y.max() > 0:
+        return
+    left, top, right, bottom = box
+    columns = left + (x - span[0]) / max(span[1] - span[0], 1e-9) * (right - left)
+    rows = bottom - 4 - y / y.max() * (bottom - top - 8)
+    draw.line([(float(a), float(b)) for a, b in zip(columns, rows, strict=True)], colour, 2)

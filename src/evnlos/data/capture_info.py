@@ -1,0 +1,258 @@
+"""What `capture.yaml` says about a shot; a user writes it, everything but the camera's size has a default.
+
+- The commented `capture.yaml` that a new capture folder begins with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from evnlos.config import from_dict, read_yaml
+from evnlos.errors import ConfigError, DataError
+from evnlos.files import write_atomically
+from evnlos.untrusted import MOST_SENSOR_PIXELS
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """The event camera that watched the wall, and the frames beside it."""
+
+    width: int
+    """Sensor width, pixels."""
+    height: int
+    """Sensor height, pixels."""
+    name: str = "unknown"
+    """Maker and model."""
+    frame_rate_hz: float | None = None
+    """Frames a second, hertz; the frames' times where they carry none (frame 0 at 0 on the frames' clock)."""
+    exposure_s: float | None = None
+    """Exposure of a frame, seconds."""
+    clock_mhz: int | None = None
+    """Clock of a CeleX-V sensor, MHz, where the file's name does not say it."""
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.width <= 65_536 and 1 <= self.height <= 65_536):
+            raise ConfigError(f"camera is {self.width} x {self.height} pixels; give sides of 1 to 65536")
+        if self.width * self.height > MOST_SENSOR_PIXELS:
+            raise ConfigError(
+                f"camera is {self.width} x {self.height} pixels; at most {MOST_SENSOR_PIXELS:,} are read"
+            )
+
+
+@dataclass(frozen=True)
+class TargetInfo:
+    """The hidden plate, where it is known."""
+
+    name: str
+    """What it shows, e.g. a letter."""
+    mask: str | None = None
+    """Picture of the plate, a file in the folder; white shines."""
+    plate_m: float = 0.08
+    """Side of the plate, metres."""
+
+
+@dataclass(frozen=True)
+class MotionInfo:
+    """A straight, steady motion: the plate's centre is at start_m + speed (t - start_us) along `direction`."""
+
+    start_m: float | tuple[float, float]
+    """Centre at `start_us` relative to the middle of the travel: along the direction, or (x, y), metres."""
+    speed_m_s: float
+    """Speed, metres a second."""
+    direction: tuple[float, float] = (1.0, 0.0)
+    """Direction (x to the right, y downwards)."""
+    start_us: int = 0
+    """Instant of the start on the events' clock, microseconds: the time stamp that ties the truth to the
+    shot."""
+
+
+@dataclass(frozen=True)
+class AlignmentInfo:
+    """How the frames' clock becomes the events': event time = frame time + offset."""
+
+    offset_us: int | Literal["auto"] = 0
+    """Offset, microseconds, or auto: found from what both saw change at once (a blink, a jerk)."""
+    search_s: float = 1.0
+    """Largest offset that auto looks at, seconds."""
+    blocks: int = 8
+    """Blocks of pixels along the longer side that auto compares; 1 for cameras that see different things."""
+    trigger_channel: int | None = None
+    """Input of the event camera that frame exposures are wired to: frame k is at its k-th rising edge."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.search_s <= 60:
+            raise ConfigError(f"alignment.search_s is {self.search_s}; give more than 0 and at most 60 s")
+        if self.trigger_channel is not None and self.offset_us == "auto":
+            raise ConfigError("alignment has a trigger_channel and offset_us: auto; give one of them")
+
+
+@dataclass(frozen=True)
+class DotsInfo:
+    """A grid of dots that both cameras saw: bright in a frame, blinking for the events."""
+
+    rows: int
+    """Rows of dots."""
+    columns: int
+    """Dots a row."""
+    frame: str
+    """Picture of the grid by the frame camera, a file in the folder."""
+    events: str
+    """Recording of the blinking grid by the event camera, a file in the folder."""
+
+
+@dataclass(frozen=True)
+class RegistrationInfo:
+    """How frame pixels become event pixels; one of the three."""
+
+    homography: tuple[tuple[float, float, float], ...] | None = None
+    """Three rows of three numbers that map frame (x, y, 1) to event (x, y, 1), pixels."""
+    points: tuple[tuple[float, float, float, float], ...] | None = None
+    """At least four of (frame x, frame y, event x, event y), pixels."""
+    dots: DotsInfo | None = None
+    """A calibration shot of a grid of dots."""
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("homography", "points", "dots") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ConfigError(
+                f"registration has {' and '.join(given) or 'nothing'}; give homography, points or dots"
+            )
+
+
+@dataclass(frozen=True)
+class RegionInfo:
+    """The part of the event camera's sensor that is used."""
+
+    x: int
+    """First column, pixels."""
+    y: int
+    """First row, pixels."""
+    width: int
+    """Columns, pixels."""
+    height: int
+    """Rows, pixels."""
+
+
+@dataclass(frozen=True)
+class FilterInfo:
+    """Events that are left out."""
+
+    hot_pixel_factor: float | None = None
+    """A pixel with that many times the median of its surroundings is hot, e.g. 10; none = keep all."""
+    background_us: int | None = None
+    """Events without one of their 8 neighbours in that time before are noise, microseconds; none = keep all."""
+
+
+@dataclass(frozen=True)
+class CaptureInfo:
+    """What `capture.yaml` holds."""
+
+    camera: CameraInfo
+    """The camera."""
+    events: str = "events.raw"
+    """The event file, as the camera wrote it."""
+    frames: str = "frames.csv"
+    """Frames: a table t_us,file; a video; a folder of pictures; an AEDAT4 file; a CeleX-V recording of mode
+    F."""
+    frames_turned: bool = False
+    """Whether the frames are turned by 180 degrees against the events, as the CeleX-V program exports them."""
+    target: TargetInfo | None = None
+    """The target, where it is known."""
+    motion: MotionInfo | None = None
+    """Its motion, where it is known."""
+    alignment: AlignmentInfo = field(default_factory=AlignmentInfo)
+    """Clock of the frames."""
+    registration: RegistrationInfo | None = None
+    """Pixels of the frames; without it they are those of the events."""
+    dark: str | None = None
+    """Frame with the lens covered, a file in the folder, of the frame camera's size."""
+    flat: str | None = None
+    """Frame of an evenly lit surface, a file in the folder, of the frame camera's size."""
+    roi: RegionInfo | None = None
+    """Part of the event camera's sensor to use, after registration; none = all."""
+    filters: FilterInfo = field(default_factory=FilterInfo)
+    """Events to leave out."""
+    rig: dict[str, Any] = field(default_factory=dict)
+    """Notes about the rig: distance_m, wall, ambient."""
+
+
+def read_capture_info(folder: Path) -> CaptureInfo:
+    """Read the `capture.yaml` of a folder.
+
+    Raises:
+        ConfigError: It is missing, or has an unknown key or a wrong type.
+    """
+    path = folder / "capture.yaml"
+    if not path.is_file():
+        inside = sorted(one.parent.name for one in folder.glob("*/capture.yaml"))
+        held = f" (it holds {len(inside)} captures, such as {inside[0]})" if inside else ""
+        raise ConfigError(f"{folder} holds no capture.yaml; give the folder of one capture{held}")
+    return from_dict(CaptureInfo, read_yaml(path), source=str(path))
+
+
+_TEMPLATE = """\
+# One shot: a hidden target moves past, an event camera and a frame camera watch the wall.
+# Lines that begin with # are notes, or settings that you may need; `evnlos capture check FOLDER` reads what you
+# recorded and says what is wrong with it.
+
+camera:
+  name: {name}
+  width: {width}             # pixels of the event camera's sensor
+  height: {height}
+  frame_rate_hz: 30.0        # of the frames, where their file carries no times
+  # exposure_s: 0.01         # of a frame; the calibration blurs by it
+  # clock_mhz: 100           # CeleX-V only, where the file's name does not say it
+
+events: events.raw           # as the camera wrote it; the format is found from its content
+frames: frames               # a folder of pictures, a video, a table t_us,file, or an AEDAT4 file
+# frames_turned: true        # pictures that the CeleX-V program exported are turned by 180 degrees
+
+# Clocks. Leave out where both files share one; otherwise one of:
+# alignment: {{offset_us: 41000}}         # event time = frame time + offset
+# alignment: {{trigger_channel: 0}}       # the frame camera's exposure is wired to the event camera
+# alignment: {{offset_us: auto}}          # blink the light a few times, irregularly, at the start
+
+# Pixels. Leave out where frames and events share a sensor; otherwise four points or more that both saw:
+# registration: {{points: [[102, 80, 40, 33], [1180, 95, 601, 38], [1160, 690, 592, 440], [110, 702, 44, 446]]}}
+
+# dark: dark.png             # a frame with the lens covered
+# flat: flat.png             # a frame of an evenly lit surface
+# roi: {{x: 0, y: 0, width: {width}, height: {height}}}
+# filters: {{hot_pixel_factor: 10, background_us: 20000}}
+
+# What was hidden: leave out when unknown. The mask is a picture of the plate, white shines.
+# target: {{name: R, mask: target.png, plate_m: 0.08}}
+# How it moved: the centre is at start_m + speed_m_s (t - start_us), relative to the middle of the travel.
+# motion: {{start_m: -0.08, speed_m_s: 0.02, direction: [1, 0], start_us: 0}}
+
+# Your notes about the rig; the calibration takes distance_m (target's plane to wall) as measured.
+# rig: {{distance_m: 0.30, wall: rough aluminium, ambient: dark room}}
+"""
+
+
+def begin_capture(folder: str | Path, width: int, height: int, name: str = "my camera") -> Path:
+    """Write a commented `capture.yaml` into a new or empty folder and return its path.
+
+    Args:
+        folder: The folder of the shot.
+        width: Columns of the event camera's sensor, pixels.
+        height: Rows, pixels.
+        name: Maker and model.
+
+    Raises:
+        DataError: The folder has a capture.yaml already, or is a file; or the size is none.
+    """
+    folder = Path(folder)
+    path = folder / "capture.yaml"
+    if folder.exists() and not folder.is_dir():
+        raise DataError(f"{folder} is a file; give a folder for the shot")
+    if path.exists():
+        raise DataError(f"{path} exists; edit it, or give another folder")
+    if width < 1 or height < 1:
+        raise DataError(f"the sensor is {width} x {height} pixels; give its width and height")
+    folder.mkdir(parents=True, exist_ok=True)
+    text = _TEMPLATE.format(name=name.replace("\n", " ").replace(":", " "), width=width, height=height)
+    write_atomically(path, text.encode())
+    return path

@@ -1,0 +1,343 @@
+"""The clocks of frames and events: how far they are apart, and whether a capture says so.
+
+- How far the frames' clock is from the events' clock, found from what both saw move.
+- How far the frames of a capture are from its events, told by the course of the light in both.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.errors import DataError
+from evnlos.types import Events
+
+_DARK = 0.02  # of the peak: added to frames before the logarithm, or black noise would count most
+_EDGES_NEEDED = 4  # intervals between frames that lie inside the recording of events
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """A found offset and how sure it is.
+
+    Args:
+        offset_us: Event time minus frame time, microseconds.
+        correlation: Correlation at that offset, -1..1.
+        ratio: That correlation over the best one outside its own lobe; infinite where no other is positive.
+        lobe_us: Width of the lobe at half of its height, microseconds: the offset is known far better than
+            that.
+    """
+
+    offset_us: int
+    correlation: float
+    ratio: float
+    lobe_us: int
+
+
+def find_offset(
+    events: Events,
+    frames: NDArray,
+    times_us: NDArray[np.int64],
+    *,
+    search_us: int = 1_000_000,
+    step_us: int = 5_000,
+    blocks: int = 8,
+    min_correlation: float = 0.6,
+    min_ratio: float = 1.5,
+    max_lobe_frames: float = 2.0,
+) -> ClockOffset:
+    """Return the offset at which the events between two frames explain the frames' difference best.
+
+    For each block of pixels b and each pair of frames k the change of the mean logarithm is compared with the
+    sum of the polarities of the events between their (shifted) times, both without their mean over time:
+
+        r(offset) = corr_(k, b)(log F_(k+1, b) - log F_(k, b), sum of p over t_k + offset < t <= t_(k+1) +
+        offset)
+
+    The greatest r, refined by a parabola, gives the offset. Without known polarities changes and events are
+    counted without their sign. Something must happen at once: a blink of the light, a jerk of the target. A
+    slow and steady motion correlates well over a second and more, and events come late where the light changes
+    slowly (by the time in which it changes by a threshold): such a recording is refused, because its lobe is
+    too wide.
+
+    Args:
+        events: The events; times relative to any zero.
+        frames: Frames on the same pixels as the events (or one block is used), [N, H, W], N at least 5.
+        times_us: Their times on their own clock, [N], microseconds, ascending.
+        search_us: Largest offset looked at, either sign, microseconds.
+        step_us: Distance between offsets looked at, microseconds.
+        blocks: Blocks along the longer side, 1 to 64; 1 for cameras that are not registered to each other.
+        min_correlation: Correlation below which the answer is refused.
+        min_ratio: Ratio of the best lobe to the next below which the answer is refused.
+        max_lobe_frames: Width of the lobe, in times between frames, above which the answer is refused.
+
+    Raises:
+        DataError: Too few frames, or no offset stands out: the correlation, its ratio and the cures are named.
+
+    Example:
+        >>> t = np.arange(0, 3_000_000, 1_000)  # a lamp that is dimmed and brightened irregularly
+        >>> level = np.cumsum(np.random.default_rng(1).normal(size=3000)) / 20
+        >>> steps = np.diff(np.round(level * 20), prepend=0).astype(int)
+        >>> nowhere = np.zeros(abs(steps).sum(), int)
+        >>> events = Events(np.repeat(t, abs(steps)), nowhere, nowhere, np.repeat(steps > 0, abs(steps)), 1, 1)
+        >>> frames = np.exp(level[::50, None, None])
+        >>> round(find_offset(events, frames, t[::50] - 300_000, blocks=1).offset_us, -4)
+        300000
+    """
+    if len(frames) <= _EDGES_NEEDED or len(times_us) != len(frames):
+        raise DataError(
+            f"{len(frames)} frames and {len(times_us)} times; an offset needs 5 frames, a time each"
+        )
+    if not len(events):
+        raise DataError("no events to find the clock offset from; state offset_us")
+    signed = events.polarity_known is None or bool(events.polarity_known.any())
+    same = frames.shape[1:] == events.shape
+    grid = grid_of(events.shape, blocks) if same else (1, 1)
+    changes = _changes(frames, grid, signed)  # [N - 1, B]
+    clock_us, sums = running_sums(events, grid, step_us, signed)  # [T], [T, B]
+    offsets = np.arange(-search_us, search_us + 1, step_us, dtype=np.int64)
+    scores = np.array([agreement(changes, times_us + offset, clock_us, sums) for offset in offsets])
+    if np.isnan(scores).all():
+        raise DataError(
+            f"no offset up to {search_us} us puts frames at {times_us[0]}..{times_us[-1]} us over events at "
+            f"{events.t_us[0]}..{events.t_us[-1]} us; state offset_us, or search further"
+        )
+    found = _peak(offsets, np.nan_to_num(scores, nan=0.0))
+    widest = round(max_lobe_frames * float(np.median(np.diff(times_us))))
+    if found.correlation < min_correlation or found.ratio < min_ratio or found.lobe_us > widest:
+        raise DataError(
+            f"the clock offset is uncertain: correlation {found.correlation:.2f} (at least {min_correlation:g} "
+            f"is needed), {found.ratio:.2f} times the next best (at least {min_ratio:g}), in a lobe "
+            f"{found.lobe_us} us wide (at most {widest}); state offset_us, or record a blink of the light or a "
+            "jerk of the target"
+        )
+    return found
+
+
+def grid_of(shape: tuple[int, int], blocks: int) -> tuple[int, int]:
+    """Return rows and columns of nearly square blocks."""
+    if not 1 <= blocks <= 64:
+        raise DataError(f"blocks is {blocks}; give 1 to 64")
+    return tuple(max(1, min(side, round(blocks * side / max(shape)))) for side in shape)  # type: ignore[return-value]
+
+
+def blocks_of(grid: tuple[int, int], shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return the block of each pixel of an image of `shape` (H, W), [H * W]."""
+    rows, columns = (np.arange(side) * count // side for count, side in zip(grid, shape, strict=True))
+    return (rows[:, None] * grid[1] + columns).ravel()
+
+
+def _changes(frames: NDArray, grid: tuple[int, int], signed: bool) -> NDArray[np.float64]:
+    """Return the change of the blocks' mean logarithm from frame to frame, [N - 1, B]."""
+    peak = float(np.iinfo(frames.dtype).max) if frames.dtype.kind == "u" else float(np.max(frames)) or 1.0
+    block = blocks_of(grid, frames.shape[1:])
+    size = np.bincount(block)
+    out = np.empty((len(frames) - 1, len(size)))
+    before = np.log(frames[0].astype(np.float64).ravel() / peak + _DARK)
+    for k in range(1, len(frames)):
+        now = np.log(frames[k].astype(np.float64).ravel() / peak + _DARK)
+        change = now - before
+        out[k - 1] = np.bincount(block, change if signed else np.abs(change)) / size
+        before = now
+    return out
+
+
+def running_sums(
+    events: Events, grid: tuple[int, int], step_us: int, signed: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return instants [T] and, for each block, the sum of all polarities up to them, [T, B]."""
+    first, last = int(events.t_us[0]), int(events.t_us[-1])
+    bins = int((last - first) // step_us) + 1
+    block = blocks_of(grid, events.shape)[events.y.astype(np.int64) * events.width + events.x]
+    count = grid[0] * grid[1]
+    weight = np.where(events.p, 1.0, -1.0) if signed else np.ones(len(events))
+    if signed and events.polarity_known is not None:
+        weight[~events.polarity_known] = 0.0
+    place = (events.t_us - first) // step_us * count + block
+    sums = np.bincount(place, weight, bins * count).astype(np.float64).reshape(bins, count)
+    clock = first + step_us * np.arange(bins + 1, dtype=np.float64)
+    return clock, np.concatenate([np.zeros((1, count)), np.cumsum(sums, axis=0)])
+
+
+def agreement(
+    changes: NDArray[np.float64], edges_us: NDArray, clock_us: NDArray[np.float64], sums: NDArray[np.float64]
+) -> float:
+    """Return the correlation over the intervals inside the recording, NaN where there are too few."""
+    step = clock_us[1] - clock_us[0]
+    place = (edges_us - clock_us[0]) / step
+    inside = (place >= 0) & (place <= len(clock_us) - 1)
+    whole = inside[1:] & inside[:-1]
+    if whole.sum() < max(_EDGES_NEEDED, len(whole) // 2):
+        return float("nan")
+    place = np.clip(place, 0, len(clock_us) - 1)
+    low = np.minimum(place.astype(np.int64), len(clock_us) - 2)
+    part = (place - low)[:, None]
+    at_edges = sums[low] * (1 - part) + sums[low + 1] * part  # [N, B]
+    ours = np.diff(at_edges, axis=0)[whole]
+    theirs = changes[whole]
+    ours = ours - ours.mean(axis=0)
+    theirs = theirs - theirs.mean(axis=0)
+    norm = np.sqrt((ours**2).sum() * (theirs**2).sum())
+    # A chance correlation of few intervals is large: it counts as if spread over all.
+    share = np.sqrt(whole.mean())
+    return float((ours * theirs).sum() / norm * share) if norm > 0 else 0.0
+
+
+def _peak(offsets: NDArray[np.int64], scores: NDArray[np.float64]) -> ClockOffset:
+    best = int(np.argmax(scores))
+    top = float(scores[best])
+    low = high = best
+    while low > 0 and scores[low - 1] > top / 2:
+        low -= 1
+    while high + 1 < len(scores) and scores[high + 1] > top / 2:
+        high += 1
+    # A slope of the lobe is no rival; a maximum of its own is.
+    inner = np.flatnonzero((scores[1:-1] >= scores[:-2]) & (scores[1:-1] >= scores[2:])) + 1
+    rivals = [float(scores[i]) for i in (0, *inner, len(scores) - 1) if i < low or i > high]
+    second = max(rivals, default=0.0)
+    offset = float(offsets[best])
+    if 0 < best < len(scores) - 1:
+        left, right = scores[best - 1], scores[best + 1]
+        bend = left - 2 * top + right
+        if bend < 0:
+            offset += 0.5 * (left - right) / bend * float(offsets[1] - offsets[0])
+    ratio = top / second if second > 0 else float("inf")
+    if best in (0, len(scores) - 1):
+        ratio = 0.0  # the true maximum may lie beyond
+    return ClockOffset(round(offset), top, ratio, int(offsets[high] - offsets[low]))
+
+
+LEAST_AGREEMENT, LEAST_RATIO = 0.2, 1.2
+"""Agreement below which nothing is told, and how far one order of the frames must be ahead of the other."""
+_THRESHOLDS = (0.05, 0.1, 0.15, 0.2, 0.3)  # log units
+_CELLS = 24  # along the longer side
+_PHASES = 8  # pixels of a cell, their references spread evenly over the dead zone
+_STEPS = 8  # of the light between two frames
+_MOST_FRAMES, _MOST_BINS, _FINEST_BIN_US = 400, 4_000, 5_000
+_LAGS = 201
+_LOBE, _SHARE_OF_LOBE = 0.9, 0.1
+_NEARLY = 0.9  # of the best threshold's agreement
+_FEWEST_FRAMES = 6
+_DARK_SHARE = 1e-3  # of the peak
+
+
+@dataclass(frozen=True)
+class ClockLag:
+    """How frames and events agree.
+
+    Args:
+        lag_us: What to add to the frames' times, microseconds.
+        limit_us: What can be told, microseconds: half a time between frames, or a tenth of the lobe's width
+            where that is more.
+        agreement: Correlation at that lag, -1..1.
+        backwards: Greatest correlation of the frames in reversed order, -1..1.
+    """
+
+    lag_us: int
+    limit_us: int
+    agreement: float
+    backwards: float
+
+    @property
+    def reversed(self) -> bool:
+        """Whether the events fit the frames in reversed order clearly better."""
+        return self.backwards >= max(LEAST_AGREEMENT, LEAST_RATIO * self.agreement)
+
+    @property
+    def told(self) -> bool:
+        """Whether the events fit the frames well enough, and clearly better than in reversed order."""
+        return self.agreement >= max(LEAST_AGREEMENT, LEAST_RATIO * self.backwards)
+
+
+def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> ClockLag | None:
+    """Return how far the frames' times are from the events', from a slow and steady motion too.
+
+    `find_offset` compares changes of the light, which events of a slowly changing wall follow late. Here
+    pixels with a threshold are led along the frames' light, and what they would send is compared with what was
+    sent, so that the lateness is on both sides. The lag is the middle of the lobe's top, a mean over those of
+    five thresholds that agree nearly as well as the best one: a threshold too high makes it too early.
+
+    Args:
+        events: The events.
+        frames: Frames on the events' pixels, [N, H, W], digital numbers.
+        times_us: Their times, [N], microseconds, ascending.
+
+    Returns:
+        The lag; None where it can't be looked for: other pixels, too few frames, or no polarities.
+    """
+    known = events.polarity_known
+    if frames.shape[1:] != events.shape or len(frames) < _FEWEST_FRAMES or not len(events):
+        return None
+    if known is not None and not known.all():
+        return None
+    every = math.ceil(len(frames) / _MOST_FRAMES)
+    times = times_us[::every].astype(np.int64)
+    grid = grid_of(events.shape, _CELLS)
+    level = _levels(frames[::every], grid)
+    step = max(_FINEST_BIN_US, math.ceil((int(events.t_us[-1]) - int(events.t_us[0])) / _MOST_BINS))
+    clock, sums = running_sums(events, grid, step, True)
+    half = (int(times[-1]) - int(times[0])) / 2
+    lags = np.linspace(-half, half, _LAGS)
+
+    def curve(expected: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = np.array([agreement(expected, times + lag, clock, sums) for lag in lags])
+        return np.nan_to_num(found, nan=-1.0)
+
+    curves = [curve(expected_counts(level, threshold)) for threshold in _THRESHOLDS]
+    tops = np.array([one.max() for one in curves])
+    best, top = int(np.argmax(tops)), float(tops.max())
+    backwards = curve(expected_counts(level[::-1], _THRESHOLDS[best]))
+    near = [_middle(lags, one) for one in curves if one.max() >= _NEARLY * top]
+    lag, width = np.mean(near, axis=0)
+    limit = max(0.5 * float(np.median(np.diff(times_us))), _SHARE_OF_LOBE * float(width))
+    return ClockLag(round(float(lag)), round(limit), top, float(backwards.max()))
+
+
+def expected_counts(level: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
+    """Return what pixels with a threshold send while their light goes from frame to frame, a pixel's mean.
+
+    Args:
+        level: Logarithm of the cells' light, [N, B]; straight between frames.
+        threshold: Of either polarity, log units, above 0.
+
+    Returns:
+        ON less OFF events of each interval and cell, [N - 1, B].
+
+    Example:
+        >>> expected_counts(np.array([[0.0], [0.4], [0.4], [0.0]]), 0.1).round(2).ravel().tolist()
+        [3.5, 0.0, -3.0]
+    """
+    phase = (2 * np.arange(_PHASES) + 1) / _PHASES - 1  # -1..1 of the threshold
+    reference = level[0][:, None] + threshold * phase
+    start = [reference.mean(axis=1)]
+    for before, after in itertools.pairwise(level):
+        for part in np.arange(1, _STEPS + 1) / _STEPS:
+            away = (before + (after - before) * part)[:, None] - reference
+            reference = reference + threshold * np.trunc(away / threshold)
+        start.append(reference.mean(axis=1))
+    sent: NDArray[np.float64] = np.diff(np.array(start), axis=0)
+    return sent / threshold
+
+
+def _levels(frames: NDArray, grid: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the logarithm of the cells' mean light in each frame, [N, B]."""
+    peak = float(np.iinfo(frames.dtype).max)
+    cell = blocks_of(grid, frames.shape[1:])
+    sums = np.array([np.bincount(cell, frame.ravel().astype(np.float64)) for frame in frames])
+    return np.log(sums / np.bincount(cell) / peak + _DARK_SHARE)
+
+
+def _middle(lags: NDArray[np.float64], curve: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the middle of the lobe's top, weighted by its height, and the width of the top."""
+    best = low = high = int(np.argmax(curve))
+    floor = _LOBE * float(curve[best])
+    while low > 0 and curve[low - 1] > floor:
+        low -= 1
+    while high + 1 < len(curve) and curve[high + 1] > floor:
+        high += 1
+    weight = np.maximum(curve[low : high + 1] - floor, 1e-12)
+    return float(np.average(lags[low : high + 1], weights=weight)), float(lags[high] - lags[low])

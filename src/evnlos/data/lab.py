@@ -1,0 +1,298 @@
+"""The sensor of a rendered laboratory: drawn once a rig, from ranges that are not the training simulator's.
+
+- Pseudo-real captures: shots that the training simulator did not make, for people without a camera.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from evnlos.cameras import EventPixel, FrameCamera
+from evnlos.config import check_made, differing_keys, read_yaml, save_yaml, to_dict
+from evnlos.data.pool import processes, run_tasks
+from evnlos.data.simulate import check_passes, check_ranges, pass_bytes, varied
+from evnlos.errors import ConfigError, DataError
+from evnlos.events import write_events
+from evnlos.files import new_folder
+from evnlos.migrate import __version__
+from evnlos.progress import Progress, Step, silent
+from evnlos.scene import FontGlyphs, Glyphs, LineMotion, Scene
+from evnlos.setups import RadiometricSetup, Setup, named_setup, setup_preset
+from evnlos.setups.load import is_name
+from evnlos.types import derive_seed
+
+SENSOR_SPREAD: dict[str, tuple[float, float]] = {
+    "setup.pixel.threshold_on": (0.18, 0.28),
+    "setup.pixel.threshold_off": (0.20, 0.30),
+    "setup.pixel.threshold_sigma": (0.035, 0.06),
+    "setup.pixel.cutoff_hz": (25.0, 90.0),
+    "setup.pixel.leak_rate_hz": (0.02, 0.15),
+    "setup.pixel.shot_noise_rate_hz": (0.03, 0.20),
+    "setup.pixel.refractory_s": (2e-4, 1.5e-3),
+    "setup.pixel.hot_pixel_fraction": (0.0, 4e-4),
+    "setup.pixel.jitter_s": (2e-5, 2e-4),
+    "setup.frame_camera.exposure_s": (0.012, 0.030),
+    "setup.frame_camera.full_well_e": (6_000.0, 12_000.0),
+    "setup.frame_camera.read_noise_e": (8.0, 16.0),
+    "setup.frame_camera.prnu": (0.012, 0.025),
+    "setup.frame_camera.dsnu_e": (5.0, 15.0),
+}
+"""Uniform ranges of a rig's sensor.
+
+The training simulator has mismatch 0.03, leak 0.01 Hz, no dead time, no hot pixels, no jitter, 15,000
+electrons, 6 electrons of read noise, 1 % and 3 electrons of fixed pattern, 10 ms of exposure. No range holds
+these but that of the hot pixels, which begins there. Thresholds, bandwidth and shot noise, which it draws from
+wide ranges itself, lie inside those.
+"""
+
+
+LIGHT = {"gain": 0.7, "ambient": 0.06, "ambient_gradient": (0.3, -0.2)}
+"""Light of the lab: dimmer and less even than in the training simulator."""
+_CAMERAS = {
+    "frame_camera": FrameCamera(exposure_s=0.016, full_well_e=9000.0, read_noise_e=12.0),
+    "pixel": EventPixel(
+        threshold_on=0.21,
+        threshold_off=0.24,
+        threshold_sigma=0.04,
+        cutoff_hz=40.0,
+        leak_rate_hz=0.05,
+        shot_noise_rate_hz=0.08,
+        refractory_s=0.0005,
+    ),
+}
+
+_SKETCH = (6, 10)  # pixels
+
+
+def in_the_lab(setup: Setup) -> Setup:
+    """Return a wall and its geometry in the lab's light, before the lab's cameras."""
+    return replace(setup, **LIGHT, **_CAMERAS)
+
+
+@dataclass(frozen=True)
+class Lab:
+    """A rendered laboratory: a wall of metal or paint instead of a tPSF, and other cameras."""
+
+    name: str = "lab"
+    """Name of the rig; captures are called NAME_A, NAME_B, ..."""
+    glyphs: Glyphs = field(default_factory=FontGlyphs)
+    """What is hidden."""
+    motion: LineMotion = field(default_factory=LineMotion)
+    """How it moves."""
+    duration_s: float = 8.0
+    """Length of a pass, seconds."""
+    frame_rate_hz: float = 5.0
+    """Frames a second, hertz; a pass of 8 s has the 40 positions of the paper."""
+    setup: Setup = field(default_factory=lambda: in_the_lab(RadiometricSetup()))
+    """Wall, geometry, light and cameras; the frame camera has 8 bits, as captures have, and the event pixel is
+    on purpose not that of the training simulator."""
+    spread: dict[str, tuple[float, float]] = field(default_factory=lambda: dict(SENSOR_SPREAD))
+    """Settings drawn once for the rig, uniformly: dotted name -> (low, high); {} takes them as they stand."""
+    seed: int = 0
+    """Seed of every draw, the sensor's own settings among them."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", self.name):
+            raise ConfigError(f"Lab.name is {self.name!r}; give letters, digits, '.', '_' or '-'")
+        for name, unit in (("duration_s", "seconds"), ("frame_rate_hz", "hertz")):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"Lab.{name} is {getattr(self, name)}; give a positive number of {unit}")
+        if self.duration_s * self.frame_rate_hz < 1:
+            raise ConfigError(
+                f"Lab.duration_s is {self.duration_s} s at {self.frame_rate_hz} Hz; a sample needs two frames"
+            )
+        if self.setup.frame_camera.bit_depth != 8:
+            raise ConfigError(
+                f"Lab.setup.frame_camera.bit_depth is {self.setup.frame_camera.bit_depth}; captures hold 8 bits"
+            )
+        _ = self.setup.event_camera  # refuses a step that does not fit the model
+        check_ranges(self, self.spread)
+        check_made(self)
+
+    def drawn(self) -> Lab:
+        """Return the lab with its sensor's settings drawn from `spread`: a function of the seed and the name.
+
+        Example:
+            >>> one, other = Lab(seed=1).drawn(), Lab(seed=2).drawn()
+            >>> one.setup.pixel == other.setup.pixel, 0.18 <= one.setup.pixel.threshold_on <= 0.28, one.spread
+            (False, True, {})
+        """
+        if not self.spread:
+            return self
+        pattern = derive_seed(self.seed, self.name, "fixed pattern")
+        camera = replace(self.setup.frame_camera, pattern_seed=pattern)
+        own = replace(self, setup=replace(self.setup, frame_camera=camera))
+        return replace(varied(own, self.spread, self.seed, self.name), spread={})
+
+
+def lab_preset(name: str) -> Lab:
+    """Return the lab of a named rig, e.g. "main-near" (see `setup_preset`), in the lab's light.
+
+    Raises:
+        ConfigError: The name is unknown.
+
+    Example:
+        >>> lab_preset("aperture-far").setup.distance_m
+        0.5
+    """
+    return Lab(name=name, setup=in_the_lab(setup_preset(name)))
+
+
+def lab_of(word: str | Path, lab: Lab | None = None) -> Lab:
+    """Return the lab with the setup of a word (see `load_setup`), and its name.
+
+    Args:
+        word: A name, which leaves light and cameras to the lab, the name of a room, or a file or folder, which
+            state all. A room's cameras are as stated, with no `spread`.
+        lab: All other settings; None is the default lab.
+
+    Raises:
+        ConfigError: The word names no setup.
+    """
+    lab = Lab() if lab is None else lab
+    found = named_setup(word)
+    name = re.sub(r"[^A-Za-z0-9._-]", "-", found.name).lstrip(".-_") or lab.name
+    if not is_name(word):
+        return replace(lab, name=name, setup=found.setup)
+    setup = replace(found.setup, sensor=lab.setup.sensor)
+    if setup.is_lit:
+        return replace(lab, name=name, setup=setup, spread={})
+    return replace(lab, name=name, setup=in_the_lab(setup))
+
+
+def render_captures(
+    lab: Lab,
+    out: str | Path,
+    names: list[str] | None = None,
+    workers: int = 1,
+    progress: Progress = silent,
+    force: bool = False,
+) -> list[Path]:
+    """Render one capture folder per object, and `lab.yaml` beside them.
+
+    A capture that exists is done and is kept, so that a run can be taken up again; the captures are the same
+    for any number of workers.
+
+    Args:
+        lab: Rig, cameras and objects.
+        out: The folder for the captures; new, or begun with the same settings (other characters may be added).
+        names: Objects of `lab.glyphs`; all by default.
+        workers: Processes; 0 means one for each core.
+        progress: Called when the work begins and as each capture is in place, with its folder.
+        force: Whether to begin although the machine's memory will hardly do.
+
+    Returns:
+        The capture folders, in the order of `names`.
+
+    Raises:
+        DataError: `out` is a file, or was begun with other settings, or holds a folder in a capture's place, or
+            the captures that are rendered at a time take more memory than there is.
+        ConfigError: The rig can't be.
+    """
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise DataError(f"{out} is a file; give a folder for the captures")
+    drawn = lab.drawn()
+    names = lab.glyphs.objects() if names is None else names
+    at_once = processes(workers, max(len(names), 1))
+    if not force:
+        frames = round(lab.duration_s * lab.frame_rate_hz) + 1
+        check_passes(pass_bytes(drawn.setup, lab.glyphs.plate.size_m, lab.duration_s, frames), at_once)
+    folders = {name: out / _folder_name(lab, name) for name in names}
+    for folder in folders.values():
+        if folder.exists() and not (folder / "capture.yaml").is_file():
+            raise DataError(f"{folder} is there without a capture.yaml; move it away, it is no capture")
+    # A wrong rig is an error before anything is written; a few pixels are enough to find it.
+    if names:
+        drawn.setup.resized(_SKETCH).observe(_scene(drawn, names[0]))
+    out.mkdir(parents=True, exist_ok=True)
+    _record(lab, drawn, out)
+    missing = [(drawn, name, folder) for name, folder in folders.items() if not folder.is_dir()]
+    what, total, there = f"render {out.name}", len(folders), len(folders) - len(missing)
+    progress(Step(what, there, total, "captures"))
+    with closing(run_tasks(_render, missing, workers)) as finished:
+        for done, folder in enumerate(finished, start=there + 1):
+            progress(Step(what, done, total, "captures", folder))
+    return list(folders.values())
+
+
+def _record(lab: Lab, drawn: Lab, out: Path) -> None:
+    """Write `lab.yaml`, or refuse a folder that was begun with other settings."""
+    path, asked = out / "lab.yaml", to_dict(lab)
+    if path.is_file():
+        before = read_yaml(path).get("lab")
+        differing = differing_keys(asked, before) if isinstance(before, dict) else ["lab: missing"]
+        differing = [line for line in differing if not line.startswith("glyphs.characters:")]
+        if differing:
+            raise DataError(
+                f"{out} was begun with other settings ({'; '.join(differing[:3])}); give another folder"
+            )
+    sensor = {"pixel": to_dict(drawn.setup.pixel), "frame_camera": to_dict(drawn.setup.frame_camera)}
+    save_yaml({"evnlos": __version__, "lab": asked, "drawn": sensor}, path)
+
+
+def _folder_name(lab: Lab, name: str) -> str:
+    """Return NAME_A for a font, which shows each character once, and NAME_object for other glyphs."""
+    return f"{lab.name}_{name.rsplit('_', 1)[-1] if isinstance(lab.glyphs, FontGlyphs) else name}"
+
+
+def _scene(lab: Lab, name: str) -> Scene:
+    return Scene(lab.glyphs.target(name, lab.seed), lab.motion, lab.duration_s)
+
+
+def _render(task: tuple[Lab, str, Path]) -> Path:
+    """Render a capture into a folder that is there whole or not at all."""
+    lab, name, folder = task
+    scene = _scene(lab, name)
+    wall = lab.setup.observe(scene)
+    times_s = np.arange(round(lab.duration_s * lab.frame_rate_hz) + 1) / lab.frame_rate_hz
+    seed = derive_seed(lab.seed, name)
+    events = lab.setup.event_camera.record(wall, 0.0, lab.duration_s, seed=derive_seed(seed, "events"))
+    frames = lab.setup.frame_camera.capture(wall, times_s, seed=derive_seed(seed, "frames"))
+    with new_folder(folder) as draft:
+        (draft / "frames").mkdir()
+        write_events(draft / "events.raw", events)
+        rows = ["t_us,file"]
+        for k, (time_s, frame) in enumerate(zip(times_s, frames, strict=True)):
+            Image.fromarray(frame).save(draft / f"frames/{k:04d}.png")
+            rows.append(f"{round(time_s * 1e6)},frames/{k:04d}.png")
+        (draft / "frames.csv").write_text("\n".join(rows) + "\n")
+        Image.fromarray(np.round(scene.target.mask * 255).astype(np.uint8)).save(draft / "target.png")
+        save_yaml(_description(lab, folder.name, scene.target.size_m), draft / "capture.yaml")
+    return folder
+
+
+def _description(lab: Lab, name: str, plate_m: float) -> dict[str, Any]:
+    setup = lab.setup
+    distance_m = setup.default_distance_m if lab.motion.z_m is None else lab.motion.z_m
+    return {
+        "camera": {
+            "name": "rendered laboratory",
+            "width": setup.sensor.width,
+            "height": setup.sensor.height,
+            "frame_rate_hz": lab.frame_rate_hz,
+            "exposure_s": setup.frame_camera.exposure_s,
+        },
+        "events": "events.raw",
+        "frames": "frames.csv",
+        "target": {"name": name.rsplit("_", 1)[-1], "mask": "target.png", "plate_m": plate_m},
+        "motion": {
+            "start_m": list(lab.motion.start_m),
+            "speed_m_s": lab.motion.speed_m_s,
+            "direction": list(lab.motion.direction),
+            "start_us": round(lab.motion.start_s * 1e6),
+        },
+        "rig": {
+            **({} if distance_m is None else {"distance_m": distance_m}),
+            "wall": f"rendered: {setup.wall_description()}",
+            "ambient": f"{setup.ambient:g} of the white level in the middle",
+            "rendered": {"by": f"evnlos {__version__}", "seed": lab.seed, "setup": to_dict(setup)},
+        },
+    }

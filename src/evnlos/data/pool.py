@@ -1,0 +1,258 @@
+"""A pool of processes that survives the death of a worker: lost tasks are run again.
+
+- The same tasks on a Dask cluster: many machines that share a file system.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from multiprocessing.connection import wait as wait_for
+from typing import Any, TypeVar
+
+from threadpoolctl import ThreadpoolController
+
+from evnlos.errors import ConfigError, EvnlosError, MissingDependencyError
+from evnlos.threads import children_undisturbed, cores, one_thread
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+Engine = Callable[[Callable[[Any], str], Iterable[Any], int], Generator[str, None, None]]
+"""Runs a function on each task with so many processes, and yields the results as they come."""
+
+_TRIES = 3
+_GRACE_S = 5.0  # in which a worker may leave what it writes
+
+
+def processes(workers: int, tasks: int) -> int:
+    """Return how many processes `workers` asks for: that many, or one for each core, but not more than tasks.
+
+    Raises:
+        ConfigError: A number below 0.
+    """
+    if workers < 0:
+        raise ConfigError(f"workers is {workers}; give 0 (one for each core) or more")
+    return min(workers or cores(), tasks)
+
+
+def run_tasks(
+    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int
+) -> Generator[Result, None, None]:
+    """Run `function` on each task and yield the results as they come.
+
+    Args:
+        function: A picklable function of one task; it writes its own file and returns its name.
+        tasks: The tasks, in the order in which they start.
+        workers: Processes; 1 runs everything in this process, 0 means one for each core.
+
+    Raises:
+        ConfigError: A number of workers below 0.
+        EvnlosError: A task broke its worker three times (killed, out of memory); other errors pass through.
+    """
+    pending = list(tasks)
+    workers = processes(workers, len(pending))
+    if workers <= 1:
+        yield from _run_here(function, pending)
+        return
+    tries = [0] * len(pending)
+    left = set(range(len(pending)))
+    while left:
+        with _workers(workers) as pool:
+            try:
+                yield from _drain(pool, function, pending, left, workers)
+            except BrokenProcessPool:
+                # The pool can't say which task killed the worker: all that were in flight get a try more.
+                first = sorted(left)[: 2 * workers]
+                for i in first:
+                    tries[i] += 1
+                if max(tries) >= _TRIES:
+                    raise EvnlosError(
+                        f"a worker process died {_TRIES} times (killed, or out of memory?); "
+                        "run again with fewer at a time (--workers, --trainings): what is finished is kept"
+                    ) from None
+
+
+def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+    """Run `function` on each task ahead of its use and yield the results in the order of the tasks.
+
+    Args:
+        function: A picklable function of one task.
+        tasks: The tasks.
+        workers: Processes; 1 runs each task in this process when its result is asked for, 0 means one a core.
+
+    Raises:
+        ConfigError: A number of workers below 0.
+        EvnlosError: A worker died; other errors pass through.
+    """
+    pending = list(tasks)
+    workers = processes(workers, len(pending))
+    if workers <= 1:
+        yield from _run_here(function, pending)
+        return
+    with _workers(workers) as pool:
+        try:
+            flying: deque[Future] = deque()
+            for task in pending:
+                flying.append(pool.submit(function, task))
+                if len(flying) >= 2 * workers:
+                    yield flying.popleft().result()
+            while flying:
+                yield flying.popleft().result()
+        except BrokenProcessPool:
+            raise EvnlosError(
+                "a worker process died (killed, or out of memory?); run the command again with fewer --workers"
+            ) from None
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Give a pool whose processes end with the block, at once where it is left early, and with this process.
+
+    They don't hear Ctrl-C, which a terminal sends to all: this process ends them, also those that still start.
+    """
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin)
+    try:
+        resource_tracker.ensure_running()  # it unblocks the signal when it starts
+        with children_undisturbed():
+            pool.submit(int)  # the first task starts all processes, and inherit what is blocked
+        yield pool
+        pool.shutdown()
+    except BaseException:
+        running = list((pool._processes or {}).values())  # the manager takes them away as they end
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in running:
+            process.terminate()
+        until = time.monotonic() + _GRACE_S
+        for process in running:
+            process.join(max(0.0, until - time.monotonic()))
+            if process.is_alive():
+                process.kill()
+        raise
+
+
+def _begin() -> None:
+    """Prepare a worker: one thread, an end that leaves no half-written file, and no life after its parent."""
+    one_thread()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), name="parent", daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent's end of a pipe is closed: by SIGTERM, and then at once."""
+    wait_for([parent])
+    until = time.monotonic() + _GRACE_S
+    while time.monotonic() < until:
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(_GRACE_S / 20)
+    os._exit(1)
+
+
+def _run_here(function: Callable[[Task], Result], tasks: list[Task]) -> Iterator[Result]:
+    """Run tasks one by one in this process, with one thread of NumPy's linear algebra for small products."""
+    libraries = ThreadpoolController()
+    for task in tasks:
+        with libraries.limit(limits=1, user_api="blas"):
+            result = function(task)
+        yield result
+
+
+def _drain(
+    pool: ProcessPoolExecutor,
+    function: Callable[[Task], Result],
+    tasks: list[Task],
+    left: set[int],
+    workers: int,
+) -> Iterator[Result]:
+    """Keep twice as many tasks in flight as there are workers, so that memory stays bounded."""
+    queue = iter(sorted(left))
+    flying: dict[Future, int] = {}
+    while True:
+        for i in queue:
+            flying[pool.submit(function, tasks[i])] = i
+            if len(flying) >= 2 * workers:
+                break
+        if not flying:
+            return
+        done, _ = wait(flying, return_when=FIRST_COMPLETED)
+        for future in done:
+            i = flying.pop(future)
+            result = future.result()
+            left.discard(i)
+            yield result
+
+
+_RETRIES = 3
+
+
+def run_on_dask(
+    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0, scheduler: str | None = None
+) -> Generator[Result, None, None]:
+    """Run `function` on each task on a Dask cluster and yield the results as they come.
+
+    A task whose worker dies is run again elsewhere; it writes its own file atomically, so nothing is half done.
+
+    Args:
+        function: A picklable function of one task; it writes its own file, on a file system that all machines
+            share, and returns its name.
+        tasks: The tasks.
+        workers: Processes of a cluster on this machine, 0 = one for each core; not for a given scheduler.
+        scheduler: Address of a running scheduler, e.g. tcp://node1:8786; None starts a cluster here.
+
+    Raises:
+        MissingDependencyError: Dask is not installed.
+        ConfigError: A number of workers below 0.
+        EvnlosError: The scheduler does not answer, or a task killed its worker again and again.
+    """
+    try:
+        from dask.config import set as set_option
+        from distributed import Client, KilledWorker, LocalCluster, as_completed
+    except ImportError:
+        raise MissingDependencyError(
+            'a Dask cluster needs the extra "cluster": pip install "evnlos[cluster]"'
+        ) from None
+    pending = list(tasks)
+    at_once = processes(workers, len(pending))
+    if not pending:
+        return
+    set_option({"distributed.scheduler.allowed-failures": _RETRIES})
+    cluster = None
+    try:
+        if scheduler is None:
+            cluster = LocalCluster(
+                n_workers=at_once,
+                threads_per_worker=1,
+                dashboard_address="",
+                silence_logs=50,
+            )
+        client = Client(cluster or scheduler, timeout=20)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise EvnlosError(
+            f"the Dask scheduler {scheduler} does not answer ({' '.join(str(error).split())[:120]}); "
+            "start one with `dask scheduler`, or leave --scheduler out for a cluster on this machine"
+        ) from None
+    try:
+        futures = client.map(function, pending, pure=False)
+        for future in as_completed(futures):
+            try:
+                yield future.result()
+            except KilledWorker:
+                raise EvnlosError(
+                    f"a task killed its worker {_RETRIES + 1} times (out of memory?); finished shards are "
+                    "kept: give the workers more memory and run the command again"
+                ) from None
+    finally:
+        client.close()
+        if cluster is not None:
+            cluster.close()

@@ -1,0 +1,238 @@
+"""Frames of another camera on the pixels of the event camera: a homography from points, and the resampling.
+
+- A grid of bright dots, as a screen or a board of lamps shows it, found in a frame or in a map of events.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import DataError
+
+_MAX_SAMPLES = 8  # a side, in a pixel of the event camera
+_FLAT = 1e-6  # ratio of singular values below which points lie on a line
+
+
+def homography_from_points(source: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
+    """Return the matrix that maps points of one plane's picture to those of another, by the normalised DLT.
+
+    (x', y', 1) ~ H (x, y, 1), least squares of the algebraic error after both sets of points are shifted to
+    their mean and scaled to a mean distance of sqrt 2 (Hartley, "In defense of the eight-point algorithm",
+    TPAMI 1997).
+
+    Args:
+        source: Points (x, y), [N, 2], N at least 4, pixels.
+        target: Where they are in the other picture, [N, 2], pixels.
+
+    Returns:
+        float64 [3, 3], the last entry 1.
+
+    Raises:
+        DataError: Fewer than four points, unequal counts, or points on a line or twice the same.
+
+    Example:
+        >>> corners = [(0, 0), (10, 0), (10, 5), (0, 5)]
+        >>> homography_from_points(corners, [(2 * x + 1, 2 * y) for x, y in corners]).round(6) + 0.0
+        array([[2., 0., 1.], [0., 2., 0.], [0., 0., 1.]])
+    """
+    ours, theirs = np.asarray(source, float), np.asarray(target, float)
+    if ours.shape != theirs.shape or ours.ndim != 2 or ours.shape[1:] != (2,) or len(ours) < 4:
+        raise DataError(f"points of shapes {ours.shape} and {theirs.shape}; give at least 4 pairs (x, y)")
+    if not (np.isfinite(ours).all() and np.isfinite(theirs).all()):
+        raise DataError("a point of the registration is not finite; give pixels")
+    a, b = _normaliser(ours), _normaliser(theirs)
+    p, q = _map(a, ours), _map(b, theirs)
+    zero, one = np.zeros(len(p)), np.ones(len(p))
+    rows = np.concatenate(
+        [
+            np.stack([p[:, 0], p[:, 1], one, zero, zero, zero, *(-q[:, :1] * p).T, -q[:, 0]], axis=1),
+            np.stack([zero, zero, zero, p[:, 0], p[:, 1], one, *(-q[:, 1:] * p).T, -q[:, 1]], axis=1),
+        ]
+    )  # [2 N, 9]
+    _, values, vectors = np.linalg.svd(rows)
+    if values[7] < _FLAT * values[0]:
+        raise DataError(
+            "the points of the registration lie on a line or coincide; spread them over the picture"
+        )
+    found = np.linalg.inv(b) @ vectors[8].reshape(3, 3) @ a
+    if abs(found[2, 2]) < 1e-12 or abs(np.linalg.det(found / found[2, 2])) < 1e-12:
+        raise DataError("the points of the registration give no invertible homography; check their order")
+    return found / found[2, 2]
+
+
+def _normaliser(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    middle = points.mean(axis=0)
+    distance = np.sqrt(((points - middle) ** 2).sum(axis=1)).mean()
+    if distance == 0:
+        raise DataError("the points of the registration coincide; spread them over the picture")
+    scale = np.sqrt(2) / distance
+    return np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1]])
+
+
+def _map(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    mapped = np.column_stack([points, np.ones(len(points))]) @ matrix.T
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def registration_error(matrix: NDArray, source: ArrayLike, target: ArrayLike) -> float:
+    """Return the root mean square distance, target pixels, between mapped source points and their targets.
+
+    Args:
+        matrix: Homography, [3, 3].
+        source: Points (x, y), [N, 2], pixels.
+        target: Where they should be, [N, 2], pixels.
+    """
+    away = _map(np.asarray(matrix, float), np.asarray(source, float)) - np.asarray(target, float)
+    return float(np.sqrt((away**2).sum(axis=1).mean()))
+
+
+@njit(cache=True)
+def _warp(frames, back, samples, out, covered):
+    height, width = frames.shape[1], frames.shape[2]
+    for row in range(out.shape[1]):
+        for column in range(out.shape[2]):
+            inside = 0
+            for i in range(samples):
+                for j in range(samples):
+                    x, y = column + (j + 0.5) / samples - 0.5, row + (i + 0.5) / samples - 0.5
+                    w = back[2, 0] * x + back[2, 1] * y + back[2, 2]
+                    u = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / w if w != 0 else -1e9
+                    v = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / w if w != 0 else -1e9
+                    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+                        continue
+                    u, v = min(max(u, 0.0), width - 1.0), min(max(v, 0.0), height - 1.0)
+                    left, top = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
+                    right, low = min(left + 1, width - 1), min(top + 1, height - 1)
+                    a, b = u - left, v - top
+                    inside += 1
+                    for n in range(len(frames)):
+                        upper = (1 - a) * frames[n, top, left] + a * frames[n, top, right]
+                        lower = (1 - a) * frames[n, low, left] + a * frames[n, low, right]
+                        out[n, row, column] += (1 - b) * upper + b * lower
+            covered[row, column] = inside / (samples * samples)
+            if inside:
+                for n in range(len(frames)):
+                    out[n, row, column] /= inside
+
+
+def warp_frames(
+    frames: NDArray, matrix: ArrayLike, shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return frames on another camera's pixels, and how much of each of these the frames cover.
+
+    A pixel is the mean of bilinear samples on a square grid in it, as many as keep them about a source pixel
+    apart (at most 8 x 8), so that a finer camera is averaged and not merely picked from.
+
+    Args:
+        frames: [N, H, W], any real numbers; pixel centres are at whole coordinates.
+        matrix: Homography from frame coordinates (x, y) to those of the result, [3, 3].
+        shape: Rows and columns of the result.
+
+    Returns:
+        float32 [N, *shape], 0 where nothing is covered, and the covered part, float32 [*shape], 0..1.
+
+    Raises:
+        DataError: The matrix cannot be inverted, or the frames cover nothing.
+    """
+    matrix = np.asarray(matrix, float)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
+        raise DataError(f"the homography {matrix.tolist()} cannot be inverted; give 3 rows of 3 numbers")
+    back = np.linalg.inv(matrix)
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    steps = _map(back, middle + np.array([[0, 0], [1, 0], [0, 1]]))
+    scale = max(np.hypot(*(steps[1] - steps[0])), np.hypot(*(steps[2] - steps[0])))
+    samples = int(np.clip(np.ceil(scale - 1e-9), 1, _MAX_SAMPLES)) if np.isfinite(scale) else 1
+    out = np.zeros((len(frames), *shape), np.float64)
+    covered = np.zeros(shape, np.float32)
+    _warp(np.ascontiguousarray(frames, dtype=np.float32), back, samples, out, covered)
+    if not covered.any():
+        raise DataError("after registration the frames lie outside the event camera's view; check the points")
+    return out.astype(np.float32), covered
+
+
+_SMALLEST = 3  # pixels of a dot
+_OFF_GRID = 0.3  # of a grid step: farther dots are no grid
+
+
+@njit(cache=True)
+def _blobs(bright, picture):
+    """Return for each 8-connected set of bright pixels: weight, weighted sums of x and y, pixels."""
+    height, width = bright.shape
+    seen = np.zeros((height, width), np.bool_)
+    stack = np.empty((height * width, 2), np.int64)
+    found = []
+    for row in range(height):
+        for column in range(width):
+            if not bright[row, column] or seen[row, column]:
+                continue
+            seen[row, column] = True
+            stack[0, 0], stack[0, 1] = row, column
+            size, weight, sum_x, sum_y, pixels = 1, 0.0, 0.0, 0.0, 0
+            while size:
+                size -= 1
+                at_row, at_column = stack[size, 0], stack[size, 1]
+                value = picture[at_row, at_column]
+                weight += value
+                sum_x += value * at_column
+                sum_y += value * at_row
+                pixels += 1
+                for v in range(max(0, at_row - 1), min(height, at_row + 2)):
+                    for u in range(max(0, at_column - 1), min(width, at_column + 2)):
+                        if bright[v, u] and not seen[v, u]:
+                            seen[v, u] = True
+                            stack[size, 0], stack[size, 1] = v, u
+                            size += 1
+            found.append((weight, sum_x, sum_y, float(pixels)))
+    return found
+
+
+def find_dots(picture: NDArray, rows: int, columns: int) -> NDArray[np.float64]:
+    """Return the centres of a grid of bright dots on a dark ground, row by row from the top left.
+
+    Pixels above the middle between the ground (median) and the brightest (99.9th percentile) form dots; the
+    `rows` x `columns` largest are taken, their centres of brightness fitted by a homography from their four
+    corners. The grid may be tilted by less than 45 degrees and seen in perspective.
+
+    Args:
+        picture: [H, W], brighter dots; for a blinking grid the number of events a pixel.
+        rows: Rows of dots, at least 2.
+        columns: Dots a row, at least 2.
+
+    Returns:
+        Points (x, y), float64 [rows * columns, 2], pixels.
+
+    Raises:
+        DataError: Another number of dots, or dots that form no such grid.
+    """
+    if rows < 2 or columns < 2:
+        raise DataError(f"a grid of {rows} x {columns} dots; give at least 2 x 2")
+    picture = np.asarray(picture, np.float64)
+    ground, top = np.median(picture), np.percentile(picture, 99.9)
+    top = max(top, picture.max() * 0.5)  # dots may cover less than a thousandth
+    above = np.clip(picture - ground, 0, None)
+    blobs = [blob for blob in _blobs(above > (top - ground) / 2, above) if blob[3] >= _SMALLEST]
+    count = rows * columns
+    if top <= ground or len(blobs) < count:
+        raise DataError(
+            f"{len(blobs)} dots found where {rows} x {columns} are announced; check light and focus"
+        )
+    largest = np.array(sorted(blobs, key=lambda blob: -blob[0])[:count])
+    if len(blobs) > count and sorted(blob[0] for blob in blobs)[-count - 1] > 0.5 * np.median(largest[:, 0]):
+        raise DataError(f"{len(blobs)} dots found where {rows} x {columns} are announced; hide other lights")
+    centres = largest[:, 1:3] / largest[:, :1]
+    ends = centres.sum(axis=1), centres[:, 0] - centres[:, 1]
+    corners = [np.argmin(ends[0]), np.argmax(ends[1]), np.argmax(ends[0]), np.argmin(ends[1])]
+    steps = np.array([(0, 0), (columns - 1, 0), (columns - 1, rows - 1), (0, rows - 1)], float)
+    if len(set(corners)) < 4:
+        raise DataError("the dots have no four corners; turn the grid upright")
+    to_grid = homography_from_points(centres[corners], steps)
+    mapped = np.column_stack([centres, np.ones(count)]) @ to_grid.T
+    place = mapped[:, :2] / mapped[:, 2:]
+    nearest = np.round(place)
+    away = np.abs(place - nearest).max()
+    order = (nearest[:, 1] * columns + nearest[:, 0]).astype(int)
+    if away > _OFF_GRID or sorted(order) != list(range(count)):
+        raise DataError(f"the dots form no grid of {rows} x {columns}; check its rows and columns")
+    return centres[np.argsort(order)]

@@ -1,0 +1,373 @@
+"""Variation from object to object: settings drawn from ranges, so that no network learns one rig by heart.
+
+- From settings to a dataset of shards: each object is a pure function of (settings, seed, name).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from evnlos.cameras import FrameCamera, PixelSettings
+from evnlos.config import check_made, config_hash, to_dict
+from evnlos.data.pool import Engine, processes, run_tasks
+from evnlos.data.sampling import Samples, Sampling, edges_from, make_samples
+from evnlos.data.store import Dataset, claim_dataset, write_shard
+from evnlos.errors import ConfigError
+from evnlos.progress import Progress, Step, silent
+from evnlos.scene import Glyphs, HandwritingGlyphs, LineMotion, Scene, character_name
+from evnlos.setups import PaperSetup, SensorSize, Setup
+from evnlos.setups.base import CAMERA_FIELDS, LIGHT_FIELDS, is_camera
+from evnlos.types import Events, derive_seed
+from evnlos.untrusted import check_memory
+
+T = TypeVar("T")
+Ranges = dict[str, tuple[float, float]]
+
+
+def varied(config: T, ranges: Ranges, seed: int, name: str) -> T:
+    """Return `config` with the named settings drawn uniformly from their ranges, for one object.
+
+    Args:
+        config: A nested frozen dataclass.
+        ranges: Dotted name of a number (`setup.pixel.threshold_on`; `setup.offset_m.0` for the first entry of a
+            tuple) -> (low, high), in the setting's own unit.
+        seed: The run's seed.
+        name: The object's name; the same seed and name draw the same settings.
+
+    Raises:
+        ConfigError: A name is unknown (the nearest is named) or is not a number.
+    """
+    for path, (low, high) in ranges.items():
+        draw = np.random.default_rng(derive_seed(seed, name, "vary", _seed_word(path))).uniform(low, high)
+        config = _replaced(config, path.split("."), float(draw), path)
+    return config
+
+
+def check_ranges(config: object, ranges: Ranges) -> None:
+    """Try both ends of every range, so that a wrong name or value is an error at once.
+
+    Raises:
+        ConfigError: As for `varied`, or a value that the setting itself refuses.
+    """
+    for path, (low, high) in ranges.items():
+        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+            raise ConfigError(f"vary.{path} is ({low}, {high}); give two ascending finite numbers")
+        first, *rest = path.split(".")
+        names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
+        if first not in names:
+            raise _unknown(path, first, names)
+        for value in (low, high):
+            _replaced(getattr(config, first), rest, value, path)
+
+
+def _seed_word(path: str) -> str:
+    """Return the word that a setting's draw is seeded with: it stays when settings move, and so do datasets."""
+    section, _, rest = path.partition(".")
+    if section != "setup":
+        return path
+    return rest if is_camera(rest) else f"transport.{rest}"
+
+
+def _unknown(path: str, key: str, names: list[str]) -> ConfigError:
+    near = difflib.get_close_matches(key, names, n=1)
+    cure = f"perhaps you meant {near[0]!r}" if near else f"known here: {', '.join(names) or 'nothing'}"
+    return ConfigError(f"vary.{path}: unknown setting {key!r}; {cure}")
+
+
+def _replaced(node: Any, keys: list[str], value: float, path: str) -> Any:
+    if not keys:
+        if isinstance(node, bool) or not isinstance(node, (int, float)):
+            raise ConfigError(f"vary.{path} names {node!r}, which is no number; name a number")
+        return value
+    key, rest = keys[0], keys[1:]
+    if isinstance(node, tuple) and key.isdigit() and int(key) < len(node):
+        i = int(key)
+        return (*node[:i], _replaced(node[i], rest, value, path), *node[i + 1 :])
+    if not dataclasses.is_dataclass(node) or isinstance(node, type):
+        raise _unknown(path, key, [])
+    names = [field.name for field in dataclasses.fields(node)]
+    if key not in names:
+        raise _unknown(path, key, names)
+    return dataclasses.replace(node, **{key: _replaced(getattr(node, key), rest, value, path)})
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Everything that decides a simulated dataset."""
+
+    glyphs: Glyphs = field(default_factory=HandwritingGlyphs)
+    """What is hidden."""
+    motion: LineMotion = field(default_factory=LineMotion)
+    """How it moves."""
+    duration_s: float = 8.0
+    """Length of a pass, seconds."""
+    positions: int = 40
+    """Equidistant positions of an object, one sample each."""
+    setup: Setup = field(default_factory=PaperSetup)
+    """Wall, geometry, ambient light and cameras: how the light becomes frames and events."""
+    sampling: Sampling = field(default_factory=Sampling)
+    """Resolution and representation of the stored samples."""
+    vary: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Settings drawn for each object from a range: dotted name -> (low, high)."""
+    rigs: int = 0
+    """Number of different walls and geometries that the ranges of the setup are drawn for, shared by the
+    objects (each costs a light-transport matrix); 0 = one for each object."""
+    validation: float = 0.05
+    """Share of the objects that is held out for validation, 0..1."""
+    held_out: str = ""
+    """Characters whose objects are for testing alone, one after the other: GK49."""
+    keep_events: bool = False
+    """Store the events of each object beside the maps."""
+    seed: int = 0
+    """Seed of every draw."""
+
+    def __post_init__(self) -> None:
+        if not self.duration_s > 0:
+            raise ConfigError(f"Simulation.duration_s is {self.duration_s}; give a positive number of seconds")
+        if self.positions < 1:
+            raise ConfigError(f"Simulation.positions is {self.positions}; give at least 1")
+        if self.rigs < 0:
+            raise ConfigError(
+                f"Simulation.rigs is {self.rigs}; give 0 (one for each object) or a number of rigs"
+            )
+        if not 0 <= self.validation < 1:
+            raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
+        _ = self.setup.event_camera  # refuses a step that does not fit the model
+        check_ranges(self, self.vary)
+        check_made(self)
+
+    def optics(self) -> dict[str, float]:
+        """Return what diffraction and the wall do to the picture: Fresnel number, blurs, sampling limit.
+
+        Empty for a radiometric wall, whose blur `evnlos identify` measures.
+
+        Example:
+            >>> round(Simulation().optics()["fresnel_number"])
+            6400
+        """
+        return self.setup.optical_values(self.glyphs.plate.size_m)
+
+    def with_setup(self, **changes: Any) -> Simulation:
+        """Return the simulation with some settings of its setup replaced, by name.
+
+        Args:
+            changes: Settings of the setup, e.g. `pixel=EventPixel(...)`.
+        """
+        return replace(self, setup=replace(self.setup, **changes))
+
+    @property
+    def frame_camera(self) -> FrameCamera:
+        """The setup's frame camera."""
+        return self.setup.frame_camera
+
+    @property
+    def pixel(self) -> PixelSettings:
+        """The setup's event model and its parameters."""
+        return self.setup.pixel
+
+    @property
+    def sensor(self) -> SensorSize:
+        """The size of the setup's sensor."""
+        return self.setup.sensor
+
+
+def drawn_for(config: Simulation, name: str) -> Simulation:
+    """Return the settings that `vary` draws for an object; those of the optics are shared by `rigs` groups.
+
+    Gain and ambient light cost nothing, so they are always the object's own.
+    """
+    optics = {path: ends for path, ends in config.vary.items() if config.rigs and _needs_a_matrix(path)}
+    others = {path: ends for path, ends in config.vary.items() if path not in optics}
+    if optics:
+        group = derive_seed(config.seed, name, "rig") % config.rigs
+        config = varied(config, optics, config.seed, f"rig {group}")
+    return varied(config, others, config.seed, name)
+
+
+def _needs_a_matrix(path: str) -> bool:
+    section, name, *_ = path.split(".")
+    return section == "setup" and name not in (*LIGHT_FIELDS, *CAMERA_FIELDS)
+
+
+def scene_of(config: Simulation, drawn: Simulation, name: str) -> Scene:
+    """Return what an object's pass shows, given the settings drawn for it: the glyph is not varied."""
+    target = config.glyphs.target(name, derive_seed(config.seed, "glyph"))
+    return Scene(target, drawn.motion, drawn.duration_s)
+
+
+def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
+    """Simulate one object's pass: scene -> wall -> events and frames -> samples.
+
+    Args:
+        config: The settings.
+        name: One of `config.glyphs.objects()`.
+
+    Returns:
+        The samples of all positions, and the events of the whole pass.
+    """
+    drawn = drawn_for(config, name)
+    scene = scene_of(config, drawn, name)
+    setup = drawn.setup
+    wall = setup.observe(scene)
+    times_s = scene.position_times_s(config.positions)
+    seed = derive_seed(config.seed, name, "events")
+    events = setup.event_camera.record(wall, 0.0, drawn.duration_s, seed=seed)
+    frames = setup.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
+    edges_us = edges_from(times_s)
+    peak = 2**setup.frame_camera.bit_depth - 1
+    return make_samples(
+        frames, peak, events, edges_us, config.sampling, motion=scene.motion, target=scene.target
+    ), events
+
+
+def pass_bytes(setup: Setup, plate_m: float, duration_s: float, frames: int, cells: int = 0) -> int:
+    """Return the memory that simulating one pass takes at least, bytes, without simulating anything.
+
+    Counted are the wall's matrix, the states of the sensor's pixels, its frames, the maps, and the events that
+    noise alone sends.
+
+    Args:
+        setup: Wall and cameras.
+        plate_m: Side of the target, metres.
+        duration_s: Length of the pass, seconds.
+        frames: Frames.
+        cells: Cells of the maps of each frame.
+    """
+    pixels = setup.sensor.height * setup.sensor.width
+    noise = pixels * duration_s * setup.pixel.noise_hz
+    wall = setup.bytes_of_a_scene(plate_m)
+    return int(wall + 100 * pixels + frames * (4 * pixels + 32 * cells) + 26 * noise)
+
+
+def object_bytes(config: Simulation) -> int:
+    """Return the memory that simulating one object takes at least, bytes, without simulating anything.
+
+    Args:
+        config: The settings.
+    """
+    cells = config.sampling.height * config.sampling.width
+    return pass_bytes(config.setup, config.glyphs.plate.size_m, config.duration_s, config.positions, cells)
+
+
+def check_passes(needed: int, at_once: int) -> None:
+    """Refuse passes that take more memory together than there is.
+
+    Args:
+        needed: Bytes of each.
+        at_once: How many are simulated at a time.
+
+    Raises:
+        DataError: They need more.
+    """
+    what = "an object" if at_once < 2 else f"simulating {at_once} objects at a time"
+    fewer = "" if at_once < 2 else "use fewer --workers, or "
+    cure = f"{fewer}take a smaller sensor, fewer positions or less time; or force it"
+    check_memory(needed * at_once, what, cure)
+
+
+def split_of(config: Simulation) -> dict[str, list[str]]:
+    """Return the split by object: those held out for testing, a seeded share for validation, the others.
+
+    Raises:
+        ConfigError: No object shows one of the characters that are to be held out.
+    """
+    every = config.glyphs.objects()
+    held_out = set()
+    for char in config.held_out:
+        shown = {name for name in every if name.endswith(f"_{character_name(char)}")}
+        if not shown:
+            raise ConfigError(
+                f"held_out is {config.held_out!r}, and none of the {len(every)} objects shows {char!r}; give "
+                "characters that the glyphs have, one after the other and nothing between"
+            )
+        held_out |= shown
+    tested = [name for name in every if name in held_out]
+    names = [name for name in every if name not in held_out]
+    count = round(config.validation * len(names))
+    order = np.random.default_rng(derive_seed(config.seed, "split")).permutation(len(names))
+    chosen = {names[i] for i in order[:count]}
+    return {
+        "train": [name for name in names if name not in chosen],
+        "validation": [name for name in names if name in chosen],
+        "test": tested,
+    }
+
+
+def simulate(
+    config: Simulation,
+    folder: str | Path,
+    workers: int = 1,
+    share: tuple[int, int] = (1, 1),
+    engine: Engine = run_tasks,
+    progress: Progress = silent,
+    force: bool = False,
+) -> Dataset:
+    """Simulate a dataset, or what is missing of it, and return it.
+
+    Shards that exist are not made again, so a run that was killed goes on where it was. The shards are
+    the same bytes for any number of workers.
+
+    Args:
+        config: The settings.
+        folder: Where the dataset goes; new, or begun with the same settings.
+        workers: Processes; 0 means one for each core.
+        share: (i, n): only every n-th object, beginning with the i-th; i from 1 to n. The n shares together,
+            made anywhere and in any order, are the dataset.
+        engine: What runs the tasks: processes here, or `run_on_dask`.
+        progress: Called when the work begins and as each shard is in place, with the object's name.
+        force: Whether to begin although the machine's memory will hardly do.
+
+    Returns:
+        The dataset; of a share, with the shards of the others still missing.
+
+    Raises:
+        ConfigError: The share is none, a number of workers below 0, or a held-out character that no
+            object shows.
+        DataError: An object takes more memory than there is, the folder holds something else, or another
+            process is at work in it.
+    """
+    first, stride = share
+    if not 1 <= first <= stride:
+        raise ConfigError(f"share {first} of {stride} is none; give i/n with i from 1 to n")
+    if not force:
+        check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects()) // stride + 1))
+    values = to_dict(config)
+    dataset = Dataset(
+        Path(folder),
+        "simulation",
+        config.sampling,
+        split_of(config),
+        config=values,
+        config_hash=config_hash(config),
+        optics=config.optics(),
+    )
+    with claim_dataset(dataset, f"{first}-of-{stride}" if stride > 1 else ""):
+        share_names = set(config.glyphs.objects()[first - 1 :: stride])
+        missing = [name for name in dataset.missing() if name in share_names]
+        what, total, there = (
+            f"simulate {dataset.folder.name}",
+            len(share_names),
+            len(share_names) - len(missing),
+        )
+        progress(Step(what, there, total, "objects"))
+        tasks = [(config, name, dataset.shard(name), dataset.config_hash) for name in missing]
+        with closing(engine(_simulate_shard, tasks, workers)) as finished:
+            for done, name in enumerate(finished, start=there + 1):
+                progress(Step(what, done, total, "objects", name))
+    return dataset
+
+
+def _simulate_shard(task: tuple[Simulation, str, Path, str]) -> str:
+    config, name, path, settings = task
+    samples, events = simulate_object(config, name)
+    attributes = {"object": name, "config_hash": settings, "seed": config.seed}
+    write_shard(path, samples, attributes, events if config.keep_events else None)
+    return name

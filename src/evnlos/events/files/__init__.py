@@ -1,0 +1,35 @@
+"""Event files: one format a file, found from the content."""
+
+from evnlos.events.files.aedat4 import write_aedat4
+from evnlos.events.files.celex import CelexOptions
+from evnlos.events.files.celex_write import write_celex_frames
+from evnlos.events.files.columns import ReadReport
+from evnlos.events.files.read import (
+    Frames,
+    Triggers,
+    iter_events,
+    read_events,
+    read_events_report,
+    read_frames,
+    read_timed_frames,
+    read_triggers,
+)
+from evnlos.events.files.registry import FORMATS, EventWriter, write_events
+
+__all__ = [
+    "FORMATS",
+    "CelexOptions",
+    "EventWriter",
+    "Frames",
+    "ReadReport",
+    "Triggers",
+    "iter_events",
+    "read_events",
+    "read_events_report",
+    "read_frames",
+    "read_timed_frames",
+    "read_triggers",
+    "write_aedat4",
+    "write_celex_frames",
+    "write_events",
+]

@@ -1,0 +1,303 @@
+"""AEDAT4, the format of iniVation's cameras, read and written.
+
+- AEDAT4, the format of iniVation's cameras, read through the optional package `aedat`.
+
+Writing AEDAT4: an XML description, then packets of events or frames as flat buffers, not compressed.
+
+Flat buffers are laid out by hand: each packet is one table whose places are known beforehand. Numbers of bytes
+in the comments count from the start of the packet's size.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import closing
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.errors import DataError, EventFileError, MissingDependencyError
+from evnlos.events.files.columns import ColumnCheck, Columns, FileSink, ReadReport, join, unreadable
+from evnlos.files import new_file
+from evnlos.types import Events
+from evnlos.untrusted import Child
+
+SIGNATURE = b"#!AER-DAT4.0\r\n"
+_CHILD_BYTES = 2 << 30  # address space of numpy and the package
+_MAX_RATIO = 300  # LZ4 expands at most 255 times
+_CURE = "the file is damaged or not complete: copy it again"
+
+
+def _require_package() -> None:
+    try:
+        import aedat  # noqa: F401
+    except ImportError:
+        raise MissingDependencyError(
+            "reading AEDAT4 needs the package aedat: pip install evnlos[aedat], "
+            "or convert the file elsewhere to HDF5 (DSEC columns), NPZ or RAW"
+        ) from None
+
+
+class _Decoder(Child):
+    """The package at work in a process of its own, whose memory and time grow with the file only."""
+
+    def __init__(self, path: Path, kind: str) -> None:
+        self._path = path
+        size = path.stat().st_size
+        limits = [str(_CHILD_BYTES + _MAX_RATIO * size), str(30 + size // 500_000)]
+        super().__init__(Path(__file__).with_name("_aedat4_child.py"), [str(path.absolute()), *limits, kind])
+
+    def stream_size(self) -> tuple[int, int] | None:
+        """Return width and height of the stream, None where there is none; the first thing to take."""
+        size = self.take_json()
+        return None if size is None else (size[0], size[1])
+
+    def failure(self, found: str) -> EventFileError:
+        """Return the error of a decoder that stopped before the end of the file."""
+        return unreadable(self._path, 0, f"AEDAT4 cannot be decoded ({found})", _CURE)
+
+
+def check_packets(path: Path, report: ReadReport) -> None:
+    """Walk the packets' lengths from the header to the data table, which shows where a file was cut."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        start = len(SIGNATURE)
+        file.seek(start)
+        prefix = file.read(4)
+        length = struct.unpack("<I", prefix)[0] if len(prefix) == 4 else 0
+        if length < 16 or start + 4 + length > size:
+            raise unreadable(path, start, f"a header of {length} bytes in a file of {size}", _CURE)
+        end = _data_table_position(file.read(length))
+        if end is None:
+            end = size
+        at = start + 4 + length
+        if not at <= end <= size:
+            raise unreadable(path, start, f"a data table at byte {end} of {size}", _CURE)
+        while at < end:
+            file.seek(at)
+            head = file.read(8)
+            length = struct.unpack("<ii", head)[1] if len(head) == 8 else -1
+            if length < 0 or at + 8 + length > end:
+                raise unreadable(path, at, f"a packet of {length} bytes, {end - at} are left", _CURE)
+            at += 8 + length
+
+
+def _data_table_position(header: bytes) -> int | None:
+    """Return the second field of the header's flat buffer, None where it is absent or -1."""
+    try:
+        root = struct.unpack_from("<I", header, 0)[0]
+        vtable = root - struct.unpack_from("<i", header, root)[0]
+        if vtable < 0 or struct.unpack_from("<H", header, vtable)[0] < 8:
+            return None
+        field = struct.unpack_from("<H", header, vtable + 6)[0]
+        position = struct.unpack_from("<q", header, root + field)[0] if field else -1
+    except struct.error:
+        return 2**63 - 1  # outside every file: the caller reports it
+    return None if position < 0 else position
+
+
+class Aedat4Source:
+    """The first event stream of an AEDAT4 file."""
+
+    def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
+        self.path, self.report = path, report
+        report.format = "AEDAT4"
+        _require_package()
+        check_packets(path, report)
+        if width is not None:
+            report.set_geometry(width, height, "caller")
+
+    def _read_size(self, decoder: _Decoder) -> None:
+        size = decoder.stream_size()
+        if size is None:
+            raise unreadable(self.path, 0, "an AEDAT4 file without an event stream", "record events as well")
+        if not self.report.geometry_from:
+            self.report.set_geometry(size[0], size[1], "header")
+
+    def blocks(self) -> Iterator[Columns]:
+        """Yield the columns packet by packet."""
+        check = ColumnCheck(self.report)
+        with _Decoder(self.path, "events") as decoder:
+            self._read_size(decoder)
+            while True:
+                count = struct.unpack("<q", decoder.take(8))[0]
+                if count < 0:
+                    return
+                data = decoder.take(13 * count)
+                times = np.frombuffer(data, "<i8", count)
+                x, y = (
+                    np.frombuffer(data, "<u2", count, 8 * count),
+                    np.frombuffer(data, "<u2", count, 10 * count),
+                )
+                yield check(
+                    {"t_us": times, "x": x, "y": y, "p": np.frombuffer(data, np.bool_, count, 12 * count)}
+                )
+
+    def read(self) -> Columns:
+        """Return all events of the stream."""
+        return join(list(self.blocks()))
+
+
+def read_aedat4_frames(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Return the pictures of the first frame stream as grey [T, H, W], and their times [T], microseconds.
+
+    Raises:
+        EventFileError: The file is damaged, has no frames, or frames of several sizes.
+        MissingDependencyError: The package `aedat` is not installed.
+    """
+    _require_package()
+    check_packets(path, ReadReport(path))
+    frames: list[NDArray[np.uint8]] = []
+    times: list[int] = []
+    with _Decoder(path, "frame") as decoder:
+        if decoder.stream_size() is None:
+            raise unreadable(path, 0, "an AEDAT4 file without frames", "record frames as well")
+        while True:
+            t_us = struct.unpack("<q", decoder.take(8))[0]
+            if t_us == -1:
+                break
+            height, width, channels = struct.unpack("<3q", decoder.take(24))
+            pixels = np.frombuffer(decoder.take(height * width * channels), np.uint8)
+            frames.append(_grey(pixels.reshape(height, width, channels)))  # [H, W]
+            times.append(t_us)
+            if frames[-1].shape != frames[0].shape:
+                found = (
+                    f"a frame of {width} x {height} pixels after {frames[0].shape[1]} x {frames[0].shape[0]}"
+                )
+                raise unreadable(path, 0, found, "record frames of one size")
+    if not frames:
+        raise unreadable(path, 0, "an AEDAT4 file whose frame stream is empty", "record frames as well")
+    return np.stack(frames), np.array(times, np.int64)
+
+
+def _grey(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return [H, W] of [H, W, channels]: grey as it is, colours by ITU-R BT.601, transparency left out."""
+    if pixels.shape[2] < 3:
+        return pixels[:, :, 0]
+    weights = np.array([0.299, 0.587, 0.114])
+    return np.round(pixels[:, :, :3] @ weights).astype(np.uint8)
+
+
+_SIGNATURE = b"#!AER-DAT4.0\r\n"
+_MAX_SIDE = 1 << 15
+_PACKET = 1 << 14  # events
+_EVENT = np.dtype(
+    {
+        "names": ["t", "x", "y", "on"],
+        "formats": ["<i8", "<i2", "<i2", "?"],
+        "offsets": [0, 8, 10, 12],
+        "itemsize": 16,
+    }
+)
+_EVENTS, _FRAMES = 0, 1  # numbers of the streams
+
+
+def _description(width: int, height: int, has_frames: bool) -> bytes:
+    """Return the XML that names the streams."""
+    streams = [(_EVENTS, "events", "EVTS")] + [(_FRAMES, "frames", "FRME")] * has_frames
+    nodes = "".join(
+        f'<node name="{number}" path="/outInfo/{number}/">'
+        f'<attr key="compression" type="string">NONE</attr>'
+        f'<attr key="originalOutputName" type="string">{name}</attr>'
+        f'<attr key="typeIdentifier" type="string">{kind}</attr>'
+        f'<node name="info" path="/outInfo/{number}/info/">'
+        f'<attr key="sizeX" type="int">{width}</attr><attr key="sizeY" type="int">{height}</attr>'
+        f'<attr key="source" type="string">evnlos</attr></node></node>'
+        for number, name, kind in streams
+    )
+    return f'<dv version="2.0"><node name="outInfo" path="/outInfo/">{nodes}</node></dv>'.encode("ascii")
+
+
+def _header(description: bytes) -> bytes:
+    """Return the table IOHeader: no compression, no data table, the description."""
+    vtable = struct.pack("<5H", 10, 20, 12, 4, 16)  # at 12
+    table = struct.pack("<iqiI", 28 - 12, -1, 0, 4)  # at 28
+    text = struct.pack("<I", len(description)) + description + b"\0"  # at 48
+    body = struct.pack("<I4s", 28 - 4, b"IOHE") + vtable + bytes(6) + table + text
+    return struct.pack("<I", len(body)) + body
+
+
+def _event_packet(events: Events) -> bytes:
+    """Return the table EventPacket: a vector of structures of 16 bytes."""
+    rows = np.zeros(len(events), _EVENT)
+    rows["t"], rows["x"], rows["y"], rows["on"] = events.t_us, events.x, events.y, events.p
+    vtable = struct.pack("<3H", 6, 8, 4)  # at 12
+    table = struct.pack("<iI", 20 - 12, 4)  # at 20
+    body = struct.pack("<I4s", 20 - 4, b"EVTS") + vtable + bytes(2) + table
+    body += struct.pack("<I", len(rows)) + rows.tobytes()  # at 28, the rows at 32
+    return struct.pack("<I", len(body)) + body
+
+
+def _frame_packet(frame: NDArray[np.uint8], t_us: int) -> bytes:
+    """Return the table Frame: five times, the format (0 is grey), size, place and pixels."""
+    height, width = frame.shape
+    vtable = struct.pack("<13H", 26, 60, 4, 12, 20, 28, 36, 56, 48, 50, 52, 54, 44)  # at 12
+    table = struct.pack("<i5qI4hb3x", 44 - 12, *[t_us] * 5, 16, width, height, 0, 0, 0)  # at 44
+    body = struct.pack("<I4s", 44 - 4, b"FRME") + vtable + bytes(6) + table
+    body += struct.pack("<I", frame.size) + frame.tobytes()  # at 104
+    return struct.pack("<I", len(body)) + body
+
+
+class Aedat4Sink(FileSink):
+    """An AEDAT4 file that grows; intensities of events are left out."""
+
+    def __init__(self, path: Path, first: Events, *, has_frames: bool = False) -> None:
+        if max(first.width, first.height) > _MAX_SIDE:
+            raise DataError(
+                f"AEDAT4 holds sensors up to {_MAX_SIDE} x {_MAX_SIDE}, not {first.width} x {first.height}; "
+                "write .h5 or .npz"
+            )
+        super().__init__(path)
+        self.file.write(_SIGNATURE + _header(_description(first.width, first.height, has_frames)))
+
+    def _packet(self, stream: int, content: bytes) -> None:
+        self.file.write(struct.pack("<ii", stream, len(content)) + content)
+
+    def append(self, events: Events) -> None:
+        """Write the packets of a piece."""
+        if events.polarity_known is not None and not events.polarity_known.all():
+            raise DataError(
+                "AEDAT4 has no mark for an unknown polarity; use keep_known_polarity(events) first, "
+                "or write .h5"
+            )
+        for start in range(0, len(events), _PACKET):
+            self._packet(_EVENTS, _event_packet(events[start : start + _PACKET]))
+
+    def append_frame(self, frame: NDArray[np.uint8], t_us: int) -> None:
+        """Write one grey picture [H, W] of 8 bits."""
+        self._packet(_FRAMES, _frame_packet(frame, t_us))
+
+    def finish(self) -> None:
+        """Do nothing: the file holds no count and no index."""
+
+
+def write_aedat4(
+    path: str | PathLike[str], events: Events, frames: NDArray[np.uint8], times_us: NDArray
+) -> None:
+    """Write events and frames of one clock into one AEDAT4 file, as cameras with both kinds of pixels do.
+
+    Args:
+        path: The file to write; an existing one is replaced.
+        events: The events.
+        frames: Grey pictures, uint8 [T, H, W].
+        times_us: Time of each frame, [T], microseconds, ascending, on the events' clock.
+
+    Raises:
+        DataError: Frames of another shape or type, times that do not ascend or are not as many as the frames.
+    """
+    frames, times = np.asarray(frames), np.asarray(times_us, np.int64)
+    if frames.ndim != 3 or frames.dtype != np.uint8 or max(frames.shape[1:]) >= _MAX_SIDE:
+        raise DataError(f"frames of shape {frames.shape} and type {frames.dtype}; give uint8 [T, H, W]")
+    if times.shape != frames.shape[:1] or (np.diff(times) <= 0).any():
+        raise DataError(f"{len(frames)} frames with times of shape {times.shape}; give one each, ascending")
+    with new_file(path) as temporary, closing(Aedat4Sink(temporary, events, has_frames=True)) as sink:
+        done = 0
+        for frame, t_us in zip(frames, times.tolist(), strict=True):
+            until = int(np.searchsorted(events.t_us, t_us, side="right"))
+            sink.append(events[done:until])
+            sink.append_frame(frame, t_us)
+            done = until
+        sink.append(events[done:])

@@ -1,0 +1,315 @@
+"""What every format shares: blocks of event columns, reports of reading, pieces in writing.
+
+- What reading an event file found: the strict mode raises at the first fault, salvage keeps a tally.
+- What every writer of event files offers: pieces in, one complete file.
+- Blocks of event columns on their way from a file to `Events`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from evnlos.errors import EventFileError
+from evnlos.types import Events
+
+OnError = Literal["strict", "salvage"]
+
+
+def check_on_error(on_error: str) -> None:
+    """Raise unless `on_error` is "strict" or "salvage"."""
+    if on_error not in ("strict", "salvage"):
+        raise EventFileError(f'on_error is {on_error!r}; give "strict" or "salvage"')
+
+
+@dataclass
+class ReadReport:
+    """What was found in one event file.
+
+    Args:
+        path: The file.
+        strict: Whether the first fault raises.
+        format: Name of the format, as in `FORMATS`.
+        width: Sensor width, pixels.
+        height: Sensor height, pixels.
+        geometry_from: Where the size comes from: "caller", "header", "camera" (the model that the header
+            names), "format" (it has one sensor only), "events" (one past the largest coordinate) or
+            "assumed" (the format's usual sensor).
+        events: Events returned.
+        triggers: External trigger edges seen.
+        skipped: Events before the first row or time of a recording that starts in the middle; no fault.
+        faults: How many faults of each kind: "truncated", "left_over", "out_of_range", "backwards",
+            "undated", "unknown", "header", "checksum", "count".
+        first: One line on the first fault of each kind, with its byte offset.
+        bytes_left_over: Bytes that could not be used.
+        truncated: Whether the file ends before it should.
+    """
+
+    path: Path
+    strict: bool = True
+    format: str = ""
+    width: int = 0
+    height: int = 0
+    geometry_from: str = ""
+    events: int = 0
+    triggers: int = 0
+    skipped: int = 0
+    faults: dict[str, int] = field(default_factory=dict)
+    first: dict[str, str] = field(default_factory=dict)
+    bytes_left_over: int = 0
+    truncated: bool = False
+
+    def set_geometry(self, width: object, height: object, source: str, offset: int = 0) -> None:
+        """Take over a sensor size and where it comes from.
+
+        Raises:
+            EventFileError: A side is not a whole number of pixels between 1 and 65536.
+        """
+        try:
+            sides = int(width), int(height)  # type: ignore[call-overload]
+        except (TypeError, ValueError):
+            sides = 0, 0
+        if not all(1 <= side <= 65_536 for side in sides):
+            found = f"a sensor of {str(width)[:20]} x {str(height)[:20]} pixels"
+            raise unreadable(self.path, offset, found, "give width= and height=")
+        self.width, self.height, self.geometry_from = *sides, source
+
+    @property
+    def clean(self) -> bool:
+        """Whether no fault was found."""
+        return not self.faults
+
+    def fault(
+        self, kind: str, offset: int, found: str, cure: str, *, count: int = 1, lost_bytes: int = 0
+    ) -> None:
+        """Note a fault at byte `offset`; in strict mode raise it as one line."""
+        line = f"{self.path}: byte {offset}: {found}; {cure}"
+        if self.strict:
+            raise EventFileError(line)
+        self.faults[kind] = self.faults.get(kind, 0) + count
+        self.first.setdefault(kind, line)
+        self.bytes_left_over += lost_bytes
+        self.truncated |= kind == "truncated"
+
+    def __str__(self) -> str:
+        size = f"{self.width} x {self.height} ({self.geometry_from})"
+        head = f"{self.path}: {self.format}, {size}, {self.events:,} events"
+        if self.clean:
+            return f"{head}, no faults"
+        tally = ", ".join(f"{count:,} {kind.replace('_', ' ')}" for kind, count in self.faults.items())
+        return f"{head}; {tally}; {self.bytes_left_over:,} bytes left over"
+
+
+def unreadable(path: Path, offset: int, found: str, cure: str) -> EventFileError:
+    """Return the error of a file from which nothing can be taken, strict or not."""
+    return EventFileError(f"{path}: byte {offset}: {found}; {cure}")
+
+
+class Sink(Protocol):
+    """An event file that grows; it is complete after `finish`."""
+
+    def append(self, events: Events) -> None:
+        """Write a piece: the same sensor and columns as the first, and no time before its predecessor's."""
+        ...
+
+    def finish(self) -> None:
+        """Complete the file: counts, indices."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the file, complete or not."""
+        ...
+
+
+class FileSink:
+    """A sink on one plain file."""
+
+    def __init__(self, path: Path) -> None:
+        self.file = path.open("wb")
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+
+Columns = dict[str, NDArray]
+DTYPES = {
+    "t_us": np.int64,
+    "x": np.uint16,
+    "y": np.uint16,
+    "p": np.bool_,
+    "adc": np.uint16,
+    "polarity_known": np.bool_,
+}
+
+
+def allocate(count: int, names: Iterable[str] = ("t_us", "x", "y", "p")) -> Columns:
+    """Return uninitialised columns for `count` events."""
+    return {name: np.empty(count, DTYPES[name]) for name in names}
+
+
+def cut(columns: Columns, start: int, stop: int) -> Columns:
+    """Return a view of the events start..stop."""
+    return {name: column[start:stop] for name, column in columns.items()}
+
+
+def enlarge(columns: Columns, count: int, room: int) -> None:
+    """Put columns of `room` places in place of these, with their first `count` events."""
+    for name, column in columns.items():
+        larger = np.empty(room, column.dtype)
+        larger[:count] = column[:count]
+        columns[name] = larger
+
+
+def shorten(columns: Columns, count: int) -> None:
+    """Give the memory behind the first `count` events back; nothing is copied."""
+    for column in columns.values():
+        column.resize(count, refcheck=False)
+
+
+def join(blocks: list[Columns]) -> Columns:
+    """Return the blocks as one; no block gives empty columns."""
+    if not blocks:
+        return allocate(0)
+    if len(blocks) == 1:
+        return blocks[0]
+    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+
+
+def trusted_events(columns: Columns, width: int, height: int) -> Events:
+    """Return `Events` of columns that a decoder has checked already."""
+    return Events._trusted(columns, width, height)
+
+
+@njit(cache=True)
+def _is_clean(t_us, x, y, width, height, newest):
+    """Return whether all events are inside the sensor and in order, in loops for vector code."""
+    largest_x, largest_y = np.uint16(0), np.uint16(0)
+    for value in x:
+        largest_x = max(largest_x, value)
+    for value in y:
+        largest_y = max(largest_y, value)
+    backwards = len(t_us) > 0 and t_us[0] < newest
+    for index in range(1, len(t_us)):
+        backwards |= t_us[index] < t_us[index - 1]
+    return largest_x < width and largest_y < height and not backwards
+
+
+@njit(cache=True)
+def _check_columns(t_us, x, y, width, height, newest):
+    """Return index and kind (0 none, 1 out of range, 2 backwards) of the first fault and both tallies."""
+    first, kind, outside, backwards = -1, 0, 0, 0
+    for index in range(len(t_us)):
+        if x[index] >= width or y[index] >= height:
+            outside += 1
+            if first < 0:
+                first, kind = index, 1
+            continue
+        if t_us[index] < newest:
+            backwards += 1
+            if first < 0:
+                first, kind = index, 2
+        newest = t_us[index]
+    return first, kind, outside, backwards, newest
+
+
+class ColumnCheck:
+    """Checks blocks of a file that stores columns (HDF5, NPZ, CSV, AEDAT4): coordinates and order of time."""
+
+    def __init__(self, report: ReadReport, locate: Callable[[int], int] | None = None) -> None:
+        """`locate` gives the byte of the file where an event, by its number, stands."""
+        self._report, self._locate = report, locate
+        self._newest = np.iinfo(np.int64).min
+        self._events = 0
+
+    def __call__(self, columns: Columns, offsets: NDArray[np.int64] | None = None) -> Columns:
+        """Return the block without events outside the sensor; report them, and times that run backwards.
+
+        `offsets` are the bytes of the file where the events stand, where that is known.
+        """
+        report, count = self._report, len(columns["t_us"])
+        sides = report.width, report.height
+        if _is_clean(columns["t_us"], columns["x"], columns["y"], *sides, self._newest):
+            self._events += count
+            self._newest = columns["t_us"][-1] if count else self._newest
+            return columns
+        first, kind, outside, backwards, self._newest = _check_columns(
+            columns["t_us"], columns["x"], columns["y"], *sides, self._newest
+        )
+        if kind:
+            number = self._events + first
+            offset = int(offsets[first]) if offsets is not None else self._locate(number) if self._locate else 0
+            order = ((1, outside), (2, backwards)) if kind == 1 else ((2, backwards), (1, outside))
+            for which, many in order:
+                if many and which == 1:
+                    found = f"event {number} at x={columns['x'][first]}, y={columns['y'][first]}"
+                    cure = f"the sensor is {report.width} x {report.height}; give width= and height="
+                    report.fault("out_of_range", offset, found, cure, count=many)
+                elif many:
+                    found = f"event {number} at {columns['t_us'][first]} us is earlier than the one before it"
+                    cure = 'sort the file by time or read with on_error="salvage"'
+                    report.fault("backwards", offset, found, cure, count=many)
+        self._events += count
+        if outside:
+            inside = (columns["x"] < report.width) & (columns["y"] < report.height)
+            columns = {name: column[inside] for name, column in columns.items()}
+        return columns
+
+
+@njit(cache=True)
+def _longest_ascent(t_us):
+    """Return a mask of the longest non-decreasing subsequence (patience sorting, n log n)."""
+    count = len(t_us)
+    tails = np.empty(count, np.int64)  # index of the smallest end of a subsequence of each length
+    before = np.full(count, -1, np.int64)
+    length = 0
+    for index in range(count):
+        low, high = 0, length
+        if length and t_us[tails[length - 1]] <= t_us[index]:
+            low = length
+        else:
+            while low < high:
+                middle = (low + high) // 2
+                if t_us[tails[middle]] <= t_us[index]:
+                    low = middle + 1
+                else:
+                    high = middle
+        before[index] = tails[low - 1] if low else -1
+        tails[low] = index
+        length = max(length, low + 1)
+    kept = np.zeros(count, np.bool_)
+    index = tails[length - 1] if length else -1
+    while index >= 0:
+        kept[index] = True
+        index = before[index]
+    return kept
+
+
+def keep_in_order(columns: Columns) -> Columns:
+    """Return the largest set of events in the order of time, so that one outlier costs one event."""
+    kept = _longest_ascent(columns["t_us"])
+    return {name: column[kept] for name, column in columns.items()}
+
+
+def keep_after(columns: Columns, newest_us: int) -> Columns:
+    """Return the events not earlier than `newest_us`."""
+    if not len(columns["t_us"]) or columns["t_us"][0] >= newest_us:
+        return columns
+    return cut(columns, int(np.searchsorted(columns["t_us"], newest_us)), len(columns["t_us"]))
+
+
+def in_order(blocks: Iterable[Columns], report: ReadReport) -> Iterator[Columns]:
+    """Yield the blocks, in salvage mode without events that are earlier than one before them."""
+    newest = np.iinfo(np.int64).min
+    for block in blocks:
+        if report.faults.get("backwards"):
+            block = keep_after(keep_in_order(block), newest)
+        if len(block["t_us"]):
+            newest = int(block["t_us"][-1])
+            yield block

@@ -1,0 +1,311 @@
+"""The formats of event files, and writing them.
+
+- The formats, found from a file's content before its name; a new format is one entry here.
+- Writing event files: under a temporary name first, so that a file that exists is complete.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from evnlos.errors import DataError, EventFileError
+from evnlos.events.files import aedat4, celex, celex_write, csv, csv_rows, fixed_words, hdf5, npz, raw
+from evnlos.events.files.celex import CelexOptions
+from evnlos.events.files.columns import Columns, ReadReport, Sink, unreadable
+from evnlos.files import new_file
+from evnlos.types import Events
+from evnlos.untrusted import open_regular
+
+_SNIFFED_BYTES = 65_536
+
+
+class Source(Protocol):
+    """An open event file: checked header, events as one set of columns or block by block."""
+
+    def read(self) -> Columns:
+        """Return all events."""
+        ...
+
+    def blocks(self) -> Iterator[Columns]:
+        """Yield the events in blocks of bounded size."""
+        ...
+
+
+@dataclass(frozen=True)
+class Format:
+    """One event file format.
+
+    Args:
+        name: Its name, as `write_events(format=...)` takes it.
+        suffixes: File name endings, lower case with the dot.
+        sniff: Whether the first bytes of a file (64 KiB at most) are of this format.
+        open: Opens a file: (path, report, width, height, celex options).
+        create: Begins a file: (path, first piece of the events, the name that it will get); None where the
+            format is only read.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    sniff: Callable[[bytes], bool]
+    open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None], Source]
+    create: Callable[[Path, Events, Path], Sink] | None = None
+
+
+def _plain(source: Callable[[Path, ReadReport, int | None, int | None], Source]) -> Callable[..., Source]:
+    """Return an opener that has no use for the options of CeleX-V."""
+    return lambda path, report, width, height, _: source(path, report, width, height)
+
+
+def _raw(name: str) -> Format:
+    return Format(
+        name,
+        (".raw",),
+        lambda start: raw.sniff_raw(start) == name,
+        _plain(raw.RawSource),
+        lambda path, first, _: raw.RawSink(path, first, name),
+    )
+
+
+FORMATS = (
+    Format(
+        "HDF5",
+        (".h5", ".hdf5"),
+        lambda start: start.startswith(hdf5.SIGNATURE),
+        _plain(hdf5.Hdf5Source),
+        lambda path, first, _: hdf5.Hdf5Sink(path, first),
+    ),
+    Format(
+        "NPZ",
+        (".npz",),
+        lambda start: start.startswith(npz.SIGNATURE),
+        _plain(npz.NpzSource),
+        lambda path, first, _: npz.NpzSink(path, first),
+    ),
+    _raw("EVT3"),  # the first of a suffix is the one that is written by default
+    _raw("EVT2"),
+    _raw("EVT21"),
+    Format("DAT", (".dat",), fixed_words.sniff_dat, _plain(fixed_words.DatSource)),
+    Format("ES", (".es",), lambda start: start.startswith(fixed_words.SIGNATURE), _plain(fixed_words.EsSource)),
+    Format(
+        "AEDAT4",
+        (".aedat4",),
+        lambda start: start.startswith(aedat4.SIGNATURE),
+        _plain(aedat4.Aedat4Source),
+        lambda path, first, _: aedat4.Aedat4Sink(path, first),
+    ),
+    Format("CELEX", (".bin",), celex.sniff_celex, celex.CelexSource, celex_write.CelexSink),
+    Format(  # read as CELEX: the header tells the event formats apart
+        "CELEX0",
+        (),
+        lambda _: False,
+        celex.CelexSource,
+        lambda path, first, target: celex_write.CelexSink(path, first, target, event_format=0),
+    ),
+    Format(
+        "CSV",
+        (".csv", ".txt"),
+        lambda start: csv_rows.find_layout(start) is not None,
+        csv.CsvSource,
+        lambda path, first, _: csv.CsvSink(path, first),
+    ),
+)
+
+
+def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format:
+    """Return the format of a file from its content; a stated CeleX event format overrides a damaged header.
+
+    Raises:
+        EventFileError: The file is absent, empty, or of no known format.
+    """
+    if not path.is_file():
+        raise EventFileError(f"{path}: no such file; check the path")
+    with open_regular(path) as file:
+        start = file.read(_SNIFFED_BYTES)
+    if not start:
+        raise unreadable(path, 0, "the file is empty", "record or copy it again")
+    if celex_options is not None and celex_options.event_format is not None:
+        return next(format for format in FORMATS if format.name == "CELEX")
+    for format in FORMATS:
+        if format.sniff(start):
+            return format
+    known = ", ".join(format.name for format in FORMATS if format.suffixes)
+    raise unreadable(
+        path, 0, f"no known event format starts with {start[:8].hex(' ')}", f"these are read: {known}"
+    )
+
+
+def format_to_write(path: Path, name: str | None) -> Format:
+    """Return the format to write: the named one, else the first of the file's suffix.
+
+    Raises:
+        EventFileError: The name or suffix is unknown, or the format is only read.
+    """
+    writable = [format for format in FORMATS if format.create]
+    if name is None:
+        found = [format for format in writable if path.suffix.lower() in format.suffixes]
+        what = f"suffix {path.suffix!r}"
+    else:
+        found = [format for format in writable if format.name == name.upper()]
+        what = f"format {name!r}"
+    if not found:
+        suffixes = dict.fromkeys(suffix for format in writable for suffix in format.suffixes)
+        names = ", ".join(format.name for format in writable)
+        raise EventFileError(f"{path}: cannot write {what}; suffixes {', '.join(suffixes)}, formats {names}")
+    return found[0]
+
+
+_PIECE = 1 << 16  # smaller pieces are put together: they would cost a call and a chunk each
+
+
+class EventWriter:
+    """An event file that grows piece by piece; it appears under its name when all went well.
+
+    Memory is bounded by the largest piece. Leaving the block by an error leaves no file.
+
+    Args:
+        path: The file to write; an existing one is replaced.
+        format: Name of the format, by default that of the suffix (`write_events` lists them).
+
+    Raises:
+        EventFileError: No writable format has that suffix or name, or the folder cannot be written.
+        DataError: A piece of another sensor or with other columns than the first, or earlier than the one
+            before; no piece at all; or the format cannot hold the sensor size or the times.
+
+    Example:
+        >>> import tempfile, pathlib
+        >>> from evnlos.events import read_events
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "three.raw"
+        >>> with EventWriter(path) as writer:
+        ...     writer.write(Events([5], [0], [1], [True], width=4, height=2))
+        ...     writer.write(Events([5, 9], [3, 3], [1, 0], [True, False], width=4, height=2))
+        >>> read_events(path)
+        Events(3 events, 4 x 2, 5..9 us, 67 % ON)
+    """
+
+    def __init__(self, path: str | PathLike[str], *, format: str | None = None) -> None:
+        self.path = Path(path)
+        self._format = format_to_write(self.path, format)
+        if not self.path.parent.is_dir():
+            raise EventFileError(f"{self.path}: no such folder {self.path.parent}; create it first")
+        self._place = new_file(self.path)
+        self._temporary = self._place.__enter__()
+        self._sink: Sink | None = None
+        self._blank: Events | None = None  # states the sensor
+        self._names: tuple[str, ...] = ()
+        self._held: list[Events] = []
+        self._newest: int | None = None
+        self.events = 0
+
+    def __enter__(self) -> EventWriter:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        try:
+            with ExitStack() as leaving:
+                leaving.push(self._place)  # at the end: the file gets its name, or goes
+                leaving.callback(self._let_go)
+                if error is not None:
+                    raise error
+                self._finish()
+        except OSError as failure:
+            if failure is error:
+                raise
+            raise self._failure(failure) from None
+
+    def _let_go(self) -> None:
+        if self._sink is not None:
+            with suppress(OSError):  # what could not be written was told before, and the file goes
+                self._sink.close()
+
+    def write(self, events: Events) -> None:
+        """Add a piece; one without events states the sensor size, for a stream that may have none."""
+        self._check(events)
+        if len(events):
+            self._held.append(events)
+            self.events += len(events)
+        if sum(map(len, self._held)) >= _PIECE:
+            try:
+                self._flush()
+            except OSError as error:
+                raise self._failure(error) from None
+
+    def _check(self, events: Events) -> None:
+        if self._blank is None:
+            self._blank = events[:0]
+        if events.shape != self._blank.shape:
+            raise DataError(
+                f"{self.path}: a piece of {events.width} x {events.height} pixels after one of "
+                f"{self._blank.width} x {self._blank.height}; write one sensor a file"
+            )
+        if not len(events):
+            return
+        names = tuple(events.columns())
+        if self._names and names != self._names:
+            raise DataError(
+                f"{self.path}: a piece with columns {names} after {self._names}; make them the same"
+            )
+        self._names = names
+        if self._newest is not None and int(events.t_us[0]) < self._newest:
+            raise DataError(
+                f"{self.path}: a piece from {int(events.t_us[0])} us after an event at {self._newest} us; "
+                "write pieces in the order of time"
+            )
+        self._newest = int(events.t_us[-1])
+
+    def _flush(self) -> None:
+        piece = _joined(self._held) if self._held else self._blank
+        assert piece is not None
+        self._held = []
+        if self._sink is None:
+            assert self._format.create is not None
+            self._sink = self._format.create(self._temporary, piece, self.path)
+        self._sink.append(piece)
+
+    def _finish(self) -> None:
+        if self._blank is None:
+            raise DataError(f"{self.path}: nothing to write; give at least one piece, which may be empty")
+        if self._held or self._sink is None:
+            self._flush()
+        assert self._sink is not None
+        self._sink.finish()
+        self._sink.close()
+
+    def _failure(self, error: OSError) -> EventFileError:
+        return EventFileError(f"{self.path}: writing failed ({error}); check the folder and the space on it")
+
+
+def _joined(pieces: list[Events]) -> Events:
+    if len(pieces) == 1:
+        return pieces[0]
+    columns = {
+        name: np.concatenate([piece.columns()[name] for piece in pieces]) for name in pieces[0].columns()
+    }
+    return Events._trusted(columns, pieces[0].width, pieces[0].height)
+
+
+def write_events(
+    path: str | PathLike[str], events: Events | Iterable[Events], *, format: str | None = None
+) -> None:
+    """Write events to a file; it appears under its name only when it is complete.
+
+    Args:
+        path: The file to write; an existing one is replaced.
+        events: The events, or pieces of one stream in the order of time, such as `iter_events` yields: memory
+            is then bounded by the largest piece.
+        format: Name of the format, such as "EVT2"; by default the suffix decides: .h5 and .hdf5 HDF5 with
+            DSEC columns, .npz NPZ, .raw EVT3, .csv CSV, .bin CeleX-V (name it ..._100M.bin).
+
+    Raises:
+        EventFileError: No writable format has that suffix or name, or the folder cannot be written.
+        DataError: The format cannot hold the sensor size or the times, or the pieces do not fit together.
+    """
+    with EventWriter(path, format=format) as writer:
+        for piece in [events] if isinstance(events, Events) else events:
+            writer.write(piece)

@@ -1,0 +1,30 @@
+"""Names of `evnlos.experiment`; `__init__.py` reads this list."""
+
+from .carry_over import CarriedOver as CarriedOver
+from .carry_over import carried_table as carried_table
+from .carry_over import carry_over as carry_over
+from .carry_over import write_carried as write_carried
+from .conditions import Condition as Condition
+from .conditions import Finding as Finding
+from .conditions import base_simulation as base_simulation
+from .conditions import conditions as conditions
+from .conditions import conditions_table as conditions_table
+from .conditions import map_conditions as map_conditions
+from .presets import STUDIES as STUDIES
+from .presets import on_sequences as on_sequences
+from .run import Simulated as Simulated
+from .run import captures_of as captures_of
+from .run import run_simulated as run_simulated
+from .run import run_study as run_study
+from .study import Arm as Arm
+from .study import Place as Place
+from .study import Record as Record
+from .study import Study as Study
+from .study import read_records as read_records
+from .study import write_record as write_record
+from .table import character_table as character_table
+from .table import checks_table as checks_table
+from .table import difference as difference
+from .table import gain_table as gain_table
+from .table import means_of as means_of
+from .table import summary_table as summary_table

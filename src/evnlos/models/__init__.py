@@ -1,0 +1,44 @@
+"""Reconstructors, their closed-form parts, what their images are worth, and their weights on disk."""
+
+from evnlos.models.confidence import Confidence, Judgement, halves_of, plates
+from evnlos.models.linear import LinearEstimate, fit_linear
+from evnlos.models.reconstructor import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
+from evnlos.models.sequence import SequenceConfig, SequenceReconstructor
+from evnlos.models.unet import ResidualUNet, UNetConfig, UNetReconstructor
+from evnlos.models.weights import (
+    Weights,
+    describe_network,
+    load_weights,
+    published,
+    published_for,
+    published_rig,
+    published_single,
+    save_weights,
+    with_rank,
+)
+
+__all__ = [
+    "RECONSTRUCTORS",
+    "Confidence",
+    "Judgement",
+    "LinearEstimate",
+    "Reconstructor",
+    "ReconstructorSettings",
+    "ResidualUNet",
+    "SequenceConfig",
+    "SequenceReconstructor",
+    "UNetConfig",
+    "UNetReconstructor",
+    "Weights",
+    "describe_network",
+    "fit_linear",
+    "halves_of",
+    "load_weights",
+    "plates",
+    "published",
+    "published_for",
+    "published_rig",
+    "published_single",
+    "save_weights",
+    "with_rank",
+]

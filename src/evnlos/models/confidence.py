@@ -1,0 +1,239 @@
+"""The plate in a picture: the square that holds the hidden object, cut out wherever it is.
+
+- What a picture is worth: how much of it the measurement supports, and where each pixel's level lies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from evnlos.errors import DataError
+from evnlos.models.reconstructor import Reconstructor
+from evnlos.types import Plane
+
+SIDE = 32
+"""Side of a plate's picture, pixels."""
+
+
+def plates(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
+    """Return the part of each picture that shows the plate, resampled to 32 x 32.
+
+    Args:
+        images: Pictures of the canvas, float [N, H, W].
+        canvas: Their geometry.
+        position_m: Centre (x, y) of the plate in each picture, [N, 2], metres.
+        size_m: Side of the plate, metres.
+
+    Returns:
+        float32 [N, 1, 32, 32]; zero outside the canvas.
+    """
+    centre = torch.as_tensor(np.asarray(position_m), dtype=torch.float32)  # [N, 2]
+    span = torch.tensor([canvas.width, canvas.height]) * (canvas.pitch_m / 2)
+    ticks = (torch.arange(SIDE) + 0.5) / SIDE * size_m - size_m / 2
+    y, x = torch.meshgrid(ticks, ticks, indexing="ij")
+    middle = torch.tensor(canvas.center_m, dtype=torch.float32)
+    points = torch.stack([x, y], dim=-1) + (centre - middle)[:, None, None]  # [N, 32, 32, 2]
+    return F.grid_sample(images[:, None].float(), points / span, align_corners=False)
+
+
+def on_canvas(plate: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
+    """Return pictures of the canvas that show one plate at each position; `plates` takes it out again.
+
+    Args:
+        plate: Picture of the plate, float [P, P].
+        canvas: Geometry of the pictures.
+        position_m: Centre (x, y) of the plate in each picture, [N, 2], metres.
+        size_m: Side of the plate, metres.
+
+    Returns:
+        float32 [N, H, W]; zero beside the plate.
+    """
+    centre = torch.as_tensor(position_m, dtype=torch.float32, device=plate.device)
+    y, x = (torch.from_numpy(at).float().to(plate.device) for at in (canvas.y_m, canvas.x_m))
+    place = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)  # [H, W, 2]
+    grid = (place - centre[:, None, None]) / (size_m / 2)
+    return F.grid_sample(plate.float().expand(len(grid), 1, -1, -1), grid, align_corners=False)[:, 0]
+
+
+COVERAGE = 0.9
+"""Share of a plate's pixels whose true level the intervals are to hold."""
+CONFIRMED = 0.7
+"""Share of the frames that pictures have to explain where the rig is known (see `Judgement.explained`)."""
+LEVELS = 16
+"""Bins of a pixel's reconstructed level."""
+GROUPS = 3
+"""Groups of passes, by agreement, with intervals of their own."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What one pass of pictures is worth.
+
+    Args:
+        agreement: Share of what tells this object from the average one that both halves of the pass agree on:
+            1 = all that objects differ by, 0 = nothing.
+        threshold: Agreement that one in 20 passes shows in which each position saw another object, so that
+            nothing of any one object was measured.
+        low: Lower end of each pixel's interval, float32 [N, H, W], 0..1.
+        high: Upper end.
+        explained: Share of what the average object leaves unexplained in the frames that the pictures explain,
+            where the rig is known; 0 or less is no better than the average object, and `CONFIRMED` is the least
+            that is believed.
+    """
+
+    agreement: float
+    threshold: float
+    low: Tensor
+    high: Tensor
+    explained: float | None = None
+
+    @property
+    def support(self) -> float:
+        """How much of this picture the measurement supports, 0..1: the smaller of agreement and explained."""
+        known = self.agreement if self.explained is None else min(self.agreement, self.explained)
+        return min(max(known, 0.0), 1.0) if self.measured else 0.0
+
+    @property
+    def measured(self) -> bool:
+        """Whether the measurement tells this object from others at all."""
+        return self.agreement > self.threshold and (self.explained is None or self.explained > CONFIRMED)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence for a reader."""
+        if self.agreement > self.threshold and not self.measured:
+            return (
+                f"nothing measured: the pictures explain {100 * max(self.explained or 0, 0):.0f} % of what the "
+                "frames show of this object; the wall is not that of the rig, or not one that the weights know"
+            )
+        if not self.measured:
+            return (
+                "nothing measured: both halves of the pass share "
+                f"{100 * max(self.agreement, 0):.0f} % of what tells objects apart; passes without any object "
+                f"share up to {100 * self.threshold:.0f} %"
+            )
+        return f"the measurement supports {100 * self.support:.0f} % of the picture"
+
+
+@dataclass(frozen=True, eq=False)
+class Confidence:
+    """What `fit_confidence` learned from passes that the network was not trained on.
+
+    Args:
+        mean: Mean of the true plates, float32 [32, 32].
+        empty: What the network shows where nothing of any one object was measured, as its mean difference from
+            the mean plate, [32, 32].
+        power: Mean of |d|^2 over true plates, d what tells a plate from an empty answer (see `telling`), [].
+        threshold: See `Judgement.threshold`, [].
+        edges: Agreements that separate the groups of passes, ascending, [G - 1].
+        low: Lower end of the interval for each group and level, [G, L].
+        high: Upper end.
+    """
+
+    mean: Tensor
+    empty: Tensor
+    power: Tensor
+    threshold: Tensor
+    edges: Tensor
+    low: Tensor
+    high: Tensor
+
+    def judge(self, pictures: Tensor, halves: Tensor, explained: float | None = None) -> Judgement:
+        """Return what the pictures of a pass are worth.
+
+        Args:
+            pictures: Pictures of all positions, float [N, H, W], 0..1.
+            halves: What the two halves of the pass show of the plate, [2, 32, 32]: see `halves_of`.
+            explained: How much of the frames the pictures explain, where the rig is known.
+        """
+        agreement, threshold = float(self.agreement(halves)), float(self.threshold)
+        blank = Judgement(
+            agreement, threshold, torch.zeros_like(pictures), torch.ones_like(pictures), explained
+        )
+        if not blank.measured:
+            return blank
+        group = int(torch.searchsorted(self.edges, torch.tensor(agreement)))
+        # Halfway between the middles of two bins lies halfway between their intervals.
+        at = (pictures * LEVELS - 0.5).clamp(0, LEVELS - 1)
+        below = at.floor().long().clamp(max=LEVELS - 2)
+        part = at - below
+        low, high = (
+            torch.lerp(ends[group][below], ends[group][below + 1], part) for ends in (self.low, self.high)
+        )
+        return replace(blank, low=low, high=high)
+
+    def agreement(self, halves: Tensor) -> Tensor:
+        """Return the agreement of a pass, [], from its halves [2, 32, 32]."""
+        first, second = self.telling(halves)
+        return first @ second / self.power
+
+    def telling(self, shown: Tensor) -> Tensor:
+        """Return what tells plates [N, 32, 32] from the network's empty answer, [N, P].
+
+        It is their difference from the mean plate, without the mean plate's own direction, so that neither a
+        black plate nor a paler one tells anything; less the same of what the network shows when it knows
+        nothing, which would be in both halves of any pass.
+        """
+        mean = F.normalize(self.mean.flatten(), dim=0)
+        away = (shown - self.mean).flatten(1)
+        return away - (away @ mean)[:, None] * mean - self.empty.flatten()
+
+    def checked(self) -> Confidence:
+        """Return this, whose tensors may be a stranger's.
+
+        Raises:
+            DataError: Their shapes do not belong together, or a number is none.
+        """
+        shapes = {item.name: tuple(getattr(self, item.name).shape) for item in fields(self)}
+        table = (GROUPS, LEVELS)
+        plate = (SIDE, SIDE)
+        wanted = {"mean": plate, "empty": plate, "power": (), "threshold": (), "edges": (GROUPS - 1,)}
+        if shapes != wanted | {"low": table, "high": table}:
+            raise DataError(f"its tensors have the shapes {shapes}")
+        if not all(bool(torch.isfinite(one).all()) for one in self.tensors().values()) or self.power <= 0:
+            raise DataError("its numbers are not finite, or its power is not positive")
+        return self
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return all fields by name, for a file."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+
+@torch.inference_mode()
+def halves_of(network: Reconstructor, inputs: Tensor, position_m: NDArray, canvas: Plane) -> Tensor:
+    """Return what the first and the second half of a pass show of the plate, each on its own, [2, 32, 32].
+
+    The object is the same in both halves and everything else is not: the noise, and where plate, wall and
+    camera are to one another. A pattern that stays where it is, or comes from nowhere, is not in both.
+
+    Args:
+        network: The network.
+        inputs: What was measured, [N, C, H, W], in the order of time, N at least 2.
+        position_m: The plate's centre at each, (x, y) in metres, [N, 2].
+        canvas: Geometry of the pictures.
+
+    Raises:
+        DataError: The motion is unknown, or there are fewer than two positions.
+    """
+    position_m = np.asarray(position_m)
+    if len(inputs) < 2 or np.isnan(position_m).any():
+        motion = "unknown" if np.isnan(position_m).any() else "known"
+        raise DataError(
+            f"{len(inputs)} positions, motion {motion}: confidence takes two positions and the motion; give it "
+            "in capture.yaml (`evnlos track` finds it)"
+        )
+    parts = np.array_split(np.arange(len(inputs)), 2)
+    return torch.stack(
+        [
+            plates(network.infer(inputs[torch.from_numpy(part)], position_m[part]), canvas, position_m[part])
+            .mean(dim=0)[0]
+            .cpu()
+            for part in parts
+        ]
+    )

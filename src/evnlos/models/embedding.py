@@ -1,0 +1,289 @@
+"""What a network knows before its first step: the scale of its inputs, and the light path undone linearly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from evnlos.data import Modality
+from evnlos.errors import ConfigError, DataError
+from evnlos.models.linear import LinearEstimate, fit_linear
+
+Scaling = Literal["dataset", "picture"]
+
+MOST_SAMPLES = 16_384
+"""Samples that the linear embedding is fitted to, at most."""
+
+_SMALLEST = 1e-3
+
+
+class InputNormalization(nn.Module):
+    """Bring inputs [B, C, H, W] to mean 0 and size 1, each group of channels on its own.
+
+    A group that is centred (a frame) loses its mean and is divided by its standard deviation; one whose 0 means
+    "nothing here" (events) keeps it, and is divided by the root mean square of all its channels. With the
+    scaling "dataset" these numbers are those of a whole dataset, so that the brightness of one image against
+    another still counts; with "picture" they are each image's own, and gain and a constant ambient light drop
+    out.
+
+    Args:
+        modality: What is seen.
+        scaling: Whose mean and size.
+    """
+
+    mean: Tensor
+    size: Tensor
+
+    def __init__(self, modality: Modality, scaling: Scaling) -> None:
+        super().__init__()
+        self.modality, self.scaling = modality, scaling
+        self.register_buffer("mean", torch.zeros(modality.channels))
+        self.register_buffer("size", torch.ones(modality.channels))
+
+    def fit(self, inputs: Tensor) -> None:
+        """Take mean and size from the inputs of a dataset, [N, C, H, W]."""
+        mean, size = self._measured(inputs, dims=(0, 1, 2, 3))
+        self.mean.copy_(mean[0, :, 0, 0])
+        self.size.copy_(size[0, :, 0, 0])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to normalized [B, C, H, W]."""
+        if self.scaling == "picture":
+            mean, size = self._measured(x, dims=(1, 2, 3))
+            return (x - mean) / size
+        return (x - self.mean[:, None, None]) / self.size[:, None, None]
+
+    def _measured(self, x: Tensor, dims: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        """Return mean and size over `dims`, [B or 1, C, 1, 1] each, of every group of channels."""
+        means, sizes = [], []
+        for group, own in zip(self.modality.groups, self.modality.slices.values(), strict=True):
+            part = x[:, own]
+            mean = part.mean(dim=dims, keepdim=True, dtype=torch.float32)
+            if not group.centred:
+                mean = torch.zeros_like(mean)
+            size = (part - mean).square().mean(dim=dims, keepdim=True).sqrt().clamp_min(_SMALLEST)
+            means.append(mean.expand(-1, part.shape[1], -1, -1))
+            sizes.append(size.expand(-1, part.shape[1], -1, -1))
+        return torch.cat(means, dim=1), torch.cat(sizes, dim=1)
+
+    @staticmethod
+    def today(name: str, modality: Modality) -> str:
+        """Return today's name of a tensor of an older file; embeddings had no groups where there was only one.
+
+        Args:
+            name: Its name in the file.
+            modality: What the network sees.
+        """
+        first, _, rest = name.partition(".")
+        if first == "standardise":
+            return f"normalization.{rest}"
+        if first != "embedding" or rest.startswith("groups."):
+            return name
+        only = f"{modality.groups[0].name}." if len(modality.groups) == 1 else ""
+        return f"embedding.groups.{only}{rest}"
+
+
+class LinearEmbedding(nn.Module):
+    """The light path undone by ridge regressions of several strengths: [B, C, H, W] -> [B, S, H, W].
+
+    Fitted in closed form to simulated samples it carries the physics of their rig: it sees the whole wall at
+    once, which convolutions would have to learn layer by layer. The weak ridge is sharp and noisy, the strong
+    one smooth; what to believe where is left to the network behind it. All strengths share one basis and one
+    matrix of weights (`LinearEstimate.shrinkage`). These numbers are not trained by gradients.
+
+    Args:
+        channels: Channels of the input.
+        size: Its height and width, pixels.
+        rank: Most components of the input.
+        strengths: Ridges in units of the one that is best on unseen objects.
+    """
+
+    mean_in: Tensor
+    basis: Tensor
+    shrinkage: Tensor
+    weights: Tensor
+    mean_out: Tensor
+
+    def __init__(self, channels: int, size: tuple[int, int], rank: int, strengths: tuple[float, ...]) -> None:
+        super().__init__()
+        self.strengths, self.shape = strengths, (channels, *size)
+        pixels = size[0] * size[1]
+        rank = min(rank, channels * pixels)
+        self.register_buffer("mean_in", torch.zeros(channels * pixels))
+        self.register_buffer("basis", torch.zeros(channels * pixels, rank))
+        self.register_buffer("shrinkage", torch.zeros(len(strengths), rank))
+        self.register_buffer("weights", torch.zeros(rank, pixels))
+        self.register_buffer("mean_out", torch.zeros(pixels))
+
+    @property
+    def rank(self) -> int:
+        """Most components of the input."""
+        return self.basis.shape[1]
+
+    @property
+    def images(self) -> int:
+        """Images that come out for each input."""
+        return len(self.strengths)
+
+    def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
+        """Fit the linear estimate to normalized samples and take its numbers; arguments of `fit_linear`."""
+        self.take(fit_linear(seen, truth, objects, self.rank, seed))
+
+    def take(self, estimate: LinearEstimate) -> None:
+        """Take the numbers of a linear estimate; of lower rank, where there were fewer samples."""
+        found = len(estimate.powers)
+        for buffer in (self.basis, self.shrinkage, self.weights):
+            buffer.zero_()
+        self.mean_in.copy_(estimate.mean_in)
+        self.basis[:, :found] = estimate.basis
+        self.shrinkage[:, :found] = torch.stack([estimate.shrinkage(s) for s in self.strengths])
+        self.weights[:found] = estimate.weights
+        self.mean_out.copy_(estimate.mean_out.flatten())
+
+    def keep(self, rank: int) -> None:
+        """Forget all but the `rank` strongest components; the estimate gives them in the order of their power.
+
+        Raises:
+            ConfigError: There are not as many.
+        """
+        if not 1 <= rank <= self.rank:
+            raise ConfigError(
+                f"the rank is to be {rank}; this embedding has {self.rank}: give 1 to {self.rank}"
+            )
+        self.basis, self.shrinkage = self.basis[:, :rank].clone(), self.shrinkage[:, :rank].clone()
+        self.weights = self.weights[:rank].clone()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to images [B, S, H, W], about 0..1; in float32 whatever surrounds it.
+
+        Raises:
+            DataError: The input has another size than this embedding was made for.
+        """
+        if tuple(x.shape[1:]) != self.shape:
+            raise DataError(f"input is {tuple(x.shape)}; this network's embedding takes [B, {self._wanted}]")
+        with torch.autocast(x.device.type, enabled=False):
+            code = (x.float().flatten(1) - self.mean_in) @ self.basis  # [B, R]
+            images = (code[:, None] * self.shrinkage) @ self.weights + self.mean_out
+        return images.unflatten(2, self.shape[1:])
+
+    @property
+    def _wanted(self) -> str:
+        return ", ".join(str(side) for side in self.shape)
+
+
+class LinearEmbeddings(nn.Module):
+    """Each group of channels undone by its own ridges: [B, C, H, W] -> [B, G S, H, W], the first group's first.
+
+    One regression on all would mix them by their noise in the samples that it was fitted to; apart, the
+    network behind weighs them, image by image and place by place.
+
+    Args:
+        modality: What is seen; each of its G groups has an embedding.
+        size: Height and width of the input, pixels.
+        rank: Most components of all groups together, at least one for each.
+        strengths: As in `LinearEmbedding`, S of them.
+
+    Raises:
+        ConfigError: The rank is less than the number of groups.
+    """
+
+    def __init__(
+        self, modality: Modality, size: tuple[int, int], rank: int, strengths: tuple[float, ...]
+    ) -> None:
+        super().__init__()
+        self.modality = modality
+        self.groups = nn.ModuleDict(
+            {
+                group.name: LinearEmbedding(group.channels, size, part, strengths)
+                for group, part in zip(modality.groups, modality.ranks(rank), strict=True)
+            }
+        )
+        self.shape = (modality.channels, *size)
+
+    @property
+    def _parts(self) -> list[tuple[slice, LinearEmbedding]]:
+        return [(own, self.groups[name]) for name, own in self.modality.slices.items()]  # type: ignore[misc]
+
+    @property
+    def rank(self) -> int:
+        """Most components of all groups together."""
+        return sum(part.rank for _, part in self._parts)
+
+    @property
+    def images(self) -> int:
+        """Images that come out for each input."""
+        return sum(part.images for _, part in self._parts)
+
+    def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
+        """Fit each group to normalized samples [N, C, H, W]; arguments as in `fit_linear`."""
+        for own, part in self._parts:
+            part.fit(seen[:, own], truth, objects, seed)
+
+    def keep(self, rank: int) -> None:
+        """Forget all but the strongest components; `rank` of all groups together.
+
+        Args:
+            rank: Components to keep.
+
+        Raises:
+            ConfigError: There are not as many, or a group would have none.
+        """
+        least = len(self._parts)
+        if not least <= rank <= self.rank:
+            raise ConfigError(
+                f"the rank is to be {rank}; this embedding has {self.rank}: give {least} to {self.rank}"
+            )
+        for (_, part), own in zip(self._parts, self.modality.ranks(rank), strict=True):
+            part.keep(own)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to images [B, G S, H, W].
+
+        Raises:
+            DataError: The input has another size than this embedding was made for.
+        """
+        if tuple(x.shape[1:]) != self.shape:
+            wanted = ", ".join(str(side) for side in self.shape)
+            raise DataError(f"input is {tuple(x.shape)}; this network's embedding takes [B, {wanted}]")
+        return torch.cat([part(x[:, own]) for own, part in self._parts], dim=1)
+
+
+@torch.inference_mode()
+def fit_input(
+    normalization: InputNormalization,
+    embedding: LinearEmbeddings | None,
+    some: Callable[[int], tuple[Tensor, Tensor, NDArray[np.str_]]],
+    seed: int,
+    *,
+    is_new: bool,
+    keep_normalization: bool,
+) -> None:
+    """Give a new network the scale of the data and its linear embedding; one with weights, at most the scale.
+
+    Args:
+        normalization: Changed in place; it need not be on the CPU.
+        embedding: Changed in place where the network is new.
+        some: Returns at most so many samples: inputs, true images, objects.
+        seed: Seed of the embedding's basis.
+        is_new: Whether the network has random weights.
+        keep_normalization: Whether a network with weights keeps the scale that it has.
+    """
+    measures = normalization.scaling == "dataset" and (is_new or not keep_normalization)
+    embeds = is_new and embedding is not None
+    if not measures and not embeds:
+        return
+    inputs, truth, names = some(MOST_SAMPLES)
+    device = normalization.mean.device
+    if measures:
+        normalization.fit(inputs.float().to(device))
+    if embeds:
+        assert embedding is not None
+        if len(np.unique(names)) < 2:  # one object: its time steps stand for objects
+            names = np.arange(len(names)).astype(str)
+        seen = torch.cat([normalization(part.float().to(device)).cpu() for part in inputs.split(256)])
+        embedding.fit(seen, truth, names, seed)

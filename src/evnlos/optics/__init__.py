@@ -1,0 +1,56 @@
+"""How light goes from the hidden scene over the wall to the camera."""
+
+from evnlos.optics.angular_spectrum import (
+    Diffraction,
+    angular_spectrum,
+    blur_radius_px,
+    fresnel_number,
+    rayleigh_sommerfeld_sum,
+    sampling_limit_m,
+)
+from evnlos.optics.matrix_wall import MatrixWall, coarsest_keyframe_step_m
+from evnlos.optics.occluder import Occluder, lamp_radiance
+from evnlos.optics.operator import LinearTransport, MatrixTransport, Patches, Transport, compose
+from evnlos.optics.radiometric import LightTransport, light_transport_matrix
+from evnlos.optics.reflection import (
+    GGX,
+    Brdf,
+    DiffuseReflection,
+    Lambert,
+    tpsf_kernel,
+    tpsf_profile,
+    tpsf_truncation,
+)
+from evnlos.optics.view import View, Viewing
+from evnlos.optics.wall import SlidingWall, Wall
+
+__all__ = [
+    "GGX",
+    "Brdf",
+    "Diffraction",
+    "DiffuseReflection",
+    "Lambert",
+    "LightTransport",
+    "LinearTransport",
+    "MatrixTransport",
+    "MatrixWall",
+    "Occluder",
+    "Patches",
+    "SlidingWall",
+    "Transport",
+    "View",
+    "Viewing",
+    "Wall",
+    "angular_spectrum",
+    "blur_radius_px",
+    "coarsest_keyframe_step_m",
+    "compose",
+    "fresnel_number",
+    "lamp_radiance",
+    "light_transport_matrix",
+    "rayleigh_sommerfeld_sum",
+    "sampling_limit_m",
+    "tpsf_kernel",
+    "tpsf_profile",
+    "tpsf_truncation",
+]

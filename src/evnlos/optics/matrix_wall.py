@@ -1,0 +1,193 @@
+"""The wall under a shift-variant transport: a strip of cells on which the plate is drawn, and a matrix."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from evnlos.errors import ConfigError
+from evnlos.optics.interpolation import spline_coefficients, spline_weights
+from evnlos.optics.operator import MatrixTransport
+from evnlos.optics.wall import ambient_map, check_gain, checked_times
+from evnlos.scene import LineMotion, Motion, Target
+from evnlos.types import Plane
+
+_CHUNK = 64  # positions drawn and carried over at a time
+_KEYFRAME_ERROR = 1e-3  # of the light's standard deviation
+_GUARD = 3  # keyframes beyond each end of the strip
+_TAIL = 10  # keyframes beyond each end of a travel: the prefilter's tail, 0.268^n
+_PROBES_S = np.linspace(-100.0, 100.0, 2001)  # does the plate ever leave its row?
+
+
+class MatrixWall:
+    """What a light-transport matrix makes of a moving plate, at any instant.
+
+    irradiance(t) = gain A s(t) + ambient, with s(t) the plate drawn on the strip's cells, each cell the exact
+    mean of the mask over it, at any sub-cell position. For motion along the strip's rows the wall is known from
+    keyframes: A s is computed at equally spaced positions once and a cubic spline runs between them (exact at
+    the keyframes, two continuous derivatives in time); other motions multiply at every instant.
+
+    Args:
+        transport: Matrix from the strip to the camera image, in white levels a unit of the mask at gain 1.
+        target: The plate.
+        motion: Where its centre is at every instant; positions off the strip leave the light they lost.
+        magnification_px_m: Upper bound of the image motion, pixels a metre of plate motion.
+        gain: White levels, 0 or more.
+        ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
+        keyframe_step_m: Distance between keyframes, metres; None is half a cell, 0 multiplies at every instant.
+        travel_m: Smallest and largest x of the centre that are asked for, metres: keyframes are made for these
+            alone, and other places multiplied out; None is wherever the plate touches the strip.
+        along: What else moves with the plate's centre and shines with it, and its own matrix.
+
+    Raises:
+        ConfigError: The gain, the ambient light or the step is negative or not finite.
+        DataError: The ambient array does not have the image's size.
+    """
+
+    def __init__(
+        self,
+        transport: MatrixTransport,
+        target: Target,
+        motion: Motion,
+        *,
+        magnification_px_m: float,
+        gain: float = 1.0,
+        ambient: float | ArrayLike | torch.Tensor = 0.0,
+        keyframe_step_m: float | None = None,
+        travel_m: tuple[float, float] | None = None,
+        along: tuple[MatrixTransport, Target] | None = None,
+    ) -> None:
+        check_gain(gain)
+        strip = transport.source
+        if not isinstance(strip, Plane):
+            raise ConfigError("the matrix starts from patches; a moving plate needs a Plane of square cells")
+        step = strip.pitch_m / 2 if keyframe_step_m is None else keyframe_step_m
+        if not (math.isfinite(step) and step >= 0):
+            raise ConfigError(f"keyframe_step_m is {keyframe_step_m}; give 0 or more metres")
+        self.transport = transport
+        self._strip = strip
+        self.target = target
+        self.motion = motion
+        self.gain = float(gain)
+        self.ambient = ambient_map(ambient, transport.shape).to(transport.matrix.device)
+        self._along = along
+        self._magnification = magnification_px_m
+        self._step = step
+        self._keys: torch.Tensor | None = None
+        probes = motion.position_m(_PROBES_S)[:, 1]
+        self._height = float(probes[0]) if step > 0 and bool((probes == probes[0]).all()) else None
+        reach = strip.extent_m[1] / 2 + target.size_m / 2
+        everywhere = (strip.center_m[0] - reach, strip.center_m[0] + reach)
+        self._everywhere = travel_m is None
+        self._travel_m = everywhere if travel_m is None else travel_m
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the camera image, pixels."""
+        return self.transport.shape
+
+    @property
+    def speed_px_s(self) -> float:
+        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        return self.motion.speed_bound_m_s(-math.inf, math.inf) * self._magnification
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return the irradiance at times `t_s`.
+
+        Args:
+            t_s: Times, seconds, shape [] or [T].
+
+        Returns:
+            White levels, float32 [H, W] or [T, H, W].
+
+        Raises:
+            DataError: The times have more than one axis.
+        """
+        times = checked_times(t_s)
+        positions = self.motion.position_m(times).reshape(-1, 2)  # [T, 2]
+        light = self._between_keys(positions) if self._has_keys(positions) else self.light(positions)
+        image = (self.ambient + self.gain * light.clamp(min=0)).to(torch.float32)  # [T, H, W]
+        return image[0] if times.ndim == 0 else image
+
+    def light(self, positions_m: ArrayLike) -> torch.Tensor:
+        """Return A s for the plate at positions (x, y) [T, 2], metres: the direct product, real [T, H, W]."""
+        positions = np.asarray(positions_m, dtype=np.float64)
+        matrix = self.transport.matrix
+        image = matrix.new_zeros((len(positions), *self.shape))
+        for start in range(0, len(positions), _CHUNK):
+            drawn = self.target.rasterise(self._strip, positions[start : start + _CHUNK])
+            image[start : start + _CHUNK] = self.transport(torch.as_tensor(drawn).to(matrix))
+        if self._along is not None:
+            image += self.light_along(positions)
+        return image
+
+    def light_along(self, positions_m: ArrayLike) -> torch.Tensor:
+        """Return the light of what moves along with the plate at positions (x, y) [T, 2], real [T, H, W]."""
+        positions = np.asarray(positions_m, dtype=np.float64)
+        image = self.transport.matrix.new_zeros((len(positions), *self.shape))
+        if self._along is None:
+            return image
+        carry, other = self._along
+        assert isinstance(carry.source, Plane)  # a moving picture needs square cells
+        for start in range(0, len(positions), _CHUNK):
+            drawn = other.rasterise(carry.source, positions[start : start + _CHUNK])
+            image[start : start + _CHUNK] = carry(torch.as_tensor(drawn).to(image))
+        return image
+
+    def _has_keys(self, positions: np.ndarray) -> bool:
+        """Return whether keyframes tell the light at all of these places: beyond a strip it is dark."""
+        low, high = self._travel_m
+        inside = self._everywhere or bool(((positions[:, 0] >= low) & (positions[:, 0] <= high)).all())
+        return self._height is not None and inside and bool((positions[:, 1] == self._height).all())
+
+    def _between_keys(self, positions: np.ndarray) -> torch.Tensor:
+        if self._keys is None:
+            self._keys = self._make_keys()
+        # Beyond the last keyframes the plate has left the strip, and the wall stays dark.
+        at = np.clip((positions[:, 0] - self._first_m) / self._step, 1, len(self._keys) - 3)
+        whole = np.minimum(np.floor(at), len(self._keys) - 3).astype(np.int64)
+        weight = spline_weights(torch.as_tensor(at - whole)).to(self._keys)  # [4, T]
+        light = self._keys.new_zeros((len(positions), *self.shape))
+        for k in range(4):
+            light += weight[k][:, None, None] * self._keys[torch.as_tensor(whole - 1 + k)]
+        return light
+
+    def _make_keys(self) -> torch.Tensor:
+        """Return the spline's coefficients at keyframes over all places that are asked for."""
+        low, high = self._travel_m
+        guard = _GUARD if self._everywhere else _TAIL
+        steps = math.ceil((high - low) / 2 / self._step) + guard
+        self._first_m = (low + high) / 2 - steps * self._step
+        x = self._first_m + np.arange(2 * steps + 1) * self._step
+        frames = self.light(np.stack([x, np.full_like(x, self._height)], axis=-1))
+        return spline_coefficients(frames, axes=(0,))  # periodic: both ends are dark, or far enough
+
+
+def coarsest_keyframe_step_m(transport: MatrixTransport, size_m: float) -> float:
+    """Return the largest distance between keyframes that a wall's blur allows, metres: 2, 1 or 1/2 cells.
+
+    Between keyframes, splines through the light of a plate of random squares, an eighth of its side each, may
+    be off by 1e-3 of what the light changes by (root mean square); cells bring about half of that themselves.
+
+    Args:
+        transport: Matrix from a strip of square cells to the camera image.
+        size_m: Side of the plate, metres.
+    """
+    strip = transport.source
+    assert isinstance(strip, Plane)
+    draw = np.random.default_rng(0)
+    squares = np.kron(draw.integers(0, 2, (8, 8)), np.ones((8, 8))).astype(np.float32)
+    probe = Target("squares", squares, size_m)
+    reach = max(0.0, (strip.extent_m[1] - size_m) / 2)
+    x = strip.center_m[0] + draw.uniform(-reach, reach, 8)
+    places = np.stack([x, np.full(8, strip.center_m[1])], axis=-1)
+    for step in (2 * strip.pitch_m, strip.pitch_m):
+        motion = LineMotion(start_m=(float(x[0]), strip.center_m[1]))
+        wall = MatrixWall(transport, probe, motion, magnification_px_m=1.0, keyframe_step_m=step)
+        direct = wall.light(places)
+        if float((wall._between_keys(places) - direct).std()) <= _KEYFRAME_ERROR * float(direct.std()):
+            return step
+    return strip.pitch_m / 2

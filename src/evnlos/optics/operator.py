@@ -1,0 +1,248 @@
+"""Linear operators between grids of patches: what a transport must offer.
+
+- A grid of rectangular patches, for screens and walls whose samples are not square or do not touch.
+- The operator protocol: a transport maps a scene image to a wall image; a linear one also has its adjoint.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import reduce
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.types import Plane
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Equal rectangles at the crossings of given columns and rows.
+
+    Args:
+        x_m: Middles of the columns, float64 [W], metres, to the right.
+        y_m: Middles of the rows, float64 [H], metres, downwards.
+        size_m: Width and height of one patch, metres.
+
+    Raises:
+        DataError: A list of middles is empty or not finite, or a patch has no size.
+
+    Example:
+        >>> Patches([0.2, 0.1], [0.0, 0.1, 0.2], (0.08, 0.05)).shape
+        (3, 2)
+    """
+
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    size_m: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        for name in ("x_m", "y_m"):
+            object.__setattr__(self, name, _middles(getattr(self, name), name))
+        width, height = (float(side) for side in self.size_m)
+        if not (np.isfinite([width, height]).all() and width > 0 and height > 0):
+            raise DataError(f"Patches.size_m is {self.size_m}; give a positive width and height, metres")
+        object.__setattr__(self, "size_m", (width, height))
+
+    @property
+    def height(self) -> int:
+        """Number of rows."""
+        return len(self.y_m)
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return len(self.x_m)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (rows, columns)."""
+        return self.height, self.width
+
+
+def as_patches(grid: Plane | Patches) -> Patches:
+    """Return the touching squares of a sampled plane, or the patches themselves."""
+    if isinstance(grid, Patches):
+        return grid
+    return Patches(grid.x_m, grid.y_m, (grid.pitch_m, grid.pitch_m))
+
+
+def _middles(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    array = np.array(values, dtype=np.float64)  # a copy: the caller's array stays his own
+    if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
+        raise DataError(f"Patches.{name} must be one or more finite numbers, metres")
+    array.setflags(write=False)
+    return array
+
+
+class Transport(ABC):
+    """A map from images on a source plane, [..., h, w], to images [..., H, W]; linear only if
+    `LinearTransport`.
+
+    Attributes:
+        source: Plane, or grid of patches, on which the input image is sampled.
+    """
+
+    source: Plane | Patches
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the images that the transport makes."""
+
+    @property
+    def output(self) -> Plane | None:
+        """Plane on which the result is sampled; None when it is a camera image."""
+        return None
+
+    @abstractmethod
+    def _forward(self, scene: torch.Tensor) -> torch.Tensor: ...
+
+    def __call__(self, scene: torch.Tensor) -> torch.Tensor:
+        """Carry a scene image to the other side.
+
+        Args:
+            scene: Real image [..., h, w] on `source`, float32 or float64, any device; leading axes are a batch.
+
+        Returns:
+            Image [..., H, W] of the same type.
+
+        Raises:
+            DataError: The image does not have the size of `source` or is not real floating point.
+        """
+        return self._forward(_checked(scene, self.source.shape, "scene"))
+
+    def then(self, following: Transport) -> Transport:
+        """Return the transport that applies this one and then `following`; linear if both are."""
+        return compose(self, following)
+
+
+class LinearTransport(Transport):
+    """A transport with A(a x + b y) = a A x + b A y, and therefore an adjoint."""
+
+    @abstractmethod
+    def _adjoint(self, image: torch.Tensor) -> torch.Tensor: ...
+
+    def adjoint(self, image: torch.Tensor) -> torch.Tensor:
+        """Apply the transpose, for which <A x, y> = <x, A^T y>.
+
+        Args:
+            image: Real image [..., H, W] of the size that the transport makes.
+
+        Returns:
+            Image [..., h, w] on `source`.
+
+        Raises:
+            DataError: The image does not have the size `shape` or is not real floating point.
+        """
+        return self._adjoint(_checked(image, self.shape, "image"))
+
+
+def compose(*transports: Transport) -> Transport:
+    """Return the transport that applies the given ones in order; it is linear if all of them are.
+
+    Raises:
+        ConfigError: Nothing was given, or a transport makes images of another size than the next one takes.
+    """
+    if not transports:
+        raise ConfigError("compose() got no transport; give one or more")
+    for first, second in pairwise(transports):
+        if first.shape != second.source.shape:
+            raise ConfigError(
+                f"a transport makes {first.shape} samples, the next one takes {second.source.shape}"
+            )
+    linear = [transport for transport in transports if isinstance(transport, LinearTransport)]
+    return LinearChain(tuple(linear)) if len(linear) == len(transports) else Chain(tuple(transports))
+
+
+class Chain(Transport):
+    """Transports applied one after the other; built by `compose`."""
+
+    def __init__(self, steps: tuple[Transport, ...]) -> None:
+        self.steps = steps
+        self.source = steps[0].source
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size of the last step's images."""
+        return self.steps[-1].shape
+
+    @property
+    def output(self) -> Plane | None:
+        """Plane of the last step."""
+        return self.steps[-1].output
+
+    def _forward(self, scene: torch.Tensor) -> torch.Tensor:
+        return reduce(lambda image, step: step(image), self.steps, scene)
+
+
+class LinearChain(LinearTransport):
+    """Linear transports applied one after the other; built by `compose`."""
+
+    def __init__(self, steps: tuple[LinearTransport, ...]) -> None:
+        self.steps = steps
+        self.source = steps[0].source
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size of the last step's images."""
+        return self.steps[-1].shape
+
+    @property
+    def output(self) -> Plane | None:
+        """Plane of the last step."""
+        return self.steps[-1].output
+
+    def _forward(self, scene: torch.Tensor) -> torch.Tensor:
+        return reduce(lambda image, step: step(image), self.steps, scene)
+
+    def _adjoint(self, image: torch.Tensor) -> torch.Tensor:
+        return reduce(lambda wall, step: step.adjoint(wall), reversed(self.steps), image)
+
+
+class MatrixTransport(LinearTransport):
+    """A transport given by its matrix, for walls that no convolution describes.
+
+    Args:
+        matrix: Real tensor [H W, h w], rows and columns in row-major order.
+        source: Plane or patches of the scene image, h x w.
+        shape: Size (H, W) of the images that it makes.
+
+    Raises:
+        ConfigError: The matrix does not have H W rows and h w columns.
+    """
+
+    def __init__(self, matrix: torch.Tensor, source: Plane | Patches, shape: tuple[int, int]) -> None:
+        expected = (shape[0] * shape[1], source.height * source.width)
+        if tuple(matrix.shape) != expected:
+            raise ConfigError(f"the matrix is {tuple(matrix.shape)}; these planes need {expected}")
+        self.matrix = matrix
+        self.source = source
+        self._shape = (int(shape[0]), int(shape[1]))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the images that it makes."""
+        return self._shape
+
+    def _forward(self, scene: torch.Tensor) -> torch.Tensor:
+        image = scene.flatten(-2) @ self.matrix.to(scene).mT  # [..., H W]
+        return image.unflatten(-1, self.shape)
+
+    def _adjoint(self, image: torch.Tensor) -> torch.Tensor:
+        scene = image.flatten(-2) @ self.matrix.to(image)  # [..., h w]
+        return scene.unflatten(-1, self.source.shape)
+
+
+def _checked(image: torch.Tensor, shape: tuple[int, int], name: str) -> torch.Tensor:
+    if image.ndim < 2 or tuple(image.shape[-2:]) != shape:
+        raise DataError(
+            f"{name} has shape {tuple(image.shape)}; this transport takes [..., {shape[0]}, {shape[1]}]"
+        )
+    if not image.is_floating_point():
+        raise DataError(f"{name} has dtype {image.dtype}; give float32 or float64")
+    return image

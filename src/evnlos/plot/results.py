@@ -1,0 +1,363 @@
+"""Figures of results, one for each command.
+
+- The check picture of a calibration: held-out captures beside the fit.
+- Reconstructions of a hidden screen side by side; needs matplotlib.
+- The check picture of an imported scan; needs matplotlib.
+- The path of a hidden object and its speed; needs matplotlib.
+- Can the confidence be trusted? What is left when the least supported passes go, and support against skill.
+- What a rig can show, drawn: singular values, Picard plot, modes, and the best linear picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.calibration import RigFit
+from evnlos.files import write_atomically
+from evnlos.plot.figures import new_figure, save_figure, signed_map
+from evnlos.setups.files import Measurement
+from evnlos.tracking import Track
+from evnlos.untrusted import open_image
+
+if TYPE_CHECKING:
+    from evnlos.analysis.confidence import PassWorth
+    from evnlos.analysis.identify import Identification
+
+
+def draw_calibration(fit: RigFit, path: str | Path) -> None:
+    """Draw frame, model and residual of held-out captures, and the time surfaces where events were fitted.
+
+    Args:
+        fit: The calibration.
+        path: PNG file to write.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    with_events = any(example.surface is not None for example in fit.example)
+    signed = signed_map()
+    columns, rows = (6 if with_events else 3), len(fit.example)
+    figure = new_figure((2.6 * columns, 1.85 * rows + 0.4))
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for line, example in zip(axes, fit.example, strict=True):
+        top = max(float(example.frame.max()), float(example.model.max()))
+        miss = example.frame - example.model
+        pictures = [(example.frame, "frame", "gray", 0.0, top), (example.model, "model", "gray", 0.0, top)]
+        pictures.append((miss, "frame - model, times 5", signed, -top / 5, top / 5))
+        if example.surface is not None and example.model_surface is not None:
+            seen, made = (s[0] - s[1] for s in (example.surface, example.model_surface))
+            peak = float(np.abs(seen).max())
+            pictures += [
+                (seen, "events: ON - OFF", signed, -peak, peak),
+                (made, "model", signed, -peak, peak),
+                (seen - made, "difference", signed, -peak, peak),
+            ]
+        for axis in line:
+            axis.set_axis_off()
+        for axis, (picture, title, colours, low, high) in zip(line, pictures, strict=False):
+            axis.imshow(picture, cmap=colours, vmin=low, vmax=high)
+            axis.set_title(f"{example.name}: {title}" if title == "frame" else title, fontsize=8)
+    figure.supxlabel("differences and events: light orange above 0, grey at 0, dark blue below", fontsize=8)
+    # Noise hardly compresses: fewer colours keep the picture small.
+    drawn = BytesIO()
+    figure.savefig(drawn, dpi=60, format="png")
+    with open_image(drawn) as picture:
+        packed = BytesIO()
+        picture.convert("RGB").quantize(200).save(packed, "PNG", optimize=True)
+    write_atomically(path, packed.getvalue())
+
+
+def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]]) -> Path:
+    """Draw pictures [channels, h, w] in a row under their titles.
+
+    Each is drawn from 0 to its own 99.5th percentile: how bright the screen was is not known.
+
+    Args:
+        path: The picture, PNG or SVG.
+        panels: Titles and images, one or three channels.
+
+    Returns:
+        The path.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    figure = new_figure((3.1 * len(panels), 3.0))
+    for axes, (title, image) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        axes.imshow(as_picture(image), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes.set_title(title, fontsize=10)
+        axes.set_axis_off()
+    return save_figure(figure, path, dpi=100)
+
+
+def as_picture(image: torch.Tensor) -> NDArray[np.float64]:
+    """Return an image [channels, h, w] as [h, w] or [h, w, 3] in 0..1, 1 its 99.5th percentile."""
+    picture = image.detach().double().clamp(min=0).numpy()
+    picture = np.clip(picture / max(float(np.quantile(picture, 0.995)), 1e-12), 0, 1)
+    return picture[0] if len(picture) == 1 else np.moveaxis(picture[:3], 0, -1)
+
+
+def draw_scan(path: str | Path, measurement: Measurement, raw: torch.Tensor | None = None) -> Path:
+    """Draw four columns of the matrix, the light of all cells, the noise, and the singular values.
+
+    Args:
+        path: The picture, PNG or SVG.
+        measurement: What was measured.
+        raw: The matrix before denoising, [H W, n], for its singular values beside the others.
+
+    Returns:
+        The path.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    shape, plane = measurement.shape, measurement.about.plane
+    figure = new_figure((13.0, 6.0))
+    axes = figure.subplots(2, 4)
+    rows, columns = (sorted({n // 4, n // 2}) for n in plane.shape)
+    cells = [(r, c) for r in rows for c in columns][:4]
+    for place, (row, column) in zip(axes[0], cells, strict=False):
+        light = measurement.matrix[:, row * plane.width + column].reshape(shape)
+        _picture(figure, place, light, f"cell ({row}, {column}), white levels")
+    for place in axes[0][len(cells) :]:
+        place.set_axis_off()
+    _picture(figure, axes[1][0], measurement.matrix.sum(dim=1).reshape(shape), "all cells lit")
+    noise = torch.where(measurement.bad, torch.nan, measurement.noise)
+    _picture(figure, axes[1][1], noise, f"noise of an entry; {int(measurement.bad.sum())} pixels unusable")
+    _picture(figure, axes[1][2], measurement.dark, "dark frame, white levels")
+    last = axes[1][3]
+    if raw is not None and raw.shape[1] == measurement.matrix.shape[1]:
+        last.semilogy(_spectrum(raw), label="plain mean of the repeats", color="tab:gray")
+    last.semilogy(_spectrum(measurement.matrix), label="as written", color="tab:blue")
+    sigma = torch.where(measurement.bad, 0.0, measurement.noise).double()
+    edge = float(sigma.max()) * (plane.height * plane.width) ** 0.5 + float(sigma.square().sum().sqrt())
+    last.axhline(edge, color="tab:red", linestyle=":", label="largest of noise alone, at most")
+    last.set_title("singular values", fontsize=9)
+    last.set_ylim(bottom=max(last.get_ylim()[0], 1e-6))
+    last.legend(fontsize=7)
+    return save_figure(figure, path, dpi=90)
+
+
+def _picture(figure: Any, axes: Any, image: torch.Tensor, title: str) -> None:
+    shown = axes.imshow(np.asarray(image), cmap="gray", interpolation="nearest")
+    figure.colorbar(shown, ax=axes, shrink=0.7)
+    axes.set_title(title, fontsize=9)
+    axes.set_axis_off()
+
+
+def _spectrum(matrix: torch.Tensor) -> np.ndarray:
+    work = matrix.double()
+    gram = work.mT @ work if work.shape[1] <= work.shape[0] else work @ work.mT
+    return torch.linalg.eigvalsh(gram).flip(0).clamp(min=0).sqrt().numpy()
+
+
+_HEADROOM = 1.1  # of the speed's axis over the largest speed, so that no line lies on the frame
+
+
+def draw_track(
+    track: Track, path: str | Path, truth: NDArray[np.float64] | None = None, title: str = ""
+) -> Path:
+    """Draw the path, both coordinates, speed, and size or distance over time, with bands of two deviations.
+
+    Args:
+        track: The track.
+        path: The picture, PNG or SVG.
+        truth: The true position (x, y) at the track's instants, [T, 2], in its unit, where it is known.
+        title: Heading of the figure.
+
+    Returns:
+        The path.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    scale, unit = (100.0, "cm") if track.unit == "m" else (1.0, "px")
+    figure = new_figure((11.0, 6.4))
+    (plane, along), (speed, size) = figure.subplots(2, 2)
+    if title:
+        figure.suptitle(title)
+    plane.plot(*(scale * track.frame_position.T), ".", color="0.6", label="frames")
+    plane.plot(*(scale * track.position.T), color="C0", label="track")
+    if truth is not None:
+        plane.plot(*(scale * truth.T), "--", color="k", linewidth=1, label="truth")
+    plane.set(xlabel=f"x, {unit}", ylabel=f"y, {unit} (downwards)", title="path")
+    plane.invert_yaxis()
+    plane.set_aspect("equal", adjustable="datalim")
+    plane.legend()
+    for axis, name in enumerate("xy"):
+        middle, band = scale * track.position[:, axis], 2 * scale * track.position_sigma[:, axis]
+        along.plot(track.time_s, middle, color=f"C{axis}", label=name)
+        along.fill_between(track.time_s, middle - band, middle + band, color=f"C{axis}", alpha=0.3)
+        if truth is not None:
+            along.plot(track.time_s, scale * truth[:, axis], "--", color="k", linewidth=1)
+    along.set(xlabel="time, s", ylabel=f"position, {unit}", title="position")
+    along.legend()
+    middle, band = scale * track.speed, 2 * scale * track.speed_sigma
+    top = float((middle + band).max())
+    speed.plot(track.time_s, middle, color="C2")
+    speed.fill_between(track.time_s, middle - band, middle + band, color="C2", alpha=0.3)
+    if truth is not None:
+        rate = np.gradient(truth, track.time_s, axis=0)
+        true = scale * np.hypot(rate[:, 0], rate[:, 1])
+        top = max(top, float(true.max()))
+        speed.plot(track.time_s, true, "--", color="k", linewidth=1)
+    # An upper end of None would stay where it stood before and cut a band that has just been drawn.
+    speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, _HEADROOM * top or None))
+    if track.distance is None:
+        size.errorbar(track.frame_time_s, track.size, 2 * track.size_sigma, fmt=".", color="C3")
+        size.set(xlabel="time, s", ylabel="size over its mean", title="size of the picture")
+    else:
+        away = track.distance
+        middle, band = scale * away.distance_m, 2 * scale * away.distance_sigma
+        size.plot(away.time_s, middle, color="C3")
+        size.fill_between(away.time_s, middle - band, middle + band, color="C3", alpha=0.3)
+        size.set(xlabel="time, s", ylabel=f"distance, {unit}", title="distance from the wall")
+    return save_figure(figure, path, dpi=80)
+
+
+_LEAST_SKILL = -1.2  # worse passes are drawn on this line
+
+
+def draw_worth(found: Mapping[str, Sequence[PassWorth]], path: str | Path) -> Path:
+    """Draw the risk-coverage curves of all passes, and each pass's skill over its support.
+
+    Args:
+        found: The passes by the name of their set.
+        path: The picture, PNG or SVG.
+
+    Returns:
+        The path.
+
+    Raises:
+        MissingDependencyError: Matplotlib is not installed.
+    """
+    from evnlos.analysis.confidence import risk_coverage
+
+    figure = new_figure((10.5, 4.4))
+    curves, cloud = figure.subplots(1, 2)
+    passes = [one for those in found.values() for one in those]
+    skill, support = (np.array([getattr(one, key) for one in passes]) for key in ("skill", "support"))
+    for order, name, line in (
+        (support, "the most supported first", "-"),
+        (skill, "the best first (not known to a user)", "--"),
+    ):
+        kept, risk = risk_coverage(order, 1 - skill)
+        curves.plot(100 * kept, risk, line, label=name, lw=1.6)
+    curves.axhline(float(np.mean(1 - skill)), color="0.5", lw=1.0, ls=":", label="all passes")
+    curves.set(xlabel="passes kept, %", ylabel="mean risk of what is kept (1 - skill)", ylim=(0, None))
+    curves.legend(frameon=False, fontsize=8)
+    marks = "osD^v<>PX*ph"
+    for number, (name, those) in enumerate(found.items()):
+        cloud.plot(
+            [one.support for one in those],
+            [max(one.skill, _LEAST_SKILL) for one in those],
+            marks[number % len(marks)],
+            ms=5,
+            alpha=0.75,
+            label=name,
+            color=f"C{number % 10}",
+        )
+    cloud.axline((0, 0), (1, 1), color="0.5", lw=1.0, ls=":")
+    cloud.set(xlabel="support: what was said", ylabel=f"skill: what was true ({_LEAST_SKILL} or less below)")
+    cloud.set(xlim=(-0.03, 1.03), ylim=(_LEAST_SKILL - 0.1, 1.05))
+    cloud.legend(frameon=False, fontsize=7, loc="lower right")
+    return save_figure(figure, path, dpi=100)
+
+
+_FLOOR = 1e-7
+
+
+def draw_identification(found: Identification, path: str | Path) -> Path:
+    """Draw singular values, the Picard plot of a typical plate, the first modes, truth and linear picture.
+
+    Args:
+        found: What `identify` returned.
+        path: The picture, PNG or SVG.
+
+    Returns:
+        The path.
+
+    Raises:
+        MissingDependencyError: Matplotlib is not installed.
+    """
+    figure = new_figure((10.5, 6.2))
+    grid = figure.add_gridspec(2, 1, height_ratios=(1.5, 1))
+    curves, pictures = grid[0].subgridspec(1, 2), grid[1].subgridspec(2, 6)
+    _singular_values(figure.add_subplot(curves[0]), [found])
+    _picard(figure.add_subplot(curves[1]), found)
+    at = found.at_camera
+    for row, (image, title) in enumerate(((found.truth, "truth"), (at.picture, "best linear"))):
+        _image_of(figure.add_subplot(pictures[row, 0]), image, title)
+    for k, mode in enumerate(at.modes):
+        place = figure.add_subplot(pictures[k // 4, 1 + k % 4])
+        _image_of(place, mode, f"mode {k + 1}", signed_map(), float(mode.abs().max()))
+    words = figure.add_subplot(pictures[:, 5])
+    words.set_axis_off()
+    strokes = " x ".join("none" if w is None else f"{1e3 * w:.1f}" for w in at.stroke_m)
+    words.text(
+        0.0,
+        0.5,
+        f"{found.modes} modes > 1e-2\n{at.patterns} patterns > noise\nbars {strokes} mm\n"
+        f"linear {at.psnr_db:.1f} dB\nmean {found.mean_db:.1f} dB\nblack {found.zero_db:.1f} dB\n"
+        "modes: light > 0 > dark",
+        va="center",
+        fontsize=9,
+    )
+    figure.suptitle(found.name)
+    return save_figure(figure, path, dpi=100)
+
+
+def draw_rigs(found: Sequence[Identification], path: str | Path) -> Path:
+    """Draw the singular values of several rigs in one plot.
+
+    Args:
+        found: The rigs.
+        path: The picture, PNG or SVG.
+
+    Raises:
+        MissingDependencyError: Matplotlib is not installed.
+    """
+    figure = new_figure((8.0, 4.6))
+    _singular_values(figure.add_subplot(), found)
+    return save_figure(figure, path, dpi=100)
+
+
+def _singular_values(axes: Any, found: Sequence[Identification]) -> None:
+    walls = list(dict.fromkeys(one.name.partition("-")[0] for one in found))
+    for one in found:
+        values = one.singular.numpy()
+        wall, _, place = one.name.partition("-")
+        style = {"color": f"C{walls.index(wall)}", "linestyle": "--" if place == "far" else "-", "lw": 1.2}
+        axes.semilogy(np.arange(1, len(values) + 1), _above(values, _FLOOR), label=one.name, **style)
+    axes.axhline(1e-2, color="k", lw=0.7, ls=":")
+    axes.set(xlabel="mode", ylabel="singular value / largest", ylim=(_FLOOR, 1.5), xscale="log")
+    axes.legend(frameon=False, fontsize=8, ncols=2 if len(found) > 6 else 1)
+
+
+def _picard(axes: Any, found: Identification) -> None:
+    at = found.at_camera
+    mode = np.arange(1, len(at.spectrum) + 1)
+    axes.semilogy(mode, _above(at.spectrum.numpy(), 1e-3), label="singular value / noise", lw=1.2)
+    axes.semilogy(mode, _above(at.picard.numpy(), 1e-3), ".", ms=3, label="a letter's coefficient / noise")
+    axes.axhline(1.0, color="k", lw=0.7, ls=":", label="noise")
+    axes.set(xlabel="mode", xscale="log", ylim=(1e-3, None))
+    axes.legend(frameon=False, fontsize=8)
+
+
+def _above(values: Any, floor: float) -> Any:
+    """Return the values with NaN, which is not drawn, below a floor."""
+    return np.where(values > floor, values, np.nan)
+
+
+def _image_of(axes: Any, image: Any, title: str, cmap: Any = "gray", largest: float | None = None) -> None:
+    low, high = (0.0, 1.0) if largest is None else (-largest, largest)
+    axes.imshow(image.numpy(), cmap=cmap, vmin=low, vmax=high)
+    axes.set_title(title, fontsize=8)
+    axes.set_axis_off()

@@ -1,0 +1,307 @@
+"""The setup to scale, the wall's kernel, and the time stamps that rows of pixels send.
+
+- The set-up of a rig, to scale, seen from above; SVG in the colours of the page that it stands on.
+- The wall's kernel: curves, what they do to a letter, and the cosine law beside them (paper Fig. 5).
+- Time stamps of a few rows of pixels, stream beside stream: layers show where a simulator counts in frames.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from evnlos.events.grids import OFF_HEX, ON_HEX
+from evnlos.optics import DiffuseReflection, tpsf_kernel, tpsf_profile
+from evnlos.plot.figures import new_figure, save_figure
+from evnlos.scene import FontGlyphs
+from evnlos.setups import Setup
+from evnlos.types import Events, Plane
+
+_WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
+_LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # told apart with every common kind of colour blindness
+PARTITION = "hides the object (sketch)"
+"""What stands beside the line that no rig's settings state."""
+_STEPS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """An SVG drawing; a notebook shows it as a picture.
+
+    Args:
+        svg: The drawing.
+    """
+
+    svg: str
+
+    def _repr_svg_(self) -> str:
+        return self.svg
+
+
+def setup_drawing(setup: Setup, travel_m: float = 0.16, plate_m: float = 0.08) -> Drawing | None:
+    """Return the setup from above, to scale: wall, object and its way, cameras and their view, what is between.
+
+    Where the setup has no place of the camera, none is drawn. Occluders stand where they are; what hides the
+    object from the camera is in no setup, so a dotted line sketches it.
+
+    Args:
+        setup: The setup.
+        travel_m: Way of the object's middle, metres.
+        plate_m: Side of the object's plate, metres.
+
+    Returns:
+        The drawing; None for a setup that does not know where its parts are.
+
+    Example:
+        >>> from evnlos.setups import load_setup
+        >>> setup_drawing(load_setup("main-near")).svg[:4]
+        '<svg'
+    """
+    layout = setup.layout()
+    if layout is None:
+        return None
+    parts, around = [], []  # drawn in metres first: (kind, points, style or words)
+    middle, deep = layout.target
+    half = (travel_m + plate_m) / 2
+    parts.append(
+        ("line", [(middle - half, deep), (middle + half, deep)], f"stroke='{_LIGHT}' stroke-dasharray='2 3'")
+    )
+    parts.append(
+        (
+            "line",
+            [(middle - plate_m / 2, deep), (middle + plate_m / 2, deep)],
+            f"stroke='{_LIGHT}' stroke-width='4'",
+        )
+    )
+    parts.append(("text", [(middle, deep)], f"object {100 * plate_m:.3g} cm, way {100 * travel_m:.3g} cm"))
+    reach = max(half + abs(middle) + 0.04, 0.2)
+    around += [(middle - half, deep), (middle + half, deep)]
+    if layout.camera is not None:
+        eye = layout.camera
+        seen = [(x, 0.0) for x in layout.seen_m or ()]
+        reach = max(reach, *(abs(x) + 0.02 for x, _ in seen))
+        parts += [("line", [eye, one], f"stroke='{_SIGHT}' stroke-width='1'") for one in seen]
+        parts.append(("disc", [eye], f"fill='{_SIGHT}'"))
+        parts.append(("text", [eye], f"cameras, {layout.camera_words}"))
+        for polygon in layout.occluders:
+            corners = np.asarray(polygon)
+            parts.append(
+                ("line", [tuple(c) for c in (*corners, corners[0])], "stroke='currentColor' stroke-width='3'")
+            )
+            parts.append(("text", [tuple(corners.mean(axis=0))], "occluder"))
+        hidden = _partition(eye, seen, (middle - half, middle + half), deep)
+        if hidden is not None:
+            dotted = "stroke='currentColor' stroke-width='3' stroke-dasharray='2 4' data-part='partition'"
+            parts += [("line", list(hidden), dotted), ("text", [hidden[1]], PARTITION)]
+            around += list(hidden)
+        if layout.lamp is not None:
+            lamp = layout.lamp
+            parts += [("disc", [lamp], f"fill='{_LIGHT}'"), ("text", [lamp], "lamp")]
+            around.append(lamp)
+        parts.append(
+            (
+                "line",
+                [(middle, deep), (0.0, 0.0), eye],
+                f"stroke='{_LIGHT}' stroke-width='.8' stroke-dasharray='6 4'",
+            )
+        )
+        around += [eye, *seen]
+    parts.append(("line", [(-reach, 0.0), (reach, 0.0)], "stroke='currentColor' stroke-width='5'"))
+    around += [(-reach, 0.0), (reach, 0.0)]
+    return Drawing(_svg(parts, np.array(around), layout.wall, deep))
+
+
+def _partition(
+    eye: tuple[float, float], seen: list[tuple[float, float]], way: tuple[float, float], deep: float
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Return a line that hides the object's whole way from the camera and leaves light and sight free.
+
+    It stands between the object's way and the camera's nearer line of sight, upright on the wall.
+
+    Returns:
+        Its ends (x, z), metres, from the object's depth on; None where the camera is no deeper than the object,
+        or there is no gap.
+    """
+    if eye[1] <= deep:
+        return None
+    side = 1.0 if eye[0] > (way[0] + way[1]) / 2 else -1.0
+    near, far = max(way, key=lambda x: side * x), min(way, key=lambda x: side * x)
+    share = deep / eye[1]
+    sight = min((x + share * (eye[0] - x) for x, _ in seen), key=lambda x: side * x)
+    if side * (sight - near) <= 0:
+        return None
+    x = (near + sight) / 2
+    steepest = deep + (x - far) / (eye[0] - far) * (eye[1] - deep)  # where the line to the far end passes
+    end = deep + 1.15 * (steepest - deep)
+    return (x, deep), (x, end)
+
+
+def _svg(parts: list, around: NDArray[np.float64], wall: str, deep: float) -> str:
+    low, high = around.min(axis=0), around.max(axis=0)
+    scale = min(
+        (_WIDTH - 2 * _MARGIN) / (high[0] - low[0]), (_HEIGHT - 2 * _MARGIN - 26) / max(high[1] - low[1], 1e-9)
+    )
+
+    def place(point: tuple[float, float]) -> tuple[float, float]:
+        return _MARGIN + (point[0] - low[0]) * scale, _MARGIN + (point[1] - low[1]) * scale
+
+    drawn = []
+    for kind, points, style in parts:
+        at = [place(point) for point in points]
+        if kind == "line":
+            drawn.append(
+                f"<polyline points='{' '.join(f'{x:.1f},{y:.1f}' for x, y in at)}' fill='none' {style}/>"
+            )
+        elif kind == "disc":
+            drawn.append(f"<circle cx='{at[0][0]:.1f}' cy='{at[0][1]:.1f}' r='6' {style}/>")
+        else:
+            x = min(max(at[0][0], 90), _WIDTH - 110)
+            drawn.append(_text(x, at[0][1] + 20, style))
+    drawn.append(_text(place((0.0, 0.0))[0], _MARGIN - 16, wall))
+    x, top, bottom = place((low[0], 0.0))[0] + 12, place((0.0, 0.0))[1] + 4, place((0.0, deep))[1]
+    drawn.append(f"<path d='M{x:.1f} {top:.1f}V{bottom:.1f}' stroke='currentColor' stroke-width='.8' />")
+    drawn.append(_text(x + 5, (top + bottom) / 2, f"{100 * deep:.3g} cm", "start"))
+    step = max((one for one in _STEPS_M if one * scale <= 150), default=_STEPS_M[0])
+    left, foot = _MARGIN, _HEIGHT - 14
+    drawn.append(f"<path d='M{left} {foot - 4}v4h{step * scale:.1f}v-4' fill='none' stroke='currentColor' />")
+    drawn.append(_text(left + step * scale + 8, foot, f"{100 * step:g} cm; seen from above, to scale", "start"))
+    return (
+        f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {_WIDTH} {_HEIGHT}' width='{_WIDTH}' role='img' "
+        f"aria-label='set-up, to scale' font-family='sans-serif' font-size='12'>{''.join(drawn)}</svg>"
+    )
+
+
+def _text(x: float, y: float, words: str, anchor: str = "middle") -> str:
+    return (
+        f"<text x='{x:.1f}' y='{y:.1f}' text-anchor='{anchor}' fill='currentColor'>{html.escape(words)}</text>"
+    )
+
+
+CURVES = (0.2, 0.4, 0.6, 0.8, 0.9)
+"""Mean free paths of the curves, in units of t."""
+PICTURES = (0.4, 0.8, 1.2, 1.6)
+"""Mean free paths of the pictures, at t = 2."""
+
+
+def cosine_law(rho: NDArray, height: float, power: int = 3) -> NDArray:
+    """Return the light that a point source at a height throws on a plane, over its maximum: cos^power.
+
+    A source that shines alike in all directions gives E ~ cos / r^2, cos^3; one that itself obeys Lambert's law
+    gives cos^4.
+
+    Args:
+        rho: Distance along the plane from the foot of the source, [...], any unit.
+        height: Height of the source, the same unit.
+        power: 3 or 4.
+
+    Example:
+        >>> cosine_law(np.array([0.0, 1.0]), 1.0).round(4)
+        array([1.    , 0.3536])
+    """
+    return (1 + (rho / height) ** 2) ** (-power / 2)
+
+
+def blurred(letter: str, mean_free_path: float, t: float = 2.0, side: int = 96) -> NDArray:
+    """Return a letter after the convolution with the tPSF, rho in samples of 0.02 as in the paper, [H, W]."""
+    name = FontGlyphs(characters=letter)
+    target = name.target(name.objects()[0], 0)
+    plane = Plane(side, side, target.size_m / side)
+    kernel = tpsf_kernel(plane.pitch_m, t=t, mean_free_path=mean_free_path)
+    wall = DiffuseReflection(plane, kernel)(torch.from_numpy(target.rasterise(plane)))
+    middle, half = [n // 2 for n in wall.shape], side
+    image = wall[middle[0] - half : middle[0] + half, middle[1] - half : middle[1] + half]
+    return image.numpy() / float(image.max())
+
+
+def draw_kernel(path: str | Path, letter: str = "R") -> Path:
+    """Draw the kernel's curves and a letter behind each of several walls; needs matplotlib.
+
+    Args:
+        path: The picture, PNG or SVG.
+        letter: What is hidden.
+
+    Returns:
+        The path.
+    """
+    figure = new_figure((10.5, 5.6))
+    grid = figure.add_gridspec(2, len(PICTURES), height_ratios=(1.35, 1))
+    axes = figure.add_subplot(grid[0, :])
+    rho = np.linspace(0, 3, 301)
+    for share in CURVES:
+        curve = tpsf_profile(torch.from_numpy(rho), 1.0, share).numpy()
+        (line,) = axes.plot(rho, curve / curve[0], label=f"tPSF, <l> = {share:g} t")
+        law = cosine_law(rho, 1 - share)
+        axes.plot(rho, law, "--", color=line.get_color(), linewidth=0.9)
+    axes.plot([], [], "k--", linewidth=0.9, label="cosine law, source at t - <l>")
+    axes.set(xlabel="rho / t", ylabel="H(rho) / H(0)", xlim=(0, 3), ylim=(0, 1.02))
+    axes.legend(frameon=False)
+    for column, path_length in enumerate(PICTURES):
+        picture = figure.add_subplot(grid[1, column])
+        picture.imshow(blurred(letter, path_length), cmap="gray", vmin=0, vmax=1)
+        picture.set_title(f"t = 2, <l> = {path_length:g}", fontsize=10)
+        picture.set_axis_off()
+    return save_figure(figure, path, dpi=110)
+
+
+def share_on_frame_times(events: Events, times_s: ArrayLike) -> float:
+    """Return the share of events whose time stamp is that of a frame, to the microsecond; NaN without events.
+
+    Args:
+        events: The events of a simulated video.
+        times_s: Times of its frames, [T], seconds.
+
+    Example:
+        >>> events = Events([1000, 1500, 2000, 2001], [0] * 4, [0] * 4, [1] * 4, width=1, height=1)
+        >>> share_on_frame_times(events, [0.001, 0.002])
+        0.5
+    """
+    frames_us = np.round(np.asarray(times_s, dtype=np.float64) * 1e6).astype(np.int64)
+    return float(np.isin(events.t_us, frames_us).mean()) if len(events) else float("nan")
+
+
+def draw_time_stamps(
+    path: str | Path,
+    streams: Mapping[str, Events],
+    times_s: ArrayLike,
+    *,
+    rows: tuple[int, int],
+    window_s: tuple[float, float],
+) -> Path:
+    """Draw column against time of the events of some rows, one panel a stream; needs matplotlib.
+
+    Args:
+        path: The picture, PNG or SVG.
+        streams: Events of the same scene by title.
+        times_s: Times of the frames that they were made from, [T], seconds: thin lines.
+        rows: First row, and the row after the last.
+        window_s: Begin and end of what is drawn, seconds.
+
+    Returns:
+        The path.
+    """
+    figure = new_figure((10.5, 3.6))
+    panels = figure.subplots(1, len(streams), sharex=True, sharey=True, squeeze=False)[0]
+    start, stop = window_s
+    frames_ms = 1e3 * np.asarray(times_s, dtype=np.float64)
+    frames_ms = frames_ms[(frames_ms >= 1e3 * start) & (frames_ms <= 1e3 * stop)]
+    for axes, (title, events) in zip(panels, streams.items(), strict=True):
+        shown = (events.y >= rows[0]) & (events.y < rows[1])
+        shown &= (events.t_us >= 1e6 * start) & (events.t_us <= 1e6 * stop)
+        for frame_ms in frames_ms:
+            axes.axvline(frame_ms, color="#d8d8d8", linewidth=0.6, zorder=0)
+        for sign, colour, name in ((True, ON_HEX, "ON"), (False, OFF_HEX, "OFF")):
+            part = events[shown & (events.p == sign)]
+            axes.scatter(part.t_us / 1e3, part.x, s=7, color=colour, linewidths=0, label=name)
+        share = share_on_frame_times(events, times_s)
+        axes.set_title(f"{title}: {100 * share:.3g} % of all events on frame times", fontsize=10)
+        axes.set(xlabel="time, ms", xlim=(1e3 * start, 1e3 * stop))
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("column, pixels")
+    panels[-1].legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=2)
+    return save_figure(figure, path, dpi=110)

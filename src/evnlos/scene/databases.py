@@ -1,0 +1,266 @@
+"""Databases of handwriting that a user has a copy of: NIST Special Database 19 and EMNIST.
+
+Read the user's own copy of NIST Special Database 19, in its official layout "by_class".
+
+    by_class/41/hsf_0/hsf_0_00000.png      41 = hexadecimal ASCII of "A"; hsf_0 .. hsf_8: groups of writers
+    by_class/41/train_41/train_41_00000.png   the forms that NIST suggests for training, together
+
+`hsf_4` holds the writers that NIST suggests for testing; `train_XX` repeats images of other partitions, so one
+data set should take one partition.
+
+- Read the user's own copy of EMNIST: gzip-compressed idx files and a mapping from labels to characters.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.errors import DataError
+from evnlos.scene.glyphs import DIGITS, UPPER_CASE
+from evnlos.untrusted import open_image
+
+_MAX_SIDE = 1024  # the official images have 128 pixels a side
+
+
+class Handwritten(NamedTuple):
+    """One scanned character.
+
+    Args:
+        char: The character.
+        source: Where it comes from, unique within the database, e.g. "hsf_0_00012".
+        mask: Bright ink on dark ground, float32 [h, w], 0..1.
+    """
+
+    char: str
+    source: str
+    mask: NDArray[np.float32]
+
+
+def list_sd19(
+    folder: str | Path,
+    characters: str = UPPER_CASE + DIGITS,
+    partition: str = "hsf_0",
+    first: int = 0,
+    count: int | None = None,
+) -> Iterator[tuple[str, str, Path]]:
+    """Yield (character, source, file) of a copy of NIST SD19 in the order of characters and file names.
+
+    Args:
+        folder: The folder `by_class`, or the one that holds it.
+        characters: Characters to list.
+        partition: "hsf_0" .. "hsf_8", or "train" for the folders train_XX.
+        first: Number of images of each character to pass over.
+        count: Images of each character to list after those; None for all.
+
+    Raises:
+        DataError: The folder does not have the official layout, or holds fewer images than asked for.
+    """
+    if not re.fullmatch(r"hsf_[0-8]|train", partition):
+        raise DataError(f"partition is {partition!r}; NIST SD19 has hsf_0 to hsf_8 and train")
+    root = Path(folder).expanduser()
+    root = root / "by_class" if (root / "by_class").is_dir() else root
+    for char in characters:
+        name = f"{ord(char):02x}"
+        images = root / name / (f"train_{name}" if partition == "train" else partition)
+        if not images.is_dir():
+            raise DataError(
+                f"{images} is not there; NIST SD19 by_class keeps {char!r} in {name}/{images.name}/*.png: "
+                "give the folder by_class of your copy"
+            )
+        files = sorted(path for path in images.iterdir() if path.suffix.lower() == ".png")
+        chosen = files[first : None if count is None else first + count]
+        if not chosen or (count is not None and len(chosen) < count):
+            raise DataError(
+                f"{images} holds {len(files)} images; {count or 'some'} from number {first} on were asked for: "
+                "ask for fewer or take another partition"
+            )
+        for path in chosen:
+            yield char, path.stem, path
+
+
+def read_sd19_image(path: str | Path) -> NDArray[np.float32]:
+    """Read one image, black ink on white, as bright ink on dark ground, float32 [h, w], 0..1.
+
+    Raises:
+        DataError: The file is no image, or larger than any of the database.
+    """
+    try:
+        with open_image(path) as image:
+            if max(image.size) > _MAX_SIDE:
+                raise DataError(
+                    f"{path} is {image.size[0]} x {image.size[1]} pixels; NIST SD19 images are 128 x 128"
+                )
+            grey = np.asarray(image.convert("L"), dtype=np.float32)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(
+            f"{path} is no image that can be read ({error}); restore it from the database"
+        ) from None
+    return 1 - grey / np.float32(255)
+
+
+def read_sd19(
+    folder: str | Path,
+    characters: str = UPPER_CASE + DIGITS,
+    partition: str = "hsf_0",
+    first: int = 0,
+    count: int | None = None,
+) -> Iterator[Handwritten]:
+    """Yield the scanned characters that `list_sd19` lists, one image in memory at a time."""
+    for char, source, path in list_sd19(folder, characters, partition, first, count):
+        yield Handwritten(char, source, read_sd19_image(path))
+
+
+_SIDE = 28
+_BATCH = 4096  # images in memory at a time
+_DEFLATE_LIMIT = 1032  # deflate never expands more than this
+
+
+def list_emnist(
+    folder: str | Path,
+    characters: str = UPPER_CASE + DIGITS,
+    subset: str = "byclass",
+    part: str = "train",
+    first: int = 0,
+    count: int | None = None,
+) -> list[tuple[str, int]]:
+    """Return (character, number of the image in its file) in the order of the file; reads labels only.
+
+    Args:
+        folder: Folder with the official files, e.g. emnist-byclass-train-images-idx3-ubyte.gz, the labels
+            beside it and emnist-byclass-mapping.txt.
+        characters: Characters to list.
+        subset: "byclass", "bymerge", "balanced", "letters" or "digits".
+        part: "train" or "test".
+        first: Number of images of each character to pass over.
+        count: Images of each character to list after those; None for all.
+
+    Raises:
+        DataError: A file is missing, damaged or not what its header says, or has fewer images than asked for.
+    """
+    root = Path(folder).expanduser()
+    mapping = _read_mapping(
+        _file(root, f"emnist-{subset}-mapping.txt", "a text file of labels and ASCII codes")
+    )
+    labels_file = _file(root, f"emnist-{subset}-{part}-labels-idx1-ubyte.gz", "the official label file")
+    with _idx(labels_file, dimensions=1) as (stream, (total,)):
+        labels = _read_exactly(stream, total, labels_file)
+    chosen: list[tuple[str, int]] = []
+    for char in characters:
+        numbers = [label for label, known in mapping.items() if char == known]
+        places = np.flatnonzero(np.isin(labels, np.array(numbers, dtype=np.uint8)))
+        wanted = places[first : None if count is None else first + count]
+        if not len(wanted) or (count is not None and len(wanted) < count):
+            raise DataError(
+                f"{labels_file} holds {len(places)} images of {char!r}; {count or 'some'} from number {first} "
+                "on were asked for: ask for fewer, or take another subset"
+            )
+        chosen += [(char, int(place)) for place in wanted]
+    return sorted(chosen, key=lambda item: item[1])
+
+
+def read_emnist_images(
+    folder: str | Path, numbers: Sequence[int], subset: str = "byclass", part: str = "train"
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Yield (number, mask) of chosen images in the order of the file, in one pass, upright.
+
+    Args:
+        folder: As in `list_emnist`.
+        numbers: Numbers of the images in the file.
+        subset: As in `list_emnist`.
+        part: As in `list_emnist`.
+
+    Yields:
+        The number and the mask, float32 [28, 28], 0..1, bright ink on dark ground. The official files hold the
+        images transposed; this undoes it.
+
+    Raises:
+        DataError: The file is missing, damaged, or shorter than its header says.
+    """
+    path = _file(
+        Path(folder).expanduser(), f"emnist-{subset}-{part}-images-idx3-ubyte.gz", "the official image file"
+    )
+    wanted = sorted(set(numbers))
+    with _idx(path, dimensions=3) as (stream, (total, rows, columns)):
+        if (rows, columns) != (_SIDE, _SIDE):
+            raise DataError(f"{path} says {rows} x {columns} pixels; EMNIST images are {_SIDE} x {_SIDE}")
+        if wanted and not 0 <= wanted[0] <= wanted[-1] < total:
+            raise DataError(
+                f"image {wanted[-1]} of {path} was asked for; it holds {total}: take its own label file"
+            )
+        for start in range(0, wanted[-1] + 1 if wanted else 0, _BATCH):
+            size = min(_BATCH, total - start)
+            batch = _read_exactly(stream, size * _SIDE * _SIDE, path).reshape(size, _SIDE, _SIDE)  # [b, 28, 28]
+            for number in wanted[np.searchsorted(wanted, start) : np.searchsorted(wanted, start + size)]:
+                yield number, batch[number - start].T.astype(np.float32) / np.float32(255)
+
+
+def read_emnist(
+    folder: str | Path,
+    characters: str = UPPER_CASE + DIGITS,
+    subset: str = "byclass",
+    part: str = "train",
+    first: int = 0,
+    count: int | None = None,
+) -> Iterator[Handwritten]:
+    """Yield the characters that `list_emnist` lists, in the order of the file, in bounded memory."""
+    chars = {number: char for char, number in list_emnist(folder, characters, subset, part, first, count)}
+    for number, mask in read_emnist_images(folder, list(chars), subset, part):
+        yield Handwritten(chars[number], f"{part}_{number:06d}", mask)
+
+
+def _file(root: Path, name: str, what: str) -> Path:
+    path = root / name
+    if not path.is_file():
+        raise DataError(f"{path} is not there; it is {what} of EMNIST: give the folder of your copy")
+    return path
+
+
+def _read_mapping(path: Path) -> dict[int, str]:
+    """Return label -> character; where two cases share a label, the first code on the line counts."""
+    mapping: dict[int, str] = {}
+    try:
+        for line in path.read_text(encoding="ascii").splitlines():
+            if line.strip():
+                label, code, *_ = (int(field) for field in line.split())
+                mapping[label] = chr(code)
+    except (ValueError, OverflowError, OSError):
+        raise DataError(f"{path} is no EMNIST mapping; each line holds a label and its ASCII code") from None
+    if any(not 0 <= label <= 255 for label in mapping):
+        raise DataError(f"{path} holds a label outside 0..255; restore it from the database")
+    return mapping
+
+
+@contextmanager
+def _idx(path: Path, dimensions: int) -> Iterator[tuple[gzip.GzipFile, tuple[int, ...]]]:
+    """Open a compressed idx file of bytes, check its header, and give the stream and the sizes."""
+    try:
+        with gzip.open(path, "rb") as stream:
+            header = stream.read(4 + 4 * dimensions)
+            if len(header) < 4 + 4 * dimensions or header[:4] != bytes((0, 0, 8, dimensions)):
+                raise DataError(f"{path} is no idx file of bytes with {dimensions} dimensions; restore it")
+            sizes = struct.unpack(f">{dimensions}I", header[4:])
+            promised, possible = int(np.prod(sizes, dtype=object)), path.stat().st_size * _DEFLATE_LIMIT
+            if promised > possible:
+                raise DataError(
+                    f"the header of {path} promises {promised} bytes; the file can hold {possible} at most"
+                )
+            yield stream, sizes
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{path} is damaged ({error}); restore it from the database") from None
+
+
+def _read_exactly(stream: gzip.GzipFile, size: int, path: Path) -> NDArray[np.uint8]:
+    content = stream.read(size)
+    if len(content) < size:
+        raise DataError(f"{path} ends early: {len(content)} of {size} bytes; restore it from the database")
+    return np.frombuffer(content, dtype=np.uint8)

@@ -1,0 +1,22 @@
+"""Names of `evnlos.tracking`; `__init__.py` reads this list."""
+
+from .follow import Tracking as Tracking
+from .follow import static_light as static_light
+from .follow import temporal_noise as temporal_noise
+from .follow import track_capture as track_capture
+from .follow import track_doubts as track_doubts
+from .follow import track_frames as track_frames
+from .registration import EventVelocity as EventVelocity
+from .registration import Registration as Registration
+from .registration import event_velocity as event_velocity
+from .registration import register as register
+from .rig_shift import RigShift as RigShift
+from .rig_shift import rig_shift as rig_shift
+from .track import Distance as Distance
+from .track import Measurements as Measurements
+from .track import PlaneMap as PlaneMap
+from .track import Smoothed as Smoothed
+from .track import Track as Track
+from .track import most_likely_acceleration as most_likely_acceleration
+from .track import plane_map as plane_map
+from .track import smooth as smooth

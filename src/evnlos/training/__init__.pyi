@@ -1,0 +1,17 @@
+"""Names of `evnlos.training`; `__init__.py` reads this list."""
+
+from .choice import Choice as Choice
+from .choice import alternatives as alternatives
+from .choice import between as between
+from .choice import choose_and_finetune as choose_and_finetune
+from .choice import read_choice as read_choice
+from .settings import LOSSES as LOSSES
+from .settings import Training as Training
+from .settings import balanced_loss as balanced_loss
+from .settings import finetuning as finetuning
+from .settings import paper_finetuning as paper_finetuning
+from .settings import paper_loss as paper_loss
+from .settings import paper_pretraining as paper_pretraining
+from .settings import step_size as step_size
+from .train import TrainingResult as TrainingResult
+from .train import train as train
