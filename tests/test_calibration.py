@@ -160,7 +160,13 @@ def test_the_fixed_pattern_is_found_and_left_out_of_the_training_set(fit, tmp_pa
     assert found.after == pytest.approx(found.noise, rel=0.1)
     assert load_pattern(folder).digest == fit.noise.pattern.digest
     training = load_yaml(Simulation, folder / "training.yaml")
-    assert training == fit.training
+    glyphs = replace(training.glyphs, known="", redrawn=0)
+    assert replace(training, glyphs=glyphs) == fit.training
+    # What is known of the targets is drawn again, about as often as the writers write; held-out captures too.
+    again = [name for name in training.glyphs.objects() if name.startswith("redrawn")]
+    assert sorted(p.stem for p in (folder / "targets").iterdir()) == sorted(fit.known)
+    assert set(fit.known) == {*fit.fitted, *fit.held_out}
+    assert len(again) == training.glyphs.redrawn * len(fit.known) and abs(len(again) - 288) < len(fit.known)
     camera = training.frame_camera
     assert camera.prnu < CAMERA.prnu / 2 and camera.dsnu_e < CAMERA.dsnu_e / 2 and camera.pattern_seed is None
     pens = [pen_width(LAB.glyphs.target(f"kalam_{c}").mask) for c in "ALEO"]

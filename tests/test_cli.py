@@ -271,19 +271,24 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
     )
     monkeypatch.setattr(demo, "default", lambda: few)
     one = ["--pretrain-epochs", 1, "--finetune-epochs", 1, "--e2e-epochs", 1, "--writers", 1, "--width", 8]
-    one += ["--workers", 1, "--no-calibrate"]
+    one += ["--workers", 1, "--no-calibrate", "--single-epochs", 1]
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     shown = capsys.readouterr().out
     assert "EPNP fusion" in shown and "E2E event" in shown and "report:" in shown
-    assert "EPNP - E2E" in shown and "was not fitted to this rig" in shown
+    assert "EPNP - strongest E2E" in shown and "was not fitted to this rig" in shown
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "not recordings" not in page
     # A second call takes up what is there: nothing is made again, the table is the same.
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     assert shown.splitlines()[1] in capsys.readouterr().out
-    around = tiny_captures[0].parent
-    said = fails(capsys, "demo", "--out", tmp_path / "none", "--captures", around)
-    assert "has no capture.yaml" in said and f"{around}/*" in said and not (tmp_path / "none").exists()
+    # The folder above the captures, with a file beside them, is the same; one without captures is refused.
+    note = tiny_captures[0].parent / "note.txt"
+    note.write_text("seen on a Monday")
+    call("demo", "--out", tmp_path / "demo", "--captures", note.parent, note, *one)
+    assert shown.splitlines()[1] in capsys.readouterr().out
+    (tmp_path / "empty").mkdir()
+    said = fails(capsys, "demo", "--out", tmp_path / "none", "--captures", tmp_path / "empty")
+    assert "holds no capture.yaml" in said and not (tmp_path / "none").exists()
 
 
 def test_the_demos_own_captures_hold_its_test_characters() -> None:

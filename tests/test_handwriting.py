@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from evnlos.errors import ConfigError, DataError
@@ -13,10 +14,12 @@ from evnlos.scene import (
     TRAIN_WRITERS,
     HandwritingGlyphs,
     Strokes,
+    find_font,
     hand,
     held_out_writers,
     nist_like,
     pen_width,
+    redrawn,
     render_glyph,
 )
 from evnlos.scene.handwriting import signed_distance
@@ -167,3 +170,36 @@ def test_a_pen_is_measured_as_it_was_drawn():
 def test_wrong_strokes_are_refused(arguments, word):
     with pytest.raises(ConfigError, match=word):
         Strokes(*arguments)
+
+
+def test_a_known_drawing_is_drawn_again_as_by_another_hand() -> None:
+    known = render_glyph("R", find_font("kalam"), 128, 0.8)
+    drawn = [redrawn(known, "R", number, 0) for number in range(4)]
+    assert all(one.shape == known.shape and one.dtype == np.float32 for one in drawn)
+    assert np.array_equal(drawn[1], redrawn(known, "R", 1, 0))
+    size = max(np.ptp(np.nonzero(known > 0.5), axis=1))
+    for one in drawn:
+        assert np.abs(one - known).mean() > 0.01 and one.min() >= 0 and one.max() <= 1
+        assert 0.8 * size < max(np.ptp(np.nonzero(one > 0.5), axis=1)) <= 1.02 * size
+        assert pen_width(one) == pytest.approx(
+            pen_width(known), rel=0.4
+        )  # a quarter by itself, and proportions
+    with pytest.raises(DataError, match="no ink"):
+        redrawn(np.zeros((64, 64), np.float32), "R", 0, 0)
+
+
+def test_redrawn_targets_are_objects_of_the_set(tmp_path) -> None:
+    known = render_glyph("R", find_font("kalam"), 128, 0.8)
+    Image.fromarray((255 * known).astype(np.uint8)).save(tmp_path / "lab_R.png")
+    glyphs = HandwritingGlyphs(characters="A", writers=1, known=str(tmp_path), redrawn=2)
+    assert glyphs.objects() == ["writer00_A", "redrawn00_lab_R", "redrawn01_lab_R"]
+    target = glyphs.target("redrawn01_lab_R", seed=3)
+    assert target.mask.shape == (128, 128) and target.size_m == glyphs.plate.size_m
+    with pytest.raises(ConfigError, match="redrawn is 2"):
+        HandwritingGlyphs(redrawn=2)
+    (tmp_path / "lab_R.png").write_bytes(b"no picture")
+    other = tmp_path / "other"
+    other.mkdir()
+    for folder in (tmp_path / "none", other):
+        with pytest.raises(ConfigError, match="holds no pictures"):
+            HandwritingGlyphs(known=str(folder), redrawn=1).objects()

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import signal
 import subprocess
 import sys
 
@@ -11,7 +12,7 @@ from threadpoolctl import threadpool_info
 
 from evnlos.data.pool import run_in_order, run_tasks
 from evnlos.errors import ConfigError
-from evnlos.threads import cores
+from evnlos.threads import cores, undisturbed
 
 
 @pytest.mark.parametrize(("chosen", "expected"), [(None, "PASSIVE"), ("active", "active")])
@@ -106,3 +107,11 @@ def _own_threads(module: str) -> int:
     """Return the most threads of a library of a new process of its own, without any limit."""
     code = f"import {module}, threadpoolctl as t; print(max(p['num_threads'] for p in t.threadpool_info()))"
     return int(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+
+
+def test_ctrl_c_waits_for_work_that_must_not_break_off() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), undisturbed():
+        signal.raise_signal(signal.SIGINT)
+        done.append("work")
+    assert done == ["work"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler

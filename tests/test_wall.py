@@ -7,7 +7,16 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.optics import DiffuseReflection, MatrixTransport, MatrixWall, SlidingWall, View, Wall, tpsf_kernel
+from evnlos.optics import (
+    DiffuseReflection,
+    MatrixTransport,
+    MatrixWall,
+    SlidingWall,
+    View,
+    Wall,
+    coarsest_keyframe_step_m,
+    tpsf_kernel,
+)
 from evnlos.optics.interpolation import spline_coefficients, spline_sample, spline_scattered, spline_weights
 from evnlos.optics.wall import ambient_plane
 from evnlos.scene import LineMotion, PathMotion, Scene, Target
@@ -240,6 +249,26 @@ def test_keyframes_agree_with_the_direct_product():
     assert float((finer - direct.irradiance(times)).abs().max()) < 0.4 * float(
         error * direct.irradiance(times).max()
     )
+
+
+def test_keyframes_of_a_travel_are_those_of_the_strip_and_other_places_are_multiplied():
+    times = np.random.default_rng(1).uniform(2.0, 4.0, 20)  # x from -4 to 0 cm
+    part = strip_wall(LineMotion(), travel_m=(-0.04, 0.0))
+    whole, direct = strip_wall(LineMotion()), strip_wall(LineMotion(), keyframe_step_m=0.0)
+    top = float(whole.irradiance(times).max())
+    assert float((part.irradiance(times) - whole.irradiance(times)).abs().max()) < 1e-4 * top
+    assert len(part._keys) < len(whole._keys)
+    torch.testing.assert_close(part.irradiance([7.0]), direct.irradiance([7.0]))
+
+
+def test_keyframes_are_as_far_apart_as_the_blur_allows():
+    strip, cell = Plane(32, 96, 0.0025), 0.0025
+    blur = [np.exp(-((np.subtract.outer(x, x) / 0.03) ** 2)) for x in (strip.y_m, strip.x_m)]
+    smooth = MatrixTransport(torch.from_numpy(np.kron(*blur)).float(), strip, strip.shape)
+    assert coarsest_keyframe_step_m(smooth, 0.08) == 2 * cell
+    # A wall that shows each cell for itself has no blur to lean on.
+    sharp = MatrixTransport(torch.eye(smooth.matrix.shape[1]), strip, strip.shape)
+    assert coarsest_keyframe_step_m(sharp, 0.08) == cell / 2
 
 
 def test_matrix_wall_equals_the_matrix_times_the_drawing():

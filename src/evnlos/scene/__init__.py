@@ -15,7 +15,16 @@ from evnlos.scene.glyph_sets import (
     Plate,
 )
 from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, fit_to_plate, render_glyph
-from evnlos.scene.handwriting import TRAIN_WRITERS, Hand, Strokes, hand, held_out_writers, nist_like, pen_width
+from evnlos.scene.handwriting import (
+    TRAIN_WRITERS,
+    Hand,
+    Strokes,
+    hand,
+    held_out_writers,
+    nist_like,
+    pen_width,
+    redrawn,
+)
 from evnlos.scene.motion import LineMotion, Motion, PathMotion, Pose
 from evnlos.scene.scene import Scene, Target
 
@@ -54,5 +63,6 @@ __all__ = [
     "pen_width",
     "read_emnist",
     "read_sd19",
+    "redrawn",
     "render_glyph",
 ]
