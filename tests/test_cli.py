@@ -274,7 +274,7 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
     one += ["--workers", 1, "--no-calibrate", "--single-epochs", 1]
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     shown = capsys.readouterr().out
-    assert "EPNP fusion" in shown and "E2E event" in shown and "report:" in shown
+    assert "EPNP sequence fusion" in shown and "E2E event" in shown and "report:" in shown
     assert "EPNP - strongest E2E" in shown and "was not fitted to this rig" in shown
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "not recordings" not in page

@@ -101,7 +101,9 @@ def stacked(images: torch.Tensor, samples: NlosDataset, dataset: Dataset) -> tup
 @pytest.mark.parametrize("together", [3, 128])
 def test_comparing_object_by_object_is_comparing_with_the_stack_of_all(together, tiny, tmp_path, monkeypatch):
     """Motions differ from object to object, so that images are moved by parts of a pixel."""
-    monkeypatch.setattr("evnlos.analysis.evaluate._TOGETHER", together)
+    monkeypatch.setattr(
+        sys.modules[compare_with_training.__module__], "_TOGETHER", together
+    )  # the room gives the function
     config = replace(tiny, validation=0.0, held_out="T", vary={"motion.speed_m_s": (0.015, 0.02)})
     dataset = simulate(config, tmp_path / "d")
     samples = NlosDataset(dataset, "test", "fusion")

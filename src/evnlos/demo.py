@@ -18,6 +18,7 @@ from evnlos.config import write_atomically
 from evnlos.data import STANDARD_MODALITIES
 from evnlos.data.capture import character_of
 from evnlos.data.lab import Lab, lab_of, render_captures
+from evnlos.data.sampling import Sampling
 from evnlos.data.simulations import default
 from evnlos.errors import CalibrationError, ConfigError
 from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
@@ -149,21 +150,22 @@ def _study(settings: Demo, test: list[str]) -> Study:
     network = SequenceConfig(width=settings.width, rank=256, strengths=(0.001, 0.01, 0.1, 1.0))
     plan = Training(batch_size=16, network=network)
     before = dataclasses.replace(plan, epochs=settings.pretrain_epochs, sequence_augmentations=2)
-    # What forgets least comes first; captures that are held out of it choose among these, or nothing at all.
+    # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
     after = dataclasses.replace(
         plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True
     )
-    quicker = dataclasses.replace(after, learning_rate=1e-3)
     alone = dataclasses.replace(plan, epochs=settings.e2e_epochs)
     source = "calibrated" if settings.calibrate else "uncalibrated"
+    # Of the time surfaces, the one that validation characters are seen best in.
+    sampling = Sampling(surface="hots", radius=1)
     return Study(
         "demo",
         "demo",
         (
-            Arm("simulation only", source, before, None),
-            Arm("E2E, single positions", "none", None, single),
-            Arm("E2E", "none", None, alone),
-            Arm("EPNP", source, before, after, (quicker,)),
+            Arm("simulation only", source, before, None, sampling=sampling),
+            Arm("E2E, single positions", "none", None, single, sampling=sampling),
+            Arm("E2E", "none", None, alone, sampling=sampling),
+            Arm("EPNP", source, before, after, choose=True, sampling=sampling),
         ),
         seeds=(settings.seed,),
         test=tuple(test),

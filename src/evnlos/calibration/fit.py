@@ -27,6 +27,7 @@ from evnlos.errors import DataError
 from evnlos.scene import LineMotion, Strokes
 from evnlos.setups import RadiometricSetup, SensorSize, Setup
 
+_AT_NOISE = 1.03  # times the noise's residual: what is below has nothing left to explain
 _EXAMPLES = 3
 _FEWEST_FOR_ANY = 5  # captures: fewer do not tell a wall's slopes from a camera's place
 _WITHOUT_PATTERN = "frames held out, without pattern"
@@ -102,9 +103,15 @@ class RigFit:
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """Residuals on held-out captures that the fit did not lower, or not below those of the mean frame."""
+        """Residuals on held-out captures that the fit did not lower, or not below those of the mean frame.
+
+        One that is as low as the noise of the fitted cameras has nothing left to lower: the start's may be lower
+        still, as events that are too few are nearer to noisy ones than as noisy others.
+        """
         found = [
-            name for name, r in self.residuals.items() if name.endswith("held out") and not r.after < r.before
+            name
+            for name, r in self.residuals.items()
+            if name.endswith("held out") and not r.after < r.before and r.after > _AT_NOISE * r.noise
         ]
         if not self.residuals["frames held out"].after < self.mean_frame and "frames held out" not in found:
             found.append("frames held out")

@@ -42,21 +42,20 @@ class Run:
         settings: How.
         out: Its folder.
         start: Run whose weights it starts from; None: random ones.
-        alternatives: Further settings of a fine-tuning: captures held out choose the best of all, or none.
+        choose: Whether captures held out decide how much of a fine-tuning is taken.
     """
 
     data: Dataset
     settings: Training
     out: Path
     start: Path | None = None
-    alternatives: tuple[Training, ...] = ()
+    choose: bool = False
 
 
 def train_one(run: Run, progress: Progress = silent) -> None:
     """Train what is not trained yet; `progress` is that of `train`."""
-    if run.alternatives and run.start is not None:
-        candidates = (run.settings, *run.alternatives)
-        choose_and_finetune(run.data, candidates, run.out, run.start, progress=progress)
+    if run.choose and run.start is not None:
+        choose_and_finetune(run.data, (run.settings,), run.out, run.start, progress=progress)
         return
     train(run.data, run.settings, run.out, run.start, progress)
 
@@ -237,14 +236,13 @@ def _planned(
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
         settings = replace(arm.finetuning, modality=modality, seed=seed)
-        others = tuple(replace(other, modality=modality, seed=seed) for other in arm.alternatives)
         start = runs[-1].out if runs else None
         decides = {"data": shots.folder.name, "settings": to_dict(settings), "from": start and start.name}
-        if others:
-            decides["alternatives"] = [to_dict(other) for other in others]
+        if arm.choose:
+            decides["choose"] = True
         key = config_hash(decides)[:8]
         out = place.out / "runs" / f"{study.rig}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
-        runs.append(Run(shots, settings, out, start, others))
+        runs.append(Run(shots, settings, out, start, arm.choose))
     return runs, decided
 
 

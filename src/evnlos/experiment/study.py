@@ -41,8 +41,8 @@ class Arm:
     """Settings of the pre-training."""
     finetuning: Training | None = None
     """Settings of the fine-tuning, or of the end-to-end training where there is no pre-training."""
-    alternatives: tuple[Training, ...] = ()
-    """Further settings of the fine-tuning: the best of all, or none, is chosen on captures held out of it."""
+    choose: bool = False
+    """Choose on captures held out of the fine-tuning how much of it is taken, if any."""
     writers: int | None = None
     """Writers of the simulated characters; None is as many as the study says."""
     shots: int | None = None
@@ -59,8 +59,8 @@ class Arm:
             )
         if self.pretraining is None and self.finetuning is None:
             raise ConfigError(f"arm {self.name!r} trains nothing; give pre-training, fine-tuning or both")
-        if self.alternatives and (self.pretraining is None or self.finetuning is None):
-            raise ConfigError(f"arm {self.name!r}: alternatives choose a fine-tuning; give both trainings")
+        if self.choose and (self.pretraining is None or self.finetuning is None):
+            raise ConfigError(f"arm {self.name!r}: only a fine-tuning can be chosen; give both trainings")
         if self.shots is not None and self.shots < 1:
             raise ConfigError(
                 f"arm {self.name!r}: shots is {self.shots}; give at least 1, or leave out fine-tuning"
