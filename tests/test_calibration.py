@@ -426,6 +426,14 @@ def test_a_number_on_the_bound_of_the_search_is_named(fit) -> None:
     assert "evnlos scan" in found["warnings"][0] and "\n" not in found["warnings"][0]
 
 
+def test_a_fit_at_the_noise_is_not_worse_than_its_start(fit) -> None:
+    def after(value: float):
+        left = Residual(before=0.82, after=value, noise=0.85)
+        return replace(fit, residuals={**fit.residuals, "surfaces held out": left})
+
+    assert after(0.84).worse == () and after(0.9).worse == ("surfaces held out",)
+
+
 def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targets(fit, tmp_path) -> None:
     def leaving(after: float, targets: str):
         left = Residual(before=0.5, after=after, noise=0.1)

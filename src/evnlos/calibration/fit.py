@@ -105,8 +105,8 @@ class RigFit:
     def worse(self) -> tuple[str, ...]:
         """Residuals on held-out captures that the fit did not lower, or not below those of the mean frame.
 
-        One that is as low as the noise of the fitted cameras has nothing left to lower: the start's may be lower
-        still, as events that are too few are nearer to noisy ones than as noisy others.
+        One that is as low as the noise of the fitted cameras has nothing left to lower: the start's may be
+        lower still, as too few events are nearer to noisy ones than others that are as noisy.
         """
         found = [
             name
