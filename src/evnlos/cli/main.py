@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import MISSING, fields, is_dataclass, replace
+from types import FrameType
 from typing import Any, TextIO, cast
 
 from evnlos.cli.parsing import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen, parse, todays_words
@@ -80,7 +82,12 @@ class _Terminated(KeyboardInterrupt):
 def _terminable() -> Iterator[None]:
     """Raise `_Terminated` at SIGTERM, so that workers end and half-written files go."""
 
-    def end(*_: object) -> None:
+    def end(number: int, frame: FrameType | None) -> None:
+        while frame is not None:
+            if frame.f_code.co_name == "__del__":  # what is raised there is printed and lost: a moment later
+                threading.Timer(0.02, os.kill, (os.getpid(), number)).start()
+                return
+            frame = frame.f_back
         raise _Terminated
 
     is_main = threading.current_thread() is threading.main_thread()
