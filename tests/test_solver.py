@@ -14,7 +14,6 @@ from evnlos.inverse import (
     LogChange,
     Problem,
     block_folds,
-    dense_matrix,
     log_change,
     operator_norm,
     plug_and_play,
@@ -23,7 +22,7 @@ from evnlos.inverse import (
     train_denoiser,
 )
 from evnlos.inverse.tikhonov import Spectrum
-from evnlos.optics import LinearTransport, MatrixTransport
+from evnlos.optics import LinearTransport, MatrixTransport, dense_matrix
 from evnlos.types import Events, Plane
 from transports import EXAMPLES
 

@@ -22,7 +22,6 @@ from evnlos.errors import DataError
 from evnlos.models import Confidence, Judgement, Reconstructor, Weights, halves_of, plates
 from evnlos.models.confidence import on_canvas
 from evnlos.setups import Setup
-from evnlos.setups.base import dense_matrix
 from evnlos.types import Plane
 
 _TOLERANCE, _MOST_STEPS = 1e-3, 200
@@ -116,7 +115,7 @@ def _matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
     if cells is not None:
         height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
     plane = Plane(height, sampling.width, sampling.pitch_m)
-    matrix = dense_matrix(setup.operator(plane, dtype=torch.float32), torch.float32)
+    matrix = setup.operator(plane, dtype=torch.float32).dense(torch.float32)
     images = matrix.T.reshape(-1, *setup.shape).numpy()
     small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(len(images), -1)
     return torch.from_numpy(small).T.contiguous(), plane

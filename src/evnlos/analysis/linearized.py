@@ -15,7 +15,6 @@ import torch
 from evnlos.cameras import FrameCamera
 from evnlos.errors import ConfigError, DataError
 from evnlos.setups import OperatorNoise, Setup
-from evnlos.setups.base import dense_matrix
 from evnlos.types import Plane
 
 
@@ -104,7 +103,7 @@ def linearized(setup: Setup, bench: Bench = Bench()) -> LinearizedSetup:
         (torch.Size([240, 64]), True)
     """
     setup = setup.resized(bench.shape)
-    matrix = dense_matrix(setup.linear_part(bench.plate))
+    matrix = setup.linear_part(bench.plate).dense()
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera gets no light from the target; move the target or the camera")
     return LinearizedSetup(matrix, setup.ambient_light().double().flatten(), bench.plate, setup.shape)

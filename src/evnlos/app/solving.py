@@ -28,7 +28,6 @@ from evnlos.models import Weights, load_weights, published, published_for, publi
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import Setup, load_setup
-from evnlos.setups.base import dense_matrix
 from evnlos.types import Plane
 
 _PAGE = "page-{}-pass"  # trained on the simulation `page`
@@ -152,7 +151,7 @@ def from_whole_pass(recorded: Recorded) -> Reconstruction:
     places = recorded.motion.position_m(recorded.times_s)
     plate = Plane(_CELLS, _CELLS, size_m / _CELLS)
     problem = JointProblem(
-        PlatePass(MatrixTransport(dense_matrix(made, torch.float32), strip, shape), plate, places), _STATIC
+        PlatePass(MatrixTransport(made.dense(torch.float32), strip, shape), plate, places), _STATIC
     )
     variance = camera_variance(light.mean() + setup.ambient, setup.frame_camera)
     image = problem.tikhonov(light, _SMOOTH * float(variance)).image

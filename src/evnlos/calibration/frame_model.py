@@ -18,7 +18,6 @@ from evnlos.data.cleaning import FixedPattern
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.setups import Setup
-from evnlos.setups.base import dense_matrix
 from evnlos.types import Plane
 
 
@@ -95,7 +94,7 @@ class FrameModel:
         cells = plain.target_cells()
         if cells is not None and plain.is_linear:
             # One matrix carries the frames of all captures at once.
-            matrix = dense_matrix(plain.operator(cells, dtype=torch.float32), torch.float32)
+            matrix = plain.operator(cells, dtype=torch.float32).dense(torch.float32)
             strips = self._strips(cells)
             return (strips @ matrix.T).reshape(-1, *self.shape) + self._along(plain)
         walls = [plain.observe(scene) for scene in self._scenes]

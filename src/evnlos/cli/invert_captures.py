@@ -33,7 +33,7 @@ from evnlos.metrics import psnr
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import Setup, load_setup
-from evnlos.setups.base import dense_matrix, linear_kinds
+from evnlos.setups.base import linear_kinds
 from evnlos.setups.measured import averaged
 from evnlos.types import Plane
 
@@ -235,7 +235,7 @@ def invert_stills(
     image = flat.mT.unflatten(1, shape).double()
     image = image / image.abs().max().clamp(min=1e-12)
     cells = measured.about.plane
-    matrix = dense_matrix(setup.operator(cells, shape))
+    matrix = setup.operator(cells, shape).dense()
     operator = MatrixTransport(matrix / torch.linalg.matrix_norm(matrix, 2), cells, shape)
     degree = chosen_degree(operator, image) if options.degree is None else options.degree
     found: dict[str, Any] = {

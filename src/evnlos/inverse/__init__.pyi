@@ -11,7 +11,6 @@ from .measurements import log_change as log_change
 from .operators import Gradient as Gradient
 from .operators import LinearOperator as LinearOperator
 from .operators import Solution as Solution
-from .operators import dense_matrix as dense_matrix
 from .operators import operator_norm as operator_norm
 from .plug_and_play import DenoiserTraining as DenoiserTraining
 from .plug_and_play import ResidualDenoiser as ResidualDenoiser

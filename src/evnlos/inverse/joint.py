@@ -18,7 +18,6 @@ from evnlos.inverse.operators import Gradient, Solution, normal_matrix
 from evnlos.inverse.tikhonov import smallest
 from evnlos.inverse.total_variation import total_variation
 from evnlos.optics import LinearTransport, MatrixTransport
-from evnlos.setups.base import dense_matrix
 from evnlos.types import Plane
 
 
@@ -158,7 +157,7 @@ def strip_of(positions_m: ArrayLike, plate: Plane) -> Plane:
 
 def matrix_of(operator: LinearTransport) -> MatrixTransport:
     """Return a linear map by its matrix, float64: what a pass multiplies many times."""
-    return MatrixTransport(dense_matrix(operator), operator.source, operator.shape)
+    return MatrixTransport(operator.dense(), operator.source, operator.shape)
 
 
 def strip_gram_of(transport: MatrixTransport) -> torch.Tensor:

@@ -14,9 +14,8 @@ from typing import Literal, Protocol
 import torch
 
 from evnlos.errors import ConfigError
+from evnlos.optics import dense_matrix
 from evnlos.types import derive_seed
-
-_COLUMNS = 256  # unit images carried over at a time
 
 
 class LinearOperator(Protocol):
@@ -114,24 +113,6 @@ def operator_norm(
         if abs(norm - before) <= tolerance * norm:
             break
     return norm
-
-
-def dense_matrix(operator: LinearOperator, like: torch.Tensor) -> torch.Tensor:
-    """Return the matrix [outputs, h w] of an operator, column by column, in the type of `like` [h, w].
-
-    A `MatrixTransport` hands over the matrix that it holds.
-    """
-    held = getattr(operator, "matrix", None)
-    if isinstance(held, torch.Tensor):
-        return held.to(like)
-    count = like.numel()
-    columns = []
-    for start in range(0, count, _COLUMNS):
-        stop = min(start + _COLUMNS, count)
-        units = like.new_zeros(stop - start, count)
-        units[torch.arange(stop - start), torch.arange(start, stop)] = 1
-        columns.append(operator(units.reshape(-1, *like.shape)).flatten(1).mT)  # [outputs, columns]
-    return torch.cat(columns, dim=1)
 
 
 def normal_matrix(operator: LinearOperator, like: torch.Tensor) -> torch.Tensor:

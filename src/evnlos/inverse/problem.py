@@ -12,7 +12,8 @@ from functools import cached_property
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.operators import LinearOperator, dense_matrix
+from evnlos.inverse.operators import LinearOperator
+from evnlos.optics import dense_matrix
 
 _MAX_DEGREE = 12
 

@@ -10,7 +10,7 @@ from evnlos.optics.angular_spectrum import (
 )
 from evnlos.optics.matrix_wall import MatrixWall, coarsest_keyframe_step_m
 from evnlos.optics.occluder import Occluder, lamp_radiance
-from evnlos.optics.operator import LinearTransport, MatrixTransport, Patches, Transport, compose
+from evnlos.optics.operator import LinearTransport, MatrixTransport, Patches, Transport, compose, dense_matrix
 from evnlos.optics.radiometric import LightTransport, light_transport_matrix
 from evnlos.optics.reflection import (
     GGX,
@@ -45,6 +45,7 @@ __all__ = [
     "blur_radius_px",
     "coarsest_keyframe_step_m",
     "compose",
+    "dense_matrix",
     "fresnel_number",
     "lamp_radiance",
     "light_transport_matrix",

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
@@ -17,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Plane
+
+_COLUMNS = 256  # unit images carried over at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +144,14 @@ class LinearTransport(Transport):
         """
         return self._adjoint(_checked(image, self.shape, "image"))
 
+    def dense(self, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+        """Return the matrix of the map, [H W, h w], rows and columns in row-major order.
+
+        Args:
+            dtype: Floating-point type of the matrix, and of the images that it is found from.
+        """
+        return dense_matrix(self, torch.zeros(self.source.shape, dtype=dtype))
+
 
 def compose(*transports: Transport) -> Transport:
     """Return the transport that applies the given ones in order; it is linear if all of them are.
@@ -236,6 +247,28 @@ class MatrixTransport(LinearTransport):
     def _adjoint(self, image: torch.Tensor) -> torch.Tensor:
         scene = image.flatten(-2) @ self.matrix.to(image)  # [..., h w]
         return scene.unflatten(-1, self.source.shape)
+
+
+def dense_matrix(operator: Callable[[torch.Tensor], torch.Tensor], like: torch.Tensor) -> torch.Tensor:
+    """Return the matrix [outputs, h w] of an operator, column by column, in the type of `like` [h, w].
+
+    A `MatrixTransport` hands over the matrix that it holds.
+
+    Args:
+        operator: A linear map.
+        like: An image that it takes, [h, w]; its values are not used, its size, type and device are.
+    """
+    held = getattr(operator, "matrix", None)
+    if isinstance(held, torch.Tensor):
+        return held.to(like)
+    count = like.numel()
+    columns = []
+    for start in range(0, count, _COLUMNS):
+        stop = min(start + _COLUMNS, count)
+        units = like.new_zeros(stop - start, count)
+        units[torch.arange(stop - start), torch.arange(start, stop)] = 1
+        columns.append(operator(units.reshape(-1, *like.shape)).flatten(1).mT)  # [outputs, columns]
+    return torch.cat(columns, dim=1)
 
 
 def _checked(image: torch.Tensor, shape: tuple[int, int], name: str) -> torch.Tensor:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
 from evnlos.errors import ConfigError
-from evnlos.optics import LinearTransport, MatrixTransport, Wall
+from evnlos.optics import LinearTransport, Wall
 from evnlos.optics.wall import ambient_plane
 from evnlos.registry import Kinded, Registry
 from evnlos.scene import Scene
@@ -189,7 +189,7 @@ class Setup(Kinded, ABC):
             source: Cells of the target plane, in the coordinates of the target's motion.
             dtype: Floating-point type of the matrix.
         """
-        return dense_matrix(self.operator(source, shape, dtype), dtype)
+        return self.operator(source, shape, dtype).dense(dtype)
 
     def target_cells(self) -> Plane | None:
         """Return the cells on which `observe` draws targets; None where it draws them in another way."""
@@ -341,20 +341,6 @@ def is_camera(path: str) -> bool:
 def linear_kinds() -> list[str]:
     """Return the kinds of setups that have an operator."""
     return [kind for kind in Setup.registry if Setup.registry[kind].is_linear]
-
-
-def dense_matrix(operator: LinearTransport, dtype: torch.dtype = torch.float64) -> torch.Tensor:
-    """Return the matrix of a linear map, [H W, h w].
-
-    Args:
-        operator: The map.
-        dtype: Floating-point type of the result.
-    """
-    if isinstance(operator, MatrixTransport):
-        return operator.matrix.to(dtype)
-    height, width = operator.source.shape
-    unit = torch.eye(height * width, dtype=dtype).unflatten(-1, (height, width))
-    return operator(unit).flatten(-2).mT.contiguous()
 
 
 def stated_distance_m(setup: Setup, scene: Scene) -> float | None:
