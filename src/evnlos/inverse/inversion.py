@@ -190,7 +190,10 @@ def _load(path: str | Path) -> dict[str, Any]:
         with open_regular(path) as opened, np.load(opened, allow_pickle=False) as file:
             sizes = {info.filename: info.file_size for info in file.zip.infolist()}  # type: ignore[union-attr]
             check_memory(4 * sum(sizes.values()), f"{path}", "give a smaller photograph")
-            return dict(file)
+            found = dict(file)
+            if not all(isinstance(value, np.ndarray) for value in found.values()):
+                raise ValueError("a member that does not begin as an array is given as its bytes")
+            return found
     except FileNotFoundError:
         raise DataError(f"{path} does not exist; give an NPZ file") from None
     except NUMPY_ERRORS:
