@@ -1,14 +1,19 @@
 """Reading characters, telling memory from sight, and intervals for differences."""
 
+import json
+import random
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save
 from scipy.ndimage import map_coordinates
 
+import evnlos.analysis
 from evnlos import EvnlosError
 from evnlos.analysis.evaluate import compare_with_training
 from evnlos.analysis.scores import CHARACTERS, load_reader, paired_difference, read_characters
@@ -62,6 +67,35 @@ def test_a_file_of_something_else_is_refused(tmp_path) -> None:
     path = tmp_path / "r.safetensors"
     path.write_bytes(b"nonsense")
     with pytest.raises(EvnlosError, match="no character reader"):
+        load_reader(path)
+
+
+def test_no_flipped_byte_of_the_reader_goes_unseen(tmp_path) -> None:
+    own = Path(evnlos.analysis.__file__).with_name("classifier.safetensors")
+    whole, draw = own.read_bytes(), random.Random(0)
+    expected = load_reader().state_dict()
+    places = [*range(0, 2000, 13), *(draw.randrange(len(whole)) for _ in range(200))]
+    noticed = 0
+    for number, place in enumerate(places):  # each its own name: what was read well is kept by its name
+        path, changed = tmp_path / f"{number}.safetensors", bytearray(whole)
+        changed[place] ^= 1 << draw.randrange(8)
+        path.write_bytes(changed)
+        try:
+            found = load_reader(path).state_dict()
+        except EvnlosError as error:
+            assert "\n" not in str(error)
+            noticed += 1
+        else:
+            assert all(torch.equal(found[name], value) for name, value in expected.items()), place
+        path.unlink()
+    assert noticed > 0.9 * len(places)
+
+
+def test_a_reader_that_nothing_vouches_for_is_refused(tmp_path) -> None:
+    path = tmp_path / "r.safetensors"
+    state = {name: value.half() for name, value in load_reader().state_dict().items()}
+    path.write_bytes(save(state, metadata={"evnlos": json.dumps({"characters": CHARACTERS})}))
+    with pytest.raises(EvnlosError, match="nothing vouches"):
         load_reader(path)
 
 

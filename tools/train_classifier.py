@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.torch import save
 from torch import Tensor
 from tqdm import tqdm
 
@@ -23,6 +22,7 @@ from evnlos.analysis.scores import CHARACTERS, CharacterReader
 from evnlos.files import write_atomically
 from evnlos.models.confidence import SIDE
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
+from evnlos.tensor_file import sealed_bytes
 from evnlos.types import Plane, derive_seed
 
 FAMILIES = (
@@ -143,7 +143,7 @@ def main() -> None:
     """Train the reader and write it to the file that is named on the command line."""
     network, about = train_reader()
     state = {name: value.half().contiguous() for name, value in network.state_dict().items()}
-    write_atomically(Path(sys.argv[1]), save(state, metadata={"evnlos": json.dumps(about)}))
+    write_atomically(Path(sys.argv[1]), sealed_bytes(state, json.dumps(about)))
     sys.stdout.write(json.dumps(about, indent=2) + "\n")
 
 

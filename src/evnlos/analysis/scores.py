@@ -22,11 +22,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import ArrayLike
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from evnlos.errors import DataError
 from evnlos.metrics import HAAR_LEAST_SIDE, gmsd, haarpsi, ms_ssim, psnr, ssim
+from evnlos.tensor_file import read_sealed
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 _MARGIN = 2  # pixels around the target's bounding box: the blur of its edge belongs to it
@@ -174,16 +174,17 @@ def load_reader(path: str | Path = _FILE) -> CharacterReader:
     """Return the trained reader; `python tools/train_classifier.py` made the one in the package.
 
     Raises:
-        DataError: The file is missing or of another network.
+        DataError: The file is missing, damaged, without a digest, or of another network.
     """
     path = Path(path)
     reader = CharacterReader()
     try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get("evnlos", "{}"))
-            state = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - no mapping
-        reader.load_state_dict(state)
-    except (SafetensorError, OSError, RuntimeError) as error:
+        text, state, is_sealed = read_sealed(path)
+        if not is_sealed:
+            raise ValueError("nothing vouches for its numbers; make it anew with tools/train_classifier.py")
+        about = json.loads(text)
+        reader.load_state_dict({name: value.float() for name, value in state.items()})
+    except (OSError, RuntimeError, ValueError) as error:
         raise DataError(f"{path} is no character reader: {' '.join(str(error).split())[:160]}") from None
     if about.get("characters") != CHARACTERS:
         raise DataError(f"{path} knows {about.get('characters')!r}; this version reads {CHARACTERS!r}")
