@@ -39,7 +39,7 @@ def test_the_sets_change_one_thing_each() -> None:
         sets(replace(RIG, setup=PaperSetup()), SAMPLING, 4)
 
 
-def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, monkeypatch) -> None:
+def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypatch) -> None:
     rig = tmp_path / "rigs" / "lab"
     rig.mkdir(parents=True)
     save_yaml(RIG, rig / "rig.yaml")
@@ -61,7 +61,13 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, monkeypatch) -> 
     # By name: the package's attribute `carry_over` is the function, not the module.
     monkeypatch.setattr(sys.modules["evnlos.experiment.carry_over"], "sets", two)
     command = ["experiment", "carry-over", "--weights", str(tmp_path / "w.safetensors"), "--rig", "lab"]
-    main([*command, "--out", str(tmp_path), "--workers", "1"])
+    command += ["--out", str(tmp_path), "--workers", "1"]
+    with monkeypatch.context() as little:
+        little.setattr("evnlos.untrusted.memory_left", lambda: 1000)
+        with pytest.raises(SystemExit):
+            main(command)
+        assert "GB of memory" in capsys.readouterr().err.splitlines()[-1]
+        main([*command, "--force"])
     found = json.loads((tmp_path / "carry-over-lab-w.json").read_text())
     assert [one["name"] for one in found] == ["icon", "dim"]
     for one in found:

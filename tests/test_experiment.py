@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,6 +90,16 @@ def test_a_second_run_does_nothing_again(records, place) -> None:
     assert run_study(STUDY, place) == []
     after = {path: path.stat().st_mtime_ns for path in place.out.rglob("*") if path.is_file()}
     assert after == before
+
+
+def test_a_study_is_estimated_first_and_can_be_forced(records, place, monkeypatch) -> None:
+    def refuse(*_: object) -> None:
+        raise DataError("needs 9 GB of memory")
+
+    monkeypatch.setattr(sys.modules["evnlos.data.simulate"], "check_memory", refuse)
+    with pytest.raises(DataError, match="GB of memory"):
+        run_study(STUDY, place)
+    assert run_study(STUDY, replace(place, force=True)) == []
 
 
 def test_networks_trained_at_a_time_are_those_trained_one_by_one(records, place, tmp_path) -> None:

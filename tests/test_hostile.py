@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import struct
@@ -32,6 +33,7 @@ from evnlos.errors import ConfigError, printable
 from evnlos.events.recording import Recording, _Counts
 from evnlos.inverse.inversion import read_photograph
 from evnlos.models import UNetConfig
+from evnlos.progress import ProgressBars, Step
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
@@ -500,6 +502,80 @@ def test_every_simulation_is_estimated_first(words: list[str], tmp_path, capsys,
     np.save("v.npy", np.zeros((3, 4, 4), np.uint8))
     fails([*words, "--log-level", "error"], capsys, "GB of memory")
     assert {path.name for path in tmp_path.iterdir()} == {"s.yaml", "v.npy"}
+
+
+class BegunError(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["experiment", "simulation", "--writers", "1", "--workers", "1"],
+        ["experiment", "conditions", "--writers", "1", "--workers", "1"],
+        ["experiment", "mismatch", "--rigs", "torch", "--seeds", "0", "--workers", "1"],
+        ["demo", "--workers", "1"],
+    ],
+    ids=lambda words: words[words[0] == "experiment"],
+)
+def test_experiments_are_estimated_first_and_can_be_forced(words, tmp_path, capsys, monkeypatch) -> None:
+    def begun(*_: object) -> None:
+        raise BegunError
+
+    monkeypatch.setattr("evnlos.untrusted.memory_left", lambda: 1000)
+    # By name: the package's attribute `simulate` is the function, not the module.
+    monkeypatch.setattr(sys.modules["evnlos.data.simulate"], "scene_of", begun)
+    monkeypatch.setattr("evnlos.data.lab._scene", begun)
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--out", str(tmp_path / "o"), "--log-level", "error"])
+    assert ended.value.code == 2
+    assert "GB of memory" in capsys.readouterr().err.splitlines()[-1]
+    with pytest.raises(BegunError):
+        main([*words, "--out", str(tmp_path / "o"), "--log-level", "error", "--force"])
+
+
+def test_a_repair_is_estimated_first_and_can_be_forced(tiny_dataset, tmp_path, capsys, monkeypatch) -> None:
+    folder = tmp_path / "d"
+    shutil.copytree(tiny_dataset.folder, folder)
+    open_dataset(folder).shard(tiny_dataset.objects()[0]).unlink()
+    monkeypatch.setattr("evnlos.untrusted.memory_left", lambda: 1000)
+    with pytest.raises(SystemExit):
+        main(["verify", str(folder), "--repair", "--workers", "1"])
+    assert "GB of memory" in capsys.readouterr().err.splitlines()[-1]
+    main(["verify", str(folder), "--repair", "--workers", "1", "--force"])
+    assert find_faults(open_dataset(folder)) == []
+
+
+@pytest.mark.parametrize("path", ["setup", "setup.pixel", "glyphs"])
+def test_a_kind_in_a_file_brings_no_program(path: str, tmp_path, monkeypatch) -> None:
+    """Only what is installed, or was registered before, has a name."""
+    (tmp_path / "trap.py").write_text("class Trap:\n    kind = 'trap'\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for kind in ("trap", "trap:Trap", "trap.Trap", "trap.py", str(tmp_path / "trap.py")):
+        values: dict[str, Any] = {"kind": kind}
+        for key in reversed(path.split(".")):
+            values = {key: values}
+        (tmp_path / "s.yaml").write_text(yaml.safe_dump(values))
+        with pytest.raises(ConfigError, match="kind") as caught:
+            load_yaml(Simulation, tmp_path / "s.yaml")
+        assert "\n" not in str(caught.value)
+    assert "trap" not in sys.modules
+
+
+def test_the_bar_tells_the_time_that_is_left(capsys) -> None:
+    with ProgressBars() as progress:
+        progress(Step("simulate", 0, 4, "objects"))
+        time.sleep(0.02)
+        progress(Step("simulate", 1, 4, "objects"))
+    assert re.search(r"1/4 \[\d\d:\d\d<\d\d:\d\d", capsys.readouterr().err)
+
+
+def test_memory_that_is_not_enough_is_one_line(monkeypatch, capsys) -> None:
+    def too_much(_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("evnlos.cite.entries_for", too_much)
+    fails(["cite"], capsys, "the memory that this process may use is not enough")
 
 
 def test_more_processes_need_more_memory(tmp_path, monkeypatch) -> None:

@@ -61,6 +61,8 @@ class Demo:
     """Channels of the network at its finest level."""
     workers: int = 0
     """Processes that simulate, and networks trained at a time where there is no GPU; 0 = one for each core."""
+    force: bool = False
+    """Begin although the machine's memory will hardly do."""
     calibrate: bool = True
     """Fit the simulator to the rig of the captures first; without it, pre-train on the default simulation."""
     seed: int = 0
@@ -78,7 +80,7 @@ def run_demo(settings: Demo) -> Path:
     """
     began, out = time.perf_counter(), settings.out
     captures = _captures_in(settings.captures)
-    place = Place((), out, settings.workers, trainings=settings.workers)
+    place = Place((), out, settings.workers, trainings=settings.workers, force=settings.force)
     out.mkdir(parents=True, exist_ok=True)
     notes = []
     folders = captures
@@ -90,7 +92,9 @@ def run_demo(settings: Demo) -> Path:
         )
         notes += lab.glyphs.notes()
         with ProgressBars() as progress:
-            folders = render_captures(lab, out / "captures", workers=settings.workers, progress=progress)
+            folders = render_captures(
+                lab, out / "captures", workers=settings.workers, progress=progress, force=settings.force
+            )
     study = _study(settings, _held_out(folders, settings.test))
     place = dataclasses.replace(place, captures=tuple(sorted(folders)))
     try:
@@ -249,7 +253,7 @@ def run_mismatch(
         if captures is None:
             lab = lab_of(name, Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS)))
             folders = render_captures(
-                lab, base.out / "captures" / name, workers=base.workers, progress=progress
+                lab, base.out / "captures" / name, workers=base.workers, progress=progress, force=base.force
             )
         else:
             folders = [file.parent for file in sorted((captures / name).glob("*/capture.yaml"))]

@@ -265,6 +265,8 @@ class VerifyCommand:
     """Simulate faulty and missing objects again."""
     workers: int = 0
     """Processes for the repair; 0 = one for each core."""
+    force: bool = False
+    """Begin the repair although the machine's memory will hardly do."""
     json: bool = False
     """Print one JSON object."""
 
@@ -291,6 +293,6 @@ class VerifyCommand:
             )
         else:
             with ProgressBars() as progress:
-                repair(dataset, faults, self.workers, progress)
+                repair(dataset, faults, self.workers, progress, self.force)
             text = f"{self.dataset}: {len(faults)} of {len(faults)} faulty shards made again"
             result(self.json, about | {"repaired": len(faults)}, text)

@@ -81,6 +81,8 @@ class ExperimentCommand:
     trainings: int = 1
     """Networks that are trained at a time where there is no GPU, in as many times the memory; 0 = one for each
     core. For experiments on captures."""
+    force: bool = False
+    """Begin although the machine's memory will hardly do."""
     metric: Literal["psnr_db", "psnr_box_db", "ssim", "ms_ssim", "haarpsi", "gmsd", "lpips"] = "psnr_db"
     """What the printed tables show; the records hold all."""
 
@@ -101,7 +103,7 @@ class ExperimentCommand:
         assert self.captures is not None
         folders = tuple(captures_of(self.captures, self.captures_of))
         with ProgressBars() as progress:
-            run_study(study, Place(folders, self.out, self.workers, self.trainings), progress)
+            run_study(study, Place(folders, self.out, self.workers, self.trainings, self.force), progress)
         records = [r for r in read_records(self.out / "records" / study.name) if r.rig == self.captures_of]
         records = [r for r in records if r.split == study.split]
         text = _tables(study.name, records, self.metric)
@@ -154,7 +156,9 @@ class ExperimentCommand:
     def _simulation(self) -> None:
         from evnlos.experiment import Simulated, read_records, run_simulated
 
-        settings = Simulated(self.out, modalities=self.modalities, seeds=self.seeds, workers=self.workers)
+        settings = Simulated(
+            self.out, modalities=self.modalities, seeds=self.seeds, workers=self.workers, force=self.force
+        )
         epochs = {
             "pretraining": self.pretrain_epochs,
             "finetuning": self.finetune_epochs,
@@ -176,7 +180,9 @@ class ExperimentCommand:
 
         chosen = conditions(base_simulation(self.writers or 2))
         with ProgressBars() as progress:
-            findings = map_conditions(chosen, self.out / "conditions", self.workers, progress=progress)
+            findings = map_conditions(
+                chosen, self.out / "conditions", self.workers, progress=progress, force=self.force
+            )
         text = conditions_table(findings) + "\n"
         write_atomically(self.out / "conditions.md", text.encode())
         print(text)
@@ -190,7 +196,7 @@ class ExperimentCommand:
             raise ConfigError("carry-over needs --weights, a weights file or a run's folder")
         rig = self.out / "rigs" / self.captures_of
         with ProgressBars() as progress:
-            found = carry_over(weights, rig, self.out, self.workers, progress=progress)
+            found = carry_over(weights, rig, self.out, self.workers, progress=progress, force=self.force)
         name = f"carry-over-{self.captures_of}-{weights.stem}"
         write_carried(found, self.out / f"{name}.json")
         text = carried_table(found) + "\n"
@@ -204,7 +210,7 @@ class ExperimentCommand:
     def _mismatch(self) -> None:
         from evnlos.demo import Demo, mismatch_table, run_mismatch
 
-        base = Demo(out=self.out, test=self.test, workers=self.workers)
+        base = Demo(out=self.out, test=self.test, workers=self.workers, force=self.force)
         base = replace(
             base,
             writers=self.writers or base.writers,

@@ -245,7 +245,13 @@ def _fault(dataset: Dataset, name: str) -> Fault | None:
     return None
 
 
-def repair(dataset: Dataset, faults: list[Fault], workers: int = 0, progress: Progress = silent) -> Dataset:
+def repair(
+    dataset: Dataset,
+    faults: list[Fault],
+    workers: int = 0,
+    progress: Progress = silent,
+    force: bool = False,
+) -> Dataset:
     """Simulate the faulty objects of a dataset again; their shards are the same bytes as the first time.
 
     Args:
@@ -253,6 +259,7 @@ def repair(dataset: Dataset, faults: list[Fault], workers: int = 0, progress: Pr
         faults: What `find_faults` returned.
         workers: Processes; 0 means one for each core.
         progress: As of `simulate`.
+        force: As of `simulate`.
 
     Raises:
         DataError: The dataset holds captures (import them again), or its settings were changed by hand.
@@ -270,4 +277,4 @@ def repair(dataset: Dataset, faults: list[Fault], workers: int = 0, progress: Pr
     with claim_dataset(dataset):
         for fault in faults:
             dataset.shard(fault.name).unlink(missing_ok=True)
-    return simulate(config, dataset.folder, workers, progress=progress)
+    return simulate(config, dataset.folder, workers, progress=progress, force=force)

@@ -86,7 +86,13 @@ def sets(rig: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation
 
 
 def carry_over(
-    weights: Path, rig: Path, out: Path, workers: int = 0, each: int = 12, progress: Progress = silent
+    weights: Path,
+    rig: Path,
+    out: Path,
+    workers: int = 0,
+    each: int = 12,
+    progress: Progress = silent,
+    force: bool = False,
 ) -> list[CarriedOver]:
     """Run one network on all sets and return what came of each.
 
@@ -97,6 +103,7 @@ def carry_over(
         workers: Processes that simulate; 0 = one for each core.
         each: Objects of a set.
         progress: Called with each step of the simulations, and after each set, with what came of it.
+        force: Whether to begin although the machine's memory will hardly do.
 
     Raises:
         DataError: The weights do not know what their pictures are worth, or the rig can't be used.
@@ -114,7 +121,7 @@ def carry_over(
     for name, config in sets(own, sampling, each).items():
         key = config_hash(config)[:8]
         folder = out / "simulations" / f"{rig.name}-{name.replace(' ', '-')}-{key}"
-        dataset = simulate(config, folder, workers, progress=progress)
+        dataset = simulate(config, folder, workers, progress=progress, force=force)
         same = operator is None or config.setup == own.setup
         own_wall = operator if same else FrameOperator(config.setup, sampling)
         found.append(_score(name, loaded, dataset, operator, own_wall))

@@ -145,7 +145,12 @@ def conditions(base: Simulation) -> list[Condition]:
 
 
 def map_conditions(
-    chosen: list[Condition], out: Path, workers: int = 0, rank: int = 192, progress: Progress = silent
+    chosen: list[Condition],
+    out: Path,
+    workers: int = 0,
+    rank: int = 192,
+    progress: Progress = silent,
+    force: bool = False,
 ) -> list[Finding]:
     """Measure each condition and return the findings; what is done is read back.
 
@@ -158,6 +163,7 @@ def map_conditions(
         workers: Processes; 0 is one for each core.
         rank: Components of the linear estimate.
         progress: Called when the work begins and of a condition and when it is done.
+        force: Whether to begin although the machine's memory will hardly do.
     """
     processes(workers, 1)
     out.mkdir(parents=True, exist_ok=True)
@@ -168,7 +174,7 @@ def map_conditions(
             known = json.loads(path.read_text())
             finding = Finding(**known | {"gain_db": tuple(known["gain_db"])})
         else:
-            finding = measure(condition, workers, rank)
+            finding = measure(condition, workers, rank, force)
             write_atomically(path, json.dumps(asdict(finding), indent=1).encode())
         findings.append(finding)
         what = f"{condition.factor} {condition.value:g} {condition.unit}".strip()
@@ -176,17 +182,19 @@ def map_conditions(
     return findings
 
 
-def measure(condition: Condition, workers: int = 0, rank: int = 192) -> Finding:
+def measure(condition: Condition, workers: int = 0, rank: int = 192, force: bool = False) -> Finding:
     """Simulate passes, fit the linear estimate to some writers, and score it on one that it has not seen.
 
     Args:
         condition: The world.
         workers: Processes; 0 is one for each core.
         rank: Components of the linear estimate.
+        force: Whether to begin although the machine's memory will hardly do.
     """
     config = condition.simulation
     assert isinstance(config.glyphs, HandwritingGlyphs)
-    check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects())))
+    if not force:
+        check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects())))
     unseen = replace(config, glyphs=replace(config.glyphs, writers=1, first_writer=TRAIN_WRITERS))
     learned = list(run_in_order(_pass, [(config, name) for name in config.glyphs.objects()], workers))
     tested = list(run_in_order(_pass, [(unseen, name) for name in unseen.glyphs.objects()], workers))

@@ -184,7 +184,7 @@ def _simulate(study: Study, arm: Arm, place: Place, progress: Progress) -> Datas
         return None
     config = simulation_of(study, arm, place)
     folder = place.out / "simulations" / f"{arm.source}-{study.rig}-{config_hash(config)[:8]}"
-    return simulate(config, folder, place.workers, progress=progress)
+    return simulate(config, folder, place.workers, progress=progress, force=place.force)
 
 
 def _chosen(study: Study, arm: Arm, place: Place) -> list[Path]:
@@ -274,6 +274,8 @@ class Simulated:
     """Comic characters that no network is trained on."""
     workers: int = 0
     """Processes that simulate; 0 = one for each core."""
+    force: bool = False
+    """Begin although the machine's memory will hardly do."""
 
 
 def simulations(settings: Simulated) -> dict[str, Simulation]:
@@ -301,7 +303,7 @@ def run_simulated(settings: Simulated, progress: Progress = silent) -> list[Reco
     data, records = {}, list[Record]()
     for name, config in simulations(settings).items():
         folder = settings.out / "simulations" / f"paper-{name}-{config_hash(config)[:8]}"
-        data[name] = simulate(config, folder, settings.workers, progress=progress)
+        data[name] = simulate(config, folder, settings.workers, progress=progress, force=settings.force)
     for modality in settings.modalities:
         for seed in settings.seeds:
             plans = [

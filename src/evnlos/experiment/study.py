@@ -125,6 +125,7 @@ class Place:
         out: Folder for rigs, datasets, runs and records.
         workers: Processes that simulate; 0 is one for each core.
         trainings: Networks that are trained at a time where there is no GPU; 0 is one for each core.
+        force: Whether simulations begin although the machine's memory will hardly do.
 
     Raises:
         ConfigError: A number of processes below 0.
@@ -134,6 +135,7 @@ class Place:
     out: Path
     workers: int = 0
     trainings: int = 1
+    force: bool = False
 
     def __post_init__(self) -> None:
         for name in ("workers", "trainings"):
