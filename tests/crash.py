@@ -30,6 +30,8 @@ from pathlib import Path
 
 import numpy as np
 
+from watching import alive
+
 EVNLOS = [sys.executable, "-m", "evnlos"]
 KINDS = ("kill", "terminate", "interrupt", "full disk")
 _SIGNALS = {"kill": signal.SIGKILL, "terminate": signal.SIGTERM, "interrupt": signal.SIGINT}
@@ -58,11 +60,12 @@ class Command:
 
 def contents(folder: Path) -> dict[str, bytes]:
     """Return what is under final names in a folder, without what differs from run to run by design."""
-    found = {}
+    found, place = {}, str(folder.resolve()).encode()
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
         if path.is_file() and ".part" not in name and not path.name.startswith(".lock"):
-            found[name] = _timeless(path)
+            # a calibration's settings name the files beside them by their whole paths
+            found[name] = _timeless(path).replace(place, b"FOLDER")
     return found
 
 
@@ -79,19 +82,6 @@ def unfinished(folder: Path) -> list[str]:
     return [
         str(path.relative_to(folder)) for path in folder.rglob("*") if path.name.endswith((".part", ".tmp"))
     ]
-
-
-def alive(group: int) -> list[int]:
-    """Return the processes of a group that still run; those that only wait to be reaped do not."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, _, their_group = path.read_text().rsplit(")", 1)[1].split()[:3]
-        except OSError:
-            continue
-        if int(their_group) == group and state != "Z":
-            found.append(int(path.parent.name))
-    return found
 
 
 @contextmanager

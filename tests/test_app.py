@@ -26,6 +26,7 @@ from evnlos.app.page import simulated
 from evnlos.app.serve import Server, middleware, running
 from evnlos.app.solving import Networks, from_each_frame, from_weights, from_whole_pass, own_networks
 from evnlos.app.views import event_views, found_views, message_box, seen_views, verdict_on
+from evnlos.cli import main
 from evnlos.data import Sampling
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
 from evnlos.models import load_weights
@@ -203,6 +204,17 @@ def test_without_gradio_the_page_says_what_to_install(monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "gradio", None)
     with pytest.raises(MissingDependencyError, match=r"evnlos\[app\]"), running(Server(port=0)):
         pass
+
+
+@pytest.mark.parametrize(("host", "is_open"), [("127.0.0.1", False), ("localhost", False), ("0.0.0.0", True)])
+def test_a_page_that_is_open_to_the_network_says_so(host: str, is_open: bool, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "gradio", None)  # the word comes before the page is made
+    with pytest.raises(SystemExit):
+        main(["app", "--host", host, "--port", "0"])
+    said = capsys.readouterr().err.splitlines()
+    warned = [line for line in said if "asks for no password" in line]
+    assert len(warned) == is_open
+    assert not warned or warned[0].startswith(f"warning: --host {host} opens the page to the network")
 
 
 def test_a_host_or_port_that_can_not_be_had_is_one_line_at_once() -> None:

@@ -22,7 +22,7 @@ from evnlos.data import simulate
 from evnlos.data.simulations import find_faults
 from evnlos.files import claim, is_empty
 from evnlos.progress import Step
-from watching import Watch, stopped
+from watching import Watch, alive, stopped
 
 COMMAND = [sys.executable, "-m", "evnlos"]
 TINY_RUN = ["train", "--epochs", "2", "--network.width", "8", "--network.depth", "2", "--network.shuffle", "1"]
@@ -66,19 +66,6 @@ DEAD = 4_194_304  # more than any process has for a number
 def unfinished(path: Path, owner: int) -> Path:
     """Return the name under which a process of this machine writes a file."""
     return path.with_name(f".{path.name}.{socket.gethostname()}.{owner}.0123abcd.part")
-
-
-def alive(group: int) -> list[int]:
-    """Return the processes of a group that still run; those that only wait to be reaped do not."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, _, their_group = path.read_text().rsplit(")", 1)[1].split()[:3]
-        except OSError:
-            continue
-        if int(their_group) == group and state != "Z":
-            found.append(int(path.parent.name))
-    return found
 
 
 def test_damage_is_found_named_and_repaired(copy, tiny_dataset, capsys) -> None:
@@ -215,6 +202,59 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(settings, tiny_dataset, tmp
         assert bytes_of(place / "d") == whole
     finally:
         subprocess.run(["umount", str(place)], check=True)
+
+
+def test_a_full_disk_leaves_no_half_of_a_reconstruction(app_weights, tiny_captures, tmp_path, capsys) -> None:
+    from crash import small_disk
+
+    place = tmp_path / "small"
+    place.mkdir()
+    command = ["reconstruct", str(tiny_captures[0]), "--weights", str(app_weights["event"])]
+    command += ["--out", str(place / "r")]
+    with small_disk(place, 16_384) as is_small:
+        if not is_small:
+            pytest.skip("mounting a small tmpfs needs root")
+        with pytest.raises(SystemExit) as ended:
+            main(command)
+        assert ended.value.code == 2
+        said = capsys.readouterr().err.splitlines()
+        assert len([line for line in said if line.startswith("evnlos reconstruct: error")]) == 1
+        assert "No space left" in said[-1]
+        assert list(place.iterdir()) == []
+        subprocess.run(["mount", "-o", "remount,size=16m", str(place)], check=True)
+        main(command)
+        assert len(list((place / "r").glob("position_*.png"))) == 8
+
+
+def test_two_at_once_into_one_folder_are_one_result_and_one_line(app_weights, tiny_captures, tmp_path) -> None:
+    """Both used to end well, and the pictures of one capture were gone."""
+    words = ["--weights", str(app_weights["event"]), "--out"]
+    alone = []
+    for number, capture in enumerate(tiny_captures[:2]):
+        main(["reconstruct", str(capture), *words, str(tmp_path / f"alone{number}")])
+        alone.append(np.load(tmp_path / f"alone{number}" / "reconstruction.npy"))
+    assert not np.allclose(*alone, atol=1e-3)
+    both = [
+        subprocess.Popen(
+            [*COMMAND, "reconstruct", str(capture), *words, str(tmp_path / "m")],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for capture in tiny_captures[:2]
+    ]
+    errors = [process.communicate(timeout=300)[1] for process in both]
+    codes = [process.returncode for process in both]
+    assert sorted(codes) == [0, 2], errors
+    winner, loser = codes.index(0), codes.index(2)
+    said = [line for line in errors[loser].splitlines() if line.startswith("evnlos reconstruct: error")]
+    assert len(said) == 1 and "Traceback" not in errors[loser]
+    assert "another process is at work" in said[0] or "not an empty folder" in said[0]
+    whole = {path.name for path in (tmp_path / f"alone{winner}").iterdir()}
+    assert {path.name for path in (tmp_path / "m").iterdir()} == whole
+    found = np.load(tmp_path / "m" / "reconstruction.npy")
+    np.testing.assert_allclose(found, alone[winner], atol=1e-3)
+    assert {path.name for path in tmp_path.iterdir()} == {"alone0", "alone1", "m"}
 
 
 def test_ctrl_c_ends_all_processes_within_seconds(settings, tmp_path) -> None:

@@ -680,6 +680,32 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out").iterdir()] == [".draft.tmp"]
 
 
+@pytest.mark.parametrize("has_pyav", [True, False])
+def test_a_video_on_a_full_disk_is_one_line_and_nothing_is_left(
+    has_pyav: bool, engine: Engine, tmp_path: Path, monkeypatch
+) -> None:
+    from crash import small_disk
+
+    if has_pyav:
+        pytest.importorskip("av")
+    else:
+        monkeypatch.setattr(record, "_pyav", lambda: None)
+    place, events = tmp_path / "small", stream(600, 18)
+    place.mkdir()
+    with small_disk(place, 4096) as is_small:
+        if not is_small:
+            pytest.skip("mounting a small tmpfs needs root")
+        with (
+            pytest.raises(DataError, match="could not be written") as caught,
+            record.Recorder(place / "out") as to,
+        ):
+            for k in range(6):
+                shown = engine.see([chunk(events[100 * k : 100 * k + 100], restart=k == 0)])
+                to.show(replace(shown, made_s=7.0 + 0.05 * k))
+        assert "No space left" in str(caught.value) and "\n" not in str(caught.value)
+        assert list(place.iterdir()) == []
+
+
 def test_a_run_without_a_picture_leaves_no_folder(engine: Engine, tmp_path: Path) -> None:
     write_events(tmp_path / "e.npz", stream(5))
     with pytest.raises(EventFileError, match="followed"), record.Recorder(tmp_path / "new" / "out") as recorder:

@@ -1,6 +1,7 @@
-"""A `progress` for tests: it keeps every step, and may stop the verb as a user's Ctrl-C would."""
+"""Watching verbs and commands: a `progress` that keeps every step and may stop, and processes that live on."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
 
@@ -33,3 +34,16 @@ def stopped(verb, *arguments, after: int, **settings) -> list:
     with pytest.raises(StoppedError):
         verb(*arguments, progress=watch, **settings)
     return watch.results
+
+
+def alive(group: int) -> list[int]:
+    """Return the processes of a group that still run; those that only wait to be reaped do not."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, their_group = path.read_text().rsplit(")", 1)[1].split()[:3]
+        except OSError:
+            continue
+        if int(their_group) == group and state != "Z":
+            found.append(int(path.parent.name))
+    return found
