@@ -32,7 +32,7 @@ from evnlos.experiment import (
     summary_table,
     write_record,
 )
-from evnlos.models import UNetConfig
+from evnlos.models import UNetConfig, layers_of, load_weights
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
 from evnlos.training import Training
@@ -130,6 +130,20 @@ def test_arms_share_what_they_have_in_common(records, place) -> None:
     assert len([name for name in names if "pretrained" in name]) == 2  # one a seed, for two arms
     assert len(list((place.out / "simulations").iterdir())) == 1
     assert len(list((place.out / "shots").iterdir())) == 1
+
+
+def test_arms_begin_with_installed_layers(records, place, tmp_path, monkeypatch) -> None:
+    trained = next(path for path in (place.out / "runs").iterdir() if "pretrained" in path.name)
+    monkeypatch.setenv("EVNLOS_WEIGHTS", str(tmp_path))
+    (name,) = layers_of("any", "fusion")
+    before = replace(SMALL, refit_embedding=True)
+    arms = (Arm("from layers", "calibrated", before, SMALL, "any", sampling=SAMPLING),)
+    study = replace(STUDY, name="layers", arms=arms, seeds=(0,))
+    with pytest.raises(DataError, match=name):
+        run_study(study, place)
+    shutil.copy(trained / "weights.safetensors", tmp_path / f"{name}.safetensors")
+    (record,) = [r for r in run_study(study, place) if r.arm == "from layers" and r.seed == 0]
+    assert [len(load_weights(place.out / "runs" / record.settings["run"]).history)] == [3]
 
 
 def test_an_ensemble_is_the_mean_of_its_pictures(records) -> None:

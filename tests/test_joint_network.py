@@ -124,6 +124,22 @@ def test_fine_tuning_keeps_the_kind_and_frozen_parts(trained, tiny_dataset, tmp_
     assert not torch.equal(old.unet.head.weight, new.unet.head.weight)
 
 
+def test_layers_of_another_setup_start_a_training_behind_a_new_embedding(trained, tiny_dataset, tmp_path):
+    out, log = trained
+    fewer = replace(NET, rank=12)
+    plan = replace(PLAN, network=fewer, epochs=1, learning_rate=1e-9, schedule="constant", refit_embedding=True)
+    begun = train(tiny_dataset, plan, tmp_path / "begun", out)
+    old, new = load_weights(out).network, begun.load().network
+    for name, value in new.named_parameters():
+        torch.testing.assert_close(value, dict(old.named_parameters())[name], atol=1e-6, rtol=0)
+    assert new.embedding.groups["frame"].rank == 12 != old.embedding.groups["frame"].rank
+    # On the setup that the layers come from they are at home at once.
+    assert begun.records[0]["loss"] < log[0]["loss"]
+    for other in (replace(fewer, width=16), UNetConfig(width=8, depth=1, shuffle=2, rank=12)):
+        with pytest.raises(ConfigError, match="weights to start from"):
+            train(tiny_dataset, replace(plan, network=other), tmp_path / "other", out)
+
+
 def test_what_a_joint_network_cannot_do_is_said(trained, tiny_dataset) -> None:
     weights = load_weights(trained[0])
     samples = NlosDataset(tiny_dataset, "train", "frame")

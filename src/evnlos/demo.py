@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from evnlos.data.sampling import Sampling
 from evnlos.data.simulations import default
 from evnlos.errors import CalibrationError, ConfigError
 from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
-from evnlos.models import SequenceConfig, UNetConfig
+from evnlos.models import SequenceConfig, UNetConfig, layers_of, published
 from evnlos.progress import Progress, ProgressBars, silent
 from evnlos.report import gather, to_text, write_report
 from evnlos.scene import FontGlyphs
@@ -31,6 +30,10 @@ from evnlos.training import Training
 
 LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
 """What the rendered captures show."""
+
+# Half the rank of the full experiments: half the time, as good on few objects.
+SEQUENCE_NETWORK = SequenceConfig(width=32, rank=256, strengths=(0.001, 0.01, 0.1, 1.0))
+"""The network that the demo trains."""
 
 _TEST = ("G", "K", "4", "9")
 
@@ -49,8 +52,10 @@ class Demo:
     """Writers of the simulated characters, 36 objects each."""
     redrawn: int = 7
     """How often each known target of the captures is drawn again and simulated."""
-    pretrain_epochs: int = 8
-    """Epochs on the simulated sequences."""
+    start: str = "generic"
+    """Setup of installed weights whose layers the pre-training begins with; empty: random ones."""
+    pretrain_epochs: int | None = None
+    """Epochs on the simulated sequences; by default 4 from trained layers, 8 from random ones."""
     finetune_epochs: int = 12
     """Epochs on the captures when fine-tuning."""
     e2e_epochs: int = 60
@@ -95,8 +100,14 @@ def run_demo(settings: Demo) -> Path:
             folders = render_captures(
                 lab, out / "captures", workers=settings.workers, progress=progress, force=settings.force
             )
+    if settings.start and not all(name in published() for name in layers_of(settings.start)):
+        notes.append(
+            f"The layers {settings.start!r} are not installed (evnlos-weights brings them): the pre-training "
+            "began with random ones, and needs twice the epochs for less."
+        )
+        settings = replace(settings, start="")
     study = _study(settings, _held_out(folders, settings.test))
-    place = dataclasses.replace(place, captures=tuple(sorted(folders)))
+    place = replace(place, captures=tuple(sorted(folders)))
     try:
         with ProgressBars() as progress:
             run_study(study, place, progress)
@@ -150,15 +161,20 @@ def _of_calibration(rig: Path) -> list[str]:
 def _study(settings: Demo, test: list[str]) -> Study:
     """Return the comparison of E2E and EPNP, with one seed."""
     single = Training(network=UNetConfig(width=settings.width), epochs=settings.single_epochs)
-    # Half the rank of the full experiments, two views of a sequence: half the time, as good on few objects.
-    network = SequenceConfig(width=settings.width, rank=256, strengths=(0.001, 0.01, 0.1, 1.0))
+    network = replace(SEQUENCE_NETWORK, width=settings.width)
     plan = Training(batch_size=16, network=network)
-    before = dataclasses.replace(plan, epochs=settings.pretrain_epochs, sequence_augmentations=2)
-    # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
-    after = dataclasses.replace(
-        plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True
+    # Trained layers need less time and smaller steps; validation characters chose both.
+    epochs, rate = (4, 1e-3) if settings.start else (8, plan.learning_rate)
+    before = replace(
+        plan,
+        epochs=settings.pretrain_epochs or epochs,
+        learning_rate=rate,
+        sequence_augmentations=2,
+        refit_embedding=bool(settings.start),
     )
-    alone = dataclasses.replace(plan, epochs=settings.e2e_epochs)
+    # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
+    after = replace(plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True)
+    alone = replace(plan, epochs=settings.e2e_epochs)
     source = "calibrated" if settings.calibrate else "uncalibrated"
     # Of the time surfaces, the one that validation characters are seen best in.
     sampling = Sampling(surface="hots", radius=1)
@@ -166,16 +182,16 @@ def _study(settings: Demo, test: list[str]) -> Study:
         "demo",
         "demo",
         (
-            Arm("simulation only", source, before, None, sampling=sampling),
+            Arm("simulation only", source, before, None, settings.start, sampling=sampling),
             Arm("E2E, single positions", "none", None, single, sampling=sampling),
             Arm("E2E", "none", None, alone, sampling=sampling),
-            Arm("EPNP", source, before, after, choose=True, sampling=sampling),
+            Arm("EPNP", source, before, after, settings.start, choose=True, sampling=sampling),
         ),
         seeds=(settings.seed,),
         test=tuple(test),
         writers=settings.writers,
         redrawn=settings.redrawn,
-        simulation=dataclasses.replace(default(), seed=settings.seed),
+        simulation=replace(default(), seed=settings.seed),
         calibration=Calibration(event_captures=2, columns=48, seed=settings.seed),
         rigs=2,
         refine=False,

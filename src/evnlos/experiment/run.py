@@ -25,7 +25,7 @@ from evnlos.data.simulations import default, paper
 from evnlos.errors import CalibrationError, DataError, MissingDependencyError
 from evnlos.experiment.study import Arm, Place, Record, Study, keep_scores, names_there, slug
 from evnlos.experiment.table import score_arm
-from evnlos.models import load_weights
+from evnlos.models import layers_of, load_weights
 from evnlos.progress import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
 from evnlos.setups import SensorSize
@@ -41,14 +41,14 @@ class Run:
         data: What it learns from.
         settings: How.
         out: Its folder.
-        start: Run whose weights it starts from; None: random ones.
+        start: Run, or name of installed weights, whose weights it starts from; None: random ones.
         choose: Whether captures held out decide how much of a fine-tuning is taken.
     """
 
     data: Dataset
     settings: Training
     out: Path
-    start: Path | None = None
+    start: Path | str | None = None
     choose: bool = False
 
 
@@ -79,7 +79,7 @@ def train_together(runs: list[Run], at_a_time: int, progress: Progress = silent)
     done = 0
     # Pre-training and end-to-end training first: fine-tuning begins where they end.
     for stage in (True, False):
-        some = [run for run in todo.values() if (run.start is None) == stage]
+        some = [run for run in todo.values() if (run.start not in todo) == stage]
         at_once = max(1, processes(at_a_time, len(some)))
         tasks = [(run, max(1, torch.get_num_threads() // at_once)) for run in some]
         with closing(run_tasks(_trained, tasks, at_once)) as finished:
@@ -226,18 +226,22 @@ def _planned(
 ) -> tuple[list[Run], dict[str, Any]]:
     """Return the trainings of an arm's network, each from the one before it, and what decided them."""
     runs: list[Run] = []
+    begin = layers_of(arm.start, modality)[0] if arm.start else None
     decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": shots.folder.name}
     if arm.pretraining is not None:
         assert made is not None
         settings = replace(arm.pretraining, modality=modality, seed=seed)
-        key = config_hash({"data": made.config_hash, "settings": to_dict(settings)})[:8]
+        decides: dict[str, Any] = {"data": made.config_hash, "settings": to_dict(settings)}
+        if arm.start:
+            decides["from"] = arm.start
+        key = config_hash(decides)[:8]
         out = place.out / "runs" / f"{study.rig}-pretrained-{modality}-seed{seed}-{key}"
-        runs.append(Run(made, settings, out))
+        runs.append(Run(made, settings, out, begin))
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
         settings = replace(arm.finetuning, modality=modality, seed=seed)
-        start = runs[-1].out if runs else None
-        decides = {"data": shots.folder.name, "settings": to_dict(settings), "from": start and start.name}
+        start = runs[-1].out if runs else begin
+        decides = {"data": shots.folder.name, "settings": to_dict(settings), "from": start and Path(start).name}
         if arm.choose:
             decides["choose"] = True
         key = config_hash(decides)[:8]

@@ -41,6 +41,9 @@ class Arm:
     """Settings of the pre-training."""
     finetuning: Training | None = None
     """Settings of the fine-tuning, or of the end-to-end training where there is no pre-training."""
+    start: str = ""
+    """Setup of installed weights of sequences; the arm's first training begins with their layers. Empty: with
+    random ones."""
     choose: bool = False
     """Choose on captures held out of the fine-tuning how much of it is taken, if any."""
     writers: int | None = None

@@ -8,6 +8,7 @@ from evnlos.models.unet import ResidualUNet, UNetConfig, UNetReconstructor
 from evnlos.models.weights import (
     Weights,
     describe_network,
+    layers_of,
     load_weights,
     published,
     published_for,
@@ -33,6 +34,7 @@ __all__ = [
     "describe_network",
     "fit_linear",
     "halves_of",
+    "layers_of",
     "load_weights",
     "plates",
     "published",

@@ -173,6 +173,31 @@ class Reconstructor(nn.Module, ABC):
         if not any(parameter.requires_grad for parameter in self.parameters()):
             raise ConfigError(f"freeze is {parts}; leave at least one part of the network to train")
 
+    @torch.no_grad()
+    def take_layers(self, other: Reconstructor) -> None:
+        """Take what gradients trained from another reconstructor, and leave what is fitted in closed form.
+
+        Args:
+            other: One of the same kind, modality and layers; its linear embedding may have another rank.
+
+        Raises:
+            ConfigError: Kind, modality or the size of a layer differ.
+        """
+        theirs, ours = dict(other.named_parameters()), dict(self.named_parameters())
+        if (other.kind, other.modality.name) != (self.kind, self.modality.name):
+            raise ConfigError(
+                f"the weights to start from are of kind {other.kind!r} and see {other.modality.name}; this "
+                f"network is of kind {self.kind!r} and sees {self.modality.name}: give weights like it"
+            )
+        unlike = [n for n in ours if n not in theirs or theirs[n].shape != ours[n].shape]
+        if unlike or len(theirs) != len(ours):
+            raise ConfigError(
+                f"the weights to start from have other layers ({(unlike or ['more of them'])[0]}); give the "
+                "network their width, depth, blocks, shuffle, groups and number of strengths"
+            )
+        for name, value in ours.items():
+            value.copy_(theirs[name])
+
     def reduced(self, rank: int) -> Reconstructor:
         """Return a copy whose closed-form part has fewer components, the strongest.
 

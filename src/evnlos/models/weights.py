@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from evnlos.config import from_dict, to_dict
-from evnlos.data import MODALITIES, Modality, Sampling
+from evnlos.data import MODALITIES, STANDARD_MODALITIES, Modality, Sampling
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.migrate import migrate
@@ -116,6 +116,20 @@ def published_rig(weights: str | Path) -> Path | None:
         return None
     path = known[name].parent / f"{name.partition('-')[0]}.yaml"
     return path if path.is_file() else None
+
+
+def layers_of(setup: str, *modalities: str) -> list[str]:
+    """Return the names of the weights of whole sequences that were trained for a setup.
+
+    Args:
+        setup: First part of the names; "generic" are those of many walls, for trainings to begin with.
+        modalities: What they see; by default frame, event and fusion.
+
+    Example:
+        >>> layers_of("generic", "frame")
+        ['generic-frame-pass']
+    """
+    return [f"{setup}-{modality}-{_PASS}" for modality in modalities or STANDARD_MODALITIES]
 
 
 def published_single() -> list[str]:

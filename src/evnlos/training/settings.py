@@ -109,6 +109,9 @@ class Training:
     keep_normalization: bool = False
     """Fine-tuning: keep the inputs' mean and size of the weights, as after a simulation of this very setup; by
     default they are taken from the new data."""
+    refit_embedding: bool = False
+    """With weights of another setup: take only the layers that gradients trained, and fit normalization and
+    linear embedding, which carry the light path, to the new data; kind and size are then those of `network`."""
     freeze: tuple[str, ...] = ()
     """Parts of the network whose weights stay as they are: encoder, latent, decoder."""
     precision: Literal["auto", "bf16", "float32"] = "auto"

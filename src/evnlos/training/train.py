@@ -133,6 +133,7 @@ def _epochs(
     held_out = held_out_samples(dataset, network.modality, device) if leads else None
 
     done, log = 0, list[dict[str, Any]]()
+    is_new = start is None or settings.refit_embedding  # of this light path nothing is known yet
     # The hash is that of the settings as they were written, maybe by an older version.
     key = config_hash(read_yaml(out / "run.yaml", LONG_YAML)["settings"])
     if checkpoint.is_file():
@@ -142,8 +143,8 @@ def _epochs(
     else:
         keep, seed = settings.keep_normalization, settings.seed
         some = with_mirrored(steps.some) if settings.mirror else steps.some
-        network.fit(some, seed, is_new=start is None, keep_normalization=keep)
-    source = steps.for_network(network, settings.sequence_augmentations, is_new=start is None and not done)
+        network.fit(some, seed, is_new=is_new, keep_normalization=keep)
+    source = steps.for_network(network, settings.sequence_augmentations, is_new=is_new and not done)
     progress(Step(what, done, settings.epochs, "epochs"))
     processes.wait()  # nobody writes before all have read
     joined = processes.joined(network)
@@ -197,10 +198,13 @@ def _epochs(
 
 def _network(settings: Training, start: Weights | None, sampling: Sampling) -> tuple[Reconstructor, Training]:
     """Return the network to train; fine-tuning takes kind, modality and size from its weights."""
-    if start is None:
+    if start is None or settings.refit_embedding:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derive_seed(settings.seed, "weights"))
-            return settings.network.build(as_modality(settings.modality), sampling), settings
+            network = settings.network.build(as_modality(settings.modality), sampling)
+        if start is not None:
+            network.take_layers(start.network)
+        return network, settings
     return start.network, replace(settings, network=start.network.settings, modality=start.modality.name)
 
 
