@@ -319,6 +319,32 @@ def test_workers_end_with_their_parent(number, to_all: bool, moment: str, settin
     assert not list(folder.glob(".*.part"))
 
 
+AHEAD = """
+import time
+from evnlos.data.pool import run_in_order
+if __name__ == "__main__":
+    list(run_in_order(time.sleep, [1000, 1000], 2))
+"""
+"""What `train --simulate` does, whose workers make samples ahead of their use."""
+
+
+def test_workers_that_run_ahead_end_with_a_parent_that_is_killed(tmp_path) -> None:
+    (tmp_path / "ahead.py").write_text(AHEAD)
+    process = subprocess.Popen([sys.executable, str(tmp_path / "ahead.py")], start_new_session=True)
+    until = time.monotonic() + 90
+    while len(alive(process.pid)) < 4 and time.monotonic() < until:  # itself, two workers and the tracker
+        time.sleep(0.05)
+    assert len(alive(process.pid)) == 4
+    process.kill()
+    process.wait(10)
+    until = time.monotonic() + 30
+    while (left := alive(process.pid)) and time.monotonic() < until:
+        time.sleep(0.05)
+    for one in left:
+        os.kill(one, signal.SIGKILL)
+    assert not left
+
+
 DIES = """
 import os, signal, sys
 from pathlib import Path
