@@ -2,7 +2,7 @@
 
     python benchmarks/inversion.py
 
-A character on the rig "main" (rough aluminium of roughness 0.05, 0.3 m), 30 x 48 pixels in both cameras. The
+A character on the setup "main" (rough aluminium of roughness 0.05, 0.3 m), 30 x 48 pixels in both cameras. The
 unknown is the scene's change between two instants 0.8 s apart, 16 mm of travel (paper Eq. event_fm1 and
 event_fm3, without the time surface): from the difference of two frames, and from the signed event count times
 the threshold, linearised at the mean of the two frames. "exact" is the true change of log light, without noise:
@@ -30,8 +30,8 @@ def correlation(image: torch.Tensor, truth: torch.Tensor) -> float:
 def compare(gain: float, ambient: float, character: str, seed: int = 0) -> dict[str, float]:
     """Return r of each channel for one character in one light."""
     scene = Scene(HandwritingGlyphs().target(f"writer03_{character}"))
-    rig = RadiometricSetup(cell_m=0.005, strip_m=(0.24, 0.08), gain=gain, ambient=ambient)
-    wall = rig.resized(SHAPE).observe(scene)
+    setup = RadiometricSetup(cell_m=0.005, strip_m=(0.24, 0.08), gain=gain, ambient=ambient)
+    wall = setup.resized(SHAPE).observe(scene)
     operator = MatrixTransport(gain * wall.transport.matrix.double(), wall.transport.source, SHAPE)
     first, last = (torch.from_numpy(scene.truth(wall.transport.source, t)).double() for t in TIMES_S)
 

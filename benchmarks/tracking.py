@@ -25,7 +25,9 @@ from evnlos.tracking import Tracking, track_frames
 SENSOR, SECONDS, FRAMES = (32, 48), 8.0, 21
 PIXEL = EventPixel(0.18, 0.21, 0.04, 40.0, 0.0, 0.3, 0.0)
 CAMERA = FrameCamera(exposure_s=0.016, full_well_e=10_000.0, read_noise_e=48.0, prnu=0.02, dsnu_e=38.0)
-RIG = RadiometricSetup(cell_m=0.005, strip_m=(0.28, 0.16), gain=0.7, ambient=0.055, ambient_gradient=(0.1, 0.0))
+SETUP = RadiometricSetup(
+    cell_m=0.005, strip_m=(0.28, 0.16), gain=0.7, ambient=0.055, ambient_gradient=(0.1, 0.0)
+)
 T = np.linspace(0, SECONDS, 17)
 PATHS = {
     "line": LineMotion(),
@@ -37,19 +39,19 @@ PATHS = {
 }
 
 
-def measured(path: str, rig: RadiometricSetup, camera: FrameCamera, pixel: EventPixel) -> str:
+def measured(path: str, setup: RadiometricSetup, camera: FrameCamera, pixel: EventPixel) -> str:
     target = HandwritingGlyphs().target("writer03_R")
     inside = signed_distance(target.mask, 40)
     # The mean distance to the edge of a stroke is a quarter of its width.
     stroke = -4 * float(inside[inside < 0].mean()) * target.size_m / len(target.mask)
     scene = Scene(target, PATHS[path], SECONDS)
-    wall = rig.resized(SENSOR).observe(scene)
+    wall = setup.resized(SENSOR).observe(scene)
     times = np.linspace(0, SECONDS, FRAMES)
     frames = camera.capture(wall, times, seed=1) / np.float32(255)
     events = EventCamera(pixel).record(wall, 0.0, SECONDS, seed=2)
     columns = []
     for settings in (Tracking(), Tracking(events=False)):
-        track = track_frames(frames, times, events, rig, settings)
+        track = track_frames(frames, times, events, setup, settings)
         truth = scene.motion.position_m(track.time_s)
         error = track.position - truth
         error = np.sqrt(np.square(error - error.mean(axis=0)).sum(axis=1).mean())
@@ -60,13 +62,13 @@ def measured(path: str, rig: RadiometricSetup, camera: FrameCamera, pixel: Event
     return "   ".join(columns)
 
 
-def retreating(rig: RadiometricSetup, light: float) -> str:
+def retreating(setup: RadiometricSetup, light: float) -> str:
     """Return errors where the plate retreats from the wall on its way; events do not take part."""
     target, motion = HandwritingGlyphs().target("writer03_R"), PATHS["line"]
     times, away_m = np.linspace(0, SECONDS, FRAMES), np.linspace(0.28, 0.32, FRAMES)
-    cells, own = rig.source(), rig.transport(SENSOR).matrix
-    scale = light * rig.gain * float(own.sum() / rig.matrix(SENSOR, cells, torch.float32).sum())
-    fixed = replace(rig, target_offset_m=rig.offset_m())
+    cells, own = setup.source(), setup.transport(SENSOR).matrix
+    scale = light * setup.gain * float(own.sum() / setup.matrix(SENSOR, cells, torch.float32).sum())
+    fixed = replace(setup, target_offset_m=setup.offset_m())
     shown = torch.from_numpy(target.rasterise(cells, motion.position_m(times))).float().flatten(1)
     seen = [
         (replace(fixed, distance_m=d).matrix(SENSOR, cells, torch.float32) @ strip).reshape(SENSOR)
@@ -74,7 +76,7 @@ def retreating(rig: RadiometricSetup, light: float) -> str:
     ]
     noise = np.random.default_rng(4).standard_normal((FRAMES, *SENSOR))
     frames = 0.05 * light + scale * torch.stack(seen).numpy() + 4e-3 * noise
-    track = track_frames(frames, times, None, rig, Tracking(depth=True))
+    track = track_frames(frames, times, None, setup, Tracking(depth=True))
     assert track.distance is not None
     error = np.log(track.distance.distance_m / away_m)
     where = track.position - motion.position_m(track.time_s)
@@ -84,24 +86,24 @@ def retreating(rig: RadiometricSetup, light: float) -> str:
 
 
 def main() -> None:
-    rows = [(name, "roughness 0.05", RIG, CAMERA, PIXEL) for name in PATHS]
-    rows += [("curve", f"roughness {r}", replace(RIG, roughness=r), CAMERA, PIXEL) for r in (0.02, 0.1)]
+    rows = [(name, "roughness 0.05", SETUP, CAMERA, PIXEL) for name in PATHS]
+    rows += [("curve", f"roughness {r}", replace(SETUP, roughness=r), CAMERA, PIXEL) for r in (0.02, 0.1)]
     for factor in (0.1, 0.02):
-        dim = replace(RIG, gain=RIG.gain * factor, ambient=RIG.ambient * factor)
+        dim = replace(SETUP, gain=SETUP.gain * factor, ambient=SETUP.ambient * factor)
         rows.append(("curve", f"light x {factor}", dim, CAMERA, PIXEL))
-    rows.append(("curve", "ambient 0.5", replace(RIG, gain=0.4, ambient=0.5), CAMERA, PIXEL))
+    rows.append(("curve", "ambient 0.5", replace(SETUP, gain=0.4, ambient=0.5), CAMERA, PIXEL))
     chosen = sys.argv[1] if len(sys.argv) > 1 else ""
     print(f"{'path':15} {'':15}  position   speed %   frames: position   speed %")
-    for path, what, rig, camera, pixel in rows:
+    for path, what, setup, camera, pixel in rows:
         if path.startswith(chosen):
             try:
-                print(f"{path:15} {what:15} {measured(path, rig, camera, pixel)}", flush=True)
+                print(f"{path:15} {what:15} {measured(path, setup, camera, pixel)}", flush=True)
             except EvnlosError as error:
                 print(f"{path:15} {what:15} {error}", flush=True)
-    ways = [(f"roughness {r}", replace(RIG, roughness=r), 1.0) for r in (0.02, 0.05, 0.1)]
-    for what, rig, light in [*ways, ("light x 0.3", RIG, 0.3)]:
+    ways = [(f"roughness {r}", replace(SETUP, roughness=r), 1.0) for r in (0.02, 0.05, 0.1)]
+    for what, setup, light in [*ways, ("light x 0.3", SETUP, 0.3)]:
         if "retreat".startswith(chosen):
-            print(f"{'retreat':15} {what:15} {retreating(rig, light)}", flush=True)
+            print(f"{'retreat':15} {what:15} {retreating(setup, light)}", flush=True)
 
 
 if __name__ == "__main__":

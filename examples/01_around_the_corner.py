@@ -2,7 +2,7 @@
 
     python examples/01_around_the_corner.py docs/figures/around_the_corner.webp
 
-Nothing is learned: rig and motion are known, and all frames so far are inverted together.
+Nothing is learned: setup and motion are known, and all frames so far are inverted together.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Scan a rig cell by cell and by Hadamard patterns; hold what is imported against the rig's true matrix."""
+"""Scan a setup cell by cell and by Hadamard patterns; hold what is imported against the setup's true matrix."""
 
 import tempfile
 from pathlib import Path
@@ -10,7 +10,7 @@ from evnlos.calibration.scan import ScanCamera, ScanImport, ScanPlan, import_sca
 from evnlos.setups import setup_preset
 
 SHAPE = (60, 96)  # pixels
-rig = setup_preset("main-near")
+setup = setup_preset("main-near")
 camera = FrameCamera(bit_depth=12, full_well_e=15_000, read_noise_e=30, prnu=0, dsnu_e=0)
 guess = ScanCamera(full_level=0.8, lobe_m=0.05, full_well_e=15_000, read_noise_e=30, bit_depth=12)
 
@@ -23,7 +23,7 @@ errors = {}
 print("errors in 1e-4 white levels   planned  estimated  true   denoised: estimated  true")
 for pattern in ("raster", "hadamard"):
     plan = ScanPlan(plane=(0.16, 0.08), pattern=pattern, camera=guess)
-    truth = rig.matrix(SHAPE, plan.cells).numpy()
+    truth = setup.matrix(SHAPE, plan.cells).numpy()
     truth *= guess.full_level / truth.sum(axis=1).max()  # exposed alike: all cells lit reach 0.8
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "scan"

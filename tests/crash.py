@@ -273,12 +273,14 @@ def all_commands(folder: Path) -> list[Command]:
     subprocess.run([*EVNLOS, "simulate", "--config", settings, "--out", data], check=True, capture_output=True)
     subprocess.run([*EVNLOS, *train, run], check=True, capture_output=True)
     given = folder / "given"
-    (given / "rigs" / "lab").mkdir(parents=True)
-    rig = replace(simulation, setup=lab.setup, glyphs=HandwritingGlyphs(characters="AB"), held_out="", vary={})
-    for name in ("rig.yaml", "training.yaml"):
-        save_yaml(replace(rig, validation=0.0), given / "rigs" / "lab" / name)
+    (given / "setups" / "lab").mkdir(parents=True)
+    setup = replace(
+        simulation, setup=lab.setup, glyphs=HandwritingGlyphs(characters="AB"), held_out="", vary={}
+    )
+    for name in ("setup.yaml", "training.yaml"):
+        save_yaml(replace(setup, validation=0.0), given / "setups" / "lab" / name)
     flat = np.ones((sensor.height, sensor.width), np.float32)
-    save_pattern(FixedPattern(flat, 0 * flat), given / "rigs" / "lab" / "pattern.safetensors")
+    save_pattern(FixedPattern(flat, 0 * flat), given / "setups" / "lab" / "pattern.safetensors")
     study = ("experiment", "captures", "--captures", str(folder / "lab"), "--captures-of", "lab", "--test", "4")
     study += ("--arms", "E2E", "EPNP", "--seeds", "0", "--modalities", "frame", "--workers", "1")
     study += ("--e2e-epochs", "1", "--pretrain-epochs", "1", "--finetune-epochs", "1", "--writers", "1")

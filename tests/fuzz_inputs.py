@@ -104,7 +104,7 @@ class Material:
             Image.fromarray(draw.integers(0, 255, (48, 72)).astype(np.uint8)).save(shot / f"{number}.png")
             lines.append(f"{60_000 * number},{number}.png")
         (shot / "frames.csv").write_text("\n".join(lines))
-        about = {"camera": {"width": 72, "height": 48, "frame_rate_hz": 16.0}, "rig": {"distance_m": 0.3}}
+        about = {"camera": {"width": 72, "height": 48, "frame_rate_hz": 16.0}, "setup": {"distance_m": 0.3}}
         about["target"] = {"name": "A", "mask": "0.png"}  # type: ignore[assignment]
         about["motion"] = {"start_m": 0.0, "speed_m_s": 0.02}
         about["alignment"] = {"offset_us": 0}
@@ -221,7 +221,7 @@ def capture(draw: random.Random, at: Path, material: Material) -> Callable[[], o
     how = draw.random()
     if how < 0.35:
         values = yaml.safe_load(page.read_text())
-        extra = ("events", "frames", "dark", "flat", "frames_turned", "roi", "filters", "registration", "rig")
+        extra = ("events", "frames", "dark", "flat", "frames_turned", "roi", "filters", "registration", "setup")
         inner = {
             "roi": ("x", "y", "width", "height"), "filters": ("hot_pixel_factor", "background_us"),
             "registration": ("homography", "points", "dots"), "alignment": ("offset_us", "search_s", "blocks"),

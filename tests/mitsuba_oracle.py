@@ -1,6 +1,6 @@
 """The light-transport matrix and a path tracer side by side.
 
-`python tests/mitsuba_oracle.py` renders small rigs both ways and prints how far they are apart.
+`python tests/mitsuba_oracle.py` renders small setups both ways and prints how far they are apart.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def pattern() -> NDArray[np.float64]:
 
 
 def wall_image(
-    rig: RadiometricSetup,
+    setup: RadiometricSetup,
     shape: tuple[int, int],
     brightness: NDArray[np.float64],
     points: tuple[int, int] | None = None,
@@ -119,25 +119,27 @@ def wall_image(
     """Return the light-transport matrix times a pattern on the cells of `PATTERN`, [H, W].
 
     Args:
-        rig: The rig.
+        setup: The setup.
         shape: Size (H, W) of the camera image, pixels.
         brightness: Radiance of the cells, [8, 8].
         points: Quadrature points a side of a (pixel, cell); None adapts them, which is too coarse for the edge
             of a shadow on the large pixels of a small image.
     """
-    place = {"offset_m": rig.offset_m(), "occluders": rig.occluders()}
+    place = {"offset_m": setup.offset_m(), "occluders": setup.occluders()}
     matrix = light_transport_matrix(
-        rig.view(shape), PATTERN, rig.distance_m, rig.brdf(), points=points, **place
+        setup.view(shape), PATTERN, setup.distance_m, setup.brdf(), points=points, **place
     )
     return (matrix @ torch.as_tensor(brightness.copy()).flatten()).reshape(shape).numpy()
 
 
-def trace_rig(
-    rig: RadiometricSetup, shape: tuple[int, int], brightness: NDArray[np.float64], samples: int = 128
+def trace_setup(
+    setup: RadiometricSetup, shape: tuple[int, int], brightness: NDArray[np.float64], samples: int = 128
 ) -> NDArray[np.float64]:
     """Return 16 renders of a pattern on the cells of `PATTERN`, [16, H, W]; see `trace`."""
-    place = {"offset_m": rig.offset_m(), "occluders": rig.occluders()}
-    return trace(rig.view(shape), PATTERN, brightness, rig.distance_m, rig.brdf(), samples=samples, **place)
+    place = {"offset_m": setup.offset_m(), "occluders": setup.occluders()}
+    return trace(
+        setup.view(shape), PATTERN, brightness, setup.distance_m, setup.brdf(), samples=samples, **place
+    )
 
 
 WALLS = {
@@ -149,7 +151,7 @@ WALLS = {
     "Lambert, post": RadiometricSetup(wall_material="lambert", post_width_m=0.016),
     "GGX 0.3, post": RadiometricSetup(roughness=0.3, post_width_m=0.016),
 }
-"""The rigs that are rendered both ways."""
+"""The setups that are rendered both ways."""
 
 
 def check_walls(shape: tuple[int, int] = (8, 12), samples: int = 128) -> dict[str, Agreement]:
@@ -160,10 +162,10 @@ def check_walls(shape: tuple[int, int] = (8, 12), samples: int = 128) -> dict[st
         samples: Paths a pixel, lit cell and render.
     """
     found = {}
-    for name, rig in WALLS.items():
-        points = SHADOW_POINTS if rig.occluders() else None
-        image = wall_image(rig, shape, pattern(), points)
-        found[name] = compare(image, trace_rig(rig, shape, pattern(), samples))
+    for name, setup in WALLS.items():
+        points = SHADOW_POINTS if setup.occluders() else None
+        image = wall_image(setup, shape, pattern(), points)
+        found[name] = compare(image, trace_setup(setup, shape, pattern(), samples))
     return found
 
 

@@ -18,13 +18,13 @@ from evnlos.calibration import (
     Calibration,
     Residual,
     figures,
-    fit_rig,
+    fit_setup,
     fit_transport,
     read_shots,
     rows_of,
     table,
     warnings_of,
-    write_rig,
+    write_setup,
 )
 from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import _block_counts, count_map, read_recordings, within
@@ -41,7 +41,7 @@ from evnlos.scene import FontGlyphs, pen_width
 from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.types import Events
 
-RIG = RadiometricSetup(
+SETUP = RadiometricSetup(
     roughness=0.07,
     camera_angle_deg=26.0,
     cell_m=0.005,
@@ -53,7 +53,7 @@ CAMERA = FrameCamera(exposure_s=0.016, full_well_e=8000.0, read_noise_e=20.0, pr
 PIXEL = EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0)
 LAB = Lab(
     glyphs=FontGlyphs(family="kalam", characters="ALT4EO"),
-    setup=replace(RIG, sensor=SensorSize(50, 80), frame_camera=CAMERA, pixel=PIXEL),
+    setup=replace(SETUP, sensor=SensorSize(50, 80), frame_camera=CAMERA, pixel=PIXEL),
     frame_rate_hz=2.0,
     spread={},
 )
@@ -63,14 +63,14 @@ HELD = ("4", "T")
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory) -> list[Path]:
-    """Six captures of a known rig."""
-    return render_captures(LAB, tmp_path_factory.mktemp("rig"))
+    """Six captures of a known setup."""
+    return render_captures(LAB, tmp_path_factory.mktemp("setup"))
 
 
 @pytest.fixture(scope="module")
 def fit(folders):
     settings = Calibration(holdout=HELD, start=Simulation(setup=START), event_captures=2, columns=32)
-    return fit_rig(folders, settings)
+    return fit_setup(folders, settings)
 
 
 @pytest.fixture
@@ -91,18 +91,18 @@ def edit(folder: Path, **changes) -> None:
 
 def test_optics_come_back(fit) -> None:
     found = fit.optics.setup
-    assert found.roughness == pytest.approx(RIG.roughness, rel=0.02)
-    assert found.gain == pytest.approx(RIG.gain, rel=0.03)
-    assert found.ambient == pytest.approx(RIG.ambient, rel=0.03)
-    assert found.ambient_gradient == pytest.approx(RIG.ambient_gradient, abs=0.03)
+    assert found.roughness == pytest.approx(SETUP.roughness, rel=0.02)
+    assert found.gain == pytest.approx(SETUP.gain, rel=0.03)
+    assert found.ambient == pytest.approx(SETUP.ambient, rel=0.03)
+    assert found.ambient_gradient == pytest.approx(SETUP.ambient_gradient, abs=0.03)
     # Distance, angle and field of view of the camera trade against each other: what they show must agree.
     shape = LAB.setup.sensor.height, LAB.setup.sensor.width
     seen = [
-        rig.view(shape).wall_points_m()[25, 10] - rig.view(shape).wall_points_m()[25, 70]
-        for rig in (found, RIG)
+        setup.view(shape).wall_points_m()[25, 10] - setup.view(shape).wall_points_m()[25, 70]
+        for setup in (found, SETUP)
     ]
     assert float(seen[0].norm()) == pytest.approx(float(seen[1].norm()), rel=0.04)
-    assert found.camera_angle_deg == pytest.approx(RIG.camera_angle_deg, abs=2.0)
+    assert found.camera_angle_deg == pytest.approx(SETUP.camera_angle_deg, abs=2.0)
 
 
 def test_residual_falls_to_the_noise_on_unseen_captures(fit) -> None:
@@ -137,23 +137,23 @@ def test_pixel_comes_back(fit) -> None:
         assert found.noise * 0.9 < found.after < found.before
 
 
-def test_the_rig_file_simulates(fit, tmp_path) -> None:
+def test_the_setup_file_simulates(fit, tmp_path) -> None:
     rows = rows_of(fit, EventPixel(), FrameCamera())
-    rig = load_yaml(Simulation, write_rig(fit, rows, tmp_path))
-    assert rig == fit.simulation
-    assert rig.setup == fit.optics.setup.with_cameras_of(rig.setup) and rig.pixel == fit.pixel.pixel
-    assert (rig.positions, rig.duration_s, rig.motion.start_m) == (16, 8.0, (-0.08, 0.0))
-    samples, _ = simulate_object(replace(rig, glyphs=FontGlyphs(family="kalam", characters="A")), "kalam_A")
+    setup = load_yaml(Simulation, write_setup(fit, rows, tmp_path))
+    assert setup == fit.simulation
+    assert setup.setup == fit.optics.setup.with_cameras_of(setup.setup) and setup.pixel == fit.pixel.pixel
+    assert (setup.positions, setup.duration_s, setup.motion.start_m) == (16, 8.0, (-0.08, 0.0))
+    samples, _ = simulate_object(replace(setup, glyphs=FontGlyphs(family="kalam", characters="A")), "kalam_A")
     assert samples.frame.shape == (16, 64, 96)
     found = json.loads((tmp_path / "calibration.json").read_text())
     assert found["held_out"] == ["lab_4", "lab_T"]
     assert {row.name for row in rows} == set(found["parameters"])
     with pytest.raises(ConfigError, match="exists"):
-        write_rig(fit, rows, tmp_path)
+        write_setup(fit, rows, tmp_path)
 
 
 def test_the_fixed_pattern_is_found_and_left_out_of_the_training_set(fit, tmp_path) -> None:
-    folder = write_rig(fit, rows_of(fit, EventPixel(), FrameCamera()), tmp_path).parent
+    folder = write_setup(fit, rows_of(fit, EventPixel(), FrameCamera()), tmp_path).parent
     found = fit.residuals["frames held out, without pattern"]
     # What stays is the temporal noise: the pattern of captures that were fitted is that of those held out.
     assert found.after < 0.8 * found.before
@@ -185,31 +185,31 @@ def test_a_fit_that_fails_on_unseen_captures_is_refused(folders, tmp_path, capsy
     """The captures to fit show a rougher wall than those held out, from which the search starts."""
     rougher = replace(LAB, setup=replace(LAB.setup, roughness=0.2), glyphs=replace(LAB.glyphs, characters="IV"))
     shots = render_captures(rougher, tmp_path / "other")
-    noted = yaml.safe_load((folders[0] / "capture.yaml").read_text())["rig"]
+    noted = yaml.safe_load((folders[0] / "capture.yaml").read_text())["setup"]
     for folder in shots:
-        edit(folder, rig=noted)  # the notes claim that nothing changed
+        edit(folder, setup=noted)  # the notes claim that nothing changed
     shots += [folder for folder in folders if folder.name[-1] in "AL"]
     start, out = tmp_path / "start.yaml", tmp_path / "out"
-    save_yaml(Calibration(start=Simulation(setup=RIG), columns=24), start)
+    save_yaml(Calibration(start=Simulation(setup=SETUP), columns=24), start)
     words = ["calibrate", *shots, "--out", out, "--holdout", "A", "L", "--no-events", "--config", start]
     with pytest.raises(SystemExit) as stop:
         main([str(word) for word in words])
     error = capsys.readouterr().err.splitlines()
     assert stop.value.code == 2
-    assert len([line for line in error if "frames held out" in line and "no rig file" in line]) == 1, error
-    assert not (out / "rig.yaml").exists() and (out / "calibration.json").exists()
+    assert len([line for line in error if "frames held out" in line and "no setup file" in line]) == 1, error
+    assert not (out / "setup.yaml").exists() and (out / "calibration.json").exists()
 
 
 def test_the_command_prints_and_writes(folders, tmp_path, capsys) -> None:
-    out = tmp_path / "rig"
+    out = tmp_path / "setup"
     words = ["--out", out, "--holdout", "4", "--exclude", "A", "E", "O", "--no-events", "--preset", "paper"]
     words += ["--start.setup.field-of-view-m", 0.6, "--columns", 24]
     main(["calibrate", *map(str, folders), *map(str, words)])
     text = capsys.readouterr().out
     assert "held out: lab_4" in text and "lab_E" not in text
     assert "setup.tpsf_length_m" in text and "frames held out" in text
-    rig = load_yaml(Simulation, out / "rig.yaml")
-    assert isinstance(rig.setup, PaperSetup)
+    setup = load_yaml(Simulation, out / "setup.yaml")
+    assert isinstance(setup.setup, PaperSetup)
     found = json.loads((out / "calibration.json").read_text())["residuals"]["frames held out"]
     assert found["after"] < 0.25 < found["before"]
 
@@ -233,7 +233,7 @@ def test_the_draw_of_the_holdout_follows_the_seed(folders) -> None:
         ({"target": {"mask": None}}, "no known target mask"),
         ({"motion": None}, "no known motion"),
         ({"camera": {"name": "another"}}, "differ in camera"),
-        ({"rig": {"distance_m": 0.5}}, "differ in rig"),
+        ({"setup": {"distance_m": 0.5}}, "differ in setup"),
         ({"target": {"plate_m": 0.05}}, "differ in plate_m"),
     ],
 )
@@ -254,7 +254,7 @@ def test_too_few_captures_and_unknown_names(folders) -> None:
     with pytest.raises(ConfigError, match="holdout_share"):
         Calibration(holdout_share=1.0)
     with pytest.raises(DataError, match=r"distance_m is '30 cm'"):
-        fit_rig(_with_distance(folders), Calibration())
+        fit_setup(_with_distance(folders), Calibration())
 
 
 def _with_distance(folders: list[Path]) -> list[Path]:
@@ -262,7 +262,7 @@ def _with_distance(folders: list[Path]) -> list[Path]:
     for folder in folders[:3]:
         copy = folder.parent / "noted" / folder.name
         shutil.copytree(folder, copy, dirs_exist_ok=True)
-        edit(copy, rig={"distance_m": "30 cm"})
+        edit(copy, setup={"distance_m": "30 cm"})
         copied.append(copy)
     return copied
 
@@ -299,9 +299,9 @@ def test_light_is_solved_for_exactly(folders) -> None:
 def test_one_matrix_gives_what_the_walls_give(folders) -> None:
     fit, _ = read_shots(folders)
     model = FrameModel(fit, (25, 40), every=5)
-    together = model.light(RIG)
+    together = model.light(SETUP)
     k = 2
-    wall = replace(RIG, gain=1.0, ambient=0.0).resized((25, 40)).observe(fit.scenes[k])
+    wall = replace(SETUP, gain=1.0, ambient=0.0).resized((25, 40)).observe(fit.scenes[k])
     alone = wall.irradiance(fit.times_s(k)[::5])
     count = len(fit.times_s(k)[::5])
     assert float((together[k * count : (k + 1) * count] - alone).abs().max()) < 2e-3 * float(alone.max())
@@ -381,10 +381,10 @@ def test_event_statistics_count_by_hand() -> None:
 
 def test_light_of_recordings_follows_the_wall(folders) -> None:
     fit, _ = read_shots(folders)
-    found = read_recordings(fit, RIG, 2)
+    found = read_recordings(fit, SETUP, 2)
     assert [r.index for r in found] == [0, len(fit.names) - 1]
     assert found[0].times_s[[0, -1]].tolist() == [0.0, 8.0]
-    wall = RIG.resized(fit.shape).observe(fit.scenes[0])
+    wall = SETUP.resized(fit.shape).observe(fit.scenes[0])
     assert np.allclose(found[0].light[7], 255 * wall.irradiance(found[0].times_s[7]).numpy(), atol=1e-3)
 
 
@@ -402,7 +402,7 @@ def test_independent_captures_are_fitted(shared_data, group, limit) -> None:
     if not folders[0].is_dir():
         pytest.skip(f"no captures at {folders[0].parent}")
     fit, held = read_shots(folders, holdout=["A", "T"])
-    distance = fit.captures[0].info.rig["distance_m"]
+    distance = fit.captures[0].info.setup["distance_m"]
     start = RadiometricSetup(roughness=0.1, distance_m=distance)
     found = fit_transport(fit, start, fixed=("distance_m",), columns=24, iterations=6)
     model = FrameModel(held, held.shape, every=4)
@@ -447,12 +447,12 @@ def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targe
     assert warnings_of(leaving(0.15, "unknown")) == []  # plates that are only expected leave that much
     wrong = leaving(0.412, "unknown")
     rows = rows_of(wrong, EventPixel(), FrameCamera())
-    with pytest.raises(DataError, match=r"41\.2 % is left .* no rig file was written"):
-        write_rig(wrong, rows, tmp_path / "refused")
-    assert not (tmp_path / "refused" / "rig.yaml").exists()
+    with pytest.raises(DataError, match=r"41\.2 % is left .* no setup file was written"):
+        write_setup(wrong, rows, tmp_path / "refused")
+    assert not (tmp_path / "refused" / "setup.yaml").exists()
     assert "41.2 %" in json.loads((tmp_path / "refused" / "calibration.json").read_text())["warnings"][0]
-    assert write_rig(wrong, rows, tmp_path / "forced", force=True).exists()
-    assert write_rig(leaving(0.412, "known"), rows, tmp_path / "known").exists()
+    assert write_setup(wrong, rows, tmp_path / "forced", force=True).exists()
+    assert write_setup(leaving(0.412, "known"), rows, tmp_path / "known").exists()
 
 
 def test_the_gain_of_unknown_targets_is_called_arbitrary(fit) -> None:
@@ -470,7 +470,7 @@ def test_a_matte_wall_ends_on_the_bounds(tmp_path, capsys) -> None:
         LAB, setup=replace(LAB.setup, wall_material="lambert", sensor=SensorSize(25, 40)), frame_rate_hz=1.0
     )
     shots = render_captures(matte, tmp_path / "shots")
-    words = ["calibrate", *shots, "--out", tmp_path / "rig", "--holdout", "4", "--no-events", "--columns", 16]
+    words = ["calibrate", *shots, "--out", tmp_path / "setup", "--holdout", "4", "--no-events", "--columns", 16]
     main([str(word) for word in [*words, "--wall", "formula"]])
     shown = capsys.readouterr()
     assert "on the bound of the search" in shown.out

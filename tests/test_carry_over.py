@@ -19,7 +19,7 @@ from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.training.validation import fit_confidence
 
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
-RIG = Simulation(
+SETUP = Simulation(
     setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),
     positions=8,
     vary={"setup.gain": (0.5, 0.9)},
@@ -27,34 +27,34 @@ RIG = Simulation(
 
 
 def test_the_sets_change_one_thing_each() -> None:
-    found = sets(RIG, SAMPLING, 4)
+    found = sets(SETUP, SAMPLING, 4)
     assert set(KINDS) < set(found) and "matte wall" in found
     for name, config in found.items():
-        assert config.sampling == SAMPLING and not config.vary and config.frame_camera == RIG.frame_camera
-        moved = config.setup != RIG.setup
+        assert config.sampling == SAMPLING and not config.vary and config.frame_camera == SETUP.frame_camera
+        moved = config.setup != SETUP.setup
         assert moved == (name not in KINDS and name != "characters of an unseen hand")
         assert moved <= isinstance(config.glyphs, HandwritingGlyphs)
         assert len(config.glyphs.objects()) == (36 if "unseen" in name else 4)
     with pytest.raises(DataError, match="radiometric"):
-        sets(replace(RIG, setup=PaperSetup()), SAMPLING, 4)
+        sets(replace(SETUP, setup=PaperSetup()), SAMPLING, 4)
 
 
 def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypatch) -> None:
-    rig = tmp_path / "rigs" / "lab"
-    rig.mkdir(parents=True)
-    save_yaml(RIG, rig / "rig.yaml")
+    setup = tmp_path / "setups" / "lab"
+    setup.mkdir(parents=True)
+    save_yaml(SETUP, setup / "setup.yaml")
     torch.manual_seed(0)
     network = UNetConfig(width=4, depth=1, rank=0).build("frame", SAMPLING).eval()
     bare = Weights(network)
     save_weights(tmp_path / "bare.safetensors", bare)
     with pytest.raises(DataError, match="does not know what its pictures are worth"):
-        carry_over(tmp_path / "bare.safetensors", rig, tmp_path, 1)
+        carry_over(tmp_path / "bare.safetensors", setup, tmp_path, 1)
     confidence = fit_confidence(network, NlosDataset(tiny_dataset, "train", "frame"), SAMPLING.canvas)
     save_weights(tmp_path / "w.safetensors", replace(bare, confidence=confidence))
 
-    def two(rig: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation]:
-        base = replace(rig, sampling=sampling, vary={}, validation=0.0)
-        dim = replace(RIG.setup, gain=0.2)
+    def two(setup: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation]:
+        base = replace(setup, sampling=sampling, vary={}, validation=0.0)
+        dim = replace(SETUP.setup, gain=0.2)
         icons = replace(base, glyphs=DrawingGlyphs(kinds=("icon",), each=2))
         return {"icon": icons, "dim": replace(icons, setup=dim)}
 

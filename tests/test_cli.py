@@ -198,7 +198,7 @@ def test_without_weights_published_ones_that_fit_are_taken(tiny_captures, tmp_pa
         text = (copy / "capture.yaml").read_text()
         (copy / "capture.yaml").write_text(text.replace("  mask: target.png\n", ""))
     text = (unknown / "capture.yaml").read_text()
-    (unknown / "capture.yaml").write_text(text[: text.index("motion:")] + "rig:\n  distance_m: unknown\n")
+    (unknown / "capture.yaml").write_text(text[: text.index("motion:")] + "setup:\n  distance_m: unknown\n")
     taken = []
     for number, capture in enumerate((folder, unknown)):
         capsys.readouterr()
@@ -275,7 +275,7 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     shown = capsys.readouterr().out
     assert "EPNP sequence fusion" in shown and "E2E event" in shown and "report:" in shown
-    assert "EPNP - strongest E2E" in shown and "was not fitted to this rig" in shown
+    assert "EPNP - strongest E2E" in shown and "was not fitted to this setup" in shown
     page = (tmp_path / "demo" / "report.html").read_text()
     assert "not recordings" not in page
     # A second call takes up what is there: nothing is made again, the table is the same.

@@ -111,14 +111,14 @@ def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys
     path = published()[name]
     assert path.stat().st_size <= 16_000_000
     loaded = load_weights(name)
-    rig, modality, *kind = name.split("-")
+    setup, modality, *kind = name.split("-")
     assert loaded.modality.name == modality and loaded.network.sees_sequence == (kind == ["pass"])
     assert loaded.confidence is not None and loaded.scores["images"] >= 160
     better = loaded.scores["overall"]["psnr_db"] - loaded.scores["baselines"]["mean"]["psnr_db"]
     assert better > 1
     # What they were trained on is not what they were scored on.
     captures = [step["data"] for step in loaded.history if step["data"]["origin"] == "captures"]
-    if rig == "page":
+    if setup == "page":
         assert not captures and loaded.scores["data"] == "test"
     else:
         assert captures and not {name[-1] for data in captures for name in data["train"]} & set("GK49")
@@ -126,11 +126,11 @@ def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys
     assert f"{name}: {modality}, {loaded.network.kind}: " in capsys.readouterr().out
 
 
-def test_the_weights_of_the_nearest_rig_are_taken() -> None:
+def test_the_weights_of_the_nearest_setup_are_taken() -> None:
     assert published_for(0.36, "frame", is_motion_known=True) == "near-frame-pass"
     assert published_for(0.44, "frame", is_motion_known=True) == "far-frame-pass"
     assert published_for(None, "event", is_motion_known=True) == "near-event-pass"
     with pytest.raises(DataError, match="give the motion"):
         published_for(0.3, "fusion", is_motion_known=False)
-    # Where there are none for the nearest rig, those of the next one are.
+    # Where there are none for the nearest setup, those of the next one are.
     assert published_for(0.5, "frame", is_motion_known=False) == "near-frame"

@@ -30,13 +30,13 @@ def test_conditions_change_one_factor_and_clip_nothing() -> None:
         }
         if wall.with_cameras_of(SMALL.setup) != SMALL.setup:
             changed.add("wall")
-        rig = dict.fromkeys(("ambient", "light", "roughness", "albedo", "distance"), "wall")
-        expected = rig | {"speed": "motion"}
+        setup = dict.fromkeys(("ambient", "light", "roughness", "albedo", "distance"), "wall")
+        expected = setup | {"speed": "motion"}
         assert changed == {expected.get(one.factor, "frame_camera")}
         way = one.simulation.motion.speed_m_s * one.simulation.duration_s
         assert way == pytest.approx(SMALL.motion.speed_m_s * SMALL.duration_s)
-    rig = {"roughness", "albedo", "distance"}
-    assert {one.factor for one in others} == {"ambient", "light", "read noise", "exposure", "speed"} | rig
+    setup = {"roughness", "albedo", "distance"}
+    assert {one.factor for one in others} == {"ambient", "light", "read noise", "exposure", "speed"} | setup
 
 
 def test_noise_takes_from_frames_what_it_leaves_to_events(tmp_path) -> None:

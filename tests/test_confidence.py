@@ -19,7 +19,7 @@ from evnlos.models import (
     halves_of,
     load_weights,
     plates,
-    published_rig,
+    published_setup,
     save_weights,
 )
 from evnlos.models.confidence import COVERAGE, on_canvas
@@ -192,14 +192,14 @@ def test_confidence_needs_motion_and_passes() -> None:
         halves_of(Given(), samples.inputs[:1], samples.position_m[:1], CANVAS)
 
 
-def lab_rig() -> Simulation:
-    """The rig of the rendered captures."""
+def lab_setup() -> Simulation:
+    """The setup of the rendered captures."""
     transport = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06)
     return Simulation(setup=replace(transport, sensor=SensorSize(48, 72)), sampling=SAMPLING)
 
 
 def test_the_truth_explains_the_frames_and_another_object_does_not() -> None:
-    operator = FrameOperator(lab_rig().setup, SAMPLING)
+    operator = FrameOperator(lab_setup().setup, SAMPLING)
     at = np.stack([np.linspace(-0.06, 0.06, 6), np.zeros(6)], axis=1)
     draw = torch.Generator().manual_seed(3)
     average = torch.full((32, 32), 0.5)
@@ -213,12 +213,12 @@ def test_the_truth_explains_the_frames_and_another_object_does_not() -> None:
     assert explained(true, frames, *known) == pytest.approx(1, abs=1e-6)
     assert explained(on_canvas(average, SAMPLING.canvas, at), frames, *known) == pytest.approx(0, abs=1e-6)
     assert explained(wrong, frames, *known) < 0.5
-    with pytest.raises(DataError, match="do not fit a rig"):
+    with pytest.raises(DataError, match="do not fit a setup"):
         explained(true[:2], frames, *known)
 
 
 def test_light_pattern_and_noise_need_not_be_known() -> None:
-    operator = FrameOperator(lab_rig().setup, SAMPLING)
+    operator = FrameOperator(lab_setup().setup, SAMPLING)
     at = np.stack([np.linspace(-0.06, 0.06, 30), np.zeros(30)], axis=1)
     draw = torch.Generator().manual_seed(3)
     average = torch.full((32, 32), 0.5)
@@ -241,9 +241,9 @@ def test_light_pattern_and_noise_need_not_be_known() -> None:
 
 
 def test_noise_that_grows_with_the_light_is_taken_off() -> None:
-    rig = lab_rig()
-    weak = replace(rig.frame_camera, full_well_e=30.0, read_noise_e=0.3)
-    operator = FrameOperator(replace(rig.setup, frame_camera=weak), SAMPLING)
+    setup = lab_setup()
+    weak = replace(setup.frame_camera, full_well_e=30.0, read_noise_e=0.3)
+    operator = FrameOperator(replace(setup.setup, frame_camera=weak), SAMPLING)
     at = np.stack([np.linspace(-0.06, 0.06, 40), np.zeros(40)], axis=1)
     draw = torch.Generator().manual_seed(5)
     own, average = (torch.rand(4, 4, generator=draw) > 0.5).float(), torch.full((32, 32), 0.5)
@@ -260,15 +260,15 @@ def test_noise_that_grows_with_the_light_is_taken_off() -> None:
 
 
 def test_published_weights_refuse_a_wall_that_is_not_theirs() -> None:
-    path = published_rig("near-frame-pass")
-    assert path is not None and published_rig("page-frame-pass") is None and published_rig(path) is None
-    rig, weights = load_yaml(Simulation, path), load_weights("near-frame-pass")
+    path = published_setup("near-frame-pass")
+    assert path is not None and published_setup("page-frame-pass") is None and published_setup(path) is None
+    setup, weights = load_yaml(Simulation, path), load_weights("near-frame-pass")
     sampling = weights.sampling
-    operator = FrameOperator(rig.setup, sampling)
-    matte = replace(rig.setup, wall_material="lambert")
+    operator = FrameOperator(setup.setup, sampling)
+    matte = replace(setup.setup, wall_material="lambert")
     said = []
-    for transport in (rig.setup, matte):
-        config = replace(rig, setup=transport, positions=16)
+    for transport in (setup.setup, matte):
+        config = replace(setup, setup=transport, positions=16)
         samples, _ = simulate_object(config, "writer00_K")
         images = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
         said.append(judgement_of(weights, samples, images, operator))
@@ -291,12 +291,12 @@ def test_reconstruct_and_evaluate_say_what_the_pictures_are_worth(
     main(["evaluate", "--weights", str(tmp_path / "w.safetensors"), "--data", str(tiny_dataset.folder)])
     assert "confidence: support" in capsys.readouterr().out
     out = tmp_path / "out"
-    found = reconstruct_capture(tiny_captures[0], tmp_path / "w.safetensors", out, setup=lab_rig().setup)
+    found = reconstruct_capture(tiny_captures[0], tmp_path / "w.safetensors", out, setup=lab_setup().setup)
     assert set(found["confidence"]) == {"support", "agreement", "threshold", "measured", "verdict", "explained"}
     low, high = np.load(out / "interval.npy")
     shown = np.load(out / "reconstruction.npy")
     assert shown.shape == (8, 32, 48) and (low <= shown).all() and (shown <= high).all()
-    assert found["moved_by_the_rig"] == (0.75 < found["light"] < 1.33)
+    assert found["moved_by_the_setup"] == (0.75 < found["light"] < 1.33)
     assert (out / "unsure.png").is_file()
 
 

@@ -11,7 +11,7 @@ from evnlos.scene import Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup
 
 SAMPLING = Sampling(height=16, width=24, pitch_m=0.01, scored_rows=12)
-RIG = Simulation(
+SETUP = Simulation(
     setup=RadiometricSetup(
         roughness=0.05,
         cell_m=0.01,
@@ -25,7 +25,7 @@ RIG = Simulation(
 
 @pytest.fixture(scope="module")
 def operator() -> FrameOperator:
-    return FrameOperator(RIG.setup, SAMPLING)
+    return FrameOperator(SETUP.setup, SAMPLING)
 
 
 def pictures(seed: int, count: int = 3) -> torch.Tensor:
@@ -38,8 +38,8 @@ def pictures(seed: int, count: int = 3) -> torch.Tensor:
 def test_the_operator_is_the_simulators_wall(operator) -> None:
     mask = torch.zeros(16, 16)
     mask[2:14, 3:6] = 1.0
-    scene = Scene(Target("bar", mask.numpy(), 0.08), RIG.motion, 8.0)
-    wall = RIG.setup.resized((20, 30)).observe(scene)
+    scene = Scene(Target("bar", mask.numpy(), 0.08), SETUP.motion, 8.0)
+    wall = SETUP.setup.resized((20, 30)).observe(scene)
     light = wall.irradiance([4.0]).numpy()
     from evnlos.data.sampling import reduce_by_area
 

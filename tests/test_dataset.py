@@ -326,13 +326,13 @@ def test_optics_are_drawn_for_groups_of_objects_and_light_for_each() -> None:
     config = Simulation(
         setup=RadiometricSetup(),
         vary={"setup.roughness": (0.03, 0.08), "setup.gain": (0.5, 1.5), "setup.pixel.cutoff_hz": (10, 90)},
-        rigs=3,
+        setups=3,
     )
     names = config.glyphs.objects()[:40]
     drawn = [drawn_for(config, name) for name in names]
     assert len({d.setup.roughness for d in drawn}) == 3
     assert len({d.setup.gain for d in drawn}) == len({d.pixel.cutoff_hz for d in drawn}) == 40
-    own = [drawn_for(replace(config, rigs=0), name) for name in names]
+    own = [drawn_for(replace(config, setups=0), name) for name in names]
     assert len({d.setup.roughness for d in own}) == 40
-    with pytest.raises(ConfigError, match="rigs"):
-        Simulation(rigs=-1)
+    with pytest.raises(ConfigError, match="setups"):
+        Simulation(setups=-1)

@@ -50,20 +50,20 @@ STUDY = Study("captures", "lab", ARMS, ("fusion",), (0, 1), ("4",), writers=1)
 
 @pytest.fixture(scope="module")
 def place(tiny_captures, tmp_path_factory) -> Place:
-    """A place whose rig is calibrated already, with few objects to simulate."""
+    """A place whose setup is calibrated already, with few objects to simulate."""
     out = tmp_path_factory.mktemp("experiment")
-    rig = out / "rigs" / "lab"
-    rig.mkdir(parents=True)
+    setup = out / "setups" / "lab"
+    setup.mkdir(parents=True)
     simulation = Simulation(
         glyphs=HandwritingGlyphs(characters="AB"),
         setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),
         positions=8,
         validation=0.0,
     )
-    save_yaml(simulation, rig / "rig.yaml")
-    save_yaml(simulation, rig / "training.yaml")
+    save_yaml(simulation, setup / "setup.yaml")
+    save_yaml(simulation, setup / "training.yaml")
     flat = FixedPattern(np.ones((48, 72), np.float32), np.zeros((48, 72), np.float32))
-    save_pattern(flat, rig / "pattern.safetensors")
+    save_pattern(flat, setup / "pattern.safetensors")
     return Place(tuple(tiny_captures), out, workers=1)
 
 
@@ -103,7 +103,7 @@ def test_a_study_is_estimated_first_and_can_be_forced(records, place, monkeypatc
 
 
 def test_networks_trained_at_a_time_are_those_trained_one_by_one(records, place, tmp_path) -> None:
-    for part in ("rigs", "simulations", "shots"):
+    for part in ("setups", "simulations", "shots"):
         shutil.copytree(place.out / part, tmp_path / part)
     study = replace(STUDY, seeds=(0,))
     watch = Watch()
@@ -177,7 +177,7 @@ def test_few_shots_are_nested_and_keep_the_test(place) -> None:
         run_study(replace(STUDY, arms=(replace(ARMS[0], shots=9),)), place)
 
 
-def test_captures_that_no_rig_fits_say_so(tiny_captures, tmp_path) -> None:
+def test_captures_that_no_setup_fits_say_so(tiny_captures, tmp_path) -> None:
     place = Place(tuple(tiny_captures[:1]), tmp_path)
     with pytest.raises(CalibrationError, match="capture"):
         run_study(replace(STUDY, test=()), place)
@@ -317,7 +317,7 @@ def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeyp
         workers=1,
     )
     found = run_simulated(settings)
-    assert [(r.rig, r.arm) for r in found] == [
+    assert [(r.setup, r.arm) for r in found] == [
         ("nist", "pre-trained"),
         ("comic", "pre-trained"),
         ("comic", "EPNP"),

@@ -69,7 +69,7 @@ def fails(words: list[str], capsys, match: str = "") -> str:
     [
         "seed: 2001-99-99\n",
         "seed: " + "9" * 5000 + "\n",
-        "rig: {a: [" + ",".join(["1"] * 900_000) + "]}\n",
+        "setup: {a: [" + ",".join(["1"] * 900_000) + "]}\n",
         "\n".join(f"k{number}: {number}" for number in range(100_000)),
         "a: " + "x" * 10_000_000,
         "x" * 1_000_000 + ": 1\n",

@@ -1,4 +1,4 @@
-"""What a rig can show: the linear algebra against slow truths, the mode counts, the words, the command."""
+"""What a setup can show: the linear algebra against slow truths, the mode counts, the words, the command."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evnlos.analysis.identify import counted, identify, rig_table, singular_values, verdict
+from evnlos.analysis.identify import counted, identify, setup_table, singular_values, verdict
 from evnlos.analysis.linearized import Bench, LinearEstimator, bars, camera_variance, finest_bars, linearized
 from evnlos.cameras import FrameCamera
 from evnlos.cli import main
@@ -142,16 +142,16 @@ def plate_in_the_middle() -> Scene:
     return Scene(Target("corner", mask), LineMotion(), 8.0)
 
 
-def test_the_matrix_is_the_rig_that_the_lab_renders():
-    for rig in (
+def test_the_matrix_is_the_setup_that_the_lab_renders():
+    for setup in (
         RadiometricSetup(roughness=0.3, gain=0.6, ambient=0.1, ambient_gradient=(0.2, -0.1)),
         RadiometricSetup(roughness=0.3, strip_m=(0.24, 0.12), gain=0.6),
         RadiometricSetup(wall_material="lambert", lamp_m=(-0.4, 0.0, 0.05)),
     ):
         scene, bench = plate_in_the_middle(), Bench(height=12, width=20)
-        seen = linearized(rig, bench)
+        seen = linearized(setup, bench)
         mask = torch.from_numpy(scene.target.rasterise(bench.plate)).double().flatten()
-        rendered = rig.resized(bench.shape).observe(scene).irradiance(4.0)
+        rendered = setup.resized(bench.shape).observe(scene).irradiance(4.0)
         expected = (seen.ambient + seen.matrix @ mask).reshape(bench.shape).float()
         torch.testing.assert_close(rendered, expected, rtol=1e-4, atol=1e-6)
 
@@ -159,10 +159,10 @@ def test_the_matrix_is_the_rig_that_the_lab_renders():
 def test_the_papers_matrix_is_its_wall_but_for_diffraction():
     scene, bench = plate_in_the_middle(), Bench(height=25, width=40)
     for length_m in (0.004, 0.02):
-        rig = PaperSetup(tpsf_length_m=length_m, gain=0.9, field_of_view_m=0.3)
-        seen = linearized(rig, bench)
+        setup = PaperSetup(tpsf_length_m=length_m, gain=0.9, field_of_view_m=0.3)
+        seen = linearized(setup, bench)
         mask = torch.from_numpy(scene.target.rasterise(bench.plate)).double().flatten()
-        rendered = rig.resized(bench.shape).observe(scene).irradiance(4.0).double().flatten()
+        rendered = setup.resized(bench.shape).observe(scene).irradiance(4.0).double().flatten()
         expected = seen.ambient + seen.matrix @ mask
         assert float((rendered - expected).abs().max()) < 0.03 * float(expected.max())
 
@@ -186,7 +186,7 @@ def test_prior_and_test_share_no_character():
     assert 0.004 < plates.stroke_m < 0.012
 
 
-def test_a_sharp_rig_shows_more_than_a_matte_wall():
+def test_a_sharp_setup_shows_more_than_a_matte_wall():
     bench = Bench(cells=16, height=30, width=48, writers=1)
     easy, matte = (identify(setup_preset(name), bench=bench, name=name) for name in ("easy", "matte"))
     assert easy.modes > 5 * matte.modes
@@ -200,7 +200,7 @@ def test_a_sharp_rig_shows_more_than_a_matte_wall():
     assert averaged.at_camera.patterns > easy.at_camera.patterns
     assert averaged.at_camera.finest_m < easy.at_camera.finest_m
     json.dumps(easy.summary(arrays=True))
-    assert rig_table([easy, matte]).count("\n| ") == 2
+    assert setup_table([easy, matte]).count("\n| ") == 2
 
 
 def test_a_post_resolves_across_itself_only():
@@ -214,10 +214,10 @@ def test_a_post_resolves_across_itself_only():
 def test_picard_and_picture():
     """The coefficients of a noiseless picture, from the definition; the same seed draws the same picture."""
     one, same, other = (identify(setup_preset("hard"), bench=SMALL, seed=seed) for seed in (0, 0, 1))
-    rig = linearized(setup_preset("hard"), SMALL)
+    setup = linearized(setup_preset("hard"), SMALL)
     plates = handwritten_plates(SMALL.plate, 1)
-    light = rig.ambient + rig.matrix @ plates.mean
-    whitened = rig.matrix / camera_variance(light, FrameCamera()).sqrt()[:, None]
+    light = setup.ambient + setup.matrix @ plates.mean
+    whitened = setup.matrix / camera_variance(light, FrameCamera()).sqrt()[:, None]
     left, values, _ = torch.linalg.svd(whitened, full_matrices=False)
     torch.testing.assert_close(one.at_camera.spectrum[:20], values[:20], rtol=1e-6, atol=1e-9)
     seen = (left.mT @ (whitened @ plates.test[plates.typical])).abs()
@@ -251,13 +251,13 @@ def test_command(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "| matte-near | 3 |" in shown and "hard-far: With this wall" in shown
     names = {path.name for path in (tmp_path / "o").iterdir()}
-    assert names == {"identify_matte-near.png", "identify_hard-far.png", "identify_rigs.png", "identify.json"}
+    assert names == {"identify_matte-near.png", "identify_hard-far.png", "identify_setups.png", "identify.json"}
     assert len(json.loads((tmp_path / "o" / "identify.json").read_text())) == 2
 
 
-def test_rig_files(tmp_path):
+def test_setup_files(tmp_path):
     assert named_setup("simulate-paper").setup.optics() == PaperSetup().optics()
-    path = tmp_path / "rig.yaml"
+    path = tmp_path / "setup.yaml"
     save_yaml(setup_preset("hard"), path)
     assert named_setup(path).setup == setup_preset("hard")
     save_yaml(Simulation(setup=PaperSetup(taper=0.3)), path)
@@ -279,8 +279,8 @@ def test_rig_files(tmp_path):
         ("- 1\n", "mapping"),
     ],
 )
-def test_bad_rig_files(tmp_path, text, match):
-    path = tmp_path / "rig.yaml"
+def test_bad_setup_files(tmp_path, text, match):
+    path = tmp_path / "setup.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=match):
         named_setup(path)
@@ -310,7 +310,7 @@ def test_bad_sizes():
         LinearEstimator.known(torch.eye(3), torch.zeros(3), torch.eye(4))
 
 
-def test_no_rig(capsys):
+def test_no_setup(capsys):
     with pytest.raises(SystemExit):
         main(["identify"])
     assert "no setup given" in capsys.readouterr().err

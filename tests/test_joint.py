@@ -125,10 +125,10 @@ def test_total_variation_is_that_of_one_picture(sight) -> None:
 
 
 def test_a_pass_shows_more_than_a_picture() -> None:
-    rig = RadiometricSetup(roughness=0.05, cell_m=0.01, gain=1.0)
+    setup = RadiometricSetup(roughness=0.05, cell_m=0.01, gain=1.0)
     plate = Plane(10, 10, 0.008)
     positions = np.stack([np.linspace(-0.06, 0.06, 8), np.zeros(8)], axis=1)
-    transport = matrix_of(rig.resized((16, 24)).operator(strip_of(positions, plate), (16, 24)))
+    transport = matrix_of(setup.resized((16, 24)).operator(strip_of(positions, plate), (16, 24)))
     truth = torch.zeros(10, 10, dtype=torch.float64)
     truth[2:8, 2:4] = truth[6:8, 2:8] = 1
     generator = torch.Generator().manual_seed(0)
@@ -142,14 +142,14 @@ def test_a_pass_shows_more_than_a_picture() -> None:
     assert error[8] < 0.9 * error[1]
 
 
-def test_white_levels_are_the_rigs() -> None:
-    """A strip of other cells at a smaller size shows a plate as bright as the rig's own wall does."""
-    rig = RadiometricSetup(roughness=0.08, cell_m=0.008, gain=0.9)
+def test_white_levels_are_the_setups() -> None:
+    """A strip of other cells at a smaller size shows a plate as bright as the setup's own wall does."""
+    setup = RadiometricSetup(roughness=0.08, cell_m=0.008, gain=0.9)
     lit = torch.ones(10, 10, dtype=torch.float64)
     plate, place = Plane(10, 10, 0.008), np.array([(0.01, 0.0)])
-    small = matrix_of(rig.resized((20, 32)).operator(strip_of(place, plate), (10, 16)))
-    own = rig.transport((20, 32))
-    wall = rig.gain * own(torch.from_numpy(Target("square", np.ones((4, 4))).rasterise(own.source, place[0])))
+    small = matrix_of(setup.resized((20, 32)).operator(strip_of(place, plate), (10, 16)))
+    own = setup.transport((20, 32))
+    wall = setup.gain * own(torch.from_numpy(Target("square", np.ones((4, 4))).rasterise(own.source, place[0])))
     wall = wall.unflatten(0, (10, 2)).unflatten(2, (16, 2)).mean(dim=(1, 3))
     torch.testing.assert_close(PlatePass(small, plate, place)(lit)[0].float(), wall, rtol=0.03, atol=0.01)
 

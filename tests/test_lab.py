@@ -1,4 +1,4 @@
-"""The virtual laboratory: captures in the format of real ones, from a rig file, with a sensor of their own."""
+"""The virtual laboratory: captures in the format of real ones, from a setup's file, with their own sensor."""
 
 import dataclasses
 import socket
@@ -26,7 +26,7 @@ def small(**changes) -> Lab:
     """Return a lab that renders a capture in a second or so."""
     setup = replace(Lab().setup, cell_m=0.01, gain=0.7, ambient=0.06, ambient_gradient=(0.0, 0.0))
     cameras = {name: changes.pop(name) for name in ("sensor", "frame_camera", "pixel") if name in changes}
-    setup = replace(setup, **{"sensor": SensorSize(24, 36), **cameras, **changes.pop("rig", {})})
+    setup = replace(setup, **{"sensor": SensorSize(24, 36), **cameras, **changes.pop("setup", {})})
     settings = {
         "glyphs": FontGlyphs(family="kalam", characters="AL"),
         "frame_rate_hz": 1.0,
@@ -60,7 +60,7 @@ def test_sensor_is_drawn_from_the_stated_ranges():
         assert np.ptp(seen[path]) > 0.8 * (high - low), f"{path} does not fill its range"
 
 
-def test_a_rig_keeps_its_sensor_and_another_rig_has_its_own():
+def test_a_setup_keeps_its_sensor_and_another_setup_has_its_own():
     assert Lab(seed=3).drawn() == Lab(seed=3).drawn() == Lab(seed=3).drawn().drawn()
     assert Lab(seed=3).drawn().setup.pixel != Lab(seed=4).drawn().setup.pixel
     assert Lab(name="other", seed=3).drawn().setup.pixel != Lab(seed=3).drawn().setup.pixel
@@ -95,7 +95,7 @@ def test_what_was_drawn_is_written_down(rendered):
     drawn = lab.drawn()
     assert from_dict(Lab, notes["lab"]) == lab
     assert from_dict(type(drawn.setup.pixel), notes["drawn"]["pixel"]) == drawn.setup.pixel
-    about = read_capture(rendered / "near_L").info.rig["rendered"]
+    about = read_capture(rendered / "near_L").info.setup["rendered"]
     assert from_dict(RadiometricSetup, about["setup"]) == drawn.setup
 
 
@@ -113,7 +113,7 @@ def test_a_run_is_taken_up_again(rendered, tmp_path):
     assert content(out) == content(rendered)
 
 
-def test_more_characters_may_be_added_but_no_other_rig(rendered):
+def test_more_characters_may_be_added_but_no_other_setup(rendered):
     more = small(name="near", glyphs=FontGlyphs(family="kalam", characters="ALI"))
     with pytest.raises(DataError, match=r"begun with other settings.*seed: 0 -> 1"):
         render_captures(dataclasses.replace(more, seed=1), rendered)
@@ -127,7 +127,7 @@ def test_other_glyphs_keep_their_whole_name(tmp_path):
     assert [path.name for path in render_captures(lab, tmp_path / "o")] == ["lab_writer00_A"]
 
 
-RIG_FILE = """
+CALIBRATED_FILE = """
 name: bench
 seed: 5
 glyphs: {kind: font, family: kalam, characters: L}
@@ -147,15 +147,15 @@ spread:
 """
 
 
-def test_a_rig_file_reaches_every_option(tmp_path):
-    path = tmp_path / "rig.yaml"
-    path.write_text(RIG_FILE)
+def test_a_setup_file_reaches_every_option(tmp_path):
+    path = tmp_path / "setup.yaml"
+    path.write_text(CALIBRATED_FILE)
     lab = load_yaml(Lab, path)
     assert len(lab.setup.occluders()) == 1
     assert 0.3 <= lab.drawn().setup.pixel.threshold_on <= 0.4
     (folder,) = render_captures(lab, tmp_path / "o")
     capture = read_capture(folder)
-    assert "1 occluder(s), torch-lit target" in capture.info.rig["wall"]
+    assert "1 occluder(s), torch-lit target" in capture.info.setup["wall"]
     # Each option changes what the camera sees.
     scene = Scene(lab.glyphs.target("kalam_L"), lab.motion, lab.duration_s)
     seen = lab.setup.resized((24, 36)).observe(scene).irradiance(4.0)
@@ -170,7 +170,7 @@ def test_a_rig_file_reaches_every_option(tmp_path):
         assert float((other - seen).abs().max()) > 1e-3, change
 
 
-def test_the_documents_rig_file():
+def test_the_documents_setup_file():
     text = (Path(__file__).parent.parent / "docs" / "lab.md").read_text()
     lab = from_dict(Lab, yaml.safe_load(text.split("```yaml")[1].split("```")[0]))
     assert (lab.name, lab.setup.lamp_m, lab.spread) == (
@@ -183,7 +183,7 @@ def test_the_documents_rig_file():
 
 
 @pytest.mark.parametrize("name", ["matte-near", "aperture-far"])
-def test_named_rigs_render(name, tmp_path):
+def test_named_setups_render(name, tmp_path):
     lab = lab_preset(name)
     lab = dataclasses.replace(
         lab,
@@ -195,7 +195,7 @@ def test_named_rigs_render(name, tmp_path):
     capture = read_capture(folder)
     assert folder.name == f"{name}_T"
     assert capture.frames.mean() > 1.3 * 255 * lab.setup.ambient
-    assert capture.info.rig["distance_m"] == (0.5 if name.endswith("far") else 0.3)
+    assert capture.info.setup["distance_m"] == (0.5 if name.endswith("far") else 0.3)
 
 
 def test_all_names():
@@ -206,12 +206,12 @@ def test_all_names():
     assert setup_preset("main-far", 0.4).distance_m == 0.4
 
 
-def test_occluders_of_a_rig_are_those_of_its_matrix():
+def test_occluders_of_a_setup_are_those_of_its_matrix():
     """A plate-sized screen right before the target leaves only what passes beside it."""
     wide = ((-0.4, -0.3, 0.29), (0.0, -0.3, 0.29), (0.0, 0.3, 0.29), (-0.4, 0.3, 0.29))
-    rig = RadiometricSetup(wall_material="lambert", cell_m=0.01, occluders_m=(wide,))
+    setup = RadiometricSetup(wall_material="lambert", cell_m=0.01, occluders_m=(wide,))
     with pytest.raises(ConfigError, match="no light"):
-        rig.transport((6, 9))
+        setup.transport((6, 9))
     half = tuple((min(x, -0.173), y, z) for x, y, z in wide)
     left = RadiometricSetup(wall_material="lambert", cell_m=0.01, occluders_m=(half,))
     matrix = left.matrix((6, 9), Plane(2, 2, 0.04))
@@ -255,7 +255,7 @@ BAD = [
     ),
     (
         "needs 4 cells a side to show any shape: give at most 0.005 m",
-        lambda: small(rig={}).setup.resized((6, 9)).observe(tiny_plate()),
+        lambda: small(setup={}).setup.resized((6, 9)).observe(tiny_plate()),
     ),
     ("cell_m is 0", lambda: RadiometricSetup(cell_m=0.0).resized((6, 9)).observe(scene())),
     ("strip_height_m is 0", lambda: RadiometricSetup(strip_m=(0.24, 0.0)).resized((6, 9)).observe(scene())),
@@ -290,13 +290,13 @@ def tiny_plate() -> Scene:
 
 
 @pytest.mark.parametrize(("match", "make"), BAD, ids=[match for match, _ in BAD])
-def test_bad_rigs(match, make):
+def test_bad_setups(match, make):
     with pytest.raises(ConfigError, match=match):
         make()
 
 
-def test_a_wrong_rig_writes_nothing(tmp_path):
-    lab = small(rig={"camera_angle_deg": 80.0})
+def test_a_wrong_setup_writes_nothing(tmp_path):
+    lab = small(setup={"camera_angle_deg": 80.0})
     with pytest.raises(ConfigError, match="does not see the wall"):
         render_captures(lab, tmp_path / "o")
     assert not (tmp_path / "o").exists()
@@ -323,6 +323,6 @@ def test_a_pitch_at_the_limit_still_propagates():
 
 
 def test_settings_survive_a_file(tmp_path):
-    lab = small(rig={"occluders_m": (((-0.14, 0.0, 0.2), (-0.1, 0.0, 0.2), (-0.1, 0.05, 0.2)),)})
+    lab = small(setup={"occluders_m": (((-0.14, 0.0, 0.2), (-0.1, 0.0, 0.2), (-0.1, 0.05, 0.2)),)})
     save_yaml(lab, tmp_path / "lab.yaml")
     assert load_yaml(Lab, tmp_path / "lab.yaml") == lab

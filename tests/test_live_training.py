@@ -97,8 +97,8 @@ def test_training_without_a_dataset_goes_on_after_a_stop_with_the_same_bytes(few
 
 
 def test_the_command_simulates_as_it_trains(few, tmp_path, capsys) -> None:
-    save_yaml(few, tmp_path / "rig.yaml")
-    arguments = ["train", "--simulate", str(tmp_path / "rig.yaml"), "--epochs", "1", "--precision", "float32"]
+    save_yaml(few, tmp_path / "setup.yaml")
+    arguments = ["train", "--simulate", str(tmp_path / "setup.yaml"), "--epochs", "1", "--precision", "float32"]
     arguments += [
         "--simulate-on",
         "cpu",
@@ -113,7 +113,7 @@ def test_the_command_simulates_as_it_trains(few, tmp_path, capsys) -> None:
     assert "1 epochs" in capsys.readouterr().out
     (line,) = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     assert json.loads(line)["epoch"] == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.yaml", "run"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["setup.yaml", "run"]
     assert not list(tmp_path.rglob("*.h5"))
 
 

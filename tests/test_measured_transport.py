@@ -1,4 +1,4 @@
-"""A rig's own light transport: planned, rendered by our simulator, imported, simulated, inverted."""
+"""A setup's own light transport: planned, rendered by our simulator, imported, simulated, inverted."""
 
 import csv
 import json
@@ -47,14 +47,14 @@ from pretend_device import PRETENDED, PretendedDevice
 
 SHAPE = (24, 40)
 PLANE = Plane(6, 12, 0.01)
-RIG = RadiometricSetup(roughness=0.1, cell_m=0.01, strip_m=(0.12, 0.06), ambient=0.03)
+SETUP = RadiometricSetup(roughness=0.1, cell_m=0.01, strip_m=(0.12, 0.06), ambient=0.03)
 CAMERA = FrameCamera(bit_depth=16, black_level=1024, full_well_e=1e9, read_noise_e=0, prnu=0, dsnu_e=0)
 SCALE = (65535 - 1024) / 65535  # white levels of the picture to one of light
 
 
-def rig_matrix(level: float) -> np.ndarray:
-    """Return the rig's matrix [H W, cells] whose largest entry is `level` white levels."""
-    matrix = RIG.matrix(SHAPE, PLANE).numpy()
+def setup_matrix(level: float) -> np.ndarray:
+    """Return the setup's matrix [H W, cells] whose largest entry is `level` white levels."""
+    matrix = SETUP.matrix(SHAPE, PLANE).numpy()
     return matrix * (level / matrix.max())
 
 
@@ -77,11 +77,11 @@ def small_plan(**changes) -> ScanPlan:
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory) -> dict[str, Path]:
-    """The same rig scanned by raster and by Hadamard patterns, with the same noise of a frame."""
+    """The same setup scanned by raster and by Hadamard patterns, with the same noise of a frame."""
     folders = {}
     for pattern in ("raster", "hadamard"):
         folders[pattern] = tmp_path_factory.mktemp("scan") / pattern
-        record(folders[pattern], small_plan(pattern=pattern), rig_matrix(0.02), with_read_noise(0.004))
+        record(folders[pattern], small_plan(pattern=pattern), setup_matrix(0.02), with_read_noise(0.004))
     return folders
 
 
@@ -89,7 +89,7 @@ def noisy(tmp_path_factory) -> dict[str, Path]:
 def clean(tmp_path_factory) -> tuple[Path, Path]:
     """A scan with little noise, and its transport."""
     folder = tmp_path_factory.mktemp("scan") / "clean"
-    own = RIG.transport(SHAPE).matrix.double().numpy() * RIG.gain
+    own = SETUP.transport(SHAPE).matrix.double().numpy() * SETUP.gain
     record(folder, small_plan(exposure_s=0.02), own, with_read_noise(2e-5))
     out = folder / "transport.safetensors"
     write_measurement(out, import_scan(folder).measurement)
@@ -148,7 +148,7 @@ def test_estimate_follows_the_camera() -> None:
 
 
 def test_import_recovers_the_matrix_within_its_noise(noisy) -> None:
-    truth = rig_matrix(0.02) * SCALE
+    truth = setup_matrix(0.02) * SCALE
     errors = {}
     for pattern, folder in noisy.items():
         found = import_scan(folder, ScanImport(denoise=False))
@@ -169,7 +169,7 @@ def test_import_recovers_the_matrix_within_its_noise(noisy) -> None:
 
 
 def test_denoising_helps_by_what_it_says_or_is_left_out(noisy, clean) -> None:
-    truth = rig_matrix(0.02) * SCALE
+    truth = setup_matrix(0.02) * SCALE
     for folder in noisy.values():
         found = import_scan(folder)
         assert found.denoising.applied
@@ -181,7 +181,7 @@ def test_denoising_helps_by_what_it_says_or_is_left_out(noisy, clean) -> None:
         )
     folder, _ = clean
     found = import_scan(folder)
-    own = RIG.transport(SHAPE).matrix.double().numpy() * RIG.gain * SCALE
+    own = SETUP.transport(SHAPE).matrix.double().numpy() * SETUP.gain * SCALE
     assert rms(found.measurement.matrix.numpy() - own) <= 1.02 * rms(found.raw.numpy() - own)
 
 
@@ -199,41 +199,41 @@ def test_denoising_leaves_a_rough_matrix_alone() -> None:
 
 def test_one_repeat_is_not_denoised(tmp_path) -> None:
     record(
-        tmp_path / "one", small_plan(repeats=1, pattern="hadamard"), rig_matrix(0.02), with_read_noise(0.002)
+        tmp_path / "one", small_plan(repeats=1, pattern="hadamard"), setup_matrix(0.02), with_read_noise(0.002)
     )
     found = import_scan(tmp_path / "one")
     assert not found.denoising.applied
     assert any("one repeat" in warning for warning in found.warnings)
-    error = found.measurement.matrix.numpy() - rig_matrix(0.02) * SCALE
+    error = found.measurement.matrix.numpy() - setup_matrix(0.02) * SCALE
     assert rms(error) == pytest.approx(rms(found.measurement.noise), rel=0.1)
 
 
 @pytest.mark.parametrize("shape", [SHAPE, (17, 29)])
 def test_adjoint_of_a_measured_transport(clean, shape) -> None:
-    rig = MeasuredSetup(file=str(clean[1]))
-    operator = rig.transport(shape)
+    setup = MeasuredSetup(file=str(clean[1]))
+    operator = setup.transport(shape)
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(3, *PLANE.shape, generator=draw, dtype=torch.float64)
     y = torch.randn(3, *shape, generator=draw, dtype=torch.float64)
     left, right = (operator(x) * y).sum(), (x * operator.adjoint(y)).sum()
     assert float(left) == pytest.approx(float(right), rel=1e-10)
     finer = Plane(12, 24, 0.005)
-    split = rig.matrix(shape, finer).unflatten(1, (6, 2, 12, 2)).sum(dim=(2, 4)).flatten(1)
+    split = setup.matrix(shape, finer).unflatten(1, (6, 2, 12, 2)).sum(dim=(2, 4)).flatten(1)
     torch.testing.assert_close(split, operator.matrix.double())
     with pytest.raises(ConfigError, match="scan a larger plane"):
-        rig.matrix(shape, Plane(6, 20, 0.01))
+        setup.matrix(shape, Plane(6, 20, 0.01))
     with pytest.raises(ConfigError, match="24 x 40 pixels"):
-        rig.transport((25, 40))
+        setup.transport((25, 40))
 
 
-def test_simulation_of_the_measured_rig_is_that_of_the_true_one(clean) -> None:
+def test_simulation_of_the_measured_setup_is_that_of_the_true_one(clean) -> None:
     _, file = clean
     measured = MeasuredSetup(file=str(file), gain=1 / SCALE, dark_frames=False, ambient=0.03)
     mask = np.zeros((8, 8), np.float32)
     mask[:, 2:4], mask[6:, 2:7] = 1, 1
     scene = Scene(Target("L", mask, 0.04), LineMotion((-0.03, 0.0)), 3.0)
     times = np.linspace(0, 3, 9)
-    ours, true = (rig.resized(SHAPE).observe(scene).irradiance(times).numpy() for rig in (measured, RIG))
+    ours, true = (setup.resized(SHAPE).observe(scene).irradiance(times).numpy() for setup in (measured, SETUP))
     light = true - 0.03
     assert rms(ours - true) < 2e-3 * light.max()
     assert np.abs(ours - true).max() < 1e-2 * light.max()
@@ -246,10 +246,12 @@ def test_simulation_of_the_measured_rig_is_that_of_the_true_one(clean) -> None:
         motion=LineMotion((-0.02, 0.0)),
         duration_s=2.0,
         positions=4,
-        setup=replace(RIG, sensor=SensorSize(*SHAPE)),
+        setup=replace(SETUP, sensor=SensorSize(*SHAPE)),
     )
     name = config.glyphs.objects()[0]
-    samples = [simulate_object(replace(config, setup=rig.resized(SHAPE)), name)[0] for rig in (RIG, measured)]
+    samples = [
+        simulate_object(replace(config, setup=setup.resized(SHAPE)), name)[0] for setup in (SETUP, measured)
+    ]
     frames = [one.frame.astype(np.float32) for one in samples]
     assert rms(frames[0] - frames[1]) < 1 / 255  # 8 bits and noise of their own
     counts = [one.event_count.sum() for one in samples]
@@ -335,7 +337,7 @@ def test_bad_folders_are_refused(clean, tmp_path, how, match) -> None:
 
 
 def test_a_moved_camera_a_faded_light_and_a_gamma_are_told(tmp_path) -> None:
-    matrix, quiet = rig_matrix(0.5), with_read_noise(0.002)
+    matrix, quiet = setup_matrix(0.5), with_read_noise(0.002)
 
     def moving(light, shot):
         return np.roll(light, 1, axis=1) if shot.repeat else light
@@ -359,7 +361,7 @@ def test_a_moved_camera_a_faded_light_and_a_gamma_are_told(tmp_path) -> None:
 
 def test_hot_pixels_are_left_out(tmp_path) -> None:
     plan = small_plan()
-    record(tmp_path / "hot", plan, rig_matrix(0.5), with_read_noise(1e-4))
+    record(tmp_path / "hot", plan, setup_matrix(0.5), with_read_noise(1e-4))
     for shot in plan.shots():
         path = tmp_path / "hot" / shot.file
         image = np.asarray(Image.open(path)).copy()
@@ -368,7 +370,7 @@ def test_hot_pixels_are_left_out(tmp_path) -> None:
     measured = import_scan(tmp_path / "hot").measurement
     assert measured.bad.nonzero().tolist() == [[10, 20]]
     row = measured.matrix.unflatten(0, SHAPE)[10, 20].numpy()
-    true = rig_matrix(0.5).reshape(*SHAPE, -1)[10, 20] * SCALE
+    true = setup_matrix(0.5).reshape(*SHAPE, -1)[10, 20] * SCALE
     assert np.abs(row - true).max() < 0.15 * true.max()
     images = np.zeros((1, 3, 3), np.float32)
     assert fill_bad(images, np.ones(9, bool), (3, 3)) is images
@@ -472,7 +474,7 @@ def test_strange_files_are_refused(tmp_path) -> None:
 def test_identify_tells_the_scan_s_own_noise(noisy, clean, tmp_path) -> None:
     bench = Bench(plate_m=0.06, cells=12, height=60, width=96, writers=1)
     found = identify(MeasuredSetup(file=str(clean[1]), gain=1 / SCALE), bench=bench)
-    true = identify(replace(RIG, strip_m=(0.12, 0.06)), bench=replace(bench, height=24, width=40))
+    true = identify(replace(SETUP, strip_m=(0.12, 0.06)), bench=replace(bench, height=24, width=40))
     assert found.modes == pytest.approx(true.modes, abs=3)
     assert found.at_fixed.psnr_db == pytest.approx(true.at_fixed.psnr_db, abs=0.3)
     assert any("10.0 mm" in warning for warning in found.warnings)
@@ -484,14 +486,14 @@ def test_identify_tells_the_scan_s_own_noise(noisy, clean, tmp_path) -> None:
 
 
 def test_commands_from_plan_to_picture(tmp_path, capsys) -> None:
-    scan, out = tmp_path / "scan", tmp_path / "rig.safetensors"
+    scan, out = tmp_path / "scan", tmp_path / "setup.safetensors"
     main(["scan", "plan", str(scan), "--plane", "0.12", "0.06", "--pattern", "hadamard", "--json"])
     planned = json.loads(capsys.readouterr().out)
     assert planned["shots"] == 2 * (79 + 3) + 5
     import shutil
 
     shutil.rmtree(scan)
-    matrix = rig_matrix(0.02)
+    matrix = setup_matrix(0.02)
     record(scan, small_plan(pattern="hadamard"), matrix, with_read_noise(2e-4))
     main(["scan", "import", str(scan), "--out", str(out), "--json"])
     found = json.loads(capsys.readouterr().out)
@@ -516,15 +518,15 @@ def test_commands_from_plan_to_picture(tmp_path, capsys) -> None:
     assert "does not exist" in capsys.readouterr().err
 
 
-def test_whole_passes_are_inverted_under_a_measured_rig(tiny_captures, tmp_path, capsys) -> None:
-    rig, shape = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06), (48, 72)
-    save_yaml(Simulation(setup=replace(rig, sensor=SensorSize(*shape))), tmp_path / "rig.yaml")
-    matrix = rig.transport(shape).matrix * rig.gain
+def test_whole_passes_are_inverted_under_a_measured_setup(tiny_captures, tmp_path, capsys) -> None:
+    setup, shape = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06), (48, 72)
+    save_yaml(Simulation(setup=replace(setup, sensor=SensorSize(*shape))), tmp_path / "setup.yaml")
+    matrix = setup.transport(shape).matrix * setup.gain
     flat = torch.full(shape, 0.06)
-    measured = Measurement(matrix, torch.full(shape, 1e-4), flat, About(rig.source(), *shape, 400.0))
-    write_measurement(tmp_path / "rig.safetensors", measured)
+    measured = Measurement(matrix, torch.full(shape, 1e-4), flat, About(setup.source(), *shape, 400.0))
+    write_measurement(tmp_path / "setup.safetensors", measured)
     pictures = []
-    for name in ("rig.yaml", "rig.safetensors"):
+    for name in ("setup.yaml", "setup.safetensors"):
         options = ["--cells", "8", "--solver", "tikhonov", "--out", str(tmp_path / f"{name}.png"), "--json"]
         main(["invert", str(tiny_captures[0]), "--setup", str(tmp_path / name), *options])
         rows = json.loads(capsys.readouterr().out)["rows"]

@@ -1,4 +1,4 @@
-"""What a mismatch costs: rows from a demo's records and calibration, margins, and rigs that are refused."""
+"""What a mismatch costs: rows from a demo's records and calibration, margins, and setups that are refused."""
 
 import json
 import math
@@ -28,9 +28,9 @@ def keep(out: Path, seed: int, scores: dict[tuple[str, str], float], warnings: l
         means = {"psnr_db": {"x_G": value - 1, "x_K": value + 1}}
         record = Record("demo", "demo", arm, modality, seed, "test", means, {}, mean, {}, {})
         write_record(record, out / "records" / "demo")
-    rig = out / "rigs" / "demo"
-    rig.mkdir(parents=True, exist_ok=True)
-    (rig / FIGURES_FILE).write_text(
+    setup = out / "setups" / "demo"
+    setup.mkdir(parents=True, exist_ok=True)
+    (setup / FIGURES_FILE).write_text(
         json.dumps({"residuals": LEFT, "warnings": warnings, "expectation": "ahead"})
     )
 
@@ -65,17 +65,17 @@ def test_the_least_lead_is_named(tmp_path):
     assert "- two: the calibration warned of nothing; it expected: ahead." in text
 
 
-def test_each_rig_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
-    for rig in ("flat", "odd"):
+def test_each_setup_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
+    for setup in ("flat", "odd"):
         for name in "AG":
-            (tmp_path / "captures" / rig / f"{rig}_{name}").mkdir(parents=True)
-            (tmp_path / "captures" / rig / f"{rig}_{name}" / "capture.yaml").write_text("x: 1")
+            (tmp_path / "captures" / setup / f"{setup}_{name}").mkdir(parents=True)
+            (tmp_path / "captures" / setup / f"{setup}_{name}" / "capture.yaml").write_text("x: 1")
     ran = []
 
     def demo(settings: Demo) -> None:
         ran.append((settings.out.name, [folder.name for folder in settings.captures], settings.seed))
         if settings.out.name.startswith("odd"):
-            raise CalibrationError("no rig fits")
+            raise CalibrationError("no setup fits")
         keep(settings.out, settings.seed, {("E2E", "frame"): 1.0, ("EPNP", "frame"): 2.0}, [])
 
     monkeypatch.setattr("evnlos.demo.run_demo", demo)
@@ -86,13 +86,13 @@ def test_each_rig_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
         ("odd-seed0", ["odd_A", "odd_G"], 0),
         ("odd-seed3", ["odd_A", "odd_G"], 3),
     ]
-    assert [one.rig for one in found] == ["flat", "odd"] and found[1].refused == "no rig fits"
+    assert [one.setup for one in found] == ["flat", "odd"] and found[1].refused == "no setup fits"
     written = (tmp_path / "out" / "mismatch.md").read_text()
-    assert "| odd | refused: no rig fits |" in written and "| flat | frame |" in written
+    assert "| odd | refused: no setup fits |" in written and "| flat | frame |" in written
 
 
-def test_unknown_rigs_and_empty_folders_are_refused(tmp_path):
-    with pytest.raises(ConfigError, match="rig 'flat' is unknown; give some of two-lobes"):
+def test_unknown_setups_and_empty_folders_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="setup 'flat' is unknown; give some of two-lobes"):
         run_mismatch(Demo(out=tmp_path), ("flat",))
     with pytest.raises(ConfigError, match="holds no folders of captures"):
         run_mismatch(Demo(out=tmp_path), (), tmp_path)

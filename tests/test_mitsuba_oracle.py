@@ -18,7 +18,7 @@ from mitsuba_oracle import (
     Agreement,
     compare,
     pattern,
-    trace_rig,
+    trace_setup,
     wall_image,
 )
 
@@ -30,14 +30,17 @@ def renders(name: str) -> np.ndarray:
     """Return the renders of one wall; each is made once."""
     pytest.importorskip("mitsuba")
     if name not in RENDERS:
-        RENDERS[name] = trace_rig(WALLS[name], SHAPE, pattern())
+        RENDERS[name] = trace_setup(WALLS[name], SHAPE, pattern())
     return RENDERS[name]
 
 
 def image(name: str, brightness: np.ndarray | None = None, **changes) -> np.ndarray:
-    rig = dataclasses.replace(WALLS[name], **changes)
+    setup = dataclasses.replace(WALLS[name], **changes)
     return wall_image(
-        rig, SHAPE, pattern() if brightness is None else brightness, SHADOW_POINTS if rig.occluders() else None
+        setup,
+        SHAPE,
+        pattern() if brightness is None else brightness,
+        SHADOW_POINTS if setup.occluders() else None,
     )
 
 
@@ -82,22 +85,24 @@ def test_a_notched_and_tilted_occluder():
     pytest.importorskip("mitsuba")
     flat = [(-0.15, -0.03), (-0.05, -0.03), (-0.05, 0.04), (-0.1, -0.01), (-0.15, 0.04)]
     notched = Occluder(tuple((x, y, 0.2 + 0.5 * y) for x, y in flat))
-    rig = RadiometricSetup(roughness=0.3)
-    place = {"offset_m": rig.offset_m(), "occluders": (notched,)}
-    matrix = light_transport_matrix(rig.view(SHAPE), PATTERN, 0.3, rig.brdf(), points=SHADOW_POINTS, **place)
+    setup = RadiometricSetup(roughness=0.3)
+    place = {"offset_m": setup.offset_m(), "occluders": (notched,)}
+    matrix = light_transport_matrix(
+        setup.view(SHAPE), PATTERN, 0.3, setup.brdf(), points=SHADOW_POINTS, **place
+    )
     expected = (matrix @ torch.as_tensor(pattern()).flatten()).reshape(SHAPE).numpy()
-    traced = trace(rig.view(SHAPE), PATTERN, pattern(), 0.3, rig.brdf(), **place)
+    traced = trace(setup.view(SHAPE), PATTERN, pattern(), 0.3, setup.brdf(), **place)
     assert compare(expected, traced).agrees
     assert not compare(image("GGX 0.3"), traced).agrees
 
 
 def test_same_seed_same_render():
     pytest.importorskip("mitsuba")
-    rig = WALLS["GGX 0.3"]
+    setup = WALLS["GGX 0.3"]
 
     def once(seed: int) -> np.ndarray:
-        camera, place = rig.view((3, 4)), {"offset_m": rig.offset_m()}
-        return trace(camera, PATTERN, pattern(), 0.3, rig.brdf(), samples=4, repeats=2, seed=seed, **place)
+        camera, place = setup.view((3, 4)), {"offset_m": setup.offset_m()}
+        return trace(camera, PATTERN, pattern(), 0.3, setup.brdf(), samples=4, repeats=2, seed=seed, **place)
 
     np.testing.assert_array_equal(once(5), once(5))
     assert (once(5)[0] != once(5)[1]).any()

@@ -38,7 +38,7 @@ def modes(matrix: torch.Tensor) -> int:
     return int((values > 1e-2 * values.max()).sum())
 
 
-def rig_matrix(brdf, distance: float, **options) -> torch.Tensor:
+def setup_matrix(brdf, distance: float, **options) -> torch.Tensor:
     offset = (-distance * math.tan(ANGLE), 0.0)
     return light_transport_matrix(camera(), Plane(32, 32, 0.0025), distance, brdf, offset_m=offset, **options)
 
@@ -54,18 +54,18 @@ def directions(theta: torch.Tensor, phi: torch.Tensor):
 )
 def test_mode_counts(brdf, near, far):
     for distance, count in ((0.3, near), (0.5, far)):
-        assert abs(modes(rig_matrix(brdf, distance)) - count) <= max(1, 0.03 * count)
+        assert abs(modes(setup_matrix(brdf, distance)) - count) <= max(1, 0.03 * count)
 
 
 def test_mode_count_of_the_smoothest_wall():
     """One quadrature point a cell will do for a count within three per cent; 106 of 107 near take two."""
-    assert abs(modes(rig_matrix(GGX(0.02), 0.5, points=(2, 1))) - 47) <= 1.5
+    assert abs(modes(setup_matrix(GGX(0.02), 0.5, points=(2, 1))) - 47) <= 1.5
 
 
 def test_mode_count_behind_a_post():
     for distance, count in ((0.3, 16), (0.5, 17)):
         post = Occluder.post(-distance * math.tan(ANGLE) / 2, distance / 2, 0.016)
-        assert abs(modes(rig_matrix(Lambert(), distance, occluders=(post,))) - count) <= 1
+        assert abs(modes(setup_matrix(Lambert(), distance, occluders=(post,))) - count) <= 1
 
 
 @pytest.mark.parametrize("brdf", [Lambert(0.7), GGX(0.2), GGX(0.3, 0.1)], ids=["lambert", "ggx", "brushed"])
@@ -311,7 +311,7 @@ def test_lamp():
     assert float(lit[150] / lit[100]) == pytest.approx(math.cos(angle) ** (3 + exponent))
 
 
-def test_torch_lit_rig_is_the_bare_one_times_the_light():
+def test_torch_lit_setup_is_the_bare_one_times_the_light():
     bare = RadiometricSetup(roughness=0.3, cell_m=0.02)
     lit = RadiometricSetup(roughness=0.3, cell_m=0.02, lamp_m=(-0.5, 0.0, 0.05))
     ratio = lit.transport((4, 6)).matrix / bare.transport((4, 6)).matrix
@@ -394,7 +394,7 @@ def test_presets():
             lambda: Occluder(((0.0, 0.0, 0.1), (0.1, 0.0, 0.1), (0.1, 0.1, 0.1), (0.0, 0.1, 0.2))),
         ),
         ("width_m", lambda: Occluder.post(0.0, 0.1, 0.0)),
-        ("reaches z", lambda: rig_matrix(Lambert(), 0.1, occluders=(Occluder.post(0.0, 0.15, 0.01),))),
+        ("reaches z", lambda: setup_matrix(Lambert(), 0.1, occluders=(Occluder.post(0.0, 0.15, 0.01),))),
         ("needs it below", lambda: lamp_radiance(Plane(1, 1, 1.0), 0.3, (0.0, 0.0, 0.4))),
         ("half_angle_deg", lambda: lamp_radiance(Plane(1, 1, 1.0), 0.3, (0.0, 0.0, 0.0), half_angle_deg=90.0)),
         (

@@ -1,4 +1,4 @@
-"""The page to mail: set-up, films, failures, limits and origin, small and without requests."""
+"""The page to mail: setup, films, failures, limits and origin, small and without requests."""
 
 import html
 import re
@@ -68,23 +68,23 @@ def made(tmp_path_factory):
 
 def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None:
     data, runs = made
-    rig = named_setup("main-near")
-    limits = identify(rig.setup, Bench(cells=8, height=12, width=20, writers=1), "main-near")
-    path = write_report(tmp_path / "report.html", data, runs, [], rig=rig, limits=limits)
+    setup = named_setup("main-near")
+    limits = identify(setup.setup, Bench(cells=8, height=12, width=20, writers=1), "main-near")
+    path = write_report(tmp_path / "report.html", data, runs, [], setup=setup, limits=limits)
     page = path.read_text()
     assert path.stat().st_size < 5e6
     assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
     assert not re.findall(r"https?:", page.replace("http://www.w3.org/2000/svg", ""))
     for heading in (
         "Words",
-        "The set-up",
+        "The setup",
         "Moving",
         "Position by position",
         "Where it fails",
         "How it was made",
     ):
         assert f"<h2>{heading}</h2>" in page
-    assert "What this rig can show at all" in page and html.escape(limits.verdict) in page
+    assert "What this setup can show at all" in page and html.escape(limits.verdict) in page
     assert "metal of roughness 0.05" in page
     assert page.count("data:image/webp") == 2  # an animation an object
     assert page.count("near_G: ") >= 3  # truth and both runs over positions
@@ -135,23 +135,23 @@ def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypat
 
 
 def test_report_and_reconstruct_take_a_calibrated_folder_and_say_what_else(tmp_path, capsys) -> None:
-    folder = tmp_path / "near_rig"
+    folder = tmp_path / "near_setup"
     folder.mkdir()
     transport = RadiometricSetup(roughness=0.07)
-    save_yaml(Simulation(setup=transport), folder / "rig.yaml")
-    for given in (folder, folder / "rig.yaml"):
+    save_yaml(Simulation(setup=transport), folder / "setup.yaml")
+    for given in (folder, folder / "setup.yaml"):
         assert named_setup(given).setup == transport
-        assert named_setup(given).word == named_setup(given).name == "near_rig"
+        assert named_setup(given).word == named_setup(given).name == "near_setup"
         assert calibrated_folder(given) == folder
     save_yaml(Simulation(), tmp_path / "mine.yaml")
     save_yaml(Simulation(), folder / "dataset.yaml")
     assert named_setup(tmp_path / "mine.yaml").word == "mine.yaml"
-    assert named_setup(folder / "dataset.yaml").word == "near_rig/dataset.yaml"
+    assert named_setup(folder / "dataset.yaml").word == "near_setup/dataset.yaml"
     assert named_setup("main-near").word == "main-near"
     with pytest.raises(SystemExit):
         main(["reconstruct", str(tmp_path), "--setup", "main-near", "--out", str(tmp_path / "out")])
     said = capsys.readouterr().err
-    assert "holds no rig.yaml" in said and "`calibrate` wrote" in said and "main-near" in said
+    assert "holds no setup.yaml" in said and "`calibrate` wrote" in said and "main-near" in said
     assert not (tmp_path / "out").exists()
 
 
@@ -184,7 +184,7 @@ def test_the_page_explains_its_words_and_fits_a_phone_and_paper(made, tmp_path) 
         assert min(browser.run(shown)) > 20 and browser.run(closed) > before + 20
 
 
-def test_the_plot_of_what_a_rig_shows_ends_where_the_values_do() -> None:
+def test_the_plot_of_what_a_setup_shows_ends_where_the_values_do() -> None:
     values = torch.tensor([10.0, 1.0, 0.1, 1e-5, 1e-2, 1e-4, 1e-9])
     points = _points(values)
     assert [x for x, _ in points] == [1, 2, 3, 4, 5]
@@ -195,8 +195,8 @@ def test_the_plot_of_what_a_rig_shows_ends_where_the_values_do() -> None:
 @pytest.mark.parametrize("name", ["main-near", "hard-far", "aperture-near"])
 @pytest.mark.parametrize("angle", [30.0, -30.0])
 def test_the_drawing_sketches_what_hides_the_object_and_nothing_else(name, angle) -> None:
-    rig = replace(setup_preset(name), camera_angle_deg=angle)
-    drawn = setup_drawing(rig, travel_m=0.16, plate_m=0.08).svg
+    setup = replace(setup_preset(name), camera_angle_deg=angle)
+    drawn = setup_drawing(setup, travel_m=0.16, plate_m=0.08).svg
     assert drawn.count(PARTITION) == 1 and (">occluder</text>" in drawn) == (name == "aperture-near")
     lines = [
         [tuple(float(v) for v in one.split(",")) for one in points.split()]
@@ -286,22 +286,22 @@ def test_the_worst_pictures_are_of_several_objects() -> None:
     assert _worst(gain[:2], names[:2]) == [0, 1]
 
 
-def test_without_a_rig_the_page_says_how_to_name_it(made, tmp_path) -> None:
+def test_without_a_setup_the_page_says_how_to_name_it(made, tmp_path) -> None:
     page = write_report(tmp_path / "report.html", *made, []).read_text()
-    assert "evnlos report --rig RIG.yaml" in page and "What this rig can show" not in page
+    assert "evnlos report --setup SETUP.yaml" in page and "What this setup can show" not in page
 
 
-def test_the_drawing_of_a_rig_is_to_scale() -> None:
+def test_the_drawing_of_a_setup_is_to_scale() -> None:
     from xml.dom.minidom import parseString
 
-    for rig in (RadiometricSetup(distance_m=0.3), PaperSetup(distance_m=0.5)):
-        drawing = parseString(setup_drawing(rig, travel_m=0.16, plate_m=0.08).svg)
+    for setup in (RadiometricSetup(distance_m=0.3), PaperSetup(distance_m=0.5)):
+        drawing = parseString(setup_drawing(setup, travel_m=0.16, plate_m=0.08).svg)
         lines = [one.getAttribute("points") for one in drawing.getElementsByTagName("polyline")]
         way, plate = (np.array([[float(v) for v in p.split(",")] for p in line.split()]) for line in lines[:2])
         wall = np.array([[float(v) for v in p.split(",")] for p in lines[-1].split()])
         length = float(np.ptp(plate[:, 0]))
         assert np.ptp(way[:, 0]) == pytest.approx(3 * length, abs=0.3)  # 24 cm beside 8 cm
-        assert plate[0, 1] - wall[0, 1] == pytest.approx(length * rig.distance_m / 0.08, rel=0.01)
+        assert plate[0, 1] - wall[0, 1] == pytest.approx(length * setup.distance_m / 0.08, rel=0.01)
 
 
 @pytest.mark.parametrize("value", [0.0, 18.5, -3e9])

@@ -16,6 +16,7 @@ from evnlos.config import from_dict, load_yaml, save_yaml, to_dict
 from evnlos.data import Simulation, simulate_object
 from evnlos.data.lab import Lab, lab_of
 from evnlos.errors import ConfigError, DataError
+from evnlos.migrate import migrate
 from evnlos.optics.facets import SlopeTable
 from evnlos.scene import LineMotion, PathMotion, Pose, Scene, Target
 from evnlos.setups import (
@@ -25,6 +26,7 @@ from evnlos.setups import (
     RadiometricSetup,
     SensorSize,
     Setup,
+    calibrated_folder,
     load_setup,
     named_setup,
     setup_names,
@@ -216,8 +218,8 @@ def test_words_become_setups(tmp_path: Path) -> None:
     folder = tmp_path / "near"
     folder.mkdir()
     rough = RadiometricSetup(roughness=0.07, pixel=EventPixel(threshold_on=0.3))
-    save_yaml(Simulation(setup=rough), folder / "rig.yaml")
-    for word in (folder, folder / "rig.yaml"):
+    save_yaml(Simulation(setup=rough), folder / "setup.yaml")
+    for word in (folder, folder / "setup.yaml"):
         found = named_setup(word)
         assert (found.setup, found.name, found.word) == (rough, "near", "near")
     measured = _measured(tmp_path)
@@ -225,7 +227,7 @@ def test_words_become_setups(tmp_path: Path) -> None:
     for word, says in (
         ("main-nera", "perhaps you meant 'main-near'"),
         (tmp_path / "none.yaml", "does not exist"),
-        (tmp_path, "holds no rig.yaml"),
+        (tmp_path, "holds no setup.yaml"),
     ):
         with pytest.raises(ConfigError) as caught:
             load_setup(word)
@@ -295,3 +297,17 @@ def test_a_part_of_the_radiometric_setup_is_replaced_by_itself(tmp_path: Path) -
     torch.testing.assert_close(ratio[SHAPE[1] - 1], torch.full_like(ratio[0], 0.25))
     samples, _ = simulate_object(Simulation(setup=dimmed, positions=1), Simulation().glyphs.objects()[0])
     assert samples.frame.shape[0] == 1
+
+
+def test_a_setup_that_was_called_rig_loads(tmp_path: Path) -> None:
+    folder = tmp_path / "near"
+    folder.mkdir()
+    (folder / "rig.yaml").write_text("setup: {kind: radiometric, roughness: 0.07}\nrigs: 6\n")
+    for word in (folder, folder / "rig.yaml"):
+        found = named_setup(word)
+        assert (found.setup, found.name, found.word) == (RadiometricSetup(roughness=0.07), "near", "near")
+        assert calibrated_folder(word) == folder
+    assert load_yaml(Simulation, folder / "rig.yaml").setups == 6
+    notes = {"camera": {"name": "c"}, "rig": {"distance_m": 0.3}}
+    assert migrate("CaptureInfo", notes) == {"camera": {"name": "c"}, "setup": {"distance_m": 0.3}}
+    assert migrate("Record", {"study": "captures", "rig": "near"}) == {"study": "captures", "setup": "near"}

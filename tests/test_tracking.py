@@ -31,10 +31,10 @@ from evnlos.tracking import (
     Track,
     Tracking,
     event_velocity,
+    fit_motion,
     most_likely_acceleration,
     plane_map,
     register,
-    rig_shift,
     smooth,
     static_light,
     temporal_noise,
@@ -42,12 +42,12 @@ from evnlos.tracking import (
     track_doubts,
     track_frames,
 )
+from evnlos.tracking.motion_fit import Depths, Fit
 from evnlos.tracking.registration import explained_change
-from evnlos.tracking.rig_shift import Depths, Fit
 from evnlos.types import Events, Plane
 
 SHAPE = (24, 36)
-RIG = RadiometricSetup(
+SETUP = RadiometricSetup(
     roughness=0.04, camera_angle_deg=20.0, field_of_view_deg=40.0, cell_m=0.008, gain=0.8, ambient=0.05
 )
 
@@ -228,9 +228,9 @@ def test_too_few_events_say_nothing(registered) -> None:
 
 
 def test_the_plane_map_leads_back_to_the_cell() -> None:
-    to_plane = plane_map(RIG, SHAPE)
+    to_plane = plane_map(SETUP, SHAPE)
     cell = Plane(1, 1, 0.01, (0.03, -0.02))
-    picture = RIG.matrix(SHAPE, cell).reshape(SHAPE).numpy()
+    picture = SETUP.matrix(SHAPE, cell).reshape(SHAPE).numpy()
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     middle = np.array([(picture * x).sum(), (picture * y).sum()]) / picture.sum()
     np.testing.assert_allclose(to_plane(middle), (0.03, -0.02), atol=2e-3)
@@ -241,7 +241,7 @@ def test_the_plane_map_leads_back_to_the_cell() -> None:
 
 
 def test_a_matte_wall_shows_no_place() -> None:
-    with pytest.raises(DataError, match="without the rig"):
+    with pytest.raises(DataError, match="without the setup"):
         plane_map(RadiometricSetup(wall_material="lambert"), SHAPE)
 
 
@@ -252,10 +252,10 @@ def letter() -> Target:
 
 
 def test_the_calibrated_operator_finds_the_path() -> None:
-    own = RIG.transport(SHAPE)
+    own = SETUP.transport(SHAPE)
     positions = np.stack([np.linspace(-0.06, 0.06, 5), np.zeros(5)], axis=1)
-    light = RIG.gain * own(torch.from_numpy(letter().rasterise(own.source, positions)))
-    found = rig_shift(light, RIG, positions + 0.002, 2e-3, 0.1, cells=10)
+    light = SETUP.gain * own(torch.from_numpy(letter().rasterise(own.source, positions)))
+    found = fit_motion(light, SETUP, positions + 0.002, 2e-3, 0.1, cells=10)
     error = found.position_m - positions
     assert np.abs(error - error.mean(axis=0)).max() < 1e-3
     along = (np.arange(16) + 0.5) / 16 * 0.08 - 0.04
@@ -265,13 +265,13 @@ def test_the_calibrated_operator_finds_the_path() -> None:
 
 
 def retreating(log_distance: np.ndarray, positions: np.ndarray) -> torch.Tensor:
-    """Frames of a letter whose distance changes while nothing else of the rig does."""
-    source = RIG.source()
+    """Frames of a letter whose distance changes while nothing else of the setup does."""
+    source = SETUP.source()
     strips = torch.from_numpy(letter().rasterise(source, positions)).double()
-    scale = RIG.gain * float(RIG.transport(SHAPE).matrix.double().sum() / RIG.matrix(SHAPE, source).sum())
-    fixed = replace(RIG, target_offset_m=RIG.offset_m())
+    scale = SETUP.gain * float(SETUP.transport(SHAPE).matrix.double().sum() / SETUP.matrix(SHAPE, source).sum())
+    fixed = replace(SETUP, target_offset_m=SETUP.offset_m())
     frames = [
-        replace(fixed, distance_m=RIG.distance_m * np.exp(far)).matrix(SHAPE, source) @ strip.flatten()
+        replace(fixed, distance_m=SETUP.distance_m * np.exp(far)).matrix(SHAPE, source) @ strip.flatten()
         for far, strip in zip(log_distance, strips, strict=True)
     ]
     return scale * torch.stack(frames).unflatten(1, SHAPE)
@@ -283,7 +283,7 @@ def test_approach_and_retreat_are_found(change) -> None:
     away = change * (np.linspace(-0.5, 0.5, 7) + 0.2 * np.cos(np.arange(7.0)))
     light = retreating(away, positions)
     noisy = light + 2e-3 * torch.from_numpy(np.random.default_rng(3).standard_normal(light.shape))
-    found = rig_shift(noisy, RIG, positions + 0.002, 2e-3, 0.1, cells=10, depth=True)
+    found = fit_motion(noisy, SETUP, positions + 0.002, 2e-3, 0.1, cells=10, depth=True)
     assert found.log_distance is not None and found.log_distance_sigma is not None
     error = found.log_distance - (away - away.mean())
     assert np.abs(error).max() < 0.02
@@ -292,7 +292,7 @@ def test_approach_and_retreat_are_found(change) -> None:
     assert np.abs(place - place.mean(axis=0)).max() < 3e-3
     # Without depth the path takes the blame.
     if change:
-        plain = rig_shift(noisy, RIG, positions + 0.002, 2e-3, 0.1, cells=10).position_m - positions
+        plain = fit_motion(noisy, SETUP, positions + 0.002, 2e-3, 0.1, cells=10).position_m - positions
         assert np.abs(plain - plain.mean(axis=0)).max() > 1.5 * np.abs(place - place.mean(axis=0)).max()
 
 
@@ -302,15 +302,15 @@ def test_the_step_is_that_of_plate_and_places_together(depth) -> None:
     rng = np.random.default_rng(7)
     plate = Plane(6, 6, 0.016)
     state = rng.uniform(-0.03, 0.03, (4, 3 if depth else 2))
-    transport = matrix_of(RIG.resized(SHAPE).operator(strip_of(state[:, :2] + 0.0, plate), SHAPE))
-    fit = Fit(plate, transport, Depths(RIG, transport) if depth else None, state, RIG.distance_m)
+    transport = matrix_of(SETUP.resized(SHAPE).operator(strip_of(state[:, :2] + 0.0, plate), SHAPE))
+    fit = Fit(plate, transport, Depths(SETUP, transport) if depth else None, state, SETUP.distance_m)
     light = torch.from_numpy(rng.standard_normal((4, *SHAPE)))
     prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(plate.shape, dtype=torch.float64))
     image, step, _, _ = fit.step(light, prior, 1.0)
     maps = torch.stack(
         [
             PlatePass(
-                Depths(RIG, transport).at(s[2] / RIG.distance_m) if depth else transport, plate, s[None, :2]
+                Depths(SETUP, transport).at(s[2] / SETUP.distance_m) if depth else transport, plate, s[None, :2]
             )
             .matrix()[0]
             .double()
@@ -335,7 +335,7 @@ def test_the_step_is_that_of_plate_and_places_together(depth) -> None:
     np.testing.assert_allclose(step.ravel(), reference[36 : 36 + frames * kinds].numpy(), rtol=2e-3, atol=1e-7)
 
 
-def test_a_track_in_pixels_needs_no_rig(registered) -> None:
+def test_a_track_in_pixels_needs_no_setup(registered) -> None:
     frames = ambient() + blobs(PLACES) + 2e-3 * np.random.default_rng(5).standard_normal((12, *SHAPE))
     track = track_frames(frames, np.linspace(0, 1.1, 12))
     assert track.unit == "px" and track.event_windows == 0
@@ -363,7 +363,7 @@ def test_settings_that_cannot_be_are_refused() -> None:
         Tracking(columns=4)
     with pytest.raises(ConfigError, match="window_s is 0"):
         Tracking(window_s=0.0)
-    with pytest.raises(ConfigError, match="depth needs a rig"):
+    with pytest.raises(ConfigError, match="depth needs a setup"):
         track_frames(np.zeros((9, *SHAPE)), np.arange(9.0), settings=Tracking(depth=True))
     with pytest.raises(DataError, match="3 frames"):
         track_frames(np.zeros((3, *SHAPE)), np.arange(3.0))
@@ -374,7 +374,7 @@ def capture(tmp_path_factory):
     lab = Lab(
         glyphs=FontGlyphs(family="kalam", characters="L"),
         setup=replace(
-            RIG,
+            SETUP,
             sensor=SensorSize(24, 40),
             frame_camera=FrameCamera(exposure_s=0.016, full_well_e=8000.0, read_noise_e=20.0),
             pixel=EventPixel(0.18, 0.23, 0.03, 80.0, 0.0, 0.4, 0.0),
@@ -384,17 +384,27 @@ def capture(tmp_path_factory):
         frame_rate_hz=2.0,
         spread={},
     )
-    folder = tmp_path_factory.mktemp("rig")
+    folder = tmp_path_factory.mktemp("setup")
     (made,) = render_captures(lab, folder / "captures")
-    save_yaml(Simulation(setup=RIG), folder / "rig.yaml")
-    return made, folder / "rig.yaml"
+    save_yaml(Simulation(setup=SETUP), folder / "setup.yaml")
+    return made, folder / "setup.yaml"
 
 
 def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
-    folder, rig = capture
+    folder, setup = capture
     pytest.importorskip("matplotlib")
     main(
-        ["track", str(folder), "--setup", str(rig), "--cells", "10", "--out", str(tmp_path / "t.png"), "--json"]
+        [
+            "track",
+            str(folder),
+            "--setup",
+            str(setup),
+            "--cells",
+            "10",
+            "--out",
+            str(tmp_path / "t.png"),
+            "--json",
+        ]
     )
     found = json.loads(capsys.readouterr().out)
     assert found["unit"] == "m"
@@ -409,7 +419,7 @@ def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
             "track",
             str(folder),
             "--setup",
-            str(rig),
+            str(setup),
             "--cells",
             "10",
             "--depth",
@@ -419,34 +429,34 @@ def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
     )
     assert "distance " in capsys.readouterr().out
     away = json.loads((tmp_path / "d.json").read_text())["track"]["distance"]
-    assert np.mean(away["distance_m"]) == pytest.approx(RIG.distance_m, rel=0.02)
+    assert np.mean(away["distance_m"]) == pytest.approx(SETUP.distance_m, rel=0.02)
     assert np.std(away["distance_m"]) < 0.01
 
 
-def test_a_rig_of_another_distance_or_wall_is_doubted(capture, tmp_path, capsys) -> None:
+def test_a_setup_of_another_distance_or_wall_is_doubted(capture, tmp_path, capsys) -> None:
     shot, settings = read_capture(capture[0]), Tracking(cells=10, events=False)
-    tracks = [track_capture(shot, replace(RIG, roughness=one), settings) for one in (RIG.roughness, 0.15)]
+    tracks = [track_capture(shot, replace(SETUP, roughness=one), settings) for one in (SETUP.roughness, 0.15)]
     right, rough = tracks
     assert right.misfit == pytest.approx(1, abs=0.1)
     assert rough.misfit > 1.2 and (rough.frame_sigma > right.frame_sigma).mean() > 0.9
-    assert not track_doubts(shot, RIG, right) and not track_doubts(shot, None, replace(right, misfit=None))
-    (doubt,) = track_doubts(shot, RIG, rough)
+    assert not track_doubts(shot, SETUP, right) and not track_doubts(shot, None, replace(right, misfit=None))
+    (doubt,) = track_doubts(shot, SETUP, rough)
     assert "times the noise" in doubt and "calibrate" in doubt
-    (doubt,) = track_doubts(shot, replace(RIG, distance_m=0.5), right)
-    assert "states a distance of 0.3 m, the rig 0.5 m" in doubt
-    assert not track_doubts(shot, replace(RIG, distance_m=0.305), right)
+    (doubt,) = track_doubts(shot, replace(SETUP, distance_m=0.5), right)
+    assert "states a distance of 0.3 m, the setup 0.5 m" in doubt
+    assert not track_doubts(shot, replace(SETUP, distance_m=0.305), right)
 
 
 def test_the_command_takes_a_calibrated_folder_and_says_what_no_capture_is(capture, tmp_path, capsys) -> None:
-    folder, rig = capture
-    assert linear_setup(rig.parent).optics() == linear_setup(rig).optics() == RIG.optics()
+    folder, setup = capture
+    assert linear_setup(setup.parent).optics() == linear_setup(setup).optics() == SETUP.optics()
     for words, said in (
-        ([str(folder), "--setup", str(folder)], "holds no rig.yaml; give the folder"),
+        ([str(folder), "--setup", str(folder)], "holds no setup.yaml; give the folder"),
         (
             [str(folder.parent)],
             f"give the folder of one capture (it holds 1 captures, such as {folder.name})",
         ),
-        ([str(rig.parent)], "holds no capture.yaml; give the folder of one capture"),
+        ([str(setup.parent)], "holds no capture.yaml; give the folder of one capture"),
     ):
         with pytest.raises(SystemExit):
             main(["track", *words, "--out", str(tmp_path / "t.png")])
@@ -471,8 +481,8 @@ def test_no_line_of_the_speed_lies_on_the_frame(tmp_path, monkeypatch) -> None:
 
 def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, capsys, monkeypatch) -> None:
     """Motion found gives a picture near that of motion stated, and the confidence that goes with it."""
-    folder, rig = capture
-    # The network is untrained, and its light anything: let the rig move its pictures all the same.
+    folder, setup = capture
+    # The network is untrained, and its light anything: let the setup move its pictures all the same.
     monkeypatch.setattr("evnlos.analysis.model._SAME_LIGHT", (0.0, np.inf))
     sampling = Sampling(height=24, width=36, scored_rows=18)
     torch.manual_seed(0)
@@ -485,7 +495,7 @@ def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, caps
     (without / "capture.yaml").write_text(yaml.safe_dump(info))
     blank = np.zeros((24, 40), np.float32)
     save_pattern(FixedPattern(blank + 1, blank), tmp_path / "pattern.safetensors")
-    shutil.copy(rig, tmp_path / "rig.yaml")
+    shutil.copy(setup, tmp_path / "setup.yaml")
     common = ["--weights", str(tmp_path / "w.safetensors"), "--setup", str(tmp_path)]
     with pytest.raises(SystemExit):
         main(["reconstruct", str(without), "--track", "--out", str(tmp_path / "none")])
@@ -500,9 +510,20 @@ def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, caps
 
 
 def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:
-    folder, rig = capture
+    folder, setup = capture
     pytest.importorskip("matplotlib")
-    options = ["--setup", str(rig), "--positions", "1", "8", "--cells", "10", "--solver", "tikhonov", "--json"]
+    options = [
+        "--setup",
+        str(setup),
+        "--positions",
+        "1",
+        "8",
+        "--cells",
+        "10",
+        "--solver",
+        "tikhonov",
+        "--json",
+    ]
     out = ["--out", str(tmp_path / "j.png")]
     main(["invert", str(folder), *options, "--out", str(tmp_path / "i.png")])
     rows = json.loads(capsys.readouterr().out)["rows"]
@@ -511,7 +532,7 @@ def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:
             "invert",
             str(folder),
             "--setup",
-            str(rig),
+            str(setup),
             "--cells",
             "8",
             "--lam",
@@ -528,7 +549,7 @@ def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:
     assert set(np.load(tmp_path / "i.npz")) == {f"{folder.name}_tikhonov_{n}" for n in (1, 8)}
 
 
-def test_a_folder_without_a_rig_is_no_photograph(capture, capsys) -> None:
+def test_a_folder_without_a_setup_is_no_photograph(capture, capsys) -> None:
     with pytest.raises(SystemExit):
         main(["invert", str(capture[0])])
     assert "give one NPZ file, or capture folders and --setup" in capsys.readouterr().err

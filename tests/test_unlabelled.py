@@ -1,4 +1,4 @@
-"""A rig fitted to passes of objects that nobody knows."""
+"""A setup fitted to passes of objects that nobody knows."""
 
 from dataclasses import replace
 
@@ -7,14 +7,14 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from evnlos.calibration import Calibration, fit_rig
+from evnlos.calibration import Calibration, fit_setup
 from evnlos.calibration.captures import read_shots
 from evnlos.calibration.unlabelled import CELLS, WRITERS, MovingLight, fit_unlabelled
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.measurements import handwritten_plates
 from evnlos.setups import PaperSetup, RadiometricSetup
 
-RIG = RadiometricSetup(roughness=0.06)
+SETUP = RadiometricSetup(roughness=0.06)
 PLACES = np.stack([np.linspace(-0.06, 0.06, 7), np.zeros(7)], axis=1)
 SHAPE = (6, 10)
 
@@ -24,7 +24,7 @@ def passes(noise: float, seed: int = 0) -> tuple[MovingLight, torch.Tensor]:
     draw = torch.Generator().manual_seed(seed)
     empty = MovingLight(torch.zeros(1, 7, *SHAPE), PLACES, 0.08, CELLS)
     plates = handwritten_plates(empty.plate, WRITERS).test[::2].unflatten(1, empty.plate.shape)
-    light = empty.sight(RIG)(plates)
+    light = empty.sight(SETUP)(plates)
     light = light / light.std()
     light = light + noise * torch.randn(light.shape, generator=draw)
     # Ambient light and the pattern of the camera: still, and of any form.
@@ -34,7 +34,7 @@ def passes(noise: float, seed: int = 0) -> tuple[MovingLight, torch.Tensor]:
 
 def test_the_evidence_is_that_of_the_dense_gaussian() -> None:
     light, _ = passes(0.3)
-    sight, terms = light.sight(RIG), light.terms(RIG)
+    sight, terms = light.sight(SETUP), light.terms(SETUP)
     prior = handwritten_plates(light.plate, WRITERS)
     gain, variance = 0.7 / terms.lit**0.5, 0.05
     eye = torch.eye(CELLS**2, dtype=torch.float64).unflatten(1, light.plate.shape)
@@ -55,7 +55,9 @@ def test_the_evidence_is_that_of_the_dense_gaussian() -> None:
 
 def test_the_right_wall_is_the_likeliest_and_shows_the_plates() -> None:
     light, plates = passes(0.1)
-    found = {rough: light.explained(replace(RIG, roughness=rough)) for rough in (0.03, 0.045, 0.06, 0.08, 0.12)}
+    found = {
+        rough: light.explained(replace(SETUP, roughness=rough)) for rough in (0.03, 0.045, 0.06, 0.08, 0.12)
+    }
     assert min(found, key=lambda rough: found[rough].cost) == 0.06
     best = found[0.06]
     assert best.noise == pytest.approx(0.1, rel=0.15)
@@ -64,7 +66,7 @@ def test_the_right_wall_is_the_likeliest_and_shows_the_plates() -> None:
     assert float(alike.mean()) > 0.5
 
 
-def test_a_rig_is_found_without_its_targets(tiny_captures, tmp_path) -> None:
+def test_a_setup_is_found_without_its_targets(tiny_captures, tmp_path) -> None:
     fit, held = read_shots(tiny_captures, holdout=("4",), plate_m=0.08)
     assert all(capture.target is None for capture in (*fit.captures, *held.captures))
     start = RadiometricSetup(roughness=0.12)  # the lab's is 0.05
@@ -89,4 +91,4 @@ def test_unknown_targets_need_a_radiometric_start_and_a_motion(tiny_captures, tm
     text = (folder / "capture.yaml").read_text()
     (folder / "capture.yaml").write_text(text[: text.index("motion:")])
     with pytest.raises(DataError, match=r"no known motion.*evnlos track"):
-        fit_rig([folder, *tiny_captures[1:]], Calibration(targets="unknown"))
+        fit_setup([folder, *tiny_captures[1:]], Calibration(targets="unknown"))

@@ -513,7 +513,7 @@ def test_the_same_tensors_are_the_same_bytes() -> None:
     assert len({sealed_bytes(tensors, '{"some": "thing"}') for _ in range(20)}) == 1
 
 
-def _rig_files(folder: Path) -> dict[str, tuple[Path, Callable[[Path], tuple[Any, ...]]]]:
+def _setup_files(folder: Path) -> dict[str, tuple[Path, Callable[[Path], tuple[Any, ...]]]]:
     """Write a measured transport, a fitted wall and a fixed pattern; return each with what reads it."""
     draw = np.random.default_rng(0)
     picture = draw.random((3, 4)).astype(np.float32)
@@ -545,8 +545,8 @@ def _rig_files(folder: Path) -> dict[str, tuple[Path, Callable[[Path], tuple[Any
 
 
 @pytest.mark.parametrize("kind", ["measured transport", "fitted wall", "fixed pattern"])
-def test_no_flipped_byte_of_a_rig_s_file_goes_unseen(kind: str, tmp_path) -> None:
-    path, read = _rig_files(tmp_path)[kind]
+def test_no_flipped_byte_of_a_setup_s_file_goes_unseen(kind: str, tmp_path) -> None:
+    path, read = _setup_files(tmp_path)[kind]
     whole, expected, draw = path.read_bytes(), read(path), random.Random(kind)
     places = [*range(len(whole)), *(draw.randrange(len(whole)) for _ in range(200))]
     noticed = 0
@@ -563,8 +563,8 @@ def test_no_flipped_byte_of_a_rig_s_file_goes_unseen(kind: str, tmp_path) -> Non
 
 
 @pytest.mark.parametrize("kind", ["measured transport", "fitted wall", "fixed pattern"])
-def test_a_rig_s_file_without_a_digest_still_loads(kind: str, tmp_path) -> None:
-    path, read = _rig_files(tmp_path)[kind]
+def test_a_setup_s_file_without_a_digest_still_loads(kind: str, tmp_path) -> None:
+    path, read = _setup_files(tmp_path)[kind]
     assert read(unsealed(path)) == read(path)
 
 

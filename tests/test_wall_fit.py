@@ -60,7 +60,7 @@ def shots_of(characters: str, matrix: np.ndarray, shining: float = 0.0, seed: in
             CameraInfo(SHAPE[1], SHAPE[0], "rendered", 2.0, 0.01),
             motion=MotionInfo((-0.05, 0.0), 0.02, (1.0, 0.0), 0),
             target=TargetInfo(name, "target.png", 0.08),
-            rig={"distance_m": 0.3},
+            setup={"distance_m": 0.3},
         )
         times = np.arange(11) * 500_000
         empty = Events.empty(SHAPE[1], SHAPE[0])

@@ -1,6 +1,6 @@
-"""The main job on one page: calibrate, simulate the rig, pre-train, fine-tune, train end to end, report.
+"""The main job on one page: calibrate, simulate the setup, pre-train, fine-tune, train end to end, report.
 
-- What a mismatch costs: the demo's comparison on rigs that the simulator does not describe, in one table.
+- What a mismatch costs: the demo's comparison on setups that the simulator does not describe, in one table.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Demo:
     force: bool = False
     """Begin although the machine's memory will hardly do."""
     calibrate: bool = True
-    """Fit the simulator to the rig of the captures first; without it, pre-train on the default simulation."""
+    """Fit the simulator to the setup of the captures first; without it, pre-train on the default simulation."""
     seed: int = 0
     """Seed of every draw."""
 
@@ -81,7 +81,7 @@ def run_demo(settings: Demo) -> Path:
 
     Raises:
         ConfigError: One of the captures is none.
-        CalibrationError: No rig fits the captures.
+        CalibrationError: No setup fits the captures.
     """
     began, out = time.perf_counter(), settings.out
     captures = _captures_in(settings.captures)
@@ -117,15 +117,15 @@ def run_demo(settings: Demo) -> Path:
         ) from None
     records = read_records(out / "records" / study.name)
     if settings.calibrate:
-        notes += _of_calibration(out / "rigs" / study.rig)
+        notes += _of_calibration(out / "setups" / study.setup)
     else:
-        notes.append("The simulator was not fitted to this rig.")
+        notes.append("The simulator was not fitted to this setup.")
 
     single = [record for record in records if record.arm in [arm.name for arm in study.arms]]
     runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
     dataset, results = gather(runs, out / "shots" / single[0].settings["captures"])
-    rig = named_setup(out / "rigs" / study.rig / "rig.yaml") if settings.calibrate else None
-    path = write_report(out / "report.html", dataset, results, notes, rig=rig)
+    setup = named_setup(out / "setups" / study.setup) if settings.calibrate else None
+    path = write_report(out / "report.html", dataset, results, notes, setup=setup)
     for note in notes:
         print(note)
     print(to_text(results))
@@ -149,11 +149,11 @@ def _captures_in(given: tuple[Path, ...]) -> list[Path]:
     return sorted(found)
 
 
-def _of_calibration(rig: Path) -> list[str]:
+def _of_calibration(setup: Path) -> list[str]:
     """Return what the calibration found, and what it warns of."""
-    drawn = f" ({rig.parent.name}/{rig.name}/check.png)" if (rig / "check.png").is_file() else ""
-    found = json.loads((rig / "calibration.json").read_text())
-    notes = [f"The simulator was fitted to this rig, without the test characters{drawn}."]
+    drawn = f" ({setup.parent.name}/{setup.name}/check.png)" if (setup / "check.png").is_file() else ""
+    found = json.loads((setup / "calibration.json").read_text())
+    notes = [f"The simulator was fitted to this setup, without the test characters{drawn}."]
     notes += [f"Warning: {line}." for line in found.get("warnings", [])]
     return [*notes, f"{found['expectation']}."] if "expectation" in found else notes
 
@@ -193,7 +193,7 @@ def _study(settings: Demo, test: list[str]) -> Study:
         redrawn=settings.redrawn,
         simulation=replace(default(), seed=settings.seed),
         calibration=Calibration(event_captures=2, columns=48, seed=settings.seed),
-        rigs=2,
+        setups=2,
         refine=False,
         correct_pattern=settings.calibrate,
     )
@@ -211,10 +211,10 @@ _FRAMES, _EVENTS = "frames", "surfaces"
 
 @dataclass(frozen=True)
 class Finding:
-    """What came of the demo on one rig.
+    """What came of the demo on one setup.
 
     Args:
-        rig: Name of the rig.
+        setup: Name of the setup.
         refused: Why the calibration refused the captures; empty where it did not.
         warnings: What the calibration said against itself.
         expected: What the calibration says that EPNP will bring; empty where it said nothing.
@@ -223,7 +223,7 @@ class Finding:
         psnr_db: (arm, modality) -> PSNR of each seed, dB.
     """
 
-    rig: str
+    setup: str
     refused: str
     warnings: tuple[str, ...]
     expected: str
@@ -243,29 +243,29 @@ class Finding:
 
 def run_mismatch(
     base: Demo,
-    rigs: tuple[str, ...] = (),
+    setups: tuple[str, ...] = (),
     captures: Path | None = None,
     seeds: tuple[int, ...] = (0,),
     progress: Progress = silent,
 ) -> list[Finding]:
-    """Run the demo on each rig, one after the other, and return what came of it; run it again to go on.
+    """Run the demo on each setup, one after the other, and return what came of it; run it again to go on.
 
     Args:
-        base: Settings of the demo; `out` holds a folder for each rig and seed.
-        rigs: Names of rigs: of the rooms of `evnlos lab`, or of folders in `captures`; all by default.
-        captures: Folder that holds a folder of captures for each rig; None renders the rooms.
+        base: Settings of the demo; `out` holds a folder for each setup and seed.
+        setups: Names of setups: of the rooms of `evnlos lab`, or of folders in `captures`; all by default.
+        captures: Folder that holds a folder of captures for each setup; None renders the rooms.
         seeds: Seeds of the demo.
         progress: Called as the captures are rendered.
 
     Raises:
-        ConfigError: A rig is unknown, or its folder holds no captures.
+        ConfigError: A setup is unknown, or its folder holds no captures.
     """
-    known = tuple(ROOMS) if captures is None else _rigs_in(captures)
-    unknown = [name for name in rigs if name not in known]
+    known = tuple(ROOMS) if captures is None else _setups_in(captures)
+    unknown = [name for name in setups if name not in known]
     if unknown:
-        raise ConfigError(f"rig {unknown[0]!r} is unknown; give some of {', '.join(known)}")
+        raise ConfigError(f"setup {unknown[0]!r} is unknown; give some of {', '.join(known)}")
     found = []
-    for name in rigs or known:
+    for name in setups or known:
         if captures is None:
             lab = lab_of(name, Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS)))
             folders = render_captures(
@@ -287,22 +287,22 @@ def run_mismatch(
     return found
 
 
-def _rigs_in(captures: Path) -> tuple[str, ...]:
+def _setups_in(captures: Path) -> tuple[str, ...]:
     names = sorted({file.parent.parent.name for file in Path(captures).glob("*/*/capture.yaml")})
     if not names:
         raise ConfigError(f"{captures} holds no folders of captures; give the folder above them")
     return tuple(names)
 
 
-def finding(rig: str, outs: list[Path]) -> Finding:
+def finding(setup: str, outs: list[Path]) -> Finding:
     """Return what the demo left in its folders, one a seed.
 
     Args:
-        rig: Name of the rig.
+        setup: Name of the setup.
         outs: The demo's folders.
     """
     refused = [out / _REFUSED for out in outs if (out / _REFUSED).is_file()]
-    figures = [json.loads(f.read_text()) for out in outs for f in (out / "rigs").glob(f"*/{FIGURES_FILE}")]
+    figures = [json.loads(f.read_text()) for out in outs for f in (out / "setups").glob(f"*/{FIGURES_FILE}")]
     records: list[Record] = []
     for out in outs:
         if any((out / "records").rglob("*.json")):
@@ -321,7 +321,7 @@ def finding(rig: str, outs: list[Path]) -> Finding:
     warnings = dict.fromkeys(line for one in figures for line in one["warnings"])
     words = refused[0].read_text() if refused else ""
     expected = next((str(one["expectation"]) for one in figures if one.get("expectation")), "")
-    return Finding(rig, words, tuple(warnings), expected, left, mean_image, means_of(records))
+    return Finding(setup, words, tuple(warnings), expected, left, mean_image, means_of(records))
 
 
 def _left(residuals: dict[str, dict[str, float]], kind: str) -> tuple[float, float] | None:
@@ -332,8 +332,8 @@ def _left(residuals: dict[str, dict[str, float]], kind: str) -> tuple[float, flo
 
 
 def mismatch_table(found: list[Finding]) -> str:
-    """Return Markdown: a row for each rig and modality, and the margins that matter below it."""
-    head = ["rig", "sees", "left / noise, %", "mean image", "E2E", "simulation only", "EPNP", "EPNP - E2E"]
+    """Return Markdown: a row for each setup and modality, and the margins that matter below it."""
+    head = ["setup", "sees", "left / noise, %", "mean image", "E2E", "simulation only", "EPNP", "EPNP - E2E"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in found:
         for modality in [p for p in STANDARD_MODALITIES if p in one.mean_image_db]:
@@ -343,10 +343,10 @@ def mismatch_table(found: list[Finding]) -> str:
             )
             e2e, epnp = one.best_e2e(modality), one.of("EPNP", modality)
             numbers = (one.mean_image_db[modality], e2e, one.of("simulation only", modality), epnp)
-            cells = [one.rig, modality, left, *(f"{v:.2f}" for v in numbers), f"{epnp - e2e:+.2f}"]
+            cells = [one.setup, modality, left, *(f"{v:.2f}" for v in numbers), f"{epnp - e2e:+.2f}"]
             lines.append(f"| {' | '.join(cells)} |")
         if one.refused:
-            lines.append(f"| {one.rig} | refused: {one.refused} |" + " |" * (len(head) - 2))
+            lines.append(f"| {one.setup} | refused: {one.refused} |" + " |" * (len(head) - 2))
     return "\n".join([*lines, "", *_margins(found), "", *_said(found)]) + "\n"
 
 
@@ -354,13 +354,13 @@ def _margins(found: list[Finding]) -> list[str]:
     """Return a line for each modality: by how much EPNP leads, in the mean and where it leads least."""
     lines = []
     for modality in STANDARD_MODALITIES:
-        lead = {one.rig: one.of("EPNP", modality) - one.best_e2e(modality) for one in found}
+        lead = {one.setup: one.of("EPNP", modality) - one.best_e2e(modality) for one in found}
         above = {
-            one.rig: one.of("simulation only", modality) - one.mean_image_db[modality]
+            one.setup: one.of("simulation only", modality) - one.mean_image_db[modality]
             for one in found
             if modality in one.mean_image_db
         }
-        lead = {rig: value for rig, value in lead.items() if np.isfinite(value)}
+        lead = {setup: value for setup, value in lead.items() if np.isfinite(value)}
         if not lead:
             continue
         least, lowest = min(lead, key=lead.__getitem__), min(above, key=above.__getitem__)
@@ -378,5 +378,5 @@ def _said(found: list[Finding]) -> list[str]:
     for one in found:
         words = "; ".join(one.warnings) or one.refused or "nothing"
         expected = f"; it expected: {one.expected}" if one.expected else ""
-        lines.append(f"- {one.rig}: the calibration warned of {words}{expected}.")
+        lines.append(f"- {one.setup}: the calibration warned of {words}{expected}.")
     return lines

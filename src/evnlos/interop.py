@@ -1,6 +1,6 @@
 """Thin adapters to other packages, imported when they are used: Mitsuba 3 and deepinv.
 
-- The same rig in Mitsuba 3: an independent path tracer to hold the light-transport matrix against.
+- The same setup in Mitsuba 3: an independent path tracer to hold the light-transport matrix against.
 - Our operators as physics of deepinv, so that its solvers and networks run on them.
 - Thin adapters to other packages, imported when they are used.
 """

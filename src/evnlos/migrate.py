@@ -95,7 +95,17 @@ def _renamed(values: dict[str, Any], **names: str) -> dict[str, Any]:
 
 def _record(values: dict[str, Any]) -> dict[str, Any]:
     """The record of an experiment."""
-    return _renamed(values, paradigm="modality")
+    return _renamed(values, paradigm="modality", rig="setup")
+
+
+def _capture(values: dict[str, Any]) -> dict[str, Any]:
+    """The `capture.yaml` of a recording."""
+    return _renamed(values, rig="setup")
+
+
+def _several_setups(values: dict[str, Any]) -> dict[str, Any]:
+    """Name the number of walls that a simulation draws."""
+    return _renamed(values, rigs="setups")
 
 
 _CAMERAS = ("sensor", "frame_camera", "pixel", "time_step_s")
@@ -152,10 +162,11 @@ def _lab_setup(values: dict[str, Any]) -> dict[str, Any]:
 
 
 _STEPS: dict[str, tuple[Step, ...]] = {
-    "Simulation": (_pixel_has_a_kind, _one_setup),
+    "Simulation": (_pixel_has_a_kind, _one_setup, _several_setups),
     "Lab": (_lab_setup,),
     "Training": (_training,),
     "weights": (_weights,),
     "run": (_run,),
     "Record": (_record,),
+    "CaptureInfo": (_capture,),
 }

@@ -55,7 +55,7 @@ class FrameOperator:
         self.sigma = float(self.variance(self.ambient.mean() + 0.1 * setup.gain).sqrt())
 
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return the frames [N, h, w] that the rig makes of pictures [N, H, W]."""
+        """Return the frames [N, h, w] that the setup makes of pictures [N, H, W]."""
         light = pictures[:, self.rows].flatten(1) @ self.matrix.T + self.ambient  # [N, h w]
         return light.unflatten(1, self.size)
 
@@ -76,7 +76,7 @@ def consistent(
     Args:
         pictures: The network's pictures p, float32 [N, H, W], 0..1.
         frames: Frames of the samples y, float32 [N, h, w], white levels, without fixed pattern.
-        operator: The rig.
+        operator: The setup.
         trust: How much the frames may move the pictures, above 0; 0 returns the pictures.
         floor: Smallest variance of a pixel at trust 1.
 
@@ -85,7 +85,7 @@ def consistent(
     """
     if frames.shape[1:] != operator.size or len(frames) != len(pictures):
         raise DataError(
-            f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a rig of "
+            f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a setup of "
             f"{operator.size[1]} x {operator.size[0]} samples"
         )
     if trust <= 0:
@@ -148,7 +148,7 @@ def explained(
         frames: Frames of the samples y, float32 [N, h, w].
         position_m: The plate's centre in each, (x, y) in metres, [N, 2].
         average: The average plate, [P, P].
-        operator: The rig.
+        operator: The setup.
         canvas: Geometry of the pictures.
 
     Raises:
@@ -156,7 +156,7 @@ def explained(
     """
     if frames.shape != (len(pictures), *operator.size):
         raise DataError(
-            f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a rig of "
+            f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a setup of "
             f"{operator.size[1]} x {operator.size[0]} samples"
         )
     plain = on_canvas(average, canvas, position_m)
@@ -169,12 +169,12 @@ def explained(
 
 
 def light_gain(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> float:
-    """Return how much brighter the moving light of frames is than the rig makes it from pictures.
+    """Return how much brighter the moving light of frames is than the setup makes it from pictures.
 
     Args:
         pictures: Pictures of the canvas, float32 [N, H, W], 0..1.
         frames: Frames of the samples, float32 [N, h, w], white levels.
-        operator: The rig.
+        operator: The setup.
     """
     return _gain(_moving(operator(pictures)), _moving(frames))
 
@@ -197,7 +197,7 @@ def _left(made: Tensor, seen: Tensor) -> Tensor:
 def _noise(frames: Tensor, operator: FrameOperator) -> Tensor:
     """Return what noise adds to the moving light, squared and summed: from the scatter about the neighbours.
 
-    How the noise grows with the level is told by the rig's camera, how strong it is by the frames. The light
+    How the noise grows with the level is told by the setup's camera, how strong it is by the frames. The light
     moves slowly and over few pixels; the median over the pixels is that of the others. In time alone:
     `temporal_noise` also takes differences between neighbours, but samples share the sensor's pixels with
     theirs, so that it finds a tenth too little here.
@@ -221,7 +221,7 @@ def judgement_of(
         weights: The network, and what it learned of its pictures' worth.
         samples: The pass.
         images: The network's pictures, float32 [N, H, W].
-        operator: The calibrated rig, where it is known.
+        operator: The calibrated setup, where it is known.
     """
     if why_unjudged(weights, samples) is not None:
         return None
@@ -240,7 +240,7 @@ def why_unjudged(weights: Weights, samples: Samples) -> str | None:
         samples: The pass.
     """
     if samples.position_m is None:
-        why = "the motion is unknown; state it in capture.yaml, or give --rig and --track to find it"
+        why = "the motion is unknown; state it in capture.yaml, or give --setup and --track to find it"
     elif len(samples) < 2:
         why = f"{len(samples)} position, 2 are the least; record a pass"
     elif weights.confidence is None:
@@ -269,7 +269,7 @@ def _judged(
 
 
 def said(worth: Judgement) -> dict[str, Any]:
-    """Return a judgement as plain values; `explained` is there only where the rig is known."""
+    """Return a judgement as plain values; `explained` is there only where the setup is known."""
     numbers = {name: round(getattr(worth, name), 4) for name in ("support", "agreement", "threshold")}
     if worth.explained is not None:
         numbers["explained"] = round(worth.explained, 4)
@@ -284,7 +284,7 @@ class PassWorth:
         name: Object of the pass.
         support: What it said, in one number: how much of the picture the measurement supports, 0..1.
         agreement: Share of what tells this object from others that both halves of the pass agree on.
-        explained: Share of the frames that the pictures explain (see `explained`); None without a rig.
+        explained: Share of the frames that the pictures explain (see `explained`); None without a setup.
         measured: Whether it said that anything was.
         skill: 1 - |x - t|^2 / |x0 - t|^2 over the plates, with x the pictures, t the truth, and x0 the average
             plate: 1 is perfect, 0 is no better than the average object, below 0 is worse.
@@ -319,7 +319,7 @@ def worth_of(
         samples: The passes, all of known motion.
         images: The network's pictures of all samples, float32 [N, H, W].
         canvas: Their geometry.
-        operator: The rig that the network was trained for; the modality then has a group "frame".
+        operator: The setup that the network was trained for; the modality then has a group "frame".
 
     Raises:
         DataError: The motion of a pass is unknown.

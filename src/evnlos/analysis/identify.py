@@ -1,8 +1,8 @@
 """What a setup can show at all.
 
-- What the figures of a rig mean, in words.
-- What a rig can show at all: singular values, patterns above the noise, finest stroke, best linear picture.
-- Rigs side by side, as a table in Markdown.
+- What the figures of a setup mean, in words.
+- What a setup can show at all: singular values, patterns above the noise, finest stroke, best linear picture.
+- Setups side by side, as a table in Markdown.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _EXTRA_MODES = 1.1
 
 
 def verdict(patterns: int, finest_m: tuple[float | None, float | None], stroke_m: float, plate_m: float) -> str:
-    """Return in a sentence what a reconstruction with this rig would be.
+    """Return in a sentence what a reconstruction with this setup would be.
 
     Strokes are measured where bars of their width are resolved in both directions; the rough shape where bars
     of a quarter of the plate are.
@@ -97,7 +97,7 @@ KINK_LEVEL = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class AtNoise:
-    """What is left of a rig at one noise; figures are expectations over the noise of one picture of the wall.
+    """What is left of a setup at one noise; figures are expectations over the noise of one picture of the wall.
 
     Args:
         noise: Root mean square noise of a pixel, white levels.
@@ -128,10 +128,10 @@ class AtNoise:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """What a rig can show at all.
+    """What a setup can show at all.
 
     Args:
-        name: Name of the rig.
+        name: Name of the setup.
         setup: Its settings.
         bench: How the question was put.
         singular: Singular values over the largest, float64 [n], descending.
@@ -205,7 +205,7 @@ def identify(
     Args:
         setup: The setup; its frame camera's noise is what counts.
         bench: Cells, pixels and noise; None is the default, that of the table in docs/identifiability.md.
-        name: What to call the rig.
+        name: What to call the setup.
         seed: Seed of the one picture that is drawn with noise.
 
     Raises:
@@ -258,7 +258,7 @@ def identify(
 
 
 def at_noise(seen: LinearizedSetup, variance: torch.Tensor, plates: Plates, seed: int = 0) -> AtNoise:
-    """Return what is left of a rig at independent noise of a given variance.
+    """Return what is left of a setup at independent noise of a given variance.
 
     Args:
         seen: The linear map.
@@ -315,16 +315,16 @@ def _rounded(length_m: float | None) -> float | None:
 
 
 _HEAD = (
-    "| rig | modes > 1e-2 | patterns above noise: camera / 1 % | bars, upright x lying, mm: camera / 1 % "
+    "| setup | modes > 1e-2 | patterns above noise: camera / 1 % | bars, upright x lying, mm: camera / 1 % "
     "| best linear picture, dB: camera / 1 % |\n|---|---|---|---|---|"
 )
 
 
-def rig_table(found: Sequence[Identification]) -> str:
-    """Return one row a rig, and a line that says what holds for all of them.
+def setup_table(found: Sequence[Identification]) -> str:
+    """Return one row a setup, and a line that says what holds for all of them.
 
     Args:
-        found: The rigs, all on the same bench.
+        found: The setups, all on the same bench.
     """
     rows = [_HEAD]
     for one in found:

@@ -2,7 +2,7 @@
 
 - A setup as a matrix with a noise: what every question about its limits starts from.
 - The best linear estimate of a plate from one picture of the wall, and how wrong it is on average.
-- What a measured matrix can't say about a rig: its own noise and the size of its cells, in words.
+- What a measured matrix can't say about a setup: its own noise and the size of its cells, in words.
 """
 
 from __future__ import annotations

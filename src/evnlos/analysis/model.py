@@ -21,7 +21,7 @@ from evnlos.analysis.evaluate import check_sampling, reconstruct
 from evnlos.data import Capture, Dataset, FixedPattern, NlosDataset, Samples, capture_samples, read_capture
 from evnlos.errors import ConfigError, DataError
 from evnlos.metrics import psnr
-from evnlos.models import Judgement, Weights, load_weights, published_rig, published_single
+from evnlos.models import Judgement, Weights, load_weights, published_setup, published_single
 from evnlos.setups import Setup, load_setup
 
 
@@ -191,7 +191,7 @@ def load_model(weights: str | Path) -> Model:
         >>> load_model("near-frame").weights.modality.name
         'frame'
     """
-    return Model(load_weights(weights), published_rig(weights))
+    return Model(load_weights(weights), published_setup(weights))
 
 
 def setup_for_track(setup: Setup | None) -> Setup:

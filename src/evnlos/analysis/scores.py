@@ -116,7 +116,7 @@ def paired_difference(
 
     The positions of one object are not independent, so whole objects are drawn, and both methods are always
     compared on the same pictures. With few objects (4 characters) such an interval is coarse and, as a rule,
-    too narrow; it speaks of other objects like these, not of other rigs.
+    too narrow; it speaks of other objects like these, not of other setups.
 
     Args:
         a: Scores of one method, [N], or [S, N] for S seeds, which are averaged.

@@ -25,7 +25,7 @@ from evnlos.scene.glyph_sets import Plate
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.types import Events, derive_seed
 
-_PAGE = page()  # what the package's networks learned from: rig and samples here are the same
+_PAGE = page()  # what the package's networks learned from: setup and samples here are the same
 POSITIONS = _PAGE.positions
 """Positions of a pass, as in a dataset."""
 TRAVEL_M = _PAGE.motion.speed_m_s * _PAGE.duration_s
@@ -39,7 +39,7 @@ Wall = Literal["metal", "matte"]
 
 @dataclass(frozen=True)
 class Controls:
-    """Rig and camera as the page's controls state them; hidden object apart.
+    """Setup and camera as the page's controls state them; hidden object apart.
 
     Raises:
         ConfigError: A value outside its range.
@@ -199,7 +199,7 @@ class Recorded:
         peak: Largest digital number of a frame.
         motion: The hidden object's motion on the events' clock; None where it is unknown.
         target: The hidden object; None where it is unknown.
-        simulation: The rig, where it is known.
+        simulation: The setup, where it is known.
         distance_m: From hidden object to wall, metres, where it is noted.
         notes: What reading did, a line each.
     """
@@ -242,11 +242,11 @@ def simulate_pass(controls: Controls, target: Target) -> Recorded:
     """Simulate one pass of a hidden object.
 
     Args:
-        controls: Rig and camera.
+        controls: Setup and camera.
         target: What is hidden.
 
     Raises:
-        ConfigError: The rig can't be, or the camera gets no light.
+        ConfigError: The setup is geometrically impossible, or the camera gets no light.
     """
     simulation = controls.simulation()
     scene = Scene(target, simulation.motion, simulation.duration_s)

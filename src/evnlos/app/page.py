@@ -73,7 +73,7 @@ def simulated(controls: Controls, target: Target, networks: Networks) -> Iterato
     """Yield (sheet, verdict) of a simulated pass three times: without networks, with them, with the verdict.
 
     Args:
-        controls: Rig and camera.
+        controls: Setup and camera.
         target: What is hidden.
         networks: The page's networks.
 
@@ -93,7 +93,7 @@ def simulated(controls: Controls, target: Target, networks: Networks) -> Iterato
 
 
 def opening_verdict(controls: Controls) -> str:
-    """Return the verdict on the rig that the page opens with."""
+    """Return the verdict on the setup that the page opens with."""
     return verdict_box(verdict_on(controls.simulation()))
 
 
@@ -222,7 +222,7 @@ def _controls(gr: Any, opening: Controls) -> list[Any]:
         show_progress="hidden",
         api_visibility="private",
     )
-    with gr.Accordion("Rig", open=True):
+    with gr.Accordion("Setup", open=True):
         wall = gr.Radio([_METAL, _MATTE], value=_METAL, label="Wall")
         rough = slider(0.01, 0.3, opening.roughness, 0.01, "Wall roughness (metal)")
         distance = slider(15, 60, 100 * opening.distance_m, 1, "Distance from object to wall, cm")

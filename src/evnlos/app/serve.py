@@ -321,7 +321,7 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
     first = next(pieces)
     if not networks.own:  # those of the package are small and quick
         first = next(pieces)
-    # The verdict on the first rig takes seconds where nothing is compiled yet: it is made while the page loads.
+    # The verdict on the first setup takes seconds until all is compiled: it is made while the page loads.
     threading.Thread(target=lambda: list(pieces), daemon=True).start()
     limit = round(1e6 * server.upload_mb)
     with tempfile.TemporaryDirectory(prefix="evnlos-app-", ignore_cleanup_errors=True) as scratch:

@@ -1,7 +1,7 @@
 """What is reconstructed from a sequence, by solvers and by networks.
 
-- Which networks look at a pass: the user's own, or those that come with the package and know its rig.
-- What can be made of a pass: two classical pictures where the rig is known, and one of each network.
+- Which networks look at a pass: the user's own, or those that come with the package and know its setup.
+- What can be made of a pass: two classical pictures where the setup is known, and one of each network.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from evnlos.errors import DataError
 from evnlos.inverse import JointProblem, PlatePass
 from evnlos.inverse.measurements import object_light
 from evnlos.metrics import psnr
-from evnlos.models import Weights, load_weights, published, published_for, published_rig
+from evnlos.models import Weights, load_weights, published, published_for, published_setup
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import Setup, load_setup
@@ -48,7 +48,7 @@ class Networks:
         """Return the networks for a pass, by the name to show.
 
         Those of the package see whole passes, so they need the motion; of a simulated pass they are the page's,
-        of a capture those of the published rig whose distance is nearest.
+        of a capture those of the published setup whose distance is nearest.
         """
         if self.own:
             return self.own
@@ -69,11 +69,11 @@ class Networks:
 
         None where there are no frames, or where the networks are the user's and so is the recording.
         """
-        rig = None if recorded.simulation is None else recorded.simulation.setup
-        if rig is None and not self.own and recorded.motion is not None:
-            known = published_rig(published_for(recorded.distance_m, "frame", is_motion_known=True))
-            rig = load_setup(known) if known else None
-        return None if rig is None or recorded.frames is None else cache(partial(FrameOperator, rig))
+        setup = None if recorded.simulation is None else recorded.simulation.setup
+        if setup is None and not self.own and recorded.motion is not None:
+            known = published_setup(published_for(recorded.distance_m, "frame", is_motion_known=True))
+            setup = load_setup(known) if known else None
+        return None if setup is None or recorded.frames is None else cache(partial(FrameOperator, setup))
 
 
 @cache
@@ -121,24 +121,24 @@ class Reconstruction:
 
 
 def from_each_frame(recorded: Recorded) -> Reconstruction:
-    """Return the regularised least squares picture of each frame alone, the rig and its noise being known.
+    """Return the regularised least squares picture of each frame alone, the setup and its noise being known.
 
     Raises:
-        DataError: The pass has no frames, or its rig is unknown.
+        DataError: The pass has no frames, or its setup is unknown.
     """
     setup, frames = _known(recorded)
     operator = FrameOperator(setup, COARSE)
     seen = torch.from_numpy(recorded.samples(COARSE).frame)
     flat = torch.full((len(frames), COARSE.height, COARSE.width), _DIM)
     images = consistent(flat, seen, operator, trust=_TRUST)[:, COARSE.scored].numpy()
-    return _scored("least squares", "one frame, rig known, nothing learned", images, recorded, COARSE)
+    return _scored("least squares", "one frame, setup known, nothing learned", images, recorded, COARSE)
 
 
 def from_whole_pass(recorded: Recorded) -> Reconstruction:
-    """Return one picture from all frames at once, rig and motion being known, drawn where the object was.
+    """Return one picture from all frames at once, setup and motion being known, drawn where the object was.
 
     Raises:
-        DataError: The pass has no frames, or its rig or its motion is unknown.
+        DataError: The pass has no frames, or its setup or its motion is unknown.
     """
     setup, frames = _known(recorded)
     if recorded.motion is None or recorded.target is None:
@@ -158,7 +158,7 @@ def from_whole_pass(recorded: Recorded) -> Reconstruction:
     found = Target("found", image.clamp(0, 1).float().numpy(), size_m)
     fine = Sampling()
     images = found.rasterise(fine.canvas, places)[:, fine.scored]
-    return _scored("whole pass", "all frames, rig and motion known, nothing learned", images, recorded, fine)
+    return _scored("whole pass", "all frames, setup and motion known, nothing learned", images, recorded, fine)
 
 
 def from_weights(

@@ -1,6 +1,6 @@
 """Pictures and words of the page.
 
-- What the chosen rig can show at all, in plain words.
+- What the chosen setup can show at all, in plain words.
 - From a pass and its reconstructions to the pictures that stand side by side on the page.
 - Views as one piece of HTML without requests: each a tall picture of all positions, of which one is shown.
 """
@@ -62,10 +62,10 @@ def _identified(setup: Setup) -> Identification:
 
 
 def verdict_on(simulation: Simulation) -> Verdict:
-    """Return what one frame of this rig and camera can show of a plate at a known place, whatever the method.
+    """Return what one frame of this setup and camera can show of a plate at a known place, whatever the method.
 
     Raises:
-        ConfigError: The rig can't be, or the camera gets no light.
+        ConfigError: The setup is geometrically impossible, or the camera gets no light.
     """
     # The event pixel is no part of the question: one answer for all of its settings.
     found = _identified(replace(simulation.setup, pixel=EventPixel()))
@@ -237,7 +237,7 @@ def verdict_box(verdict: Verdict) -> str:
     texts = (html.escape(text) for text in (verdict.meaning, verdict.reason, verdict.figures))
     meaning, reason, figures = texts
     return (
-        '<div class="ev-verdict" role="status"><strong>Can this rig show anything? </strong>'
+        '<div class="ev-verdict" role="status"><strong>Can this setup show anything? </strong>'
         f"<span>{meaning}</span><p>{reason} {figures}</p></div>"
     )
 
@@ -245,7 +245,7 @@ def verdict_box(verdict: Verdict) -> str:
 def waiting_box() -> str:
     """Return what stands where the verdict will be."""
     return (
-        '<div class="ev-verdict" role="status"><strong>Can this rig show anything? </strong>'
+        '<div class="ev-verdict" role="status"><strong>Can this setup show anything? </strong>'
         "<span>Looking at it.</span></div>"
     )
 

@@ -1,4 +1,4 @@
-"""Fitting the simulator to captures of a rig."""
+"""Fitting the simulator to captures of a setup."""
 
 import lazy_loader
 

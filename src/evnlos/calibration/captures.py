@@ -1,4 +1,4 @@
-"""The captures that a calibration works on: one rig, one camera, known motions, some of them held out.
+"""The captures that a calibration works on: one setup, one camera, known motions, some of them held out.
 
 - What the fit of a wall works on: some pixels of some frames, and the targets as sparse pictures.
 """
@@ -24,7 +24,7 @@ FEWEST = 3
 
 @dataclass(frozen=True)
 class Shots:
-    """Captures of one rig, in the order of their names.
+    """Captures of one setup, in the order of their names.
 
     Args:
         captures: The captures; the motion of each is known, and, where they are `labelled`, the target.
@@ -82,7 +82,7 @@ def read_shots(
     seed: int = 0,
     plate_m: float | None = None,
 ) -> tuple[Shots, Shots]:
-    """Read the captures of one rig and split them into those to fit and those to check the fit on.
+    """Read the captures of one setup and split them into those to fit and those to check the fit on.
 
     Args:
         folders: Capture folders.
@@ -98,21 +98,21 @@ def read_shots(
 
     Raises:
         DataError: Too few captures, two of one name, one without target or motion, or captures of different
-            cameras, rigs or plates.
+            cameras, setups or plates.
     """
     paths = {Path(folder).resolve().name: Path(folder).resolve() for folder in folders}
     _refuse_strangers(paths, (*exclude, *holdout))
     chosen = [name for name in sorted(paths) if not _named(name, exclude)]
     if len(chosen) < FEWEST:
         raise DataError(
-            f"{len(chosen)} capture(s) are left to calibrate on; give {FEWEST} or more, best 20, of one rig"
+            f"{len(chosen)} capture(s) are left to calibrate on; give {FEWEST} or more, best 20, of one setup"
         )
     captures = [read_capture(paths[name]) for name in chosen]
     if plate_m is not None:
         captures = [replace(capture, target=None) for capture in captures]
     for capture in captures:
         _motion(capture) if plate_m is not None else _scene(capture)
-        _check_same_rig(captures[0], capture)
+        _check_same_setup(captures[0], capture)
     side = _scene(captures[0]).target.size_m if plate_m is None else plate_m
     held = {name for name in chosen if _named(name, holdout)} or _drawn(chosen, share, seed)
     if len(chosen) - len(held) < FEWEST - 1:
@@ -163,11 +163,11 @@ def _motion(capture: Capture) -> LineMotion:
     return capture.motion
 
 
-def _check_same_rig(first: Capture, other: Capture) -> None:
-    """Refuse captures of another camera, rig or plate than the first one's."""
+def _check_same_setup(first: Capture, other: Capture) -> None:
+    """Refuse captures of another camera, setup or plate than the first one's."""
     pairs = {
         "camera": (first.info.camera, other.info.camera),
-        "rig": (first.info.rig, other.info.rig),
+        "setup": (first.info.setup, other.info.setup),
         "plate_m": tuple(one.target.size_m if one.target else None for one in (first, other)),
         "size": (first.frames.shape[1:], other.frames.shape[1:]),
         "bit depth": (str(first.frames.dtype), str(other.frames.dtype)),
@@ -176,7 +176,7 @@ def _check_same_rig(first: Capture, other: Capture) -> None:
         if mine != theirs:
             raise DataError(
                 f"{first.name} and {other.name} differ in {what} ({mine} and {theirs}); "
-                "calibrate the captures of one rig and one camera at a time"
+                "calibrate the captures of one setup and one camera at a time"
             )
 
 

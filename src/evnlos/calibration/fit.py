@@ -1,4 +1,4 @@
-"""From captures of a rig to a simulation of it, with the proof on captures that the fit has not seen."""
+"""From captures of a setup to a simulation of it, with the proof on captures that the fit has not seen."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ class Example:
 
 
 @dataclass(frozen=True)
-class RigFit:
+class SetupFit:
     """A calibrated simulation and what it is worth.
 
     Args:
-        simulation: The settings that make the simulator match the rig.
+        simulation: The settings that make the simulator match the setup.
         training: The same, varied around the fit, with strokes like the targets': what to pre-train on.
         fitted: Names of the captures that were fitted.
         held_out: Names of the captures that it was checked on.
@@ -118,14 +118,14 @@ class RigFit:
         return tuple(found)
 
 
-def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) -> RigFit:
-    """Fit the simulator to captures of a rig whose targets are known, or, with `targets="unknown"`, are not.
+def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None) -> SetupFit:
+    """Fit the simulator to captures of a setup whose targets are known, or, with `targets="unknown"`, are not.
 
     Where they are not, everything behind the optics (noise, event pixel) is fitted with the plates that are
     expected; they show what reaches the wall, which is all that counts for it.
 
     Args:
-        folders: Capture folders of one rig and one camera.
+        folders: Capture folders of one setup and one camera.
         settings: What to hold out, what to fit and where to start; None is a wall of rough metal.
 
     Returns:
@@ -133,7 +133,7 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
         that were fitted and on those held out.
 
     Raises:
-        DataError: Too few captures, unknown targets or motions, different rigs or cameras, or frames that do
+        DataError: Too few captures, unknown targets or motions, different setups or cameras, or frames that do
             not follow the targets.
     """
     settings = Calibration() if settings is None else settings
@@ -192,7 +192,7 @@ def fit_rig(folders: Iterable[str | Path], settings: Calibration | None = None) 
         side = simulation.glyphs.plate.size_m
         known = {name: scene.target.mask for name, scene in seen_targets if scene.target.size_m == side}
     training = training_simulation(simulation, noise, pixel, strokes)
-    return RigFit(
+    return SetupFit(
         simulation,
         training,
         fit.names,
@@ -216,12 +216,12 @@ def _is_any(settings: Calibration, fit: Shots) -> bool:
 
 def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[Setup, tuple[str, ...]]:
     """Return the start at the measured distance of target and wall, and the names of what is known."""
-    noted = shots.captures[0].info.rig.get("distance_m")
+    noted = shots.captures[0].info.setup.get("distance_m")
     setup = settings.start.setup
     if noted is not None:
         if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not noted > 0:
             raise DataError(
-                f"{shots.names[0]}: rig.distance_m is {noted!r}; give the metres from target to wall, above 0"
+                f"{shots.names[0]}: setup.distance_m is {noted!r}; give the metres from target to wall, above 0"
             )
         if setup.default_distance_m is not None:
             setup = setup.with_parameters({"distance_m": float(noted)})

@@ -1,6 +1,6 @@
 """What decides a calibration.
 
-- What to pre-train on once a rig is known: its simulation, varied a little, with strokes like the targets'.
+- What to pre-train on once a setup is known: its simulation, varied a little, with strokes like the targets'.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def _rough_metal() -> Simulation:
 
 @dataclass(frozen=True)
 class Calibration:
-    """How captures of a rig become a simulation of it."""
+    """How captures of a setup become a simulation of it."""
 
     exclude: tuple[str, ...] = ()
     """Names of captures, or characters, that the calibration never reads: those that a network is tested on."""
@@ -108,7 +108,7 @@ _SPREAD = {
 """Relative half-widths: far more than the fit's own errors, because no wall is exactly its model."""
 
 _SLACK_M = 0.0005  # of the place of the travel
-_RIGS = 6  # different walls and cameras: each costs a light-transport matrix
+_SETUPS = 6  # different walls and cameras: each costs a light-transport matrix
 _LEAK_HZ = 0.1  # captures of some seconds do not show a smaller leak
 
 
@@ -127,7 +127,7 @@ def training_simulation(
     range is that of the known targets, a tenth wider at both ends; their letters are not copied.
 
     Args:
-        fitted: The simulation that matches the rig.
+        fitted: The simulation that matches the setup.
         noise: The frame camera's noise.
         pixel: The fitted event pixel; None where only frames were fitted.
         pens: Thinnest and thickest pen of the known targets.
@@ -154,5 +154,5 @@ def training_simulation(
         vary["setup.pixel.leak_rate_hz"] = (0.0, max(_LEAK_HZ, getattr(pixel.pixel, "leak_rate_hz", 0.0)))
     camera = replace(fitted.frame_camera, prnu=prnu, dsnu_e=dsnu, pattern_seed=None)
     return replace(
-        fitted, glyphs=glyphs, setup=replace(fitted.setup, frame_camera=camera), vary=vary, rigs=_RIGS
+        fitted, glyphs=glyphs, setup=replace(fitted.setup, frame_camera=camera), vary=vary, setups=_SETUPS
     )

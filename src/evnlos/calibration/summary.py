@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from evnlos.calibration.fit import RigFit
+from evnlos.calibration.fit import SetupFit
 from evnlos.calibration.transport_fit import Residual, values_of
 from evnlos.calibration.wall_search import WALL_FILE
 from evnlos.config import save_yaml
@@ -24,9 +24,9 @@ from evnlos.migrate import __version__
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import CALIBRATED_FILE, FittedSetup
 
-RIG_FILE, TRAINING_FILE, FIGURES_FILE = CALIBRATED_FILE, "training.yaml", "calibration.json"
+TRAINING_FILE, FIGURES_FILE = "training.yaml", "calibration.json"
 TARGETS = "targets"
-"""Folder, beside the rig's file, of the known targets' pictures."""
+"""Folder, beside the setup's file, of the known targets' pictures."""
 
 _MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25
 _GOOD, _FAIR, _POOR = 3.0, 6.0, 10.0  # per cent of the light beside the noise
@@ -57,7 +57,7 @@ class Row:
     note: str = ""
 
 
-def rows_of(fit: RigFit, start_pixel: Any, start_camera: Any) -> list[Row]:
+def rows_of(fit: SetupFit, start_pixel: Any, start_camera: Any) -> list[Row]:
     """Return all fitted numbers: optics, light, frame camera, event pixel.
 
     Args:
@@ -95,7 +95,7 @@ def rows_of(fit: RigFit, start_pixel: Any, start_camera: Any) -> list[Row]:
     return rows + _pixel_rows(fit, start_pixel)
 
 
-def _pixel_rows(fit: RigFit, start: Any) -> list[Row]:
+def _pixel_rows(fit: SetupFit, start: Any) -> list[Row]:
     if fit.pixel is None:
         return []
     pixel, error = fit.pixel.pixel, fit.pixel.error
@@ -138,7 +138,7 @@ def table(rows: list[Row]) -> str:
     return _aligned(cells)
 
 
-def residual_table(fit: RigFit) -> str:
+def residual_table(fit: SetupFit) -> str:
     """Return the residuals as a text table, in per cent of the standard deviation of what the camera saw."""
     cells = [["residual, % of standard deviation", "before", "after", "noise alone"]]
     for name, r in fit.residuals.items():
@@ -152,7 +152,7 @@ def _aligned(cells: list[list[str]]) -> str:
     return "\n".join(lines)
 
 
-def warnings_of(fit: RigFit) -> list[str]:
+def warnings_of(fit: SetupFit) -> list[str]:
     """Return why a fit should not be believed as it stands, one line each; none where nothing was found."""
     found, cure = [], f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
     if on_bound := fit.optics.on_bound:
@@ -163,7 +163,7 @@ def warnings_of(fit: RigFit) -> list[str]:
     return found + _event_warnings(fit)
 
 
-def _event_warnings(fit: RigFit) -> list[str]:
+def _event_warnings(fit: SetupFit) -> list[str]:
     """Return where the event pixel does not make what the camera recorded."""
     counts = fit.residuals.get("counts held out")
     if fit.pixel is None or counts is None:
@@ -183,7 +183,7 @@ def _event_warnings(fit: RigFit) -> list[str]:
     return found
 
 
-def expectation(fit: RigFit) -> str:
+def expectation(fit: SetupFit) -> str:
     """Return in one line what training on the calibrated simulation can be expected to bring."""
     left = fit.residuals["frames held out, without pattern"]
     share, frames = 100 * left.unexplained, "frames"
@@ -208,7 +208,7 @@ def _left(r: Residual) -> str:
     )
 
 
-def figures(fit: RigFit, rows: list[Row]) -> dict[str, Any]:
+def figures(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
     """Return a calibration as plain values for JSON; an unknown error is null."""
     return {
         "evnlos": __version__,
@@ -238,21 +238,21 @@ def figures(fit: RigFit, rows: list[Row]) -> dict[str, Any]:
 
 
 def check_out(out: Path, force: bool) -> None:
-    """Refuse a folder that already holds a rig, so that an old one is never taken for a new one.
+    """Refuse a folder that already holds a setup, so that an old one is never taken for a new one.
 
     Raises:
-        ConfigError: The folder is a file or holds a rig file.
+        ConfigError: The folder is a file or holds a setup file.
     """
     if out.exists() and not out.is_dir():
-        raise ConfigError(f"{out} is a file; give a folder for the rig")
-    if (out / RIG_FILE).exists() and not force:
-        raise ConfigError(f"{out / RIG_FILE} exists; give another folder, or --force to replace it")
+        raise ConfigError(f"{out} is a file; give a folder for the setup")
+    if (out / CALIBRATED_FILE).exists() and not force:
+        raise ConfigError(f"{out / CALIBRATED_FILE} exists; give another folder, or --force to replace it")
 
 
-def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> Path:
-    """Write `calibration.json` and, where the fit stands on captures that it has not seen, the rig.
+def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) -> Path:
+    """Write `calibration.json` and, where the fit stands on captures that it has not seen, the setup.
 
-    The rig is `rig.yaml` (the simulation that matches it), `training.yaml` (that simulation, varied, to
+    The setup is `setup.yaml` (the simulation that matches it), `training.yaml` (that simulation, varied, to
     pre-train on), `targets` (the known targets, which it draws again) and `pattern.safetensors` (the frame
     camera's fixed pattern, for `import --pattern`).
 
@@ -260,10 +260,10 @@ def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> P
         fit: The calibration.
         rows: Its numbers (see `rows_of`).
         out: Folder; made where it is missing.
-        force: Write the rig file although the fit is no better on the held-out captures, or one exists.
+        force: Write the setup file although the fit is no better on the held-out captures, or one exists.
 
     Returns:
-        The rig file, which `evnlos simulate --config` takes.
+        The setup file, which `evnlos simulate --config` takes.
 
     Raises:
         DataError: The fit is no better than the start on the held-out captures, or, with unknown targets,
@@ -277,22 +277,22 @@ def write_rig(fit: RigFit, rows: list[Row], out: Path, force: bool = False) -> P
         r = fit.residuals[name]
         raise DataError(
             f"{name}: the residual went from {100 * r.before:.1f} % to {100 * r.after:.1f} %, so it is no fit "
-            "of the rig and no rig file was written; check that all captures show one unmoved rig, try another "
-            "--preset or start, or --no-events where only events got worse"
+            "of the setup and no setup file was written; check that all captures show one unmoved setup, try "
+            "another --preset or start, or --no-events where only events got worse"
         )
     if fit.targets == "unknown" and fit.unexplained is not None and not force:
         raise DataError(
-            f"{_left(fit.unexplained)}, so it is no fit of the rig and no rig file was written; "
+            f"{_left(fit.unexplained)}, so it is no fit of the setup and no setup file was written; "
             f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
         )
     save_pattern(fit.noise.pattern, out / PATTERN_FILE)
     save_yaml(_with_targets(fit, _with_wall(fit, fit.training, out), out / TARGETS), out / TRAINING_FILE)
-    save_yaml(_with_wall(fit, fit.simulation, out), out / RIG_FILE)
-    return out / RIG_FILE
+    save_yaml(_with_wall(fit, fit.simulation, out), out / CALIBRATED_FILE)
+    return out / CALIBRATED_FILE
 
 
-def _with_wall(fit: RigFit, simulation: Simulation, out: Path) -> Simulation:
-    """Return the simulation with the file of its fitted wall in the rig's folder; copied there."""
+def _with_wall(fit: SetupFit, simulation: Simulation, out: Path) -> Simulation:
+    """Return the simulation with the file of its fitted wall in the setup's folder; copied there."""
     setup = simulation.setup
     if not isinstance(setup, FittedSetup):
         return simulation
@@ -302,7 +302,7 @@ def _with_wall(fit: RigFit, simulation: Simulation, out: Path) -> Simulation:
     return simulation.with_setup(file=str(path), misfit="; ".join(warnings_of(fit)))
 
 
-def _with_targets(fit: RigFit, simulation: Simulation, folder: Path) -> Simulation:
+def _with_targets(fit: SetupFit, simulation: Simulation, folder: Path) -> Simulation:
     """Return the simulation that draws the known targets again, about as many as those of its writers."""
     glyphs = simulation.glyphs
     if not fit.known or not isinstance(glyphs, HandwritingGlyphs):

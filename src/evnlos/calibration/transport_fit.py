@@ -319,7 +319,7 @@ def _scanned(model: FrameModel, start: Setup) -> Setup:
         raise DataError(
             f"the targets explain {100 * max(explained, 0):.0f} % of what moves in the frames, below "
             f"{100 * _EXPLAINED:.0f} %; check the motion's start, speed and direction, or start "
-            "nearer to the rig"
+            "nearer to the setup"
         )
     return best
 

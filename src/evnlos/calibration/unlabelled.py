@@ -1,7 +1,7 @@
 """Calibration from sequences of unknown targets: what makes the frames likeliest.
 
 - How likely frames are where nobody knows what was hidden: the plate is integrated out.
-- Fitting a rig to passes of objects that nobody knows: what makes the frames likeliest for any handwriting.
+- Fitting a setup to passes of objects that nobody knows: what makes the frames likeliest for any handwriting.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ _REACH = 12.0  # of the search for gain and noise, in units of their logarithms
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """How a rig explains the passes of unknown objects.
+    """How a setup explains the passes of unknown objects.
 
     Args:
         cost: Negative log evidence over the number of samples; lower is better.
-        gain: White levels a unit of the rig's light.
+        gain: White levels a unit of the setup's light.
         noise: Standard deviation of a sample's noise, white levels; what the model cannot do counts as noise.
         plates: Expected plate of each pass, float64 [P, n, n]; noise makes some values leave 0..1.
     """
@@ -59,9 +59,9 @@ class Explained:
 
 @dataclass(frozen=True, eq=False)
 class EvidenceTerms:
-    """The evidence of one rig for any gain g and noise variance v.
+    """The evidence of one setup for any gain g and noise variance v.
 
-    y = g B x + e with B the rig's light from the plate's cells to all frames, less its mean over the pass,
+    y = g B x + e with B the setup's light from the plate's cells to all frames, less its mean over the pass,
     x ~ N(m, C) handwritten plates, and e ~ N(0, v). With C = R R^T and R^T B^T B R = V diag(l) V^T,
 
         -2 log p(y) = n log v + sum log(1 + g^2 l / v) + (|z|^2 - c^T (v + g^2 l)^-1 c) / v,
@@ -129,11 +129,11 @@ class MovingLight:
         """Standard deviation of what moves, white levels."""
         return float(self.moving.square().mean().sqrt())
 
-    def explained(self, rig: Setup) -> Explained:
-        """Return how a rig explains the frames at its best gain and noise."""
+    def explained(self, setup: Setup) -> Explained:
+        """Return how a setup explains the frames at its best gain and noise."""
         from scipy.optimize import minimize  # scipy loads slowly
 
-        terms = self.terms(rig)
+        terms = self.terms(setup)
         # The gain at which the mean plate alone moves as much as the frames, and a tenth of that as noise.
         power = float(terms.power.mean())
         start = np.log([math.sqrt(power / terms.lit), _SHARE * power / terms.samples])
@@ -148,18 +148,18 @@ class MovingLight:
         plates = self._plates(terms, gain, variance)
         return Explained(float(found.fun), gain, math.sqrt(variance), plates)
 
-    def explained_at(self, rig: Setup, gain: float, noise: float) -> Explained:
-        """Return how a rig explains the frames at a gain and a noise that other passes told."""
-        terms, variance = self.terms(rig), noise**2
+    def explained_at(self, setup: Setup, gain: float, noise: float) -> Explained:
+        """Return how a setup explains the frames at a gain and a noise that other passes told."""
+        terms, variance = self.terms(setup), noise**2
         return Explained(terms.cost(gain, variance), gain, noise, self._plates(terms, gain, variance))
 
     def _plates(self, terms: EvidenceTerms, gain: float, variance: float) -> torch.Tensor:
         plates = self._prior.mean + terms.code(gain, variance) @ terms.turn.mT @ self._prior.root.mT
         return plates.unflatten(1, self.plate.shape)
 
-    def terms(self, rig: Setup) -> EvidenceTerms:
-        """Return what the evidence of a rig is made of, all but gain and noise."""
-        sight = self.sight(rig)
+    def terms(self, setup: Setup) -> EvidenceTerms:
+        """Return what the evidence of a setup is made of, all but gain and noise."""
+        sight = self.sight(setup)
         gram = sight.gram(strip_gram_of(sight.transport), static=math.inf)
         mean, root = self._prior.mean, self._prior.root
         strength, turn = torch.linalg.eigh(root.mT @ gram @ root)
@@ -175,15 +175,15 @@ class MovingLight:
             samples=self.moving[0].numel() - self.moving[0, 0].numel(),
         )
 
-    def predicted(self, rig: Setup, known: Explained) -> torch.Tensor:
-        """Return what moves in the frames that a rig makes of known plates, [P, N, h, w]."""
-        frames = known.gain * self.sight(rig)(known.plates)
+    def predicted(self, setup: Setup, known: Explained) -> torch.Tensor:
+        """Return what moves in the frames that a setup makes of known plates, [P, N, h, w]."""
+        frames = known.gain * self.sight(setup)(known.plates)
         return frames - frames.mean(dim=1, keepdim=True)
 
-    def sight(self, rig: Setup) -> PlatePass:
+    def sight(self, setup: Setup) -> PlatePass:
         """Return the operator from a plate to all frames, at gain 1."""
         shape = (int(self.moving.shape[2]), int(self.moving.shape[3]))
-        matrix = rig.matrix(shape, self._strip)
+        matrix = setup.matrix(shape, self._strip)
         return PlatePass(MatrixTransport(matrix, self._strip, shape), self.plate, self.position_m)
 
 
@@ -198,7 +198,7 @@ _FAR = 1e3  # cost of a camera that can't be
 
 @dataclass(frozen=True, eq=False)
 class UnlabelledFit:
-    """A rig fitted to passes of unknown objects.
+    """A setup fitted to passes of unknown objects.
 
     Args:
         optics: The fit; its errors are those of each number alone, the others held.
@@ -217,7 +217,7 @@ class UnlabelledFit:
 def fit_unlabelled(
     fit: Shots, held: Shots, start: Setup, *, fixed: tuple[str, ...] = (), iterations: int = 25
 ) -> UnlabelledFit:
-    """Fit a rig to passes of unknown objects with known motion, and check it on other passes.
+    """Fit a setup to passes of unknown objects with known motion, and check it on other passes.
 
     The numbers of the optics are those that make the frames likeliest when the plates are any handwriting
     (`MovingLight.explained`): first a scan over blur and magnification, then quasi-Newton steps (L-BFGS-B).
@@ -237,12 +237,12 @@ def fit_unlabelled(
     parameters = parameters_of(start, fixed)
     found = _search(light, _scanned(light, start), parameters, iterations)
     given, asked = _moving(held, slice(0, None, 2)), _moving(held, slice(1, None, 2))
-    before, after = (_missed(given, asked, rig) for rig in (start, found))
+    before, after = (_missed(given, asked, setup) for setup in (start, found))
     known = light.explained(found)
     unseen = _moving(held, slice(None)).explained_at(found, known.gain, known.noise)
     seen, other = _with_plates(fit, known), _with_plates(held, unseen)
     full = FrameModel(seen, fit.shape, max(1, len(fit.frames()) // 200))
-    lit = [full.fit(full.light(rig.coarsened()))[0].into(rig.coarsened()) for rig in (start, found)]
+    lit = [full.fit(full.light(setup.coarsened()))[0].into(setup.coarsened()) for setup in (start, found)]
     optics = TransportFit(lit[0], lit[1], parameters, _errors(light, found, parameters))
     return UnlabelledFit(optics, seen, other, Residual(before, after, known.noise / light.spread))
 
@@ -269,7 +269,7 @@ def _moving(shots: Shots, frames: slice) -> MovingLight:
 
 def _scanned(light: MovingLight, start: Setup) -> Setup:
     trials = (rescaled(start, magnification=a, blur=b) for a, b in _SCANS)
-    return min(trials, key=lambda rig: _cost(light, rig))
+    return min(trials, key=lambda setup: _cost(light, setup))
 
 
 def _search(light: MovingLight, start: Setup, parameters: tuple[Parameter, ...], iterations: int) -> Setup:
@@ -300,20 +300,22 @@ def _search(light: MovingLight, start: Setup, parameters: tuple[Parameter, ...],
         options={"maxiter": iterations},
     )
     if not found.fun < _FAR:
-        raise DataError("no camera near the start explains the frames; give a start that is nearer to the rig")
+        raise DataError(
+            "no camera near the start explains the frames; give a start that is nearer to the setup"
+        )
     return moved(start, parameters, middle + found.x * scale)
 
 
-def _cost(light: MovingLight, rig: Setup) -> float:
+def _cost(light: MovingLight, setup: Setup) -> float:
     try:
-        return light.explained(rig).cost
+        return light.explained(setup).cost
     except ConfigError:  # a camera that can't be, e.g. one that sees past the wall: the search turns back
         return _FAR
 
 
-def _missed(given: MovingLight, asked: MovingLight, rig: Setup) -> float:
+def _missed(given: MovingLight, asked: MovingLight, setup: Setup) -> float:
     """Return how far some frames are from what others predict of them, over the spread of what moves."""
-    away = asked.moving - asked.predicted(rig, given.explained(rig))
+    away = asked.moving - asked.predicted(setup, given.explained(setup))
     return float(away.square().mean().sqrt()) / asked.spread
 
 
@@ -327,17 +329,17 @@ def _with_plates(shots: Shots, found: Explained) -> Shots:
     )
 
 
-def _errors(light: MovingLight, rig: Setup, parameters: tuple[Parameter, ...]) -> NDArray[np.float64]:
+def _errors(light: MovingLight, setup: Setup, parameters: tuple[Parameter, ...]) -> NDArray[np.float64]:
     """Return the standard error of each number, the others held, from the evidence's curvature."""
-    known = values_of(rig)
+    known = values_of(setup)
     values = np.array([encoded(p, known[p.name]) for p in parameters])
     count = light.moving.numel()
-    here = _cost(light, rig) * count
+    here = _cost(light, setup) * count
     found: list[float] = []
     for k, p in enumerate(parameters):
         step = np.zeros(len(values))
         step[k] = p.step
-        sides = [_cost(light, moved(rig, parameters, values + sign * step)) * count for sign in (1, -1)]
+        sides = [_cost(light, moved(setup, parameters, values + sign * step)) * count for sign in (1, -1)]
         bend = (sum(sides) - 2 * here) / p.step**2
         error = bend**-0.5 if bend > 0 else np.inf
         found.append(error * (known[p.name] if p.log else 1.0))

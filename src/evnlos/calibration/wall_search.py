@@ -119,7 +119,7 @@ def _scanned(data: WallData, known: Pose) -> list[WallState]:
             continue
         tried.append((left, state))
     if not tried:
-        raise DataError("no camera near the start sees the wall; give a start that is nearer to the rig")
+        raise DataError("no camera near the start sees the wall; give a start that is nearer to the setup")
     tried.sort(key=lambda one: one[0])
     least = tried[0][0]
     if mirrored < _MIRRORED * least:
@@ -131,7 +131,7 @@ def _scanned(data: WallData, known: Pose) -> list[WallState]:
         raise DataError(
             f"the targets explain {100 * (1 - math.sqrt(least)):.0f} % of what differs between captures, below "
             f"{100 * (1 - math.sqrt(_LEAST)):.0f} %; check the motion's start, speed and direction, or start "
-            "nearer to the rig"
+            "nearer to the setup"
         )
     return [state for _, state in tried]
 

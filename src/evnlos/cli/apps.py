@@ -88,7 +88,7 @@ class LiveCommand:
                     modality = "frame" if source.has_frames else "event"
                     name = published_for(None, modality, is_motion_known=False)
                     weights = load_weights(name)
-                    say(f"{name} makes the pictures: weights of the package, for its own rig; see --weights")
+                    say(f"{name} makes the pictures: weights of the package, for its own setup; see --weights")
                 engine = Engine(weights)
                 run = Run(source, engine, self.pace)
                 sinks = []

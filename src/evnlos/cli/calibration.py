@@ -1,7 +1,7 @@
 """Commands that measure a setup: `calibrate` and `scan`.
 
-- `evnlos calibrate`: captures with known targets in, a simulation of their rig out.
-- `evnlos scan`: plan a measurement of a rig's own light transport, and import what was recorded.
+- `evnlos calibrate`: captures with known targets in, a simulation of their setup out.
+- `evnlos scan`: plan a measurement of a setup's own light transport, and import what was recorded.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CalibrateCommand:
-    """Fit the simulator to captures with known targets; check it on captures held out; write a rig file."""
+    """Fit the simulator to captures with known targets; check it on captures held out; write a setup file."""
 
     PRESETS: ClassVar[Presets[Calibration]] = PRESETS
 
     captures: Folders
-    """Capture folders of one rig and one camera."""
+    """Capture folders of one setup and one camera."""
     out: Path
-    """Folder for rig.yaml, training.yaml, pattern.safetensors, calibration.json and check.png."""
+    """Folder for setup.yaml, training.yaml, pattern.safetensors, calibration.json and check.png."""
     preset: str = "default"
     """Kind of wall: `default` is rough metal (GGX roughness, camera), `paper` the tPSF and an affine view."""
     config: Path | None = None
@@ -44,7 +44,7 @@ class CalibrateCommand:
     """Where the search starts, of the kind that is fitted: a name, a settings file, or a folder of
     `calibrate`."""
     force: bool = False
-    """Write the rig file also where the fit fails on the held-out captures, or where one exists."""
+    """Write the setup file also where the fit fails on the held-out captures, or where one exists."""
     json: bool = False
     """Print one JSON object instead of tables."""
     settings: Flat[Calibration] = field(default_factory=Calibration)
@@ -56,13 +56,21 @@ class CalibrateCommand:
 
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""
-        from evnlos.calibration import figures, fit_rig, residual_table, rows_of, table, warnings_of, write_rig
+        from evnlos.calibration import (
+            figures,
+            fit_setup,
+            residual_table,
+            rows_of,
+            table,
+            warnings_of,
+            write_setup,
+        )
         from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
         from evnlos.errors import MissingDependencyError
         from evnlos.plot.results import draw_calibration
 
         check_out(self.out, self.force)
-        fit = fit_rig(self.captures, self.settings)
+        fit = fit_setup(self.captures, self.settings)
         rows = rows_of(fit, self.settings.start.pixel, self.settings.start.frame_camera)
         self.out.mkdir(parents=True, exist_ok=True)
         if self.json:
@@ -76,7 +84,7 @@ class CalibrateCommand:
             say(f"note: {error}")
         for line in warnings_of(fit):
             say(f"warning: {line}")
-        path = write_rig(fit, rows, self.out, self.force)
+        path = write_setup(fit, rows, self.out, self.force)
         if not self.json:
             print(
                 f"\nto pre-train on:   evnlos simulate --config {path.with_name(TRAINING_FILE)} --out DATASET"
@@ -87,7 +95,7 @@ class CalibrateCommand:
 
 @dataclass(frozen=True)
 class ScanCommand:
-    """Measure a rig's own light transport with a display or a moving LED: plan it, import what was recorded."""
+    """Measure a setup's own light transport with a display or a moving LED: plan a scan, import its frames."""
 
     action: Annotated[Literal["plan", "import"], tyro.conf.Positional]
     """plan writes scan.yaml, the table of pictures and what to show; import makes a transport of them."""

@@ -43,18 +43,18 @@ class ExperimentCommand:
     """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss, width,
     embedding, sequence (whole sequences) or objects (how many are simulated);
     without captures: simulation (handwriting, transfer to Comic), conditions (frames against events over
-    light, noise, exposure, speed and rigs), carry-over (given weights on unseen hands, other things than
+    light, noise, exposure, speed and setups), carry-over (given weights on unseen hands, other things than
     characters, and other walls, with what their confidence says), and mismatch (the demo on walls, lenses and
     sensors that the simulator does not describe)."""
     captures: Path | None = None
     """Folder of the capture folders."""
     weights: Path | None = None
-    """Weights for carry-over, which were trained for the setup OUT/rigs/NAME, NAME as for --captures-of."""
+    """Weights for carry-over, which were trained for the setup OUT/setups/NAME, NAME as for --captures-of."""
     out: Path = Path("experiments")
-    """Folder for rigs, datasets, runs, records and tables; experiments in one folder share what they can."""
+    """Folder for setups, datasets, runs, records and tables; experiments in one folder share what they can."""
     captures_of: str = "near"
     """Which captures: those whose names begin with this and an underscore."""
-    rigs: tuple[str, ...] = ()
+    setups: tuple[str, ...] = ()
     """For mismatch: rooms of `evnlos lab`, or, with --captures, folders of captures in it; all by default."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of initial weights and order of the samples."""
@@ -104,7 +104,7 @@ class ExperimentCommand:
         folders = tuple(captures_of(self.captures, self.captures_of))
         with ProgressBars() as progress:
             run_study(study, Place(folders, self.out, self.workers, self.trainings, self.force), progress)
-        records = [r for r in read_records(self.out / "records" / study.name) if r.rig == self.captures_of]
+        records = [r for r in read_records(self.out / "records" / study.name) if r.setup == self.captures_of]
         records = [r for r in records if r.split == study.split]
         text = _tables(study.name, records, self.metric)
         write_atomically(self.out / f"{study.name}-{self.captures_of}-{study.split}.md", text.encode())
@@ -170,7 +170,7 @@ class ExperimentCommand:
             run_simulated(settings, progress)
         text = ""
         for tested in ("nist", "comic"):
-            records = [r for r in read_records(self.out / "records" / "simulation") if r.rig == tested]
+            records = [r for r in read_records(self.out / "records" / "simulation") if r.setup == tested]
             text += _tables("simulation", records, self.metric) + "\n"
         write_atomically(self.out / "simulation.md", text.encode())
         print(text)
@@ -194,9 +194,9 @@ class ExperimentCommand:
         weights = self.weights
         if weights is None:
             raise ConfigError("carry-over needs --weights, a weights file or a run's folder")
-        rig = self.out / "rigs" / self.captures_of
+        setup = self.out / "setups" / self.captures_of
         with ProgressBars() as progress:
-            found = carry_over(weights, rig, self.out, self.workers, progress=progress, force=self.force)
+            found = carry_over(weights, setup, self.out, self.workers, progress=progress, force=self.force)
         name = f"carry-over-{self.captures_of}-{weights.stem}"
         write_carried(found, self.out / f"{name}.json")
         text = carried_table(found) + "\n"
@@ -219,14 +219,14 @@ class ExperimentCommand:
             e2e_epochs=self.e2e_epochs or base.e2e_epochs,
         )
         with ProgressBars() as progress:
-            found = run_mismatch(base, self.rigs, self.captures, self.seeds, progress)
+            found = run_mismatch(base, self.setups, self.captures, self.seeds, progress)
         print(mismatch_table(found))
 
 
 def _tables(name: str, records: list, metric: str) -> str:
     from evnlos.experiment import character_table, checks_table, gain_table, summary_table
 
-    parts = [f"# {name}, {records[0].rig}, {records[0].split} characters", summary_table(records, metric)]
+    parts = [f"# {name}, {records[0].setup}, {records[0].split} characters", summary_table(records, metric)]
     arms = {record.arm for record in records if record.seed >= 0}
     if {"EPNP", "E2E"} <= arms:
         parts += [gain_table(records), character_table(records, ("E2E", "EPNP"), metric)]

@@ -1,4 +1,4 @@
-"""`evnlos invert`: a photograph, captures or pictures of a known rig in; what is hidden out."""
+"""`evnlos invert`: a photograph, captures or pictures of a known setup in; what is hidden out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import tyro
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 
-LAM_TIKHONOV, LAM_TV = 4.0, 0.3  # best on eight characters of one rig, docs/inversion.md
+LAM_TIKHONOV, LAM_TV = 4.0, 0.3  # best on eight characters of one setup, docs/inversion.md
 
 
 @dataclass(frozen=True)

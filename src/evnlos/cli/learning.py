@@ -171,7 +171,7 @@ class EvaluateCommand:
     def run(self) -> None:
         """Evaluate and print."""
         from evnlos.analysis import available_lpips, curve_over_positions, evaluate, load_lpips
-        from evnlos.models import load_weights, published_rig
+        from evnlos.models import load_weights, published_setup
         from evnlos.report import refuse_seen, seen_in_training
         from evnlos.setups import calibrated_folder, load_setup
 
@@ -180,7 +180,7 @@ class EvaluateCommand:
         refuse_seen(weights.history, dataset, split)
         metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
         curve = curve_over_positions(weights, dataset, split, self.positions) if self.positions else []
-        word = calibrated_folder(self.setup) if self.setup else published_rig(self.weights)
+        word = calibrated_folder(self.setup) if self.setup else published_setup(self.weights)
         known = load_setup(word) if word else None
         found = evaluate(weights, dataset, split, metric, known).summary()
         about = {

@@ -74,7 +74,7 @@ class ReconstructCommand:
             print(json.dumps(found | {"out": str(self.out)}))
             return
         print(f"{self.out}: {found['positions']} positions of {found['capture']} by {found['weights']}")
-        if not found.get("moved_by_the_rig", True):
+        if not found.get("moved_by_the_setup", True):
             print(
                 f"the light is {found['light']:.2f} x that of the setup: its gain is not this capture's, the "
                 "pictures stay as the network draws them; calibrate at this exposure, on known targets"
@@ -105,7 +105,7 @@ class TrackCommand:
     """Setup of the capture (a file, or the folder that `evnlos calibrate` wrote): positions in metres; without
     it they are in image pixels."""
     pattern: Path | None = None
-    """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated rig."""
+    """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup."""
     out: Path = Path("track.png")
     """The picture; the numbers go to the same name with .json."""
     json: bool = False
@@ -190,19 +190,19 @@ def to_text(found: dict[str, Any]) -> str:
         f"mean speed  {scale * found['mean_speed']:8.3f} {unit}/s, "
         f"+- {scale * found['speed_sigma']:.3f} at an instant",
         f"position    {scale * found['position_sigma']:8.3f} {unit} standard deviation"
-        + (" by the noise; the rig's own errors come on top" if unit == "mm" else ""),
+        + (" by the noise; the setup's own errors come on top" if unit == "mm" else ""),
         f"size        {found['size_change']:8.3f} at the end over the start",
     ]
     if "misfit" in found:
         lines.append(
-            f"misfit      {found['misfit']:8.2f} times the noise is left in the frames by plate and rig"
+            f"misfit      {found['misfit']:8.2f} times the noise is left in the frames by plate and setup"
         )
     if "distance" in found:
         first, last = (scale * v for v in found["distance"])
         lines.append(
             f"distance    {first:8.2f} {unit} at the start, {last:.2f} {unit} at the end, "
             f"+- {scale * found['distance_sigma']:.2f} {unit}; "
-            f"{scale * found['distance_spread']:.2f} {unit} rms about its mean, which is the rig's"
+            f"{scale * found['distance_spread']:.2f} {unit} rms about its mean, which is the setup's"
         )
     if "position_error" in found:
         x, y = (scale * v for v in found["position_offset"])
@@ -236,8 +236,8 @@ class IdentifyCommand:
         """Identify and print."""
         from tqdm import tqdm
 
-        from evnlos.analysis.identify import identify, rig_table
-        from evnlos.plot.results import draw_identification, draw_rigs
+        from evnlos.analysis.identify import identify, setup_table
+        from evnlos.plot.results import draw_identification, draw_setups
         from evnlos.setups import named_setup, setup_names
 
         names = [*self.setups, *self.setup, *(setup_names() if self.all else [])]
@@ -255,14 +255,14 @@ class IdentifyCommand:
             for one in found:
                 draw_identification(one, self.out / f"identify_{one.name}.png")
             if len(found) > 1:
-                draw_rigs(found, self.out / "identify_rigs.png")
+                draw_setups(found, self.out / "identify_setups.png")
             curves = json.dumps([one.summary(arrays=True) for one in found], indent=1)
             write_atomically(self.out / "identify.json", curves.encode())
         if self.json:
             plain = [one.summary() for one in found]
             print(json.dumps(plain if len(plain) > 1 else plain[0]))
             return
-        print(rig_table(found))
+        print(setup_table(found))
         for one in found:
             print(f"{one.name}: {one.verdict}")
             for warning in one.warnings:

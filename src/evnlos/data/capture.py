@@ -67,8 +67,8 @@ class Capture:
 
     @property
     def distance_m(self) -> float | None:
-        """From hidden object to wall, metres, as noted in `rig`; None where it is not, or is no length."""
-        noted = self.info.rig.get("distance_m")
+        """From hidden object to wall, metres, as noted in `setup`; None where it is not, or is no length."""
+        noted = self.info.setup.get("distance_m")
         if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not 0 < noted < float("inf"):
             return None
         return float(noted)

@@ -174,8 +174,8 @@ class CaptureInfo:
     """Part of the event camera's sensor to use, after registration; none = all."""
     filters: FilterInfo = field(default_factory=FilterInfo)
     """Events to leave out."""
-    rig: dict[str, Any] = field(default_factory=dict)
-    """Notes about the rig: distance_m, wall, ambient."""
+    setup: dict[str, Any] = field(default_factory=dict)
+    """Notes about the setup: distance_m, wall, ambient."""
 
 
 def read_capture_info(folder: Path) -> CaptureInfo:
@@ -227,8 +227,8 @@ frames: frames               # a folder of pictures, a video, a table t_us,file,
 # How it moved: the centre is at start_m + speed_m_s (t - start_us), relative to the middle of the travel.
 # motion: {{start_m: -0.08, speed_m_s: 0.02, direction: [1, 0], start_us: 0}}
 
-# Your notes about the rig; the calibration takes distance_m (target's plane to wall) as measured.
-# rig: {{distance_m: 0.30, wall: rough aluminium, ambient: dark room}}
+# Your notes about the setup; the calibration takes distance_m (target's plane to wall) as measured.
+# setup: {{distance_m: 0.30, wall: rough aluminium, ambient: dark room}}
 """
 
 

@@ -225,7 +225,7 @@ def load_pattern(path: str | Path) -> FixedPattern:
     """Read a fixed pattern.
 
     Args:
-        path: The file, or the folder of a calibrated rig that holds it.
+        path: The file, or the folder of a calibrated setup that holds it.
 
     Raises:
         DataError: There is no such file, it is damaged, or it holds something else.
@@ -234,7 +234,9 @@ def load_pattern(path: str | Path) -> FixedPattern:
     if path.is_dir():
         path = path / PATTERN_FILE
     if not path.is_file():
-        raise DataError(f"{path} does not exist; `evnlos calibrate` writes the fixed pattern of a rig's camera")
+        raise DataError(
+            f"{path} does not exist; `evnlos calibrate` writes the fixed pattern of a setup's camera"
+        )
     try:
         _, tensors, _ = read_sealed(path)
         check_floats(tensors)
@@ -249,4 +251,4 @@ def load_pattern(path: str | Path) -> FixedPattern:
 
 
 PATTERN_FILE = "pattern.safetensors"
-"""Name of the file in a rig's folder."""
+"""Name of the file in a setup's folder."""

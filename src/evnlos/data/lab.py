@@ -1,4 +1,4 @@
-"""The sensor of a rendered laboratory: drawn once a rig, from ranges that are not the training simulator's.
+"""The sensor of a rendered laboratory: drawn once a setup, from ranges that are not the training simulator's.
 
 - Pseudo-real captures: shots that the training simulator did not make, for people without a camera.
 """
@@ -44,7 +44,7 @@ SENSOR_SPREAD: dict[str, tuple[float, float]] = {
     "setup.frame_camera.prnu": (0.012, 0.025),
     "setup.frame_camera.dsnu_e": (5.0, 15.0),
 }
-"""Uniform ranges of a rig's sensor.
+"""Uniform ranges of a setup's sensor.
 
 The training simulator has mismatch 0.03, leak 0.01 Hz, no dead time, no hot pixels, no jitter, 15,000
 electrons, 6 electrons of read noise, 1 % and 3 electrons of fixed pattern, 10 ms of exposure. No range holds
@@ -81,7 +81,7 @@ class Lab:
     """A rendered laboratory: a wall of metal or paint instead of a tPSF, and other cameras."""
 
     name: str = "lab"
-    """Name of the rig; captures are called NAME_A, NAME_B, ..."""
+    """Name of the setup; captures are called NAME_A, NAME_B, ..."""
     glyphs: Glyphs = field(default_factory=FontGlyphs)
     """What is hidden."""
     motion: LineMotion = field(default_factory=LineMotion)
@@ -94,7 +94,7 @@ class Lab:
     """Wall, geometry, light and cameras; the frame camera has 8 bits, as captures have, and the event pixel is
     on purpose not that of the training simulator."""
     spread: dict[str, tuple[float, float]] = field(default_factory=lambda: dict(SENSOR_SPREAD))
-    """Settings drawn once for the rig, uniformly: dotted name -> (low, high); {} takes them as they stand."""
+    """Settings drawn once for the setup, uniformly: dotted name -> (low, high); {} takes them as they stand."""
     seed: int = 0
     """Seed of every draw, the sensor's own settings among them."""
 
@@ -133,7 +133,7 @@ class Lab:
 
 
 def lab_preset(name: str) -> Lab:
-    """Return the lab of a named rig, e.g. "main-near" (see `setup_preset`), in the lab's light.
+    """Return the lab of a named setup, e.g. "main-near" (see `setup_preset`), in the lab's light.
 
     Raises:
         ConfigError: The name is unknown.
@@ -181,7 +181,7 @@ def render_captures(
     for any number of workers.
 
     Args:
-        lab: Rig, cameras and objects.
+        lab: Setup, cameras and objects.
         out: The folder for the captures; new, or begun with the same settings (other characters may be added).
         names: Objects of `lab.glyphs`; all by default.
         workers: Processes; 0 means one for each core.
@@ -194,7 +194,7 @@ def render_captures(
     Raises:
         DataError: `out` is a file, or was begun with other settings, or holds a folder in a capture's place, or
             the captures that are rendered at a time take more memory than there is.
-        ConfigError: The rig can't be.
+        ConfigError: The setup is geometrically impossible.
     """
     out = Path(out)
     if out.exists() and not out.is_dir():
@@ -209,7 +209,7 @@ def render_captures(
     for folder in folders.values():
         if folder.exists() and not (folder / "capture.yaml").is_file():
             raise DataError(f"{folder} is there without a capture.yaml; move it away, it is no capture")
-    # A wrong rig is an error before anything is written; a few pixels are enough to find it.
+    # A wrong setup is an error before anything is written; a few pixels are enough to find it.
     if names:
         drawn.setup.resized(_SKETCH).observe(_scene(drawn, names[0]))
     out.mkdir(parents=True, exist_ok=True)
@@ -289,7 +289,7 @@ def _description(lab: Lab, name: str, plate_m: float) -> dict[str, Any]:
             "direction": list(lab.motion.direction),
             "start_us": round(lab.motion.start_s * 1e6),
         },
-        "rig": {
+        "setup": {
             **({} if distance_m is None else {"distance_m": distance_m}),
             "wall": f"rendered: {setup.wall_description()}",
             "ambient": f"{setup.ambient:g} of the white level in the middle",

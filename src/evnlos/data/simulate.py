@@ -1,4 +1,4 @@
-"""Variation from object to object: settings drawn from ranges, so that no network learns one rig by heart.
+"""Variation from object to object: settings drawn from ranges, so that no network learns one setup by heart.
 
 - From settings to a dataset of shards: each object is a pure function of (settings, seed, name).
 """
@@ -117,7 +117,7 @@ class Simulation:
     """Resolution and representation of the stored samples."""
     vary: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Settings drawn for each object from a range: dotted name -> (low, high)."""
-    rigs: int = 0
+    setups: int = 0
     """Number of different walls and geometries that the ranges of the setup are drawn for, shared by the
     objects (each costs a light-transport matrix); 0 = one for each object."""
     validation: float = 0.05
@@ -134,9 +134,9 @@ class Simulation:
             raise ConfigError(f"Simulation.duration_s is {self.duration_s}; give a positive number of seconds")
         if self.positions < 1:
             raise ConfigError(f"Simulation.positions is {self.positions}; give at least 1")
-        if self.rigs < 0:
+        if self.setups < 0:
             raise ConfigError(
-                f"Simulation.rigs is {self.rigs}; give 0 (one for each object) or a number of rigs"
+                f"Simulation.setups is {self.setups}; give 0 (one for each object) or a number of setups"
             )
         if not 0 <= self.validation < 1:
             raise ConfigError(f"Simulation.validation is {self.validation}; give a share from 0 to below 1")
@@ -180,15 +180,15 @@ class Simulation:
 
 
 def drawn_for(config: Simulation, name: str) -> Simulation:
-    """Return the settings that `vary` draws for an object; those of the optics are shared by `rigs` groups.
+    """Return the settings that `vary` draws for an object; those of the optics are shared by `setups` groups.
 
     Gain and ambient light cost nothing, so they are always the object's own.
     """
-    optics = {path: ends for path, ends in config.vary.items() if config.rigs and _needs_a_matrix(path)}
+    optics = {path: ends for path, ends in config.vary.items() if config.setups and _needs_a_matrix(path)}
     others = {path: ends for path, ends in config.vary.items() if path not in optics}
     if optics:
-        group = derive_seed(config.seed, name, "rig") % config.rigs
-        config = varied(config, optics, config.seed, f"rig {group}")
+        group = derive_seed(config.seed, name, "rig") % config.setups
+        config = varied(config, optics, config.seed, f"rig {group}")  # the word decides the seed, so it stays
     return varied(config, others, config.seed, name)
 
 

@@ -28,7 +28,7 @@ from evnlos.setups.load import as_in_the_paper, page_setup, rough_paper
 
 
 def default() -> Simulation:
-    """Return the simulation to pre-train on when the rig is known only roughly: the paper's transport, varied.
+    """Return the simulation to pre-train on when little is known of the setup: the paper's transport, varied.
 
     Blur, light, noise and thresholds are drawn for each object from wide ranges, the magnification from a
     narrow one around a target 0.3 m from the wall and a camera 0.6 m from it; the camera aims at the middle
@@ -86,7 +86,7 @@ def _tested_on(glyphs: HandwritingGlyphs | FontGlyphs) -> Simulation:
 
 
 def page() -> Simulation:
-    """Return the simulation that the networks of `evnlos app` learn from: the page's rig, its sliders moved.
+    """Return the simulation that the networks of `evnlos app` learn from: the page's setup, its sliders moved.
 
     Metal from smooth to rough, the distances, lights, noises and thresholds around the page's first setting;
     beyond, where even the best linear picture shows next to nothing, the networks are not at home.
@@ -108,7 +108,7 @@ def page() -> Simulation:
             "setup.pixel.threshold_off": (0.08, 0.3),
             "setup.pixel.shot_noise_rate_hz": (0.0, 0.2),
         },
-        rigs=200,
+        setups=200,
     )
 
 

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from evnlos.analysis.confidence import FrameOperator, PassWorth, consistent, risk_coverage, worth_of
-from evnlos.calibration import RIG_FILE
 from evnlos.calibration.transport_fit import values_of
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
@@ -26,6 +25,7 @@ from evnlos.models.confidence import on_canvas
 from evnlos.progress import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS
+from evnlos.setups import calibrated_file
 
 
 @dataclass(frozen=True)
@@ -52,22 +52,22 @@ class CarriedOver:
         return float(np.mean([getattr(one, key) for one in self.worth]))
 
 
-def sets(rig: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation]:
+def sets(setup: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation]:
     """Return the sets: unseen hands, each kind of drawings, and the same hands in front of other walls.
 
     Args:
-        rig: The calibrated rig.
+        setup: The calibrated setup.
         sampling: Resolution and representation of the network's samples.
         each: Objects of a set; of the unseen hand all 36 characters.
 
     Raises:
-        DataError: The rig's wall is not radiometric.
+        DataError: The setup's wall is not radiometric.
     """
-    wall: Any = rig.setup  # of rough metal, as the sets say
+    wall: Any = setup.setup  # of rough metal, as the sets say
     known = values_of(wall)
     if "roughness" not in known:
         raise DataError(f"the setup is {wall.kind!r}; give a calibrated one (radiometric)")
-    base = replace(rig, sampling=sampling, vary={}, rigs=0, validation=0.0, held_out="", keep_events=False)
+    base = replace(setup, sampling=sampling, vary={}, setups=0, validation=0.0, held_out="", keep_events=False)
     hand = HandwritingGlyphs(characters=UPPER_CASE + DIGITS, writers=1, first_writer=TRAIN_WRITERS)
     some = replace(hand, characters="".join((UPPER_CASE + DIGITS)[:: max(1, 36 // each)][:each]))
     offset = wall.target_offset_m  # None: in the mirror direction, at any distance
@@ -87,7 +87,7 @@ def sets(rig: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation
 
 def carry_over(
     weights: Path,
-    rig: Path,
+    setup: Path,
     out: Path,
     workers: int = 0,
     each: int = 12,
@@ -98,7 +98,7 @@ def carry_over(
 
     Args:
         weights: Weights file, or a run's folder.
-        rig: Folder of the calibrated rig.
+        setup: Folder of the calibrated setup.
         out: Folder for datasets and results.
         workers: Processes that simulate; 0 = one for each core.
         each: Objects of a set.
@@ -106,7 +106,7 @@ def carry_over(
         force: Whether to begin although the machine's memory will hardly do.
 
     Raises:
-        DataError: The weights do not know what their pictures are worth, or the rig can't be used.
+        DataError: The weights do not know what their pictures are worth, or the setup can't be used.
     """
     loaded = load_weights(weights)
     if loaded.confidence is None:
@@ -114,13 +114,13 @@ def carry_over(
             f"{weights} does not know what its pictures are worth; train on a dataset with a validation split"
         )
     sampling = loaded.sampling
-    own = load_yaml(Simulation, rig / RIG_FILE)
+    own = load_yaml(Simulation, calibrated_file(setup))
     operator = FrameOperator(own.setup, sampling) if "frame" in loaded.modality.slices else None
     processes(workers, 1)
     found = list[CarriedOver]()
     for name, config in sets(own, sampling, each).items():
         key = config_hash(config)[:8]
-        folder = out / "simulations" / f"{rig.name}-{name.replace(' ', '-')}-{key}"
+        folder = out / "simulations" / f"{setup.name}-{name.replace(' ', '-')}-{key}"
         dataset = simulate(config, folder, workers, progress=progress, force=force)
         same = operator is None or config.setup == own.setup
         own_wall = operator if same else FrameOperator(config.setup, sampling)
@@ -136,7 +136,7 @@ def _score(
     operator: FrameOperator | None,
     own_wall: FrameOperator | None,
 ) -> CarriedOver:
-    """Score a set; `operator` is the rig that the network was trained for, `own_wall` that of the set."""
+    """Score a set; `operator` is the setup that the network was trained for, `own_wall` that of the set."""
     assert weights.confidence is not None
     samples = NlosDataset(dataset, "all", weights.modality)
     images = weights.network.infer(samples.inputs, samples.position_m, samples.names)

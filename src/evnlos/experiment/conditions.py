@@ -102,7 +102,7 @@ def conditions(base: Simulation) -> list[Condition]:
     - read noise of the frame camera, electrons.
     - exposure of the frames, seconds; their gain is set so that the level stays.
     - speed of the target, metres a second, over the same way; the surface's time constant follows it.
-    - difficulty of the rig: roughness of the metal, a matte wall, distance from target to wall, metres; the
+    - difficulty of the setup: roughness of the metal, a matte wall, distance from target to wall, metres; the
       brightest pixel stays as bright.
     """
     found = [Condition("base", 1.0, "", base)]
@@ -133,13 +133,13 @@ def conditions(base: Simulation) -> list[Condition]:
             sampling=replace(base.sampling, tau_s=tau_s),
         )
         found.append(Condition("speed", speed, "m/s", moved))
-    rig: Any = base.setup  # a radiometric one, see `base_simulation`
+    setup: Any = base.setup  # a radiometric one, see `base_simulation`
     for roughness in (0.02, 0.1, 0.2):
-        wall = replace(rig, roughness=roughness)
+        wall = replace(setup, roughness=roughness)
         found.append(Condition("roughness", roughness, "of the wall", replace(base, setup=wall)))
-    matte = replace(rig, wall_material="lambert")
+    matte = replace(setup, wall_material="lambert")
     found.append(Condition("albedo", matte.albedo, "of a matte wall", replace(base, setup=matte)))
-    far = replace(rig, distance_m=FAR_M)
+    far = replace(setup, distance_m=FAR_M)
     found.append(Condition("distance", FAR_M, "m", replace(base, setup=far)))
     return found
 

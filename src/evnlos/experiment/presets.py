@@ -17,7 +17,7 @@ PRETRAINING = Training(epochs=2)
 FINETUNING = Training(epochs=3, learning_rate=2e-4, keep_normalization=True)
 """Fine-tuning after a calibrated simulation, whose scale stays; chosen on validation characters."""
 UNCALIBRATED = replace(FINETUNING, epochs=10, learning_rate=1e-3, keep_normalization=False)
-"""Fine-tuning after a simulation of another rig: longer, in larger steps, with the scale of the captures."""
+"""Fine-tuning after a simulation of another setup: longer, in larger steps, with the scale of the captures."""
 END_TO_END = Training(epochs=12)
 """End-to-end training; validation characters gain nothing after half of it."""
 
@@ -26,7 +26,7 @@ _E2E = Arm("E2E", "none", None, END_TO_END)
 _EPNP = Arm("EPNP", "calibrated", PRETRAINING, FINETUNING)
 
 
-def captures(rig: str) -> Study:
+def captures(setup: str) -> Study:
     """Return the main comparison: E2E, simulation alone, EPNP on the uncalibrated and the calibrated one.
 
     E2E is there twice: with our network, whose linear embedding it learns from the captures, and as the paper
@@ -35,7 +35,7 @@ def captures(rig: str) -> Study:
     plain = replace(END_TO_END, network=_PLAIN)
     return Study(
         "captures",
-        rig,
+        setup,
         (
             Arm("E2E plain", "none", None, plain),
             _E2E,
@@ -46,12 +46,12 @@ def captures(rig: str) -> Study:
     )
 
 
-def paper(rig: str) -> Study:
+def paper(setup: str) -> Study:
     """Return the comparison with the paper's own settings: 200 epochs, 1e-4, L1 + 2/SSIM; a GPU's work."""
     fine = paper_finetuning()
     return Study(
         "paper",
-        rig,
+        setup,
         (
             Arm("E2E", "none", None, replace(fine, learning_rate=1e-4)),
             Arm("EPNP", "uncalibrated", paper_pretraining(), fine),
@@ -61,17 +61,17 @@ def paper(rig: str) -> Study:
     )
 
 
-def frozen(rig: str) -> Study:
+def frozen(setup: str) -> Study:
     """Return the ablation of what stays as pre-trained in fine-tuning."""
     parts = {"nothing": (), "encoder": ("encoder",), "latent": ("latent",), "both": ("encoder", "latent")}
     arms = (
         replace(_EPNP, name=f"frozen: {name}", finetuning=replace(FINETUNING, freeze=freeze))
         for name, freeze in parts.items()
     )
-    return Study("frozen", rig, tuple(arms))
+    return Study("frozen", setup, tuple(arms))
 
 
-def shots(rig: str) -> Study:
+def shots(setup: str) -> Study:
     """Return the ablation of the number of real shots, with and without pre-training."""
     arms = [Arm("EPNP 0 shots", "calibrated", PRETRAINING, None)]
     for count in (1, 2, 4, 8, 16, None):
@@ -82,10 +82,10 @@ def shots(rig: str) -> Study:
         alone = replace(END_TO_END, epochs=END_TO_END.epochs * min(longer, 8))
         arms.append(replace(_EPNP, name=f"EPNP {words}", shots=count, finetuning=fine))
         arms.append(replace(_E2E, name=f"E2E {words}", shots=count, finetuning=alone))
-    return Study("shots", rig, tuple(arms))
+    return Study("shots", setup, tuple(arms))
 
 
-def surface(rig: str) -> Study:
+def surface(setup: str) -> Study:
     """Return the ablation of the time surface: time constant, kind and radius; events alone."""
     samplings = {f"sae, {tau:g} s": Sampling(tau_s=tau) for tau in (0.05, 0.1, 0.2, 0.4, 0.8)}
     samplings |= {
@@ -96,10 +96,10 @@ def surface(rig: str) -> Study:
         for name, s in samplings.items()
         for arm in (_E2E, _EPNP)
     ]
-    return Study("surface", rig, tuple(arms), ("event",))
+    return Study("surface", setup, tuple(arms), ("event",))
 
 
-def thresholds(rig: str) -> Study:
+def thresholds(setup: str) -> Study:
     """Return the ablation of the simulated event thresholds: right, and wrong by factors; events alone."""
     arms = []
     for factor in (0.5, 0.75, 1.0, 1.5, 2.0):
@@ -107,20 +107,20 @@ def thresholds(rig: str) -> Study:
             f"setup.pixel.threshold_{p}": (0.2 * factor * 0.95, 0.2 * factor * 1.05) for p in ("on", "off")
         }
         arms.append(replace(_EPNP, name=f"thresholds {0.2 * factor:.2f}", vary=ranges))
-    return Study("thresholds", rig, tuple(arms), ("event",))
+    return Study("thresholds", setup, tuple(arms), ("event",))
 
 
-def loss(rig: str) -> Study:
+def loss(setup: str) -> Study:
     """Return the ablation of the loss: the balanced one and the paper's."""
     arms = []
     for name in ("balanced", "paper"):
         arms.append(replace(_E2E, name=f"E2E {name} loss", finetuning=replace(END_TO_END, loss=name)))
         pre, fine = replace(PRETRAINING, loss=name), replace(FINETUNING, loss=name)
         arms.append(replace(_EPNP, name=f"EPNP {name} loss", pretraining=pre, finetuning=fine))
-    return Study("loss", rig, tuple(arms))
+    return Study("loss", setup, tuple(arms))
 
 
-def width(rig: str) -> Study:
+def width(setup: str) -> Study:
     """Return the ablation of the network's width."""
     arms = []
     for channels in (16, 32, 48, 64):
@@ -128,10 +128,10 @@ def width(rig: str) -> Study:
         arms.append(replace(_E2E, name=f"E2E width {channels}", finetuning=replace(END_TO_END, network=net)))
         pre = replace(PRETRAINING, network=net)
         arms.append(replace(_EPNP, name=f"EPNP width {channels}", pretraining=pre))
-    return Study("width", rig, tuple(arms))
+    return Study("width", setup, tuple(arms))
 
 
-def embedding(rig: str) -> Study:
+def embedding(setup: str) -> Study:
     """Return the ablation of what the network knows before its first step: scale and linear embedding."""
     kinds = {
         "plain, each picture scaled": _PLAIN,
@@ -143,7 +143,7 @@ def embedding(rig: str) -> Study:
     for name, net in kinds.items():
         arms.append(replace(_E2E, name=f"E2E {name}", finetuning=replace(END_TO_END, network=net)))
         arms.append(replace(_EPNP, name=f"EPNP {name}", pretraining=replace(PRETRAINING, network=net)))
-    return Study("embedding", rig, tuple(arms))
+    return Study("embedding", setup, tuple(arms))
 
 
 _SEQUENCE_NETWORK = SequenceConfig(rank=512, strengths=(0.001, 0.01, 0.1, 1.0))
@@ -151,7 +151,7 @@ _SEQUENCE = Training(epochs=6, batch_size=16, network=_SEQUENCE_NETWORK)
 _SEQUENCE_FINETUNING = replace(FINETUNING, epochs=8, batch_size=16)
 
 
-def sequence(rig: str) -> Study:
+def sequence(setup: str) -> Study:
     """Return the comparison of E2E and EPNP where all time steps of a sequence are seen together.
 
     A sequence is one sample: the simulation has four times the writers of the other studies.
@@ -161,7 +161,7 @@ def sequence(rig: str) -> Study:
         Arm("simulation only sequence", "calibrated", _SEQUENCE, None),
         Arm("EPNP sequence", "calibrated", _SEQUENCE, _SEQUENCE_FINETUNING),
     )
-    return Study("sequence", rig, arms, writers=44)
+    return Study("sequence", setup, arms, writers=44)
 
 
 def on_sequences(study: Study) -> Study:
@@ -204,7 +204,7 @@ def _of_passes(single: Training, longer: int, arm: str) -> Training:
     return replace(single, epochs=longer * single.epochs, batch_size=_SEQUENCE.batch_size, network=network)
 
 
-def objects(rig: str) -> Study:
+def objects(setup: str) -> Study:
     """Return the ablation of the number of simulated objects, of sequence networks.
 
     With 396 objects the validation no longer gains after 12 epochs; with more there is time for fewer.
@@ -214,7 +214,7 @@ def objects(rig: str) -> Study:
         before, words = replace(_SEQUENCE, epochs=epochs), f"{36 * writers} objects"
         arms.append(Arm(f"simulation only, {words}", "calibrated", before, None, writers=writers))
         arms.append(Arm(f"EPNP, {words}", "calibrated", before, _SEQUENCE_FINETUNING, writers=writers))
-    return Study("objects", rig, tuple(arms))
+    return Study("objects", setup, tuple(arms))
 
 
 STUDIES: dict[str, Callable[[str], Study]] = {

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from evnlos.analysis import available_lpips, evaluate
-from evnlos.calibration import RigFit, fit_rig, rows_of, write_rig
+from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import STANDARD_MODALITIES, Dataset, Simulation, import_captures, load_pattern, simulate
 from evnlos.data.capture import character_of
@@ -28,7 +28,7 @@ from evnlos.experiment.table import score_arm
 from evnlos.models import layers_of, load_weights
 from evnlos.progress import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
-from evnlos.setups import SensorSize
+from evnlos.setups import SensorSize, calibrated_file
 from evnlos.training import Training, choose_and_finetune, train
 from evnlos.types import derive_seed
 
@@ -99,7 +99,7 @@ def _trained(task: tuple[Run, int]) -> str:
 def run_study(study: Study, place: Place, progress: Progress = silent) -> list[Record]:
     """Run what is not done yet of a study, and return the records that are new; run it again to go on.
 
-    Rigs, datasets and runs have names that hold a hash of what decides them, so arms and studies share what
+    Setups, datasets and runs have names that hold a hash of what decides them, so arms and studies share what
     they have in common.
 
     Args:
@@ -109,22 +109,22 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
 
     Raises:
         DataError: Fewer captures than an arm learns from.
-        CalibrationError: Captures that no rig fits, or whose targets are unknown.
+        CalibrationError: Captures that no setup fits, or whose targets are unknown.
     """
     for arm in study.arms:
         _chosen(study, arm, place)
-    rig = place.out / "rigs" / study.rig
-    needs_rig = study.correct_pattern or any(arm.source == "calibrated" for arm in study.arms)
-    if needs_rig and not (rig / "rig.yaml").is_file():
+    setup = place.out / "setups" / study.setup
+    needs_setup = study.correct_pattern or any(arm.source == "calibrated" for arm in study.arms)
+    if needs_setup and not calibrated_file(setup).is_file():
         settings = replace(study.calibration, exclude=(*study.calibration.exclude, *study.test))
-        progress(Step(f"calibrate {study.rig}", 0, 1, "setups"))
+        progress(Step(f"calibrate {study.setup}", 0, 1, "setups"))
         try:
-            fit = fit_rig(place.captures, settings)
-            write_rig(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), rig)
-            _draw(fit, rig / "check.png")
+            fit = fit_setup(place.captures, settings)
+            write_setup(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), setup)
+            _draw(fit, setup / "check.png")
         except DataError as error:
             raise CalibrationError(str(error)) from None
-        progress(Step(f"calibrate {study.rig}", 1, 1, "setups"))
+        progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))
     networks, records = [], list[Record]()
     for arm in study.arms:
         shots = _import(study, arm, place, progress)
@@ -144,7 +144,7 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
     return records
 
 
-def _draw(fit: RigFit, path: Path) -> None:
+def _draw(fit: SetupFit, path: Path) -> None:
     """Draw held-out captures beside the fit, where matplotlib is installed."""
     from evnlos.plot.results import draw_calibration  # matplotlib loads slowly
 
@@ -152,23 +152,23 @@ def _draw(fit: RigFit, path: Path) -> None:
         draw_calibration(fit, path)
 
 
-def captures_of(root: Path, rig: str) -> list[Path]:
-    """Return the capture folders of a rig, by name.
+def captures_of(root: Path, setup: str) -> list[Path]:
+    """Return the capture folders of a setup, by name.
 
     Raises:
         DataError: There are none.
     """
-    folders = sorted(path.parent for path in Path(root).glob(f"{rig}_*/capture.yaml"))
+    folders = sorted(path.parent for path in Path(root).glob(f"{setup}_*/capture.yaml"))
     if not folders:
-        raise DataError(f"{root} holds no captures {rig}_*; give the folder that holds them with --captures")
+        raise DataError(f"{root} holds no captures {setup}_*; give the folder that holds them with --captures")
     return folders
 
 
 def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     """Return the simulation that an arm is pre-trained on."""
     if arm.source == "calibrated":
-        config = load_yaml(Simulation, place.out / "rigs" / study.rig / "training.yaml")
-        config = replace(config, rigs=config.rigs if study.rigs is None else study.rigs)
+        config = load_yaml(Simulation, place.out / "setups" / study.setup / "training.yaml")
+        config = replace(config, setups=config.setups if study.setups is None else study.setups)
     else:
         config = study.simulation or default()
     glyphs = config.glyphs
@@ -183,7 +183,7 @@ def _simulate(study: Study, arm: Arm, place: Place, progress: Progress) -> Datas
     if arm.source == "none":
         return None
     config = simulation_of(study, arm, place)
-    folder = place.out / "simulations" / f"{arm.source}-{study.rig}-{config_hash(config)[:8]}"
+    folder = place.out / "simulations" / f"{arm.source}-{study.setup}-{config_hash(config)[:8]}"
     return simulate(config, folder, place.workers, progress=progress, force=place.force)
 
 
@@ -196,7 +196,7 @@ def _chosen(study: Study, arm: Arm, place: Place) -> list[Path]:
 def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset:
     held = study.test if not study.validation else ()
     chosen = _chosen(study, arm, place)
-    pattern = load_pattern(place.out / "rigs" / study.rig) if study.correct_pattern else None
+    pattern = load_pattern(place.out / "setups" / study.setup) if study.correct_pattern else None
     key = config_hash(
         {
             "captures": [f.name for f in chosen],
@@ -206,7 +206,7 @@ def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset
             "pattern": pattern and pattern.digest,
         }
     )
-    out = place.out / "shots" / f"{study.rig}-{key[:8]}"
+    out = place.out / "shots" / f"{study.setup}-{key[:8]}"
     split = {"test": held, "validation": study.validation}
     return import_captures(chosen, out, arm.sampling, **split, pattern=pattern, progress=progress)
 
@@ -235,7 +235,7 @@ def _planned(
         if arm.start:
             decides["from"] = arm.start
         key = config_hash(decides)[:8]
-        out = place.out / "runs" / f"{study.rig}-pretrained-{modality}-seed{seed}-{key}"
+        out = place.out / "runs" / f"{study.setup}-pretrained-{modality}-seed{seed}-{key}"
         runs.append(Run(made, settings, out, begin))
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
@@ -245,7 +245,7 @@ def _planned(
         if arm.choose:
             decides["choose"] = True
         key = config_hash(decides)[:8]
-        out = place.out / "runs" / f"{study.rig}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
+        out = place.out / "runs" / f"{study.setup}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
         runs.append(Run(shots, settings, out, start, arm.choose))
     return runs, decided
 

@@ -36,7 +36,7 @@ class Arm:
     name: str
     """Name in the tables; also of the runs' folders."""
     source: Source = "calibrated"
-    """Simulation to pre-train on: of the calibrated rig, the uncalibrated default, or none."""
+    """Simulation to pre-train on: of the calibrated setup, the uncalibrated default, or none."""
     pretraining: Training | None = None
     """Settings of the pre-training."""
     finetuning: Training | None = None
@@ -72,12 +72,12 @@ class Arm:
 
 @dataclass(frozen=True)
 class Study:
-    """Arms, compared on the captures of one rig."""
+    """Arms, compared on the captures of one setup."""
 
     name: str
     """Name of the experiment."""
-    rig: str = "near"
-    """Name of the rig; the calibrated rig and all that follows from it are kept under this name."""
+    setup: str = "near"
+    """Name of the setup; the calibrated setup and all that follows from it are kept under this name."""
     arms: tuple[Arm, ...] = ()
     """What is compared."""
     modalities: tuple[str, ...] = STANDARD_MODALITIES
@@ -96,11 +96,11 @@ class Study:
     simulation: Simulation | None = None
     """What an uncalibrated arm is pre-trained on; None is the default simulation."""
     calibration: Calibration = field(default_factory=Calibration)
-    """How the rig is calibrated; the test characters are left out of it whatever it says."""
-    rigs: int | None = None
+    """How the setup is calibrated; the test characters are left out of it whatever it says."""
+    setups: int | None = None
     """Different walls and cameras in the calibrated simulation; None is as many as the calibration says."""
     refine: bool = True
-    """Also score pictures after data consistency, where there are a frame and a calibrated rig."""
+    """Also score pictures after data consistency, where there are a frame and a calibrated setup."""
     correct_pattern: bool = True
     """Take the frame camera's fixed pattern, as the calibration found it, from all frames."""
 
@@ -124,8 +124,8 @@ class Place:
     """Where an experiment finds its captures and keeps what it makes.
 
     Args:
-        captures: Capture folders of the study's rig.
-        out: Folder for rigs, datasets, runs and records.
+        captures: Capture folders of the study's setup.
+        out: Folder for setups, datasets, runs and records.
         workers: Processes that simulate; 0 is one for each core.
         trainings: Networks that are trained at a time where there is no GPU; 0 is one for each core.
         force: Whether simulations begin although the machine's memory will hardly do.
@@ -152,7 +152,7 @@ class Record:
 
     Args:
         study: Name of the study.
-        rig: Rig of the captures.
+        setup: Setup of the captures.
         arm: Name of the arm.
         modality: What the network saw.
         seed: Its seed; -1 for an ensemble over the seeds.
@@ -165,7 +165,7 @@ class Record:
     """
 
     study: str
-    rig: str
+    setup: str
     arm: str
     modality: str
     seed: int
@@ -180,7 +180,7 @@ class Record:
     def name(self) -> str:
         """File name of the record."""
         seed = "ensemble" if self.seed < 0 else f"seed{self.seed}"
-        return f"{self.rig}-{self.split}-{slug(self.arm)}-{self.modality}-{seed}"
+        return f"{self.setup}-{self.split}-{slug(self.arm)}-{self.modality}-{seed}"
 
 
 def slug(text: str) -> str:

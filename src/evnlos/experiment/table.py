@@ -19,7 +19,6 @@ from torch import Tensor
 from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling
 from evnlos.analysis.confidence import FrameOperator, consistent
 from evnlos.analysis.scores import Interval, paired_difference
-from evnlos.calibration import RIG_FILE
 from evnlos.data import Dataset, NlosDataset, Sampling, as_modality, character_of, modality_order, read_shard
 from evnlos.errors import DataError
 from evnlos.experiment.study import Arm, Place, Record, Study, keep_scores, names_there
@@ -68,7 +67,7 @@ def score_arm(
     )
 
     def record(name: str, seed: int, settings: dict[str, Any]) -> Record:
-        return Record(study.name, study.rig, name, modality, seed, study.split, {}, {}, {}, {}, settings)
+        return Record(study.name, study.setup, name, modality, seed, study.split, {}, {}, {}, {}, settings)
 
     def score(blank: Record, images: Tensor, mean_image: Tensor | None) -> None:
         found = assess(images, samples, shots, study.split, mean_image, available_lpips())
@@ -126,16 +125,16 @@ def _linear(data: Dataset, modality: str, samples: NlosDataset) -> Tensor:
 
 
 def _consistent(study: Study, arm: Arm, shots: Dataset, place: Place, images: Tensor) -> Tensor:
-    """Return pictures of the scored split after data consistency with the calibrated rig."""
-    operator = _operator(place.out / "rigs" / study.rig / RIG_FILE, arm.sampling)
+    """Return pictures of the scored split after data consistency with the calibrated setup."""
+    operator = _operator(place.out / "setups" / study.setup, arm.sampling)
     names = shots.objects(study.split)
     frames = torch.cat([torch.from_numpy(read_shard(shots.shard(name))[0].frame) for name in names])
     return consistent(images, frames, operator, TRUST)
 
 
 @lru_cache(maxsize=2)
-def _operator(rig: Path, sampling: Sampling) -> FrameOperator:
-    return FrameOperator(load_setup(rig), sampling)
+def _operator(setup: Path, sampling: Sampling) -> FrameOperator:
+    return FrameOperator(load_setup(setup), sampling)
 
 
 _PLACES = {"psnr_db": 2, "psnr_box_db": 2}

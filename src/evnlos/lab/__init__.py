@@ -1,4 +1,4 @@
-"""A second renderer, for captures that the simulator's own models of a rig do not describe."""
+"""A second renderer, for captures that the simulator's own models of a setup do not describe."""
 
 from evnlos.lab.light_path import Optics, Rays, cast, fill_throughput, texture
 from evnlos.lab.reflection import Lobe, Reflection

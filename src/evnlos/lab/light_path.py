@@ -1,4 +1,4 @@
-"""The light path of a real rig: lens -> curved, textured wall -> target plane, as a matrix of throughputs.
+"""The light path of a real setup: lens -> curved, textured wall -> target plane, as a matrix of throughputs.
 
 Coordinates: x to the right, y downwards, z from the wall's middle into the room, metres. The wall is the
 paraboloid z = -(c_x x^2 + c_y y^2) / 2, the target's plane is z = distance. A pixel averages `samples` rays,

@@ -1,4 +1,4 @@
-"""How the wall of a real rig reflects: a mixture of microfacet lobes that no single formula holds, and paint.
+"""How the wall of a real setup reflects: a mixture of microfacet lobes that no single formula holds, and paint.
 
 The lobes are densities over the slopes of the microfacets: P(u, v), u = h_x / h_z and v = h_y / h_z of the half
 vector, with integral 1. The wall's BRDF is

@@ -1,4 +1,4 @@
-"""What stands in the room of a rendered rig, and the light on its wall in continuous time."""
+"""What stands in the room of a rendered setup, and the light on its wall in continuous time."""
 
 from __future__ import annotations
 

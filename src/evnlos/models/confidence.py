@@ -64,7 +64,7 @@ def on_canvas(plate: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float
 COVERAGE = 0.9
 """Share of a plate's pixels whose true level the intervals are to hold."""
 CONFIRMED = 0.7
-"""Share of the frames that pictures have to explain where the rig is known (see `Judgement.explained`)."""
+"""Share of the frames that pictures have to explain where the setup is known (see `Judgement.explained`)."""
 LEVELS = 16
 """Bins of a pixel's reconstructed level."""
 GROUPS = 3
@@ -83,8 +83,8 @@ class Judgement:
         low: Lower end of each pixel's interval, float32 [N, H, W], 0..1.
         high: Upper end.
         explained: Share of what the average object leaves unexplained in the frames that the pictures explain,
-            where the rig is known; 0 or less is no better than the average object, and `CONFIRMED` is the least
-            that is believed.
+            where the setup is known; 0 or less is no better than the average object, and `CONFIRMED` is the
+            least that is believed.
     """
 
     agreement: float
@@ -110,7 +110,7 @@ class Judgement:
         if self.agreement > self.threshold and not self.measured:
             return (
                 f"nothing measured: the pictures explain {100 * max(self.explained or 0, 0):.0f} % of what the "
-                "frames show of this object; the wall is not that of the rig, or not one that the weights know"
+                "frames show of this object; the wall is not the setup's, or not one that the weights know"
             )
         if not self.measured:
             return (
@@ -150,7 +150,7 @@ class Confidence:
         Args:
             pictures: Pictures of all positions, float [N, H, W], 0..1.
             halves: What the two halves of the pass show of the plate, [2, 32, 32]: see `halves_of`.
-            explained: How much of the frames the pictures explain, where the rig is known.
+            explained: How much of the frames the pictures explain, where the setup is known.
         """
         agreement, threshold = float(self.agreement(halves)), float(self.threshold)
         blank = Judgement(

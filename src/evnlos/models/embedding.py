@@ -91,7 +91,7 @@ class InputNormalization(nn.Module):
 class LinearEmbedding(nn.Module):
     """The light path undone by ridge regressions of several strengths: [B, C, H, W] -> [B, S, H, W].
 
-    Fitted in closed form to simulated samples it carries the physics of their rig: it sees the whole wall at
+    Fitted in closed form to simulated samples it carries the physics of their setup: it sees the whole wall at
     once, which convolutions would have to learn layer by layer. The weak ridge is sharp and noisy, the strong
     one smooth; what to believe where is left to the network behind it. All strengths share one basis and one
     matrix of weights (`LinearEstimate.shrinkage`). These numbers are not trained by gradients.

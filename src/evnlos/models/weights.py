@@ -34,8 +34,8 @@ GROUP = "evnlos.weights"
 """Group of entry points; the object of each is a package whose folder holds weights."""
 
 _CHECKOUT = Path(__file__).resolve().parents[3] / "packages" / "evnlos-weights" / "src" / "evnlos_weights"
-_RIGS_M = {"near": 0.30, "far": 0.50}
-"""Distance from hidden object to wall of each rig that there are weights for, metres."""
+_SETUPS_M = {"near": 0.30, "far": 0.50}
+"""Distance from hidden object to wall of each setup that there are weights for, metres."""
 _PASS = "pass"
 
 
@@ -67,7 +67,7 @@ def weights_folders() -> list[Path]:
 def published() -> dict[str, Path]:
     """Return the weights that are installed: name, such as "near-frame", -> file.
 
-    A name is rig and modality; one that ends in "-pass" sees all positions of a pass together.
+    A name is setup and modality; one that ends in "-pass" sees all positions of a pass together.
     """
     found: dict[str, Path] = {}
     for folder in weights_folders():
@@ -105,8 +105,8 @@ def is_as_published(path: Path) -> bool:
         return hashlib.file_digest(file, "sha256").hexdigest() == stated.get(path.name)
 
 
-def published_rig(weights: str | Path) -> Path | None:
-    """Return the calibrated rig that published weights were trained for, a `rig.yaml`; None for other weights.
+def published_setup(weights: str | Path) -> Path | None:
+    """Return the calibrated setup that published weights were trained for; None for other weights.
 
     Args:
         weights: A name of `published`, or what else stands for weights.
@@ -157,11 +157,11 @@ def published_for(distance_m: float | None, modality: str, *, is_motion_known: b
         >>> published_for(0.28, "frame", is_motion_known=False)
         'near-frame'
     """
-    wanted = _RIGS_M["near"] if distance_m is None else distance_m
+    wanted = _SETUPS_M["near"] if distance_m is None else distance_m
     names = published()
-    rigs = sorted(_RIGS_M, key=lambda rig: abs(_RIGS_M[rig] - wanted))
+    setups = sorted(_SETUPS_M, key=lambda setup: abs(_SETUPS_M[setup] - wanted))
     kinds = [f"{modality}-{_PASS}", modality] if is_motion_known else [modality]
-    for name in (f"{rig}-{kind}" for rig in rigs for kind in kinds):
+    for name in (f"{setup}-{kind}" for setup in setups for kind in kinds):
         if name in names:
             return name
     if not names:

@@ -5,7 +5,7 @@
 - The check picture of an imported scan; needs matplotlib.
 - The path of a hidden object and its speed; needs matplotlib.
 - Can the confidence be trusted? What is left when the least supported passes go, and support against skill.
-- What a rig can show, drawn: singular values, Picard plot, modes, and the best linear picture.
+- What a setup can show, drawn: singular values, Picard plot, modes, and the best linear picture.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration import RigFit
+from evnlos.calibration import SetupFit
 from evnlos.files import write_atomically
 from evnlos.plot.figures import new_figure, save_figure, signed_map
 from evnlos.setups.files import Measurement
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from evnlos.analysis.identify import Identification
 
 
-def draw_calibration(fit: RigFit, path: str | Path) -> None:
+def draw_calibration(fit: SetupFit, path: str | Path) -> None:
     """Draw frame, model and residual of held-out captures, and the time surfaces where events were fitted.
 
     Args:
@@ -314,11 +314,11 @@ def draw_identification(found: Identification, path: str | Path) -> Path:
     return save_figure(figure, path, dpi=100)
 
 
-def draw_rigs(found: Sequence[Identification], path: str | Path) -> Path:
-    """Draw the singular values of several rigs in one plot.
+def draw_setups(found: Sequence[Identification], path: str | Path) -> Path:
+    """Draw the singular values of several setups in one plot.
 
     Args:
-        found: The rigs.
+        found: The setups.
         path: The picture, PNG or SVG.
 
     Raises:

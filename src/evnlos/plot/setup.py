@@ -1,6 +1,6 @@
 """The setup to scale, the wall's kernel, and the time stamps that rows of pixels send.
 
-- The set-up of a rig, to scale, seen from above; SVG in the colours of the page that it stands on.
+- A setup, to scale, seen from above; SVG in the colours of the page that it stands on.
 - The wall's kernel: curves, what they do to a letter, and the cosine law beside them (paper Fig. 5).
 - Time stamps of a few rows of pixels, stream beside stream: layers show where a simulator counts in frames.
 """
@@ -26,7 +26,7 @@ from evnlos.types import Events, Plane
 _WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
 _LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # told apart with every common kind of colour blindness
 PARTITION = "hides the object (sketch)"
-"""What stands beside the line that no rig's settings state."""
+"""What stands beside the line that no setup's settings state."""
 _STEPS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
@@ -173,7 +173,7 @@ def _svg(parts: list, around: NDArray[np.float64], wall: str, deep: float) -> st
     drawn.append(_text(left + step * scale + 8, foot, f"{100 * step:g} cm; seen from above, to scale", "start"))
     return (
         f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {_WIDTH} {_HEIGHT}' width='{_WIDTH}' role='img' "
-        f"aria-label='set-up, to scale' font-family='sans-serif' font-size='12'>{''.join(drawn)}</svg>"
+        f"aria-label='setup, to scale' font-family='sans-serif' font-size='12'>{''.join(drawn)}</svg>"
     )
 
 

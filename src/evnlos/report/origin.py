@@ -32,13 +32,13 @@ class Commands:
         dataset: What the runs were evaluated on.
         results: The runs.
         split: Name of the split.
-        rig: The rig that was named; None where none was.
+        setup: The setup that was named; None where none was.
     """
 
     def __init__(
-        self, dataset: Dataset, results: list[RunResult], split: str, rig: NamedSetup | None = None
+        self, dataset: Dataset, results: list[RunResult], split: str, setup: NamedSetup | None = None
     ) -> None:
-        self._dataset, self._results, self._split, self._rig = dataset, results, split, rig
+        self._dataset, self._results, self._split, self._setup = dataset, results, split, setup
         self._here = dataset.folder.resolve().name
         self._names: dict[tuple[Any, ...], str] = {}
 
@@ -48,8 +48,8 @@ class Commands:
         lines = [*self._data_here(), *(line for r in own for line in self._trainings(r))]
         words = ["evnlos", "report", *(r.name for r in self._results), "--data", self._here]
         words += ["--split", self._split]
-        if self._rig is not None:
-            words += ["--setup", self._rig.word]
+        if self._setup is not None:
+            words += ["--setup", self._setup.word]
         return list(dict.fromkeys([*lines, shlex.join([*words, "--out", "report.html"])]))
 
     def published(self) -> list[str]:
@@ -158,10 +158,10 @@ _PACKAGES = ("torch", "numpy", "numba", "h5py", "Pillow")
 
 
 def origin_section(
-    dataset: Dataset, results: list[RunResult], split: str, rig: NamedSetup | None = None
+    dataset: Dataset, results: list[RunResult], split: str, setup: NamedSetup | None = None
 ) -> str:
-    """Return the section of environment, commands and settings; `rig` is the one that was named."""
-    commands = Commands(dataset, results, split, rig)
+    """Return the section of environment, commands and settings; `setup` is the one that was named."""
+    commands = Commands(dataset, results, split, setup)
     parts = [
         f"<h2>How it was made</h2><p>{html.escape(environment())}</p>"
         "<p>To make it again, where the folders of the captures lie, with the files of settings below:</p>"

@@ -141,7 +141,7 @@ def write_report(
     results: list[RunResult],
     notes: list[str],
     split: str = "test",
-    rig: NamedSetup | None = None,
+    setup: NamedSetup | None = None,
     limits: Identification | None = None,
 ) -> Path:
     """Write the report and, beside it, its numbers as CSV.
@@ -152,8 +152,8 @@ def write_report(
         results: Evaluated runs; all on the same split.
         notes: Sentences that a reader must know, e.g. that the captures are rendered.
         split: Name of the split.
-        rig: The rig of the recordings, to be drawn; None where it is unknown.
-        limits: What `identify` found on the rig.
+        setup: The setup of the recordings, to be drawn; None where it is unknown.
+        limits: What `identify` found on the setup.
 
     Returns:
         The path of the page.
@@ -167,7 +167,7 @@ def write_report(
             "<meta name=viewport content='width=device-width,initial-scale=1'>",
             f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
             _head(dataset, results, notes, split, words),
-            setup_section(rig.name if rig else "", rig.setup if rig else None),
+            setup_section(setup.name if setup else "", setup.setup if setup else None),
             lead(results),
             *(_table(results, metric, *about, words) for metric, about in metrics.items()),
             _checks(results),
@@ -179,7 +179,7 @@ def write_report(
             limits_section(limits),
             _curves(results),
             _optics(dataset, results),
-            origin_section(dataset, results, split, None if limits is None else rig),
+            origin_section(dataset, results, split, None if limits is None else setup),
             words.section(list(metrics)),
             "</html>",
         ]

@@ -191,22 +191,22 @@ def reconstruct_capture(
     Args:
         capture: A capture folder; its target may be unknown.
         weights: A weights file, a run's folder or a name of `published`; None: the published frame weights of
-            the rig whose distance is nearest, of whole passes where the motion is known or found.
+            the setup whose distance is nearest, of whole passes where the motion is known or found.
         out: The folder for the pictures; must not exist or be empty. It is there with all of them, or
             not at all.
         zoom: Size of a pixel in the pictures.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
         setup: The calibrated setup; the pictures are then moved to where the wall agrees with the frames, if
             these are as bright as it makes them, and the confidence says how much of the frames they explain.
-            Without one, that is told by the rig of published weights, and the pictures stay.
-        track: Find the motion in the recording with the rig, also where it is stated; the truth, where it is
+            Without one, that is told by the setup of published weights, and the pictures stay.
+        track: Find the motion in the recording with the setup, also where it is stated; the truth, where it is
             known, stays where the capture states it.
 
     Returns:
         Capture, weights, modality, number of positions; where the truth is known, the mean scores; where it can
-        be told, the confidence: support, threshold, measured, verdict and, where a rig is known, explained;
-        else no_confidence, which says why. With a rig also `light`, the capture's brightness in that of the
-        rig, and whether the pictures were moved; with `track` the warnings of the track.
+        be told, the confidence: support, threshold, measured, verdict and, where a setup is known, explained;
+        else no_confidence, which says why. With a setup also `light`, the capture's brightness in that of the
+        setup, and whether the pictures were moved; with `track` the warnings of the track.
 
     Raises:
         ConfigError: `track` without a setup.
@@ -246,7 +246,7 @@ def reconstruct_capture(
             "positions": len(pictures),
         }
         if made.light is not None:
-            found |= {"light": round(made.light, 4), "moved_by_the_rig": made.is_moved}
+            found |= {"light": round(made.light, 4), "moved_by_the_setup": made.is_moved}
         if worth is not None:
             save_png(draft / "unsure.png", strip([grey(one) for one in worth.high - worth.low]), 2)
             write_atomically(draft / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))

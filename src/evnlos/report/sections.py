@@ -1,6 +1,6 @@
 """Sections of a report: the setup, the summary, confidence, images over time steps.
 
-- The rig of a report: its drawing to scale, and what it can show at all.
+- The setup of a report: its drawing to scale, and what it can show at all.
 - The figure that a report leads with: what pre-training gains, beside what one scores without looking.
 - How far to believe the pictures: what each run said of its own passes, beside what was true.
 - Pictures of a report over positions: a strip of each object, animations, and the worst on purpose.
@@ -26,15 +26,15 @@ from evnlos.setups import Setup
 _LOWEST = 1e-3
 
 
-def setup_section(name: str, rig: Setup | None, travel_m: float = 0.16, plate_m: float = 0.08) -> str:
-    """Return the section that shows the rig; without one, how to have it shown."""
-    head = "<h2>The set-up</h2>"
-    if rig is None:
-        said = "The rig is not known to this page; <code>evnlos report --rig RIG.yaml</code> draws it."
+def setup_section(name: str, setup: Setup | None, travel_m: float = 0.16, plate_m: float = 0.08) -> str:
+    """Return the section that shows the setup; without one, how to have it shown."""
+    head = "<h2>The setup</h2>"
+    if setup is None:
+        said = "The setup is not known to this page; <code>evnlos report --setup SETUP.yaml</code> draws it."
         return f"{head}<p class=dim>{said}</p>"
-    drawing = setup_drawing(rig, travel_m, plate_m)
+    drawing = setup_drawing(setup, travel_m, plate_m)
     if drawing is None:
-        words = html.escape(f"{name}: {rig.describe()}")
+        words = html.escape(f"{name}: {setup.describe()}")
         return f"{head}<p>{words}. Where its parts stand is not known, so it has no drawing.</p>"
     told = (
         "An object moves around the corner. Its light falls on the relay wall, which scatters it; two cameras "
@@ -42,15 +42,17 @@ def setup_section(name: str, rig: Setup | None, travel_m: float = 0.16, plate_m:
     )
     drawn = drawing.svg
     hides = (
-        " What hides the object is not among the settings of the rig: the dotted line is a sketch."
+        " What hides the object is not among the settings of the setup: the dotted line is a sketch."
         if PARTITION in drawn
-        else " What hides the object is not among the settings of the rig, and is not drawn."
+        else " What hides the object is not among the settings of the setup, and is not drawn."
     )
-    return f"{head}<p>{told} Rig: {html.escape(name)}.</p><div class=rig>{drawn}</div><p class=dim>{hides}</p>"
+    return (
+        f"{head}<p>{told} Setup: {html.escape(name)}.</p><div class=setup>{drawn}</div><p class=dim>{hides}</p>"
+    )
 
 
 def limits_section(found: Identification | None) -> str:
-    """Return the section that says what any method can make of one picture; nothing without a rig."""
+    """Return the section that says what any method can make of one picture; nothing without a setup."""
     if found is None:
         return ""
     at = found.at_camera
@@ -64,10 +66,10 @@ def limits_section(found: Identification | None) -> str:
     )
     warned = "".join(f"<p>{html.escape(words)}</p>" for words in found.warnings)
     return (
-        "<h2>What this rig can show at all</h2>"
+        "<h2>What this setup can show at all</h2>"
         f"<p><b>{html.escape(found.verdict)}</b></p>{warned}<p class=dim>One picture of the wall, the object "
-        "at a known place, the rig known exactly; patterns whose value lies above 0 stand above the noise. On "
-        f"the plate itself: best linear picture {at.psnr_db:.1f} dB, mean plate {found.mean_db:.1f} dB, "
+        "at a known place, the setup known exactly; patterns whose value lies above 0 stand above the noise. "
+        f"On the plate itself: best linear picture {at.psnr_db:.1f} dB, mean plate {found.mean_db:.1f} dB, "
         f"all-black {found.zero_db:.1f} dB. What a network draws beyond that it knows from its training.</p>"
         f"<div class=pair>{pictures}</div>{curves_svg(series, 'pattern', 'log10 of value over noise')}"
     )

@@ -226,7 +226,7 @@ WALL = TensorFile(
     AboutWall,
     _wall,
     "a fitted wall",
-    "the file that `evnlos calibrate` wrote beside rig.yaml",
+    "the file that `evnlos calibrate` wrote beside setup.yaml",
 )
 """Fitted walls on disk."""
 

@@ -313,9 +313,9 @@ class FittedSetup(Setup):
 
 
 @lru_cache(maxsize=4)
-def _transport(rig: FittedSetup, shape: tuple[int, int], device: torch.device) -> MatrixTransport:
-    source = rig.source()
-    matrix = rig.matrix(shape, source, torch.float32).to(device)
+def _transport(setup: FittedSetup, shape: tuple[int, int], device: torch.device) -> MatrixTransport:
+    source = setup.source()
+    matrix = setup.matrix(shape, source, torch.float32).to(device)
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera receives no light from the target; calibrate again")
     return MatrixTransport(matrix, source, shape)
@@ -334,16 +334,16 @@ def _magnification_px_m(pose: Pose, shape: tuple[int, int]) -> float:
 
 
 @lru_cache(maxsize=8)
-def _keyframe_step_m(rig: FittedSetup, shape: tuple[int, int], size_m: float) -> float:
-    return coarsest_keyframe_step_m(_transport(rig, shape, torch.device("cpu")), size_m)
+def _keyframe_step_m(setup: FittedSetup, shape: tuple[int, int], size_m: float) -> float:
+    return coarsest_keyframe_step_m(_transport(setup, shape, torch.device("cpu")), size_m)
 
 
 @lru_cache(maxsize=4)
-def _companion_transport(rig: FittedSetup, shape: tuple[int, int], device: torch.device) -> MatrixTransport:
+def _companion_transport(setup: FittedSetup, shape: tuple[int, int], device: torch.device) -> MatrixTransport:
     """Return the matrix for light beside the target: larger cells over a larger region."""
-    side = rig.fitted().about.companion.pitch_m * len(rig.fitted().companion)
-    width, height = rig.strip_m[0] + side, rig.strip_m[1] + side
+    side = setup.fitted().about.companion.pitch_m * len(setup.fitted().companion)
+    width, height = setup.strip_m[0] + side, setup.strip_m[1] + side
     rows, columns = (max(1, math.ceil(n / _COMPANION_CELL_M)) for n in (height, width))
     cells = Plane(rows, columns, _COMPANION_CELL_M)
-    matrix = replace(rig, correction=0.0).matrix(shape, cells, torch.float32)
+    matrix = replace(setup, correction=0.0).matrix(shape, cells, torch.float32)
     return MatrixTransport(matrix.to(device), cells, shape)

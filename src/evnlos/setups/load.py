@@ -221,9 +221,10 @@ NAMED: dict[str, Callable[[], Setup]] = {
 """Setups by name: walls with -near or -far, rooms, and the setups of the presets of `evnlos simulate`."""
 
 
-CALIBRATED_FILE = "rig.yaml"
+CALIBRATED_FILE = "setup.yaml"
 """The simulation that `evnlos calibrate` fits, in its folder."""
-_TOLD_BY_FOLDER = ("rig", "lab", "dataset")  # files that are told apart by their folder
+_OLDER_FILE = "rig.yaml"  # its name in folders of before
+_TOLD_BY_FOLDER = ("setup", "rig", "lab", "dataset")  # files that are told apart by their folder
 
 
 def load_setup(word: str | Path) -> Setup:
@@ -283,10 +284,11 @@ def calibrated_file(path: Path) -> Path:
     """Return the settings file of a folder that `calibrate` wrote; any other path stays as it is.
 
     Example:
-        >>> str(calibrated_file(Path("rig.yaml")))
-        'rig.yaml'
+        >>> str(calibrated_file(Path("setup.yaml")))
+        'setup.yaml'
     """
-    return path / CALIBRATED_FILE if (path / CALIBRATED_FILE).is_file() else path
+    files = (path / name for name in (CALIBRATED_FILE, _OLDER_FILE))
+    return next((file for file in files if file.is_file()), path)
 
 
 def calibrated_folder(word: str | Path) -> Path:
@@ -296,8 +298,8 @@ def calibrated_folder(word: str | Path) -> Path:
         ConfigError: The word names no such folder.
     """
     path = Path(word)
-    folder = path.parent if path.name == CALIBRATED_FILE else path
-    if not (folder / CALIBRATED_FILE).is_file():
+    folder = path.parent if path.name in (CALIBRATED_FILE, _OLDER_FILE) else path
+    if calibrated_file(folder) == folder:
         raise ConfigError(
             f"--setup is {word}, which holds no {CALIBRATED_FILE}; give the folder that `calibrate` wrote for "
             "this very setup (a name such as main-near knows neither its light nor its cameras), or none"
@@ -319,7 +321,7 @@ def setup_word(word: str | Path) -> str:
     if not path.is_file():
         return str(word)
     folder = path.resolve().parent.name
-    if path.name == CALIBRATED_FILE:
+    if path.name in (CALIBRATED_FILE, _OLDER_FILE):
         return folder
     return f"{folder}/{path.name}" if path.stem in _TOLD_BY_FOLDER else path.name
 

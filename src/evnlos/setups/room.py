@@ -1,4 +1,4 @@
-"""The room: a setup with what real rigs have and the radiometric one lacks, rendered by code of its own."""
+"""The room: a setup with what real setups have and the radiometric one lacks, rendered by code of its own."""
 
 from __future__ import annotations
 

@@ -6,12 +6,12 @@ from .follow import temporal_noise as temporal_noise
 from .follow import track_capture as track_capture
 from .follow import track_doubts as track_doubts
 from .follow import track_frames as track_frames
+from .motion_fit import MotionFit as MotionFit
+from .motion_fit import fit_motion as fit_motion
 from .registration import EventVelocity as EventVelocity
 from .registration import Registration as Registration
 from .registration import event_velocity as event_velocity
 from .registration import register as register
-from .rig_shift import RigShift as RigShift
-from .rig_shift import rig_shift as rig_shift
 from .track import Distance as Distance
 from .track import Measurements as Measurements
 from .track import PlaneMap as PlaneMap

@@ -17,8 +17,8 @@ from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import Background
 from evnlos.setups import Setup
+from evnlos.tracking.motion_fit import fit_motion
 from evnlos.tracking.registration import EventVelocity, Registration, event_velocity, register
-from evnlos.tracking.rig_shift import rig_shift
 from evnlos.tracking.track import Distance, Measurements, Track, most_likely_acceleration, plane_map, smooth
 from evnlos.types import Events
 
@@ -82,8 +82,8 @@ def static_light(frames: NDArray, degree: int = 2) -> NDArray[np.float64]:
 
 
 _LEAST_FRAMES = 4
-_SAME_DISTANCE = 0.03  # share by which a capture's stated distance may differ from its rig's
-_MOST_MISFIT = 1.2  # times the noise: calibrated rigs leave 0.95 to 1.05 of captures of their own
+_SAME_DISTANCE = 0.03  # share by which a capture's stated distance may differ from its setup's
+_MOST_MISFIT = 1.2  # times the noise: calibrated setups leave 0.95 to 1.05 of captures of their own
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,11 @@ class Tracking:
     events: bool = True
     """Use the events; without them only the frames speak."""
     plate_m: float = 0.1
-    """With a rig: side of a square that surely holds the object, metres."""
+    """With a setup: side of a square that surely holds the object, metres."""
     cells: int = 20
-    """With a rig: cells a side of that square."""
+    """With a setup: cells a side of that square."""
     depth: bool = False
-    """With a rig: also find how far the object is from the wall in each frame."""
+    """With a setup: also find how far the object is from the wall in each frame."""
     degree: int = 2
     """Degree of the ambient light over the wall, as a polynomial."""
 
@@ -115,7 +115,7 @@ class Tracking:
 
 def track_capture(
     capture: Capture,
-    rig: Setup | None = None,
+    setup: Setup | None = None,
     settings: Tracking | None = None,
     pattern: FixedPattern | None = None,
 ) -> Track:
@@ -123,7 +123,7 @@ def track_capture(
 
     Args:
         capture: The recording.
-        rig: The calibrated rig; with it the track is in metres on the target's plane.
+        setup: The calibrated setup; with it the track is in metres on the target's plane.
         settings: How to follow.
         pattern: The frame camera's fixed pattern, to be taken off first.
 
@@ -133,14 +133,16 @@ def track_capture(
     frames = capture.frames / np.float32(capture.peak)
     if pattern is not None:
         frames = pattern.correct(capture.frames, capture.peak)
-    return track_frames(frames, capture.frame_times_us.astype(np.float64) * 1e-6, capture.events, rig, settings)
+    return track_frames(
+        frames, capture.frame_times_us.astype(np.float64) * 1e-6, capture.events, setup, settings
+    )
 
 
 def track_frames(
     frames: NDArray,
     times_s: NDArray[np.float64],
     events: Events | None = None,
-    rig: Setup | None = None,
+    setup: Setup | None = None,
     settings: Tracking | None = None,
 ) -> Track:
     """Return the track of one moving object.
@@ -149,15 +151,15 @@ def track_frames(
         frames: White levels, real [N, H, W].
         times_s: Their instants, [N], seconds, on the events' clock.
         events: The events of the same pixels, or None.
-        rig: The calibrated rig, or None.
+        setup: The calibrated setup, or None.
         settings: How to follow.
 
     Raises:
         DataError: Too few frames, or the object does not stand out.
     """
     settings = settings or Tracking()
-    if settings.depth and rig is None:
-        raise ConfigError("Tracking.depth needs a rig: give its file (--rig), or leave depth out")
+    if settings.depth and setup is None:
+        raise ConfigError("Tracking.depth needs a setup: give its file (--setup), or leave depth out")
     if len(frames) < _LEAST_FRAMES:
         raise DataError(f"{len(frames)} frames; tracking needs {_LEAST_FRAMES} or more")
     sensor = (int(frames.shape[1]), int(frames.shape[2]))
@@ -169,32 +171,32 @@ def track_frames(
     by_events = None
     if events is not None and settings.events:
         by_events = event_velocity(events, found, times_s, settings.window_s)
-    if rig is None:
+    if setup is None:
         return _in_pixels(found, by_events, times_s, sensor[1] / columns)
-    return _in_metres(found, by_events, times_s, small, rig, noise, settings)
+    return _in_metres(found, by_events, times_s, small, setup, noise, settings)
 
 
-def track_doubts(capture: Capture, rig: Setup | None, track: Track) -> list[str]:
+def track_doubts(capture: Capture, setup: Setup | None, track: Track) -> list[str]:
     """Return why a track in metres may be wrong by more than it states, a line each; none where nothing is odd.
 
     Args:
         capture: The recording.
-        rig: The rig that it was followed with; None: nothing is known.
+        setup: The setup that it was followed with; None: nothing is known.
         track: What was found.
     """
     doubts = []
     stated = capture.distance_m
-    known_m = None if rig is None else rig.default_distance_m
+    known_m = None if setup is None else setup.default_distance_m
     if known_m is not None and stated is not None and abs(stated / known_m - 1) > _SAME_DISTANCE:
         doubts.append(
-            f"capture.yaml states a distance of {stated:g} m, the rig {known_m:g} m, more than "
-            f"{100 * _SAME_DISTANCE:.0f} % apart: lengths and their deviations are wrong; take the rig of that "
-            "distance"
+            f"capture.yaml states a distance of {stated:g} m, the setup {known_m:g} m, more than "
+            f"{100 * _SAME_DISTANCE:.0f} % apart: lengths and their deviations are wrong; take the setup of "
+            "that distance"
         )
     if track.misfit is not None and track.misfit > _MOST_MISFIT:
         doubts.append(
-            f"the rig leaves {track.misfit:.1f} times the noise in the frames, {_MOST_MISFIT:g} is the most: "
-            "positions are worse than their stated deviations; calibrate this very rig (`evnlos calibrate`)"
+            f"the setup leaves {track.misfit:.1f} times the noise in the frames, {_MOST_MISFIT:g} is the most: "
+            "positions are worse than their stated deviations; calibrate this very setup (`evnlos calibrate`)"
         )
     return doubts
 
@@ -213,15 +215,15 @@ def _in_metres(
     by_events: EventVelocity | None,
     times_s: NDArray[np.float64],
     small: NDArray,
-    rig: Setup,
+    setup: Setup,
     noise: float,
     settings: Tracking,
 ) -> Track:
     shape = (small.shape[1], small.shape[2])
-    to_plane = plane_map(rig, shape)
+    to_plane = plane_map(setup, shape)
     light = torch.from_numpy(small - found.background)
     start_m = to_plane(found.place_px)
-    fitted = rig_shift(light, rig, start_m, noise, settings.plate_m, settings.cells, depth=settings.depth)
+    fitted = fit_motion(light, setup, start_m, noise, settings.plate_m, settings.cells, depth=settings.depth)
     sigma = np.sqrt(np.diagonal(fitted.covariance, axis1=1, axis2=2))
     velocity = None
     if by_events is not None:
@@ -237,19 +239,19 @@ def _in_metres(
     track = replace(track, misfit=fitted.misfit)
     if fitted.log_distance is None or fitted.log_distance_sigma is None:
         return track
-    return replace(track, distance=_distance(fitted.log_distance, fitted.log_distance_sigma, times_s, rig))
+    return replace(track, distance=_distance(fitted.log_distance, fitted.log_distance_sigma, times_s, setup))
 
 
 def _distance(
     log_distance: NDArray[np.float64],
     sigma: NDArray[np.float64],
     times_s: NDArray[np.float64],
-    rig: Setup,
+    setup: Setup,
 ) -> Distance:
     blank = np.full(len(times_s), np.nan)
     measured = Measurements(times_s, log_distance, sigma**2, blank, blank)
     smoothed = smooth(measured, most_likely_acceleration([measured]))
-    near = (rig.default_distance_m or 1.0) * np.exp(smoothed.mean[:, 0])
+    near = (setup.default_distance_m or 1.0) * np.exp(smoothed.mean[:, 0])
     spread = np.sqrt(np.diagonal(smoothed.covariance, axis1=1, axis2=2))  # [N, 2]
     return Distance(times_s, near, near * spread[:, 0], near * smoothed.mean[:, 1], near * spread[:, 1])
 

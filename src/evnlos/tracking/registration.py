@@ -178,7 +178,7 @@ def explained_change(light: torch.Tensor, drawn: torch.Tensor, noise: float) -> 
 def _unfollowed(what: str) -> str:
     return (
         f"the light's middle hardly follows any target: {what}; nothing to track on this wall if it is matte "
-        "(`evnlos identify` tells what a rig shows), else show more of the wall"
+        "(`evnlos identify` tells what a setup shows), else show more of the wall"
     )
 
 

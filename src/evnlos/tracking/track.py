@@ -73,7 +73,7 @@ def plane_map(setup: Setup, shape: tuple[int, int]) -> PlaneMap:
     if used.sum() < 12:
         raise DataError(
             f"{int(used.sum())} of {len(used)} places of the target's plane make a bounded picture, 12 are the "
-            "least: this wall does not show where its light comes from; track without the rig"
+            "least: this wall does not show where its light comes from; track without the setup"
         )
     place = np.stack(np.meshgrid(cells.x_m, cells.y_m), axis=-1).reshape(-1, 2)[used]
     blank = PlaneMap(np.zeros((6, 2)), shape, 0.0)
@@ -202,7 +202,7 @@ def most_likely_acceleration(axes: list[Measurements]) -> float:
 class Distance:
     """How far the object was from the wall, smoothed.
 
-    Its mean is that of the rig, which no pass tells: a plate that is nearer and one that is larger look alike.
+    Its mean is the setup's, which no pass tells: a plate that is nearer and one that is larger look alike.
 
     Args:
         time_s: Instants of the frames, [N], seconds.
@@ -232,7 +232,7 @@ class Track:
         velocity: (x, y), float64 [T, 2], `unit` a second.
         position_sigma: Standard deviation of each coordinate, [T, 2].
         velocity_sigma: Standard deviation of each component, [T, 2].
-        unit: "m" on the target's plane where the rig is known, else "px" on the sensor.
+        unit: "m" on the target's plane where the setup is known, else "px" on the sensor.
         frame_time_s: Instants of the frames, [N], seconds.
         frame_position: What the frames alone say, [N, 2], in `unit`.
         frame_sigma: Its standard deviation, [N, 2].
@@ -241,7 +241,7 @@ class Track:
         size_sigma: Standard deviation of the size, [N].
         event_windows: Number of velocities that came from events.
         distance: Distance from the wall, where it was looked for.
-        misfit: With a rig: what it leaves of the frames' changes, over their noise, root mean square. The
+        misfit: With a setup: what it leaves of the frames' changes, over their noise, root mean square. The
             stated deviations hold it as if it were noise.
     """
 

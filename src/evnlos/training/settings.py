@@ -152,7 +152,7 @@ PLAIN_NETWORK = UNetConfig(width=24, depth=4, shuffle=2, scaling="picture", rank
 
 
 def finetuning(modality: str = "frame") -> Training:
-    """Return our fine-tuning after a simulation of any rig: smaller steps than those of a training."""
+    """Return our fine-tuning after a simulation of any setup: smaller steps than those of a training."""
     return Training(modality=modality, epochs=10, learning_rate=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""A rig's own light transport, measured with a display or a moving LED: plan, folder, import."""
+"""A setup's own light transport, measured with a display or a moving LED: plan, folder, import."""
 
 from evnlos.calibration.scan.folder import Patterns, ScanInfo, Shot, read_scan_info, read_shots
 from evnlos.calibration.scan.frames import rehearse_scan

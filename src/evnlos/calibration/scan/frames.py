@@ -320,7 +320,7 @@ def rehearse_scan(
     seed: int = 0,
     change: Change | None = None,
 ) -> int:
-    """Take the pictures of a planned scan with a known rig, and return their number.
+    """Take the pictures of a planned scan with a known setup, and return their number.
 
     Args:
         folder: A folder that `write_plan` wrote.

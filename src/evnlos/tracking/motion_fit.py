@@ -1,4 +1,4 @@
-"""Approach and retreat: the rig with its target's plane at other distances.
+"""Approach and retreat: the setup with its target's plane at other distances.
 
 - Positions by the calibrated operator: places and distances that make the frames of one plate likeliest.
 """
@@ -21,7 +21,7 @@ from evnlos.tracking.registration import middle_of_light
 from evnlos.types import Plane
 
 REACH = 0.3
-"""Largest change of the distance's logarithm that is looked for: 0.74 to 1.35 of the rig's own distance."""
+"""Largest change of the distance's logarithm that is looked for: 0.74 to 1.35 of the setup's own distance."""
 _STEP = 0.05  # of the logarithm between two matrices: the light moves by less than any wall's blur
 _NODES = np.linspace(-REACH, REACH, round(2 * REACH / _STEP) + 1)
 _NEAR = 4  # matrices that one in between is made of
@@ -32,8 +32,8 @@ _BASIS = np.linalg.inv(np.vander(np.arange(-1.0, _NEAR - 1.0), increasing=True))
 class Depths:
     """Matrices from the target's plane at any distance, by Lagrange's cubics in its logarithm.
 
-    Nothing else of the rig moves. What is further away is smaller in the picture, more blurred, dimmer and seen
-    elsewhere: all four tell the distance.
+    Nothing else of the setup moves. What is further away is smaller in the picture, more blurred, dimmer and
+    seen elsewhere: all four tell the distance.
 
     Args:
         setup: The setup.
@@ -53,7 +53,7 @@ class Depths:
         self._scale = float(own.matrix.sum() / self._nodes[len(_NODES) // 2].double().sum())
 
     def at(self, log_distance: float) -> MatrixTransport:
-        """Return the matrix at a distance, ln(distance / rig's distance) within +- `REACH`."""
+        """Return the matrix at a distance, ln(distance / setup's distance) within +- `REACH`."""
         first, along = _place(log_distance)
         weights = np.power(along, np.arange(_NEAR)) @ _BASIS
         return MatrixTransport(self._sum(weights, self._nodes[first : first + _NEAR]), self._strip, self._shape)
@@ -88,17 +88,17 @@ _UNTOLD = 1e-3  # share of a direction's information that the plate leaves, belo
 
 
 @dataclass(frozen=True, eq=False)
-class RigShift:
+class MotionFit:
     """Positions of the plate and the plate itself.
 
     Args:
         position_m: Middle of the object's light (x, y), float64 [N, 2], metres.
         covariance: Of each position, [N, 2, 2], squared metres.
         plate: The object, its light's middle in the array's middle, float64 [n, n].
-        log_distance: ln(distance to the wall / the rig's), [N]; its mean is 0, as a plate that is nearer and
+        log_distance: ln(distance to the wall / the setup's), [N]; its mean is 0, as a plate that is nearer and
             one that is larger and dimmer look much the same. None where it was not looked for.
         log_distance_sigma: Its standard deviation, [N].
-        misfit: What the plate leaves of the frames' changes, over their noise, root mean square; 1 is a rig
+        misfit: What the plate leaves of the frames' changes, over their noise, root mean square; 1 is a setup
             that explains all.
     """
 
@@ -110,7 +110,7 @@ class RigShift:
     misfit: float = 1.0
 
 
-def rig_shift(
+def fit_motion(
     light: torch.Tensor,
     setup: Setup,
     start_m: NDArray[np.float64],
@@ -119,7 +119,7 @@ def rig_shift(
     cells: int = 20,
     *,
     depth: bool = False,
-) -> RigShift:
+) -> MotionFit:
     """Find the places of a plate, and the plate, that explain the frames best: Gauss and Newton's method.
 
     The plate is eliminated (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973): a step
@@ -159,9 +159,9 @@ def rig_shift(
         if (np.abs(step) < _ENOUGH * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).all():
             break
     if not depth:
-        return RigShift(state, covariance, image, misfit=misfit)
+        return MotionFit(state, covariance, image, misfit=misfit)
     sigma = np.sqrt(covariance[:, 2, 2]) / distance_m
-    return RigShift(state[:, :2], covariance[:, :2, :2], image, state[:, 2] / distance_m, sigma, misfit)
+    return MotionFit(state[:, :2], covariance[:, :2, :2], image, state[:, 2] / distance_m, sigma, misfit)
 
 
 def _middle(image: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,10 +175,10 @@ class Fit:
 
     Args:
         plate: The plate's cells.
-        transport: The rig's matrix from the strip.
+        transport: The setup's matrix from the strip.
         depths: The matrices of other distances, where those are looked for.
         state: x, y and, with `depths`, R ln(distance / R) of each frame, [N, K], metres.
-        distance_m: R, the rig's distance, metres.
+        distance_m: R, the setup's distance, metres.
     """
 
     def __init__(
