@@ -2,7 +2,7 @@
 
     python benchmarks/intervals.py --weights RUN [RUN ...] --calibration DATASET --test DATASET [DATASET ...]
 
-Six ways to give each pixel of a plate an interval that shall hold its true level nine times in ten, all of
+Six ways to give each pixel of a target an interval that shall hold its true level nine times in ten, all of
 them set on the validation split of `--calibration`, which none of the networks was trained on, and scored on
 `--test`:
 
@@ -31,25 +31,25 @@ import torch
 from torch import Tensor, nn
 
 from evnlos.data import NlosDataset, open_dataset
-from evnlos.models import Confidence, Weights, halves_of, load_weights, plates
+from evnlos.models import Confidence, Weights, halves_of, load_weights, on_target_plane
 from evnlos.models.confidence import COVERAGE
 from evnlos.training.validation import fit_confidence
 
 _GAUSSIAN = 1.645  # standard deviations that hold nine tenths
 _FLOOR = 0.003  # of the variance of an unsure pixel, as data consistency has it
 _SAME = 0.005  # deviation among networks that happen to agree
-_STEPS, _PLATES = 1500, 32  # of the training of the network of quantiles: steps, plates a step
+_STEPS, _TARGETS = 1500, 32  # of the training of the network of quantiles: steps, targets a step
 Interval = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Plates of some passes.
+    """Targets of some passes.
 
     Args:
         drawn: What the networks drew, [E, N, 32, 32], 0..1.
         true: The truth, [N, 32, 32], 0..1.
-        owner: Pass of each plate, [N].
+        owner: Pass of each target, [N].
         halves: What the halves of each pass show to the first network, [P, 2, 32, 32].
     """
 
@@ -66,13 +66,14 @@ def look(networks: list[Weights], folder: Path, split: str) -> Seen:
     data = NlosDataset(dataset, split, networks[0].modality)
     canvas, at = dataset.sampling.canvas, data.position_m
     drawn = [
-        plates(one.network.infer(data.inputs, at, data.names), canvas, at)[:, 0].clamp(0, 1) for one in networks
+        on_target_plane(one.network.infer(data.inputs, at, data.names), canvas, at)[:, 0].clamp(0, 1)
+        for one in networks
     ]
     names = list(dict.fromkeys(data.names.tolist()))
     rows = [np.flatnonzero(data.names == name) for name in names]
     halves = [halves_of(networks[0].network, data.inputs[mine], at[mine], canvas) for mine in rows]
     owner = torch.from_numpy(np.array([names.index(name) for name in data.names]))
-    true = plates(data.truth.float(), canvas, at)[:, 0].clamp(0, 1)
+    true = on_target_plane(data.truth.float(), canvas, at)[:, 0].clamp(0, 1)
     return Seen(torch.stack(drawn), true, owner, torch.stack(halves))
 
 
@@ -120,7 +121,7 @@ class Quantiles(nn.Module):
 
 
 def of_passes(seen: Seen) -> Tensor:
-    """Return the mean plate of each picture's pass, [N, 32, 32]."""
+    """Return the mean target of each picture's pass, [N, 32, 32]."""
     passes = torch.stack([seen.drawn[0, seen.owner == k].mean(dim=0) for k in range(len(seen.halves))])
     return passes[seen.owner]
 
@@ -133,7 +134,7 @@ def learned_quantiles(seen: Seen) -> Callable[[Seen], Interval]:
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, _STEPS)
     to_learn, average = torch.nonzero(seen.owner % 2 == 0)[:, 0], of_passes(seen)
     for _ in range(_STEPS):
-        some = to_learn[torch.randint(len(to_learn), (_PLATES,))]
+        some = to_learn[torch.randint(len(to_learn), (_TARGETS,))]
         loss = torch.zeros(())
         for end, share in zip(network(seen.drawn[0, some], average[some]), (0.05, 0.95), strict=True):
             miss = seen.true[some] - end

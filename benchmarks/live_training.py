@@ -72,7 +72,7 @@ def stages(config: Simulation, names: list[str], device: torch.device, together:
     total = clock(device) - start
     for place, function in before.items():
         setattr(*place, function)
-    spent["plates, optics, truth"] = total - sum(spent.values())
+    spent["targets, optics, truth"] = total - sum(spent.values())
     count = together * (len(groups) - 1)
     return {stage: seconds / count for stage, seconds in (*spent.items(), ("all", total))}
 

@@ -63,7 +63,7 @@ def measured(path: str, setup: RadiometricSetup, camera: FrameCamera, pixel: Eve
 
 
 def retreating(setup: RadiometricSetup, light: float) -> str:
-    """Return errors where the plate retreats from the wall on its way; events do not take part."""
+    """Return errors where the target retreats from the wall on its way; events do not take part."""
     target, motion = HandwritingGlyphs().target("writer03_R"), PATHS["line"]
     times, away_m = np.linspace(0, SECONDS, FRAMES), np.linspace(0.28, 0.32, FRAMES)
     cells, own = setup.source(), setup.transport(SENSOR).matrix

@@ -13,7 +13,7 @@ import torch
 
 from evnlos import EventCamera, EventPixel, FrameCamera, Scene, Target, psnr, time_surface
 from evnlos.data import Sampling
-from evnlos.inverse import JointProblem, PlatePass
+from evnlos.inverse import JointProblem, SequenceOperator
 from evnlos.inverse.joint import strip_gram_of
 from evnlos.inverse.measurements import object_light
 from evnlos.plot.event_views import signed_pictures, slice_pictures
@@ -36,11 +36,11 @@ edges_us = np.r_[0, 1e6 * times_s].astype(np.int64)
 surface = time_surface(events, edges_us, tau_us=200_000)
 
 camera = setup.operator(setup.target_cells())
-light, plate, gram = object_light(frames, 255, setup, SHAPE), Plane(16, 16, 0.005), strip_gram_of(camera)
+light, target_plane, gram = object_light(frames, 255, setup, SHAPE), Plane(16, 16, 0.005), strip_gram_of(camera)
 truth = scene.truth(CANVAS.canvas, times_s)[:, CANVAS.scored]
 found = np.zeros_like(truth)
 for k in range(40) if len(sys.argv) > 1 else (0, 39):
-    problem = JointProblem(PlatePass(camera, plate, places[: k + 1]), strip_gram=gram)
+    problem = JointProblem(SequenceOperator(camera, target_plane, places[: k + 1]), strip_gram=gram)
     image = problem.tikhonov(light[: k + 1], 1e-3).image.clamp(0, 1).float()
     drawn = Target("found", image.numpy(), 0.08).rasterise(CANVAS.canvas, places[k : k + 1])
     found[k] = drawn[0][CANVAS.scored]

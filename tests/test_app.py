@@ -62,7 +62,7 @@ def test_settings_out_of_range_are_one_line(name: str) -> None:
             replace(SMALL, **{name: wrong})
 
 
-def test_a_drawing_is_a_plate() -> None:
+def test_a_drawing_is_a_target() -> None:
     ink = np.zeros((INK_SIDE, INK_SIDE), np.uint8)
     ink[4:9, 10:] = 255
     target = drawn(ink.tobytes().hex())

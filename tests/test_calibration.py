@@ -234,7 +234,7 @@ def test_the_draw_of_the_holdout_follows_the_seed(folders) -> None:
         ({"motion": None}, "no known motion"),
         ({"camera": {"name": "another"}}, "differ in camera"),
         ({"setup": {"distance_m": 0.5}}, "differ in setup"),
-        ({"target": {"plate_m": 0.05}}, "differ in plate_m"),
+        ({"target": {"size_m": 0.05}}, "differ in target_size_m"),
     ],
 )
 def test_unfit_captures_are_named(copies, change, words) -> None:
@@ -444,7 +444,7 @@ def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targe
     assert warnings_of(leaving(0.105, "known")) == []
     (line,) = warnings_of(leaving(0.13, "known"))
     assert "13.0 % is left where noise alone leaves 10.0 %" in line and "evnlos scan" in line
-    assert warnings_of(leaving(0.15, "unknown")) == []  # plates that are only expected leave that much
+    assert warnings_of(leaving(0.15, "unknown")) == []  # targets that are only expected leave that much
     wrong = leaving(0.412, "unknown")
     rows = rows_of(wrong, EventPixel(), FrameCamera())
     with pytest.raises(DataError, match=r"41\.2 % is left .* no setup file was written"):

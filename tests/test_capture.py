@@ -45,12 +45,12 @@ def test_the_standard_sample_of_a_shared_capture(shared_data) -> None:
     for i in range(int(np.searchsorted(t, 1_400_000, side="right"))):
         expected[0 if p[i] else 1, y[i], x[i]] = np.exp(-(1.4e6 - t[i]) / 0.2e6)
     np.testing.assert_allclose(samples.surface[6], reduce_by_area(expected, (64, 96)), atol=2e-6)
-    # The truth is the plate: 8 cm of a canvas of 24 cm, in the middle at 4 s.
-    plate = np.asarray(Image.open(folder / "target.png"), dtype=np.float64) / 255
+    # The truth is the target: 8 cm of a canvas of 24 cm, in the middle at 4 s.
+    target = np.asarray(Image.open(folder / "target.png"), dtype=np.float64) / 255
     np.testing.assert_allclose(
-        samples.truth[19, 16:48, 32:64], plate.reshape(32, 8, 32, 8).mean(axis=(1, 3)), atol=1e-6
+        samples.truth[19, 16:48, 32:64], target.reshape(32, 8, 32, 8).mean(axis=(1, 3)), atol=1e-6
     )
-    assert samples.truth[19].sum() == pytest.approx(plate.mean() * 32 * 32, rel=1e-5)
+    assert samples.truth[19].sum() == pytest.approx(target.mean() * 32 * 32, rel=1e-5)
 
 
 def test_every_shared_capture_imports(shared_data, tmp_path) -> None:
@@ -126,7 +126,7 @@ def _edit(name: str, old: str, new: str):
 
 DAMAGE = {
     "no capture.yaml": (lambda f: (f / "capture.yaml").unlink(), "capture.yaml"),
-    "unknown key": (_edit("capture.yaml", "plate_m", "plate"), "plate_m"),
+    "unknown key": (_edit("capture.yaml", "target_size_m", "side_m"), "size_m"),
     "wrong type": (_edit("capture.yaml", "width: 72", "width: wide"), "camera.width"),
     "missing events": (lambda f: (f / "events.raw").unlink(), "events.raw"),
     "empty events": (lambda f: (f / "events.raw").write_bytes(b""), "events.raw"),

@@ -19,7 +19,7 @@ from evnlos.analysis.evaluate import compare_with_training
 from evnlos.analysis.scores import CHARACTERS, load_reader, paired_difference, read_characters
 from evnlos.data import Dataset, NlosDataset, Sampling, import_captures, read_shard, simulate
 from evnlos.metrics import psnr
-from evnlos.models import plates
+from evnlos.models import on_target_plane
 from evnlos.scene import FontGlyphs, find_font
 from evnlos.types import Plane
 from train_classifier import train_reader
@@ -36,7 +36,9 @@ def read_all(family: str) -> tuple[list[str], list[str], list[str]]:
     pictures = torch.from_numpy(
         np.stack([glyphs.target(n).rasterise(CANVAS, place) for n, place in zip(names, places, strict=True)])
     )
-    found, elsewhere = (read_characters(plates(pictures, CANVAS, where)) for where in (places, -places))
+    found, elsewhere = (
+        read_characters(on_target_plane(pictures, CANVAS, where)) for where in (places, -places)
+    )
     return [name[-1] for name in names], found, elsewhere
 
 
@@ -44,7 +46,7 @@ def share(truth: list[str], found: list[str]) -> float:
     return float(np.mean([a == b for a, b in zip(truth, found, strict=True)]))
 
 
-def test_the_reader_reads_plates_wherever_they_are() -> None:
+def test_the_reader_reads_targets_wherever_they_are() -> None:
     truth, found, elsewhere = read_all("Kalam Bold")
     assert share(truth, found) >= 0.94  # O and 0 of one typeface, and the like
     assert share(truth, elsewhere) < 0.5

@@ -18,7 +18,7 @@ from evnlos.models import (
     Weights,
     halves_of,
     load_weights,
-    plates,
+    on_target_plane,
     published_setup,
     save_weights,
 )
@@ -56,8 +56,8 @@ def passes(
     inputs, truth, names = [], [], []
     for k in range(count):
         squares = (torch.rand(4, 4, generator=draw) > 0.5).float()
-        plate = squares.repeat_interleave(8, 0).repeat_interleave(8, 1)
-        true = on_canvas(plate, CANVAS, at)
+        target = squares.repeat_interleave(8, 0).repeat_interleave(8, 1)
+        true = on_canvas(target, CANVAS, at)
         seen = share * true + (1 - share) * on_canvas(torch.full((32, 32), 0.5), CANVAS, at)
         inputs.append((seen + noise * torch.randn(true.shape, generator=draw)).clamp(0, 1)[:, None])
         truth.append(true)
@@ -76,12 +76,12 @@ def judged(confidence, samples: NlosDataset, name: str):
     return confidence.judge(inputs[:, 0], halves)
 
 
-def test_a_plate_put_on_the_canvas_is_taken_out_again() -> None:
-    plate = torch.rand(32, 32, generator=torch.Generator().manual_seed(1))
+def test_a_target_put_on_the_canvas_is_taken_out_again() -> None:
+    target = torch.rand(32, 32, generator=torch.Generator().manual_seed(1))
     at = np.array([[0.0, 0.0], [0.025, -0.01]])  # whole pixels
-    back = plates(on_canvas(plate, CANVAS, at), CANVAS, at)[:, 0]
-    torch.testing.assert_close(back[0], plate, atol=1e-4, rtol=0)
-    torch.testing.assert_close(back[1], plate, atol=1e-4, rtol=0)
+    back = on_target_plane(on_canvas(target, CANVAS, at), CANVAS, at)[:, 0]
+    torch.testing.assert_close(back[0], target, atol=1e-4, rtol=0)
+    torch.testing.assert_close(back[1], target, atol=1e-4, rtol=0)
 
 
 def test_support_is_the_share_of_the_variance_that_is_seen() -> None:
@@ -108,7 +108,7 @@ def test_noise_that_the_halves_do_not_share_is_no_support() -> None:
 
 def test_what_a_network_always_draws_tells_no_object() -> None:
     def with_habit(samples: NlosDataset) -> NlosDataset:
-        """Add a bar to the plate at every position: in both halves of every pass, whatever the object is."""
+        """Add a bar to the target at every position: in both halves of every pass, whatever the object is."""
         bar = torch.zeros(32, 32)
         bar[:16, 8:16] = 0.7
         for name in dict.fromkeys(samples.names.tolist()):
@@ -157,8 +157,8 @@ def test_intervals_cover_unseen_passes_as_often_as_they_say() -> None:
         rows = torch.from_numpy(np.flatnonzero(fresh.names == f"o{k}"))
         truth, at = fresh.truth[rows], fresh.position_m[rows.numpy()]
         held = ((truth >= found.low - 1e-6) & (truth <= found.high + 1e-6)).float()
-        inside.append(plates(held, CANVAS, at).mean())
-        width.append(plates(found.high - found.low, CANVAS, at).mean())
+        inside.append(on_target_plane(held, CANVAS, at).mean())
+        width.append(on_target_plane(found.high - found.low, CANVAS, at).mean())
     assert float(torch.stack(inside).mean()) >= COVERAGE - 0.02
     assert float(torch.stack(width).mean()) < 0.8  # tells something
 

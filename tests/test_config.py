@@ -96,7 +96,7 @@ def test_the_papers_settings() -> None:
     assert (paper.sensor.height, paper.sensor.width, paper.positions) == (600, 960, 40)
     assert dataclasses.astuple(paper.pixel)[:7] == (0.15, 0.15, 0.03, 15.0, 0.01, 0.0015, 0.0)
     assert paper.pixel == EventPixel()
-    assert (paper.motion.speed_m_s, paper.glyphs.plate.size_m) == (0.02, 0.08)
+    assert (paper.motion.speed_m_s, paper.glyphs.target_plane.size_m) == (0.02, 0.08)
     assert (paper.setup.tpsf_t, paper.setup.mean_free_path, paper.setup.rho_max) == (2.0, 0.8, 2.0)
     assert (pre.epochs, pre.batch_size, pre.learning_rate, pre.step_epoch, pre.loss) == (
         200,

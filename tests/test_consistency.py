@@ -46,7 +46,7 @@ def test_the_operator_is_the_simulators_wall(operator) -> None:
     truth = torch.from_numpy(scene.target.rasterise(SAMPLING.canvas, scene.motion.position_m([4.0])))
     made = operator(truth)
     seen = torch.from_numpy(reduce_by_area(light, (16, 24)))
-    # Cells of canvas and strip are the same size here, so both draw the same plate.
+    # Cells of canvas and strip are the same size here, so both draw the same target.
     torch.testing.assert_close(made, seen, atol=2e-3, rtol=0)
 
 

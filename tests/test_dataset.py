@@ -54,7 +54,7 @@ def test_area_averaging_is_the_mean_over_each_cell(h: int, w: int, hh: int, ww: 
     np.testing.assert_array_equal(image, before)
 
 
-def test_a_sample_shows_the_plate_where_it_is(tiny_dataset) -> None:
+def test_a_sample_shows_the_target_where_it_is(tiny_dataset) -> None:
     samples, attributes = read_shard(tiny_dataset.shard("writer00_T"))
     sampling = tiny_dataset.sampling
     assert samples.frame.shape == (8, 32, 48)
@@ -65,7 +65,7 @@ def test_a_sample_shows_the_plate_where_it_is(tiny_dataset) -> None:
     assert 0 < samples.frame.max() <= 1
     assert samples.surface.min() >= 0
     assert samples.event_count.sum() > 100
-    # The truth's centre of light moves as the plate does, 2 cm a position.
+    # The truth's centre of light moves as the target does, 2 cm a position.
     x = (np.arange(48) - 23.5) * sampling.pitch_m
     centre = (samples.truth * x).sum(axis=(1, 2)) / samples.truth.sum(axis=(1, 2))
     np.testing.assert_allclose(np.diff(centre), 0.02, atol=2e-4)

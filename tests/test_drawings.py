@@ -11,7 +11,7 @@ from evnlos.scene.drawings import KINDS, Canvas
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_drawing_is_on_the_plate_and_like_no_other(kind: str) -> None:
+def test_every_drawing_is_on_the_target_and_like_no_other(kind: str) -> None:
     pictures = [drawing(kind, number, size_px=64) for number in range(16)]
     for picture in pictures:
         assert picture.shape == (64, 64) and picture.min() == 0

@@ -69,15 +69,17 @@ def test_a_recording_is_the_simulation_of_its_frames() -> None:
 
 
 NOISY = EventPixel(0.15, 0.12, 0.03, 60.0, 0.5, 2.0, 0.0)
-PLATE = Plane(60, 70, 0.001)
+TARGET_PLANE = Plane(60, 70, 0.001)
 
 
 def sliding_wall(direction: tuple[float, float], image: torch.Tensor | None = None) -> SlidingWall:
-    x, y = torch.as_tensor(PLATE.x_m), torch.as_tensor(PLATE.y_m)[:, None]
+    x, y = torch.as_tensor(TARGET_PLANE.x_m), torch.as_tensor(TARGET_PLANE.y_m)[:, None]
     spot = torch.exp(-(x**2 + (y - 0.01) ** 2) / (2 * 0.006**2)) + 0.4 * (torch.abs(x + y) < 0.004)
     motion = LineMotion((-0.03, 0.0), 0.08, direction)
     view = View.affine((45, 70), 700.0)
-    return SlidingWall(spot.float() if image is None else image, PLATE, view, motion, gain=0.7, ambient=0.1)
+    return SlidingWall(
+        spot.float() if image is None else image, TARGET_PLANE, view, motion, gain=0.7, ambient=0.1
+    )
 
 
 @pytest.mark.parametrize("mode", ["exact", "v2e"])
@@ -98,11 +100,11 @@ def test_a_wall_in_strips_gives_the_events_of_its_frames(mode, refractory_s: flo
 
 @pytest.mark.parametrize("broken", [float("nan"), float("inf")])
 def test_a_broken_wall_is_refused_strip_by_strip(broken: float) -> None:
-    """The plate comes into view after the first image, which is dark."""
-    plate = torch.zeros(PLATE.shape)
-    plate[30, 30] = broken
+    """The target comes into view after the first image, which is dark."""
+    target = torch.zeros(TARGET_PLANE.shape)
+    target[30, 30] = broken
     view, motion = View.affine((45, 70), 700.0), LineMotion((-0.3, 0.0), 0.2)
-    wall = SlidingWall(plate, PLATE, view, motion)
+    wall = SlidingWall(target, TARGET_PLANE, view, motion)
     assert not wall.irradiance(0.0).any()
     with pytest.raises(DataError, match="NaN or infinity"):
         EventCamera(CLEAN, time_step_s=0.05).record(wall, 0.0, 2.0)
@@ -146,7 +148,7 @@ def test_steps_below_the_precision_of_the_times_are_refused() -> None:
 
 def test_a_wall_in_double_precision_gives_the_events_of_its_frames() -> None:
     wall = sliding_wall(
-        (1.0, 0.0), torch.rand(PLATE.shape, dtype=torch.float64, generator=torch.manual_seed(0))
+        (1.0, 0.0), torch.rand(TARGET_PLANE.shape, dtype=torch.float64, generator=torch.manual_seed(0))
     )
     times_s = np.arange(101) * 4e-3
     expected = simulate_events(wall.irradiance(times_s).numpy() * np.float32(255), times_s, NOISY, seed=1)

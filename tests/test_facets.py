@@ -269,14 +269,14 @@ def test_larger_slopes_are_a_wider_lobe_of_as_much_light(tmp_path):
     np.testing.assert_allclose(wide.density(2 * x, -x), setup.table().density(x, -x / 2) / 4, rtol=1e-9)
 
 
-def test_what_travels_along_is_seen_beside_the_plate(tmp_path):
-    plate = Target("plate", np.ones((4, 4), np.float32), 0.08)
-    scene = Scene(plate, LineMotion(start_m=(-0.04, 0.0), speed_m_s=0.02), 4.0)
+def test_what_travels_along_is_seen_beside_the_target(tmp_path):
+    target = Target("target", np.ones((4, 4), np.float32), 0.08)
+    scene = Scene(target, LineMotion(start_m=(-0.04, 0.0), speed_m_s=0.02), 4.0)
     dark = setup_of(tmp_path / "a.safetensors", fitted(rank=0)).observe(scene)
     lit = setup_of(tmp_path / "b.safetensors", fitted(rank=0, companion=0.5)).observe(scene)
     times = np.array([0.5, 2.0, 3.1])
     added = (lit.irradiance(times) - dark.irradiance(times)).numpy()
-    # The cell (row 6, column 4) of 8 x 8 cells of 2 cm: 1 cm right of and 5 cm below the plate's middle.
+    # The cell (row 6, column 4) of 8 x 8 cells of 2 cm: 1 cm right of and 5 cm below the target's middle.
     spot = Target("spot", np.full((1, 1), 0.5, np.float32), 0.02)
     cells = Plane(24, 40, 0.01)
     setup = setup_of(tmp_path / "b.safetensors", fitted(rank=0))
@@ -291,7 +291,7 @@ def test_what_travels_along_is_seen_beside_the_plate(tmp_path):
     torch.testing.assert_close(gone.irradiance(times), dark.irradiance(times))
 
 
-def test_a_plate_that_leaves_the_strip_is_refused(tmp_path):
-    plate = Target("plate", np.ones((4, 4), np.float32), 0.08)
+def test_a_target_that_leaves_the_strip_is_refused(tmp_path):
+    target = Target("target", np.ones((4, 4), np.float32), 0.08)
     with pytest.raises(ConfigError, match="strip_m to at least"):
-        setup_of(tmp_path / "a.safetensors", fitted()).observe(Scene(plate, LineMotion((-0.2, 0.0)), 1.0))
+        setup_of(tmp_path / "a.safetensors", fitted()).observe(Scene(target, LineMotion((-0.2, 0.0)), 1.0))

@@ -15,9 +15,9 @@ from evnlos.scene import (
     FontGlyphs,
     HandwritingGlyphs,
     NistGlyphs,
-    Plate,
+    TargetPlane,
     find_font,
-    fit_to_plate,
+    fit_to_target_plane,
     fonts,
     list_emnist,
     list_sd19,
@@ -119,7 +119,7 @@ def test_folders_are_scanned_where_fontconfig_is_not_there(monkeypatch, tmp_path
 
 @pytest.mark.parametrize("char", "AIMWgQ1-")
 @pytest.mark.parametrize("fraction", [1.0, 0.6])
-def test_a_glyph_fills_its_part_of_the_plate_and_is_centred(char, fraction):
+def test_a_glyph_fills_its_part_of_the_target_and_is_centred(char, fraction):
     mask = render_glyph(char, find_font("Kalam Bold"), 128, fraction)
     left, top, right, bottom = ink_box(mask)
     assert max(right - left, bottom - top) == pytest.approx(128 * fraction, abs=2)
@@ -153,16 +153,16 @@ def test_names_stay_distinct_when_case_is_ignored():
     assert all(name.replace("_", "").isalnum() and name.isascii() for name in names)
 
 
-def test_fit_to_plate_cuts_scales_and_centres():
+def test_fit_to_target_plane_cuts_scales_and_centres():
     picture = np.zeros((40, 60))
     picture[3:13, 41:46] = 1
-    left, top, right, bottom = ink_box(fit_to_plate(picture, 128, 0.75))
+    left, top, right, bottom = ink_box(fit_to_target_plane(picture, 128, 0.75))
     assert bottom - top == pytest.approx(96, abs=1)
     assert right - left == pytest.approx(48, abs=1)
     assert (left + right, top + bottom) == (pytest.approx(128, abs=2), pytest.approx(128, abs=2))
     for bad in (np.zeros((4, 4)), np.ones(4), np.full((3, 3), np.nan)):
         with pytest.raises(DataError):
-            fit_to_plate(bad)
+            fit_to_target_plane(bad)
 
 
 # The user's own databases
@@ -217,7 +217,7 @@ def test_sd19_says_what_is_missing(sd19):
 
 
 def test_sd19_objects_become_targets(sd19):
-    glyphs = NistGlyphs(folder=str(sd19), characters="A", per_character=2, plate=Plate(size_px=64))
+    glyphs = NistGlyphs(folder=str(sd19), characters="A", per_character=2, target_plane=TargetPlane(size_px=64))
     assert glyphs.objects() == ["nist_hsf_0_00000_A", "nist_hsf_0_00001_A"]
     later = NistGlyphs(folder=str(sd19), characters="A", first=2, per_character=1)
     assert not set(glyphs.objects()) & set(later.objects())
@@ -253,7 +253,9 @@ def test_emnist_is_turned_upright(tmp_path):
 
 def test_emnist_objects_become_targets(tmp_path):
     folder = write_emnist(tmp_path / "e")
-    glyphs = EmnistGlyphs(folder=str(folder), characters="A0", per_character=1, plate=Plate(size_px=128))
+    glyphs = EmnistGlyphs(
+        folder=str(folder), characters="A0", per_character=1, target_plane=TargetPlane(size_px=128)
+    )
     assert glyphs.objects() == ["emnist_byclass_train_000000_A", "emnist_byclass_train_000003_0"]
     letter, digit = (ink_box(glyphs.target(name).mask) for name in glyphs.objects())
     assert letter[3] - letter[1] == 128
@@ -311,7 +313,7 @@ def test_objects_are_unique_file_names_on_any_system():
 
 
 def test_font_objects_and_the_smaller_digits():
-    glyphs = FontGlyphs(family="Kalam Bold", characters="A7", plate=Plate(size_px=128))
+    glyphs = FontGlyphs(family="Kalam Bold", characters="A7", target_plane=TargetPlane(size_px=128))
     letter, digit = (glyphs.target(name) for name in glyphs.objects())
     assert (letter.name, letter.size_m) == ("kalam_bold_A", 0.08)
     assert ink_box(letter.mask)[3] - ink_box(letter.mask)[1] == pytest.approx(128, abs=1)
@@ -324,8 +326,8 @@ def test_comic_glyphs_resemble_the_drawings_of_the_captures(shared_data):
     glyphs = FontGlyphs()
     for char in "AEIMTWXZ":
         drawing = np.asarray(Image.open(shared_data / f"captures/near_{char}/target.png")) / 255
-        # The drawings are not centred by their ink and fill a little less than the plate: fit both alike.
-        ours, theirs = glyphs.target(f"comic_neue_bold_{char}").mask, fit_to_plate(drawing)
+        # The drawings are not centred by their ink and fill a little less than the target: fit both alike.
+        ours, theirs = glyphs.target(f"comic_neue_bold_{char}").mask, fit_to_target_plane(drawing)
         assert np.minimum(ours, theirs).sum() / np.maximum(ours, theirs).sum() > 0.95
 
 
@@ -334,7 +336,7 @@ def test_sets_round_trip_through_a_settings_file(tmp_path):
         HandwritingGlyphs(writers=2, characters="AB"),
         FontGlyphs(family="Kalam"),
         NistGlyphs(folder="x"),
-        EmnistGlyphs(part="test", plate=Plate(size_m=0.05)),
+        EmnistGlyphs(part="test", target_plane=TargetPlane(size_m=0.05)),
     ):
         config.save_yaml(glyphs, tmp_path / "glyphs.yaml")
         assert config.load_yaml(type(glyphs), tmp_path / "glyphs.yaml") == glyphs
@@ -349,8 +351,8 @@ def test_sets_round_trip_through_a_settings_file(tmp_path):
         lambda: FontGlyphs(characters="A B"),
         lambda: NistGlyphs(per_character=0),
         lambda: EmnistGlyphs(first=-1),
-        lambda: Plate(size_m=-1),
-        lambda: Plate(digit_fraction=2),
+        lambda: TargetPlane(size_m=-1),
+        lambda: TargetPlane(digit_fraction=2),
         lambda: HandwritingGlyphs().target("writer99_A"),
         lambda: NistGlyphs(folder="/nowhere").objects(),
     ],

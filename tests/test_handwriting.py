@@ -72,7 +72,7 @@ def test_another_process_draws_the_same_bytes():
     assert done.stdout.strip() == hashlib.sha256(nist_like(2, "K", 5, 64).tobytes()).hexdigest()
 
 
-def test_every_training_letter_fits_the_plate_and_has_ink():
+def test_every_training_letter_fits_the_target_and_has_ink():
     for writer in range(0, TRAIN_WRITERS, 3):
         for char in "AMQWI8":
             mask = nist_like(writer, char, 0, 64)
@@ -194,7 +194,7 @@ def test_redrawn_targets_are_objects_of_the_set(tmp_path) -> None:
     glyphs = HandwritingGlyphs(characters="A", writers=1, known=str(tmp_path), redrawn=2)
     assert glyphs.objects() == ["writer00_A", "redrawn00_lab_R", "redrawn01_lab_R"]
     target = glyphs.target("redrawn01_lab_R", seed=3)
-    assert target.mask.shape == (128, 128) and target.size_m == glyphs.plate.size_m
+    assert target.mask.shape == (128, 128) and target.size_m == glyphs.target_plane.size_m
     with pytest.raises(ConfigError, match="redrawn is 2"):
         HandwritingGlyphs(redrawn=2)
     (tmp_path / "lab_R.png").write_bytes(b"no picture")

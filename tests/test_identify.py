@@ -17,7 +17,7 @@ from evnlos.config import save_yaml
 from evnlos.data import Simulation
 from evnlos.data.lab import Lab
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.measurements import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_plates
+from evnlos.inverse.measurements import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_targets
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup, named_setup, setup_names, setup_preset
 
@@ -49,18 +49,18 @@ def test_the_estimator_is_the_textbook_one():
     assert estimator.noise_error == pytest.approx(float((gain @ torch.diag(variance) @ gain.mT).trace()) / 12)
     # The posterior variance, averaged over the prior, is the expected error: trace(C - K A C).
     posterior = float((covariance - gain @ matrix @ covariance).trace()) / 12
-    plates = mean + torch.randn(20_000, 12, generator=torch.Generator().manual_seed(2)).double() @ root.mT
-    assert float(estimator.expected_error(plates).mean()) == pytest.approx(posterior, rel=0.03)
+    targets = mean + torch.randn(20_000, 12, generator=torch.Generator().manual_seed(2)).double() @ root.mT
+    assert float(estimator.expected_error(targets).mean()) == pytest.approx(posterior, rel=0.03)
 
 
 def test_expected_error_against_drawn_noise():
     matrix, mean, root, variance = random_problem()
     estimator = LinearEstimator.known(matrix.mT @ (matrix / variance[:, None]), mean, root)
-    plate = torch.linspace(0, 1, 12, dtype=torch.float64)
+    target = torch.linspace(0, 1, 12, dtype=torch.float64)
     noise = torch.randn(20_000, 30, generator=torch.Generator().manual_seed(3)).double() * variance.sqrt()
-    seen = (matrix @ (plate - mean) + noise) / variance
-    error = (estimator.estimate(seen @ matrix) - plate).square().mean()
-    assert float(estimator.expected_error(plate)) == pytest.approx(float(error), rel=0.03)
+    seen = (matrix @ (target - mean) + noise) / variance
+    error = (estimator.estimate(seen @ matrix) - target).square().mean()
+    assert float(estimator.expected_error(target)) == pytest.approx(float(error), rel=0.03)
 
 
 def test_white_prior_is_the_general_one_with_independent_cells():
@@ -70,8 +70,8 @@ def test_white_prior_is_the_general_one_with_independent_cells():
     white = LinearEstimator.white(gram, power.flip(0), axes.flip(1))
     half = torch.full((12,), 0.5, dtype=torch.float64)
     known = LinearEstimator.known(gram, half, torch.eye(12, dtype=torch.float64) / 2)
-    plates = torch.rand(5, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    torch.testing.assert_close(white.expected(plates), known.expected(plates))
+    targets = torch.rand(5, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.testing.assert_close(white.expected(targets), known.expected(targets))
     assert white.noise_error == pytest.approx(known.noise_error)
     assert white.patterns_seen == known.patterns_seen
 
@@ -136,7 +136,7 @@ def test_mode_counts_of_the_presets(name, count):
     assert abs(found - count) <= max(1, 0.03 * count)
 
 
-def plate_in_the_middle() -> Scene:
+def target_in_the_middle() -> Scene:
     mask = np.zeros((32, 32))
     mask[4:20, 6:10], mask[16:20, 6:28] = 1.0, 0.5
     return Scene(Target("corner", mask), LineMotion(), 8.0)
@@ -148,20 +148,20 @@ def test_the_matrix_is_the_setup_that_the_lab_renders():
         RadiometricSetup(roughness=0.3, strip_m=(0.24, 0.12), gain=0.6),
         RadiometricSetup(wall_material="lambert", lamp_m=(-0.4, 0.0, 0.05)),
     ):
-        scene, bench = plate_in_the_middle(), Bench(height=12, width=20)
+        scene, bench = target_in_the_middle(), Bench(height=12, width=20)
         seen = linearized(setup, bench)
-        mask = torch.from_numpy(scene.target.rasterise(bench.plate)).double().flatten()
+        mask = torch.from_numpy(scene.target.rasterise(bench.target_plane)).double().flatten()
         rendered = setup.resized(bench.shape).observe(scene).irradiance(4.0)
         expected = (seen.ambient + seen.matrix @ mask).reshape(bench.shape).float()
         torch.testing.assert_close(rendered, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_the_papers_matrix_is_its_wall_but_for_diffraction():
-    scene, bench = plate_in_the_middle(), Bench(height=25, width=40)
+    scene, bench = target_in_the_middle(), Bench(height=25, width=40)
     for length_m in (0.004, 0.02):
         setup = PaperSetup(tpsf_length_m=length_m, gain=0.9, field_of_view_m=0.3)
         seen = linearized(setup, bench)
-        mask = torch.from_numpy(scene.target.rasterise(bench.plate)).double().flatten()
+        mask = torch.from_numpy(scene.target.rasterise(bench.target_plane)).double().flatten()
         rendered = setup.resized(bench.shape).observe(scene).irradiance(4.0).double().flatten()
         expected = seen.ambient + seen.matrix @ mask
         assert float((rendered - expected).abs().max()) < 0.03 * float(expected.max())
@@ -181,9 +181,9 @@ def test_a_cut_tpsf_is_told_apart():
 def test_prior_and_test_share_no_character():
     assert not set(TEST_CHARACTERS) & set(TRAIN_CHARACTERS)
     assert len(TEST_CHARACTERS) + len(TRAIN_CHARACTERS) == 36
-    plates = handwritten_plates(SMALL.plate, 1)
-    assert len(plates.names) == len(plates.test) == 2 * len(TEST_CHARACTERS)
-    assert 0.004 < plates.stroke_m < 0.012
+    targets = handwritten_targets(SMALL.target_plane, 1)
+    assert len(targets.names) == len(targets.test) == 2 * len(TEST_CHARACTERS)
+    assert 0.004 < targets.stroke_m < 0.012
 
 
 def test_a_sharp_setup_shows_more_than_a_matte_wall():
@@ -215,12 +215,12 @@ def test_picard_and_picture():
     """The coefficients of a noiseless picture, from the definition; the same seed draws the same picture."""
     one, same, other = (identify(setup_preset("hard"), bench=SMALL, seed=seed) for seed in (0, 0, 1))
     setup = linearized(setup_preset("hard"), SMALL)
-    plates = handwritten_plates(SMALL.plate, 1)
-    light = setup.ambient + setup.matrix @ plates.mean
+    targets = handwritten_targets(SMALL.target_plane, 1)
+    light = setup.ambient + setup.matrix @ targets.mean
     whitened = setup.matrix / camera_variance(light, FrameCamera()).sqrt()[:, None]
     left, values, _ = torch.linalg.svd(whitened, full_matrices=False)
     torch.testing.assert_close(one.at_camera.spectrum[:20], values[:20], rtol=1e-6, atol=1e-9)
-    seen = (left.mT @ (whitened @ plates.test[plates.typical])).abs()
+    seen = (left.mT @ (whitened @ targets.test[targets.typical])).abs()
     torch.testing.assert_close(one.at_camera.picard[:20], seen[:20], rtol=1e-5, atol=1e-6)
     assert torch.equal(one.at_camera.picture, same.at_camera.picture)
     assert not torch.equal(one.at_camera.picture, other.at_camera.picture)
@@ -294,7 +294,7 @@ def test_bad_setup_files(tmp_path, text, match):
         ("no preset 'papr'", lambda: named_setup("simulate-papr")),
         ("cells is 4", lambda: Bench(cells=4)),
         ("cells is 100", lambda: Bench(cells=100)),
-        ("plate_m is 0", lambda: Bench(plate_m=0.0)),
+        ("target_size_m is 0", lambda: Bench(target_size_m=0.0)),
         ("fixed_noise", lambda: Bench(fixed_noise=float("nan"))),
         ("does not see the wall", lambda: linearized(RadiometricSetup(camera_angle_deg=80.0), SMALL)),
         ("no light", lambda: linearized(PaperSetup(offset_m=(5.0, 0.0)), SMALL)),

@@ -1,11 +1,11 @@
-"""One plate from many positions: the compressed problem is the stacked one; what rests does not disturb it."""
+"""One target from many positions: the compressed problem is the stacked one; what rests does not disturb it."""
 
 import numpy as np
 import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import Gradient, JointProblem, PlatePass, total_variation
+from evnlos.inverse import Gradient, JointProblem, SequenceOperator, total_variation
 from evnlos.inverse.joint import matrix_of, strip_gram_of, strip_of
 from evnlos.inverse.measurements import position_subsets
 from evnlos.inverse.operators import normal_matrix
@@ -14,24 +14,24 @@ from evnlos.scene import Target
 from evnlos.setups import RadiometricSetup
 from evnlos.types import Plane
 
-PLATE = Plane(4, 4, 0.01)
+TARGET_PLANE = Plane(4, 4, 0.01)
 POSITIONS = np.array([(-0.02, 0.0), (0.003, 0.004), (0.021, -0.003)])
-STRIP = strip_of(POSITIONS, PLATE)
+STRIP = strip_of(POSITIONS, TARGET_PLANE)
 SHAPE = (5, 7)
 
 
 @pytest.fixture(scope="module")
-def sight() -> PlatePass:
+def sight() -> SequenceOperator:
     generator = torch.Generator().manual_seed(3)
     matrix = torch.rand(35, STRIP.height * STRIP.width, generator=generator, dtype=torch.float64)
-    return PlatePass(MatrixTransport(matrix, STRIP, SHAPE), PLATE, POSITIONS)
+    return SequenceOperator(MatrixTransport(matrix, STRIP, SHAPE), TARGET_PLANE, POSITIONS)
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def stacked(sight: PlatePass) -> torch.Tensor:
+def stacked(sight: SequenceOperator) -> torch.Tensor:
     """The whole pass as a matrix [N P, n n], column by column."""
     return sight(torch.eye(16, dtype=torch.float64).reshape(16, 4, 4)).flatten(1).mT
 
@@ -51,7 +51,7 @@ def test_adjoint(sight) -> None:
 
 def test_the_strip_is_drawn_as_the_target_draws_itself(sight) -> None:
     mask = random(4, 4).float()
-    drawn = Target("plate", mask.numpy(), 0.04).rasterise(STRIP, POSITIONS)
+    drawn = Target("target", mask.numpy(), 0.04).rasterise(STRIP, POSITIONS)
     torch.testing.assert_close(sight.drawn(mask.double()).float(), torch.from_numpy(drawn), rtol=0, atol=2e-7)
 
 
@@ -93,8 +93,8 @@ def test_what_rests_says_nothing(sight) -> None:
 def test_gcv_finds_the_weight_where_the_noise_is_white(sight) -> None:
     """Against the best weight on a grid, with noise that dominates the small modes."""
     generator = torch.Generator().manual_seed(1)
-    plate = random(4, 4, seed=7)
-    clean = sight(plate)
+    target = random(4, 4, seed=7)
+    clean = sight(target)
     noisy = clean + 0.3 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
     problem = JointProblem(sight)
     chosen = problem.tikhonov(noisy)
@@ -107,9 +107,9 @@ def test_gcv_finds_the_weight_where_the_noise_is_white(sight) -> None:
 
 
 def test_total_variation_is_that_of_one_picture(sight) -> None:
-    one = PlatePass(sight.transport, PLATE, POSITIONS[:1])
+    one = SequenceOperator(sight.transport, TARGET_PLANE, POSITIONS[:1])
     images = one(random(4, 4, seed=8)) + 0.1 * random(1, *SHAPE, seed=9)
-    operator = MatrixTransport(one(torch.eye(16).double().reshape(16, 4, 4)).flatten(1).mT, PLATE, SHAPE)
+    operator = MatrixTransport(one(torch.eye(16).double().reshape(16, 4, 4)).flatten(1).mT, TARGET_PLANE, SHAPE)
     expected = total_variation(operator, images[0], 0.05, box=(0.0, 1.0), border="dark", tolerance=1e-4)
     found = JointProblem(one).total_variation(images, 0.05, tolerance=1e-4)
     assert found.converged and expected.converged
@@ -126,15 +126,15 @@ def test_total_variation_is_that_of_one_picture(sight) -> None:
 
 def test_a_pass_shows_more_than_a_picture() -> None:
     setup = RadiometricSetup(roughness=0.05, cell_m=0.01, gain=1.0)
-    plate = Plane(10, 10, 0.008)
+    target_plane = Plane(10, 10, 0.008)
     positions = np.stack([np.linspace(-0.06, 0.06, 8), np.zeros(8)], axis=1)
-    transport = matrix_of(setup.resized((16, 24)).operator(strip_of(positions, plate), (16, 24)))
+    transport = matrix_of(setup.resized((16, 24)).operator(strip_of(positions, target_plane), (16, 24)))
     truth = torch.zeros(10, 10, dtype=torch.float64)
     truth[2:8, 2:4] = truth[6:8, 2:8] = 1
     generator = torch.Generator().manual_seed(0)
     gram, error = strip_gram_of(transport), {}
     for count in (1, 8):
-        sight = PlatePass(transport, plate, positions[:count])
+        sight = SequenceOperator(transport, target_plane, positions[:count])
         clean = sight(truth)
         noisy = clean + 5e-3 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
         found = JointProblem(sight, 0.0, gram).tikhonov(noisy, 4 * 5e-3**2)
@@ -143,15 +143,17 @@ def test_a_pass_shows_more_than_a_picture() -> None:
 
 
 def test_white_levels_are_the_setups() -> None:
-    """A strip of other cells at a smaller size shows a plate as bright as the setup's own wall does."""
+    """A strip of other cells at a smaller size shows a target as bright as the setup's own wall does."""
     setup = RadiometricSetup(roughness=0.08, cell_m=0.008, gain=0.9)
     lit = torch.ones(10, 10, dtype=torch.float64)
-    plate, place = Plane(10, 10, 0.008), np.array([(0.01, 0.0)])
-    small = matrix_of(setup.resized((20, 32)).operator(strip_of(place, plate), (10, 16)))
+    target_plane, place = Plane(10, 10, 0.008), np.array([(0.01, 0.0)])
+    small = matrix_of(setup.resized((20, 32)).operator(strip_of(place, target_plane), (10, 16)))
     own = setup.transport((20, 32))
     wall = setup.gain * own(torch.from_numpy(Target("square", np.ones((4, 4))).rasterise(own.source, place[0])))
     wall = wall.unflatten(0, (10, 2)).unflatten(2, (16, 2)).mean(dim=(1, 3))
-    torch.testing.assert_close(PlatePass(small, plate, place)(lit)[0].float(), wall, rtol=0.03, atol=0.01)
+    torch.testing.assert_close(
+        SequenceOperator(small, target_plane, place)(lit)[0].float(), wall, rtol=0.03, atol=0.01
+    )
 
 
 def test_position_subsets_are_equally_spaced() -> None:
@@ -170,17 +172,17 @@ def test_wrong_input_is_named(sight) -> None:
     with pytest.raises(ConfigError, match=r"static is -0\.5"):
         JointProblem(sight, -0.5)
     with pytest.raises(DataError, match="off the strip"):
-        PlatePass(sight.transport, PLATE, np.array([(1.0, 0.0)]))
+        SequenceOperator(sight.transport, TARGET_PLANE, np.array([(1.0, 0.0)]))
     with pytest.raises(DataError, match="shape"):
-        PlatePass(sight.transport, PLATE, np.zeros(2))
-    with pytest.raises(DataError, match="nothing of the plate"):
-        JointProblem(PlatePass(sight.transport, PLATE, POSITIONS[:1]), np.inf)
+        SequenceOperator(sight.transport, TARGET_PLANE, np.zeros(2))
+    with pytest.raises(DataError, match="nothing of the target"):
+        JointProblem(SequenceOperator(sight.transport, TARGET_PLANE, POSITIONS[:1]), np.inf)
     with pytest.raises(ConfigError, match="7 positions of 6"):
         position_subsets(6, 7, 1)
 
 
 def test_the_dense_map_of_a_pass_is_the_pass(sight) -> None:
-    plate = torch.rand(PLATE.shape, dtype=sight.transport.matrix.dtype)
+    target = torch.rand(TARGET_PLANE.shape, dtype=sight.transport.matrix.dtype)
     dense = sight.matrix()
-    assert dense.shape == (len(sight), SHAPE[0] * SHAPE[1], PLATE.height * PLATE.width)
-    torch.testing.assert_close((dense @ plate.flatten()).unflatten(1, SHAPE), sight(plate))
+    assert dense.shape == (len(sight), SHAPE[0] * SHAPE[1], TARGET_PLANE.height * TARGET_PLANE.width)
+    torch.testing.assert_close((dense @ target.flatten()).unflatten(1, SHAPE), sight(target))

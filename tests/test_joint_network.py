@@ -28,15 +28,15 @@ def network() -> SequenceReconstructor:
     return SequenceReconstructor(as_modality("frame"), NET, Sampling(height=64, width=96, pitch_m=PITCH_M))
 
 
-def test_pictures_of_a_moving_plate_meet_on_the_plate_and_come_back() -> None:
+def test_pictures_of_a_moving_target_meet_on_the_target_and_come_back() -> None:
     target = FontGlyphs(characters="F").target("comic_neue_bold_F")
     places = np.array([[-0.05, -0.01], [0.0, 0.0], [0.0313, 0.0117], [0.06, 0.02]])
     truth = torch.from_numpy(target.rasterise(Plane(64, 96, PITCH_M), places)).float()
     at = torch.from_numpy(places).float()
     net = network()
-    plate = net.plane_of(truth, at)
-    assert plate.shape == (80, 80)
-    error = (net.on_canvas(plate, at) - truth).square().mean()
+    target = net.plane_of(truth, at)
+    assert target.shape == (80, 80)
+    error = (net.on_canvas(target, at) - truth).square().mean()
     assert 10 * torch.log10(1 / error) > 27
     shuffled = net.plane_of(truth, at.flip(0))
     assert (net.on_canvas(shuffled, at) - truth).square().mean() > 4 * error

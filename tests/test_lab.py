@@ -83,7 +83,7 @@ def test_the_sensor_is_not_the_training_simulators():
 
 def test_a_capture_reads_like_a_recording(rendered):
     capture = read_capture(rendered / "near_A")
-    assert (capture.name, capture.target.name, capture.info.target.plate_m) == ("near_A", "A", 0.08)
+    assert (capture.name, capture.target.name, capture.info.target.size_m) == ("near_A", "A", 0.08)
     assert capture.frames.shape == (9, 24, 36)
     assert capture.frame_times_us.tolist() == [1_000_000 * k for k in range(9)]
     assert len(capture.events) > 100
@@ -207,7 +207,7 @@ def test_all_names():
 
 
 def test_occluders_of_a_setup_are_those_of_its_matrix():
-    """A plate-sized screen right before the target leaves only what passes beside it."""
+    """A target-sized screen right before the target leaves only what passes beside it."""
     wide = ((-0.4, -0.3, 0.29), (0.0, -0.3, 0.29), (0.0, 0.3, 0.29), (-0.4, 0.3, 0.29))
     setup = RadiometricSetup(wall_material="lambert", cell_m=0.01, occluders_m=(wide,))
     with pytest.raises(ConfigError, match="no light"):
@@ -255,7 +255,7 @@ BAD = [
     ),
     (
         "needs 4 cells a side to show any shape: give at most 0.005 m",
-        lambda: small(setup={}).setup.resized((6, 9)).observe(tiny_plate()),
+        lambda: small(setup={}).setup.resized((6, 9)).observe(tiny_target()),
     ),
     ("cell_m is 0", lambda: RadiometricSetup(cell_m=0.0).resized((6, 9)).observe(scene())),
     ("strip_height_m is 0", lambda: RadiometricSetup(strip_m=(0.24, 0.0)).resized((6, 9)).observe(scene())),
@@ -280,13 +280,17 @@ BAD = [
     ),
     ("threshold_on", lambda: Lab(spread={"setup.pixel.threshold_on": (0.0, 0.2)})),
     ("treshold", lambda: Lab(spread={"setup.pixel.treshold_on": (0.1, 0.2)})),
-    ("size_m", lambda: FontGlyphs(plate=dataclasses.replace(FontGlyphs().plate, size_m=0.0))),
+    ("size_m", lambda: FontGlyphs(target_plane=dataclasses.replace(FontGlyphs().target_plane, size_m=0.0))),
 ]
 
 
-def tiny_plate() -> Scene:
-    plate = dataclasses.replace(FontGlyphs().plate, size_m=0.02)
-    return Scene(FontGlyphs(family="kalam", characters="A", plate=plate).target("kalam_A"), LineMotion(), 8.0)
+def tiny_target() -> Scene:
+    target_plane = dataclasses.replace(FontGlyphs().target_plane, size_m=0.02)
+    return Scene(
+        FontGlyphs(family="kalam", characters="A", target_plane=target_plane).target("kalam_A"),
+        LineMotion(),
+        8.0,
+    )
 
 
 @pytest.mark.parametrize(("match", "make"), BAD, ids=[match for match, _ in BAD])

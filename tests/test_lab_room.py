@@ -13,7 +13,7 @@ def scene() -> Scene:
     return Scene(Target("square", np.full((4, 4), 0.5)), LineMotion(), duration_s=8.0)
 
 
-def test_mount_and_plate_stay_on_the_plane_with_all_their_light():
+def test_mount_and_target_stay_on_the_plane_with_all_their_light():
     mount = Mount(0.04, rim_m=0.004, stick_m=(0.012, 0.08))
     plane = covered_plane(scene(), mount, 0.0025)
     times = np.linspace(0, 8, 7)
@@ -25,11 +25,11 @@ def test_mount_and_plate_stay_on_the_plane_with_all_their_light():
     assert float(bare.max()) == pytest.approx(0.5)
 
 
-def test_the_stick_hangs_below_the_plate_and_moves_with_it():
+def test_the_stick_hangs_below_the_target_and_moves_with_it():
     mount = Mount(1.0)
     plane = covered_plane(scene(), mount, 0.002)
     first, last = brightness(scene(), mount, plane, np.array([0.0, 8.0]))
-    row = int(np.argmin(np.abs(plane.y_m - 0.1)))  # downwards of the plate's edge at 0.04 m
+    row = int(np.argmin(np.abs(plane.y_m - 0.1)))  # downwards of the target's edge at 0.04 m
     middles = [float((picture[row] * plane.x_m).sum() / picture[row].sum()) for picture in (first, last)]
     np.testing.assert_allclose(middles, [-0.08, 0.08], atol=1e-4)
     assert first[int(np.argmin(np.abs(plane.y_m + 0.05)))].sum() == 0
@@ -44,7 +44,7 @@ def test_a_torch_lights_the_place_before_it_most_and_falls_off_as_cosines_over_t
     assert light[1] == pytest.approx(1.0)
 
 
-def test_a_holder_shades_the_plate_with_a_penumbra_of_the_torchs_size():
+def test_a_holder_shades_the_target_with_a_penumbra_of_the_torchs_size():
     x = np.linspace(-0.1, 0.1, 2001)
     holder = (0.0, 0.0, 0.2, 0.02)
     sharp = Torch((0.0, 0.0, 0.1), radius_m=0.0, holder_m=holder).emission(x, 0 * x, 0.3)

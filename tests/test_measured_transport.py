@@ -39,7 +39,7 @@ from evnlos.inverse import read_photograph
 from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.optics import MatrixTransport
 from evnlos.scene import HandwritingGlyphs, LineMotion, Scene, Target
-from evnlos.scene.glyph_sets import Plate
+from evnlos.scene.glyph_sets import TargetPlane
 from evnlos.setups import MeasuredSetup, RadiometricSetup
 from evnlos.setups.files import MEASUREMENT, About, Measurement, write_measurement
 from evnlos.types import Plane
@@ -242,7 +242,7 @@ def test_simulation_of_the_measured_setup_is_that_of_the_true_one(clean) -> None
         assert there[0].transport.matrix is there[1].transport.matrix
         np.testing.assert_allclose(there[0].irradiance(times).cpu().numpy(), ours, rtol=1e-6)
     config = Simulation(
-        HandwritingGlyphs(characters="L", writers=1, plate=Plate(size_m=0.04)),
+        HandwritingGlyphs(characters="L", writers=1, target_plane=TargetPlane(size_m=0.04)),
         motion=LineMotion((-0.02, 0.0)),
         duration_s=2.0,
         positions=4,
@@ -472,7 +472,7 @@ def test_strange_files_are_refused(tmp_path) -> None:
 
 
 def test_identify_tells_the_scan_s_own_noise(noisy, clean, tmp_path) -> None:
-    bench = Bench(plate_m=0.06, cells=12, height=60, width=96, writers=1)
+    bench = Bench(target_size_m=0.06, cells=12, height=60, width=96, writers=1)
     found = identify(MeasuredSetup(file=str(clean[1]), gain=1 / SCALE), bench=bench)
     true = identify(replace(SETUP, strip_m=(0.12, 0.06)), bench=replace(bench, height=24, width=40))
     assert found.modes == pytest.approx(true.modes, abs=3)
@@ -499,7 +499,7 @@ def test_commands_from_plan_to_picture(tmp_path, capsys) -> None:
     found = json.loads(capsys.readouterr().out)
     assert out.with_suffix(".png").stat().st_size > 10_000
     assert found["about"]["repeats"] == 2
-    main(["identify", str(out), "--plate-m", "0.06", "--cells", "8", "--writers", "1", "--json"])
+    main(["identify", str(out), "--target-size-m", "0.06", "--cells", "8", "--writers", "1", "--json"])
     assert json.loads(capsys.readouterr().out)["modes_above_1e-2"] >= 5
     letter = np.zeros(PLANE.shape)
     letter[1:5, 3] = letter[4, 3:8] = 1

@@ -328,7 +328,7 @@ def test_beside_a_gpu_the_settings_alone_say_what_is_simulated(small) -> None:
     assert live_dataset(small, where="cpu").note(PRETENDED) == ""
 
 
-def test_a_plate_may_move_along_any_path(small) -> None:
+def test_a_target_may_move_along_any_path(small) -> None:
     path = PathMotion((0.0, 1.0, 2.0), ((0.0, 0.0), (0.02, 0.01), (0.03, -0.01)))
     name = small.glyphs.objects()[0]
     config = replace(small, motion=path)

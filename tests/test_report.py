@@ -196,7 +196,7 @@ def test_the_plot_of_what_a_setup_shows_ends_where_the_values_do() -> None:
 @pytest.mark.parametrize("angle", [30.0, -30.0])
 def test_the_drawing_sketches_what_hides_the_object_and_nothing_else(name, angle) -> None:
     setup = replace(setup_preset(name), camera_angle_deg=angle)
-    drawn = setup_drawing(setup, travel_m=0.16, plate_m=0.08).svg
+    drawn = setup_drawing(setup, travel_m=0.16, target_size_m=0.08).svg
     assert drawn.count(PARTITION) == 1 and (">occluder</text>" in drawn) == (name == "aperture-near")
     lines = [
         [tuple(float(v) for v in one.split(",")) for one in points.split()]
@@ -295,13 +295,13 @@ def test_the_drawing_of_a_setup_is_to_scale() -> None:
     from xml.dom.minidom import parseString
 
     for setup in (RadiometricSetup(distance_m=0.3), PaperSetup(distance_m=0.5)):
-        drawing = parseString(setup_drawing(setup, travel_m=0.16, plate_m=0.08).svg)
+        drawing = parseString(setup_drawing(setup, travel_m=0.16, target_size_m=0.08).svg)
         lines = [one.getAttribute("points") for one in drawing.getElementsByTagName("polyline")]
-        way, plate = (np.array([[float(v) for v in p.split(",")] for p in line.split()]) for line in lines[:2])
+        way, target = (np.array([[float(v) for v in p.split(",")] for p in line.split()]) for line in lines[:2])
         wall = np.array([[float(v) for v in p.split(",")] for p in lines[-1].split()])
-        length = float(np.ptp(plate[:, 0]))
+        length = float(np.ptp(target[:, 0]))
         assert np.ptp(way[:, 0]) == pytest.approx(3 * length, abs=0.3)  # 24 cm beside 8 cm
-        assert plate[0, 1] - wall[0, 1] == pytest.approx(length * setup.distance_m / 0.08, rel=0.01)
+        assert target[0, 1] - wall[0, 1] == pytest.approx(length * setup.distance_m / 0.08, rel=0.01)
 
 
 @pytest.mark.parametrize("value", [0.0, 18.5, -3e9])

@@ -54,7 +54,7 @@ def test_gain_is_the_brightest_pixel_while_a_square_shines():
     assert float(light.max()) == pytest.approx(0.6, rel=1e-4)
 
 
-def test_the_mount_adds_light_below_the_plate():
+def test_the_mount_adds_light_below_the_target():
     still = Scene(Target("dark", np.zeros((4, 4), np.float32)), LineMotion(), 8.0)
     assert torch.equal(room().observe(still).irradiance(4.0), room().ambient_light())
     with_mount = room(mount=Mount(0.05)).observe(still).irradiance(4.0) - room().ambient_light()

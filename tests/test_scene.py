@@ -97,7 +97,7 @@ def test_many_positions_equal_one_at_a_time_and_the_mask_is_unchanged():
     assert target.rasterise(CANVAS, np.zeros((0, 2))).shape == (0, 64, 96)
 
 
-def test_outside_the_plate_is_exactly_dark_and_far_away_draws_nothing():
+def test_outside_the_target_is_exactly_dark_and_far_away_draws_nothing():
     target = Target("bright", np.ones((5, 5)), 0.02)
     picture = target.rasterise(CANVAS, (0.0, 0.0))
     assert picture.sum() == pytest.approx(64)

@@ -299,15 +299,19 @@ def test_a_part_of_the_radiometric_setup_is_replaced_by_itself(tmp_path: Path) -
     assert samples.frame.shape[0] == 1
 
 
-def test_a_setup_that_was_called_rig_loads(tmp_path: Path) -> None:
+def test_files_that_speak_of_rigs_and_plates_load(tmp_path: Path) -> None:
     folder = tmp_path / "near"
     folder.mkdir()
-    (folder / "rig.yaml").write_text("setup: {kind: radiometric, roughness: 0.07}\nrigs: 6\n")
+    (folder / "rig.yaml").write_text(
+        "setup: {kind: radiometric, roughness: 0.07}\nrigs: 6\nglyphs: {kind: font, plate: {size_m: 0.05}}\n"
+    )
     for word in (folder, folder / "rig.yaml"):
         found = named_setup(word)
         assert (found.setup, found.name, found.word) == (RadiometricSetup(roughness=0.07), "near", "near")
         assert calibrated_folder(word) == folder
     assert load_yaml(Simulation, folder / "rig.yaml").setups == 6
+    assert load_yaml(Simulation, folder / "rig.yaml").glyphs.target_plane.size_m == 0.05
+    assert migrate("TargetInfo", {"name": "R", "plate_m": 0.05}) == {"name": "R", "size_m": 0.05}
     notes = {"camera": {"name": "c"}, "rig": {"distance_m": 0.3}}
     assert migrate("CaptureInfo", notes) == {"camera": {"name": "c"}, "setup": {"distance_m": 0.3}}
     assert migrate("Record", {"study": "captures", "rig": "near"}) == {"study": "captures", "setup": "near"}

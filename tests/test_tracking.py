@@ -18,7 +18,7 @@ from evnlos.data.cleaning import save_pattern
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import PlatePass
+from evnlos.inverse import SequenceOperator
 from evnlos.inverse.joint import matrix_of, strip_of
 from evnlos.inverse.operators import Gradient, normal_matrix
 from evnlos.models import SequenceConfig, Weights, save_weights
@@ -297,20 +297,22 @@ def test_approach_and_retreat_are_found(change) -> None:
 
 
 @pytest.mark.parametrize("depth", [False, True])
-def test_the_step_is_that_of_plate_and_places_together(depth) -> None:
-    """Slow reference: one least squares problem of all unknowns, with the plate's own shift forbidden."""
+def test_the_step_is_that_of_target_and_places_together(depth) -> None:
+    """Slow reference: one least squares problem of all unknowns, with the target's own shift forbidden."""
     rng = np.random.default_rng(7)
-    plate = Plane(6, 6, 0.016)
+    target_plane = Plane(6, 6, 0.016)
     state = rng.uniform(-0.03, 0.03, (4, 3 if depth else 2))
-    transport = matrix_of(SETUP.resized(SHAPE).operator(strip_of(state[:, :2] + 0.0, plate), SHAPE))
-    fit = Fit(plate, transport, Depths(SETUP, transport) if depth else None, state, SETUP.distance_m)
+    transport = matrix_of(SETUP.resized(SHAPE).operator(strip_of(state[:, :2] + 0.0, target_plane), SHAPE))
+    fit = Fit(target_plane, transport, Depths(SETUP, transport) if depth else None, state, SETUP.distance_m)
     light = torch.from_numpy(rng.standard_normal((4, *SHAPE)))
-    prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(plate.shape, dtype=torch.float64))
+    prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(target_plane.shape, dtype=torch.float64))
     image, step, _, _ = fit.step(light, prior, 1.0)
     maps = torch.stack(
         [
-            PlatePass(
-                Depths(SETUP, transport).at(s[2] / SETUP.distance_m) if depth else transport, plate, s[None, :2]
+            SequenceOperator(
+                Depths(SETUP, transport).at(s[2] / SETUP.distance_m) if depth else transport,
+                target_plane,
+                s[None, :2],
             )
             .matrix()[0]
             .double()

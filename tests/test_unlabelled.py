@@ -11,7 +11,7 @@ from evnlos.calibration import Calibration, fit_setup
 from evnlos.calibration.captures import read_shots
 from evnlos.calibration.unlabelled import CELLS, WRITERS, MovingLight, fit_unlabelled
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.measurements import handwritten_plates
+from evnlos.inverse.measurements import handwritten_targets
 from evnlos.setups import PaperSetup, RadiometricSetup
 
 SETUP = RadiometricSetup(roughness=0.06)
@@ -20,24 +20,24 @@ SHAPE = (6, 10)
 
 
 def passes(noise: float, seed: int = 0) -> tuple[MovingLight, torch.Tensor]:
-    """Return frames of unseen handwriting with noise in units of what moves, and the true plates."""
+    """Return frames of unseen handwriting with noise in units of what moves, and the true targets."""
     draw = torch.Generator().manual_seed(seed)
     empty = MovingLight(torch.zeros(1, 7, *SHAPE), PLACES, 0.08, CELLS)
-    plates = handwritten_plates(empty.plate, WRITERS).test[::2].unflatten(1, empty.plate.shape)
-    light = empty.sight(SETUP)(plates)
+    targets = handwritten_targets(empty.target_plane, WRITERS).test[::2].unflatten(1, empty.target_plane.shape)
+    light = empty.sight(SETUP)(targets)
     light = light / light.std()
     light = light + noise * torch.randn(light.shape, generator=draw)
     # Ambient light and the pattern of the camera: still, and of any form.
     light = light + 3 * torch.rand(SHAPE, generator=draw)
-    return MovingLight(light, PLACES, 0.08, CELLS), plates
+    return MovingLight(light, PLACES, 0.08, CELLS), targets
 
 
 def test_the_evidence_is_that_of_the_dense_gaussian() -> None:
     light, _ = passes(0.3)
     sight, terms = light.sight(SETUP), light.terms(SETUP)
-    prior = handwritten_plates(light.plate, WRITERS)
+    prior = handwritten_targets(light.target_plane, WRITERS)
     gain, variance = 0.7 / terms.lit**0.5, 0.05
-    eye = torch.eye(CELLS**2, dtype=torch.float64).unflatten(1, light.plate.shape)
+    eye = torch.eye(CELLS**2, dtype=torch.float64).unflatten(1, light.target_plane.shape)
     matrix = sight(eye)  # [n n, N, h, w]
     matrix = (matrix - matrix.mean(dim=1, keepdim=True)).flatten(1).mT
     # The means of the pass take 1 of 7 dimensions: look at 6 of an orthonormal basis of the others.
@@ -53,21 +53,21 @@ def test_the_evidence_is_that_of_the_dense_gaussian() -> None:
     assert terms.cost(gain, variance) * len(onto) == pytest.approx(expected, rel=1e-7)  # the matrix is float32
 
 
-def test_the_right_wall_is_the_likeliest_and_shows_the_plates() -> None:
-    light, plates = passes(0.1)
+def test_the_right_wall_is_the_likeliest_and_shows_the_targets() -> None:
+    light, targets = passes(0.1)
     found = {
         rough: light.explained(replace(SETUP, roughness=rough)) for rough in (0.03, 0.045, 0.06, 0.08, 0.12)
     }
     assert min(found, key=lambda rough: found[rough].cost) == 0.06
     best = found[0.06]
     assert best.noise == pytest.approx(0.1, rel=0.15)
-    shown, true = (one.flatten(1) - one.flatten(1).mean(dim=1, keepdim=True) for one in (best.plates, plates))
+    shown, true = (one.flatten(1) - one.flatten(1).mean(dim=1, keepdim=True) for one in (best.targets, targets))
     alike = (shown * true).sum(dim=1) / (shown.norm(dim=1) * true.norm(dim=1))
     assert float(alike.mean()) > 0.5
 
 
 def test_a_setup_is_found_without_its_targets(tiny_captures, tmp_path) -> None:
-    fit, held = read_shots(tiny_captures, holdout=("4",), plate_m=0.08)
+    fit, held = read_shots(tiny_captures, holdout=("4",), target_size_m=0.08)
     assert all(capture.target is None for capture in (*fit.captures, *held.captures))
     start = RadiometricSetup(roughness=0.12)  # the lab's is 0.05
     known = ("distance_m", "target_offset_m", "camera_distance_m", "camera_angle_deg", "field_of_view_deg")

@@ -213,7 +213,7 @@ def test_paper_defaults():
     assert light.shape == (5, 50, 80)
     assert float(light.min()) >= 0.05
     assert float(light.max()) < 1.05
-    # The centre of light moves to the right at the speed of the plate.
+    # The centre of light moves to the right at the speed of the target.
     x = torch.arange(80.0)
     centre = ((light - 0.05) * x).sum((1, 2)) / (light - 0.05).sum((1, 2))
     speed = float(centre[3] - centre[1]) / 4
@@ -280,7 +280,7 @@ def test_matrix_wall_equals_the_matrix_times_the_drawing():
     assert wall.speed_px_s == pytest.approx(2.5)
 
 
-def test_matrix_wall_is_dark_when_the_plate_has_left():
+def test_matrix_wall_is_dark_when_the_target_has_left():
     wall = strip_wall(LineMotion(), ambient=0.03)
     gone = wall.irradiance([-100.0, 100.0])
     assert float((gone - 0.03).abs().max()) < 1e-4
@@ -294,7 +294,7 @@ def test_matrix_wall_scalar_and_array_times_agree():
 
 def test_radiometric_wall():
     config = RadiometricSetup(roughness=0.3, cell_m=0.01, gain=0.6, ambient=0.1)
-    lit = Scene(Target("plate", np.ones((8, 8)), 0.08))
+    lit = Scene(Target("target", np.ones((8, 8)), 0.08))
     wall = config.resized((20, 32)).observe(lit)
     assert wall.transport is config.resized((20, 32)).observe(lit).transport  # one matrix for all targets
     middle = wall.irradiance(4.0)

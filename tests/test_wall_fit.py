@@ -23,7 +23,7 @@ from evnlos.types import Events, Plane
 SHAPE = (30, 48)
 PLANE = Plane(32, 96, 0.0025)
 KNOWN = RadiometricSetup(distance_m=0.3)
-SHINING = 0.25  # brightness of a bar below the plate
+SHINING = 0.25  # brightness of a bar below the target
 
 
 def operator(bent: float = 0.0) -> np.ndarray:
@@ -43,7 +43,7 @@ def operator(bent: float = 0.0) -> np.ndarray:
     return out
 
 
-WIDE = Plane(56, 96, 0.0025)  # taller than the plate: room for the bar
+WIDE = Plane(56, 96, 0.0025)  # taller than the target: room for the bar
 
 
 def shots_of(characters: str, matrix: np.ndarray, shining: float = 0.0, seed: int = 0) -> Shots:

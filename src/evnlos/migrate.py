@@ -103,6 +103,16 @@ def _capture(values: dict[str, Any]) -> dict[str, Any]:
     return _renamed(values, rig="setup")
 
 
+def _target(values: dict[str, Any]) -> dict[str, Any]:
+    """The target of a `capture.yaml`."""
+    return _renamed(values, plate_m="size_m")
+
+
+def _glyphs(values: dict[str, Any]) -> dict[str, Any]:
+    """Hidden characters of any kind."""
+    return _renamed(values, plate="target_plane")
+
+
 def _several_setups(values: dict[str, Any]) -> dict[str, Any]:
     """Name the number of walls that a simulation draws."""
     return _renamed(values, rigs="setups")
@@ -142,6 +152,7 @@ def _one_setup(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _path_in_setup(path: str) -> str:
+    path = path.replace("glyphs.plate.", "glyphs.target_plane.")
     section, _, rest = path.partition(".")
     if section == "transport":
         return f"setup.{rest}"
@@ -161,6 +172,7 @@ def _lab_setup(values: dict[str, Any]) -> dict[str, Any]:
     return _one_setup(_pixel_has_a_kind({**_LAB_CAMERAS, **values, "transport": wall}))
 
 
+_GLYPHS = ("DrawingGlyphs", "EmnistGlyphs", "FontGlyphs", "HandwritingGlyphs", "NistGlyphs")
 _STEPS: dict[str, tuple[Step, ...]] = {
     "Simulation": (_pixel_has_a_kind, _one_setup, _several_setups),
     "Lab": (_lab_setup,),
@@ -169,4 +181,6 @@ _STEPS: dict[str, tuple[Step, ...]] = {
     "run": (_run,),
     "Record": (_record,),
     "CaptureInfo": (_capture,),
+    "TargetInfo": (_target,),
+    **dict.fromkeys(_GLYPHS, (_glyphs,)),
 }

@@ -19,7 +19,7 @@ from evnlos.analysis.linearized import camera_variance
 from evnlos.data import NlosDataset, Samples, Sampling
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
-from evnlos.models import Confidence, Judgement, Reconstructor, Weights, halves_of, plates
+from evnlos.models import Confidence, Judgement, Reconstructor, Weights, halves_of, on_target_plane
 from evnlos.models.confidence import on_canvas
 from evnlos.setups import Setup
 from evnlos.types import Plane
@@ -136,18 +136,18 @@ def explained(
 ) -> float:
     """Return the share of what the average object leaves unexplained in the frames that the pictures explain.
 
-    1 - (|m y - g m A x|^2 - n) / (|m y - g0 m A x0|^2 - n), with x the pictures, x0 the average plate where the
-    plate is, and n the noise. m takes what stands still away, each pixel's mean over the pass, and the gains g
-    and g0 are the best ones: neither ambient light nor the camera's fixed pattern nor how bright the object is
-    has to be known, only what the wall does. 1 = the frames are as the pictures make them; 0 = they are as good
-    as those of the average plate, or the frames do not tell objects from it, as before a matte wall; below 0 =
-    they are worse: the pictures are not what was in front of the wall, or the wall is another.
+    1 - (|m y - g m A x|^2 - n) / (|m y - g0 m A x0|^2 - n), with x the pictures, x0 the average target where
+    the target is, and n the noise. m takes what stands still away, each pixel's mean over the pass, and the
+    gains g and g0 are the best ones: neither ambient light nor the camera's fixed pattern nor how bright the
+    object is has to be known, only what the wall does. 1 = the frames are as the pictures make them; 0 = they
+    are as good as those of the average target, or the frames do not tell objects from it, as before a matte
+    wall; below 0 = they are worse: the pictures are not what was in front of the wall, or the wall is another.
 
     Args:
         pictures: Pictures of the canvas, float32 [N, H, W], 0..1.
         frames: Frames of the samples y, float32 [N, h, w].
-        position_m: The plate's centre in each, (x, y) in metres, [N, 2].
-        average: The average plate, [P, P].
+        position_m: The target's centre in each, (x, y) in metres, [N, 2].
+        average: The average target, [P, P].
         operator: The setup.
         canvas: Geometry of the pictures.
 
@@ -263,7 +263,7 @@ def _judged(
     share = None
     if operator is not None and bool(frames.any()):
         # What the pass shows, at each position: what changes from picture to picture is not the object.
-        shown = on_canvas(plates(images, canvas, position_m).mean(dim=0)[0], canvas, position_m)
+        shown = on_canvas(on_target_plane(images, canvas, position_m).mean(dim=0)[0], canvas, position_m)
         share = explained(shown, frames, position_m, confidence.mean, operator, canvas)
     return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
 
@@ -286,9 +286,9 @@ class PassWorth:
         agreement: Share of what tells this object from others that both halves of the pass agree on.
         explained: Share of the frames that the pictures explain (see `explained`); None without a setup.
         measured: Whether it said that anything was.
-        skill: 1 - |x - t|^2 / |x0 - t|^2 over the plates, with x the pictures, t the truth, and x0 the average
-            plate: 1 is perfect, 0 is no better than the average object, below 0 is worse.
-        coverage: Share of the plates' pixels whose true level lies in its interval.
+        skill: 1 - |x - t|^2 / |x0 - t|^2 over the targets, with x the pictures, t the truth, and x0 the average
+            target: 1 is perfect, 0 is no better than the average object, below 0 is worse.
+        coverage: Share of the target planes' pixels whose true level lies in its interval.
         width: Mean length of these intervals, 0..1.
     """
 
@@ -333,7 +333,7 @@ def worth_of(
         said = _judged(network, confidence, *pass_, canvas, operator)
         true, shown = samples.truth[rows].float(), images[rows]
         average = on_canvas(confidence.mean, canvas, at)
-        missed, blank = (plates((one - true).square(), canvas, at).sum() for one in (shown, average))
+        missed, blank = (on_target_plane((one - true).square(), canvas, at).sum() for one in (shown, average))
         # Where the resampled truth is a rounding error beyond 0 or 1, it still is 0 or 1.
         held = ((true >= said.low - 1e-3) & (true <= said.high + 1e-3)).float()
         found.append(
@@ -344,8 +344,8 @@ def worth_of(
                 said.explained,
                 said.measured,
                 float(1 - missed / blank),
-                float(plates(held, canvas, at).mean()),
-                float(plates(said.high - said.low, canvas, at).mean()),
+                float(on_target_plane(held, canvas, at).mean()),
+                float(on_target_plane(said.high - said.low, canvas, at).mean()),
             )
         )
     return found

@@ -20,7 +20,7 @@ from evnlos.config import to_dict
 from evnlos.data import Dataset, Modality, NlosDataset, Sampling, character_of, read_shard, read_shard_index
 from evnlos.errors import DataError
 from evnlos.metrics import psnr
-from evnlos.models import Weights, plates
+from evnlos.models import Weights, on_target_plane
 from evnlos.setups import Setup
 from evnlos.types import Plane
 
@@ -285,7 +285,7 @@ def _reading(
     position = np.concatenate([place for place in places if place is not None])
     found = {}
     for key, pictures in (("read", images), ("read_truth", truth)):
-        read = read_characters(plates(pictures, scored, position))
+        read = read_characters(on_target_plane(pictures, scored, position))
         found[key] = round(float(np.mean([a == b for a, b in zip(read, answers, strict=True)])), 4)
     return found
 

@@ -26,24 +26,26 @@ from evnlos.setups import Setup
 from evnlos.types import derive_seed
 
 if TYPE_CHECKING:
-    from evnlos.inverse.measurements import Plates
+    from evnlos.inverse.measurements import TargetPrior
 
 
-_SHAPE = 4  # bars of a quarter of the plate tell where a letter is filled and where it is open
+_SHAPE = 4  # bars of a quarter of the target plane tell where a letter is filled and where it is open
 _EXTRA_MODES = 1.1
 
 
-def verdict(patterns: int, finest_m: tuple[float | None, float | None], stroke_m: float, plate_m: float) -> str:
+def verdict(
+    patterns: int, finest_m: tuple[float | None, float | None], stroke_m: float, target_size_m: float
+) -> str:
     """Return in a sentence what a reconstruction with this setup would be.
 
     Strokes are measured where bars of their width are resolved in both directions; the rough shape where bars
-    of a quarter of the plate are.
+    of a quarter of the target plane are.
 
     Args:
-        patterns: Patterns in which handwritten plates differ by more than the noise.
+        patterns: Patterns in which handwritten targets differ by more than the noise.
         finest_m: Width of the finest upright and lying bars that are resolved, metres; None where none are.
-        stroke_m: Typical stroke of the plates, metres.
-        plate_m: Side of the plate, metres.
+        stroke_m: Typical stroke of the targets, metres.
+        target_size_m: Side of the target plane, metres.
 
     Example:
         >>> verdict(3, (None, None), 0.008, 0.08).split(": ")[1]
@@ -61,7 +63,7 @@ def verdict(patterns: int, finest_m: tuple[float | None, float | None], stroke_m
     finest = None if upright is None or lying is None else max(upright, lying)
     if finest is not None and finest <= stroke_m:
         meaning = f"strokes of {1e3 * stroke_m:.1f} mm are measured"
-    elif finest is not None and finest <= plate_m / _SHAPE:
+    elif finest is not None and finest <= target_size_m / _SHAPE:
         fine = f"strokes of {1e3 * stroke_m:.1f} mm"
         meaning = f"the rough shape is measured, {fine} are not: their detail will be memory"
     else:
@@ -101,13 +103,13 @@ class AtNoise:
 
     Args:
         noise: Root mean square noise of a pixel, white levels.
-        patterns: Patterns in which handwritten plates differ by more than the noise.
-        psnr_db: Mean over unseen plates of the PSNR of the best linear picture, on the plate.
+        patterns: Patterns in which handwritten targets differ by more than the noise.
+        psnr_db: Mean over unseen targets of the PSNR of the best linear picture, on the target plane.
         stroke_m: Width of the finest bars that are resolved, upright and lying, metres; None where none are.
         spectrum: Singular values of the matrix in units of the noise, float64 [n], descending.
-        picard: Coefficient of the typical plate's picture on each mode, in units of the noise, float64 [n].
-        modes: The first modes as plates, float64 [8, h, w], unit norm.
-        picture: The best linear picture of the typical plate with one draw of the noise, float64 [h, w].
+        picard: Coefficient of the typical target's picture on each mode, in units of the noise, float64 [n].
+        modes: The first modes as targets, float64 [8, h, w], unit norm.
+        picture: The best linear picture of the typical target with one draw of the noise, float64 [h, w].
     """
 
     noise: float
@@ -136,10 +138,10 @@ class Identification:
         bench: How the question was put.
         singular: Singular values over the largest, float64 [n], descending.
         modes: How many of them lie above 1e-2.
-        zero_db: Mean PSNR of the all-black picture, on the plate.
-        mean_db: Mean PSNR of the mean training plate, on the plate.
-        stroke_m: Typical stroke of the plates, metres.
-        truth: The typical plate, float64 [h, w].
+        zero_db: Mean PSNR of the all-black picture, on the target plane.
+        mean_db: Mean PSNR of the mean training target, on the target plane.
+        stroke_m: Typical stroke of the targets, metres.
+        truth: The typical target, float64 [h, w].
         at_camera: At the frame camera's own noise.
         at_fixed: At the fixed noise of the bench.
         verdict: The same in words.
@@ -195,12 +197,12 @@ def identify(
     name: str = "setup",
     seed: int = 0,
 ) -> Identification:
-    """Say what one picture of the wall can show of a plate at a known place, whatever the method.
+    """Say what one picture of the wall can show of a target at a known place, whatever the method.
 
-    The linear map from the plate's cells to the camera's pixels is taken apart by its singular values; the
-    noise is the frame camera's at the light of the mean plate, and a fixed share of the brightest pixel. The
-    best linear picture uses mean and covariance of handwriting and is tested on characters and writers that it
-    never saw.
+    The linear map from the target plane's cells to the camera's pixels is taken apart by its singular values;
+    the noise is the frame camera's at the light of the mean target, and a fixed share of the brightest pixel.
+    The best linear picture uses mean and covariance of handwriting and is tested on characters and writers that
+    it never saw.
 
     Args:
         setup: The setup; its frame camera's noise is what counts.
@@ -219,26 +221,26 @@ def identify(
     """
     bench = bench or Bench()
     seen = linearized(setup, bench)
-    from evnlos.inverse.measurements import handwritten_plates
+    from evnlos.inverse.measurements import handwritten_targets
 
-    plates = handwritten_plates(bench.plate, bench.writers)
+    targets = handwritten_targets(bench.target_plane, bench.writers)
     singular = singular_values(seen.matrix)
-    light = seen.ambient + seen.matrix @ plates.mean
+    light = seen.ambient + seen.matrix @ targets.mean
     own = camera_variance(light, setup.frame_camera, bench.frames, bench.known_pattern)
     fixed = torch.full_like(own, (bench.fixed_noise * seen.white) ** 2 / bench.frames)
-    at_camera, at_fixed = (at_noise(seen, variance, plates, seed) for variance in (own, fixed))
+    at_camera, at_fixed = (at_noise(seen, variance, targets, seed) for variance in (own, fixed))
     warnings = []
     plain = setup.without_artifacts()
     if plain is not None:
         wide = singular_values(linearized(plain, bench).matrix)
         note = artifact_note(setup, plain, counted(singular, KINK_LEVEL), counted(wide, KINK_LEVEL), KINK_LEVEL)
         warnings += [note] if note else []
-    noise = setup.resized(seen.shape).operator_noise(seen.plate)
+    noise = setup.resized(seen.shape).operator_noise(seen.target_plane)
     if noise is not None:
         warnings += scan_notes(noise, seen, singular, MODE_LEVEL)
     zero_db, mean_db = (
-        _psnr((plates.test - blank).square().mean(dim=-1))
-        for blank in (torch.zeros_like(plates.mean), plates.mean)
+        _psnr((targets.test - blank).square().mean(dim=-1))
+        for blank in (torch.zeros_like(targets.mean), targets.mean)
     )
     return Identification(
         name,
@@ -248,43 +250,43 @@ def identify(
         counted(singular, MODE_LEVEL),
         zero_db,
         mean_db,
-        plates.stroke_m,
-        plates.test[plates.typical].reshape(bench.plate.shape),
+        targets.stroke_m,
+        targets.test[targets.typical].reshape(bench.target_plane.shape),
         at_camera,
         at_fixed,
-        verdict(at_camera.patterns, at_camera.stroke_m, plates.stroke_m, bench.plate_m),
+        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, bench.target_size_m),
         tuple(warnings),
     )
 
 
-def at_noise(seen: LinearizedSetup, variance: torch.Tensor, plates: Plates, seed: int = 0) -> AtNoise:
+def at_noise(seen: LinearizedSetup, variance: torch.Tensor, targets: TargetPrior, seed: int = 0) -> AtNoise:
     """Return what is left of a setup at independent noise of a given variance.
 
     Args:
         seen: The linear map.
         variance: Variance of each pixel's noise, white levels squared, [H W], above 0.
-        plates: Prior and test.
+        targets: Prior and test.
         seed: Seed of the one picture that is drawn with noise.
     """
-    cells, shape = seen.plate.width, seen.plate.shape
+    cells, shape = seen.target_plane.width, seen.target_plane.shape
     whitened = seen.matrix / variance.sqrt()[:, None]
     gram = whitened.mT @ whitened
     power, axes = torch.linalg.eigh(gram)
     power, axes = power.flip(0).clamp(min=0), axes.flip(1)
     # The sign of a mode is free: the larger half is shown bright.
     axes = axes * torch.where(axes.sum(dim=0) < 0, -1.0, 1.0)
-    typical = plates.test[plates.typical]
-    estimator = LinearEstimator.known(gram, plates.mean, plates.root)
+    typical = targets.test[targets.typical]
+    estimator = LinearEstimator.known(gram, targets.mean, targets.root)
     shapeless = LinearEstimator.white(gram, power, axes)
     generator = torch.Generator().manual_seed(derive_seed(seed, "identify"))
     noise = torch.randn(len(variance), generator=generator, dtype=torch.float64)
-    backprojected = gram @ (typical - plates.mean) + whitened.mT @ noise
+    backprojected = gram @ (typical - targets.mean) + whitened.mT @ noise
     strokes = [finest_bars(shapeless, cells, upright) for upright in (True, False)]
-    upright, lying = (None if one is None else one * seen.plate.pitch_m for one in strokes)
+    upright, lying = (None if one is None else one * seen.target_plane.pitch_m for one in strokes)
     return AtNoise(
         float(variance.mean().sqrt()),
         estimator.patterns_seen,
-        _psnr(estimator.expected_error(plates.test)),
+        _psnr(estimator.expected_error(targets.test)),
         (upright, lying),
         power.sqrt(),
         power.sqrt() * (axes.mT @ typical).abs(),
@@ -335,8 +337,8 @@ def setup_table(found: Sequence[Identification]) -> str:
         )
     first, bench = found[0], found[0].bench
     rows.append(
-        f"\nOn the plate of {1e3 * bench.plate_m:g} mm: all-black {first.zero_db:.2f} dB, mean training plate "
-        f"{first.mean_db:.2f} dB; typical stroke {1e3 * first.stroke_m:.1f} mm; "
+        f"\nOn the target plane of {1e3 * bench.target_size_m:g} mm: all-black {first.zero_db:.2f} dB, "
+        f"mean training target {first.mean_db:.2f} dB; typical stroke {1e3 * first.stroke_m:.1f} mm; "
         f"{bench.cells} x {bench.cells} cells, {bench.height} x {bench.width} pixels."
     )
     return "\n".join(rows)

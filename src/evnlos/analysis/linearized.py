@@ -1,7 +1,7 @@
 """A setup as a matrix with a noise, and the best linear estimate that it allows.
 
 - A setup as a matrix with a noise: what every question about its limits starts from.
-- The best linear estimate of a plate from one picture of the wall, and how wrong it is on average.
+- The best linear estimate of a target from one picture of the wall, and how wrong it is on average.
 - What a measured matrix can't say about a setup: its own noise and the size of its cells, in words.
 """
 
@@ -20,20 +20,20 @@ from evnlos.types import Plane
 
 @dataclass(frozen=True)
 class Bench:
-    """How the question is put: cells of the plate, pixels of the camera, noise."""
+    """How the question is put: cells of the target plane, pixels of the camera, noise."""
 
-    plate_m: float = 0.08
-    """Side of the plate, in the middle of its travel, metres."""
+    target_size_m: float = 0.08
+    """Side of the target plane, in the middle of its travel, metres."""
     cells: int = 32
-    """Cells a side of the plate."""
+    """Cells a side of the target plane."""
     height: int = 60
     """Rows of the camera, pixels."""
     width: int = 96
     """Columns of the camera, pixels."""
     fixed_noise: float = 0.01
-    """Standard deviation of the fixed noise, share of the brightest pixel while the whole plate shines."""
+    """Standard deviation of the fixed noise, share of the brightest pixel while the whole target shines."""
     frames: int = 1
-    """Frames that are averaged, all of the plate in the same place."""
+    """Frames that are averaged, all of the target in the same place."""
     known_pattern: bool = True
     """Whether the camera's fixed pattern was measured and taken off."""
     writers: int = 6
@@ -45,15 +45,15 @@ class Bench:
                 raise ConfigError(f"Bench.{name} is {getattr(self, name)}; give {least} or more")
         if self.cells > 64:
             raise ConfigError(f"Bench.cells is {self.cells}; give at most 64, the matrix grows with its square")
-        for name in ("plate_m", "fixed_noise"):
+        for name in ("target_size_m", "fixed_noise"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"Bench.{name} is {value}; give a positive number")
 
     @property
-    def plate(self) -> Plane:
-        """The cells of the plate."""
-        return Plane(self.cells, self.cells, self.plate_m / self.cells)
+    def target_plane(self) -> Plane:
+        """The cells of the target plane."""
+        return Plane(self.cells, self.cells, self.target_size_m / self.cells)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -68,13 +68,13 @@ class LinearizedSetup:
     Args:
         matrix: White levels of a pixel per unit of a cell's brightness, float64 [H W, n].
         ambient: Ambient light, white levels, float64 [H W].
-        plate: The cells.
+        target_plane: The cells.
         shape: Size (H, W) of the camera image, pixels.
     """
 
     matrix: torch.Tensor
     ambient: torch.Tensor
-    plate: Plane
+    target_plane: Plane
     shape: tuple[int, int]
 
     @property
@@ -103,10 +103,10 @@ def linearized(setup: Setup, bench: Bench = Bench()) -> LinearizedSetup:
         (torch.Size([240, 64]), True)
     """
     setup = setup.resized(bench.shape)
-    matrix = setup.linear_part(bench.plate).dense()
+    matrix = setup.linear_part(bench.target_plane).dense()
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera gets no light from the target; move the target or the camera")
-    return LinearizedSetup(matrix, setup.ambient_light().double().flatten(), bench.plate, setup.shape)
+    return LinearizedSetup(matrix, setup.ambient_light().double().flatten(), bench.target_plane, setup.shape)
 
 
 def camera_variance(
@@ -148,9 +148,9 @@ RESOLVED = 0.5
 class LinearEstimator:
     """The linear minimum mean-square error estimator of x from y = A x + noise (Wiener; LMMSE).
 
-    x^ = m + C A^T (A C A^T + D)^-1 (y - A m), with m and C the mean and the covariance of the plates and D that
-    of the noise. In the basis T of patterns in which C = T T^T and T^T A^T D^-1 A T = diag(snr), pattern k is
-    seen with a signal-to-noise ratio snr_k in power, and x^ = m + T (snr + 1)^-1 T^T A^T D^-1 (y - A m).
+    x^ = m + C A^T (A C A^T + D)^-1 (y - A m), with m and C the mean and the covariance of the targets and D
+    that of the noise. In the basis T of patterns in which C = T T^T and T^T A^T D^-1 A T = diag(snr), pattern k
+    is seen with a signal-to-noise ratio snr_k in power, and x^ = m + T (snr + 1)^-1 T^T A^T D^-1 (y - A m).
 
     Args:
         gram: A^T D^-1 A, [n, n]: the information that the picture carries.
@@ -171,7 +171,7 @@ class LinearEstimator:
 
     @classmethod
     def known(cls, gram: torch.Tensor, mean: torch.Tensor, root: torch.Tensor) -> LinearEstimator:
-        """Return the estimator for plates of mean m and covariance C = R R^T.
+        """Return the estimator for targets of mean m and covariance C = R R^T.
 
         Args:
             gram: A^T D^-1 A, [n, n].
@@ -203,16 +203,16 @@ class LinearEstimator:
 
     @property
     def patterns_seen(self) -> int:
-        """Number of patterns in which these plates differ by more than the noise: snr above 1."""
+        """Number of patterns in which these targets differ by more than the noise: snr above 1."""
         return int((self.snr > 1).sum())
 
-    def expected(self, plates: torch.Tensor) -> torch.Tensor:
-        """Return the estimate without its noise: its mean over many pictures of each plate [..., n]."""
-        return self.mean + (plates - self.mean) @ self._kept.mT
+    def expected(self, targets: torch.Tensor) -> torch.Tensor:
+        """Return the estimate without its noise: its mean over many pictures of each target [..., n]."""
+        return self.mean + (targets - self.mean) @ self._kept.mT
 
-    def expected_error(self, plates: torch.Tensor) -> torch.Tensor:
-        """Return the mean squared error a cell, over the noise, for given plates [..., n] -> [...]."""
-        return (self.expected(plates) - plates).square().mean(dim=-1) + self.noise_error
+    def expected_error(self, targets: torch.Tensor) -> torch.Tensor:
+        """Return the mean squared error a cell, over the noise, for given targets [..., n] -> [...]."""
+        return (self.expected(targets) - targets).square().mean(dim=-1) + self.noise_error
 
     def estimate(self, backprojected: torch.Tensor) -> torch.Tensor:
         """Return x^ from A^T D^-1 (y - A m), [..., n]."""
@@ -220,7 +220,7 @@ class LinearEstimator:
 
 
 def bars(cells: int, width: float, phase: float, upright: bool = True) -> torch.Tensor:
-    """Return bright bars on a dark plate, each cell the exact mean over its area.
+    """Return bright bars on a dark target, each cell the exact mean over its area.
 
     Args:
         cells: Cells a side.
@@ -245,14 +245,14 @@ def bars(cells: int, width: float, phase: float, upright: bool = True) -> torch.
 def finest_bars(estimator: LinearEstimator, cells: int, upright: bool = True) -> float | None:
     """Return the width of the finest bars that one picture resolves, in cells; None where none are.
 
-    Bars of full contrast fill the plate. They are resolved when the expected squared error of the estimate,
-    averaged over their phase, is at most half of what an even grey of their mean would have (a quarter of the
-    all-black picture's), and so are all wider bars. Widths go from half of the plate down to one cell in steps
-    of 9 %.
+    Bars of full contrast fill the target plane. They are resolved when the expected squared error of the
+    estimate, averaged over their phase, is at most half of what an even grey of their mean would have (a
+    quarter of the all-black picture's), and so are all wider bars. Widths go from half of the target plane down
+    to one cell in steps of 9 %.
 
     Args:
         estimator: The estimator, `LinearEstimator.white` for one without any knowledge of shapes.
-        cells: Cells a side of the plate.
+        cells: Cells a side of the target plane.
         upright: Whether the bars run along y.
     """
     octaves = math.log2(cells / 2)
@@ -260,11 +260,11 @@ def finest_bars(estimator: LinearEstimator, cells: int, upright: bool = True) ->
     found = None
     for step in range(steps + 1):
         width = cells / 2 * 2 ** (-octaves * step / steps)
-        plates = torch.stack(
+        targets = torch.stack(
             [bars(cells, width, 2 * width * k / _PHASES, upright).flatten() for k in range(_PHASES)]
         ).to(estimator.mean)
-        grey = (plates - plates.mean(dim=-1, keepdim=True)).square().mean()
-        if float(estimator.expected_error(plates).mean()) > RESOLVED * float(grey):
+        grey = (targets - targets.mean(dim=-1, keepdim=True)).square().mean()
+        if float(estimator.expected_error(targets).mean()) > RESOLVED * float(grey):
             break
         found = width
     return found
@@ -297,7 +297,7 @@ def scan_notes(noise: OperatorNoise, seen: LinearizedSetup, singular: torch.Tens
             "cell "
             "to cell, and modes that were cut off count as absent"
         )
-    if noise.pitch_m > 1.01 * seen.plate.pitch_m:
+    if noise.pitch_m > 1.01 * seen.target_plane.pitch_m:
         found.append(
             f"the scan's cells are {1e3 * noise.pitch_m:.1f} mm: bars narrower than that were not measured, "
             "whatever the wall"

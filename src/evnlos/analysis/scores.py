@@ -151,7 +151,7 @@ _FILE = Path(__file__).parent / "classifier.safetensors"
 
 
 class CharacterReader(nn.Module):
-    """Three strided convolutions and a mean: pictures of a plate [N, 1, 32, 32] in 0..1 -> scores [N, 36]."""
+    """Three strided convolutions and a mean: pictures of a target [N, 1, 32, 32] in 0..1 -> scores [N, 36]."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -193,7 +193,7 @@ def load_reader(path: str | Path = _FILE) -> CharacterReader:
 
 @torch.inference_mode()
 def read_characters(pictures: Tensor) -> list[str]:
-    """Name the character on each plate [N, 1, 32, 32].
+    """Name the character on each target [N, 1, 32, 32].
 
     Example:
         >>> import numpy as np

@@ -21,7 +21,7 @@ from evnlos.data.sampling import edges_from
 from evnlos.data.simulations import page
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, HandwritingGlyphs, Motion, Scene, Target
-from evnlos.scene.glyph_sets import Plate
+from evnlos.scene.glyph_sets import TargetPlane
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.types import Events, derive_seed
 
@@ -144,7 +144,7 @@ _EMPTY = "the drawing is empty; draw something, or pick a character"
 
 @lru_cache(maxsize=64)
 def picked(character: str) -> Target:
-    """Return a character in a hand that no training set holds, on the standard plate of 8 cm.
+    """Return a character in a hand that no training set holds, on the standard target of 8 cm.
 
     Raises:
         ConfigError: It is none of `CHARACTERS`.
@@ -152,17 +152,17 @@ def picked(character: str) -> Target:
     if len(character) != 1 or character not in CHARACTERS:
         raise ConfigError(f"the hidden character is {character[:20]!r}; give one of {CHARACTERS}")
     glyphs = HandwritingGlyphs(
-        characters=character, writers=1, first_writer=TRAIN_WRITERS, plate=Plate(size_px=_SIDE)
+        characters=character, writers=1, first_writer=TRAIN_WRITERS, target_plane=TargetPlane(size_px=_SIDE)
     )
     return glyphs.target(glyphs.objects()[0])
 
 
 def drawn(ink: str, size_m: float = 0.08) -> Target:
-    """Return a drawing as a plate that shines where there is ink.
+    """Return a drawing as a target that shines where there is ink.
 
     Args:
         ink: `INK_SIDE` rows of as many values, row 0 on top, two hexadecimal digits each: 00 nothing, ff full.
-        size_m: Side of the plate, metres.
+        size_m: Side of the target plane, metres.
 
     Raises:
         DataError: There is no ink, or the text is no drawing.

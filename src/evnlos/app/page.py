@@ -211,7 +211,7 @@ def _controls(gr: Any, opening: Controls) -> list[Any]:
 
     with gr.Group():
         how = gr.Radio([_PICK, _DRAW], value=_PICK, label="Hidden object")
-        character = gr.Dropdown(list(CHARACTERS), value="R", label="Character, on a plate of 8 cm")
+        character = gr.Dropdown(list(CHARACTERS), value="R", label="Character, on a target plane of 8 cm")
         ink = gr.Textbox(elem_id="ev-ink", visible="hidden", max_length=2 * INK_SIDE**2)
         with gr.Column(visible=False) as paper:
             gr.HTML(PAPER, padding=True)

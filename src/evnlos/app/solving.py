@@ -21,7 +21,7 @@ from evnlos.analysis.linearized import camera_variance
 from evnlos.app.controls import COARSE, Recorded
 from evnlos.data import STANDARD_MODALITIES, Sampling, as_modality
 from evnlos.errors import DataError
-from evnlos.inverse import JointProblem, PlatePass
+from evnlos.inverse import JointProblem, SequenceOperator
 from evnlos.inverse.measurements import object_light
 from evnlos.metrics import psnr
 from evnlos.models import Weights, load_weights, published, published_for, published_setup
@@ -96,7 +96,7 @@ def own_networks(paths: Iterable[Path]) -> Networks:
 
 
 _DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far a picture may go from it
-_CELLS = 16  # a side of the plate of the whole pass
+_CELLS = 16  # a side of the target plane of the whole pass
 _SMOOTH = 3.0  # weight of the gradient in units of the noise's variance
 _STATIC = 1.0  # the camera's fixed pattern is about as strong as its noise
 
@@ -142,16 +142,17 @@ def from_whole_pass(recorded: Recorded) -> Reconstruction:
     """
     setup, frames = _known(recorded)
     if recorded.motion is None or recorded.target is None:
-        raise DataError("the motion or the plate is unknown; the whole pass needs both")
+        raise DataError("the motion or the target is unknown; the whole pass needs both")
     size_m, shape = recorded.target.size_m, frames.shape[1:]
     light = object_light(frames, recorded.peak, setup, shape)
     strip = setup.target_cells()
     assert strip is not None  # `_known` refuses setups without
     made = setup.resized(shape).operator(strip, dtype=torch.float32)
     places = recorded.motion.position_m(recorded.times_s)
-    plate = Plane(_CELLS, _CELLS, size_m / _CELLS)
+    target_plane = Plane(_CELLS, _CELLS, size_m / _CELLS)
     problem = JointProblem(
-        PlatePass(MatrixTransport(made.dense(torch.float32), strip, shape), plate, places), _STATIC
+        SequenceOperator(MatrixTransport(made.dense(torch.float32), strip, shape), target_plane, places),
+        _STATIC,
     )
     variance = camera_variance(light.mean() + setup.ambient, setup.frame_camera)
     image = problem.tikhonov(light, _SMOOTH * float(variance)).image

@@ -62,7 +62,8 @@ def _identified(setup: Setup) -> Identification:
 
 
 def verdict_on(simulation: Simulation) -> Verdict:
-    """Return what one frame of this setup and camera can show of a plate at a known place, whatever the method.
+    """Return what one frame of this setup and camera can show of a target at a known place, whatever the
+    method.
 
     Raises:
         ConfigError: The setup is geometrically impossible, or the camera gets no light.

@@ -28,11 +28,11 @@ class Shots:
 
     Args:
         captures: The captures; the motion of each is known, and, where they are `labelled`, the target.
-        plate_m: Side of the plates, metres.
+        target_size_m: Side of the targets, metres.
     """
 
     captures: tuple[Capture, ...]
-    plate_m: float = 0.08
+    target_size_m: float = 0.08
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -80,7 +80,7 @@ def read_shots(
     holdout: Sequence[str] = (),
     share: float = 0.25,
     seed: int = 0,
-    plate_m: float | None = None,
+    target_size_m: float | None = None,
 ) -> tuple[Shots, Shots]:
     """Read the captures of one setup and split them into those to fit and those to check the fit on.
 
@@ -90,7 +90,7 @@ def read_shots(
         holdout: Names, or characters, to check on; empty draws a share of the captures.
         share: Share of the captures that is drawn, 0..1.
         seed: Seed of the draw.
-        plate_m: Side of the plates where the targets are unknown, metres: what the captures say of their
+        target_size_m: Side of the targets where the targets are unknown, metres: what the captures say of their
             targets is then dropped. None takes the targets as known.
 
     Returns:
@@ -98,7 +98,7 @@ def read_shots(
 
     Raises:
         DataError: Too few captures, two of one name, one without target or motion, or captures of different
-            cameras, setups or plates.
+            cameras, setups or targets.
     """
     paths = {Path(folder).resolve().name: Path(folder).resolve() for folder in folders}
     _refuse_strangers(paths, (*exclude, *holdout))
@@ -108,12 +108,12 @@ def read_shots(
             f"{len(chosen)} capture(s) are left to calibrate on; give {FEWEST} or more, best 20, of one setup"
         )
     captures = [read_capture(paths[name]) for name in chosen]
-    if plate_m is not None:
+    if target_size_m is not None:
         captures = [replace(capture, target=None) for capture in captures]
     for capture in captures:
-        _motion(capture) if plate_m is not None else _scene(capture)
+        _motion(capture) if target_size_m is not None else _scene(capture)
         _check_same_setup(captures[0], capture)
-    side = _scene(captures[0]).target.size_m if plate_m is None else plate_m
+    side = _scene(captures[0]).target.size_m if target_size_m is None else target_size_m
     held = {name for name in chosen if _named(name, holdout)} or _drawn(chosen, share, seed)
     if len(chosen) - len(held) < FEWEST - 1:
         raise DataError(
@@ -164,11 +164,11 @@ def _motion(capture: Capture) -> LineMotion:
 
 
 def _check_same_setup(first: Capture, other: Capture) -> None:
-    """Refuse captures of another camera, setup or plate than the first one's."""
+    """Refuse captures of another camera, setup or target than the first one's."""
     pairs = {
         "camera": (first.info.camera, other.info.camera),
         "setup": (first.info.setup, other.info.setup),
-        "plate_m": tuple(one.target.size_m if one.target else None for one in (first, other)),
+        "target_size_m": tuple(one.target.size_m if one.target else None for one in (first, other)),
         "size": (first.frames.shape[1:], other.frames.shape[1:]),
         "bit depth": (str(first.frames.dtype), str(other.frames.dtype)),
     }

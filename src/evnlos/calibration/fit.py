@@ -32,7 +32,7 @@ _EXAMPLES = 3
 _FEWEST_FOR_ANY = 5  # captures: fewer do not tell a wall's slopes from a camera's place
 _WITHOUT_PATTERN = "frames held out, without pattern"
 _MOST_OF_NOISE = 1.1
-_MOST_UNEXPLAINED = {"known": 0.05, "unknown": 0.2}  # plates that nobody knows are never expected exactly
+_MOST_UNEXPLAINED = {"known": 0.05, "unknown": 0.2}  # targets that nobody knows are never expected exactly
 
 Surfaces = dict[str, tuple[NDArray, NDArray]]
 """Time surfaces [N, 2, h, w] of camera and model by capture."""
@@ -121,7 +121,7 @@ class SetupFit:
 def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None) -> SetupFit:
     """Fit the simulator to captures of a setup whose targets are known, or, with `targets="unknown"`, are not.
 
-    Where they are not, everything behind the optics (noise, event pixel) is fitted with the plates that are
+    Where they are not, everything behind the optics (noise, event pixel) is fitted with the targets that are
     expected; they show what reaches the wall, which is all that counts for it.
 
     Args:
@@ -143,7 +143,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
         holdout=settings.holdout,
         share=settings.holdout_share,
         seed=settings.seed,
-        plate_m=settings.start.glyphs.plate.size_m if settings.targets == "unknown" else None,
+        target_size_m=settings.start.glyphs.target_plane.size_m if settings.targets == "unknown" else None,
     )
     start, fixed = _at_known_distance(settings, fit)
     residuals: dict[str, Residual] = {}
@@ -189,7 +189,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
     if settings.targets == "known":
         strokes = pens_of([scene.target.mask for scene in fit.scenes])
         seen_targets = [*zip(fit.names, fit.scenes, strict=True), *zip(held.names, held.scenes, strict=True)]
-        side = simulation.glyphs.plate.size_m
+        side = simulation.glyphs.target_plane.size_m
         known = {name: scene.target.mask for name, scene in seen_targets if scene.target.size_m == side}
     training = training_simulation(simulation, noise, pixel, strokes)
     return SetupFit(
@@ -231,16 +231,16 @@ def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[Setup, tupl
 def _simulation(
     settings: Calibration, shots: Shots, setup: Setup, noise: FrameNoise, pixel: EventPixel
 ) -> Simulation:
-    """Return the start with everything that the captures tell: plate, motion, length, positions, sensor."""
+    """Return the start with everything that the captures tell: target, motion, length, positions, sensor."""
     scene, start = shots.scenes[0], settings.start
     times = shots.times_s(0)
     motion = scene.motion
     assert isinstance(motion, LineMotion)  # the only motion that a capture describes
     x, y = motion.position_m(times[0])
-    plate = replace(start.glyphs.plate, size_m=scene.target.size_m)
+    target_plane = replace(start.glyphs.target_plane, size_m=scene.target.size_m)
     return replace(
         start,
-        glyphs=replace(start.glyphs, plate=plate),
+        glyphs=replace(start.glyphs, target_plane=target_plane),
         motion=replace(motion, start_m=(float(x), float(y)), start_s=0.0),
         duration_s=float(times[-1] - times[0]),
         positions=len(times) - 1,

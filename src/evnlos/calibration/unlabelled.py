@@ -1,6 +1,6 @@
 """Calibration from sequences of unknown targets: what makes the frames likeliest.
 
-- How likely frames are where nobody knows what was hidden: the plate is integrated out.
+- How likely frames are where nobody knows what was hidden: the target is integrated out.
 - Fitting a setup to passes of objects that nobody knows: what makes the frames likeliest for any handwriting.
 """
 
@@ -26,9 +26,9 @@ from evnlos.calibration.transport_fit import (
 )
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import PlatePass
+from evnlos.inverse import SequenceOperator
 from evnlos.inverse.joint import strip_gram_of, strip_of
-from evnlos.inverse.measurements import handwritten_plates
+from evnlos.inverse.measurements import handwritten_targets
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import Parameter, Setup
@@ -48,21 +48,21 @@ class Explained:
         cost: Negative log evidence over the number of samples; lower is better.
         gain: White levels a unit of the setup's light.
         noise: Standard deviation of a sample's noise, white levels; what the model cannot do counts as noise.
-        plates: Expected plate of each pass, float64 [P, n, n]; noise makes some values leave 0..1.
+        targets: Expected target of each pass, float64 [P, n, n]; noise makes some values leave 0..1.
     """
 
     cost: float
     gain: float
     noise: float
-    plates: torch.Tensor
+    targets: torch.Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class EvidenceTerms:
     """The evidence of one setup for any gain g and noise variance v.
 
-    y = g B x + e with B the setup's light from the plate's cells to all frames, less its mean over the pass,
-    x ~ N(m, C) handwritten plates, and e ~ N(0, v). With C = R R^T and R^T B^T B R = V diag(l) V^T,
+    y = g B x + e with B the setup's light from the target plane's cells to all frames, less its mean over the
+    pass, x ~ N(m, C) handwritten targets, and e ~ N(0, v). With C = R R^T and R^T B^T B R = V diag(l) V^T,
 
         -2 log p(y) = n log v + sum log(1 + g^2 l / v) + (|z|^2 - c^T (v + g^2 l)^-1 c) / v,
 
@@ -97,7 +97,7 @@ class EvidenceTerms:
         return float(((left - told) / variance + spread).mean()) / (2 * self.samples)
 
     def code(self, gain: float, variance: float) -> torch.Tensor:
-        """Return the expected plates, as coefficients of R V, [P, n]."""
+        """Return the expected targets, as coefficients of R V, [P, n]."""
         return self._told(gain) / (variance + gain**2 * self.strength)
 
     def _told(self, gain: float) -> torch.Tensor:
@@ -111,8 +111,8 @@ class MovingLight:
 
     Args:
         frames: Frames at a working size, white levels, [P, N, h, w].
-        position_m: The plate's centre in each, (x, y) in metres, [N, 2].
-        size_m: Side of the plate, metres.
+        position_m: The target's centre in each, (x, y) in metres, [N, 2].
+        size_m: Side of the target plane, metres.
         cells: Cells a side of it.
     """
 
@@ -120,9 +120,9 @@ class MovingLight:
         frames = frames.double()
         self.moving = frames - frames.mean(dim=1, keepdim=True)
         self.position_m = np.asarray(position_m, dtype=np.float64)
-        self.plate = Plane(cells, cells, size_m / cells)
-        self._strip = strip_of(self.position_m, self.plate)
-        self._prior = handwritten_plates(self.plate, WRITERS)
+        self.target_plane = Plane(cells, cells, size_m / cells)
+        self._strip = strip_of(self.position_m, self.target_plane)
+        self._prior = handwritten_targets(self.target_plane, WRITERS)
 
     @property
     def spread(self) -> float:
@@ -134,7 +134,7 @@ class MovingLight:
         from scipy.optimize import minimize  # scipy loads slowly
 
         terms = self.terms(setup)
-        # The gain at which the mean plate alone moves as much as the frames, and a tenth of that as noise.
+        # The gain at which the mean target alone moves as much as the frames, and a tenth of that as noise.
         power = float(terms.power.mean())
         start = np.log([math.sqrt(power / terms.lit), _SHARE * power / terms.samples])
         found = minimize(
@@ -145,17 +145,17 @@ class MovingLight:
             options={"xatol": 1e-3, "fatol": 1e-9, "initial_simplex": start - np.eye(3, 2)},
         )
         gain, variance = math.exp(found.x[0]), math.exp(found.x[1])
-        plates = self._plates(terms, gain, variance)
-        return Explained(float(found.fun), gain, math.sqrt(variance), plates)
+        targets = self._targets(terms, gain, variance)
+        return Explained(float(found.fun), gain, math.sqrt(variance), targets)
 
     def explained_at(self, setup: Setup, gain: float, noise: float) -> Explained:
         """Return how a setup explains the frames at a gain and a noise that other passes told."""
         terms, variance = self.terms(setup), noise**2
-        return Explained(terms.cost(gain, variance), gain, noise, self._plates(terms, gain, variance))
+        return Explained(terms.cost(gain, variance), gain, noise, self._targets(terms, gain, variance))
 
-    def _plates(self, terms: EvidenceTerms, gain: float, variance: float) -> torch.Tensor:
-        plates = self._prior.mean + terms.code(gain, variance) @ terms.turn.mT @ self._prior.root.mT
-        return plates.unflatten(1, self.plate.shape)
+    def _targets(self, terms: EvidenceTerms, gain: float, variance: float) -> torch.Tensor:
+        targets = self._prior.mean + terms.code(gain, variance) @ terms.turn.mT @ self._prior.root.mT
+        return targets.unflatten(1, self.target_plane.shape)
 
     def terms(self, setup: Setup) -> EvidenceTerms:
         """Return what the evidence of a setup is made of, all but gain and noise."""
@@ -176,19 +176,19 @@ class MovingLight:
         )
 
     def predicted(self, setup: Setup, known: Explained) -> torch.Tensor:
-        """Return what moves in the frames that a setup makes of known plates, [P, N, h, w]."""
-        frames = known.gain * self.sight(setup)(known.plates)
+        """Return what moves in the frames that a setup makes of known targets, [P, N, h, w]."""
+        frames = known.gain * self.sight(setup)(known.targets)
         return frames - frames.mean(dim=1, keepdim=True)
 
-    def sight(self, setup: Setup) -> PlatePass:
-        """Return the operator from a plate to all frames, at gain 1."""
+    def sight(self, setup: Setup) -> SequenceOperator:
+        """Return the operator from a target to all frames, at gain 1."""
         shape = (int(self.moving.shape[2]), int(self.moving.shape[3]))
         matrix = setup.matrix(shape, self._strip)
-        return PlatePass(MatrixTransport(matrix, self._strip, shape), self.plate, self.position_m)
+        return SequenceOperator(MatrixTransport(matrix, self._strip, shape), self.target_plane, self.position_m)
 
 
 CELLS = 12
-"""Cells a side of the unknown plate."""
+"""Cells a side of the unknown target."""
 _COLUMNS = 32  # of the working pictures: a rough wall shows no finer detail
 _MOST_FRAMES = 12  # of a pass
 _SCANS = tuple((wider, rougher) for wider in (1.0, 0.7, 1.4) for rougher in (0.25, 0.5, 1.0, 2.0))
@@ -202,7 +202,7 @@ class UnlabelledFit:
 
     Args:
         optics: The fit; its errors are those of each number alone, the others held.
-        fitted: The captures that were fitted, with the plates that are expected as their targets.
+        fitted: The captures that were fitted, with the targets that are expected as their targets.
         held_out: The others, likewise.
         check: Held-out passes: what is predicted of every other frame from the rest, by the start and by the
             fit, over the spread of what moves.
@@ -219,7 +219,7 @@ def fit_unlabelled(
 ) -> UnlabelledFit:
     """Fit a setup to passes of unknown objects with known motion, and check it on other passes.
 
-    The numbers of the optics are those that make the frames likeliest when the plates are any handwriting
+    The numbers of the optics are those that make the frames likeliest when the targets are any handwriting
     (`MovingLight.explained`): first a scan over blur and magnification, then quasi-Newton steps (L-BFGS-B).
 
     Args:
@@ -240,7 +240,7 @@ def fit_unlabelled(
     before, after = (_missed(given, asked, setup) for setup in (start, found))
     known = light.explained(found)
     unseen = _moving(held, slice(None)).explained_at(found, known.gain, known.noise)
-    seen, other = _with_plates(fit, known), _with_plates(held, unseen)
+    seen, other = _with_targets(fit, known), _with_targets(held, unseen)
     full = FrameModel(seen, fit.shape, max(1, len(fit.frames()) // 200))
     lit = [full.fit(full.light(setup.coarsened()))[0].into(setup.coarsened()) for setup in (start, found)]
     optics = TransportFit(lit[0], lit[1], parameters, _errors(light, found, parameters))
@@ -264,7 +264,7 @@ def _moving(shots: Shots, frames: slice) -> MovingLight:
     pictures = [
         reduce_by_area(capture.frames[chosen] / np.float32(shots.peak), shape) for capture in shots.captures
     ]
-    return MovingLight(torch.from_numpy(np.stack(pictures)), first, shots.plate_m, CELLS)
+    return MovingLight(torch.from_numpy(np.stack(pictures)), first, shots.target_size_m, CELLS)
 
 
 def _scanned(light: MovingLight, start: Setup) -> Setup:
@@ -319,12 +319,14 @@ def _missed(given: MovingLight, asked: MovingLight, setup: Setup) -> float:
     return float(away.square().mean().sqrt()) / asked.spread
 
 
-def _with_plates(shots: Shots, found: Explained) -> Shots:
-    """Return the captures with the expected plates as their targets."""
+def _with_targets(shots: Shots, found: Explained) -> Shots:
+    """Return the captures with the expected targets as their targets."""
     return Shots(
         tuple(
-            replace(capture, target=Target(capture.name, plate.clamp(0, 1).float().numpy(), shots.plate_m))
-            for capture, plate in zip(shots.captures, found.plates, strict=True)
+            replace(
+                capture, target=Target(capture.name, target.clamp(0, 1).float().numpy(), shots.target_size_m)
+            )
+            for capture, target in zip(shots.captures, found.targets, strict=True)
         )
     )
 

@@ -40,7 +40,7 @@ class InvertCommand:
     static: float = 1.0
     """Captures: standard deviation of a pixel's constant offset over that of its noise."""
     cells: int = 24
-    """Captures: cells a side of the plate."""
+    """Captures: cells a side of the target plane."""
     columns: int = 64
     """Captures: columns to which frames are reduced, pixels."""
     subsets: int = 1

@@ -23,7 +23,7 @@ from evnlos.data import Capture, load_pattern, read_capture
 from evnlos.data.frame_sources import read_image
 from evnlos.data.sampling import Sampling
 from evnlos.errors import ConfigError
-from evnlos.inverse import JointProblem, PlatePass
+from evnlos.inverse import JointProblem, SequenceOperator
 from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.inverse.joint import matrix_of, strip_gram_of, strip_of
 from evnlos.inverse.measurements import object_light, position_subsets
@@ -72,7 +72,7 @@ def linear_setup(word: Path | str) -> Setup:
 def invert_captures(
     folders: Sequence[Path], options: PassOptions
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Return the figures, and the plates [cells, cells] by name, of every capture and solver."""
+    """Return the figures, and the targets [cells, cells] by name, of every capture and solver."""
     clock = time.perf_counter()
     setup = linear_setup(options.setup)
     captures = [read_capture(folder) for folder in folders]
@@ -88,13 +88,15 @@ def invert_captures(
     pictures: dict[str, torch.Tensor] = {}
     rows: list[dict[str, Any]] = []
     for motion, members in _by_motion(captures, options, setup):
-        size = _plate_m(captures[members[0]], _is_tracked(captures[members[0]], options))
-        plate = Plane(options.cells, options.cells, size / options.cells)
-        transport = matrix_of(setup.resized((height, width)).operator(strip_of(motion, plate), shape))
+        size = _target_size_m(captures[members[0]], _is_tracked(captures[members[0]], options))
+        target_plane = Plane(options.cells, options.cells, size / options.cells)
+        transport = matrix_of(setup.resized((height, width)).operator(strip_of(motion, target_plane), shape))
         gram = strip_gram_of(transport)
         for count in options.positions or (len(motion),):
             for chosen in position_subsets(len(motion), count, options.subsets):
-                problem = JointProblem(PlatePass(transport, plate, motion[chosen]), options.static, gram)
+                problem = JointProblem(
+                    SequenceOperator(transport, target_plane, motion[chosen]), options.static, gram
+                )
                 images = light[members][:, chosen]
                 for solver in options.solvers:
                     found = _solve(problem, images, solver, options.lam[solver])
@@ -169,9 +171,9 @@ def _is_tracked(capture: Capture, options: PassOptions) -> bool:
     return options.track or capture.motion is None
 
 
-def _plate_m(capture: Capture, tracked: bool) -> float:
-    # A tracked position is that of the light's middle, which need not be the plate's.
-    size = 0.08 if capture.info.target is None else capture.info.target.plate_m
+def _target_size_m(capture: Capture, tracked: bool) -> float:
+    # A tracked position is that of the light's middle, which need not be the target's.
+    size = 0.08 if capture.info.target is None else capture.info.target.size_m
     return 1.25 * size if tracked else size
 
 
@@ -180,8 +182,8 @@ def _score(capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray
     if scene is None:
         return None
     sampling = Sampling()
-    plate = Target("found", image.clamp(0, 1).float().numpy(), size_m)
-    drawn = plate.rasterise(sampling.canvas, motion)
+    target = Target("found", image.clamp(0, 1).float().numpy(), size_m)
+    drawn = target.rasterise(sampling.canvas, motion)
     truth = scene.truth(sampling.canvas, capture.frame_times_us[1:] * 1e-6)
     rows = sampling.scored
     return round(float(psnr(torch.from_numpy(drawn[:, rows]), torch.from_numpy(truth[:, rows])).mean()), 3)

@@ -195,7 +195,7 @@ def to_text(found: dict[str, Any]) -> str:
     ]
     if "misfit" in found:
         lines.append(
-            f"misfit      {found['misfit']:8.2f} times the noise is left in the frames by plate and setup"
+            f"misfit      {found['misfit']:8.2f} times the noise is left in the frames by target and setup"
         )
     if "distance" in found:
         first, last = (scale * v for v in found["distance"])

@@ -48,7 +48,7 @@ class Capture:
         events: The event stream.
         frames: Frames, uint8 or uint16 [N, H, W], digital numbers.
         frame_times_us: Time of each frame, int64 [N], microseconds, on the events' clock.
-        target: The hidden plate, or None where it is unknown.
+        target: The hidden target, or None where it is unknown.
         notes: What reading did to the recordings, a line each.
     """
 
@@ -259,7 +259,7 @@ def _read_target(folder: Path, info: TargetInfo | None) -> Target | None:
     if info is None or info.mask is None:
         return None
     mask = read_image(inside(folder, info.mask))
-    return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.plate_m)
+    return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.size_m)
 
 
 def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern | None = None) -> Samples:

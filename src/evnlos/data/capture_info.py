@@ -43,19 +43,19 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class TargetInfo:
-    """The hidden plate, where it is known."""
+    """The hidden target, where it is known."""
 
     name: str
     """What it shows, e.g. a letter."""
     mask: str | None = None
-    """Picture of the plate, a file in the folder; white shines."""
-    plate_m: float = 0.08
-    """Side of the plate, metres."""
+    """Picture of the target, a file in the folder; white shines."""
+    size_m: float = 0.08
+    """Side of the target plane, metres."""
 
 
 @dataclass(frozen=True)
 class MotionInfo:
-    """A straight, steady motion: the plate's centre is at start_m + speed (t - start_us) along `direction`."""
+    """A straight, steady motion: the target's centre is at start_m + speed (t - start_us) along `direction`."""
 
     start_m: float | tuple[float, float]
     """Centre at `start_us` relative to the middle of the travel: along the direction, or (x, y), metres."""
@@ -222,8 +222,8 @@ frames: frames               # a folder of pictures, a video, a table t_us,file,
 # roi: {{x: 0, y: 0, width: {width}, height: {height}}}
 # filters: {{hot_pixel_factor: 10, background_us: 20000}}
 
-# What was hidden: leave out when unknown. The mask is a picture of the plate, white shines.
-# target: {{name: R, mask: target.png, plate_m: 0.08}}
+# What was hidden: leave out when unknown. The mask is a picture of the target, white shines.
+# target: {{name: R, mask: target.png, size_m: 0.08}}
 # How it moved: the centre is at start_m + speed_m_s (t - start_us), relative to the middle of the travel.
 # motion: {{start_m: -0.08, speed_m_s: 0.02, direction: [1, 0], start_us: 0}}
 

@@ -204,7 +204,7 @@ def render_captures(
     at_once = processes(workers, max(len(names), 1))
     if not force:
         frames = round(lab.duration_s * lab.frame_rate_hz) + 1
-        check_passes(pass_bytes(drawn.setup, lab.glyphs.plate.size_m, lab.duration_s, frames), at_once)
+        check_passes(pass_bytes(drawn.setup, lab.glyphs.target_plane.size_m, lab.duration_s, frames), at_once)
     folders = {name: out / _folder_name(lab, name) for name in names}
     for folder in folders.values():
         if folder.exists() and not (folder / "capture.yaml").is_file():
@@ -269,7 +269,7 @@ def _render(task: tuple[Lab, str, Path]) -> Path:
     return folder
 
 
-def _description(lab: Lab, name: str, plate_m: float) -> dict[str, Any]:
+def _description(lab: Lab, name: str, size_m: float) -> dict[str, Any]:
     setup = lab.setup
     distance_m = setup.default_distance_m if lab.motion.z_m is None else lab.motion.z_m
     return {
@@ -282,7 +282,7 @@ def _description(lab: Lab, name: str, plate_m: float) -> dict[str, Any]:
         },
         "events": "events.raw",
         "frames": "frames.csv",
-        "target": {"name": name.rsplit("_", 1)[-1], "mask": "target.png", "plate_m": plate_m},
+        "target": {"name": name.rsplit("_", 1)[-1], "mask": "target.png", "size_m": size_m},
         "motion": {
             "start_m": list(lab.motion.start_m),
             "speed_m_s": lab.motion.speed_m_s,

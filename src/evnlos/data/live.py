@@ -1,6 +1,6 @@
 """Samples that are simulated as a training needs them, by processes or on a device.
 
-- Samples of objects, made on a device from the light to the maps; only the plate is drawn on the CPU.
+- Samples of objects, made on a device from the light to the maps; only the target is drawn on the CPU.
 - Samples that are simulated as a training needs them: no dataset on disk, and each epoch another draw.
 """
 
@@ -57,7 +57,7 @@ def simulate_objects_on(
 ) -> list[DeviceSamples]:
     """Simulate some objects' passes on a device: walls, frames, event pixels, surfaces and maps.
 
-    The plates are drawn on the CPU. The event pixels are those of the settings, run by the torch backend of
+    The targets are drawn on the CPU. The event pixels are those of the settings, run by the torch backend of
     their model, those of all objects together where they can. The samples are those of `simulate_object` but
     for what the last bits of the light decide: about one digital number in a hundred thousand, and the events
     of pixels that stop within rounding of a threshold. An object's samples do not depend on the others.
@@ -103,7 +103,7 @@ def no_backend(config: Simulation) -> str:
 
 def bytes_of_a_wall(config: Simulation) -> int:
     """Return about how much an object's wall takes on a device, bytes: its matrix and keyframes, if any."""
-    return config.setup.bytes_of_a_scene(config.glyphs.plate.size_m)
+    return config.setup.bytes_of_a_scene(config.glyphs.target_plane.size_m)
 
 
 def _samples(
@@ -167,7 +167,7 @@ class LiveDataset(Dataset):
         """Yield input [N, C, H, W] and truth [N, 1, H, W] of each object, in order, float32.
 
         Simulated on a CPU the samples are those of `simulate_object`, bit for bit. On a GPU all but the drawing
-        of the plate happens there; see `simulate_objects_on`.
+        of the target happens there; see `simulate_objects_on`.
         """
         config, seen = epoch_settings(self.simulation, epoch), as_modality(modality)
         made: Iterator[tuple[Tensor, Tensor, Tensor]]

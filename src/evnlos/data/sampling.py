@@ -64,9 +64,9 @@ class Samples:
     Args:
         frame: What the frame camera saw, float32 [N, H, W], 0..1 (1 = the largest digital number).
         surface: Time surface of the events since the position before, float32 [N, 2, H, W]: ON, OFF.
-        truth: The plate on the canvas, float32 [N, H, W], 0..1; None where the target is unknown.
+        truth: The target on the canvas, float32 [N, H, W], 0..1; None where the target is unknown.
         time_s: Instant of each position, float64 [N], seconds.
-        position_m: Plate's centre (x, y), float64 [N, 2], metres; None where the motion is unknown.
+        position_m: Target's centre (x, y), float64 [N, 2], metres; None where the motion is unknown.
         event_count: Events behind each surface, int64 [N].
     """
 

@@ -153,7 +153,7 @@ class Simulation:
             >>> round(Simulation().optics()["fresnel_number"])
             6400
         """
-        return self.setup.optical_values(self.glyphs.plate.size_m)
+        return self.setup.optical_values(self.glyphs.target_plane.size_m)
 
     def with_setup(self, **changes: Any) -> Simulation:
         """Return the simulation with some settings of its setup replaced, by name.
@@ -228,7 +228,7 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     ), events
 
 
-def pass_bytes(setup: Setup, plate_m: float, duration_s: float, frames: int, cells: int = 0) -> int:
+def pass_bytes(setup: Setup, target_size_m: float, duration_s: float, frames: int, cells: int = 0) -> int:
     """Return the memory that simulating one pass takes at least, bytes, without simulating anything.
 
     Counted are the wall's matrix, the states of the sensor's pixels, its frames, the maps, and the events that
@@ -236,14 +236,14 @@ def pass_bytes(setup: Setup, plate_m: float, duration_s: float, frames: int, cel
 
     Args:
         setup: Wall and cameras.
-        plate_m: Side of the target, metres.
+        target_size_m: Side of the target, metres.
         duration_s: Length of the pass, seconds.
         frames: Frames.
         cells: Cells of the maps of each frame.
     """
     pixels = setup.sensor.height * setup.sensor.width
     noise = pixels * duration_s * setup.pixel.noise_hz
-    wall = setup.bytes_of_a_scene(plate_m)
+    wall = setup.bytes_of_a_scene(target_size_m)
     return int(wall + 100 * pixels + frames * (4 * pixels + 32 * cells) + 26 * noise)
 
 
@@ -254,7 +254,9 @@ def object_bytes(config: Simulation) -> int:
         config: The settings.
     """
     cells = config.sampling.height * config.sampling.width
-    return pass_bytes(config.setup, config.glyphs.plate.size_m, config.duration_s, config.positions, cells)
+    return pass_bytes(
+        config.setup, config.glyphs.target_plane.size_m, config.duration_s, config.positions, cells
+    )
 
 
 def check_passes(needed: int, at_once: int) -> None:

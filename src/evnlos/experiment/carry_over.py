@@ -35,7 +35,7 @@ class CarriedOver:
     Args:
         name: What the set is.
         psnr_db: Mean PSNR of the network's pictures on the scored canvas, dB.
-        average_db: The same of the average plate, drawn where the plate is, dB.
+        average_db: The same of the average target, drawn where the target is, dB.
         consistent_db: The same of the network's pictures after data consistency with the set's own wall, dB;
             None for events alone.
         worth: What the confidence said of each pass, and what was true.
@@ -163,7 +163,7 @@ def write_carried(found: list[CarriedOver], path: Path) -> None:
 
 def carried_table(found: list[CarriedOver]) -> str:
     """Return the findings as a table, and how well the support orders all passes by their skill."""
-    head = ["set", "passes", "PSNR, dB", "+ consistency, dB", "average plate, dB"]
+    head = ["set", "passes", "PSNR, dB", "+ consistency, dB", "average target, dB"]
     head += ["skill", "support", "agreement", "explained", "measured", "coverage", "width"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in found:

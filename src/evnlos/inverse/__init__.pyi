@@ -5,7 +5,7 @@ from .inversion import Photograph as Photograph
 from .inversion import prepare_inversion as prepare_inversion
 from .inversion import read_photograph as read_photograph
 from .joint import JointProblem as JointProblem
-from .joint import PlatePass as PlatePass
+from .joint import SequenceOperator as SequenceOperator
 from .measurements import LogChange as LogChange
 from .measurements import log_change as log_change
 from .operators import Gradient as Gradient

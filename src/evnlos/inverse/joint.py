@@ -1,4 +1,4 @@
-"""One plate seen at many positions: the operator from its cells to all pictures, and its Gram matrix.
+"""One target seen at many positions: the operator from its cells to all pictures, and its Gram matrix.
 
 - One object from its whole pass: Tikhonov and total variation on the normal equations of all positions.
 """
@@ -22,24 +22,25 @@ from evnlos.types import Plane
 
 
 @dataclass(frozen=True, eq=False)
-class PlatePass:
-    """The linear map x -> (A S_1 x, ..., A S_N x), S_k the plate's cells drawn on the strip at position k.
+class SequenceOperator:
+    """The linear map x -> (A S_1 x, ..., A S_N x), S_k the target plane's cells drawn on the strip at position
+    k.
 
-    A strip's cell gets the exact mean of the plate over it, so positions need not fall on cells. Cells beyond
+    A strip's cell gets the exact mean of the target over it, so positions need not fall on cells. Cells beyond
     the strip's border are lost.
 
     Args:
         transport: A, from the strip's cells to the camera, white levels a unit of brightness.
-        plate: The plate's cells, in coordinates relative to its centre.
-        positions_m: Centre (x, y) of the plate at each position, [N, 2], metres.
+        target_plane: The target plane's cells, in coordinates relative to its centre.
+        positions_m: Centre (x, y) of the target at each position, [N, 2], metres.
 
     Raises:
-        DataError: The positions are not [N, 2] finite numbers, or the plate never touches the strip.
+        DataError: The positions are not [N, 2] finite numbers, or the target never touches the strip.
         ConfigError: The transport starts from patches.
     """
 
     transport: MatrixTransport
-    plate: Plane
+    target_plane: Plane
     positions_m: NDArray[np.float64]
 
     def __post_init__(self) -> None:
@@ -49,22 +50,22 @@ class PlatePass:
         if not np.isfinite(positions).all():
             raise DataError("positions_m holds NaN or infinity; give finite metres")
         if not isinstance(self.transport.source, Plane):
-            raise ConfigError("the matrix starts from patches; a moving plate needs a Plane of square cells")
+            raise ConfigError("the matrix starts from patches; a moving target needs a Plane of square cells")
         object.__setattr__(self, "positions_m", positions)
         if not any(bool(y.any() and x.any()) for y, x in self._shares):
-            raise DataError("the plate lies off the strip at every position; check the positions or the strip")
+            raise DataError("the target lies off the strip at every position; check the positions or the strip")
 
     def __len__(self) -> int:
         return len(self.positions_m)
 
-    def __call__(self, plate: torch.Tensor, /) -> torch.Tensor:
-        """Return the pictures [..., N, H, W] of a plate [..., n, n]."""
-        return self.transport(self.drawn(plate))
+    def __call__(self, target: torch.Tensor, /) -> torch.Tensor:
+        """Return the pictures [..., N, H, W] of a target [..., n, n]."""
+        return self.transport(self.drawn(target))
 
     def adjoint(self, images: torch.Tensor, /) -> torch.Tensor:
         """Return the transpose, [..., N, H, W] -> [..., n, n]."""
         strips = self.transport.adjoint(images)  # [..., N, h, w]
-        back = strips.new_zeros((*strips.shape[:-3], *self.plate.shape))
+        back = strips.new_zeros((*strips.shape[:-3], *self.target_plane.shape))
         for k, (y, x) in enumerate(self._shares):
             back += y.to(strips).mT @ strips[..., k, :, :] @ x.to(strips)
         return back
@@ -80,9 +81,9 @@ class PlatePass:
             dense.append((near.mT @ y[rows].to(cells)).mT.flatten(1))
         return torch.stack(dense)
 
-    def drawn(self, plate: torch.Tensor) -> torch.Tensor:
-        """Return the strip at each position, [..., N, h, w], of a plate [..., n, n]."""
-        return torch.stack([y.to(plate) @ plate @ x.to(plate).mT for y, x in self._shares], dim=-3)
+    def drawn(self, target: torch.Tensor) -> torch.Tensor:
+        """Return the strip at each position, [..., N, h, w], of a target [..., n, n]."""
+        return torch.stack([y.to(target) @ target @ x.to(target).mT for y, x in self._shares], dim=-3)
 
     def gram(self, strip_gram: torch.Tensor, static: float = 0.0) -> torch.Tensor:
         """Return sum S_k^T G S_k - (1 - rho) N S^T G S with S the mean of S_k, rho = 1 / (1 + N static^2).
@@ -98,26 +99,28 @@ class PlatePass:
         Returns:
             float64 [n n, n n].
         """
-        cells = self.plate.height * self.plate.width
+        cells = self.target_plane.height * self.target_plane.width
         strip, total = self.transport.source.shape, torch.zeros(cells, cells, dtype=torch.float64)
         for y, x in self._shares:
             total += _sandwich(strip_gram, strip, y, x)
         kept = mean_weight(len(self), static)
         if kept < 1:
-            mean = sum(torch.kron(y, x) for y, x in self._shares) / len(self)  # [strip cells, plate cells]
+            mean = sum(torch.kron(y, x) for y, x in self._shares) / len(self)  # [strip cells, target cells]
             assert isinstance(mean, torch.Tensor)
             total -= (1 - kept) * len(self) * (mean.mT @ (strip_gram.double() @ mean))
         return (total + total.mT) / 2
 
     @cached_property
     def _shares(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Return of each position how much of a strip's row, column each row, column of the plate covers."""
+        """Return of each position how much of a strip's row, column each row, column of the target plane
+        covers.
+        """
         strip = self.transport.source
         assert isinstance(strip, Plane)  # checked above
         return [
             (
-                _share(strip.y_m, strip.pitch_m, self.plate.y_m + y, self.plate.pitch_m),
-                _share(strip.x_m, strip.pitch_m, self.plate.x_m + x, self.plate.pitch_m),
+                _share(strip.y_m, strip.pitch_m, self.target_plane.y_m + y, self.target_plane.pitch_m),
+                _share(strip.x_m, strip.pitch_m, self.target_plane.x_m + x, self.target_plane.pitch_m),
             )
             for x, y in self.positions_m
         ]
@@ -138,8 +141,8 @@ def mean_weight(positions: int, static: float) -> float:
     return 1 / (1 + positions * static**2)
 
 
-def strip_of(positions_m: ArrayLike, plate: Plane) -> Plane:
-    """Return the strip of cells, of the plate's pitch, that holds the plate at all positions [N, 2], metres.
+def strip_of(positions_m: ArrayLike, target_plane: Plane) -> Plane:
+    """Return the strip of cells, of the target's pitch, that holds the target at all positions [N, 2], metres.
 
     Example:
         >>> strip_of([(-0.08, 0.0), (0.08, 0.0)], Plane(32, 32, 0.0025)).extent_m
@@ -148,11 +151,11 @@ def strip_of(positions_m: ArrayLike, plate: Plane) -> Plane:
     places = np.asarray(positions_m, dtype=np.float64)
     low, high = places.min(axis=0), places.max(axis=0)
     width, height = (
-        side + math.ceil(reach / plate.pitch_m - 1e-6)
-        for side, reach in zip((plate.width, plate.height), (high - low).tolist(), strict=True)
+        side + math.ceil(reach / target_plane.pitch_m - 1e-6)
+        for side, reach in zip((target_plane.width, target_plane.height), (high - low).tolist(), strict=True)
     )
-    middle_x, middle_y = ((low + high) / 2 + plate.center_m).tolist()
-    return Plane(height, width, plate.pitch_m, (middle_x, middle_y))
+    middle_x, middle_y = ((low + high) / 2 + target_plane.center_m).tolist()
+    return Plane(height, width, target_plane.pitch_m, (middle_x, middle_y))
 
 
 def matrix_of(operator: LinearTransport) -> MatrixTransport:
@@ -169,14 +172,14 @@ def strip_gram_of(transport: MatrixTransport) -> torch.Tensor:
 def _share(
     strip_m: NDArray[np.float64], strip_pitch: float, cell_m: NDArray[np.float64], cell_pitch: float
 ) -> torch.Tensor:
-    """Return the share of each of the strip's cells that each of the plate's covers, [strip, plate]."""
+    """Return the share of each of the strip's cells that each of the target's covers, [strip, target]."""
     low = np.maximum(strip_m[:, None] - strip_pitch / 2, cell_m - cell_pitch / 2)
     high = np.minimum(strip_m[:, None] + strip_pitch / 2, cell_m + cell_pitch / 2)
     return torch.from_numpy(np.maximum(high - low, 0.0) / strip_pitch)
 
 
 def _sandwich(gram: torch.Tensor, shape: tuple[int, int], y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """Return (y kron x)^T G (y kron x) for a symmetric G; only cells that the plate touches are looked at."""
+    """Return (y kron x)^T G (y kron x) for a symmetric G; only cells that the target touches are looked at."""
     rows, columns = torch.nonzero(y.any(dim=1)).flatten(), torch.nonzero(x.any(dim=1)).flatten()
     index = (rows[:, None] * shape[1] + columns).flatten()
     product = gram[index][:, index].double()  # [r c, r c]
@@ -192,24 +195,27 @@ _KEPT = 1e-12  # of the largest eigenvalue; what lies below is rounding
 
 
 class JointProblem:
-    """Find the plate x behind N pictures y_k = A S_k x + b + noise, b unknown and the same in all of them.
+    """Find the target x behind N pictures y_k = A S_k x + b + noise, b unknown and the same in all of them.
 
-    With R = A^T C^-1 A accumulated over the positions (`PlatePass.gram`) the pictures are looked at once, and
-    every lam costs a product of the plate's size. C holds independent noise and, of standard deviation `static`
-    times the noise, a constant offset of each pixel: the camera's fixed pattern and ambient light.
+    With R = A^T C^-1 A accumulated over the positions (`SequenceOperator.gram`) the pictures are looked at
+    once, and every lam costs a product of the target's size. C holds independent noise and, of standard
+    deviation `static` times the noise, a constant offset of each pixel: the camera's fixed pattern and ambient
+    light.
 
     Args:
         sight: The pass.
         static: Standard deviation of the offsets over that of the noise, 0 or more; infinity: whatever does not
-            move says nothing about the plate.
+            move says nothing about the target.
         strip_gram: A^T A, where it is at hand; passes over one strip share it.
 
     Raises:
         ConfigError: `static` is negative.
-        DataError: The pass shows nothing of the plate.
+        DataError: The pass shows nothing of the target.
     """
 
-    def __init__(self, sight: PlatePass, static: float = 0.0, strip_gram: torch.Tensor | None = None) -> None:
+    def __init__(
+        self, sight: SequenceOperator, static: float = 0.0, strip_gram: torch.Tensor | None = None
+    ) -> None:
         self.sight, self.static = sight, static
         strip_gram = strip_gram_of(sight.transport) if strip_gram is None else strip_gram
         self.gram = sight.gram(strip_gram, static)
@@ -218,7 +224,7 @@ class JointProblem:
         # What a difference of equal matrices leaves is rounding.
         if float(self.gram.diagonal().max()) <= _KEPT * float(strip_gram.diagonal().max()):
             raise DataError(
-                "the pass shows nothing of the plate; give positions that differ, or a lower static"
+                "the pass shows nothing of the target; give positions that differ, or a lower static"
             )
 
     @property
@@ -227,7 +233,7 @@ class JointProblem:
         return float(self._eigen[0][-1]) / 8
 
     def tikhonov(self, images: torch.Tensor, lam: float | None = None) -> Solution:
-        """Return argmin |C^-1/2 (A S x - y)|^2 + lam |grad x|^2, the plate's border counted as an edge.
+        """Return argmin |C^-1/2 (A S x - y)|^2 + lam |grad x|^2, the target's border counted as an edge.
 
         Args:
             images: y without known ambient light, [..., N, H, W]; leading axes are a batch, which shares lam.
@@ -257,7 +263,7 @@ class JointProblem:
         image = (seen / (values + lam)) @ basis.mT
         left = residual(lam)
         sigma = float((left.mean() / freedom(lam)).sqrt())
-        image = image.reshape(*images.shape[:-3], *self.sight.plate.shape)
+        image = image.reshape(*images.shape[:-3], *self.sight.target_plane.shape)
         left = left.sqrt().reshape(images.shape[:-3])
         return Solution(image, lam, 0, True, left, sigma, self.samples - freedom(lam))
 
@@ -277,14 +283,19 @@ class JointProblem:
             DataError: The pictures are not those of the pass.
         """
         back, energy = self._seen(images)
-        plate, (values, vectors) = self.sight.plate, self._eigen
+        target_plane, (values, vectors) = self.sight.target_plane, self._eigen
         root = values.sqrt()
         # |F x - f|^2 with F^T F = R and F^T f = A^T C^-1 y differs from the pass's misfit by a constant.
-        compressed = MatrixTransport((vectors * root).mT, plate, plate.shape)
+        compressed = MatrixTransport((vectors * root).mT, target_plane, target_plane.shape)
         target = torch.where(root > 0, back @ vectors / root, 0.0)  # [B, C]
         batch = images.shape[:-3]
         found = total_variation(
-            compressed, target.reshape(*batch, *plate.shape), lam, box=box, border="dark", tolerance=tolerance
+            compressed,
+            target.reshape(*batch, *target_plane.shape),
+            lam,
+            box=box,
+            border="dark",
+            tolerance=tolerance,
         )
         image = found.image.flatten(-2)
         left = energy.reshape(batch) + ((image @ self.gram - 2 * back.reshape(image.shape)) * image).sum(-1)
@@ -313,7 +324,7 @@ class JointProblem:
     @cached_property
     def _spectrum(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return s^2 and B with B^T R B = diag(s^2), B^T L^T L B = 1."""
-        blank = torch.zeros(self.sight.plate.shape, dtype=torch.float64)
+        blank = torch.zeros(self.sight.target_plane.shape, dtype=torch.float64)
         lower = torch.linalg.cholesky(normal_matrix(Gradient("dark"), blank))
         half = torch.linalg.solve_triangular(lower, self.gram, upper=False)
         values, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(lower, half.mT, upper=False))

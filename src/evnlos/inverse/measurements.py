@@ -2,7 +2,7 @@
 
 - The event form of the inverse problem: changes of log light as a linear function of the hidden scene.
 - The frames of a recording made ready for the joint problem: the object's light alone, at a working size.
-- What hidden plates look like: a Gaussian prior from some characters, and others to test it on.
+- What hidden targets look like: a Gaussian prior from some characters, and others to test it on.
 """
 
 from __future__ import annotations
@@ -169,15 +169,15 @@ _RIDGE = 1e-3  # white part of the prior, share of its mean variance: no shape i
 
 
 @dataclass(frozen=True, eq=False)
-class Plates:
-    """Plates to learn a prior from, and others to test on, drawn on the same cells.
+class TargetPrior:
+    """Targets to learn a prior from, and others to test on, drawn on the same cells.
 
     Args:
-        mean: Mean training plate, float64 [n], 0..1.
+        mean: Mean training target, float64 [n], 0..1.
         root: R with R R^T their covariance and a small white part, float64 [n, n].
-        test: Test plates, float64 [M, n].
+        test: Test targets, float64 [M, n].
         names: Their names, [M].
-        stroke_m: Median stroke width of the test plates, metres.
+        stroke_m: Median stroke width of the test targets, metres.
     """
 
     mean: torch.Tensor
@@ -188,22 +188,24 @@ class Plates:
 
     @property
     def typical(self) -> int:
-        """Number of the test plate that stands for all."""
+        """Number of the test target that stands for all."""
         return next(i for i, name in enumerate(self.names) if name.endswith(f"_{TYPICAL}"))
 
 
 @lru_cache(maxsize=2)
-def handwritten_plates(plate: Plane, writers: int = 6) -> Plates:
+def handwritten_targets(target_plane: Plane, writers: int = 6) -> TargetPrior:
     """Return NIST-like handwriting as prior and test.
 
-    Training plates are also moved by a cell each way, so that the prior does not know the place to a cell.
+    Training targets are also moved by a cell each way, so that the prior does not know the place to a cell.
 
     Args:
-        plate: Cells of the plate, square.
-        writers: Writers of the training plates.
+        target_plane: Cells of the target plane, square.
+        writers: Writers of the training targets.
     """
     training = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=writers)
-    drawn = np.stack([training.target(name).rasterise(plate) for name in training.objects()]).astype(np.float64)
+    drawn = np.stack([training.target(name).rasterise(target_plane) for name in training.objects()]).astype(
+        np.float64
+    )
     moved = [np.roll(drawn, (dy, dx), axis=(1, 2)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     samples = torch.from_numpy(np.concatenate(moved)).flatten(1)  # [9 N, n]
     mean = samples.mean(dim=0)
@@ -212,13 +214,13 @@ def handwritten_plates(plate: Plane, writers: int = 6) -> Plates:
     root = axes * (variance.clamp(min=0) + _RIDGE * variance.mean()).sqrt()
     testing = HandwritingGlyphs(characters=TEST_CHARACTERS, writers=_TEST_WRITERS, first_writer=TRAIN_WRITERS)
     targets = [testing.target(name) for name in testing.objects()]
-    test = torch.from_numpy(np.stack([one.rasterise(plate) for one in targets])).double().flatten(1)
+    test = torch.from_numpy(np.stack([one.rasterise(target_plane) for one in targets])).double().flatten(1)
     stroke = float(np.median([stroke_width_m(one) for one in targets]))
-    return Plates(mean, root, test, tuple(testing.objects()), stroke)
+    return TargetPrior(mean, root, test, tuple(testing.objects()), stroke)
 
 
 def stroke_width_m(target: Target) -> float:
-    """Return the mean width of a plate's strokes, metres: twice their area over the length of their border.
+    """Return the mean width of a target's strokes, metres: twice their area over the length of their border.
 
     A stroke of width w and length l has the area w l and, but for its ends, a border of 2 l. The border's
     length is the total variation of the mask.

@@ -18,17 +18,17 @@ Array = NDArray[np.float64]
 
 _TORCH_POINTS = 61
 _EXPOSURE_PARTS = 8
-_INSTANTS = 65  # at which the place of the plate is looked at
+_INSTANTS = 65  # at which the place of the target is looked at
 
 
 @dataclass(frozen=True)
 class Mount:
-    """What carries the plate and shines, too: a rim around it and a stick below, as bright all over."""
+    """What carries the target and shines, too: a rim around it and a stick below, as bright all over."""
 
     brightness: float = 0.0
-    """Brightness, 1 = the shining parts of the plate; 0 = nothing to be seen."""
+    """Brightness, 1 = the shining parts of the target plane; 0 = nothing to be seen."""
     rim_m: float = 0.004
-    """Width of the rim around the plate, metres."""
+    """Width of the rim around the target plane, metres."""
     stick_m: tuple[float, float] = (0.012, 0.08)
     """Width and length of the stick below the rim, metres."""
 
@@ -41,7 +41,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class Torch:
-    """A torch between wall and target that lights the plate, hides part of it, and may be hidden itself."""
+    """A torch between wall and target that lights the target, hides part of it, and may be hidden itself."""
 
     place_m: tuple[float, float, float] = (0.10, 0.07, 0.15)
     """x and y from the middle of the travel, z from the wall, metres."""
@@ -55,7 +55,7 @@ class Torch:
     """Light of the torch that reaches the wall beside it by other ways, white levels."""
 
     def emission(self, x_m: Array, y_m: Array, distance_m: float) -> Array:
-        """Return the radiance of a bright plate at places of the plane; 1 in the middle without holder.
+        """Return the radiance of a bright target at places of the plane; 1 in the middle without holder.
 
         Each of 61 points of the torch's disc gives cos cos / r^2 where the holder does not stand in its way.
 
@@ -94,7 +94,7 @@ class Torch:
 
 
 def covered_plane(scene: Scene, mount: Mount, cell_m: float) -> Plane:
-    """Return the part of the target's plane over which plate and mount move, in whole cells.
+    """Return the part of the target's plane over which target and mount move, in whole cells.
 
     Args:
         scene: The target and its motion.
@@ -114,7 +114,7 @@ def covered_plane(scene: Scene, mount: Mount, cell_m: float) -> Plane:
 
 
 def brightness(scene: Scene, mount: Mount, plane: Plane, times_s: Array) -> NDArray[np.float32]:
-    """Return the brightness of plate and mount on a plane at times [T], float32 [T, h, w].
+    """Return the brightness of target and mount on a plane at times [T], float32 [T, h, w].
 
     Args:
         scene: The target and its motion.

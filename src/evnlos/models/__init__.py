@@ -1,6 +1,6 @@
 """Reconstructors, their closed-form parts, what their images are worth, and their weights on disk."""
 
-from evnlos.models.confidence import Confidence, Judgement, halves_of, plates
+from evnlos.models.confidence import Confidence, Judgement, halves_of, on_target_plane
 from evnlos.models.linear import LinearEstimate, fit_linear
 from evnlos.models.reconstructor import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
 from evnlos.models.sequence import SequenceConfig, SequenceReconstructor
@@ -36,7 +36,7 @@ __all__ = [
     "halves_of",
     "layers_of",
     "load_weights",
-    "plates",
+    "on_target_plane",
     "published",
     "published_for",
     "published_setup",

@@ -1,4 +1,4 @@
-"""The plate in a picture: the square that holds the hidden object, cut out wherever it is.
+"""The target in a picture: the square that holds the hidden object, cut out wherever it is.
 
 - What a picture is worth: how much of it the measurement supports, and where each pixel's level lies.
 """
@@ -18,17 +18,17 @@ from evnlos.models.reconstructor import Reconstructor
 from evnlos.types import Plane
 
 SIDE = 32
-"""Side of a plate's picture, pixels."""
+"""Side of a target plane's picture, pixels."""
 
 
-def plates(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
-    """Return the part of each picture that shows the plate, resampled to 32 x 32.
+def on_target_plane(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
+    """Return the part of each picture that shows the target, resampled to 32 x 32.
 
     Args:
         images: Pictures of the canvas, float [N, H, W].
         canvas: Their geometry.
-        position_m: Centre (x, y) of the plate in each picture, [N, 2], metres.
-        size_m: Side of the plate, metres.
+        position_m: Centre (x, y) of the target in each picture, [N, 2], metres.
+        size_m: Side of the target plane, metres.
 
     Returns:
         float32 [N, 1, 32, 32]; zero outside the canvas.
@@ -42,27 +42,28 @@ def plates(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float =
     return F.grid_sample(images[:, None].float(), points / span, align_corners=False)
 
 
-def on_canvas(plate: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
-    """Return pictures of the canvas that show one plate at each position; `plates` takes it out again.
+def on_canvas(target: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
+    """Return pictures of the canvas that show one target at each position; `on_target_plane` takes it out
+    again.
 
     Args:
-        plate: Picture of the plate, float [P, P].
+        target: Picture of the target, float [P, P].
         canvas: Geometry of the pictures.
-        position_m: Centre (x, y) of the plate in each picture, [N, 2], metres.
-        size_m: Side of the plate, metres.
+        position_m: Centre (x, y) of the target in each picture, [N, 2], metres.
+        size_m: Side of the target plane, metres.
 
     Returns:
-        float32 [N, H, W]; zero beside the plate.
+        float32 [N, H, W]; zero beside the target plane.
     """
-    centre = torch.as_tensor(position_m, dtype=torch.float32, device=plate.device)
-    y, x = (torch.from_numpy(at).float().to(plate.device) for at in (canvas.y_m, canvas.x_m))
+    centre = torch.as_tensor(position_m, dtype=torch.float32, device=target.device)
+    y, x = (torch.from_numpy(at).float().to(target.device) for at in (canvas.y_m, canvas.x_m))
     place = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)  # [H, W, 2]
     grid = (place - centre[:, None, None]) / (size_m / 2)
-    return F.grid_sample(plate.float().expand(len(grid), 1, -1, -1), grid, align_corners=False)[:, 0]
+    return F.grid_sample(target.float().expand(len(grid), 1, -1, -1), grid, align_corners=False)[:, 0]
 
 
 COVERAGE = 0.9
-"""Share of a plate's pixels whose true level the intervals are to hold."""
+"""Share of a target plane's pixels whose true level the intervals are to hold."""
 CONFIRMED = 0.7
 """Share of the frames that pictures have to explain where the setup is known (see `Judgement.explained`)."""
 LEVELS = 16
@@ -126,10 +127,10 @@ class Confidence:
     """What `fit_confidence` learned from passes that the network was not trained on.
 
     Args:
-        mean: Mean of the true plates, float32 [32, 32].
+        mean: Mean of the true targets, float32 [32, 32].
         empty: What the network shows where nothing of any one object was measured, as its mean difference from
-            the mean plate, [32, 32].
-        power: Mean of |d|^2 over true plates, d what tells a plate from an empty answer (see `telling`), [].
+            the mean target, [32, 32].
+        power: Mean of |d|^2 over true targets, d what tells a target from an empty answer (see `telling`), [].
         threshold: See `Judgement.threshold`, [].
         edges: Agreements that separate the groups of passes, ascending, [G - 1].
         low: Lower end of the interval for each group and level, [G, L].
@@ -149,7 +150,7 @@ class Confidence:
 
         Args:
             pictures: Pictures of all positions, float [N, H, W], 0..1.
-            halves: What the two halves of the pass show of the plate, [2, 32, 32]: see `halves_of`.
+            halves: What the two halves of the pass show of the target, [2, 32, 32]: see `halves_of`.
             explained: How much of the frames the pictures explain, where the setup is known.
         """
         agreement, threshold = float(self.agreement(halves)), float(self.threshold)
@@ -174,10 +175,10 @@ class Confidence:
         return first @ second / self.power
 
     def telling(self, shown: Tensor) -> Tensor:
-        """Return what tells plates [N, 32, 32] from the network's empty answer, [N, P].
+        """Return what tells targets [N, 32, 32] from the network's empty answer, [N, P].
 
-        It is their difference from the mean plate, without the mean plate's own direction, so that neither a
-        black plate nor a paler one tells anything; less the same of what the network shows when it knows
+        It is their difference from the mean target, without the mean target's own direction, so that neither a
+        black target nor a paler one tells anything; less the same of what the network shows when it knows
         nothing, which would be in both halves of any pass.
         """
         mean = F.normalize(self.mean.flatten(), dim=0)
@@ -192,8 +193,8 @@ class Confidence:
         """
         shapes = {item.name: tuple(getattr(self, item.name).shape) for item in fields(self)}
         table = (GROUPS, LEVELS)
-        plate = (SIDE, SIDE)
-        wanted = {"mean": plate, "empty": plate, "power": (), "threshold": (), "edges": (GROUPS - 1,)}
+        square = (SIDE, SIDE)
+        wanted = {"mean": square, "empty": square, "power": (), "threshold": (), "edges": (GROUPS - 1,)}
         if shapes != wanted | {"low": table, "high": table}:
             raise DataError(f"its tensors have the shapes {shapes}")
         if not all(bool(torch.isfinite(one).all()) for one in self.tensors().values()) or self.power <= 0:
@@ -207,15 +208,15 @@ class Confidence:
 
 @torch.inference_mode()
 def halves_of(network: Reconstructor, inputs: Tensor, position_m: NDArray, canvas: Plane) -> Tensor:
-    """Return what the first and the second half of a pass show of the plate, each on its own, [2, 32, 32].
+    """Return what the first and the second half of a pass show of the target, each on its own, [2, 32, 32].
 
-    The object is the same in both halves and everything else is not: the noise, and where plate, wall and
+    The object is the same in both halves and everything else is not: the noise, and where target, wall and
     camera are to one another. A pattern that stays where it is, or comes from nowhere, is not in both.
 
     Args:
         network: The network.
         inputs: What was measured, [N, C, H, W], in the order of time, N at least 2.
-        position_m: The plate's centre at each, (x, y) in metres, [N, 2].
+        position_m: The target's centre at each, (x, y) in metres, [N, 2].
         canvas: Geometry of the pictures.
 
     Raises:
@@ -231,7 +232,9 @@ def halves_of(network: Reconstructor, inputs: Tensor, position_m: NDArray, canva
     parts = np.array_split(np.arange(len(inputs)), 2)
     return torch.stack(
         [
-            plates(network.infer(inputs[torch.from_numpy(part)], position_m[part]), canvas, position_m[part])
+            on_target_plane(
+                network.infer(inputs[torch.from_numpy(part)], position_m[part]), canvas, position_m[part]
+            )
             .mean(dim=0)[0]
             .cpu()
             for part in parts

@@ -1,4 +1,4 @@
-"""The wall under a shift-variant transport: a strip of cells on which the plate is drawn, and a matrix."""
+"""The wall under a shift-variant transport: a strip of cells on which the target is drawn, and a matrix."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ _CHUNK = 64  # positions drawn and carried over at a time
 _KEYFRAME_ERROR = 1e-3  # of the light's standard deviation
 _GUARD = 3  # keyframes beyond each end of the strip
 _TAIL = 10  # keyframes beyond each end of a travel: the prefilter's tail, 0.268^n
-_PROBES_S = np.linspace(-100.0, 100.0, 2001)  # does the plate ever leave its row?
+_PROBES_S = np.linspace(-100.0, 100.0, 2001)  # does the target ever leave its row?
 
 
 class MatrixWall:
-    """What a light-transport matrix makes of a moving plate, at any instant.
+    """What a light-transport matrix makes of a moving target, at any instant.
 
-    irradiance(t) = gain A s(t) + ambient, with s(t) the plate drawn on the strip's cells, each cell the exact
+    irradiance(t) = gain A s(t) + ambient, with s(t) the target drawn on the strip's cells, each cell the exact
     mean of the mask over it, at any sub-cell position. For motion along the strip's rows the wall is known from
     keyframes: A s is computed at equally spaced positions once and a cubic spline runs between them (exact at
     the keyframes, two continuous derivatives in time); other motions multiply at every instant.
 
     Args:
         transport: Matrix from the strip to the camera image, in white levels a unit of the mask at gain 1.
-        target: The plate.
+        target: The target.
         motion: Where its centre is at every instant; positions off the strip leave the light they lost.
-        magnification_px_m: Upper bound of the image motion, pixels a metre of plate motion.
+        magnification_px_m: Upper bound of the image motion, pixels a metre of target motion.
         gain: White levels, 0 or more.
         ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
         keyframe_step_m: Distance between keyframes, metres; None is half a cell, 0 multiplies at every instant.
         travel_m: Smallest and largest x of the centre that are asked for, metres: keyframes are made for these
-            alone, and other places multiplied out; None is wherever the plate touches the strip.
-        along: What else moves with the plate's centre and shines with it, and its own matrix.
+            alone, and other places multiplied out; None is wherever the target touches the strip.
+        along: What else moves with the target's centre and shines with it, and its own matrix.
 
     Raises:
         ConfigError: The gain, the ambient light or the step is negative or not finite.
@@ -63,7 +63,7 @@ class MatrixWall:
         check_gain(gain)
         strip = transport.source
         if not isinstance(strip, Plane):
-            raise ConfigError("the matrix starts from patches; a moving plate needs a Plane of square cells")
+            raise ConfigError("the matrix starts from patches; a moving target needs a Plane of square cells")
         step = strip.pitch_m / 2 if keyframe_step_m is None else keyframe_step_m
         if not (math.isfinite(step) and step >= 0):
             raise ConfigError(f"keyframe_step_m is {keyframe_step_m}; give 0 or more metres")
@@ -113,7 +113,7 @@ class MatrixWall:
         return image[0] if times.ndim == 0 else image
 
     def light(self, positions_m: ArrayLike) -> torch.Tensor:
-        """Return A s for the plate at positions (x, y) [T, 2], metres: the direct product, real [T, H, W]."""
+        """Return A s for the target at positions (x, y) [T, 2], metres: the direct product, real [T, H, W]."""
         positions = np.asarray(positions_m, dtype=np.float64)
         matrix = self.transport.matrix
         image = matrix.new_zeros((len(positions), *self.shape))
@@ -125,7 +125,7 @@ class MatrixWall:
         return image
 
     def light_along(self, positions_m: ArrayLike) -> torch.Tensor:
-        """Return the light of what moves along with the plate at positions (x, y) [T, 2], real [T, H, W]."""
+        """Return the light of what moves along with the target at positions (x, y) [T, 2], real [T, H, W]."""
         positions = np.asarray(positions_m, dtype=np.float64)
         image = self.transport.matrix.new_zeros((len(positions), *self.shape))
         if self._along is None:
@@ -146,7 +146,7 @@ class MatrixWall:
     def _between_keys(self, positions: np.ndarray) -> torch.Tensor:
         if self._keys is None:
             self._keys = self._make_keys()
-        # Beyond the last keyframes the plate has left the strip, and the wall stays dark.
+        # Beyond the last keyframes the target has left the strip, and the wall stays dark.
         at = np.clip((positions[:, 0] - self._first_m) / self._step, 1, len(self._keys) - 3)
         whole = np.minimum(np.floor(at), len(self._keys) - 3).astype(np.int64)
         weight = spline_weights(torch.as_tensor(at - whole)).to(self._keys)  # [4, T]
@@ -169,12 +169,12 @@ class MatrixWall:
 def coarsest_keyframe_step_m(transport: MatrixTransport, size_m: float) -> float:
     """Return the largest distance between keyframes that a wall's blur allows, metres: 2, 1 or 1/2 cells.
 
-    Between keyframes, splines through the light of a plate of random squares, an eighth of its side each, may
+    Between keyframes, splines through the light of a target of random squares, an eighth of its side each, may
     be off by 1e-3 of what the light changes by (root mean square); cells bring about half of that themselves.
 
     Args:
         transport: Matrix from a strip of square cells to the camera image.
-        size_m: Side of the plate, metres.
+        size_m: Side of the target plane, metres.
     """
     strip = transport.source
     assert isinstance(strip, Plane)

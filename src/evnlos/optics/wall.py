@@ -150,9 +150,9 @@ class Wall(Protocol):
 
 
 class SlidingWall:
-    """A wall image that follows the target: what a shift-invariant transport makes of a translating plate.
+    """A wall image that follows the target: what a shift-invariant transport makes of a translating target.
 
-    irradiance(p, t) = gain W(A p - m(t)) + ambient(p), with W the wall image of the plate at the origin, A the
+    irradiance(p, t) = gain W(A p - m(t)) + ambient(p), with W the wall image of the target at the origin, A the
     view and m the motion. W is averaged over a pixel's area (of mean size where the
     view is oblique) and interpolated by a cubic B-spline, so each pixel's signal has two continuous
     derivatives in time and no event is timed by the interpolation. For an affine view W is carried to the
@@ -160,16 +160,16 @@ class SlidingWall:
     is cut at zero.
 
     Args:
-        image: Wall image of the plate at the origin, real [h, w]; zero beyond its borders.
+        image: Wall image of the target at the origin, real [h, w]; zero beyond its borders.
         plane: Plane on which `image` is sampled.
         view: The camera's view of the wall.
-        motion: Where the plate's centre is at every instant.
+        motion: Where the target's centre is at every instant.
         gain: White levels a unit of `image`, 0 or more.
         ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
 
     Raises:
-        ConfigError: The gain or the ambient light is negative or not finite, or the picture of the plate is too
-            large.
+        ConfigError: The gain or the ambient light is negative or not finite, or the picture of the target is
+            too large.
         DataError: The image does not have the size of the plane, or the ambient array that of the view.
     """
 
@@ -242,8 +242,8 @@ class SlidingWall:
     def strips(self, t_s: ArrayLike) -> Strips | None:
         """Return the light at times `t_s` [T] for any pixels; None where only whole images can be rendered.
 
-        It can be had where the view is affine, the wall lies in main memory and the plate moves along the rows;
-        not of a subclass with an `irradiance` of its own.
+        It can be had where the view is affine, the wall lies in main memory and the target moves along the
+        rows; not of a subclass with an `irradiance` of its own.
         """
         if not self._compiled or type(self).irradiance is not SlidingWall.irradiance:
             return None
@@ -263,7 +263,7 @@ class SlidingWall:
         size = pixels.amax(dim=0).ceil().long() + MARGIN + 1 - low
         if int(size.max()) > _MAX_CANVAS:
             raise ConfigError(
-                f"the plate's picture is {int(size[0])} x {int(size[1])} pixels, above {_MAX_CANVAS}; "
+                f"the target's picture is {int(size[0])} x {int(size[1])} pixels, above {_MAX_CANVAS}; "
                 "lower the magnification or the length of the tPSF"
             )
         self._low = (int(low[0]), int(low[1]))
@@ -276,7 +276,7 @@ class SlidingWall:
     def _at(
         self, points_m: torch.Tensor, x_m: float, y_m: float
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the wall's coefficients, and row and column of points [H, W, 2], with the plate at (x, y)."""
+        """Return the wall's coefficients, and row and column of points [H, W, 2], with the target at (x, y)."""
         x, y = points_m.unbind(-1)
         plane = self._plane
         column = (x - x_m - plane.center_m[0]) / plane.pitch_m + (plane.width - 1) / 2 + self._margin
@@ -297,7 +297,7 @@ class SlidingWall:
         return frame
 
     def _write(self, positions_m: NDArray[np.float64], image: torch.Tensor) -> None:
-        """Write the frames with the plate at positions [T, 2] to `image`; `_shifted` is the slow reference."""
+        """Write the frames with the target at positions [T, 2] to `image`; `_shifted` is the slow reference."""
         strips = self._strips(positions_m)
         if strips is not None:
             strips.write(0, image.flatten(1).numpy())
@@ -306,7 +306,7 @@ class SlidingWall:
                 self._write(positions_m[k : k + 1], image[k : k + 1])
 
     def _slide(self, positions_m: NDArray[np.float64], image: torch.Tensor) -> None:
-        """Write the frames with the plate at positions [T, 2] to `image`; `_shifted` is the slow reference.
+        """Write the frames with the target at positions [T, 2] to `image`; `_shifted` is the slow reference.
 
         Frames on the same rows are rendered together: one by one, a GPU would mostly wait for its orders.
         """
@@ -323,7 +323,7 @@ class SlidingWall:
             image[some] = light.clamp_(min=0).mul_(self.gain).add_(self.ambient)
 
     def _strips(self, positions_m: NDArray[np.float64]) -> Strips | None:
-        """Return the light with the plate at positions [T, 2], unless they differ across the rows."""
+        """Return the light with the target at positions [T, 2], unless they differ across the rows."""
         across, down = self._pixels(positions_m)
         if len(down) and float(np.ptp(down)) > _SAME_ROWS_PX:
             return None

@@ -275,7 +275,7 @@ _FLOOR = 1e-7
 
 
 def draw_identification(found: Identification, path: str | Path) -> Path:
-    """Draw singular values, the Picard plot of a typical plate, the first modes, truth and linear picture.
+    """Draw singular values, the Picard plot of a typical target, the first modes, truth and linear picture.
 
     Args:
         found: What `identify` returned.

@@ -44,7 +44,7 @@ class Drawing:
         return self.svg
 
 
-def setup_drawing(setup: Setup, travel_m: float = 0.16, plate_m: float = 0.08) -> Drawing | None:
+def setup_drawing(setup: Setup, travel_m: float = 0.16, target_size_m: float = 0.08) -> Drawing | None:
     """Return the setup from above, to scale: wall, object and its way, cameras and their view, what is between.
 
     Where the setup has no place of the camera, none is drawn. Occluders stand where they are; what hides the
@@ -53,7 +53,7 @@ def setup_drawing(setup: Setup, travel_m: float = 0.16, plate_m: float = 0.08) -
     Args:
         setup: The setup.
         travel_m: Way of the object's middle, metres.
-        plate_m: Side of the object's plate, metres.
+        target_size_m: Side of the target plane, metres.
 
     Returns:
         The drawing; None for a setup that does not know where its parts are.
@@ -68,18 +68,20 @@ def setup_drawing(setup: Setup, travel_m: float = 0.16, plate_m: float = 0.08) -
         return None
     parts, around = [], []  # drawn in metres first: (kind, points, style or words)
     middle, deep = layout.target
-    half = (travel_m + plate_m) / 2
+    half = (travel_m + target_size_m) / 2
     parts.append(
         ("line", [(middle - half, deep), (middle + half, deep)], f"stroke='{_LIGHT}' stroke-dasharray='2 3'")
     )
     parts.append(
         (
             "line",
-            [(middle - plate_m / 2, deep), (middle + plate_m / 2, deep)],
+            [(middle - target_size_m / 2, deep), (middle + target_size_m / 2, deep)],
             f"stroke='{_LIGHT}' stroke-width='4'",
         )
     )
-    parts.append(("text", [(middle, deep)], f"object {100 * plate_m:.3g} cm, way {100 * travel_m:.3g} cm"))
+    parts.append(
+        ("text", [(middle, deep)], f"object {100 * target_size_m:.3g} cm, way {100 * travel_m:.3g} cm")
+    )
     reach = max(half + abs(middle) + 0.04, 0.2)
     around += [(middle - half, deep), (middle + half, deep)]
     if layout.camera is not None:

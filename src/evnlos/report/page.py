@@ -314,7 +314,8 @@ def _optics(dataset: Dataset, results: list[RunResult]) -> str:
     if not lines:
         return ""
     return (
-        "<h2>Optics of the simulation</h2><p class=dim>Fresnel number of half a plate; blur by diffraction and "
+        "<h2>Optics of the simulation</h2><p class=dim>Fresnel number of half a target; blur by diffraction "
+        "and "
         "radius of the tPSF in camera pixels; distance up to which the sampled wave is true, in metres.</p>"
         "<div class=wide><table><tr><th>dataset</th><th></th><th></th></tr>"
         f"{''.join(lines)}</table></div>"

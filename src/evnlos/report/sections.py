@@ -26,13 +26,13 @@ from evnlos.setups import Setup
 _LOWEST = 1e-3
 
 
-def setup_section(name: str, setup: Setup | None, travel_m: float = 0.16, plate_m: float = 0.08) -> str:
+def setup_section(name: str, setup: Setup | None, travel_m: float = 0.16, target_size_m: float = 0.08) -> str:
     """Return the section that shows the setup; without one, how to have it shown."""
     head = "<h2>The setup</h2>"
     if setup is None:
         said = "The setup is not known to this page; <code>evnlos report --setup SETUP.yaml</code> draws it."
         return f"{head}<p class=dim>{said}</p>"
-    drawing = setup_drawing(setup, travel_m, plate_m)
+    drawing = setup_drawing(setup, travel_m, target_size_m)
     if drawing is None:
         words = html.escape(f"{name}: {setup.describe()}")
         return f"{head}<p>{words}. Where its parts stand is not known, so it has no drawing.</p>"
@@ -62,14 +62,15 @@ def limits_section(found: Identification | None) -> str:
     pictures = "".join(
         f"<figure><img class=large alt='{words}' src='{data_uri(png(grey(image.numpy())))}'>"
         f"<figcaption>{words}</figcaption></figure>"
-        for image, words in ((found.truth, "a typical plate"), (at.picture, "best linear picture"))
+        for image, words in ((found.truth, "a typical target"), (at.picture, "best linear picture"))
     )
     warned = "".join(f"<p>{html.escape(words)}</p>" for words in found.warnings)
     return (
         "<h2>What this setup can show at all</h2>"
         f"<p><b>{html.escape(found.verdict)}</b></p>{warned}<p class=dim>One picture of the wall, the object "
         "at a known place, the setup known exactly; patterns whose value lies above 0 stand above the noise. "
-        f"On the plate itself: best linear picture {at.psnr_db:.1f} dB, mean plate {found.mean_db:.1f} dB, "
+        f"On the target plane itself: best linear picture {at.psnr_db:.1f} dB, mean target "
+        f"{found.mean_db:.1f} dB, "
         f"all-black {found.zero_db:.1f} dB. What a network draws beyond that it knows from its training.</p>"
         f"<div class=pair>{pictures}</div>{curves_svg(series, 'pattern', 'log10 of value over noise')}"
     )
@@ -193,7 +194,7 @@ def belief_section(results: list[RunResult]) -> str:
         "<h2>How far to believe them</h2><p class=dim>Support: the share of what tells objects apart that both "
         "halves of the pass agree on, which the network says without knowing the truth. Skill: the share of it "
         "that is right; below 0 the average object would have been nearer. The intervals are to hold 90 % of "
-        "the plate's pixels; a length of 1 is from black to white.</p>"
+        "the target plane's pixels; a length of 1 is from black to white.</p>"
         f"<div class=wide><table><tr><th></th>{heads}</tr><tr><th></th>{names}</tr>{''.join(rows)}"
         f"<tr class=mean><td>pixels in their interval</td>{held_cells}</tr>"
         f"<tr><td>length of the intervals</td>{wide_cells}</tr></table></div>"

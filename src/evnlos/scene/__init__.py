@@ -12,9 +12,9 @@ from evnlos.scene.glyph_sets import (
     HandwritingGlyphs,
     NistGlyphs,
     ObjectId,
-    Plate,
+    TargetPlane,
 )
-from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, fit_to_plate, render_glyph
+from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, fit_to_target_plane, render_glyph
 from evnlos.scene.handwriting import (
     TRAIN_WRITERS,
     Hand,
@@ -46,15 +46,15 @@ __all__ = [
     "NistGlyphs",
     "ObjectId",
     "PathMotion",
-    "Plate",
     "Pose",
     "Scene",
     "Strokes",
     "Target",
+    "TargetPlane",
     "character_name",
     "drawing",
     "find_font",
-    "fit_to_plate",
+    "fit_to_target_plane",
     "hand",
     "held_out_writers",
     "list_emnist",

@@ -1,4 +1,4 @@
-"""A square to draw shapes on, in units of the plate: from -1 to 1, x to the right and y down.
+"""A square to draw shapes on, in units of the target plane: from -1 to 1, x to the right and y down.
 
 - Things to hide that are no characters: icons, people, vehicles, doodles, several at once, in grey levels.
 """
@@ -274,7 +274,7 @@ def _wheels(c: Canvas, places: tuple[float, ...], y: float, radius: float) -> No
 
 
 def _doodle(c: Canvas) -> None:
-    """Two or three smooth strokes of a pen, sums of a few slow waves, that fill the plate."""
+    """Two or three smooth strokes of a pen, sums of a few slow waves, that fill the target plane."""
     t, waves, width = np.linspace(0, 1, 40), np.arange(3), c.draw.uniform(0.1, 0.18)
     count = int(c.draw.integers(2, 4))
     sizes = c.draw.normal(size=(count, 2, 3)) / (1 + waves)

@@ -18,7 +18,14 @@ from evnlos.errors import ConfigError
 from evnlos.scene.databases import list_emnist, list_sd19, read_emnist_images, read_sd19_image
 from evnlos.scene.drawings import KINDS, drawing
 from evnlos.scene.fonts import FONT_SUFFIXES, Font, find_font
-from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, check_size, fit_to_plate, render_glyph
+from evnlos.scene.glyphs import (
+    DIGITS,
+    UPPER_CASE,
+    character_name,
+    check_size,
+    fit_to_target_plane,
+    render_glyph,
+)
 from evnlos.scene.handwriting import Strokes, nist_like, redrawn
 from evnlos.scene.scene import Target
 from evnlos.untrusted import open_image
@@ -44,14 +51,15 @@ class GlyphSet(Protocol):
 
 
 @dataclass(frozen=True)
-class Plate:
-    """The square plate that carries a character.
+class TargetPlane:
+    """The square that carries a character.
 
     Args:
-        size_m: Side of the plate, metres.
+        size_m: Side of the target plane, metres.
         size_px: Side of the mask, pixels.
-        letter_fraction: Longer side of a letter as a part of the plate's side, 0..1.
-        digit_fraction: Longer side of a digit as a part of the plate's side, 0..1; smaller, as in the paper.
+        letter_fraction: Longer side of a letter as a part of the target plane's side, 0..1.
+        digit_fraction: Longer side of a digit as a part of the target plane's side, 0..1; smaller, as in the
+            paper.
     """
 
     size_m: float = 0.08
@@ -66,7 +74,7 @@ class Plate:
             check_size(self.size_px, fraction)
 
     def fraction(self, char: str) -> float:
-        """Return the part of the plate's side that this character fills."""
+        """Return the part of the target plane's side that this character fills."""
         return self.digit_fraction if char in DIGITS else self.letter_fraction
 
 
@@ -80,8 +88,8 @@ class HandwritingGlyphs:
         first_writer: Number of the first writer; 39 and above are held out for testing.
         characters: Characters that each writer writes.
         strokes: Base faces and pens.
-        plate: The plate that carries a character.
-        known: Folder with pictures of known targets of this plate's size, NAME.png; "" = none.
+        target_plane: The target plane that carries a character.
+        known: Folder with pictures of known targets of this target's size, NAME.png; "" = none.
         redrawn: How often each known target is drawn again, as by another hand (see `redrawn`); these objects
             come after those of the writers.
     """
@@ -91,7 +99,7 @@ class HandwritingGlyphs:
     first_writer: int = 0
     characters: str = UPPER_CASE
     strokes: Strokes = field(default_factory=Strokes)
-    plate: Plate = field(default_factory=Plate)
+    target_plane: TargetPlane = field(default_factory=TargetPlane)
     known: str = ""
     redrawn: int = 0
 
@@ -113,10 +121,12 @@ class HandwritingGlyphs:
         hand, _, name = object_id.partition("_")
         if self.redrawn and hand.startswith("redrawn"):
             drawing = _look_up(_known_targets(self.known), name)
-            return Target(object_id, redrawn(drawing, name, int(hand[7:]), seed), self.plate.size_m)
+            return Target(object_id, redrawn(drawing, name, int(hand[7:]), seed), self.target_plane.size_m)
         writer, char = _look_up(_handwriting_index(self), object_id)
-        mask = nist_like(writer, char, seed, self.plate.size_px, self.plate.fraction(char), self.strokes)
-        return Target(object_id, mask, self.plate.size_m)
+        mask = nist_like(
+            writer, char, seed, self.target_plane.size_px, self.target_plane.fraction(char), self.strokes
+        )
+        return Target(object_id, mask, self.target_plane.size_m)
 
     def notes(self) -> list[str]:
         """Return a line that says what stands in for NIST's handwriting."""
@@ -131,13 +141,13 @@ class FontGlyphs:
         kind: Names this kind of set in a settings file.
         family: Family with optional weight and slant, or a font file.
         characters: Characters to draw.
-        plate: The plate that carries a character.
+        target_plane: The target plane that carries a character.
     """
 
     kind: Literal["font"] = "font"
     family: str = "Comic Neue Bold"
     characters: str = UPPER_CASE + DIGITS
-    plate: Plate = field(default_factory=Plate)
+    target_plane: TargetPlane = field(default_factory=TargetPlane)
 
     def __post_init__(self) -> None:
         _check_characters(self.characters)
@@ -153,8 +163,8 @@ class FontGlyphs:
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one character; the seed has no part in it."""
         char = _look_up(_font_index(self), object_id)
-        mask = render_glyph(char, self.font(), self.plate.size_px, self.plate.fraction(char))
-        return Target(object_id, mask, self.plate.size_m)
+        mask = render_glyph(char, self.font(), self.target_plane.size_px, self.target_plane.fraction(char))
+        return Target(object_id, mask, self.target_plane.size_m)
 
     def notes(self) -> list[str]:
         """Return a line for the user where another font stands in for this one."""
@@ -173,7 +183,7 @@ class NistGlyphs:
         partition: Group of writers: hsf_0 to hsf_8, or train; hsf_4 is NIST's own choice for testing.
         first: Number of images of each character to pass over.
         per_character: Number of images of each character to take.
-        plate: The plate that carries a character.
+        target_plane: The target plane that carries a character.
     """
 
     kind: Literal["nist-sd19"] = "nist-sd19"
@@ -182,7 +192,7 @@ class NistGlyphs:
     partition: str = "hsf_0"
     first: int = 0
     per_character: int = 39
-    plate: Plate = field(default_factory=Plate)
+    target_plane: TargetPlane = field(default_factory=TargetPlane)
 
     def __post_init__(self) -> None:
         _check_characters(self.characters)
@@ -195,8 +205,10 @@ class NistGlyphs:
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one scanned character, cut to its ink and centred; the seed has no part in it."""
         char, path = _look_up(_nist_index(self), object_id)
-        mask = fit_to_plate(read_sd19_image(path), self.plate.size_px, self.plate.fraction(char))
-        return Target(object_id, mask, self.plate.size_m)
+        mask = fit_to_target_plane(
+            read_sd19_image(path), self.target_plane.size_px, self.target_plane.fraction(char)
+        )
+        return Target(object_id, mask, self.target_plane.size_m)
 
     def notes(self) -> list[str]:
         """Return nothing: the images are what their name says."""
@@ -215,7 +227,7 @@ class EmnistGlyphs:
         part: Part of the subset: train or test.
         first: Number of images of each character to pass over.
         per_character: Number of images of each character to take.
-        plate: The plate that carries a character.
+        target_plane: The target plane that carries a character.
     """
 
     kind: Literal["emnist"] = "emnist"
@@ -225,7 +237,7 @@ class EmnistGlyphs:
     part: Literal["train", "test"] = "train"
     first: int = 0
     per_character: int = 39
-    plate: Plate = field(default_factory=Plate)
+    target_plane: TargetPlane = field(default_factory=TargetPlane)
 
     def __post_init__(self) -> None:
         _check_characters(self.characters)
@@ -238,8 +250,10 @@ class EmnistGlyphs:
     def target(self, object_id: ObjectId, seed: int = 0) -> Target:
         """Return one character, cut to its ink, enlarged and centred; the seed has no part in it."""
         char, number = _look_up(_emnist_index(self), object_id)
-        mask = fit_to_plate(_emnist_images(self)[number], self.plate.size_px, self.plate.fraction(char))
-        return Target(object_id, mask, self.plate.size_m)
+        mask = fit_to_target_plane(
+            _emnist_images(self)[number], self.target_plane.size_px, self.target_plane.fraction(char)
+        )
+        return Target(object_id, mask, self.target_plane.size_m)
 
     def notes(self) -> list[str]:
         """Return nothing: the images are what their name says."""
@@ -324,14 +338,14 @@ class DrawingGlyphs:
         kinds: Kinds of drawings.
         each: Number of objects of each kind.
         first: Number of the first object of each kind.
-        plate: The plate that carries a drawing; its fractions are for characters only.
+        target_plane: The target plane that carries a drawing; its fractions are for characters only.
     """
 
     kind: Literal["drawings"] = "drawings"
     kinds: tuple[str, ...] = KINDS
     each: int = 12
     first: int = 0
-    plate: Plate = field(default_factory=Plate)
+    target_plane: TargetPlane = field(default_factory=TargetPlane)
 
     def __post_init__(self) -> None:
         unknown = [kind for kind in self.kinds if kind not in KINDS]
@@ -349,7 +363,9 @@ class DrawingGlyphs:
         kind, _, number = object_id.rpartition("_")
         if kind not in self.kinds or not number.isdecimal():
             raise ConfigError(f"object {object_id!r} is none of these drawings; give one of objects()")
-        return Target(object_id, drawing(kind, int(number), seed, self.plate.size_px), self.plate.size_m)
+        return Target(
+            object_id, drawing(kind, int(number), seed, self.target_plane.size_px), self.target_plane.size_m
+        )
 
     def notes(self) -> list[str]:
         """Return nothing: no font stands in for another."""

@@ -1,4 +1,4 @@
-"""Draw one character of a font on a square plate, and name characters so that any file system can hold them."""
+"""One character of a font drawn on a square target plane, and names of characters for any file system."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _MAX_SIZE_PX = 2048
 
 
 def render_glyph(char: str, font: Font, size_px: int = 256, fraction: float = 1.0) -> NDArray[np.float32]:
-    """Draw `char` as large as fits a centred square of `fraction` of the plate, bright on dark, anti-aliased.
+    """Draw `char` as large as fits a centred square of `fraction` of the target, bright on dark, anti-aliased.
 
-    The ink's bounding box is centred, and its longer side is `fraction` of the plate's side: the shape counts,
+    The ink's bounding box is centred, and its longer side is `fraction` of the target's side: the shape counts,
     not the font's metrics.
 
     Args:
         char: One character.
         font: Face to draw with (see `find_font`).
         size_px: Side of the mask, pixels, 8 to 2048.
-        fraction: Longer side of the ink as a part of the plate's side, above 0 to 1.
+        fraction: Longer side of the ink as a part of the target plane's side, above 0 to 1.
 
     Returns:
         float32 [size_px, size_px], 0..1, row 0 on top.
@@ -56,13 +56,13 @@ def render_glyph(char: str, font: Font, size_px: int = 256, fraction: float = 1.
     return np.asarray(canvas.reduce(_SUPERSAMPLING), dtype=np.float32) / np.float32(255)
 
 
-def fit_to_plate(picture: NDArray, size_px: int = 256, fraction: float = 1.0) -> NDArray[np.float32]:
-    """Cut a picture of a character to its ink, scale the ink as `render_glyph` does and centre it on the plate.
+def fit_to_target_plane(picture: NDArray, size_px: int = 256, fraction: float = 1.0) -> NDArray[np.float32]:
+    """Cut a picture of a character to its ink, scale the ink as `render_glyph` does and centre it.
 
     Args:
         picture: Bright ink on dark ground, [h, w], 0..1.
         size_px: Side of the mask, pixels, 8 to 2048.
-        fraction: Longer side of the ink as a part of the plate's side, above 0 to 1.
+        fraction: Longer side of the ink as a part of the target plane's side, above 0 to 1.
 
     Returns:
         float32 [size_px, size_px], 0..1.
@@ -78,21 +78,22 @@ def fit_to_plate(picture: NDArray, size_px: int = 256, fraction: float = 1.0) ->
     if not len(rows):
         raise DataError("a character's picture holds no ink (nothing above 0.5); leave it out")
     top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
-    # The square that becomes the plate, in the picture's pixels; a margin of zeros lets it reach outside.
+    # The square that becomes the target plane, in the picture's pixels; a margin of zeros lets it reach
+    # outside.
     side = max(bottom - top, right - left) / fraction
     margin = int(np.ceil(side)) + 2
     padded = Image.fromarray(np.pad(image, margin))
     x, y = margin + (left + right - side) / 2, margin + (top + bottom - side) / 2
-    plate = padded.resize((size_px, size_px), Image.Resampling.BICUBIC, box=(x, y, x + side, y + side))
-    return np.clip(np.asarray(plate, dtype=np.float32), 0, 1)
+    mask = padded.resize((size_px, size_px), Image.Resampling.BICUBIC, box=(x, y, x + side, y + side))
+    return np.clip(np.asarray(mask, dtype=np.float32), 0, 1)
 
 
 def check_size(size_px: int, fraction: float) -> None:
-    """Raise DataError for a mask side (pixels) or a part of the plate outside its range."""
+    """Raise DataError for a mask side (pixels) or a part of the target plane outside its range."""
     if not 8 <= size_px <= _MAX_SIZE_PX:
         raise DataError(f"size_px is {size_px}; give 8 to {_MAX_SIZE_PX} pixels")
     if not 0 < fraction <= 1:
-        raise DataError(f"fraction is {fraction}; give a part of the plate above 0 and up to 1")
+        raise DataError(f"fraction is {fraction}; give a part of the target plane above 0 and up to 1")
 
 
 def character_name(char: str) -> str:

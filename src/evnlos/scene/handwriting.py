@@ -207,14 +207,15 @@ def nist_like(
     fraction: float = 1.0,
     strokes: Strokes = Strokes(),
 ) -> NDArray[np.float32]:
-    """Write one character in a writer's hand on a square plate: a stand-in for NIST's scanned handwriting.
+    """Write one character in a writer's hand on a square target plane: a stand-in for NIST's scanned
+    handwriting.
 
     Args:
         writer: Number of the writer, 0 or more (see `held_out_writers`).
         char: One character, A-Z, a-z or 0-9.
         seed: Seed of the population; the picture depends on (seed, writer, char) and on nothing else.
         size_px: Side of the mask, pixels, 8 to 2048.
-        fraction: Room for the ink as a part of the plate's side, above 0 to 1.
+        fraction: Room for the ink as a part of the target plane's side, above 0 to 1.
         strokes: Base faces and pens of the population of writers.
 
     Returns:
@@ -250,7 +251,7 @@ def nist_like(
     # Thinning stops early: beyond it the thin parts of a stroke would break.
     thicken = max((pen - now) / 2, -0.22 * now)
     distance = signed_distance(drawn, reach=int(np.ceil(abs(thicken))) + 3)
-    return _to_plate(np.clip(thicken - distance + 0.5, 0.0, 1.0), size_px, room)
+    return _to_target_plane(np.clip(thicken - distance + 0.5, 0.0, 1.0), size_px, room)
 
 
 def redrawn(drawing: NDArray[np.float32], name: str, number: int, seed: int) -> NDArray[np.float32]:
@@ -284,10 +285,10 @@ def redrawn(drawing: NDArray[np.float32], name: str, number: int, seed: int) -> 
     drawn = _deform(base, growth * shape, waves, (-middle[0], -middle[1]), _CANVAS_PX)
     thicken = pen_px(drawn) * _between((-0.12, 0.12), rng.random())
     distance = signed_distance(drawn, reach=int(np.ceil(abs(thicken))) + 3)
-    return _to_plate(np.clip(thicken - distance + 0.5, 0.0, 1.0), len(drawing), room)
+    return _to_target_plane(np.clip(thicken - distance + 0.5, 0.0, 1.0), len(drawing), room)
 
 
-def _to_plate(ink: NDArray[np.float32], size_px: int, room: float) -> NDArray[np.float32]:
+def _to_target_plane(ink: NDArray[np.float32], size_px: int, room: float) -> NDArray[np.float32]:
     """Centre the ink, shrink it to `room` where it came out larger, and sample it at `size_px`."""
     left, top, right, bottom = ink_box(ink)
     excess = max((right - left) / room, (bottom - top) / room, 1.0)
@@ -296,8 +297,8 @@ def _to_plate(ink: NDArray[np.float32], size_px: int, room: float) -> NDArray[np
     x = margin + _CANVAS_PX / 2 + (left + right - side) / 2
     y = margin + _CANVAS_PX / 2 + (top + bottom - side) / 2
     padded = Image.fromarray(np.pad(ink.astype(np.float32), margin))
-    plate = padded.resize((size_px, size_px), Image.Resampling.BILINEAR, box=(x, y, x + side, y + side))
-    return np.clip(np.asarray(plate, dtype=np.float32), 0.0, 1.0)
+    mask = padded.resize((size_px, size_px), Image.Resampling.BILINEAR, box=(x, y, x + side, y + side))
+    return np.clip(np.asarray(mask, dtype=np.float32), 0.0, 1.0)
 
 
 def _deform(

@@ -27,7 +27,7 @@ class Pose(NamedTuple):
 
 @runtime_checkable
 class Motion(Protocol):
-    """Anything that knows where the plate's centre is at every instant.
+    """Anything that knows where the target's centre is at every instant.
 
     The distance of the target and its pose belong to the scene: a motion that knows them has a method
     `pose(t_s) -> Pose` too. Without one it stays upright in one plane, at the distance that is the setup's.
@@ -134,7 +134,7 @@ class PathMotion:
 
     Each coordinate is a cubic Hermite curve with the slopes of Fritsch and Butland (1984): it passes through
     every point, its velocity is continuous, and it never leaves the range of two neighbouring points. The slope
-    at both ends is zero, so that the plate starts from rest and comes to rest.
+    at both ends is zero, so that the target starts from rest and comes to rest.
 
     Args:
         times_s: Times of the points, seconds, strictly increasing, two or more.

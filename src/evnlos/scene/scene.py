@@ -1,4 +1,4 @@
-"""A hidden object: a flat square plate with a mask of where it shines, and its drawing on a sampled plane.
+"""A hidden object: a flat, square target with a mask of where it shines, and its drawing on a plane.
 
 - What is hidden: a target and how it moves.
 """
@@ -14,17 +14,17 @@ from evnlos.errors import DataError
 from evnlos.scene.motion import LineMotion, Motion, Pose, pose_of
 from evnlos.types import Plane
 
-_MAX_SIDE = 4096  # pixels; a drawing of 20 um a pixel on an 8 cm plate
+_MAX_SIDE = 4096  # pixels; a drawing of 20 um a pixel on an 8 cm target
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A flat, square plate that moves behind the corner.
+    """A flat, square target that moves behind the corner.
 
     Args:
         name: Name of the object, not empty.
-        mask: How bright each part of the plate is, float32 [S, S], 0..1, row 0 on top; it covers the plate.
-        size_m: Side of the plate, metres.
+        mask: How bright each part of the target is, float32 [S, S], 0..1, row 0 on top; it covers the target.
+        size_m: Side of the target plane, metres.
 
     Raises:
         DataError: The mask is not square, holds NaN or values outside 0..1, or the size is not positive.
@@ -68,18 +68,18 @@ class Target:
         return same and np.array_equal(self.mask, other.mask)
 
     def rasterise(self, plane: Plane, position_m: ArrayLike = (0.0, 0.0)) -> NDArray[np.float32]:
-        """Draw the plate on a sampled plane, exactly: each sample is the mean of the mask over its cell.
+        """Draw the target on a sampled plane, exactly: each sample is the mean of the mask over its cell.
 
         With O_y [H, S] and O_x [W, S] the fractions of each cell that each mask pixel covers along one axis,
         the picture is O_y mask O_x^T (computed from running integrals). Light is conserved: where the whole
-        plate lies on the plane, picture.sum() pitch^2 = mask.mean() size^2, at any sub-pixel position.
+        target lies on the plane, picture.sum() pitch^2 = mask.mean() size^2, at any sub-pixel position.
 
         Args:
             plane: The plane to draw on.
-            position_m: Plate's centre (x, y) in the plane's coordinates, metres, [2], or [N, 2] for N places.
+            position_m: Target's centre (x, y) in the plane's coordinates, metres, [2], or [N, 2] for N places.
 
         Returns:
-            float32 [H, W], or [N, H, W] for N places, 0..1; zero outside the plate.
+            float32 [H, W], or [N, H, W] for N places, 0..1; zero outside the target plane.
 
         Raises:
             DataError: The position is not finite or of another shape.
@@ -115,7 +115,7 @@ class Target:
     def _edges(
         self, centre_m: NDArray[np.float64], pitch_m: float, place_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the edges of a plane's cells, mask pixels from the plate's edge, float64 [N, cells + 1]."""
+        """Return the edges of a plane's cells, mask pixels from the target's edge, float64 [N, cells + 1]."""
         edge_m = np.append(centre_m - 0.5 * pitch_m, centre_m[-1] + 0.5 * pitch_m)
         side = self.mask.shape[0]
         return (edge_m[None, :] - place_m[:, None]) * (side / self.size_m) + 0.5 * side
@@ -157,7 +157,7 @@ class Scene:
     """A target, its motion, and for how long it is watched.
 
     Args:
-        target: The hidden plate.
+        target: The hidden target.
         motion: Where its centre is at every instant.
         duration_s: Length of the recording that starts at 0 s, seconds.
 

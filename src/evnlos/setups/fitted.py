@@ -306,7 +306,7 @@ class FittedSetup(Setup):
         for name, needed, side in zip(("width", "height"), reach, self.strip_m, strict=True):
             if needed > side / 2 + self.cell_m:
                 raise ConfigError(
-                    f"the plate reaches {needed:.3f} m from the middle of a strip of {name} {side} m; "
+                    f"the target reaches {needed:.3f} m from the middle of a strip of {name} {side} m; "
                     f"set strip_m to at least {2 * needed:.3f} m there"
                 )
         return positions

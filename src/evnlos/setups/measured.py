@@ -202,7 +202,7 @@ class MeasuredSetup(Setup):
             side = plane.extent_m[1 - k]
             if reach > side / 2 + plane.pitch_m:
                 raise ConfigError(
-                    f"the plate reaches {reach:.3f} m from the middle of a scanned plane of {axis} {side:.3f} "
+                    f"the target reaches {reach:.3f} m from the middle of a scanned plane of {axis} {side:.3f} "
                     "m; "
                     f"scan at least {2 * reach:.3f} m there, or shorten the travel"
                 )

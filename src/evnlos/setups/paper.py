@@ -45,7 +45,7 @@ class PaperSetup(Setup):
     wavelength_m: float = 500e-9
     """Wavelength, metres."""
     pitch_m: float = 3.125e-4
-    """Distance between samples of the plate, metres; 8 cm / 256 by default."""
+    """Distance between samples of the target, metres; 8 cm / 256 by default."""
     wave_pitch_m: float | None = None
     """Pitch that the propagation sees, metres; None is the physical `pitch_m`, about 1e-5 shows fringes."""
     field: Literal["intensity", "amplitude"] = "intensity"
@@ -93,12 +93,12 @@ class PaperSetup(Setup):
         return View.affine(shape, scale, turn, self.shear, self.stretch, (across, down))
 
     def transport(self, size_m: float) -> Transport:
-        """Return diffraction, then diffuse reflection, for a plate of side `size_m`, metres; not linear."""
+        """Return diffraction, then diffuse reflection, for a target of side `size_m`, metres; not linear."""
         plane = self.source(size_m)
         return self._diffraction(plane).then(DiffuseReflection(plane, self._kernel(self.pitch_m)))
 
     def source(self, size_m: float) -> Plane:
-        """Return the plane on which a plate of side `size_m` is drawn: the plate and room for its fringes."""
+        """Return the plane on which a target of side `size_m` is drawn: the target and room for its fringes."""
         check_lengths(pitch_m=self.pitch_m, size_m=size_m)
         side = math.ceil(size_m / self.pitch_m * (1 - 1e-9))
         fringes = blur_radius_px(self._wave_pitch_m, self.wavelength_m, self.distance_m)

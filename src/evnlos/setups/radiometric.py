@@ -364,15 +364,15 @@ class RadiometricSetup(Setup):
         for name, needed, side in zip(("width", "height"), reach, self.strip_m, strict=True):
             if needed > side / 2 + self.cell_m:
                 raise ConfigError(
-                    f"the plate reaches {needed:.3f} m from the middle of a strip of {name} {side} m; "
+                    f"the target reaches {needed:.3f} m from the middle of a strip of {name} {side} m; "
                     f"set strip_m to at least {2 * needed:.3f} m there"
                 )
 
-    def _check_cells(self, plate_m: float) -> None:
-        if self.cell_m > plate_m / _LEAST_CELLS * (1 + 1e-9):
+    def _check_cells(self, target_size_m: float) -> None:
+        if self.cell_m > target_size_m / _LEAST_CELLS * (1 + 1e-9):
             raise ConfigError(
-                f"cell_m is {self.cell_m:g} m; a plate of {plate_m:g} m needs {_LEAST_CELLS} "
-                f"cells a side to show any shape: give at most {plate_m / _LEAST_CELLS:g} m"
+                f"cell_m is {self.cell_m:g} m; a target of {target_size_m:g} m needs {_LEAST_CELLS} "
+                f"cells a side to show any shape: give at most {target_size_m / _LEAST_CELLS:g} m"
             )
 
 

@@ -90,9 +90,9 @@ class RoomSetup(Setup):
     vignetting: float = 0.0
     """Loss of light in the corners beside the cosine's fourth power, 0..1."""
     mount: Mount = field(default_factory=Mount)
-    """What shines beside the plate."""
+    """What shines beside the target plane."""
     lamp: Torch | None = None
-    """A torch that lights the plate; None: it shines itself."""
+    """A torch that lights the target; None: it shines itself."""
     ripple: float = 0.0
     """Amplitude of the lamps' ripple, share of all light, 0 to below 1."""
     ripple_hz: float = 99.97

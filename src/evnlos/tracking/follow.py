@@ -96,7 +96,7 @@ class Tracking:
     """Length of a window of events that gives one velocity, seconds."""
     events: bool = True
     """Use the events; without them only the frames speak."""
-    plate_m: float = 0.1
+    target_size_m: float = 0.1
     """With a setup: side of a square that surely holds the object, metres."""
     cells: int = 20
     """With a setup: cells a side of that square."""
@@ -108,7 +108,7 @@ class Tracking:
     def __post_init__(self) -> None:
         if self.columns < 16:
             raise ConfigError(f"Tracking.columns is {self.columns}; give 16 pixels or more")
-        for name in ("window_s", "plate_m"):
+        for name in ("window_s", "target_size_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"Tracking.{name} is {getattr(self, name)}; give a positive number")
 
@@ -223,7 +223,9 @@ def _in_metres(
     to_plane = plane_map(setup, shape)
     light = torch.from_numpy(small - found.background)
     start_m = to_plane(found.place_px)
-    fitted = fit_motion(light, setup, start_m, noise, settings.plate_m, settings.cells, depth=settings.depth)
+    fitted = fit_motion(
+        light, setup, start_m, noise, settings.target_size_m, settings.cells, depth=settings.depth
+    )
     sigma = np.sqrt(np.diagonal(fitted.covariance, axis1=1, axis2=2))
     velocity = None
     if by_events is not None:

@@ -1,6 +1,6 @@
 """Approach and retreat: the setup with its target's plane at other distances.
 
-- Positions by the calibrated operator: places and distances that make the frames of one plate likeliest.
+- Positions by the calibrated operator: places and distances that make the frames of one target likeliest.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
-from evnlos.inverse import PlatePass
+from evnlos.inverse import SequenceOperator
 from evnlos.inverse.joint import matrix_of, mean_weight, strip_of
 from evnlos.inverse.operators import Gradient, normal_matrix
 from evnlos.optics import MatrixTransport
@@ -80,31 +80,31 @@ def _place(log_distance: float) -> tuple[int, float]:
 _ROUNDS = 16
 _HALF_STEP = 0.25  # cells
 _STATIC = 1.0  # a pixel's constant offset over its noise
-_PRIOR = 3.0  # weight of the plate's smoothness, in units of the noise's variance
+_PRIOR = 3.0  # weight of the target's smoothness, in units of the noise's variance
 _MARGIN_M = 0.02
 _LONGEST_M = 0.01  # step of one round
 _ENOUGH = 0.1  # of a place's standard deviation: a step below it changes nothing that is known
-_UNTOLD = 1e-3  # share of a direction's information that the plate leaves, below which it is not told
+_UNTOLD = 1e-3  # share of a direction's information that the target leaves, below which it is not told
 
 
 @dataclass(frozen=True, eq=False)
 class MotionFit:
-    """Positions of the plate and the plate itself.
+    """Positions of the target and the target itself.
 
     Args:
         position_m: Middle of the object's light (x, y), float64 [N, 2], metres.
         covariance: Of each position, [N, 2, 2], squared metres.
-        plate: The object, its light's middle in the array's middle, float64 [n, n].
-        log_distance: ln(distance to the wall / the setup's), [N]; its mean is 0, as a plate that is nearer and
+        target: The object, its light's middle in the array's middle, float64 [n, n].
+        log_distance: ln(distance to the wall / the setup's), [N]; its mean is 0, as a target that is nearer and
             one that is larger and dimmer look much the same. None where it was not looked for.
         log_distance_sigma: Its standard deviation, [N].
-        misfit: What the plate leaves of the frames' changes, over their noise, root mean square; 1 is a setup
+        misfit: What the target leaves of the frames' changes, over their noise, root mean square; 1 is a setup
             that explains all.
     """
 
     position_m: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    plate: torch.Tensor
+    target: torch.Tensor
     log_distance: NDArray[np.float64] | None = None
     log_distance_sigma: NDArray[np.float64] | None = None
     misfit: float = 1.0
@@ -115,45 +115,45 @@ def fit_motion(
     setup: Setup,
     start_m: NDArray[np.float64],
     noise: float,
-    plate_m: float,
+    target_size_m: float,
     cells: int = 20,
     *,
     depth: bool = False,
 ) -> MotionFit:
-    """Find the places of a plate, and the plate, that explain the frames best: Gauss and Newton's method.
+    """Find the places of a target, and the target, that explain the frames best: Gauss and Newton's method.
 
-    The plate is eliminated (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973): a step
-    of the places knows that the plate follows, as it does where a path is stretched or a plate comes nearer on
-    its way. A plate and a path are only known together up to a shift; the plate's middle of light is the
-    reference.
+    The target is eliminated (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973): a
+    step of the places knows that the target follows, as it does where a path is stretched or a target comes
+    nearer on its way. A target and a path are only known together up to a shift; the target's middle of light
+    is the reference.
 
     Args:
         light: Frames without ambient light, white levels, [N, h, w].
         setup: The setup.
         start_m: First guess of the positions, [N, 2], metres.
         noise: Standard deviation of a sample's noise, white levels.
-        plate_m: Side of a plate that surely holds the object, metres.
+        target_size_m: Side of a target plane that surely holds the object, metres.
         cells: Cells a side of it.
         depth: Find the distance to the wall in each frame too.
     """
-    plate = Plane(cells, cells, plate_m / cells)
+    target_plane = Plane(cells, cells, target_size_m / cells)
     shape = (int(light.shape[1]), int(light.shape[2]))
     reach = np.concatenate([start_m + _MARGIN_M, start_m - _MARGIN_M])
     # The gain's exact meaning does not matter for places.
-    transport = matrix_of(setup.resized(shape).operator(strip_of(reach, plate)))
+    transport = matrix_of(setup.resized(shape).operator(strip_of(reach, target_plane)))
     depths = Depths(setup, transport) if depth else None
-    blank = torch.zeros(plate.shape, dtype=torch.float64)
+    blank = torch.zeros(target_plane.shape, dtype=torch.float64)
     prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), blank)
     distance_m = setup.default_distance_m or 1.0  # only a scale, where no depth is looked for
     state = np.zeros((len(start_m), 3 if depth else 2))  # x, y, and R ln(distance / R), metres
     state[:, :2] = start_m
     image, covariance, misfit = blank, np.zeros((len(state), state.shape[1], state.shape[1])), 1.0
     for _ in range(_ROUNDS):
-        fit = Fit(plate, transport, depths, state, distance_m)
+        fit = Fit(target_plane, transport, depths, state, distance_m)
         image, step, covariance, misfit = fit.step(light.double(), prior, noise)
         state = state + step * min(1.0, _LONGEST_M / np.abs(step).max())
-        # The place of the light's middle: the plate is drawn around it the next time.
-        state[:, :2] += _middle(image.numpy()) * plate.pitch_m
+        # The place of the light's middle: the target is drawn around it the next time.
+        state[:, :2] += _middle(image.numpy()) * target_plane.pitch_m
         state[:, 2:] -= state[:, 2:].mean(axis=0)
         state[:, 2:] = np.clip(state[:, 2:], -REACH * distance_m, REACH * distance_m)
         if (np.abs(step) < _ENOUGH * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))).all():
@@ -171,10 +171,10 @@ def _middle(image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Fit:
-    """The frames as a function of plate and places, around one state.
+    """The frames as a function of target and places, around one state.
 
     Args:
-        plate: The plate's cells.
+        target_plane: The target plane's cells.
         transport: The setup's matrix from the strip.
         depths: The matrices of other distances, where those are looked for.
         state: x, y and, with `depths`, R ln(distance / R) of each frame, [N, K], metres.
@@ -183,7 +183,7 @@ class Fit:
 
     def __init__(
         self,
-        plate: Plane,
+        target_plane: Plane,
         transport: MatrixTransport,
         depths: Depths | None,
         state: NDArray[np.float64],
@@ -191,8 +191,10 @@ class Fit:
     ) -> None:
         self._depths, self._state, self._distance_m = depths, state, distance_m
         self._sights = [
-            PlatePass(
-                transport if depths is None else depths.at(float(place[2]) / distance_m), plate, place[None, :2]
+            SequenceOperator(
+                transport if depths is None else depths.at(float(place[2]) / distance_m),
+                target_plane,
+                place[None, :2],
             )
             for place in state
         ]
@@ -203,11 +205,11 @@ class Fit:
     def step(
         self, light: torch.Tensor, prior: torch.Tensor, noise: float
     ) -> tuple[torch.Tensor, NDArray[np.float64], NDArray[np.float64], float]:
-        """Return the plate, the step of all frames [N, K], the covariance of each [N, K, K], and the misfit.
+        """Return the target, the step of all frames [N, K], the covariance of each [N, K, K], and the misfit.
 
         Args:
             light: Frames, float64 [N, h, w].
-            prior: Matrix of the plate's prior, [n n, n n].
+            prior: Matrix of the target's prior, [n n, n n].
             noise: Standard deviation of a sample's noise.
         """
         seen = light.flatten(1)  # [N, P]
@@ -215,8 +217,8 @@ class Fit:
         root = torch.linalg.cholesky(normal)
         image = torch.cholesky_solve(self._back(self._moving(seen))[:, None], root)[:, 0]
         left = seen - (self._maps @ image.float()).double()
-        plate = image.reshape(self._sights[0].plate.shape)
-        slope = self._slopes(plate)  # [N, K, P]
+        target = image.reshape(self._sights[0].target_plane.shape)
+        slope = self._slopes(target)  # [N, K, P]
         frames, kinds = slope.shape[:2]
         # Coordinates in which each frame alone would know its place equally well in all directions.
         lower = torch.linalg.cholesky(slope @ slope.mT)
@@ -228,7 +230,7 @@ class Fit:
         shared = torch.linalg.solve_triangular(root, back.mT, upper=False)
         one = torch.eye(len(flat), dtype=flat.dtype)
         own = one - self._still * flat @ flat.mT
-        # A step that is the same in all frames is the plate's own: it is left out.
+        # A step that is the same in all frames is the target's own: it is left out.
         alike = torch.linalg.qr(lower.mT.flatten(0, 1))[0]  # [N K, K]
         apart = one - alike @ alike.mT
         told, ways = torch.linalg.eigh(apart @ (own - shared.mT @ shared) @ apart)
@@ -239,18 +241,18 @@ class Fit:
         misfit = left.square().mean(dim=1).clamp(min=noise**2)
         covariance = misfit[:, None, None] * (up @ each.movedim(-1, 0) @ up.mT)
         unexplained = float(self._moving(left).square().mean().sqrt()) / noise
-        return plate, (up @ step[..., None])[..., 0].numpy(), covariance.numpy(), unexplained
+        return target, (up @ step[..., None])[..., 0].numpy(), covariance.numpy(), unexplained
 
     def _moving(self, frames: torch.Tensor) -> torch.Tensor:
         """Return frames [N, P] without what stands still in them, as far as it is not known."""
         return frames - self._still * frames.sum(dim=0)
 
     def _back(self, frames: torch.Tensor) -> torch.Tensor:
-        """Return the plate's gradient, [n n], of frames [N, P]."""
+        """Return the target's gradient, [n n], of frames [N, P]."""
         return torch.einsum("npc,np->c", self._maps, frames.float()).double()
 
     def _squared(self) -> torch.Tensor:
-        """Return the plate's normal matrix, [n n, n n]."""
+        """Return the target's normal matrix, [n n, n n]."""
         squares = torch.zeros(self._maps.shape[2], self._maps.shape[2], dtype=torch.float64)
         for one in self._maps:
             squares += (one.mT @ one).double()
@@ -260,13 +262,13 @@ class Fit:
         """Return the frames' derivatives by x, y and R ln(distance), [N, K, P], a metre."""
         slopes = []
         for sight, place in zip(self._sights, self._state, strict=True):
-            half = _HALF_STEP * sight.plate.pitch_m
+            half = _HALF_STEP * sight.target_plane.pitch_m
             own = []
             for axis in range(2):
                 shift = np.zeros(2)
                 shift[axis] = half
                 ahead, behind = (
-                    PlatePass(sight.transport, sight.plate, sight.positions_m + way).drawn(image)
+                    SequenceOperator(sight.transport, sight.target_plane, sight.positions_m + way).drawn(image)
                     for way in (shift, -shift)
                 )
                 own.append(sight.transport((ahead - behind) / (2 * half)).flatten())

@@ -202,7 +202,7 @@ def most_likely_acceleration(axes: list[Measurements]) -> float:
 class Distance:
     """How far the object was from the wall, smoothed.
 
-    Its mean is the setup's, which no pass tells: a plate that is nearer and one that is larger look alike.
+    Its mean is the setup's, which no pass tells: a target that is nearer and one that is larger look alike.
 
     Args:
         time_s: Instants of the frames, [N], seconds.
@@ -223,7 +223,7 @@ class Distance:
 class Track:
     """Position and velocity over time, from a smoother, with their standard deviations.
 
-    The position is that of the middle of the object's light; which point of the plate that is, only the
+    The position is that of the middle of the object's light; which point of the target that is, only the
     object's shape could tell. In pixels the origin is its mean over the frames, as a picture has no other.
 
     Args:

@@ -18,7 +18,7 @@ from torch.utils.data import TensorDataset
 from evnlos.data import Dataset, LiveDataset, Modality, NlosDataset
 from evnlos.errors import DataError
 from evnlos.metrics import psnr
-from evnlos.models import Confidence, Reconstructor, Weights, halves_of, plates
+from evnlos.models import Confidence, Reconstructor, Weights, halves_of, on_target_plane
 from evnlos.models.confidence import COVERAGE, GROUPS, LEVELS
 from evnlos.types import Plane, derive_seed
 
@@ -33,16 +33,16 @@ _MIXED = 60  # passes without an object
 def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) -> Confidence:
     """Learn what pictures of a network are worth from passes that it was not trained on.
 
-    Agreement. With d what tells a plate from the network's empty answer (`Confidence.telling`), the agreement
-    is <d1, d2> / E|t|^2: d1 and d2 from the two halves of a pass, t the same of true plates. For a network that
-    answers with the expectation of the truth, whose empty answer is the mean plate, the law of total variance
-    makes it the share of the objects' variance that the measurement explains; noise that the halves do not
-    share cancels. Empty answer and threshold come from passes in which each position saw another object: a
+    Agreement. With d what tells a target from the network's empty answer (`Confidence.telling`), the agreement
+    is <d1, d2> / E|t|^2: d1 and d2 from the two halves of a pass, t the same of true targets. For a network
+    that answers with the expectation of the truth, whose empty answer is the mean target, the law of total
+    variance makes it the share of the objects' variance that the measurement explains; noise that the halves do
+    not share cancels. Empty answer and threshold come from passes in which each position saw another object: a
     network of sequences draws the same for all of them, and that is no sign of any object.
 
-    Intervals. The central 90 % of the true levels of a plate's pixels for each level that the network gave
-    (split conformal, Mondrian by level and by agreement: Vovk et al., Algorithmic Learning in a Random World,
-    2005), so that the coverage holds for passes like these whatever the network is.
+    Intervals. The central 90 % of the true levels of a target plane's pixels for each level that the network
+    gave (split conformal, Mondrian by level and by agreement: Vovk et al., Algorithmic Learning in a Random
+    World, 2005), so that the coverage holds for passes like these whatever the network is.
 
     Args:
         network: The network.
@@ -61,8 +61,8 @@ def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) 
         mine = np.flatnonzero(names == name)
         rows, at = torch.from_numpy(mine), position_m[mine]
         halves.append(halves_of(network, samples.inputs[rows], at, canvas))
-        shown.append(plates(network.infer(samples.inputs[rows], at), canvas, at)[:, 0])
-        true.append(plates(samples.truth[rows].float(), canvas, at)[:, 0])
+        shown.append(on_target_plane(network.infer(samples.inputs[rows], at), canvas, at)[:, 0])
+        true.append(on_target_plane(samples.truth[rows].float(), canvas, at)[:, 0])
     objects_true = torch.stack([one.mean(dim=0) for one in true])
     mean = objects_true.mean(dim=0)
     blank = Confidence(mean, torch.zeros_like(mean), *(torch.ones(()) for _ in range(5)))
@@ -91,7 +91,7 @@ def _mixed(names: NDArray, count: int = _MIXED) -> list[NDArray[np.int64]]:
 
 
 def _ends(passes: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Return the ends of the intervals for each level, [L] and [L], from pairs of plates shown and true."""
+    """Return the ends of the intervals for each level, [L] and [L], from pairs of targets shown and true."""
     shown = torch.cat([one.flatten() for one, _ in passes])
     true = torch.cat([one.flatten() for _, one in passes])
     bins = (shown * LEVELS).long().clamp(0, LEVELS - 1)
