@@ -4,7 +4,7 @@
     python benchmarks/app.py --rounds 9 --write benchmarks/results/app.md
 
 The page is started once and opened in a new browser; a control is moved by a key, and the clock runs until the
-picture of the new pass stands in the page. Needs chromium and chromedriver.
+picture of the new sequence stands in the page. Needs chromium and chromedriver.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CONTROLS = {
     "speed": "Speed of",
 }
 LEFT, RIGHT = "\ue012", "\ue014"
-PASS = "document.querySelector('.ev-sheet').dataset.pass"
+SEQUENCE = "document.querySelector('.ev-sheet').dataset.sequence"
 
 
 FIRST = "first pictures, from opening the address"
@@ -51,11 +51,11 @@ def settle(browser: chromium.Chromium) -> None:
 
 def answer(browser: chromium.Chromium, label: str, key: str) -> float:
     settle(browser)
-    before = browser.run(f"return {PASS}")
+    before = browser.run(f"return {SEQUENCE}")
     browser.run(f"document.querySelector('input[type=range][aria-label*=\"{label}\"]').focus()")
     start = time.perf_counter()
     browser.press(key)
-    browser.wait(f"return {PASS} !== {json.dumps(before)}")
+    browser.wait(f"return {SEQUENCE} !== {json.dumps(before)}")
     return time.perf_counter() - start
 
 

@@ -98,7 +98,9 @@ def scene_wall(height: int, width: int) -> CameraWall:
 
 
 def scene_events(height: int, width: int, seconds: float = SCENE_S) -> Events:
-    """Make the letter, its wall and the events of its pass from nothing, with steps that the camera chooses."""
+    """Make the letter, its wall and the events of its sequence from nothing, with steps that the camera
+    chooses.
+    """
     return EventCamera(PAPER).record(scene_wall(height, width), 0.0, seconds, threads=1)
 
 

@@ -6,7 +6,7 @@ Six ways to give each pixel of a target an interval that shall hold its true lev
 them set on the validation split of `--calibration`, which none of the networks was trained on, and scored on
 `--test`:
 
-    levels         our own: by the level that the network gave and the support of the pass (`Confidence`)
+    levels         our own: by the level that the network gave and the support of the sequence (`Confidence`)
     one width      one half-width for all pixels (split conformal)
     unsure         in proportion to sqrt(p (1 - p) + 0.003), p the network's level (normalised split conformal)
     ensemble       mean of the networks +- 1.645 standard deviations among them, as a Gaussian would have it
@@ -44,13 +44,13 @@ Interval = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Seen:
-    """Targets of some passes.
+    """Targets of some sequences.
 
     Args:
         drawn: What the networks drew, [E, N, 32, 32], 0..1.
         true: The truth, [N, 32, 32], 0..1.
-        owner: Pass of each target, [N].
-        halves: What the halves of each pass show to the first network, [P, 2, 32, 32].
+        owner: Sequence of each target, [N].
+        halves: What the halves of each sequence show to the first network, [P, 2, 32, 32].
     """
 
     drawn: Tensor
@@ -86,13 +86,13 @@ def rank(scores: Tensor) -> float:
 def scaled(
     seen: Seen, middle: Callable[[Seen], Tensor], scale: Callable[[Seen], Tensor]
 ) -> Callable[[Seen], Interval]:
-    """Return middle +- q scale, with q from the calibration passes."""
+    """Return middle +- q scale, with q from the calibration sequences."""
     q = rank((seen.true - middle(seen)).abs() / scale(seen))
     return lambda new: (middle(new) - q * scale(new), middle(new) + q * scale(new))
 
 
 def by_levels(confidence: Confidence, new: Seen) -> Interval:
-    """Return our own intervals, whatever the verdict on the pass is."""
+    """Return our own intervals, whatever the verdict on the sequence is."""
     willing = replace(confidence, threshold=torch.tensor(-torch.inf))
     low, high = torch.zeros_like(new.true), torch.ones_like(new.true)
     for k, halves in enumerate(new.halves):
@@ -103,7 +103,7 @@ def by_levels(confidence: Confidence, new: Seen) -> Interval:
 
 
 class Quantiles(nn.Module):
-    """The 5 % and the 95 % point of a pixel's level, from the picture around it and that of the pass."""
+    """The 5 % and the 95 % point of a pixel's level, from the picture around it and that of the sequence."""
 
     def __init__(self, width: int = 24) -> None:
         super().__init__()
@@ -112,27 +112,27 @@ class Quantiles(nn.Module):
             *(nn.Conv2d(width, width, 3, padding=1), nn.SiLU(), nn.Conv2d(width, 2, 3, padding=1)),
         )
 
-    def forward(self, picture: Tensor, of_pass: Tensor) -> Interval:
-        """Return both ends [N, 32, 32] for a picture and the mean picture of its pass."""
-        away = self.layers(torch.stack([picture, of_pass], dim=1))
+    def forward(self, picture: Tensor, of_sequence: Tensor) -> Interval:
+        """Return both ends [N, 32, 32] for a picture and the mean picture of its sequence."""
+        away = self.layers(torch.stack([picture, of_sequence], dim=1))
         middle = torch.logit(picture.clamp(0.01, 0.99)) + away[:, 0]
         spread = nn.functional.softplus(away[:, 1])
         return torch.sigmoid(middle - spread), torch.sigmoid(middle + spread)
 
 
-def of_passes(seen: Seen) -> Tensor:
-    """Return the mean target of each picture's pass, [N, 32, 32]."""
-    passes = torch.stack([seen.drawn[0, seen.owner == k].mean(dim=0) for k in range(len(seen.halves))])
-    return passes[seen.owner]
+def of_sequences(seen: Seen) -> Tensor:
+    """Return the mean target of each picture's sequence, [N, 32, 32]."""
+    sequences = torch.stack([seen.drawn[0, seen.owner == k].mean(dim=0) for k in range(len(seen.halves))])
+    return sequences[seen.owner]
 
 
 def learned_quantiles(seen: Seen) -> Callable[[Seen], Interval]:
-    """Train on half of the calibration passes and move the ends to cover on the other half."""
+    """Train on half of the calibration sequences and move the ends to cover on the other half."""
     torch.manual_seed(0)
     network = Quantiles()
     optimiser = torch.optim.Adam(network.parameters())
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 4e-3, _STEPS)
-    to_learn, average = torch.nonzero(seen.owner % 2 == 0)[:, 0], of_passes(seen)
+    to_learn, average = torch.nonzero(seen.owner % 2 == 0)[:, 0], of_sequences(seen)
     for _ in range(_STEPS):
         some = to_learn[torch.randint(len(to_learn), (_TARGETS,))]
         loss = torch.zeros(())
@@ -146,7 +146,7 @@ def learned_quantiles(seen: Seen) -> Callable[[Seen], Interval]:
 
     @torch.inference_mode()
     def ends(new: Seen) -> Interval:
-        parts = zip(new.drawn[0].split(200), of_passes(new).split(200), strict=True)
+        parts = zip(new.drawn[0].split(200), of_sequences(new).split(200), strict=True)
         low, high = zip(*(network(*part) for part in parts), strict=True)
         return torch.cat(low), torch.cat(high)
 
@@ -196,15 +196,15 @@ def methods(networks: list[Weights], calibration: Path) -> dict[str, Callable[[S
 
 
 def figures(new: Seen, interval: Interval) -> tuple[float, float, float, float]:
-    """Return coverage, the coverage that nine passes in ten have, mean length, and interval score."""
+    """Return coverage, the coverage that nine sequences in ten have, mean length, and interval score."""
     low, high = (end.clamp(0, 1) for end in interval)
     held = (new.true >= low - 1e-3) & (new.true <= high + 1e-3)
-    passes = [float(held[new.owner == k].float().mean()) for k in range(len(new.halves))]
+    sequences = [float(held[new.owner == k].float().mean()) for k in range(len(new.halves))]
     beyond = (low - new.true).clamp_min(0) + (new.true - high).clamp_min(0)
     score = (high - low) + 2 / (1 - COVERAGE) * beyond
     return (
-        float(np.mean(passes)),
-        float(np.quantile(passes, 0.1)),
+        float(np.mean(sequences)),
+        float(np.quantile(sequences, 0.1)),
         float((high - low).mean()),
         float(score.mean()),
     )
@@ -221,7 +221,9 @@ def main() -> None:
     asked = parser.parse_args()
     networks = [load_weights(one) for one in asked.weights]
     ways = methods(networks, asked.calibration)
-    print("| set | way | coverage | nine passes in ten | length | interval score |\n|---|---|---|---|---|---|")
+    print(
+        "| set | way | coverage | nine sequences in ten | length | interval score |\n|---|---|---|---|---|---|"
+    )
     for folder in asked.test:
         new = look(networks, folder, "test" if open_dataset(folder).split.get("test") else "all")
         for name, way in ways.items():

@@ -2,7 +2,7 @@
 
     python benchmarks/paper_object.py --write benchmarks/results/paper_object.md
 
-One pass of `--preset paper`: 960 x 600 pixels, 8 s, 40 positions; CPU seconds of one thread, the least of
+One sequence of `--preset paper`: 960 x 600 pixels, 8 s, 40 positions; CPU seconds of one thread, the least of
 `--repeat` rounds in which all ways take turns, compilation left out. The ways differ in the event camera alone:
 steps that it chooses itself, and fixed steps of 1 ms, frame by frame (`mode="v2e"`) or in continuous time, with
 the wall rendered strip by strip for the pixels at work or, as a reference, in whole images. What frames and

@@ -2,11 +2,12 @@
 
     python benchmarks/reconstruct.py                 # default network, two threads
     python benchmarks/reconstruct.py --threads 1 --weights RUN
-    python benchmarks/reconstruct.py --weights near-frame-pass
+    python benchmarks/reconstruct.py --weights near-frame-sequence
 
 One position of a capture at 160 x 100: the time surface of the events since the position before, both maps
 brought to 96 x 64, and the network, as a graph (`StreamingReconstructor`) and layer by layer. Of weights that
-see whole passes: a pass of 40 positions, all times divided by 40. Wall time, medians; first runs are left out.
+see whole sequences: a sequence of 40 positions, all times divided by 40. Wall time, medians; first runs are
+left out.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ def untrained(modality: str) -> Weights:
     return Weights(UNetConfig().build(modality, Sampling()).eval())
 
 
-def whole_passes(weights: Weights, events_each: int, rounds: int) -> None:
-    """Time passes of 40 positions and print a row, a position's share."""
+def whole_sequences(weights: Weights, events_each: int, rounds: int) -> None:
+    """Time sequences of 40 positions and print a row, a position's share."""
     draw, positions = np.random.default_rng(1), 40
     frames = draw.integers(0, 256, (positions, 100, 160)).astype(np.uint8)
     each = [events_of_a_position(events_each, n) for n in range(positions)]
@@ -77,7 +78,7 @@ def main() -> None:
     print("|---|---|---|---|---|")
     given = load_weights(args.weights) if args.weights else None
     if given is not None and given.network.sees_sequence:
-        whole_passes(given, args.events, args.rounds)
+        whole_sequences(given, args.events, args.rounds)
         return
     for weights in [given] if given is not None else map(untrained, STANDARD_MODALITIES):
         see = StreamingReconstructor(weights)

@@ -4,9 +4,9 @@
     python benchmarks/tracking.py curve      # the paths whose name starts so
     python benchmarks/tracking.py retreat    # from 28 cm to 32 cm, frames alone: error of the distance, mm rms
 
-Simulated passes of a handwritten letter at 0.3 m, 48 x 32 pixels, 21 frames in 8 s. Error of the position: root
-mean square about its mean, in stroke widths; of the speed: root mean square over the true speed's, per cent;
-"frames": without events.
+Simulated sequences of a handwritten letter at 0.3 m, 48 x 32 pixels, 21 frames in 8 s. Error of the position:
+root mean square about its mean, in stroke widths; of the speed: root mean square over the true speed's, per
+cent; "frames": without events.
 """
 
 import sys

@@ -86,11 +86,11 @@ def tiny_captures(tmp_path_factory) -> list[Path]:
 
 
 @pytest.fixture(scope="session")
-def app_pass():
-    """A pass that the page simulates, at the smallest size."""
-    from evnlos.app.controls import Controls, picked, simulate_pass
+def app_sequence():
+    """A sequence that the page simulates, at the smallest size."""
+    from evnlos.app.controls import Controls, picked, simulate_sequence
 
-    return simulate_pass(Controls(columns=24), picked("R"))
+    return simulate_sequence(Controls(columns=24), picked("R"))
 
 
 @pytest.fixture(scope="session")

@@ -21,10 +21,10 @@ import pytest
 
 import chromium
 from evnlos import Events, hosts
-from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, drawn, picked, simulate_pass
+from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, drawn, picked, simulate_sequence
 from evnlos.app.page import simulated
 from evnlos.app.serve import Server, middleware, running
-from evnlos.app.solving import Networks, from_each_frame, from_weights, from_whole_pass, own_networks
+from evnlos.app.solving import Networks, from_each_frame, from_weights, from_whole_sequence, own_networks
 from evnlos.app.views import event_views, found_views, message_box, seen_views, verdict_on
 from evnlos.cli import main
 from evnlos.data import Sampling
@@ -35,19 +35,21 @@ from evnlos.plot.event_views import CloudSize, cloud_pictures, signed_pictures, 
 SMALL = Controls(columns=24)
 
 
-def test_a_pass_is_the_same_bytes_for_the_same_settings(app_pass) -> None:
-    again = simulate_pass(SMALL, picked("R"))
-    assert again.events == app_pass.events and len(app_pass.events) > 300
-    np.testing.assert_array_equal(again.frames, app_pass.frames)
-    assert simulate_pass(replace(SMALL, seed=2), picked("R")).events != app_pass.events
+def test_a_sequence_is_the_same_bytes_for_the_same_settings(app_sequence) -> None:
+    again = simulate_sequence(SMALL, picked("R"))
+    assert again.events == app_sequence.events and len(app_sequence.events) > 300
+    np.testing.assert_array_equal(again.frames, app_sequence.frames)
+    assert simulate_sequence(replace(SMALL, seed=2), picked("R")).events != app_sequence.events
 
 
-def test_settings_do_what_they_say(app_pass) -> None:
-    faster = simulate_pass(replace(SMALL, speed_m_s=0.04), picked("R"))
-    assert faster.times_s[-1] == pytest.approx(app_pass.times_s[-1] / 2)
-    higher = simulate_pass(replace(SMALL, threshold_on=0.3, threshold_off=0.3), picked("R"))
-    assert len(higher.events) < 0.7 * len(app_pass.events)
-    assert simulate_pass(replace(SMALL, ambient=0.4), picked("R")).frames.min() > app_pass.frames.max() / 2
+def test_settings_do_what_they_say(app_sequence) -> None:
+    faster = simulate_sequence(replace(SMALL, speed_m_s=0.04), picked("R"))
+    assert faster.times_s[-1] == pytest.approx(app_sequence.times_s[-1] / 2)
+    higher = simulate_sequence(replace(SMALL, threshold_on=0.3, threshold_off=0.3), picked("R"))
+    assert len(higher.events) < 0.7 * len(app_sequence.events)
+    assert (
+        simulate_sequence(replace(SMALL, ambient=0.4), picked("R")).frames.min() > app_sequence.frames.max() / 2
+    )
     usual, noisy = (Controls(frame_noise=n).simulation().frame_camera for n in (1.0, 3.0))
     for level in (0.0, 0.3):
         # Shot and read noise in white levels, both three times as strong.
@@ -67,7 +69,7 @@ def test_a_drawing_is_a_target() -> None:
     ink[4:9, 10:] = 255
     target = drawn(ink.tobytes().hex())
     np.testing.assert_array_equal(target.mask, ink / np.float32(255))
-    assert simulate_pass(SMALL, target).truth(Sampling()).max() > 0.9
+    assert simulate_sequence(SMALL, target).truth(Sampling()).max() > 0.9
     for wrong in ("", "00" * INK_SIDE**2, "ff", "zz" * INK_SIDE**2, "FF" * INK_SIDE**2, "f" * 10**6):
         with pytest.raises(DataError):
             drawn(wrong)
@@ -76,23 +78,23 @@ def test_a_drawing_is_a_target() -> None:
     assert picked(CHARACTERS[0]).mask.any()
 
 
-def test_classical_pictures_beat_black_and_the_whole_pass_beats_one_frame(app_pass) -> None:
-    whole, single = from_whole_pass(app_pass), from_each_frame(app_pass)
+def test_classical_pictures_beat_black_and_the_whole_sequence_beats_one_frame(app_sequence) -> None:
+    whole, single = from_whole_sequence(app_sequence), from_each_frame(app_sequence)
     middle = slice(10, 30)
     assert whole.psnr_db[middle].mean() > single.psnr_db[middle].mean() + 0.5
     assert single.psnr_db[middle].mean() > single.black_db[middle].mean() + 1.5
-    matte = simulate_pass(replace(SMALL, wall="matte"), picked("R"))
-    assert from_whole_pass(matte).psnr_db[middle].mean() < whole.psnr_db[middle].mean() - 1.0
+    matte = simulate_sequence(replace(SMALL, wall="matte"), picked("R"))
+    assert from_whole_sequence(matte).psnr_db[middle].mean() < whole.psnr_db[middle].mean() - 1.0
     with pytest.raises(DataError, match="setup"):
-        from_each_frame(replace(app_pass, simulation=None))
+        from_each_frame(replace(app_sequence, simulation=None))
 
 
-def test_networks_see_what_they_were_trained_on(app_pass, app_weights) -> None:
-    named = own_networks((app_weights["fusion"].parent, app_weights["event"])).of(app_pass)
+def test_networks_see_what_they_were_trained_on(app_sequence, app_weights) -> None:
+    named = own_networks((app_weights["fusion"].parent, app_weights["event"])).of(app_sequence)
     assert list(named) == ["fusion-run", "event-run"]
-    found = from_weights(app_pass, "fusion-run", named["fusion-run"])
+    found = from_weights(app_sequence, "fusion-run", named["fusion-run"])
     assert found.images.shape == (40, 12, 24) and found.psnr_db.shape == (40,)
-    blind = replace(app_pass, frames=None)
+    blind = replace(app_sequence, frames=None)
     assert from_weights(blind, "event-run", named["event-run"]).images.shape == (40, 12, 24)
     with pytest.raises(DataError, match="has none"):
         from_weights(blind, "fusion-run", named["fusion-run"])
@@ -100,12 +102,12 @@ def test_networks_see_what_they_were_trained_on(app_pass, app_weights) -> None:
         own_networks((Path("nowhere"),))
 
 
-def test_networks_of_the_package_see_more_than_least_squares(app_pass) -> None:
+def test_networks_of_the_package_see_more_than_least_squares(app_sequence) -> None:
     """The camera is half as fine as the one that they were trained on."""
-    named = Networks().of(app_pass)
+    named = Networks().of(app_sequence)
     assert list(named) == ["network, frames", "network, events", "network, both"]
-    found = {name: from_weights(app_pass, name, one) for name, one in named.items()}
-    single = from_each_frame(app_pass).psnr_db.mean()
+    found = {name: from_weights(app_sequence, name, one) for name, one in named.items()}
+    single = from_each_frame(app_sequence).psnr_db.mean()
     for name in ("network, frames", "network, both"):
         assert found[name].psnr_db.mean() > single + 2, name
         assert "all frames" in found[name].note and "supports" in found[name].note
@@ -114,7 +116,7 @@ def test_networks_of_the_package_see_more_than_least_squares(app_pass) -> None:
 def test_pictures_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames() -> None:
     networks, noted = Networks(), {}
     for name, setup in (("own", SMALL), ("rough", replace(SMALL, roughness=0.2))):
-        recorded = simulate_pass(setup, picked("R"))
+        recorded = simulate_sequence(setup, picked("R"))
         wall = networks.wall_of(recorded)
         network = networks.of(recorded)["network, frames"]
         noted[name] = from_weights(recorded, "frames", network, wall).note
@@ -122,13 +124,13 @@ def test_pictures_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames(
     assert "supports" in noted["own"] and "nothing measured" in noted["rough"]
 
 
-def test_only_networks_of_the_package_bring_a_wall_for_recordings(app_pass, app_weights) -> None:
+def test_only_networks_of_the_package_bring_a_wall_for_recordings(app_sequence, app_weights) -> None:
     package, own = Networks(), own_networks((app_weights["event"],))
-    recording = replace(app_pass, simulation=None)
-    assert package.wall_of(app_pass) is not None and own.wall_of(app_pass) is not None
+    recording = replace(app_sequence, simulation=None)
+    assert package.wall_of(app_sequence) is not None and own.wall_of(app_sequence) is not None
     assert package.wall_of(recording) is not None and own.wall_of(recording) is None
     assert package.wall_of(replace(recording, motion=None)) is None
-    assert package.wall_of(replace(app_pass, frames=None)) is None
+    assert package.wall_of(replace(app_sequence, frames=None)) is None
 
 
 def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
@@ -138,7 +140,7 @@ def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
     assert all(one.reason.endswith(".") and "dB" in one.figures for one in shown)
 
 
-def test_a_sheet_holds_every_position_and_asks_nobody(app_pass, app_weights) -> None:
+def test_a_sheet_holds_every_position_and_asks_nobody(app_sequence, app_weights) -> None:
     own = Networks({"net": load_weights(app_weights["event"])})
     first, between, second = simulated(SMALL, picked("R"), own)
     assert between == (second[0], first[1])
@@ -148,7 +150,7 @@ def test_a_sheet_holds_every_position_and_asks_nobody(app_pass, app_weights) -> 
         assert not re.findall(r"(?:src|href|url)\s*[=(]\s*['\"]?(?!data:)[a-z]", text)
         assert "http" not in re.sub(r"base64,[^)]*", "", text)
     assert first[0] == next(simulated(SMALL, picked("R"), Networks()))[0]
-    views = seen_views(app_pass) + found_views([from_each_frame(app_pass)]) + event_views(app_pass)
+    views = seen_views(app_sequence) + found_views([from_each_frame(app_sequence)]) + event_views(app_sequence)
     for view in views:
         assert len(view.pictures) == (1 if view.cursor else 40)
         assert view.pictures.dtype == np.uint8 and view.pictures.any()
@@ -472,13 +474,13 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
             "position 30 of 40"
         )
         browser.wait("return !document.querySelector('.ev-verdict').textContent.includes('Looking at it')")
-        # A control simulates another pass, looked at where the last one was.
-        pass_of = "document.querySelector('.ev-sheet').dataset.pass"
+        # A control simulates another sequence, looked at where the last one was.
+        sequence_of = "document.querySelector('.ev-sheet').dataset.sequence"
         label = "Ambient light"
-        before = browser.run(f"return {pass_of}")
+        before = browser.run(f"return {sequence_of}")
         browser.run(f"document.querySelector('input[type=range][aria-label*=\"{label}\"]').focus()")
         browser.press("\ue014\ue014")  # right
-        browser.wait(f"return {pass_of} !== {json.dumps(before)}")
+        browser.wait(f"return {sequence_of} !== {json.dumps(before)}")
         assert browser.run("return document.querySelector('.ev-now').textContent").startswith(
             "position 30 of 40"
         )
@@ -494,9 +496,9 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
             "const b = document.querySelector('.ev-pen').getBoundingClientRect();"
             " return b.width && [b.left, b.top]"
         )
-        before = browser.run(f"return {pass_of}")
+        before = browser.run(f"return {sequence_of}")
         browser.drag([(int(x) + 40, int(y) + 40), (int(x) + 150, int(y) + 150)])
-        browser.wait(f"return {pass_of} !== {json.dumps(before)}")
+        browser.wait(f"return {sequence_of} !== {json.dumps(before)}")
         # An upload is shown; one that is too large is refused.
         asked += browser.requests()
         browser.run(

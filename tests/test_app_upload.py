@@ -125,11 +125,11 @@ def test_a_capture_is_shown_and_reconstructed_and_nothing_stays(zipped_capture, 
 
 
 @pytest.mark.parametrize("suffix", [".raw", ".npz", ".csv", ".h5"])
-def test_a_recording_is_shown(suffix: str, app_pass, app_weights, tmp_path) -> None:
+def test_a_recording_is_shown(suffix: str, app_sequence, app_weights, tmp_path) -> None:
     path = tmp_path / f"walk{suffix}"
-    write_events(path, app_pass.events)
+    write_events(path, app_sequence.events)
     found = read_upload(path, tmp_path, 10 * MB)
-    assert found.events == app_pass.events and len(found) == 40 and found.frames is None
+    assert found.events == app_sequence.events and len(found) == 40 and found.frames is None
     networks = Networks({name: load_weights(one) for name, one in app_weights.items()})
     pictures, message = uploaded(str(path), tmp_path, 10 * MB, networks)
     assert ">Event<" in pictures and ">Fusion<" not in pictures and ">Wall<" not in pictures
@@ -139,7 +139,7 @@ def test_a_recording_is_shown(suffix: str, app_pass, app_weights, tmp_path) -> N
 
 
 def test_bad_uploads_are_one_line_without_this_machines_folders(
-    app_pass, zipped_capture, tmp_path, monkeypatch
+    app_sequence, zipped_capture, tmp_path, monkeypatch
 ) -> None:
     def said(name: str, content: bytes, limit: int = MB) -> str:
         path = tmp_path / name
@@ -164,7 +164,7 @@ def test_bad_uploads_are_one_line_without_this_machines_folders(
     monkeypatch.setattr("evnlos.app.upload.MOST_EVENTS", 100)
     with pytest.raises(DataError, match="100 events or more"):
         read_upload(zipped_capture, tmp_path, 10 * MB)
-    write_events(tmp_path / "long.npz", app_pass.events)
+    write_events(tmp_path / "long.npz", app_sequence.events)
     cut = read_upload(tmp_path / "long.npz", tmp_path, 10 * MB)
     assert len(cut.events) == 100 and "only the first 100" in cut.notes[-1]
 
@@ -185,8 +185,8 @@ def reader(tmp_path: Path, monkeypatch, text: str) -> None:
     monkeypatch.setattr(upload, "_PROGRAM", tmp_path / "reader.py")
 
 
-def test_what_a_process_of_its_own_reads_is_the_same(zipped_capture, app_pass, tmp_path) -> None:
-    write_events(tmp_path / "walk.raw", app_pass.events)
+def test_what_a_process_of_its_own_reads_is_the_same(zipped_capture, app_sequence, tmp_path) -> None:
+    write_events(tmp_path / "walk.raw", app_sequence.events)
     for path in (zipped_capture, tmp_path / "walk.raw"):
         here, apart = read_upload(path, tmp_path, 10 * MB), read_upload_apart(path, tmp_path, 10 * MB)
         assert here.events == apart.events and here.edges_us.tolist() == apart.edges_us.tolist()
@@ -199,12 +199,12 @@ def test_what_a_process_of_its_own_reads_is_the_same(zipped_capture, app_pass, t
             assert getattr(here, name) == getattr(apart, name), name
 
 
-def test_an_upload_that_hangs_holds_nobody(app_pass, tmp_path, monkeypatch) -> None:
+def test_an_upload_that_hangs_holds_nobody(app_sequence, tmp_path, monkeypatch) -> None:
     from evnlos.app import upload
 
     reader(tmp_path, monkeypatch, SLOW)
     for name in ("slow.raw", "walk.raw"):
-        write_events(tmp_path / name, app_pass.events)
+        write_events(tmp_path / name, app_sequence.events)
     monkeypatch.setattr(upload, "_CHILD_S", 15)
     said: list[tuple[str, str]] = []
     hangs = threading.Thread(
@@ -230,9 +230,9 @@ def test_an_upload_that_hangs_holds_nobody(app_pass, tmp_path, monkeypatch) -> N
         "x = bytearray(1 << 20)\nprint('half a line', end='')",
     ],
 )
-def test_a_reader_that_dies_is_one_line(text: str, app_pass, tmp_path, monkeypatch) -> None:
+def test_a_reader_that_dies_is_one_line(text: str, app_sequence, tmp_path, monkeypatch) -> None:
     reader(tmp_path, monkeypatch, text)
-    write_events(tmp_path / "walk.raw", app_pass.events)
+    write_events(tmp_path / "walk.raw", app_sequence.events)
     pictures, message = uploaded(str(tmp_path / "walk.raw"), tmp_path, MB, Networks())
     assert pictures == "" and 'role="alert"' in message and str(tmp_path) not in message
     with pytest.raises(DataError):
@@ -240,13 +240,13 @@ def test_a_reader_that_dies_is_one_line(text: str, app_pass, tmp_path, monkeypat
     assert {one.name for one in tmp_path.iterdir()} == {"reader.py", "walk.raw"}
 
 
-def test_an_upload_may_not_take_all_memory(app_pass, tmp_path, monkeypatch) -> None:
+def test_an_upload_may_not_take_all_memory(app_sequence, tmp_path, monkeypatch) -> None:
     reader(
         tmp_path,
         monkeypatch,
         "import sys\nfrom evnlos.untrusted import limit_this_process\n"
         "limit_this_process(int(sys.argv[4]), int(sys.argv[5]))\nbytearray(4 << 30)",
     )
-    write_events(tmp_path / "walk.raw", app_pass.events)
+    write_events(tmp_path / "walk.raw", app_sequence.events)
     with pytest.raises(DataError, match="MemoryError"):
         read_upload_apart(tmp_path / "walk.raw", tmp_path, MB)

@@ -112,7 +112,7 @@ def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys
     assert path.stat().st_size <= 16_000_000
     loaded = load_weights(name)
     setup, modality, *kind = name.split("-")
-    assert loaded.modality.name == modality and loaded.network.sees_sequence == (kind == ["pass"])
+    assert loaded.modality.name == modality and loaded.network.sees_sequence == (kind == ["sequence"])
     assert loaded.confidence is not None and loaded.scores["images"] >= 160
     better = loaded.scores["overall"]["psnr_db"] - loaded.scores["baselines"]["mean"]["psnr_db"]
     assert better > 1
@@ -127,9 +127,9 @@ def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys
 
 
 def test_the_weights_of_the_nearest_setup_are_taken() -> None:
-    assert published_for(0.36, "frame", is_motion_known=True) == "near-frame-pass"
-    assert published_for(0.44, "frame", is_motion_known=True) == "far-frame-pass"
-    assert published_for(None, "event", is_motion_known=True) == "near-event-pass"
+    assert published_for(0.36, "frame", is_motion_known=True) == "near-frame-sequence"
+    assert published_for(0.44, "frame", is_motion_known=True) == "far-frame-sequence"
+    assert published_for(None, "event", is_motion_known=True) == "near-event-sequence"
     with pytest.raises(DataError, match="give the motion"):
         published_for(0.3, "fusion", is_motion_known=False)
     # Where there are none for the nearest setup, those of the next one are.

@@ -1,4 +1,4 @@
-"""The map of where events win: one factor at a time, the same passes for both cameras, resumable."""
+"""The map of where events win: one factor at a time, the same sequences for both cameras, resumable."""
 
 from dataclasses import replace
 

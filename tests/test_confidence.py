@@ -43,10 +43,10 @@ class Given(UNetReconstructor):
         return x
 
 
-def passes(
+def sequences(
     noise: float, count: int = 24, positions: int = 10, seed: int = 0, share: float = 1.0
 ) -> NlosDataset:
-    """Return passes of objects of 4 x 4 random squares, seen with noise of their own at each position.
+    """Return sequences of objects of 4 x 4 random squares, seen with noise of their own at each position.
 
     `share` of what tells objects apart is seen; the rest is the average object.
     """
@@ -86,7 +86,7 @@ def test_a_target_put_on_the_canvas_is_taken_out_again() -> None:
 
 def test_support_is_the_share_of_the_variance_that_is_seen() -> None:
     for share in (1.0, 0.7, 0.3):
-        samples = passes(0.0, share=share)
+        samples = sequences(0.0, share=share)
         confidence = fit_confidence(Given(), samples, CANVAS)
         found = np.mean([judged(confidence, samples, f"o{k}").agreement for k in range(24)])
         # What is seen is `share` of the difference from the mean, so its square of the power.
@@ -94,21 +94,22 @@ def test_support_is_the_share_of_the_variance_that_is_seen() -> None:
 
 
 def test_noise_that_the_halves_do_not_share_is_no_support() -> None:
-    confidence = fit_confidence(Given(), passes(0.3), CANVAS)
-    blind = passes(0.3, share=0.0, seed=5)
+    confidence = fit_confidence(Given(), sequences(0.3), CANVAS)
+    blind = sequences(0.3, share=0.0, seed=5)
     supports = [judged(confidence, blind, f"o{k}") for k in range(24)]
     assert np.mean([one.agreement for one in supports]) == pytest.approx(0, abs=0.05)
     assert sum(one.measured for one in supports) <= 4
     said = next(one for one in supports if not one.measured)
     assert said.verdict.startswith("nothing measured")
     assert float(said.low.max()) == 0 and float(said.high.min()) == 1
-    seen = judged(confidence, passes(0.3, seed=6), "o0")
+    seen = judged(confidence, sequences(0.3, seed=6), "o0")
     assert seen.measured and "supports" in seen.verdict
 
 
 def test_what_a_network_always_draws_tells_no_object() -> None:
     def with_habit(samples: NlosDataset) -> NlosDataset:
-        """Add a bar to the target at every position: in both halves of every pass, whatever the object is."""
+        """Add a bar to the target at every position: in both halves of every sequence, whatever the object is.
+        """
         bar = torch.zeros(32, 32)
         bar[:16, 8:16] = 0.7
         for name in dict.fromkeys(samples.names.tolist()):
@@ -120,24 +121,24 @@ def test_what_a_network_always_draws_tells_no_object() -> None:
             samples.inputs[torch.from_numpy(rows)] = shown
         return samples
 
-    confidence = fit_confidence(Given(), with_habit(passes(0.1)), CANVAS)
+    confidence = fit_confidence(Given(), with_habit(sequences(0.1)), CANVAS)
     assert float(confidence.threshold) < 0.1
-    blind = [judged(confidence, with_habit(passes(0.1, share=0.0, seed=5)), f"o{k}") for k in range(24)]
+    blind = [judged(confidence, with_habit(sequences(0.1, share=0.0, seed=5)), f"o{k}") for k in range(24)]
     assert np.mean([one.agreement for one in blind]) == pytest.approx(0, abs=0.05)
-    half = [judged(confidence, with_habit(passes(0.1, share=0.6, seed=6)), f"o{k}") for k in range(24)]
+    half = [judged(confidence, with_habit(sequences(0.1, share=0.6, seed=6)), f"o{k}") for k in range(24)]
     assert all(one.measured for one in half)
 
 
 def test_a_pattern_that_does_not_move_with_the_object_is_no_support() -> None:
-    samples = passes(0.0)
+    samples = sequences(0.0)
     confidence = fit_confidence(Given(), samples, CANVAS)
-    still = passes(0.0, count=1, seed=7)
+    still = sequences(0.0, count=1, seed=7)
     still.inputs = still.inputs[:1].expand(10, -1, -1, -1)  # the same picture, wherever the object is
     assert not judged(confidence, still, "o0").measured
 
 
 def test_pictures_that_do_not_explain_the_frames_are_not_measured() -> None:
-    samples = passes(0.2)
+    samples = sequences(0.2)
     confidence = fit_confidence(Given(), samples, CANVAS)
     inputs, at = samples.inputs[:10], samples.position_m[:10]
     halves = halves_of(Given(), inputs, at, CANVAS)
@@ -148,9 +149,9 @@ def test_pictures_that_do_not_explain_the_frames_are_not_measured() -> None:
     assert "explain 60 % of what the frames" in wrong.verdict and float(wrong.high.min()) == 1
 
 
-def test_intervals_cover_unseen_passes_as_often_as_they_say() -> None:
-    confidence = fit_confidence(Given(), passes(0.25, count=40), CANVAS)
-    fresh = passes(0.25, count=20, seed=9)
+def test_intervals_cover_unseen_sequences_as_often_as_they_say() -> None:
+    confidence = fit_confidence(Given(), sequences(0.25, count=40), CANVAS)
+    fresh = sequences(0.25, count=20, seed=9)
     inside, width = [], []
     for k in range(20):
         found = judged(confidence, fresh, f"o{k}")
@@ -164,7 +165,7 @@ def test_intervals_cover_unseen_passes_as_often_as_they_say() -> None:
 
 
 def test_confidence_travels_with_the_weights(tmp_path) -> None:
-    confidence = fit_confidence(Given(), passes(0.2), CANVAS)
+    confidence = fit_confidence(Given(), sequences(0.2), CANVAS)
     torch.manual_seed(0)
     sampling = Sampling(height=48, width=96, scored_rows=48)
     network = UNetConfig(width=4, depth=1, rank=0).build("frame", sampling).eval()
@@ -182,9 +183,9 @@ def test_confidence_travels_with_the_weights(tmp_path) -> None:
             load_weights(tmp_path / "bad.safetensors")
 
 
-def test_confidence_needs_motion_and_passes() -> None:
-    samples = passes(0.1, count=4)
-    with pytest.raises(DataError, match="4 passes"):
+def test_confidence_needs_motion_and_sequences() -> None:
+    samples = sequences(0.1, count=4)
+    with pytest.raises(DataError, match="4 sequences"):
         fit_confidence(Given(), samples, CANVAS)
     with pytest.raises(DataError, match="motion unknown"):
         halves_of(Given(), samples.inputs[:10], np.full((10, 2), np.nan), CANVAS)
@@ -260,9 +261,9 @@ def test_noise_that_grows_with_the_light_is_taken_off() -> None:
 
 
 def test_published_weights_refuse_a_wall_that_is_not_theirs() -> None:
-    path = published_setup("near-frame-pass")
-    assert path is not None and published_setup("page-frame-pass") is None and published_setup(path) is None
-    setup, weights = load_yaml(Simulation, path), load_weights("near-frame-pass")
+    path = published_setup("near-frame-sequence")
+    assert path is not None and published_setup("page-frame-sequence") is None and published_setup(path) is None
+    setup, weights = load_yaml(Simulation, path), load_weights("near-frame-sequence")
     sampling = weights.sampling
     operator = FrameOperator(setup.setup, sampling)
     matte = replace(setup.setup, wall_material="lambert")

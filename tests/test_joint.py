@@ -32,7 +32,7 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def stacked(sight: SequenceOperator) -> torch.Tensor:
-    """The whole pass as a matrix [N P, n n], column by column."""
+    """The whole sequence as a matrix [N P, n n], column by column."""
     return sight(torch.eye(16, dtype=torch.float64).reshape(16, 4, 4)).flatten(1).mT
 
 
@@ -124,7 +124,7 @@ def test_total_variation_is_that_of_one_picture(sight) -> None:
     assert float(found.residual) == pytest.approx(float((operator(found.image) - images[0]).norm()), rel=1e-6)
 
 
-def test_a_pass_shows_more_than_a_picture() -> None:
+def test_a_sequence_shows_more_than_a_picture() -> None:
     setup = RadiometricSetup(roughness=0.05, cell_m=0.01, gain=1.0)
     target_plane = Plane(10, 10, 0.008)
     positions = np.stack([np.linspace(-0.06, 0.06, 8), np.zeros(8)], axis=1)
@@ -181,7 +181,7 @@ def test_wrong_input_is_named(sight) -> None:
         position_subsets(6, 7, 1)
 
 
-def test_the_dense_map_of_a_pass_is_the_pass(sight) -> None:
+def test_the_dense_map_of_a_sequence_is_the_sequence(sight) -> None:
     target = torch.rand(TARGET_PLANE.shape, dtype=sight.transport.matrix.dtype)
     dense = sight.matrix()
     assert dense.shape == (len(sight), SHAPE[0] * SHAPE[1], TARGET_PLANE.height * TARGET_PLANE.width)

@@ -1,4 +1,4 @@
-"""A whole pass as one measurement: aligned by the motion, pooled, and better than its best position."""
+"""A whole sequence as one measurement: aligned by the motion, pooled, and better than its best position."""
 
 import json
 from dataclasses import replace
@@ -75,7 +75,7 @@ def test_a_joint_run_learns_scores_and_is_read_back(trained, tiny_dataset) -> No
     torch.testing.assert_close(both[torch.from_numpy(mine)], alone)
 
 
-def test_the_curve_over_positions_ends_at_the_whole_pass(trained, tiny_dataset) -> None:
+def test_the_curve_over_positions_ends_at_the_whole_sequence(trained, tiny_dataset) -> None:
     weights = load_weights(trained[0])
     whole = len(NlosDataset(tiny_dataset, "train", "frame")) // len(tiny_dataset.objects("train"))
     points = curve_over_positions(weights, tiny_dataset, "train", (1, whole))
@@ -98,7 +98,7 @@ def test_evaluate_prints_the_curve(trained, tiny_dataset, capsys) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 3, 7, 20, 39, 40])
-def test_choices_are_equally_spaced_and_within_the_pass(count: int) -> None:
+def test_choices_are_equally_spaced_and_within_the_sequence(count: int) -> None:
     parts = choices(40, count)
     assert 1 <= len(parts) <= 8
     for part in parts:

@@ -665,7 +665,7 @@ def test_without_weights_published_ones_of_single_positions_are_taken(
             table["weights"] == name and table["modality"] == name.partition("-")[2] and table["pictures"] > 0
         )
     with pytest.raises(SystemExit) as stop:
-        main(["live", str(tmp_path / "walk.raw"), "--weights", "near-event-pass", "--headless"])
+        main(["live", str(tmp_path / "walk.raw"), "--weights", "near-event-sequence", "--headless"])
     assert stop.value.code == 2 and "near-event or near-frame, which come with" in capsys.readouterr().err
 
 

@@ -518,7 +518,7 @@ def test_commands_from_plan_to_picture(tmp_path, capsys) -> None:
     assert "does not exist" in capsys.readouterr().err
 
 
-def test_whole_passes_are_inverted_under_a_measured_setup(tiny_captures, tmp_path, capsys) -> None:
+def test_whole_sequences_are_inverted_under_a_measured_setup(tiny_captures, tmp_path, capsys) -> None:
     setup, shape = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06), (48, 72)
     save_yaml(Simulation(setup=replace(setup, sensor=SensorSize(*shape))), tmp_path / "setup.yaml")
     matrix = setup.transport(shape).matrix * setup.gain

@@ -36,7 +36,7 @@ WALLS = {
 
 @pytest.fixture(scope="module")
 def small() -> Simulation:
-    """One writer, four positions of a pass of two seconds, a small sensor."""
+    """One writer, four positions of a sequence of two seconds, a small sensor."""
     return Simulation(
         glyphs=HandwritingGlyphs(characters="AT", writers=1),
         setup=replace(WALLS["affine"], sensor=SensorSize(20, 32), pixel=V2ePixel(), time_step_s=0.02),

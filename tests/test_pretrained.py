@@ -14,7 +14,7 @@ from evnlos.models import load_weights, published, published_for, published_setu
 ROOT = Path(__file__).resolve().parent.parent
 DISTRIBUTION = ROOT / "packages" / "evnlos-weights"
 FILES = DISTRIBUTION / "src" / "evnlos_weights"
-NAME = "page-frame-pass"
+NAME = "page-frame-sequence"
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_the_core_holds_no_weights_and_stays_small() -> None:
 
 
 def test_a_folder_in_the_variable_comes_before_what_is_installed(tmp_path, monkeypatch) -> None:
-    other = published()["page-event-pass"]
+    other = published()["page-event-sequence"]
     shutil.copy(other, tmp_path / f"{NAME}.safetensors")
     (tmp_path / "SHA256SUMS").write_text(
         f"{hashlib.sha256(other.read_bytes()).hexdigest()}  {NAME}.safetensors\n"
@@ -92,3 +92,13 @@ def test_without_weights_one_line_names_all_ways(nothing_installed) -> None:
             way in text for way in ("a weights file", "a run", "install evnlos-weights", "EVNLOS_WEIGHTS")
         )
         assert "\n" not in text
+
+
+def test_weights_under_their_names_of_before_load(tmp_path, monkeypatch) -> None:
+    file = tmp_path / "page-frame-pass.safetensors"
+    shutil.copy(FILES / f"{NAME}.safetensors", file)
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    (tmp_path / "SHA256SUMS").write_text(f"{digest}  {file.name}\n")
+    monkeypatch.setenv("EVNLOS_WEIGHTS", str(tmp_path))
+    assert published()[NAME].parent == tmp_path
+    assert load_weights("page-frame-pass").network.sees_sequence

@@ -166,7 +166,7 @@ def test_published_weights_say_what_they_are_in_the_words_of_today() -> None:
         assert today["network"]["kind"] == ("sequence" if about.get("joint") else "unet") or "kind" in about
         loaded = load_weights(path)
         assert loaded.modality.name == name.split("-")[1]
-        assert loaded.network.sees_sequence == name.endswith("-pass")
+        assert loaded.network.sees_sequence == name.endswith("-sequence")
         for step in loaded.history:
             assert {"modality", "keep_normalization", "sequence_augmentations"} <= set(step["settings"])
             assert not {"paradigm", "joint", "views", "restandardise"} & set(step["settings"])

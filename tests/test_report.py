@@ -114,7 +114,7 @@ def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypat
     """Names of runs, of files and of published weights; each line is parsed, not run."""
     data, (run, _) = made
     file = replace(run, name="mine", history=STEPS)
-    come = replace(run, name="near-frame-pass", history=STEPS, is_published=True)
+    come = replace(run, name="near-frame-sequence", history=STEPS, is_published=True)
     live = replace(run, name="live-run", history=[{"data": {"name": "live", "origin": "simulation"}}])
     coarse = replace(data, sampling=Sampling(), config={"pattern": "ab12"})
     here = {"name": "near", "origin": "captures", "train": ["near_A"]}  # other captures under the same name
@@ -125,8 +125,10 @@ def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypat
         parsed = [_parsed(line, monkeypatch) for line in lines if not line.startswith("#")]
         assert [type(one).__name__ for one in parsed].count("ReportCommand") == 1
     again = "\n".join(Commands(data, [run, file, come, live, other], "test").again())
-    assert "evnlos report epnp mine near-frame-pass live-run 'of two words' --data near --split" in again
-    assert "--out near-frame-pass" not in again and "--out near-frame-pass" in "\n".join(commands.published())
+    assert "evnlos report epnp mine near-frame-sequence live-run 'of two words' --data near --split" in again
+    assert "--out near-frame-sequence" not in again and "--out near-frame-sequence" in "\n".join(
+        commands.published()
+    )
     assert "evnlos import near_1 near_2 --out old --sampling.height 32" in again
     assert "# sim-2.yaml: settings of hash ab12 of 1 simulated objects" in again  # `sim` is another one
     assert "evnlos simulate --config sim-2.yaml --out sim-2" in again and "--data sim-2" in again
@@ -243,11 +245,14 @@ def test_weights_are_called_by_run_file_or_published_name(tmp_path, monkeypatch)
     (run / "weights.safetensors").touch()
     (tmp_path / "mine.safetensors").touch()
     monkeypatch.chdir(run)
-    assert named(Path("near-frame-pass")) == ("near-frame-pass", True)
+    assert named(Path("near-frame-sequence")) == ("near-frame-sequence", True)
     assert named(run) == named(Path()) == named(Path("weights.safetensors")) == ("epnp", False)
     assert named(tmp_path / "mine.safetensors") == ("mine", False)
-    (run / "near-frame-pass").mkdir()
-    assert named(Path("near-frame-pass")) == ("near-frame-pass", False)  # a folder of that name comes first
+    (run / "near-frame-sequence").mkdir()
+    assert named(Path("near-frame-sequence")) == (
+        "near-frame-sequence",
+        False,
+    )  # a folder of that name comes first
 
 
 def test_weights_without_a_log_leave_no_empty_section(made, tmp_path) -> None:

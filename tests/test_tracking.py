@@ -121,7 +121,7 @@ def test_nothing_to_see_is_refused() -> None:
     shown[:2] = frames[:2]
     with pytest.raises(DataError, match=r"of 2 of 12 frames .* leave out these frames"):
         register(shown, np.full(SHAPE, 0.1), 1e-2)
-    shown[5] = frames[0]  # in the middle of the pass no frame can be left out
+    shown[5] = frames[0]  # in the middle of the sequence no frame can be left out
     with pytest.raises(DataError, match=r"of 3 of 12 frames .* does not stand out on this wall"):
         register(shown, np.full(SHAPE, 0.1), 1e-2)
 
@@ -511,7 +511,7 @@ def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, caps
     assert np.abs(found - stated).mean() < 0.2 * np.abs(stated - stated[::-1]).mean()
 
 
-def test_the_command_inverts_a_pass(capture, tmp_path, capsys) -> None:
+def test_the_command_inverts_a_sequence(capture, tmp_path, capsys) -> None:
     folder, setup = capture
     pytest.importorskip("matplotlib")
     options = [

@@ -1,4 +1,4 @@
-"""A setup fitted to passes of objects that nobody knows."""
+"""A setup fitted to sequences of objects that nobody knows."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ PLACES = np.stack([np.linspace(-0.06, 0.06, 7), np.zeros(7)], axis=1)
 SHAPE = (6, 10)
 
 
-def passes(noise: float, seed: int = 0) -> tuple[MovingLight, torch.Tensor]:
+def sequences(noise: float, seed: int = 0) -> tuple[MovingLight, torch.Tensor]:
     """Return frames of unseen handwriting with noise in units of what moves, and the true targets."""
     draw = torch.Generator().manual_seed(seed)
     empty = MovingLight(torch.zeros(1, 7, *SHAPE), PLACES, 0.08, CELLS)
@@ -33,14 +33,14 @@ def passes(noise: float, seed: int = 0) -> tuple[MovingLight, torch.Tensor]:
 
 
 def test_the_evidence_is_that_of_the_dense_gaussian() -> None:
-    light, _ = passes(0.3)
+    light, _ = sequences(0.3)
     sight, terms = light.sight(SETUP), light.terms(SETUP)
     prior = handwritten_targets(light.target_plane, WRITERS)
     gain, variance = 0.7 / terms.lit**0.5, 0.05
     eye = torch.eye(CELLS**2, dtype=torch.float64).unflatten(1, light.target_plane.shape)
     matrix = sight(eye)  # [n n, N, h, w]
     matrix = (matrix - matrix.mean(dim=1, keepdim=True)).flatten(1).mT
-    # The means of the pass take 1 of 7 dimensions: look at 6 of an orthonormal basis of the others.
+    # The means of the sequence take 1 of 7 dimensions: look at 6 of an orthonormal basis of the others.
     basis = torch.linalg.svd(torch.eye(7).double() - 1 / 7)[0][:, :6]
     onto = torch.kron(basis.mT.contiguous(), torch.eye(SHAPE[0] * SHAPE[1]).double())
     seen, through = light.moving.flatten(1) @ onto.mT, onto @ matrix
@@ -54,7 +54,7 @@ def test_the_evidence_is_that_of_the_dense_gaussian() -> None:
 
 
 def test_the_right_wall_is_the_likeliest_and_shows_the_targets() -> None:
-    light, targets = passes(0.1)
+    light, targets = sequences(0.1)
     found = {
         rough: light.explained(replace(SETUP, roughness=rough)) for rough in (0.03, 0.045, 0.06, 0.08, 0.12)
     }

@@ -39,6 +39,16 @@ def migrate(name: str, values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
+def todays_weights(name: str) -> str:
+    """Return the name of published weights of any version as it is today; other names come back as they are.
+
+    Example:
+        >>> todays_weights("near-frame-pass")
+        'near-frame-sequence'
+    """
+    return f"{name.removesuffix('-pass')}-sequence" if name.endswith("-pass") else name
+
+
 def _pixel_has_a_kind(values: dict[str, Any]) -> dict[str, Any]:
     """Name the one event model that settings without `kind` meant."""
     pixel = values.get("pixel")

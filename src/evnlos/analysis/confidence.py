@@ -2,7 +2,7 @@
 
 - Test-time data consistency: move a network's picture to where the calibrated wall agrees with the frame.
 - How much of what the frames show the pictures explain: the light path run forward again.
-- Is the confidence right? Support against skill, and coverage of the intervals, pass by pass.
+- Is the confidence right? Support against skill, and coverage of the intervals, sequence by sequence.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def explained(
     """Return the share of what the average object leaves unexplained in the frames that the pictures explain.
 
     1 - (|m y - g m A x|^2 - n) / (|m y - g0 m A x0|^2 - n), with x the pictures, x0 the average target where
-    the target is, and n the noise. m takes what stands still away, each pixel's mean over the pass, and the
+    the target is, and n the noise. m takes what stands still away, each pixel's mean over the sequence, and the
     gains g and g0 are the best ones: neither ambient light nor the camera's fixed pattern nor how bright the
     object is has to be known, only what the wall does. 1 = the frames are as the pictures make them; 0 = they
     are as good as those of the average target, or the frames do not tell objects from it, as before a matte
@@ -215,11 +215,11 @@ def _noise(frames: Tensor, operator: FrameOperator) -> Tensor:
 def judgement_of(
     weights: Weights, samples: Samples, images: Tensor, operator: FrameOperator | None = None
 ) -> Judgement | None:
-    """Return what the pictures of one pass are worth; None where the weights or the motion do not tell.
+    """Return what the pictures of one sequence are worth; None where the weights or the motion do not tell.
 
     Args:
         weights: The network, and what it learned of its pictures' worth.
-        samples: The pass.
+        samples: The sequence.
         images: The network's pictures, float32 [N, H, W].
         operator: The calibrated setup, where it is known.
     """
@@ -228,8 +228,8 @@ def judgement_of(
     assert weights.confidence is not None and samples.position_m is not None  # see why_unjudged
     seen = weights.modality.inputs(samples.frame, samples.surface)
     frames = torch.from_numpy(samples.frame)
-    pass_ = (seen, frames, images, samples.position_m)
-    return _judged(weights.network, weights.confidence, *pass_, weights.sampling.canvas, operator)
+    sequence = (seen, frames, images, samples.position_m)
+    return _judged(weights.network, weights.confidence, *sequence, weights.sampling.canvas, operator)
 
 
 def why_unjudged(weights: Weights, samples: Samples) -> str | None:
@@ -237,14 +237,14 @@ def why_unjudged(weights: Weights, samples: Samples) -> str | None:
 
     Args:
         weights: The network.
-        samples: The pass.
+        samples: The sequence.
     """
     if samples.position_m is None:
         why = "the motion is unknown; state it in capture.yaml, or give --setup and --track to find it"
     elif len(samples) < 2:
-        why = f"{len(samples)} position, 2 are the least; record a pass"
+        why = f"{len(samples)} position, 2 are the least; record a sequence"
     elif weights.confidence is None:
-        why = "these weights never learned it; take those of a whole pass (`evnlos weights` lists them)"
+        why = "these weights never learned it; take those of a whole sequence (`evnlos weights` lists them)"
     else:
         return None
     return f"no confidence: {why}"
@@ -262,7 +262,7 @@ def _judged(
 ) -> Judgement:
     share = None
     if operator is not None and bool(frames.any()):
-        # What the pass shows, at each position: what changes from picture to picture is not the object.
+        # What the sequence shows, at each position: what changes from picture to picture is not the object.
         shown = on_canvas(on_target_plane(images, canvas, position_m).mean(dim=0)[0], canvas, position_m)
         share = explained(shown, frames, position_m, confidence.mean, operator, canvas)
     return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
@@ -278,12 +278,12 @@ def said(worth: Judgement) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class PassWorth:
-    """What the confidence said of one pass, and what was true.
+    """What the confidence said of one sequence, and what was true.
 
     Args:
-        name: Object of the pass.
+        name: Object of the sequence.
         support: What it said, in one number: how much of the picture the measurement supports, 0..1.
-        agreement: Share of what tells this object from others that both halves of the pass agree on.
+        agreement: Share of what tells this object from others that both halves of the sequence agree on.
         explained: Share of the frames that the pictures explain (see `explained`); None without a setup.
         measured: Whether it said that anything was.
         skill: 1 - |x - t|^2 / |x0 - t|^2 over the targets, with x the pictures, t the truth, and x0 the average
@@ -311,26 +311,26 @@ def worth_of(
     canvas: Plane,
     operator: FrameOperator | None = None,
 ) -> list[PassWorth]:
-    """Compare what the confidence says of pictures with their truth, for each pass.
+    """Compare what the confidence says of pictures with their truth, for each sequence.
 
     Args:
         network: The network.
         confidence: What it learned of its pictures' worth.
-        samples: The passes, all of known motion.
+        samples: The sequences, all of known motion.
         images: The network's pictures of all samples, float32 [N, H, W].
         canvas: Their geometry.
         operator: The setup that the network was trained for; the modality then has a group "frame".
 
     Raises:
-        DataError: The motion of a pass is unknown.
+        DataError: The motion of a sequence is unknown.
     """
     found = []
     for name in dict.fromkeys(samples.names.tolist()):
         mine = np.flatnonzero(samples.names == name)
         rows, at = torch.from_numpy(mine), samples.position_m[mine]
         inputs = samples.inputs[rows]
-        pass_ = (inputs, _frames(samples, inputs), images[rows], at)
-        said = _judged(network, confidence, *pass_, canvas, operator)
+        sequence = (inputs, _frames(samples, inputs), images[rows], at)
+        said = _judged(network, confidence, *sequence, canvas, operator)
         true, shown = samples.truth[rows].float(), images[rows]
         average = on_canvas(confidence.mean, canvas, at)
         missed, blank = (on_target_plane((one - true).square(), canvas, at).sum() for one in (shown, average))
@@ -358,10 +358,10 @@ def _frames(samples: NlosDataset, inputs: Tensor) -> Tensor:
 
 
 def risk_coverage(support: ArrayLike, risk: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean risk of what is kept when only the most supported passes are, for each share kept.
+    """Return the mean risk of what is kept when only the most supported sequences are, for each share kept.
 
     Args:
-        support: What the confidence said of each pass, [N].
+        support: What the confidence said of each sequence, [N].
         risk: What was wrong with it, such as 1 - skill, [N].
 
     Returns:

@@ -170,8 +170,8 @@ class Evaluation:
         checks: Shares of the pictures: "read", whose character the independent reader names rightly;
             "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
             the truth than to any training picture. Only what could be found out.
-        worth: What the network's confidence said of each pass, beside what was true; empty where it has none,
-            or a motion is unknown.
+        worth: What the network's confidence said of each sequence, beside what was true; empty where it has
+            none, or a motion is unknown.
     """
 
     images: Tensor

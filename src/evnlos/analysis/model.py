@@ -182,7 +182,7 @@ def load_model(weights: str | Path) -> Model:
     """Return the model of a weights file, of a run, or of pretrained weights.
 
     Args:
-        weights: A path, or a name such as "near-frame-pass" (`evnlos weights` lists them).
+        weights: A path, or a name such as "near-frame-sequence" (`evnlos weights` lists them).
 
     Raises:
         DataError: There is no such file or name, or the file is damaged.
@@ -217,7 +217,7 @@ _MOST_SUBSETS = 8
 
 @dataclass(frozen=True)
 class PositionsPoint:
-    """Scores of a sequence network that saw a part of each pass.
+    """Scores of a sequence network that saw a part of each sequence.
 
     Args:
         positions: Positions that it saw.
@@ -236,7 +236,7 @@ class PositionsPoint:
 def curve_over_positions(
     weights: Weights, dataset: Dataset, split: str = "test", counts: tuple[int, ...] = (1, 2, 5, 10, 20, 40)
 ) -> list[PositionsPoint]:
-    """Reconstruct each pass from some of its positions and score the picture at all of them.
+    """Reconstruct each sequence from some of its positions and score the picture at all of them.
 
     The choices of n of N positions are equally spaced: begun at the first, the second and so on, up to 8
     choices spread over the N // n that there are. What is scored is the same for every n: the picture drawn
@@ -246,11 +246,11 @@ def curve_over_positions(
         weights: Those of a network of whole sequences.
         dataset: Where the samples are.
         split: "train", "validation", "test" or "all".
-        counts: Numbers of positions, each from 1 to the positions of a pass.
+        counts: Numbers of positions, each from 1 to the positions of a sequence.
 
     Raises:
         DataError: The network sees single time steps, the motion of an object is unknown, a count is more than
-            a pass has, or the samples were made in another way than those of the training.
+            a sequence has, or the samples were made in another way than those of the training.
     """
     network = weights.network
     if not network.sees_sequence:
@@ -262,15 +262,15 @@ def curve_over_positions(
     samples = NlosDataset(dataset, split, weights.modality)
     if np.isnan(samples.position_m).any():
         raise DataError("the motion of an object is unknown; give it in capture.yaml (`evnlos track` finds it)")
-    passes = {name: np.flatnonzero(samples.names == name) for name in dict.fromkeys(samples.names.tolist())}
+    sequences = {name: np.flatnonzero(samples.names == name) for name in dict.fromkeys(samples.names.tolist())}
     # All of them before the first reconstruction, so that a count that is too large costs no time.
-    chosen = {count: {name: choices(len(mine), count) for name, mine in passes.items()} for count in counts}
+    chosen = {count: {name: choices(len(mine), count) for name, mine in sequences.items()} for count in counts}
     network.eval()
     rows = dataset.sampling.scored
     found = []
     for count, parts_of in chosen.items():
         means = {}
-        for name, mine in passes.items():
+        for name, mine in sequences.items():
             places = torch.from_numpy(samples.position_m[mine].astype(np.float32))
             inputs, truth = (part[torch.from_numpy(mine)].float() for part in (samples.inputs, samples.truth))
             decibel = []
@@ -295,7 +295,7 @@ def choices(positions: int, count: int) -> list[np.ndarray]:
         [[0, 2, 4], [1, 3, 5]]
     """
     if not 1 <= count <= positions:
-        raise DataError(f"{count} positions are asked for; a pass has {positions}: give 1 to {positions}")
+        raise DataError(f"{count} positions are asked for; a sequence has {positions}: give 1 to {positions}")
     stride = positions // count
     starts = np.unique(np.linspace(0, stride - 1, min(stride, _MOST_SUBSETS)).round().astype(int))
     return [start + stride * np.arange(count) for start in starts]

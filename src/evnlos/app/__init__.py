@@ -1,1 +1,1 @@
-"""The page to play with: a pass simulated while you watch, or a recording of your own; Gradio, loaded late."""
+"""The page to play with: a sequence simulated while you watch, or your own recording; Gradio, loaded late."""

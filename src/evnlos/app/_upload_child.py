@@ -1,7 +1,8 @@
 """Reads an upload in a process of its own, so that a bad one takes neither the page's time nor its memory.
 
 Run as a program: path, folder to unpack in, largest size in bytes, limit of memory in bytes, limit of processor
-time in seconds. Writes one line of JSON, "error" or what the pass is, then the bytes of the arrays named there.
+time in seconds. Writes one line of JSON, "error" or what the sequence is, then the bytes of the arrays named
+there.
 """
 
 import json

@@ -2,7 +2,7 @@
 
 - What the page lets a visitor choose, as settings of a small simulation.
 - The hidden object: a character picked, or a visitor's drawing.
-- One pass as the cameras saw it, whether it was simulated a moment ago or uploaded.
+- One sequence as the cameras saw it, whether it was simulated a moment ago or uploaded.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from evnlos.types import Events, derive_seed
 
 _PAGE = page()  # what the package's networks learned from: setup and samples here are the same
 POSITIONS = _PAGE.positions
-"""Positions of a pass, as in a dataset."""
+"""Positions of a sequence, as in a dataset."""
 TRAVEL_M = _PAGE.motion.speed_m_s * _PAGE.duration_s
 """Way of the hidden object, metres, as in a dataset."""
 COARSE = _PAGE.sampling
@@ -94,7 +94,7 @@ class Controls:
 
     @property
     def duration_s(self) -> float:
-        """Length of the pass, seconds."""
+        """Length of the sequence, seconds."""
         return TRAVEL_M / self.speed_m_s
 
     def simulation(self) -> Simulation:
@@ -188,7 +188,7 @@ _TOLERANCE = 0.03  # thresholds: the eye sees no difference to the default, whic
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """One pass: events, the instants of its positions, and what else is known.
+    """One sequence: events, the instants of its positions, and what else is known.
 
     Args:
         name: What to call it.
@@ -238,8 +238,8 @@ class Recorded:
         return self.target.rasterise(sampling.canvas, places)[:, sampling.scored]
 
 
-def simulate_pass(controls: Controls, target: Target) -> Recorded:
-    """Simulate one pass of a hidden object.
+def simulate_sequence(controls: Controls, target: Target) -> Recorded:
+    """Simulate one sequence of a hidden object.
 
     Args:
         controls: Setup and camera.

@@ -34,8 +34,8 @@
     button.setAttribute("aria-pressed", "true");
     timer = setInterval(step, 120);
   };
-  // Where a pass replaces another one, Gradio changes the page in place: the mark of the pass tells.
-  // A new pass stays at the position that was looked at, and goes on where one was playing.
+  // Where a sequence replaces another one, Gradio changes the page in place: the mark of the sequence tells.
+  // A new sequence stays at the position that was looked at, and goes on where one was playing.
   const arrived = (sheet) => {
     performance.mark("evnlos-sheet");
     const slider = sheet.querySelector(".ev-position"), button = sheet.querySelector(".ev-play");
@@ -53,7 +53,7 @@
         if (node.nodeType === 1)
           for (const sheet of node.matches(".ev-sheet") ? [node] : node.querySelectorAll(".ev-sheet")) arrived(sheet);
     }
-  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-pass"] });
+  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-sequence"] });
 
   // Drawing: strokes on a canvas; what is sent is its ink on 32 x 32 pixels, as hexadecimal digits.
   const SIDE = 32, WIDTH = 18, STEP = 6;

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, Recorded, drawn, picked, simulate_pass
-from evnlos.app.solving import Networks, Reconstruction, from_each_frame, from_weights, from_whole_pass
+from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, Recorded, drawn, picked, simulate_sequence
+from evnlos.app.solving import Networks, Reconstruction, from_each_frame, from_weights, from_whole_sequence
 from evnlos.app.upload import read_upload_apart
 from evnlos.app.views import (
     View,
@@ -50,10 +50,10 @@ _WORDS = {
     "threshold": "How much the natural logarithm of a pixel's light has to change for an event: 0.15 is 16 %.",
     "time surface": "A picture made from events: each pixel shows how recent its newest event is.",
     "least squares": "The picture that explains one frame best, kept dark where the frame says nothing.",
-    "whole pass": "The one picture that explains all frames of the pass together.",
+    "whole sequence": "The one picture that explains all frames of the sequence together.",
     "dB": "PSNR: ten decibels more are a tenth of the squared error. It means something only beside the value "
     "of an all-black picture at the same instant.",
-    "verdict": "What wall and noise leave to be seen in one frame, whatever the method; a whole pass shows "
+    "verdict": "What wall and noise leave to be seen in one frame, whatever the method; a whole sequence shows "
     "more. Where they leave nothing, a network may still draw a letter: it remembers one.",
 }
 
@@ -70,7 +70,8 @@ _drawing = threading.Lock()  # what was read and checked takes seconds, and the 
 
 
 def simulated(controls: Controls, target: Target, networks: Networks) -> Iterator[tuple[str, str]]:
-    """Yield (sheet, verdict) of a simulated pass three times: without networks, with them, with the verdict.
+    """Yield (sheet, verdict) of a simulated sequence three times: without networks, with them, with the
+    verdict.
 
     Args:
         controls: Setup and camera.
@@ -80,9 +81,9 @@ def simulated(controls: Controls, target: Target, networks: Networks) -> Iterato
     Raises:
         EvnlosError: The settings can't be.
     """
-    recorded = simulate_pass(controls, target)
+    recorded = simulate_sequence(controls, target)
     before, after = seen_views(recorded), event_views(recorded)
-    found = [from_whole_pass(recorded), from_each_frame(recorded)]
+    found = [from_whole_sequence(recorded), from_each_frame(recorded)]
     assert recorded.simulation is not None  # it was simulated
     yield _sheet(recorded, before, found, after), waiting_box()
     wall = networks.wall_of(recorded)
@@ -164,7 +165,7 @@ def build_page(
     gr = gradio
     with gr.Blocks(title="evnlos", analytics_enabled=False, fill_width=True, delete_cache=(600, 3600)) as page:
         gr.HTML(HEAD, elem_id="ev-about")
-        with gr.Tab("Simulate a pass"), gr.Row(equal_height=False):
+        with gr.Tab("Simulate a sequence"), gr.Row(equal_height=False):
             with gr.Column(scale=1, min_width=290):
                 controls = _controls(gr, opening)
             with gr.Column(scale=4, min_width=480):
@@ -184,7 +185,7 @@ def build_page(
         quiet: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
         for control in controls:
             control.change(run, controls, [pictures, verdict], trigger_mode="always_last", **quiet)
-        # The page opens with a pass that is there already; only its verdict may still be on its way.
+        # The page opens with a sequence that is there already; only its verdict may still be on its way.
         page.load(lambda: opening_verdict(opening), None, verdict, **quiet)
         file.change(
             lambda path: uploaded(path, scratch, limit, networks),

@@ -1,7 +1,7 @@
 """What is reconstructed from a sequence, by solvers and by networks.
 
-- Which networks look at a pass: the user's own, or those that come with the package and know its setup.
-- What can be made of a pass: two classical pictures where the setup is known, and one of each network.
+- Which networks look at a sequence: the user's own, or those that come with the package and know its setup.
+- What can be made of a sequence: two classical pictures where the setup is known, and one of each network.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from evnlos.scene import Target
 from evnlos.setups import Setup, load_setup
 from evnlos.types import Plane
 
-_PAGE = "page-{}-pass"  # trained on the simulation `page`
+_PAGE = "page-{}-sequence"  # trained on the simulation `page`
 _TITLES = {"frame": "network, frames", "event": "network, events", "fusion": "network, both"}
 
 
@@ -45,10 +45,10 @@ class Networks:
     own: Mapping[str, Weights] = field(default_factory=dict)
 
     def of(self, recorded: Recorded) -> Mapping[str, Weights]:
-        """Return the networks for a pass, by the name to show.
+        """Return the networks for a sequence, by the name to show.
 
-        Those of the package see whole passes, so they need the motion; of a simulated pass they are the page's,
-        of a capture those of the published setup whose distance is nearest.
+        Those of the package see whole sequences, so they need the motion; of a simulated sequence they are the
+        page's, of a capture those of the published setup whose distance is nearest.
         """
         if self.own:
             return self.own
@@ -65,7 +65,7 @@ class Networks:
         return found
 
     def wall_of(self, recorded: Recorded) -> Callable[[Sampling], FrameOperator] | None:
-        """Return the wall that has to turn the pictures into the frames: the pass's own, or the networks'.
+        """Return the wall that has to turn the pictures into the frames: the sequence's own, or the networks'.
 
         None where there are no frames, or where the networks are the user's and so is the recording.
         """
@@ -96,14 +96,14 @@ def own_networks(paths: Iterable[Path]) -> Networks:
 
 
 _DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far a picture may go from it
-_CELLS = 16  # a side of the target plane of the whole pass
+_CELLS = 16  # a side of the target plane of the whole sequence
 _SMOOTH = 3.0  # weight of the gradient in units of the noise's variance
 _STATIC = 1.0  # the camera's fixed pattern is about as strong as its noise
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """The pictures that one method made of a pass.
+    """The pictures that one method made of a sequence.
 
     Args:
         name: The method.
@@ -124,7 +124,7 @@ def from_each_frame(recorded: Recorded) -> Reconstruction:
     """Return the regularised least squares picture of each frame alone, the setup and its noise being known.
 
     Raises:
-        DataError: The pass has no frames, or its setup is unknown.
+        DataError: The sequence has no frames, or its setup is unknown.
     """
     setup, frames = _known(recorded)
     operator = FrameOperator(setup, COARSE)
@@ -134,15 +134,15 @@ def from_each_frame(recorded: Recorded) -> Reconstruction:
     return _scored("least squares", "one frame, setup known, nothing learned", images, recorded, COARSE)
 
 
-def from_whole_pass(recorded: Recorded) -> Reconstruction:
+def from_whole_sequence(recorded: Recorded) -> Reconstruction:
     """Return one picture from all frames at once, setup and motion being known, drawn where the object was.
 
     Raises:
-        DataError: The pass has no frames, or its setup or its motion is unknown.
+        DataError: The sequence has no frames, or its setup or its motion is unknown.
     """
     setup, frames = _known(recorded)
     if recorded.motion is None or recorded.target is None:
-        raise DataError("the motion or the target is unknown; the whole pass needs both")
+        raise DataError("the motion or the target is unknown; the whole sequence needs both")
     size_m, shape = recorded.target.size_m, frames.shape[1:]
     light = object_light(frames, recorded.peak, setup, shape)
     strip = setup.target_cells()
@@ -159,7 +159,9 @@ def from_whole_pass(recorded: Recorded) -> Reconstruction:
     found = Target("found", image.clamp(0, 1).float().numpy(), size_m)
     fine = Sampling()
     images = found.rasterise(fine.canvas, places)[:, fine.scored]
-    return _scored("whole pass", "all frames, setup and motion known, nothing learned", images, recorded, fine)
+    return _scored(
+        "whole sequence", "all frames, setup and motion known, nothing learned", images, recorded, fine
+    )
 
 
 def from_weights(
@@ -171,14 +173,14 @@ def from_weights(
     """Return the pictures of a network, and how far to believe them.
 
     Args:
-        recorded: The pass.
+        recorded: The sequence.
         name: What to call the network.
         weights: The network.
         wall: What has to make the frames of these pictures, for a size of samples; None: the pictures alone
             are asked.
 
     Raises:
-        DataError: The pass has no frames, and the network needs them.
+        DataError: The sequence has no frames, and the network needs them.
     """
     if recorded.frames is None and weights.modality.needs_frames:
         raise DataError(

@@ -1,7 +1,7 @@
 """A visitor's file, unpacked and checked.
 
 - Unpacking a stranger's zip: nothing leaves its folder, nothing is a link, and no stated size is believed.
-- A visitor's file: an event recording, or a capture folder as a zip, checked and read into one pass.
+- A visitor's file: an event recording, or a capture folder as a zip, checked and read into one sequence.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def _copied(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path, left
 MOST_EVENTS = 20_000_000
 """Events that are read, at most: 260 MB."""
 _MOST_PIXELS = 2_100_000  # of a sensor whose pixels all get maps
-_MOST_MAP_BYTES = 1 << 30  # of all maps of a pass
+_MOST_MAP_BYTES = 1 << 30  # of all maps of a sequence
 _MOST_FRAME_BYTES = 1 << 28  # of the frames of a capture
 _ZIP = b"PK\x03\x04"
 _PROGRAM = Path(__file__).with_name("_upload_child.py")

@@ -1,7 +1,7 @@
 """Pictures and words of the page.
 
 - What the chosen setup can show at all, in plain words.
-- From a pass and its reconstructions to the pictures that stand side by side on the page.
+- From a sequence and its reconstructions to the pictures that stand side by side on the page.
 - Views as one piece of HTML without requests: each a tall picture of all positions, of which one is shown.
 """
 
@@ -197,7 +197,7 @@ _GROUPS = {
 }
 
 
-def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "pass") -> str:
+def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "sequence") -> str:
     """Return views in their groups, above them a slider over the positions and a button that plays them.
 
     Moving the slider asks nobody: all positions are in the page already.
@@ -205,7 +205,7 @@ def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "pass
     Args:
         views: The views.
         times_s: Instant of each position, [N], seconds.
-        name: What the pass is called, for people who listen to the page.
+        name: What the sequence is called, for people who listen to the page.
     """
     count = len(times_s)
     start = count // 2
@@ -226,9 +226,9 @@ def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "pass
             parts += [_figure(view, start) for view in chosen]
             parts.append("</div>")
     content = "".join(parts)
-    mark = zlib.crc32(content.encode())  # tells the page that another pass is shown
+    mark = zlib.crc32(content.encode())  # tells the page that another sequence is shown
     return (
-        f'<section class="ev-sheet" data-pass="{mark:08x}" style="--k:{start};--n:{count}" '
+        f'<section class="ev-sheet" data-sequence="{mark:08x}" style="--k:{start};--n:{count}" '
         f'aria-label="{html.escape(name, True)}">{content}</section>'
     )
 

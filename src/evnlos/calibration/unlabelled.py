@@ -1,7 +1,8 @@
 """Calibration from sequences of unknown targets: what makes the frames likeliest.
 
 - How likely frames are where nobody knows what was hidden: the target is integrated out.
-- Fitting a setup to passes of objects that nobody knows: what makes the frames likeliest for any handwriting.
+- Fitting a setup to sequences of objects that nobody knows: what makes the frames likeliest for any
+handwriting.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ _REACH = 12.0  # of the search for gain and noise, in units of their logarithms
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """How a setup explains the passes of unknown objects.
+    """How a setup explains the sequences of unknown objects.
 
     Args:
         cost: Negative log evidence over the number of samples; lower is better.
         gain: White levels a unit of the setup's light.
         noise: Standard deviation of a sample's noise, white levels; what the model cannot do counts as noise.
-        targets: Expected target of each pass, float64 [P, n, n]; noise makes some values leave 0..1.
+        targets: Expected target of each sequence, float64 [P, n, n]; noise makes some values leave 0..1.
     """
 
     cost: float
@@ -62,7 +63,7 @@ class EvidenceTerms:
     """The evidence of one setup for any gain g and noise variance v.
 
     y = g B x + e with B the setup's light from the target plane's cells to all frames, less its mean over the
-    pass, x ~ N(m, C) handwritten targets, and e ~ N(0, v). With C = R R^T and R^T B^T B R = V diag(l) V^T,
+    sequence, x ~ N(m, C) handwritten targets, and e ~ N(0, v). With C = R R^T and R^T B^T B R = V diag(l) V^T,
 
         -2 log p(y) = n log v + sum log(1 + g^2 l / v) + (|z|^2 - c^T (v + g^2 l)^-1 c) / v,
 
@@ -70,14 +71,14 @@ class EvidenceTerms:
     by Woodbury's identity, which leaves two numbers to search once B^T B is decomposed.
 
     Args:
-        power: |y|^2 of each pass, [P].
+        power: |y|^2 of each sequence, [P].
         both: m^T B^T y, [P].
         lit: |B m|^2.
         seen: V^T R^T B^T y, [P, n].
         shown: V^T R^T B^T B m, [n].
         strength: l, [n].
         turn: V, [n, n].
-        samples: Samples of a pass whose noise is independent: without the means that were taken off.
+        samples: Samples of a sequence whose noise is independent: without the means that were taken off.
     """
 
     power: torch.Tensor
@@ -105,7 +106,8 @@ class EvidenceTerms:
 
 
 class MovingLight:
-    """What moves in the frames of passes with one known motion: each pixel's mean over the pass is taken off.
+    """What moves in the frames of sequences with one known motion: each pixel's mean over the sequence is taken
+    off.
 
     Ambient light and the camera's fixed pattern rest, so they go with the mean, whatever they look like.
 
@@ -149,7 +151,7 @@ class MovingLight:
         return Explained(float(found.fun), gain, math.sqrt(variance), targets)
 
     def explained_at(self, setup: Setup, gain: float, noise: float) -> Explained:
-        """Return how a setup explains the frames at a gain and a noise that other passes told."""
+        """Return how a setup explains the frames at a gain and a noise that other sequences told."""
         terms, variance = self.terms(setup), noise**2
         return Explained(terms.cost(gain, variance), gain, noise, self._targets(terms, gain, variance))
 
@@ -190,7 +192,7 @@ class MovingLight:
 CELLS = 12
 """Cells a side of the unknown target."""
 _COLUMNS = 32  # of the working pictures: a rough wall shows no finer detail
-_MOST_FRAMES = 12  # of a pass
+_MOST_FRAMES = 12  # of a sequence
 _SCANS = tuple((wider, rougher) for wider in (1.0, 0.7, 1.4) for rougher in (0.25, 0.5, 1.0, 2.0))
 _SCALE = 20.0  # steps of a finite difference that a parameter may be off
 _FAR = 1e3  # cost of a camera that can't be
@@ -198,13 +200,13 @@ _FAR = 1e3  # cost of a camera that can't be
 
 @dataclass(frozen=True, eq=False)
 class UnlabelledFit:
-    """A setup fitted to passes of unknown objects.
+    """A setup fitted to sequences of unknown objects.
 
     Args:
         optics: The fit; its errors are those of each number alone, the others held.
         fitted: The captures that were fitted, with the targets that are expected as their targets.
         held_out: The others, likewise.
-        check: Held-out passes: what is predicted of every other frame from the rest, by the start and by the
+        check: Held-out sequences: what is predicted of every other frame from the rest, by the start and by the
             fit, over the spread of what moves.
     """
 
@@ -217,7 +219,7 @@ class UnlabelledFit:
 def fit_unlabelled(
     fit: Shots, held: Shots, start: Setup, *, fixed: tuple[str, ...] = (), iterations: int = 25
 ) -> UnlabelledFit:
-    """Fit a setup to passes of unknown objects with known motion, and check it on other passes.
+    """Fit a setup to sequences of unknown objects with known motion, and check it on other sequences.
 
     The numbers of the optics are those that make the frames likeliest when the targets are any handwriting
     (`MovingLight.explained`): first a scan over blur and magnification, then quasi-Newton steps (L-BFGS-B).

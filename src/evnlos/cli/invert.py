@@ -21,7 +21,7 @@ LAM_TIKHONOV, LAM_TV = 4.0, 0.3  # best on eight characters of one setup, docs/i
 
 @dataclass(frozen=True)
 class InvertCommand:
-    """Invert a photograph of a matte wall, or whole passes of captures, by the operator alone."""
+    """Invert a photograph of a matte wall, or whole sequences of captures, by the operator alone."""
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --setup, or
@@ -145,7 +145,7 @@ class InvertCommand:
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, setup: Path) -> None:
-        from evnlos.cli.invert_captures import PassOptions, invert_captures, print_pass
+        from evnlos.cli.invert_captures import SequenceOptions, invert_captures, print_sequence
         from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
@@ -158,7 +158,7 @@ class InvertCommand:
                 raise ConfigError(f"--lam is {self.lam!r}; with captures give gcv or a number")
             lam = dict.fromkeys(lam, number)
         solvers = tuple(lam) if self.solver == "all" else (self.solver,)
-        options = PassOptions(
+        options = SequenceOptions(
             setup,
             self.positions,
             self.pattern,
@@ -176,7 +176,7 @@ class InvertCommand:
         found["picture"] = str(draw_inversion(self.out, [(name, image[None]) for name, image in best.items()]))
         arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
         _save_arrays(self.out, arrays)
-        print_pass(found, self.json)
+        print_sequence(found, self.json)
 
 
 def _save_arrays(picture: Path, arrays: dict[str, Any]) -> None:

@@ -1,6 +1,6 @@
 """What `evnlos invert` does with captures and with still pictures.
 
-- `evnlos invert CAPTURE... --setup SETUP`: one picture of each object from its whole pass.
+- `evnlos invert CAPTURE... --setup SETUP`: one picture of each object from its whole sequence.
 - `evnlos invert PICTURE... --setup transport.safetensors`: still pictures of the wall, a measured setup.
 """
 
@@ -39,7 +39,7 @@ from evnlos.types import Plane
 
 
 @dataclass(frozen=True)
-class PassOptions:
+class SequenceOptions:
     """What `evnlos invert` was told about captures."""
 
     setup: Path
@@ -70,7 +70,7 @@ def linear_setup(word: Path | str) -> Setup:
 
 
 def invert_captures(
-    folders: Sequence[Path], options: PassOptions
+    folders: Sequence[Path], options: SequenceOptions
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and the targets [cells, cells] by name, of every capture and solver."""
     clock = time.perf_counter()
@@ -110,7 +110,7 @@ def invert_captures(
     return figures, pictures
 
 
-def pass_table(rows: list[dict[str, Any]]) -> str:
+def sequence_table(rows: list[dict[str, Any]]) -> str:
     """Return mean PSNR by number of positions and solver, over captures and subsets, as lines for people."""
     solvers = list(dict.fromkeys(row["solver"] for row in rows))
     lines = ["positions " + "".join(f"{s:>12}" for s in solvers)]
@@ -124,14 +124,14 @@ def pass_table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def pass_text(found: dict[str, Any]) -> str:
+def sequence_text(found: dict[str, Any]) -> str:
     """Return the figures as lines for people."""
-    return f"{' '.join(found['captures'])}\n{pass_table(found['rows'])}\n{found['seconds']} s"
+    return f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{found['seconds']} s"
 
 
-def print_pass(found: dict[str, Any], as_json: bool) -> None:
+def print_sequence(found: dict[str, Any], as_json: bool) -> None:
     """Print the figures."""
-    print(json.dumps(found) if as_json else pass_text(found))
+    print(json.dumps(found) if as_json else sequence_text(found))
 
 
 def _solve(problem: JointProblem, images: torch.Tensor, solver: str, factor: float | None) -> torch.Tensor:
@@ -148,7 +148,7 @@ def _solve(problem: JointProblem, images: torch.Tensor, solver: str, factor: flo
 
 
 def _by_motion(
-    captures: Sequence[Capture], options: PassOptions, setup: Setup
+    captures: Sequence[Capture], options: SequenceOptions, setup: Setup
 ) -> list[tuple[NDArray[np.float64], list[int]]]:
     """Return each motion [N, 2], metres, of frames 1..N with the captures that share it."""
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
@@ -167,7 +167,7 @@ def _by_motion(
     return list(groups.values())
 
 
-def _is_tracked(capture: Capture, options: PassOptions) -> bool:
+def _is_tracked(capture: Capture, options: SequenceOptions) -> bool:
     return options.track or capture.motion is None
 
 

@@ -223,7 +223,7 @@ def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
         mean = {key: sum(one[key] for one in worth) / len(worth) for key in said}
         print(
             f"confidence: support {mean['support']:.0%} said, {mean['skill']:.0%} found; "
-            f"{mean['measured']:.0%} of {len(worth)} passes said to be measured; intervals of "
+            f"{mean['measured']:.0%} of {len(worth)} sequences said to be measured; intervals of "
             f"{COVERAGE:.0%} hold {mean['coverage']:.0%} of the pixels, mean length {mean['width']:.2f}"
         )
 

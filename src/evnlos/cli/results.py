@@ -38,8 +38,9 @@ class ReconstructCommand:
     """Capture folder; its target may be unknown."""
     weights: Path | None = None
     """Weights file, run's folder, or name of published weights (`evnlos weights` lists them); none takes the
-    published ones for frames of the setup with the nearest distance, of whole passes if the motion is known or
-    found (--track)."""
+    published ones for frames of the setup with the nearest distance, of whole sequences if the motion is known
+    or found (--track).
+    """
     out: Path = Path("reconstruction")
     """Folder for the pictures; new or empty."""
     pattern: Path | None = None

@@ -17,7 +17,7 @@ from PIL import Image
 from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.config import check_made, differing_keys, read_yaml, save_yaml, to_dict
 from evnlos.data.pool import processes, run_tasks
-from evnlos.data.simulate import check_passes, check_ranges, pass_bytes, varied
+from evnlos.data.simulate import check_ranges, check_sequences, sequence_bytes, varied
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.files import new_folder
@@ -87,9 +87,9 @@ class Lab:
     motion: LineMotion = field(default_factory=LineMotion)
     """How it moves."""
     duration_s: float = 8.0
-    """Length of a pass, seconds."""
+    """Length of a sequence, seconds."""
     frame_rate_hz: float = 5.0
-    """Frames a second, hertz; a pass of 8 s has the 40 positions of the paper."""
+    """Frames a second, hertz; a sequence of 8 s has the 40 positions of the paper."""
     setup: Setup = field(default_factory=lambda: in_the_lab(RadiometricSetup()))
     """Wall, geometry, light and cameras; the frame camera has 8 bits, as captures have, and the event pixel is
     on purpose not that of the training simulator."""
@@ -204,7 +204,9 @@ def render_captures(
     at_once = processes(workers, max(len(names), 1))
     if not force:
         frames = round(lab.duration_s * lab.frame_rate_hz) + 1
-        check_passes(pass_bytes(drawn.setup, lab.glyphs.target_plane.size_m, lab.duration_s, frames), at_once)
+        check_sequences(
+            sequence_bytes(drawn.setup, lab.glyphs.target_plane.size_m, lab.duration_s, frames), at_once
+        )
     folders = {name: out / _folder_name(lab, name) for name in names}
     for folder in folders.values():
         if folder.exists() and not (folder / "capture.yaml").is_file():

@@ -25,7 +25,7 @@ from evnlos.data.pool import processes, run_in_order
 from evnlos.data.sampling import Samples, area_weights, edges_from
 from evnlos.data.simulate import (
     Simulation,
-    check_passes,
+    check_sequences,
     drawn_for,
     object_bytes,
     scene_of,
@@ -55,7 +55,7 @@ class DeviceSamples(NamedTuple):
 def simulate_objects_on(
     config: Simulation, names: Sequence[str], device: torch.device | str
 ) -> list[DeviceSamples]:
-    """Simulate some objects' passes on a device: walls, frames, event pixels, surfaces and maps.
+    """Simulate some objects' sequences on a device: walls, frames, event pixels, surfaces and maps.
 
     The targets are drawn on the CPU. The event pixels are those of the settings, run by the torch backend of
     their model, those of all objects together where they can. The samples are those of `simulate_object` but
@@ -224,7 +224,7 @@ def live_dataset(
         DataError: The objects that are simulated at a time take more memory than there is.
     """
     if not force:
-        check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects())))
+        check_sequences(object_bytes(config), processes(workers, len(config.glyphs.objects())))
     split = split_of(config)
     if not split["train"]:
         raise ConfigError(

@@ -108,7 +108,7 @@ class Simulation:
     motion: LineMotion = field(default_factory=LineMotion)
     """How it moves."""
     duration_s: float = 8.0
-    """Length of a pass, seconds."""
+    """Length of a sequence, seconds."""
     positions: int = 40
     """Equidistant positions of an object, one sample each."""
     setup: Setup = field(default_factory=PaperSetup)
@@ -198,20 +198,20 @@ def _needs_a_matrix(path: str) -> bool:
 
 
 def scene_of(config: Simulation, drawn: Simulation, name: str) -> Scene:
-    """Return what an object's pass shows, given the settings drawn for it: the glyph is not varied."""
+    """Return what an object's sequence shows, given the settings drawn for it: the glyph is not varied."""
     target = config.glyphs.target(name, derive_seed(config.seed, "glyph"))
     return Scene(target, drawn.motion, drawn.duration_s)
 
 
 def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
-    """Simulate one object's pass: scene -> wall -> events and frames -> samples.
+    """Simulate one object's sequence: scene -> wall -> events and frames -> samples.
 
     Args:
         config: The settings.
         name: One of `config.glyphs.objects()`.
 
     Returns:
-        The samples of all positions, and the events of the whole pass.
+        The samples of all positions, and the events of the whole sequence.
     """
     drawn = drawn_for(config, name)
     scene = scene_of(config, drawn, name)
@@ -228,8 +228,8 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     ), events
 
 
-def pass_bytes(setup: Setup, target_size_m: float, duration_s: float, frames: int, cells: int = 0) -> int:
-    """Return the memory that simulating one pass takes at least, bytes, without simulating anything.
+def sequence_bytes(setup: Setup, target_size_m: float, duration_s: float, frames: int, cells: int = 0) -> int:
+    """Return the memory that simulating one sequence takes at least, bytes, without simulating anything.
 
     Counted are the wall's matrix, the states of the sensor's pixels, its frames, the maps, and the events that
     noise alone sends.
@@ -237,7 +237,7 @@ def pass_bytes(setup: Setup, target_size_m: float, duration_s: float, frames: in
     Args:
         setup: Wall and cameras.
         target_size_m: Side of the target, metres.
-        duration_s: Length of the pass, seconds.
+        duration_s: Length of the sequence, seconds.
         frames: Frames.
         cells: Cells of the maps of each frame.
     """
@@ -254,13 +254,13 @@ def object_bytes(config: Simulation) -> int:
         config: The settings.
     """
     cells = config.sampling.height * config.sampling.width
-    return pass_bytes(
+    return sequence_bytes(
         config.setup, config.glyphs.target_plane.size_m, config.duration_s, config.positions, cells
     )
 
 
-def check_passes(needed: int, at_once: int) -> None:
-    """Refuse passes that take more memory together than there is.
+def check_sequences(needed: int, at_once: int) -> None:
+    """Refuse sequences that take more memory together than there is.
 
     Args:
         needed: Bytes of each.
@@ -340,7 +340,7 @@ def simulate(
     if not 1 <= first <= stride:
         raise ConfigError(f"share {first} of {stride} is none; give i/n with i from 1 to n")
     if not force:
-        check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects()) // stride + 1))
+        check_sequences(object_bytes(config), processes(workers, len(config.glyphs.objects()) // stride + 1))
     values = to_dict(config)
     dataset = Dataset(
         Path(folder),

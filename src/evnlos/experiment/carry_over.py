@@ -38,7 +38,7 @@ class CarriedOver:
         average_db: The same of the average target, drawn where the target is, dB.
         consistent_db: The same of the network's pictures after data consistency with the set's own wall, dB;
             None for events alone.
-        worth: What the confidence said of each pass, and what was true.
+        worth: What the confidence said of each sequence, and what was true.
     """
 
     name: str
@@ -48,7 +48,7 @@ class CarriedOver:
     worth: list[PassWorth]
 
     def mean(self, key: str) -> float:
-        """Return the mean of one number of the passes."""
+        """Return the mean of one number of the sequences."""
         return float(np.mean([getattr(one, key) for one in self.worth]))
 
 
@@ -156,14 +156,14 @@ def _score(
 
 
 def write_carried(found: list[CarriedOver], path: Path) -> None:
-    """Write the findings, pass by pass, as JSON."""
+    """Write the findings, sequence by sequence, as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps([to_dict(one) for one in found], indent=1).encode())
 
 
 def carried_table(found: list[CarriedOver]) -> str:
-    """Return the findings as a table, and how well the support orders all passes by their skill."""
-    head = ["set", "passes", "PSNR, dB", "+ consistency, dB", "average target, dB"]
+    """Return the findings as a table, and how well the support orders all sequences by their skill."""
+    head = ["set", "sequences", "PSNR, dB", "+ consistency, dB", "average target, dB"]
     head += ["skill", "support", "agreement", "explained", "measured", "coverage", "width"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in found:
@@ -173,11 +173,11 @@ def carried_table(found: list[CarriedOver]) -> str:
         row.append("-" if one.worth[0].explained is None else f"{one.mean('explained'):.2f}")
         row += [f"{one.mean(key):.0%}" for key in ("measured", "coverage")]
         lines.append(f"| {' | '.join(row)} | {one.mean('width'):.2f} |")
-    return "\n".join([*lines, "", _order([pass_ for one in found for pass_ in one.worth])])
+    return "\n".join([*lines, "", _order([sequence for one in found for sequence in one.worth])])
 
 
-def _order(passes: list[PassWorth]) -> str:
-    support, skill = (np.array([getattr(one, key) for one in passes]) for key in ("support", "skill"))
+def _order(sequences: list[PassWorth]) -> str:
+    support, skill = (np.array([getattr(one, key) for one in sequences]) for key in ("support", "skill"))
     risk = 1 - skill
     parts = []
     for order, name in (
@@ -188,4 +188,4 @@ def _order(passes: list[PassWorth]) -> str:
         shares, kept = risk_coverage(order, risk)
         at = [float(kept[np.searchsorted(shares, share)]) for share in (0.25, 0.5, 0.75, 1.0)]
         parts.append(f"{name} " + " / ".join(f"{1 - value:.2f}" for value in at))
-    return "Mean skill of the best 25 / 50 / 75 / 100 % of all passes: " + "; ".join(parts) + "."
+    return "Mean skill of the best 25 / 50 / 75 / 100 % of all sequences: " + "; ".join(parts) + "."

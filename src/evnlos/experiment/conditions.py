@@ -1,4 +1,4 @@
-"""Where events win: frames and events of the same passes, over light, noise, exposure and speed."""
+"""Where events win: frames and events of the same sequences, over light, noise, exposure and speed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from evnlos.analysis.scores import paired_difference
 from evnlos.config import config_hash
 from evnlos.data import STANDARD_MODALITIES, Simulation, as_modality, simulate_object
 from evnlos.data.pool import processes, run_in_order
-from evnlos.data.simulate import check_passes, object_bytes
+from evnlos.data.simulate import check_sequences, object_bytes
 from evnlos.files import write_atomically
 from evnlos.metrics import psnr
 from evnlos.models import fit_linear
@@ -61,7 +61,7 @@ class Finding:
         psnr_db: str -> mean PSNR of the linear estimate on the test writer, dB.
         mean_db: PSNR of the mean picture, dB.
         gain_db: PSNR of events minus that of frames: mean, low and high end of the 95 % interval over objects.
-        events_per_pixel: Events a pixel and pass.
+        events_per_pixel: Events a pixel and sequence.
         event_bytes_s: Data of the events, bytes a second.
         frame_bytes_s: Data of 8-bit frames at `FRAME_RATE_HZ`, bytes a second.
     """
@@ -183,7 +183,7 @@ def map_conditions(
 
 
 def measure(condition: Condition, workers: int = 0, rank: int = 192, force: bool = False) -> Finding:
-    """Simulate passes, fit the linear estimate to some writers, and score it on one that it has not seen.
+    """Simulate sequences, fit the linear estimate to some writers, and score it on one that it has not seen.
 
     Args:
         condition: The world.
@@ -194,10 +194,10 @@ def measure(condition: Condition, workers: int = 0, rank: int = 192, force: bool
     config = condition.simulation
     assert isinstance(config.glyphs, HandwritingGlyphs)
     if not force:
-        check_passes(object_bytes(config), processes(workers, len(config.glyphs.objects())))
+        check_sequences(object_bytes(config), processes(workers, len(config.glyphs.objects())))
     unseen = replace(config, glyphs=replace(config.glyphs, writers=1, first_writer=TRAIN_WRITERS))
-    learned = list(run_in_order(_pass, [(config, name) for name in config.glyphs.objects()], workers))
-    tested = list(run_in_order(_pass, [(unseen, name) for name in unseen.glyphs.objects()], workers))
+    learned = list(run_in_order(_sequence, [(config, name) for name in config.glyphs.objects()], workers))
+    tested = list(run_in_order(_sequence, [(unseen, name) for name in unseen.glyphs.objects()], workers))
     rows = config.sampling.scored
     truth = torch.cat([p.truth for p in tested])[:, rows]
     names = np.concatenate([[p.name] * len(p.truth) for p in tested])
@@ -244,7 +244,7 @@ def conditions_table(findings: list[Finding]) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pass:
+class _Sequence:
     name: str
     frame: np.ndarray
     surface: np.ndarray
@@ -252,11 +252,11 @@ class _Pass:
     events: int
 
 
-def _pass(task: tuple[Simulation, str]) -> _Pass:
+def _sequence(task: tuple[Simulation, str]) -> _Sequence:
     config, name = task
     samples, events = simulate_object(config, name)
     assert samples.truth is not None  # a simulation knows its target
-    return _Pass(name, samples.frame, samples.surface, torch.from_numpy(samples.truth), len(events))
+    return _Sequence(name, samples.frame, samples.surface, torch.from_numpy(samples.truth), len(events))
 
 
 def _lit(config: Simulation, ratio: float) -> Simulation:

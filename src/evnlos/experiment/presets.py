@@ -180,15 +180,15 @@ def on_sequences(study: Study) -> Study:
     for arm in study.arms:
         pre, fine = arm.pretraining, arm.finetuning
         if pre is not None:
-            pre = _of_passes(pre, 6, arm.name)
+            pre = _of_sequences(pre, 6, arm.name)
             fine = fine and replace(fine, epochs=round(fine.epochs * 8 / 3), batch_size=_SEQUENCE.batch_size)
         elif fine is not None:
-            fine = _of_passes(fine, 5, arm.name)
+            fine = _of_sequences(fine, 5, arm.name)
         arms.append(replace(arm, pretraining=pre, finetuning=fine))
     return replace(study, name=f"{study.name}-sequence", arms=tuple(arms))
 
 
-def _of_passes(single: Training, longer: int, arm: str) -> Training:
+def _of_sequences(single: Training, longer: int, arm: str) -> Training:
     """Return the settings of a first training on whole sequences, in place of one on single time steps."""
     if single.network.kind != UNetConfig.kind:
         return single

@@ -1,6 +1,6 @@
 """One target seen at many positions: the operator from its cells to all pictures, and its Gram matrix.
 
-- One object from its whole pass: Tikhonov and total variation on the normal equations of all positions.
+- One object from its whole sequence: Tikhonov and total variation on the normal equations of all positions.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class SequenceOperator:
     def gram(self, strip_gram: torch.Tensor, static: float = 0.0) -> torch.Tensor:
         """Return sum S_k^T G S_k - (1 - rho) N S^T G S with S the mean of S_k, rho = 1 / (1 + N static^2).
 
-        That is the pass's A^T C^-1 A where each camera pixel has independent noise of variance 1 and one
+        That is the sequence's A^T C^-1 A where each camera pixel has independent noise of variance 1 and one
         unknown offset of variance static^2 in all positions. It costs N small products once G is known.
 
         Args:
@@ -159,7 +159,7 @@ def strip_of(positions_m: ArrayLike, target_plane: Plane) -> Plane:
 
 
 def matrix_of(operator: LinearTransport) -> MatrixTransport:
-    """Return a linear map by its matrix, float64: what a pass multiplies many times."""
+    """Return a linear map by its matrix, float64: what a sequence multiplies many times."""
     return MatrixTransport(operator.dense(), operator.source, operator.shape)
 
 
@@ -203,14 +203,14 @@ class JointProblem:
     light.
 
     Args:
-        sight: The pass.
+        sight: The sequence.
         static: Standard deviation of the offsets over that of the noise, 0 or more; infinity: whatever does not
             move says nothing about the target.
-        strip_gram: A^T A, where it is at hand; passes over one strip share it.
+        strip_gram: A^T A, where it is at hand; sequences over one strip share it.
 
     Raises:
         ConfigError: `static` is negative.
-        DataError: The pass shows nothing of the target.
+        DataError: The sequence shows nothing of the target.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class JointProblem:
         # What a difference of equal matrices leaves is rounding.
         if float(self.gram.diagonal().max()) <= _KEPT * float(strip_gram.diagonal().max()):
             raise DataError(
-                "the pass shows nothing of the target; give positions that differ, or a lower static"
+                "the sequence shows nothing of the target; give positions that differ, or a lower static"
             )
 
     @property
@@ -242,7 +242,7 @@ class JointProblem:
 
         Raises:
             ConfigError: lam is not 0 or more.
-            DataError: The pictures are not those of the pass.
+            DataError: The pictures are not those of the sequence.
         """
         if lam is not None and not (math.isfinite(lam) and lam >= 0):
             raise ConfigError(f"lam is {lam}; give 0 or more, or None for generalised cross-validation")
@@ -280,12 +280,12 @@ class JointProblem:
 
         Raises:
             ConfigError: lam is not positive, or the box is empty.
-            DataError: The pictures are not those of the pass.
+            DataError: The pictures are not those of the sequence.
         """
         back, energy = self._seen(images)
         target_plane, (values, vectors) = self.sight.target_plane, self._eigen
         root = values.sqrt()
-        # |F x - f|^2 with F^T F = R and F^T f = A^T C^-1 y differs from the pass's misfit by a constant.
+        # |F x - f|^2 with F^T F = R and F^T f = A^T C^-1 y differs from the sequence's misfit by a constant.
         compressed = MatrixTransport((vectors * root).mT, target_plane, target_plane.shape)
         target = torch.where(root > 0, back @ vectors / root, 0.0)  # [B, C]
         batch = images.shape[:-3]

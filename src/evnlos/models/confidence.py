@@ -69,17 +69,17 @@ CONFIRMED = 0.7
 LEVELS = 16
 """Bins of a pixel's reconstructed level."""
 GROUPS = 3
-"""Groups of passes, by agreement, with intervals of their own."""
+"""Groups of sequences, by agreement, with intervals of their own."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What one pass of pictures is worth.
+    """What one sequence of pictures is worth.
 
     Args:
-        agreement: Share of what tells this object from the average one that both halves of the pass agree on:
-            1 = all that objects differ by, 0 = nothing.
-        threshold: Agreement that one in 20 passes shows in which each position saw another object, so that
+        agreement: Share of what tells this object from the average one that both halves of the sequence agree
+            on: 1 = all that objects differ by, 0 = nothing.
+        threshold: Agreement that one in 20 sequences shows in which each position saw another object, so that
             nothing of any one object was measured.
         low: Lower end of each pixel's interval, float32 [N, H, W], 0..1.
         high: Upper end.
@@ -115,8 +115,9 @@ class Judgement:
             )
         if not self.measured:
             return (
-                "nothing measured: both halves of the pass share "
-                f"{100 * max(self.agreement, 0):.0f} % of what tells objects apart; passes without any object "
+                "nothing measured: both halves of the sequence share "
+                f"{100 * max(self.agreement, 0):.0f} % of what tells objects apart; sequences without any "
+                "object "
                 f"share up to {100 * self.threshold:.0f} %"
             )
         return f"the measurement supports {100 * self.support:.0f} % of the picture"
@@ -124,7 +125,7 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Confidence:
-    """What `fit_confidence` learned from passes that the network was not trained on.
+    """What `fit_confidence` learned from sequences that the network was not trained on.
 
     Args:
         mean: Mean of the true targets, float32 [32, 32].
@@ -132,7 +133,7 @@ class Confidence:
             the mean target, [32, 32].
         power: Mean of |d|^2 over true targets, d what tells a target from an empty answer (see `telling`), [].
         threshold: See `Judgement.threshold`, [].
-        edges: Agreements that separate the groups of passes, ascending, [G - 1].
+        edges: Agreements that separate the groups of sequences, ascending, [G - 1].
         low: Lower end of the interval for each group and level, [G, L].
         high: Upper end.
     """
@@ -146,11 +147,11 @@ class Confidence:
     high: Tensor
 
     def judge(self, pictures: Tensor, halves: Tensor, explained: float | None = None) -> Judgement:
-        """Return what the pictures of a pass are worth.
+        """Return what the pictures of a sequence are worth.
 
         Args:
             pictures: Pictures of all positions, float [N, H, W], 0..1.
-            halves: What the two halves of the pass show of the target, [2, 32, 32]: see `halves_of`.
+            halves: What the two halves of the sequence show of the target, [2, 32, 32]: see `halves_of`.
             explained: How much of the frames the pictures explain, where the setup is known.
         """
         agreement, threshold = float(self.agreement(halves)), float(self.threshold)
@@ -170,7 +171,7 @@ class Confidence:
         return replace(blank, low=low, high=high)
 
     def agreement(self, halves: Tensor) -> Tensor:
-        """Return the agreement of a pass, [], from its halves [2, 32, 32]."""
+        """Return the agreement of a sequence, [], from its halves [2, 32, 32]."""
         first, second = self.telling(halves)
         return first @ second / self.power
 
@@ -179,7 +180,7 @@ class Confidence:
 
         It is their difference from the mean target, without the mean target's own direction, so that neither a
         black target nor a paler one tells anything; less the same of what the network shows when it knows
-        nothing, which would be in both halves of any pass.
+        nothing, which would be in both halves of any sequence.
         """
         mean = F.normalize(self.mean.flatten(), dim=0)
         away = (shown - self.mean).flatten(1)
@@ -208,7 +209,7 @@ class Confidence:
 
 @torch.inference_mode()
 def halves_of(network: Reconstructor, inputs: Tensor, position_m: NDArray, canvas: Plane) -> Tensor:
-    """Return what the first and the second half of a pass show of the target, each on its own, [2, 32, 32].
+    """Return what the first and the second half of a sequence show of the target, each on its own, [2, 32, 32].
 
     The object is the same in both halves and everything else is not: the noise, and where target, wall and
     camera are to one another. A pattern that stays where it is, or comes from nowhere, is not in both.

@@ -23,7 +23,7 @@ from evnlos.config import from_dict, to_dict
 from evnlos.data import MODALITIES, STANDARD_MODALITIES, Modality, Sampling
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
-from evnlos.migrate import migrate
+from evnlos.migrate import migrate, todays_weights
 from evnlos.models.confidence import Confidence
 from evnlos.models.reconstructor import Reconstructor, ReconstructorSettings
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
@@ -36,7 +36,7 @@ GROUP = "evnlos.weights"
 _CHECKOUT = Path(__file__).resolve().parents[3] / "packages" / "evnlos-weights" / "src" / "evnlos_weights"
 _SETUPS_M = {"near": 0.30, "far": 0.50}
 """Distance from hidden object to wall of each setup that there are weights for, metres."""
-_PASS = "pass"
+_SEQUENCE = "sequence"
 
 
 def weights_folders() -> list[Path]:
@@ -67,12 +67,12 @@ def weights_folders() -> list[Path]:
 def published() -> dict[str, Path]:
     """Return the weights that are installed: name, such as "near-frame", -> file.
 
-    A name is setup and modality; one that ends in "-pass" sees all positions of a pass together.
+    A name is setup and modality; one that ends in "-sequence" sees all positions of a sequence together.
     """
     found: dict[str, Path] = {}
     for folder in weights_folders():
         for path in sorted(folder.glob("*.safetensors")):
-            found.setdefault(path.stem, path)
+            found.setdefault(todays_weights(path.stem), path)
     return dict(sorted(found.items()))
 
 
@@ -111,7 +111,7 @@ def published_setup(weights: str | Path) -> Path | None:
     Args:
         weights: A name of `published`, or what else stands for weights.
     """
-    name, known = str(weights), published()
+    name, known = todays_weights(str(weights)), published()
     if name not in known:
         return None
     path = known[name].parent / f"{name.partition('-')[0]}.yaml"
@@ -139,7 +139,7 @@ def published_single() -> list[str]:
         >>> published_single()
         ['near-event', 'near-frame']
     """
-    return [name for name in published() if not name.endswith(f"-{_PASS}")]
+    return [name for name in published() if not name.endswith(f"-{_SEQUENCE}")]
 
 
 def published_for(distance_m: float | None, modality: str, *, is_motion_known: bool) -> str:
@@ -148,7 +148,7 @@ def published_for(distance_m: float | None, modality: str, *, is_motion_known: b
     Args:
         distance_m: From hidden object to wall, metres; None: unknown, taken for that of `near`.
         modality: What they shall see: "frame", "event" or "fusion".
-        is_motion_known: Whether the whole pass can be seen together, which needs the motion.
+        is_motion_known: Whether the whole sequence can be seen together, which needs the motion.
 
     Raises:
         DataError: There are none for this modality.
@@ -160,7 +160,7 @@ def published_for(distance_m: float | None, modality: str, *, is_motion_known: b
     wanted = _SETUPS_M["near"] if distance_m is None else distance_m
     names = published()
     setups = sorted(_SETUPS_M, key=lambda setup: abs(_SETUPS_M[setup] - wanted))
-    kinds = [f"{modality}-{_PASS}", modality] if is_motion_known else [modality]
+    kinds = [f"{modality}-{_SEQUENCE}", modality] if is_motion_known else [modality]
     for name in (f"{setup}-{kind}" for setup in setups for kind in kinds):
         if name in names:
             return name
@@ -274,6 +274,8 @@ def load_weights(path: str | Path) -> Weights:
     """
     known = published()
     given = Path(path)
+    if not given.exists() and (name := todays_weights(str(given))) in known:
+        given = Path(name)
     path = given / "weights.safetensors" if given.is_dir() else given
     if str(given) in known:
         if path.is_file():

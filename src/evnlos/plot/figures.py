@@ -1,9 +1,9 @@
 """Figures for each stage of a sequence.
 
 - An empty matplotlib figure, or one line that says what to install.
-- Films of a pass: one column a stage of the light path, one picture a position; NumPy and Pillow.
+- Films of a sequence: one column a stage of the light path, one picture a position; NumPy and Pillow.
 
-A figure for each stage of a pass: wall, events in space and time, surfaces, reconstructions.
+A figure for each stage of a sequence: wall, events in space and time, surfaces, reconstructions.
 
 They need matplotlib and take `theme` ("light" or "dark"); axes carry units, and colour maps keep their order
 in grey print.

@@ -4,7 +4,7 @@
 - Reconstructions of a hidden screen side by side; needs matplotlib.
 - The check picture of an imported scan; needs matplotlib.
 - The path of a hidden object and its speed; needs matplotlib.
-- Can the confidence be trusted? What is left when the least supported passes go, and support against skill.
+- Can the confidence be trusted? What is left when the least supported sequences go, and support against skill.
 - What a setup can show, drawn: singular values, Picard plot, modes, and the best linear picture.
 """
 
@@ -222,14 +222,14 @@ def draw_track(
     return save_figure(figure, path, dpi=80)
 
 
-_LEAST_SKILL = -1.2  # worse passes are drawn on this line
+_LEAST_SKILL = -1.2  # worse sequences are drawn on this line
 
 
 def draw_worth(found: Mapping[str, Sequence[PassWorth]], path: str | Path) -> Path:
-    """Draw the risk-coverage curves of all passes, and each pass's skill over its support.
+    """Draw the risk-coverage curves of all sequences, and each sequence's skill over its support.
 
     Args:
-        found: The passes by the name of their set.
+        found: The sequences by the name of their set.
         path: The picture, PNG or SVG.
 
     Returns:
@@ -242,16 +242,16 @@ def draw_worth(found: Mapping[str, Sequence[PassWorth]], path: str | Path) -> Pa
 
     figure = new_figure((10.5, 4.4))
     curves, cloud = figure.subplots(1, 2)
-    passes = [one for those in found.values() for one in those]
-    skill, support = (np.array([getattr(one, key) for one in passes]) for key in ("skill", "support"))
+    sequences = [one for those in found.values() for one in those]
+    skill, support = (np.array([getattr(one, key) for one in sequences]) for key in ("skill", "support"))
     for order, name, line in (
         (support, "the most supported first", "-"),
         (skill, "the best first (not known to a user)", "--"),
     ):
         kept, risk = risk_coverage(order, 1 - skill)
         curves.plot(100 * kept, risk, line, label=name, lw=1.6)
-    curves.axhline(float(np.mean(1 - skill)), color="0.5", lw=1.0, ls=":", label="all passes")
-    curves.set(xlabel="passes kept, %", ylabel="mean risk of what is kept (1 - skill)", ylim=(0, None))
+    curves.axhline(float(np.mean(1 - skill)), color="0.5", lw=1.0, ls=":", label="all sequences")
+    curves.set(xlabel="sequences kept, %", ylabel="mean risk of what is kept (1 - skill)", ylim=(0, None))
     curves.legend(frameon=False, fontsize=8)
     marks = "osD^v<>PX*ph"
     for number, (name, those) in enumerate(found.items()):

@@ -58,7 +58,8 @@ _WORDS = {
     "fusion": ("fusion", "the network sees both, frames and events, and joins them."),
     "sequence": (
         "sequence",
-        "the network sees all time steps of one pass of the object together and draws the object once; without "
+        "the network sees all time steps of one sequence of the object together and draws the object once; "
+        "without "
         "the word it sees a single time step. The motion of the object must be known.",
     ),
     "psnr_db": (

@@ -191,7 +191,7 @@ def reconstruct_capture(
     Args:
         capture: A capture folder; its target may be unknown.
         weights: A weights file, a run's folder or a name of `published`; None: the published frame weights of
-            the setup whose distance is nearest, of whole passes where the motion is known or found.
+            the setup whose distance is nearest, of whole sequences where the motion is known or found.
         out: The folder for the pictures; must not exist or be empty. It is there with all of them, or
             not at all.
         zoom: Size of a pixel in the pictures.

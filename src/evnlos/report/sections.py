@@ -2,7 +2,7 @@
 
 - The setup of a report: its drawing to scale, and what it can show at all.
 - The figure that a report leads with: what pre-training gains, beside what one scores without looking.
-- How far to believe the pictures: what each run said of its own passes, beside what was true.
+- How far to believe the pictures: what each run said of its own sequences, beside what was true.
 - Pictures of a report over positions: a strip of each object, animations, and the worst on purpose.
 """
 
@@ -180,10 +180,10 @@ def belief_section(results: list[RunResult]) -> str:
     names = "".join("<th>support</th><th>skill</th>" for _ in known)
     rows = []
     for k, name in enumerate(known[0].evaluation.characters()):
-        passes = [r.evaluation.worth[k] for r in known]
+        sequences = [r.evaluation.worth[k] for r in known]
         cells = "".join(
             f"<td>{f'{one.support:.0%}' if one.measured else 'nothing measured'}</td><td>{one.skill:.0%}</td>"
-            for one in passes
+            for one in sequences
         )
         rows.append(f"<tr><td>{html.escape(character_of(name))}</td>{cells}</tr>")
     held = [np.mean([one.coverage for one in r.evaluation.worth]) for r in known]
@@ -192,7 +192,8 @@ def belief_section(results: list[RunResult]) -> str:
     wide_cells = "".join(f"<td colspan=2>{value:.2f}</td>" for value in wide)
     return (
         "<h2>How far to believe them</h2><p class=dim>Support: the share of what tells objects apart that both "
-        "halves of the pass agree on, which the network says without knowing the truth. Skill: the share of it "
+        "halves of the sequence agree on, which the network says without knowing the truth. Skill: the share "
+        "of it "
         "that is right; below 0 the average object would have been nearer. The intervals are to hold 90 % of "
         "the target plane's pixels; a length of 1 is from black to white.</p>"
         f"<div class=wide><table><tr><th></th>{heads}</tr><tr><th></th>{names}</tr>{''.join(rows)}"
@@ -286,7 +287,7 @@ def failures_section(results: list[RunResult]) -> str:
 
 
 def _worst(gain: np.ndarray, names: np.ndarray) -> list[int]:
-    """Return the samples that gain least, spread over the objects: a whole pass would be the same picture."""
+    """Return the samples that gain least, spread over the objects: one object's would look the same."""
     each = max(2, -(-_WORST // len(np.unique(names))))
     taken: list[int] = []
     for k in np.argsort(gain, kind="stable"):

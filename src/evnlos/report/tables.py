@@ -18,6 +18,7 @@ import numpy as np
 from evnlos.analysis import BASELINES, Evaluation, Scores, available_lpips, evaluate
 from evnlos.data import Dataset, character_of, modality_order, open_dataset
 from evnlos.errors import DataError
+from evnlos.migrate import todays_weights
 from evnlos.models import load_weights, published
 
 METHODS = ("simulation only", "E2E", "EPNP")
@@ -113,8 +114,8 @@ def named(run: Path) -> tuple[str, bool]:
         >>> named(Path("runs/epnp/weights.safetensors")), named(Path("shared/mine.safetensors"))
         (('epnp', False), ('mine', False))
     """
-    if not run.exists() and str(run) in published():
-        return str(run), True
+    if not run.exists() and (name := todays_weights(str(run))) in published():
+        return name, True
     run = run.resolve()
     if run.is_dir():
         return run.name, False

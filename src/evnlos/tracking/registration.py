@@ -123,7 +123,7 @@ def _middles(light: torch.Tensor, noise: float) -> NDArray[np.float64]:
     signal = (3 * peak / noise).numpy()  # the mean of nine samples has a third of their noise
     weak, strong = np.flatnonzero(signal < _LEAST_SIGNAL), np.flatnonzero(signal >= _LEAST_SIGNAL)
     if len(weak):
-        cure = "leave out these frames, which are before or after the object's pass"
+        cure = "leave out these frames, which are before or after the object's sequence"
         if not len(strong) or np.ptp(strong) >= len(strong):
             cure = (
                 "the object does not stand out on this wall: take a brighter one, a longer exposure, less noise"

@@ -202,7 +202,7 @@ def most_likely_acceleration(axes: list[Measurements]) -> float:
 class Distance:
     """How far the object was from the wall, smoothed.
 
-    Its mean is the setup's, which no pass tells: a target that is nearer and one that is larger look alike.
+    Its mean is the setup's, which no sequence tells: a target that is nearer and one that is larger look alike.
 
     Args:
         time_s: Instants of the frames, [N], seconds.

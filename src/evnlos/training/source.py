@@ -137,7 +137,7 @@ class Stored:
     A batch is cut into as many parts as there are processes; together they are the batch of one process.
 
     Args:
-        samples: The samples: positions, or passes.
+        samples: The samples: positions, or sequences.
         batch_size: Samples a step, of all processes together.
         seed: Seed of the order.
         team: The processes.

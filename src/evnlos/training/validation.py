@@ -1,6 +1,6 @@
 """What a training is watched by, and how confidence is learned from samples that it does not learn from.
 
-- Learn what a network's pictures are worth, from passes that it was not trained on.
+- Learn what a network's pictures are worth, from sequences that it was not trained on.
 - What a training is watched by: samples that it does not learn from.
 """
 
@@ -23,39 +23,39 @@ from evnlos.models.confidence import COVERAGE, GROUPS, LEVELS
 from evnlos.types import Plane, derive_seed
 
 FALSE_ALARM = 0.05
-"""Share of passes of which nothing was measured that are taken for measured."""
+"""Share of sequences of which nothing was measured that are taken for measured."""
 FEWEST = 8
-"""Passes that confidence can be learned from, at least."""
-_MIXED = 60  # passes without an object
+"""Sequences that confidence can be learned from, at least."""
+_MIXED = 60  # sequences without an object
 
 
 @torch.inference_mode()
 def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) -> Confidence:
-    """Learn what pictures of a network are worth from passes that it was not trained on.
+    """Learn what pictures of a network are worth from sequences that it was not trained on.
 
     Agreement. With d what tells a target from the network's empty answer (`Confidence.telling`), the agreement
-    is <d1, d2> / E|t|^2: d1 and d2 from the two halves of a pass, t the same of true targets. For a network
+    is <d1, d2> / E|t|^2: d1 and d2 from the two halves of a sequence, t the same of true targets. For a network
     that answers with the expectation of the truth, whose empty answer is the mean target, the law of total
     variance makes it the share of the objects' variance that the measurement explains; noise that the halves do
-    not share cancels. Empty answer and threshold come from passes in which each position saw another object: a
-    network of sequences draws the same for all of them, and that is no sign of any object.
+    not share cancels. Empty answer and threshold come from sequences in which each position saw another object:
+    a network of sequences draws the same for all of them, and that is no sign of any object.
 
     Intervals. The central 90 % of the true levels of a target plane's pixels for each level that the network
     gave (split conformal, Mondrian by level and by agreement: Vovk et al., Algorithmic Learning in a Random
-    World, 2005), so that the coverage holds for passes like these whatever the network is.
+    World, 2005), so that the coverage holds for sequences like these whatever the network is.
 
     Args:
         network: The network.
-        samples: The passes, each object's positions in the order of time.
+        samples: The sequences, each object's positions in the order of time.
         canvas: Geometry of the pictures.
 
     Raises:
-        DataError: There are fewer than 8 passes, or a motion is unknown.
+        DataError: There are fewer than 8 sequences, or a motion is unknown.
     """
     names, position_m = samples.names, samples.position_m
     objects = list(dict.fromkeys(names.tolist()))
     if len(objects) < FEWEST:
-        raise DataError(f"{len(objects)} passes to learn confidence from; give at least {FEWEST}")
+        raise DataError(f"{len(objects)} sequences to learn confidence from; give at least {FEWEST}")
     halves, shown, true = [], [], []
     for name in objects:
         mine = np.flatnonzero(names == name)
@@ -80,20 +80,20 @@ def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) 
 
 
 def _mixed(names: NDArray, count: int = _MIXED) -> list[NDArray[np.int64]]:
-    """Return the rows of passes in which each position is of another object; always the same."""
-    passes = [np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())]
+    """Return the rows of sequences in which each position is of another object; always the same."""
+    sequences = [np.flatnonzero(names == name) for name in dict.fromkeys(names.tolist())]
     draw = np.random.default_rng(derive_seed(0, "mixed passes"))
-    length = min(len(one) for one in passes)
+    length = min(len(one) for one in sequences)
     return [
-        np.array([passes[i][k] for k, i in enumerate(draw.integers(0, len(passes), length))])
+        np.array([sequences[i][k] for k, i in enumerate(draw.integers(0, len(sequences), length))])
         for _ in range(count)
     ]
 
 
-def _ends(passes: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def _ends(sequences: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
     """Return the ends of the intervals for each level, [L] and [L], from pairs of targets shown and true."""
-    shown = torch.cat([one.flatten() for one, _ in passes])
-    true = torch.cat([one.flatten() for _, one in passes])
+    shown = torch.cat([one.flatten() for one, _ in sequences])
+    true = torch.cat([one.flatten() for _, one in sequences])
     bins = (shown * LEVELS).long().clamp(0, LEVELS - 1)
     low, high = torch.zeros(LEVELS), torch.ones(LEVELS)
     for level in range(LEVELS):

@@ -234,7 +234,8 @@ def run_tiles(
 
 @njit(cache=True, error_model="numpy")
 def settle(step, pixel, crossings, shot, sub_times, period, last_event, base, step_on, step_off):
-    """Let the events of one step pass the refractory period; return (sub-time index, pixel, polarity) columns.
+    """Let the events of one step sequence the refractory period; return (sub-time index, pixel, polarity)
+    columns.
 
     `sub_times` [M] float32 seconds; `last_event` [N] float32 seconds and `base` are updated. Dropped events
     leave the reference alone: they are deferred. The period is `period` seconds, 0 = let everything pass.
