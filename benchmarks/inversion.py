@@ -6,8 +6,9 @@ A character on the setup "main" (rough aluminium of roughness 0.05, 0.3 m), 30 x
 unknown is the scene's change between two instants 0.8 s apart, 16 mm of travel (paper Eq. event_fm1 and
 event_fm3, without the time surface): from the difference of two frames, and from the signed event count times
 the threshold, linearised at the mean of the two frames. "exact" is the true change of log light, without noise:
-what the linearisation alone costs. All by Tikhonov with the gradient towards a dark border, lam by leaving out
-blocks of the wall; r is Pearson's correlation of the found change with the true one, mean of R, K and G.
+what the linearisation alone costs. All by Tikhonov with the gradient towards a dark border, regularization by
+leaving out blocks of the wall; r is Pearson's correlation of the found change with the true one, mean of R, K
+and G.
 """
 
 import numpy as np

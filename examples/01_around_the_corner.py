@@ -13,9 +13,9 @@ import torch
 
 from evnlos import EventCamera, EventPixel, FrameCamera, Scene, Target, psnr, time_surface
 from evnlos.data import Sampling
-from evnlos.inverse import JointProblem, SequenceOperator
-from evnlos.inverse.joint import strip_gram_of
+from evnlos.inverse import SequenceOperator, SequenceProblem
 from evnlos.inverse.measurements import object_light
+from evnlos.inverse.sequence_problem import strip_gram_of
 from evnlos.plot.event_views import signed_pictures, slice_pictures
 from evnlos.plot.figures import Column, film
 from evnlos.report.pictures import grey, save_animation
@@ -40,7 +40,7 @@ light, target_plane, gram = object_light(frames, 255, setup, SHAPE), Plane(16, 1
 truth = scene.truth(CANVAS.canvas, times_s)[:, CANVAS.scored]
 found = np.zeros_like(truth)
 for k in range(40) if len(sys.argv) > 1 else (0, 39):
-    problem = JointProblem(SequenceOperator(camera, target_plane, places[: k + 1]), strip_gram=gram)
+    problem = SequenceProblem(SequenceOperator(camera, target_plane, places[: k + 1]), strip_gram=gram)
     image = problem.tikhonov(light[: k + 1], 1e-3).image.clamp(0, 1).float()
     drawn = Target("found", image.numpy(), 0.08).rasterise(CANVAS.canvas, places[k : k + 1])
     found[k] = drawn[0][CANVAS.scored]

@@ -3,7 +3,8 @@
     python examples/05_periscopy.py mushroom_chair.npz docs/figures/periscopy_rules.png
 
 A small chair between screen and wall casts shadows that differ from cell to cell; with the chair in the model
-the wall turns into a picture. No choice looks at the truth; "best lam" does, to say what the choices cost.
+the wall turns into a picture. No choice looks at the truth; "best regularization" does, to say what the choices
+cost.
 """
 
 import sys
@@ -37,9 +38,12 @@ for name, prior in (("identity", None), ("gradient", Gradient("dark"))):
         )
         r = found[name, rule] = correlation(solution.image, truth)
         panels.append((f"{name}, {rule}: r = {r:.3f}", solution.image))
-        print(f"{name}, {rule}: lam {solution.lam:.1e}, {solution.dof:.0f} degrees of freedom, r {r:.3f}")
-    best = max(correlation(spectrum.image(lam), truth) for lam in np.logspace(-7, -1, 61))
-    print(f"{name}, best lam by the truth: r {best:.3f}")
+        print(
+            f"{name}, {rule}: regularization {solution.regularization:.1e}, {solution.dof:.0f} degrees of "
+            f"freedom, r {r:.3f}"
+        )
+    best = max(correlation(spectrum.image(regularization), truth) for regularization in np.logspace(-7, -1, 61))
+    print(f"{name}, best regularization by the truth: r {best:.3f}")
 
 assert found["gradient", "cv"] >= 0.78
 if len(sys.argv) > 2:

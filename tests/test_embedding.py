@@ -14,7 +14,7 @@ from evnlos.models import UNetConfig, Weights, fit_linear, load_weights, save_we
 from evnlos.models.embedding import InputNormalization, LinearEmbedding, LinearEmbeddings
 from evnlos.training import Training
 
-NET = UNetConfig(width=8, depth=1, rank=12, strengths=(0.1, 1.0, 10.0))
+NET = UNetConfig(width=8, depth=1, rank=12, ridge_multipliers=(0.1, 1.0, 10.0))
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +29,14 @@ def samples() -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
 def test_each_strength_is_a_ridge_regression_of_its_own(samples) -> None:
     inputs, truth, names = samples
     estimate = fit_linear(inputs, truth, names, rank=96)
-    embedding = LinearEmbedding(2, (6, 8), 96, NET.strengths)
+    embedding = LinearEmbedding(2, (6, 8), 96, NET.ridge_multipliers)
     embedding.take(estimate)
     x = (inputs.flatten(1) - inputs.flatten(1).mean(0)).double()
     y = (truth.flatten(1) - truth.flatten(1).mean(0)).double()
     inner = x.T @ x
     # sixty samples span at most sixty directions: the mean power is over those that were kept
-    unit = estimate.lam * inner.diagonal().sum() / len(estimate.powers)
-    for k, strength in enumerate(NET.strengths):
+    unit = estimate.regularization * inner.diagonal().sum() / len(estimate.powers)
+    for k, strength in enumerate(NET.ridge_multipliers):
         weights = torch.linalg.solve(inner + strength * unit * torch.eye(96, dtype=torch.float64), x.T @ y)
         expected = truth.double().mean(0) + (x @ weights).unflatten(1, (6, 8))
         torch.testing.assert_close(embedding(inputs)[:, k].double(), expected, atol=2e-4, rtol=0)
@@ -47,11 +47,11 @@ def test_frame_and_events_are_undone_each_on_its_own() -> None:
     truth = torch.rand(60, 6, 8, generator=draw)
     seen = torch.stack([truth, 0.5 * truth, 0 * truth], dim=1) + 0.1 * torch.randn(60, 3, 6, 8, generator=draw)
     names = np.repeat([f"o{k}" for k in range(12)], 5)
-    both = LinearEmbeddings(as_modality("fusion"), (6, 8), 40, NET.strengths)
+    both = LinearEmbeddings(as_modality("fusion"), (6, 8), 40, NET.ridge_multipliers)
     both.fit(seen, truth, names, seed=4)
     frame, events = both.groups["frame"], both.groups["events"]
     assert (both.rank, both.images, frame.rank, events.rank) == (40, 6, 25, 15)
-    alone = LinearEmbedding(1, (6, 8), 25, NET.strengths)
+    alone = LinearEmbedding(1, (6, 8), 25, NET.ridge_multipliers)
     alone.take(fit_linear(seen[:, :1], truth, names, rank=25, seed=4))
     pictures = both(seen)
     assert pictures.shape == (60, 6, 6, 8)
@@ -164,5 +164,5 @@ def test_wrong_sizes_and_settings_are_named() -> None:
         NET.build("frame", Sampling(height=6, width=8, scored_rows=6))(torch.zeros(1, 1, 8, 8))
     with pytest.raises(ConfigError, match=r"rank is -1"):
         UNetConfig(rank=-1)
-    with pytest.raises(ConfigError, match="strengths"):
-        UNetConfig(strengths=(1.0, 0.0))
+    with pytest.raises(ConfigError, match="ridge_multipliers"):
+        UNetConfig(ridge_multipliers=(1.0, 0.0))

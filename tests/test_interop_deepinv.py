@@ -37,7 +37,7 @@ def test_adjoint_and_batch(deepinv):
 
 
 def test_its_prox_is_our_tikhonov(deepinv):
-    """prox of |A x - y|^2 / 2 at 0 with step g is the Tikhonov solution with lam = 1 / g."""
+    """prox of |A x - y|^2 / 2 at 0 with step g is the Tikhonov solution with regularization = 1 / g."""
     example = EXAMPLES["rough metal"]()
     assert isinstance(example, MatrixTransport)
     # Its conjugate gradients add an absolute 1e-8 to a denominator: norm 1 and bright pictures make that small.

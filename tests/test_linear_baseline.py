@@ -33,7 +33,7 @@ def test_it_is_the_ridge_regression_that_it_says() -> None:
     found = fit_linear(inputs, truth, names, rank=192)  # all components: no direction is left out
     x = (inputs.flatten(1) - inputs.flatten(1).mean(0)).double()
     y = (truth.flatten(1) - truth.flatten(1).mean(0)).double()
-    ridge = found.lam * (x.T @ x).diagonal().mean() * torch.eye(192, dtype=torch.float64)
+    ridge = found.regularization * (x.T @ x).diagonal().mean() * torch.eye(192, dtype=torch.float64)
     weights = torch.linalg.solve(x.T @ x + ridge, x.T @ y)
     expected = (truth.double().mean(0).flatten() + x @ weights).clamp(0, 1).reshape(truth.shape)
     torch.testing.assert_close(found(inputs).double(), expected, atol=1e-4, rtol=0)
@@ -46,22 +46,22 @@ def test_errors_on_objects_left_out_are_those_of_one_regression_for_each_ridge()
     kept = code[~left].double()
     inner, outer = kept.T @ kept, kept.T @ y[~left].double()
     plain = []
-    for lam in _LAMBDAS:
-        ridge = lam * inner.diagonal().mean() * torch.eye(40, dtype=torch.float64)
+    for regularization in _LAMBDAS:
+        ridge = regularization * inner.diagonal().mean() * torch.eye(40, dtype=torch.float64)
         plain.append((code[left].double() @ torch.linalg.solve(inner + ridge, outer) - y[left]).square().sum())
     torch.testing.assert_close(_left_out(code, y, left), torch.stack(plain), rtol=1e-5, atol=0)
 
 
 def test_more_noise_asks_for_more_ridge_and_never_loses_to_the_mean() -> None:
-    lams = []
+    regularizations = []
     for noise in (0.01, 0.3, 100.0):
         inputs, truth, names = world(noise)
         found = fit_linear(inputs[:200], truth[:200], names[:200], rank=40)
         error = (found(inputs[200:]) - truth[200:]).square().mean()
         blank = (truth[:200].mean(0) - truth[200:]).square().mean()
         assert error < 1.02 * blank
-        lams.append(found.lam)
-    assert lams[0] < lams[1] < lams[2]
+        regularizations.append(found.regularization)
+    assert regularizations[0] < regularizations[1] < regularizations[2]
 
 
 def test_same_seed_same_numbers_and_wrong_input_is_named() -> None:

@@ -510,7 +510,7 @@ def test_commands_from_plan_to_picture(tmp_path, capsys) -> None:
     picture = tmp_path / "found.png"
     options = ["--dark", str(tmp_path / "dark.png"), "--setup", str(out), "--out", str(picture)]
     main(["invert", str(tmp_path / "wall.png"), *options, "--solver", "tikhonov", "--json"])
-    assert json.loads(capsys.readouterr().out)["solutions"]["tikhonov"]["lam"] > 0
+    assert json.loads(capsys.readouterr().out)["solutions"]["tikhonov"]["regularization"] > 0
     image = np.load(picture.with_suffix(".npz"))["tikhonov"][0]
     assert np.corrcoef(image.ravel(), letter.ravel())[0, 1] > 0.6
     with pytest.raises(SystemExit):

@@ -94,15 +94,21 @@ def test_command(made, tmp_path, capsys):
     assert np.load(out.with_suffix(".npz"))["tv"].shape == (1, 10, 12)
     assert "without occluder" in to_text(found)
     InvertCommand(
-        (made,), solver="tikhonov", lam="1e-4", background_degree=2, no_occluder=True, out=out, json=True
+        (made,),
+        solver="tikhonov",
+        regularization="1e-4",
+        background_degree=2,
+        no_occluder=True,
+        out=out,
+        json=True,
     ).run()
     found = json.loads(capsys.readouterr().out)
     assert list(found["solutions"]) == ["tikhonov"]
-    assert found["solutions"]["tikhonov"]["lam"] == 1e-4
-    with pytest.raises(ConfigError, match="--lam is 'x'"):
-        InvertCommand((made,), lam="x", out=out).run()
+    assert found["solutions"]["tikhonov"]["regularization"] == 1e-4
+    with pytest.raises(ConfigError, match="--regularization is 'x'"):
+        InvertCommand((made,), regularization="x", out=out).run()
     with pytest.raises(ConfigError, match="tikhonov only"):
-        InvertCommand((made,), lam="gcv", out=out).run()
+        InvertCommand((made,), regularization="gcv", out=out).run()
 
 
 @pytest.mark.parametrize(

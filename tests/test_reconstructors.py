@@ -32,7 +32,7 @@ from evnlos.report import gather, write_report
 from evnlos.training import Training
 
 RECORDS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "experiments"
-SMALL = {"width": 8, "depth": 1, "shuffle": 2, "rank": 24, "strengths": (0.1, 1.0)}
+SMALL = {"width": 8, "depth": 1, "shuffle": 2, "rank": 24, "ridge_multipliers": (0.1, 1.0)}
 QUICK = Training(epochs=2, network=UNetConfig(**SMALL), precision="float32", batch_size=16)
 
 
@@ -173,10 +173,11 @@ def test_published_weights_say_what_they_are_in_the_words_of_today() -> None:
 
 
 def test_settings_of_before_load(tmp_path) -> None:
-    old = {"paradigm": "event", "joint": True, "views": 5, "restandardise": False, "network": {"width": 16}}
+    old = {"paradigm": "event", "joint": True, "views": 5, "restandardise": False, "loss": "balanced"}
+    old |= {"network": {"width": 16, "strengths": [0.1, 1.0]}}
     save_yaml(old, tmp_path / "old.yaml")
     found = load_yaml(Training, tmp_path / "old.yaml")
-    network = SequenceConfig(width=16)
+    network = SequenceConfig(width=16, ridge_multipliers=(0.1, 1.0))
     assert found == Training("event", network=network, sequence_augmentations=5, keep_normalization=True)
     assert old["joint"] is True  # what was read stays as it was
     assert from_dict(Training, {"paradigm": "frame", "joint": False}) == Training()

@@ -75,11 +75,13 @@ def test_tikhonov_solves_the_normal_equations_of_every_operator(name):
     operator = EXAMPLES[name]()
     assert isinstance(operator, LinearTransport)
     y = noise(2, *operator.shape)
-    lam = 1e-3 * operator_norm(operator, torch.zeros(operator.source.shape, dtype=torch.float64)) ** 2
-    x = tikhonov(operator, y, lam).image
-    left = operator.adjoint(operator(x) - y) + lam * x
+    regularization = (
+        1e-3 * operator_norm(operator, torch.zeros(operator.source.shape, dtype=torch.float64)) ** 2
+    )
+    x = tikhonov(operator, y, regularization).image
+    left = operator.adjoint(operator(x) - y) + regularization * x
     assert left.norm() <= 1e-9 * operator.adjoint(y).norm()
-    by_products = tikhonov(operator, y, lam, method="cg", tolerance=1e-12)
+    by_products = tikhonov(operator, y, regularization, method="cg", tolerance=1e-12)
     assert by_products.converged
     torch.testing.assert_close(by_products.image, x, rtol=1e-7, atol=1e-8 * float(x.abs().max()))
 
@@ -90,17 +92,19 @@ def test_tikhonov_with_everything_equals_the_stacked_least_squares(prior):
     operator, y = random_operator(), noise(3, 8, 9, seed=1)
     weight = torch.rand(8, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.1
     weight[0, :4] = 0
-    nuisance, lam = Background(2), 0.05
-    found = tikhonov(operator, y, lam, prior=prior, nuisance=nuisance, weight=weight)
+    nuisance, regularization = Background(2), 0.05
+    found = tikhonov(operator, y, regularization, prior=prior, nuisance=nuisance, weight=weight)
     steps = torch.eye(30).double() if prior is None else dense_matrix(prior, y.new_zeros(5, 6))
     extra = nuisance.polynomials((8, 9)).flatten(1).mT
     top = weight.flatten()[:, None] * torch.cat([operator.matrix, extra], 1)
-    stacked = torch.cat([top, math.sqrt(lam) * torch.cat([steps, steps.new_zeros(len(steps), 6)], 1)])
+    stacked = torch.cat(
+        [top, math.sqrt(regularization) * torch.cat([steps, steps.new_zeros(len(steps), 6)], 1)]
+    )
     right = torch.cat([(weight * y).flatten(1).mT, y.new_zeros(len(steps), 3)])
     expected = torch.linalg.lstsq(stacked, right).solution[:30].mT.reshape(3, 5, 6)
     torch.testing.assert_close(found.image, expected, rtol=1e-9, atol=1e-10)
     again = tikhonov(
-        operator, y, lam, prior=prior, nuisance=nuisance, weight=weight, method="cg", tolerance=1e-12
+        operator, y, regularization, prior=prior, nuisance=nuisance, weight=weight, method="cg", tolerance=1e-12
     )
     torch.testing.assert_close(again.image, expected, rtol=1e-7, atol=1e-9)
     problem = Problem(operator, y, nuisance, weight)
@@ -146,16 +150,23 @@ def blurred_scene(sigma: float = 0.01):
 
 
 def test_gcv_is_leave_one_out_in_spirit_and_near_the_best():
-    """GCV's own definition by the influence matrix, and lam within the reach of the best one by the truth."""
+    """GCV's own definition by the influence matrix, and regularization within the reach of the best one by the
+    truth.
+    """
     operator, truth, y = blurred_scene()
-    spectrum, lam = Spectrum(Problem(operator, y)), 1e-3
-    normal = operator.matrix.mT @ operator.matrix + lam * torch.eye(144).double()
+    spectrum, regularization = Spectrum(Problem(operator, y)), 1e-3
+    normal = operator.matrix.mT @ operator.matrix + regularization * torch.eye(144).double()
     influence = operator.matrix @ torch.linalg.solve(normal, operator.matrix.mT)
     left = (y.flatten() - influence @ y.flatten()).square().sum()
-    assert spectrum.gcv(lam) == pytest.approx(float(144 * left / (144 - influence.trace()) ** 2), rel=1e-9)
-    assert spectrum.dof(lam) == pytest.approx(float(influence.trace()), rel=1e-9)
+    assert spectrum.gcv(regularization) == pytest.approx(
+        float(144 * left / (144 - influence.trace()) ** 2), rel=1e-9
+    )
+    assert spectrum.dof(regularization) == pytest.approx(float(influence.trace()), rel=1e-9)
     found = tikhonov(operator, y)
-    assert all(spectrum.gcv(found.lam) <= spectrum.gcv(found.lam * f) for f in (0.8, 1.25, 10, 0.1))
+    assert all(
+        spectrum.gcv(found.regularization) <= spectrum.gcv(found.regularization * f)
+        for f in (0.8, 1.25, 10, 0.1)
+    )
     best = min(float((spectrum.image(x) - truth).norm()) for x in np.logspace(-8, 1, 91))
     assert float((found.image - truth).norm()) < 1.15 * best
     assert found.noise_sigma == pytest.approx(0.01, rel=0.25)
@@ -173,7 +184,7 @@ def test_discrepancy_meets_the_noise():
 def test_stochastic_gcv_is_near_the_exact_one_and_repeats():
     operator, truth, y = blurred_scene()
     exact, guess = tikhonov(operator, y), tikhonov(operator, y, method="cg", seed=3)
-    assert guess.lam == tikhonov(operator, y, method="cg", seed=3).lam
+    assert guess.regularization == tikhonov(operator, y, method="cg", seed=3).regularization
     assert float((guess.image - truth).norm()) < 1.1 * float((exact.image - truth).norm())
 
 
@@ -187,7 +198,7 @@ def test_cross_validation_resists_errors_that_neighbours_share():
     rough = torch.nn.functional.avg_pool2d(noise(1, 32, 32, seed=9), 3, stride=1)[0]
     y = operator(truth) + 0.02 * rough / rough.std()
     gcv, cv = tikhonov(operator, y), tikhonov(operator, y, rule="cv")
-    assert cv.lam > 3 * gcv.lam
+    assert cv.regularization > 3 * gcv.regularization
     assert float((cv.image - truth).norm()) < 0.9 * float((gcv.image - truth).norm())
 
 
@@ -202,8 +213,9 @@ def test_block_folds_are_even():
 # --- total variation ------------------------------------------------------------------------------
 
 
-def taut_string(y: np.ndarray, lam: float) -> np.ndarray:
-    """Return the exact minimiser of |x - y|^2 / 2 + lam sum |x[i+1] - x[i]| through its dual, by brute force.
+def taut_string(y: np.ndarray, regularization: float) -> np.ndarray:
+    """Return the exact minimiser of |x - y|^2 / 2 + regularization sum |x[i+1] - x[i]| through its dual, by
+    brute force.
 
     The dual is a box-constrained least-squares problem; active sets are tried until the conditions hold.
     """
@@ -212,7 +224,7 @@ def taut_string(y: np.ndarray, lam: float) -> np.ndarray:
     p = np.zeros(n - 1)
     step = 1 / 4
     for _ in range(200_000):  # projected gradient on the dual, to machine precision
-        new = np.clip(p + step * d @ (y - d.T @ p), -lam, lam)
+        new = np.clip(p + step * d @ (y - d.T @ p), -regularization, regularization)
         if np.abs(new - p).max() < 1e-15:
             break
         p = new
@@ -289,11 +301,11 @@ def test_total_variation_beats_tikhonov_on_a_square():
 
 def test_plug_and_play_with_a_quadratic_prox_is_tikhonov():
     operator, y = random_operator(), noise(2, 8, 9)
-    rho, lam = 0.7, 0.2
+    rho, regularization = 0.7, 0.2
     found = plug_and_play(
         operator,
         y,
-        lambda v: v * rho / (rho + lam),
+        lambda v: v * rho / (rho + regularization),
         rho,
         nuisance=Background(1),
         tolerance=1e-10,
@@ -301,7 +313,7 @@ def test_plug_and_play_with_a_quadratic_prox_is_tikhonov():
     )
     assert found.converged
     torch.testing.assert_close(
-        found.image, tikhonov(operator, y, lam, nuisance=Background(1)).image, rtol=1e-6, atol=1e-8
+        found.image, tikhonov(operator, y, regularization, nuisance=Background(1)).image, rtol=1e-6, atol=1e-8
     )
 
 
@@ -357,7 +369,7 @@ def test_log_change_counts_thresholds():
 @pytest.mark.parametrize(
     ("error", "match", "make"),
     [
-        (ConfigError, "lam is -1", lambda: tikhonov(random_operator(), noise(8, 9), -1)),
+        (ConfigError, "regularization is -1", lambda: tikhonov(random_operator(), noise(8, 9), -1)),
         (ConfigError, "rule is", lambda: tikhonov(random_operator(), noise(8, 9), rule="lcurve")),
         (ConfigError, "method is", lambda: tikhonov(random_operator(), noise(8, 9), method="qr")),
         (ConfigError, "positive one", lambda: tikhonov(random_operator(), noise(8, 9), rule="discrepancy")),
@@ -369,7 +381,7 @@ def test_log_change_counts_thresholds():
         (DataError, "weight is", lambda: tikhonov(random_operator(), noise(8, 9), 1.0, weight=torch.ones(3))),
         (DataError, "samples are left", lambda: Problem(identity(2, 2), noise(2, 2), Background(3))),
         (ConfigError, "degree is 13", lambda: Background(13)),
-        (ConfigError, "lam is 0", lambda: total_variation(identity(2, 2), noise(2, 2), 0.0)),
+        (ConfigError, "regularization is 0", lambda: total_variation(identity(2, 2), noise(2, 2), 0.0)),
         (ConfigError, "box is", lambda: total_variation(identity(2, 2), noise(2, 2), 1.0, box=(1.0, 0.0))),
         (ConfigError, "method is", lambda: total_variation(identity(2, 2), noise(2, 2), 1.0, method="x")),
         (ConfigError, "rule is", lambda: total_variation(identity(2, 2), noise(2, 2), rule="gcv")),

@@ -19,8 +19,8 @@ from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import SequenceOperator
-from evnlos.inverse.joint import matrix_of, strip_of
 from evnlos.inverse.operators import Gradient, normal_matrix
+from evnlos.inverse.sequence_problem import matrix_of, strip_of
 from evnlos.models import SequenceConfig, Weights, save_weights
 from evnlos.optics import SlidingWall, View
 from evnlos.plot.results import draw_track
@@ -537,7 +537,7 @@ def test_the_command_inverts_a_sequence(capture, tmp_path, capsys) -> None:
             str(setup),
             "--cells",
             "8",
-            "--lam",
+            "--regularization",
             "gcv",
             "--solver",
             "tikhonov",

@@ -11,7 +11,7 @@ from evnlos.data import NlosDataset
 from evnlos.errors import ConfigError, DataError
 from evnlos.models import ResidualUNet, UNetConfig, load_weights, save_weights
 from evnlos.models.sequence import SequenceConfig
-from evnlos.training import LOSSES, Training, balanced_loss, paper_loss, step_size
+from evnlos.training import LOSSES, Training, learning_rate_at, normalized_bce_mse_ssim, paper_loss
 from evnlos.training.source import half_mirrored, with_mirrored
 from evnlos.training.validation import validate
 
@@ -73,9 +73,14 @@ def test_black_costs_almost_nothing_under_the_papers_loss_only() -> None:
     truth = torch.zeros(4, 1, 48, 96)
     truth[:, :, 20:30, 40:42] = 1
     black = torch.zeros_like(truth)
-    worst = {"paper": paper_loss(1 - truth, truth), "balanced": balanced_loss(1 - truth, truth)}
+    worst = {
+        "paper": paper_loss(1 - truth, truth),
+        "normalized_bce_mse_ssim": normalized_bce_mse_ssim(1 - truth, truth),
+    }
     assert (paper_loss(black, truth) - 2) / (worst["paper"] - 2) < 0.02
-    assert balanced_loss(black, truth) > 5 * balanced_loss(torch.full_like(truth, float(truth.mean())), truth)
+    assert normalized_bce_mse_ssim(black, truth) > 5 * normalized_bce_mse_ssim(
+        torch.full_like(truth, float(truth.mean())), truth
+    )
 
 
 def test_a_tiny_run_beats_the_mean_image(trained, tiny_dataset) -> None:
@@ -120,9 +125,9 @@ def test_fine_tuning_starts_from_the_weights_and_keeps_frozen_parts(trained, tin
 
 def test_step_sizes() -> None:
     step = Training(epochs=200, learning_rate=1e-4, schedule="step", step_epoch=100)
-    assert [step_size(step, e) for e in (0, 99.9, 100, 199)] == [1e-4, 1e-4, 5e-5, 5e-5]
+    assert [learning_rate_at(step, e) for e in (0, 99.9, 100, 199)] == [1e-4, 1e-4, 5e-5, 5e-5]
     cosine = Training(epochs=10, learning_rate=1.0)
-    np.testing.assert_allclose([step_size(cosine, e) for e in (0, 5, 10)], [1, 0.5, 0], atol=1e-12)
+    np.testing.assert_allclose([learning_rate_at(cosine, e) for e in (0, 5, 10)], [1, 0.5, 0], atol=1e-12)
 
 
 def test_a_collapsed_network_is_recognised(trained, tiny_dataset, tmp_path) -> None:

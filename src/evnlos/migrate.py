@@ -70,6 +70,8 @@ def _training(values: dict[str, Any]) -> dict[str, Any]:
     if "joint" in values:
         kind = "sequence" if values.pop("joint") else "unet"
         values["network"] = {"kind": kind, **(network if isinstance(network, dict) else {})}
+    if values.get("loss") == "balanced":
+        values["loss"] = "normalized_bce_mse_ssim"
     if "restandardise" in values:
         values["keep_normalization"] = not values.pop("restandardise")
     return values
@@ -105,7 +107,11 @@ def _renamed(values: dict[str, Any], **names: str) -> dict[str, Any]:
 
 def _record(values: dict[str, Any]) -> dict[str, Any]:
     """The record of an experiment."""
-    return _renamed(values, paradigm="modality", rig="setup")
+    values = _renamed(values, paradigm="modality", rig="setup")
+    words = (
+        str(values.get("arm", "")).replace(" joint", " sequence").replace("balanced loss", "normalized loss")
+    )
+    return values | {"arm": words} if "arm" in values else values
 
 
 def _capture(values: dict[str, Any]) -> dict[str, Any]:
@@ -116,6 +122,11 @@ def _capture(values: dict[str, Any]) -> dict[str, Any]:
 def _target(values: dict[str, Any]) -> dict[str, Any]:
     """The target of a `capture.yaml`."""
     return _renamed(values, plate_m="size_m")
+
+
+def _network(values: dict[str, Any]) -> dict[str, Any]:
+    """A network behind a linear embedding."""
+    return _renamed(values, strengths="ridge_multipliers")
 
 
 def _glyphs(values: dict[str, Any]) -> dict[str, Any]:
@@ -193,4 +204,5 @@ _STEPS: dict[str, tuple[Step, ...]] = {
     "CaptureInfo": (_capture,),
     "TargetInfo": (_target,),
     **dict.fromkeys(_GLYPHS, (_glyphs,)),
+    **dict.fromkeys(("UNetConfig", "SequenceConfig"), (_network,)),
 }

@@ -21,7 +21,7 @@ from evnlos.analysis.linearized import camera_variance
 from evnlos.app.controls import COARSE, Recorded
 from evnlos.data import STANDARD_MODALITIES, Sampling, as_modality
 from evnlos.errors import DataError
-from evnlos.inverse import JointProblem, SequenceOperator
+from evnlos.inverse import SequenceOperator, SequenceProblem
 from evnlos.inverse.measurements import object_light
 from evnlos.metrics import psnr
 from evnlos.models import Weights, load_weights, published, published_for, published_setup
@@ -150,7 +150,7 @@ def from_whole_sequence(recorded: Recorded) -> Reconstruction:
     made = setup.resized(shape).operator(strip, dtype=torch.float32)
     places = recorded.motion.position_m(recorded.times_s)
     target_plane = Plane(_CELLS, _CELLS, size_m / _CELLS)
-    problem = JointProblem(
+    problem = SequenceProblem(
         SequenceOperator(MatrixTransport(made.dense(torch.float32), strip, shape), target_plane, places),
         _STATIC,
     )

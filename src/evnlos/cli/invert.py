@@ -16,7 +16,8 @@ import tyro
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 
-LAM_TIKHONOV, LAM_TV = 4.0, 0.3  # best on eight characters of one setup, docs/inversion.md
+REGULARIZATION_TIKHONOV = 4.0  # best on eight characters of one setup, docs/inversion.md
+REGULARIZATION_TV = 0.3  # likewise
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class InvertCommand:
     """Captures: choices of so many positions to average the scores over."""
     solver: Literal["all", "tikhonov", "tv"] = "all"
     """Smooth (`tikhonov`), sharp and not below 0 (`tv`), or both and, as a control, without the occluders."""
-    lam: str = "cv"
+    regularization: str = "cv"
     """Weight of the prior: `cv`, `gcv` (tikhonov only), `discrepancy`, or a number (operator's norm = 1);
     captures: `gcv`, or a number in units of the noise's variance (by default 4 for tikhonov, 0.3 for tv)."""
     noise_sigma: float | None = None
@@ -79,9 +80,11 @@ class InvertCommand:
         from evnlos.inverse import prepare_inversion, read_photograph
         from evnlos.plot.results import draw_inversion
 
-        lam, rule = _weight(self.lam)
-        if self.solver == "all" and rule == "gcv" and lam is None:
-            raise ConfigError("--lam gcv serves --solver tikhonov only; use cv, discrepancy or a number")
+        regularization, rule = _weight(self.regularization)
+        if self.solver == "all" and rule == "gcv" and regularization is None:
+            raise ConfigError(
+                "--regularization gcv serves --solver tikhonov only; use cv, discrepancy or a number"
+            )
         # Matrices of a thousand rows: threads that wait for each other cost more than they save.
         torch.set_num_threads(1)
         clock = time.perf_counter()
@@ -91,11 +94,11 @@ class InvertCommand:
         inversion = prepare_inversion(photograph, degree=self.background_degree, **options)
         names: list[Literal["tikhonov", "tv"]]
         names = ["tikhonov", "tv"] if self.solver == "all" else [self.solver]
-        solved = {name: inversion.solve(name, lam, rule, self.noise_sigma) for name in names}
+        solved = {name: inversion.solve(name, regularization, rule, self.noise_sigma) for name in names}
         if self.solver == "all" and occluded:
             options["occluded"] = False
             control = prepare_inversion(photograph, degree=inversion.degree, **options)
-            solved["without occluder"] = control.solve("tikhonov", lam, rule, self.noise_sigma)
+            solved["without occluder"] = control.solve("tikhonov", regularization, rule, self.noise_sigma)
         found: dict[str, Any] = {
             "file": str(self.files[0]),
             "wall": list(inversion.operator.shape),
@@ -124,13 +127,15 @@ class InvertCommand:
         from evnlos.setups import load_setup
 
         setup = load_setup(path)
-        lam, rule = _weight(self.lam)
+        regularization, rule = _weight(self.regularization)
         if rule == "gcv" and self.solver != "tikhonov":
-            raise ConfigError("--lam gcv serves --solver tikhonov only; use cv, discrepancy or a number")
+            raise ConfigError(
+                "--regularization gcv serves --solver tikhonov only; use cv, discrepancy or a number"
+            )
         torch.set_num_threads(1)
         solvers = ("tikhonov", "tv") if self.solver == "all" else (self.solver,)
         options = StillOptions(
-            self.dark, solvers, lam, rule, self.noise_sigma, self.background_degree, self.bin
+            self.dark, solvers, regularization, rule, self.noise_sigma, self.background_degree, self.bin
         )
         found, pictures = invert_stills(self.files, setup, options)
         panels = [
@@ -149,22 +154,27 @@ class InvertCommand:
         from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
-        lam: dict[str, float | None] = {"tikhonov": LAM_TIKHONOV, "tv": LAM_TV}
-        if self.lam == "gcv" and self.solver != "tikhonov":
-            raise ConfigError("--lam gcv serves --solver tikhonov only; give a number, or leave --lam out")
-        if self.lam != "cv":
-            number, rule = _weight(self.lam)
+        regularization: dict[str, float | None] = {"tikhonov": REGULARIZATION_TIKHONOV, "tv": REGULARIZATION_TV}
+        if self.regularization == "gcv" and self.solver != "tikhonov":
+            raise ConfigError(
+                "--regularization gcv serves --solver tikhonov only; give a number, or leave "
+                "--regularization out"
+            )
+        if self.regularization != "cv":
+            number, rule = _weight(self.regularization)
             if number is None and rule != "gcv":
-                raise ConfigError(f"--lam is {self.lam!r}; with captures give gcv or a number")
-            lam = dict.fromkeys(lam, number)
-        solvers = tuple(lam) if self.solver == "all" else (self.solver,)
+                raise ConfigError(
+                    f"--regularization is {self.regularization!r}; with captures give gcv or a number"
+                )
+            regularization = dict.fromkeys(regularization, number)
+        solvers = tuple(regularization) if self.solver == "all" else (self.solver,)
         options = SequenceOptions(
             setup,
             self.positions,
             self.pattern,
             self.track,
             solvers,
-            lam,
+            regularization,
             self.cells,
             self.columns,
             self.static,
@@ -198,10 +208,10 @@ def to_text(found: dict[str, Any]) -> str:
     lines = [
         f"{found['file']}: {width} x {height} wall patches, background of degree {found['background_degree']}"
     ]
-    lines.append(f"{'':18}{'lam':>10}{'misfit':>10}{'iterations':>12}{'r':>8}")
+    lines.append(f"{'':18}{'weight':>10}{'misfit':>10}{'iterations':>12}{'r':>8}")
     for name, row in found["solutions"].items():
         r = f"{row['r']:8.3f}" if "r" in row else f"{'-':>8}"
-        lines.append(f"{name:18}{row['lam']:10.2e}{row['misfit']:10.5f}{row['iterations']:12d}{r}")
+        lines.append(f"{name:18}{row['regularization']:10.2e}{row['misfit']:10.5f}{row['iterations']:12d}{r}")
     lines.append(f"{found['picture']}; {found['seconds']} s")
     return "\n".join(lines)
 
@@ -212,4 +222,4 @@ def _weight(text: str) -> tuple[float | None, Literal["cv", "gcv", "discrepancy"
     try:
         return float(text), "cv"
     except ValueError:
-        raise ConfigError(f"--lam is {text!r}; give cv, gcv, discrepancy or a number") from None
+        raise ConfigError(f"--regularization is {text!r}; give cv, gcv, discrepancy or a number") from None

@@ -23,11 +23,11 @@ from evnlos.data import Capture, load_pattern, read_capture
 from evnlos.data.frame_sources import read_image
 from evnlos.data.sampling import Sampling
 from evnlos.errors import ConfigError
-from evnlos.inverse import JointProblem, SequenceOperator
+from evnlos.inverse import SequenceOperator, SequenceProblem
 from evnlos.inverse.inversion import Inversion, chosen_degree
-from evnlos.inverse.joint import matrix_of, strip_gram_of, strip_of
 from evnlos.inverse.measurements import object_light, position_subsets
 from evnlos.inverse.operators import Solution
+from evnlos.inverse.sequence_problem import matrix_of, strip_gram_of, strip_of
 from evnlos.inverse.tikhonov import Rule
 from evnlos.metrics import psnr
 from evnlos.optics import MatrixTransport
@@ -47,7 +47,7 @@ class SequenceOptions:
     pattern: Path | None
     track: bool
     solvers: tuple[str, ...]
-    lam: dict[str, float | None]
+    regularization: dict[str, float | None]
     cells: int
     columns: int
     static: float
@@ -94,12 +94,12 @@ def invert_captures(
         gram = strip_gram_of(transport)
         for count in options.positions or (len(motion),):
             for chosen in position_subsets(len(motion), count, options.subsets):
-                problem = JointProblem(
+                problem = SequenceProblem(
                     SequenceOperator(transport, target_plane, motion[chosen]), options.static, gram
                 )
                 images = light[members][:, chosen]
                 for solver in options.solvers:
-                    found = _solve(problem, images, solver, options.lam[solver])
+                    found = _solve(problem, images, solver, options.regularization[solver])
                     for member, image in zip(members, found, strict=True):
                         name = captures[member].name
                         db = _score(captures[member], image, size, motion)
@@ -134,14 +134,14 @@ def print_sequence(found: dict[str, Any], as_json: bool) -> None:
     print(json.dumps(found) if as_json else sequence_text(found))
 
 
-def _solve(problem: JointProblem, images: torch.Tensor, solver: str, factor: float | None) -> torch.Tensor:
+def _solve(problem: SequenceProblem, images: torch.Tensor, solver: str, factor: float | None) -> torch.Tensor:
     first = problem.tikhonov(images)
     if factor is None:
         return first.image
-    lam = factor * first.noise_sigma**2
+    regularization = factor * first.noise_sigma**2
     if solver == "tikhonov":
-        return problem.tikhonov(images, lam).image
-    found = problem.total_variation(images, lam, tolerance=1e-5)
+        return problem.tikhonov(images, regularization).image
+    found = problem.total_variation(images, regularization, tolerance=1e-5)
     if not found.converged:
         say(f"warning: tv stopped after {found.iterations} iterations before it had converged")
     return found.image
@@ -198,7 +198,7 @@ class StillOptions:
 
     dark: Path | None
     solvers: tuple[Literal["tikhonov", "tv"], ...]
-    lam: float | None
+    regularization: float | None
     rule: Rule
     noise_sigma: float | None
     degree: int | None
@@ -250,7 +250,7 @@ def invert_stills(
     images: dict[str, torch.Tensor] = {}
     inversion = Inversion(operator, image, degree)
     for name in options.solvers:
-        solution = inversion.solve(name, options.lam, options.rule, options.noise_sigma)
+        solution = inversion.solve(name, options.regularization, options.rule, options.noise_sigma)
         found["solutions"][name] = figures_of(name, solution)
         images[name] = solution.image
     found["seconds"] = round(time.perf_counter() - clock, 1)
@@ -261,7 +261,11 @@ def figures_of(name: str, solution: Solution) -> dict[str, Any]:
     """Return the figures of a solution, with a warning where the solver gave up."""
     if not solution.converged:
         say(f"warning: {name} stopped after {solution.iterations} iterations before it had converged")
-    return {"lam": solution.lam, "misfit": solution.noise_sigma, "iterations": solution.iterations}
+    return {
+        "regularization": solution.regularization,
+        "misfit": solution.noise_sigma,
+        "iterations": solution.iterations,
+    }
 
 
 def reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:

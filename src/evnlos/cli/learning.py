@@ -98,7 +98,8 @@ def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, a
     if record.get("collapsed"):
         say(
             f"warning: the network answers the same to every input ({record['psnr_db']} dB; all-black has "
-            f"{record['zero_db']} dB): it has collapsed; use --loss balanced, or train for more epochs"
+            f"{record['zero_db']} dB): it has collapsed; use --loss normalized_bce_mse_ssim, or train for "
+            "more epochs"
         )
     text = f"{out}: {record['epoch']} epochs, loss {record['loss']}, weights in {trained.file}"
     result(as_json, {"run": str(out), "weights": str(trained.file), **record}, text)

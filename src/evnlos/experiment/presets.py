@@ -11,6 +11,7 @@ from evnlos.errors import ConfigError
 from evnlos.experiment.study import Arm, Study
 from evnlos.models import SequenceConfig, UNetConfig
 from evnlos.training import Training, paper_finetuning, paper_pretraining
+from evnlos.training.settings import LossName
 
 PRETRAINING = Training(epochs=2)
 """Pre-training of our own experiments; `--pretrain-epochs` changes the number of epochs."""
@@ -111,12 +112,13 @@ def thresholds(setup: str) -> Study:
 
 
 def loss(setup: str) -> Study:
-    """Return the ablation of the loss: the balanced one and the paper's."""
+    """Return the ablation of the loss: the normalized one and the paper's."""
     arms = []
-    for name in ("balanced", "paper"):
-        arms.append(replace(_E2E, name=f"E2E {name} loss", finetuning=replace(END_TO_END, loss=name)))
+    losses: dict[str, LossName] = {"normalized": "normalized_bce_mse_ssim", "paper": "paper"}
+    for words, name in losses.items():
+        arms.append(replace(_E2E, name=f"E2E {words} loss", finetuning=replace(END_TO_END, loss=name)))
         pre, fine = replace(PRETRAINING, loss=name), replace(FINETUNING, loss=name)
-        arms.append(replace(_EPNP, name=f"EPNP {name} loss", pretraining=pre, finetuning=fine))
+        arms.append(replace(_EPNP, name=f"EPNP {words} loss", pretraining=pre, finetuning=fine))
     return Study("loss", setup, tuple(arms))
 
 
@@ -136,7 +138,7 @@ def embedding(setup: str) -> Study:
     kinds = {
         "plain, each picture scaled": _PLAIN,
         "plain": UNetConfig(rank=0),
-        "one ridge": UNetConfig(strengths=(1.0,)),
+        "one ridge": UNetConfig(ridge_multipliers=(1.0,)),
         "three ridges": UNetConfig(),
     }
     arms = []
@@ -146,7 +148,7 @@ def embedding(setup: str) -> Study:
     return Study("embedding", setup, tuple(arms))
 
 
-_SEQUENCE_NETWORK = SequenceConfig(rank=512, strengths=(0.001, 0.01, 0.1, 1.0))
+_SEQUENCE_NETWORK = SequenceConfig(rank=512, ridge_multipliers=(0.001, 0.01, 0.1, 1.0))
 _SEQUENCE = Training(epochs=6, batch_size=16, network=_SEQUENCE_NETWORK)
 _SEQUENCE_FINETUNING = replace(FINETUNING, epochs=8, batch_size=16)
 
@@ -198,8 +200,8 @@ def _of_sequences(single: Training, longer: int, arm: str) -> Training:
             f"arm {arm!r} has no linear embedding to pool over a sequence; leave it out with --arms"
         )
     values |= {"kind": _SEQUENCE_NETWORK.kind, "rank": _SEQUENCE_NETWORK.rank}
-    if values["strengths"] == list(UNetConfig().strengths):
-        values["strengths"] = list(_SEQUENCE_NETWORK.strengths)
+    if values["ridge_multipliers"] == list(UNetConfig().ridge_multipliers):
+        values["ridge_multipliers"] = list(_SEQUENCE_NETWORK.ridge_multipliers)
     network = from_dict(SequenceConfig, values)
     return replace(single, epochs=longer * single.epochs, batch_size=_SEQUENCE.batch_size, network=network)
 

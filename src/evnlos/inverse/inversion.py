@@ -241,7 +241,7 @@ class Inversion:
     def solve(
         self,
         solver: Literal["tikhonov", "tv"],
-        lam: float | None = None,
+        regularization: float | None = None,
         rule: Rule = "cv",
         noise_sigma: float | None = None,
     ) -> Solution:
@@ -250,7 +250,7 @@ class Inversion:
         Args:
             solver: "tikhonov" with the gradient towards a dark border as prior, or "tv", total variation with
                 brightness 0 or more.
-            lam: Weight of the prior, without unit here; None: by `rule`.
+            regularization: Weight of the prior, without unit here; None: by `rule`.
             rule: "cv", "discrepancy", and for "tikhonov" also "gcv".
             noise_sigma: Noise of a wall sample in units of the largest, for "discrepancy"; None estimates it
                 from the misfit of Tikhonov's GCV solution.
@@ -259,25 +259,25 @@ class Inversion:
             ConfigError: The rule is not one of the solver's.
         """
         nuisance = Background(self.degree)
-        if lam is None and rule == "discrepancy" and noise_sigma is None:
+        if regularization is None and rule == "discrepancy" and noise_sigma is None:
             first = tikhonov(self.operator, self.measurement, prior=Gradient("dark"), nuisance=nuisance)
             noise_sigma = first.noise_sigma
         if solver == "tikhonov":
             return tikhonov(
                 self.operator,
                 self.measurement,
-                lam,
+                regularization,
                 rule=rule,
                 noise_sigma=noise_sigma,
                 prior=Gradient("dark"),
                 nuisance=nuisance,
             )
-        if lam is None and rule == "gcv":
+        if regularization is None and rule == "gcv":
             raise ConfigError("rule 'gcv' needs a linear solver; with 'tv' use 'cv', 'discrepancy' or a number")
         return total_variation(
             self.operator,
             self.measurement,
-            lam,
+            regularization,
             rule="discrepancy" if rule == "discrepancy" else "cv",
             noise_sigma=noise_sigma,
             nuisance=nuisance,

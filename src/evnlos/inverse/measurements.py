@@ -1,7 +1,8 @@
 """What goes into a problem: frames of a recording, changes counted by events, a prior of the target.
 
 - The event form of the inverse problem: changes of log light as a linear function of the hidden scene.
-- The frames of a recording made ready for the joint problem: the object's light alone, at a working size.
+- The frames of a recording made ready for the problem of a whole sequence: the object's light alone, at a
+working size.
 - What hidden targets look like: a Gaussian prior from some characters, and others to test it on.
 """
 

@@ -116,7 +116,9 @@ def operator_norm(
 
 
 def normal_matrix(operator: LinearOperator, like: torch.Tensor) -> torch.Tensor:
-    """Return A^T A as a matrix [h w, h w]; that of a gradient is kept, since every fold and lam asks for it."""
+    """Return A^T A as a matrix [h w, h w]; that of a gradient is kept, since every fold and regularization asks
+    for it.
+    """
     if isinstance(operator, Gradient):
         height, width = like.shape
         return _gradient_normal(operator, (int(height), int(width)), like.dtype, like.device).clone()
@@ -200,7 +202,7 @@ class Solution:
 
     Args:
         image: The hidden image [..., h, w], in the measurement's type.
-        lam: Weight of the prior, in the unit that the solver's equation gives it.
+        regularization: Weight of the prior, in the unit that the solver's equation gives it.
         iterations: Iterations of the last solve; 0 for a closed form.
         converged: Whether the stopping rule was met before the iterations ran out.
         residual: |P W (A x - y)| of each image of the batch, [...].
@@ -212,7 +214,7 @@ class Solution:
     """
 
     image: torch.Tensor
-    lam: float
+    regularization: float
     iterations: int
     converged: bool
     residual: torch.Tensor

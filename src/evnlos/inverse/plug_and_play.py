@@ -166,7 +166,7 @@ def plug_and_play(
         max_iterations: Most calls of the denoiser.
 
     Returns:
-        The solution, its image the denoised one, z; lam holds rho.
+        The solution, its image the denoised one, z; regularization holds rho.
 
     Raises:
         ConfigError: rho is not positive.

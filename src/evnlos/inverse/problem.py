@@ -189,7 +189,7 @@ def _legendre(u: torch.Tensor, degree: int) -> list[torch.Tensor]:
 _HOPELESS = 1.1
 
 Path = Callable[[Problem], Iterable[torch.Tensor]]
-"""From a problem to its images [..., h, w], one for each lam."""
+"""From a problem to its images [..., h, w], one for each regularization."""
 
 
 @dataclass(frozen=True)
@@ -197,11 +197,12 @@ class Choice:
     """What cross-validation found.
 
     Args:
-        lam: The best lam.
-        errors: Mean squared misfit of a left-out sample for each lam tried, in the squared weighted unit.
+        regularization: The best regularization.
+        errors: Mean squared misfit of a left-out sample for each regularization tried, in the squared weighted
+            unit.
     """
 
-    lam: float
+    regularization: float
     errors: tuple[float, ...]
 
 
@@ -231,15 +232,17 @@ def block_folds(shape: tuple[int, int], *, blocks: int = 6, folds: int = 4) -> t
     return (by[:, None] + stride * bx + (by[:, None] // folds)) % folds
 
 
-def cross_validate(problem: Problem, path: Path, lams: Sequence[float], folds: torch.Tensor) -> Choice:
-    """Return the lam whose images, made from all blocks but a fold's, predict that fold best.
+def cross_validate(
+    problem: Problem, path: Path, regularizations: Sequence[float], folds: torch.Tensor
+) -> Choice:
+    """Return the regularization whose images, made from all blocks but a fold's, predict that fold best.
 
     The search ends early once the error is a tenth above the least one seen.
 
     Args:
         problem: The problem.
         path: From a problem to the images for `lams`, in their order; only those that are asked for are made.
-        lams: Weights of the prior to try, from the strongest to the weakest.
+        regularizations: Weights of the prior to try, from the strongest to the weakest.
         folds: Fold of each sample, integers [H, W].
     """
     helds = [folds == fold for fold in range(int(folds.max()) + 1)]
@@ -251,4 +254,4 @@ def cross_validate(problem: Problem, path: Path, lams: Sequence[float], folds: t
         if errors[-1] > _HOPELESS * min(errors):
             break
     best = errors.index(min(errors))
-    return Choice(float(lams[best]), tuple(errors))
+    return Choice(float(regularizations[best]), tuple(errors))

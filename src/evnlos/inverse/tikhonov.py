@@ -54,43 +54,45 @@ class Spectrum:
 
     @property
     def scale(self) -> float:
-        """The largest squared singular value, the natural unit of lam."""
+        """The largest squared singular value, the natural unit of regularization."""
         return float(self.values[0]) ** 2
 
-    def image(self, lam: float) -> torch.Tensor:
-        """Return argmin |B x - b|^2 + lam |L x|^2, [..., h, w]."""
-        z = self._vt.mT @ ((self.values / (self.values.square() + lam))[:, None] * self._seen)
+    def image(self, regularization: float) -> torch.Tensor:
+        """Return argmin |B x - b|^2 + regularization |L x|^2, [..., h, w]."""
+        z = self._vt.mT @ ((self.values / (self.values.square() + regularization))[:, None] * self._seen)
         if self._upper is not None:
             z = torch.linalg.solve_triangular(self._upper, z, upper=True)
         return z.mT.reshape(*self._batch, *self._shape)
 
-    def squared_residual(self, lam: float) -> torch.Tensor:
+    def squared_residual(self, regularization: float) -> torch.Tensor:
         """Return |B x - b|^2 of each image, [...]."""
-        left = (lam / (self.values.square() + lam))[:, None] * self._seen
+        left = (regularization / (self.values.square() + regularization))[:, None] * self._seen
         return (self._unseen + left.square().sum(dim=0)).reshape(self._batch)
 
-    def dof(self, lam: float) -> float:
-        """Return the degrees of freedom, sum s^2 / (s^2 + lam)."""
-        return float((self.values.square() / (self.values.square() + lam)).sum())
+    def dof(self, regularization: float) -> float:
+        """Return the degrees of freedom, sum s^2 / (s^2 + regularization)."""
+        return float((self.values.square() / (self.values.square() + regularization)).sum())
 
-    def gcv(self, lam: float) -> float:
+    def gcv(self, regularization: float) -> float:
         """Return n sum |B x - b|^2 / (n - dof)^2, summed over the batch (Golub, Heath and Wahba 1979)."""
-        freedom = self.samples - self.dof(lam)
-        return self.samples * float(self.squared_residual(lam).sum()) / max(freedom, 1e-9) ** 2
+        freedom = self.samples - self.dof(regularization)
+        return self.samples * float(self.squared_residual(regularization).sum()) / max(freedom, 1e-9) ** 2
 
-    def noise_sigma(self, lam: float) -> float:
+    def noise_sigma(self, regularization: float) -> float:
         """Return the standard deviation of a sample's misfit, sqrt(|B x - b|^2 / (n - dof)), over the batch."""
-        freedom = max(self.samples - self.dof(lam), 1e-9)
-        return float((self.squared_residual(lam).mean() / freedom).sqrt())
+        freedom = max(self.samples - self.dof(regularization), 1e-9)
+        return float((self.squared_residual(regularization).mean() / freedom).sqrt())
 
     def best_gcv(self) -> float:
-        """Return the lam at which `gcv` is smallest."""
+        """Return the regularization at which `gcv` is smallest."""
         return smallest(self.gcv, self.scale * _GRID)
 
     def at_discrepancy(self, noise_sigma: float) -> float:
-        """Return the lam whose mean squared residual is samples * noise_sigma^2 (Morozov 1966)."""
+        """Return the regularization whose mean squared residual is samples * noise_sigma^2 (Morozov 1966)."""
         return matching(
-            lambda lam: float(self.squared_residual(lam).mean()), self.samples * noise_sigma**2, self.scale
+            lambda regularization: float(self.squared_residual(regularization).mean()),
+            self.samples * noise_sigma**2,
+            self.scale,
         )
 
 
@@ -110,8 +112,10 @@ def standard_form(problem: Problem, prior: LinearOperator | None) -> tuple[torch
 
 
 def smallest(function: Callable[[float], float], grid: np.ndarray) -> float:
-    """Return where a function of lam > 0 is smallest: the best grid point, then golden sections in log lam."""
-    best = int(np.argmin([function(float(lam)) for lam in grid]))
+    """Return where a function of regularization > 0 is smallest: the best grid point, then golden sections in
+    log regularization.
+    """
+    best = int(np.argmin([function(float(regularization)) for regularization in grid]))
     low, high = np.log(grid[max(best - 1, 0)]), np.log(grid[min(best + 1, len(grid) - 1)])
     for _ in range(30):
         width = _GOLDEN * (high - low)
@@ -125,10 +129,12 @@ def smallest(function: Callable[[float], float], grid: np.ndarray) -> float:
 def matching(
     squared_residual: Callable[[float], float], wanted: float, scale: float, *, relative: float = 1e-6
 ) -> float:
-    """Return the lam at which a residual that grows with lam reaches `wanted`, by bisection in log lam.
+    """Return the regularization at which a residual that grows with regularization reaches `wanted`, by
+    bisection in log regularization.
 
     Raises:
-        DataError: No lam reaches it: the model leaves more than the noise, or the noise explains everything.
+        DataError: No regularization reaches it: the model leaves more than the noise, or the noise explains
+            everything.
     """
     low, high = np.log(scale * 1e-14), np.log(scale * 1e6)
     least, most = squared_residual(float(np.exp(low))), squared_residual(float(np.exp(high)))
@@ -137,7 +143,7 @@ def matching(
         limit = least if least > wanted else most
         raise DataError(
             f"the noise asks for a squared residual of {wanted:.3g}, the model leaves {side} ({limit:.3g}); "
-            "give another noise_sigma, or choose lam by gcv or cv"
+            "give another noise_sigma, or choose regularization by gcv or cv"
         )
     while high - low > relative:
         middle = (low + high) / 2
@@ -154,7 +160,7 @@ _PROBES = 8
 def tikhonov(
     operator: LinearOperator,
     measurement: torch.Tensor,
-    lam: float | None = None,
+    regularization: float | None = None,
     *,
     rule: Rule = "gcv",
     noise_sigma: float | None = None,
@@ -166,14 +172,15 @@ def tikhonov(
     max_iterations: int = 2000,
     seed: int = 0,
 ) -> Solution:
-    """Return argmin over x of |P W (A x - y)|^2 + lam |L x|^2, with lam given or chosen without the truth.
+    """Return argmin over x of |P W (A x - y)|^2 + regularization |L x|^2, with regularization given or chosen
+    without the truth.
 
-    One lam serves the whole batch: the rules look at its residuals together.
+    One regularization serves the whole batch: the rules look at its residuals together.
 
     Args:
         operator: A, linear with an adjoint.
         measurement: y [..., H, W], float32 or float64; the solver works in its type.
-        lam: Weight of the prior, squared unit of W A, 0 or more; None: by `rule`.
+        regularization: Weight of the prior, squared unit of W A, 0 or more; None: by `rule`.
         rule: "gcv", generalised cross-validation: supposes that the errors of the samples are independent;
             "discrepancy": the residual is what `noise_sigma` explains; "cv": leaves out blocks of the wall, for
             errors that neighbours share.
@@ -181,36 +188,44 @@ def tikhonov(
         prior: L; None is the identity. `Gradient("dark")` asks for smooth images.
         nuisance: Background to project out.
         weight: Factor on each sample's residual [H, W], one over its noise.
-        method: "svd" makes the matrix (every lam is then free), "cg" uses products only.
+        method: "svd" makes the matrix (every regularization is then free), "cg" uses products only.
         tolerance: Relative residual of the normal equations at which "cg" stops.
-        max_iterations: Most iterations of "cg" for one lam.
+        max_iterations: Most iterations of "cg" for one regularization.
         seed: Seed of the probes with which "cg" estimates the degrees of freedom for "gcv" (Hutchinson 1990).
 
     Returns:
         The solution.
 
     Raises:
-        ConfigError: A negative lam, an unknown rule or method, "discrepancy" without a noise, "cv" with "cg",
-            or a prior with a null space and "svd".
-        DataError: A measurement of wrong size or type, or a noise that no lam explains.
+        ConfigError: A negative regularization, an unknown rule or method, "discrepancy" without a noise, "cv"
+            with "cg", or a prior with a null space and "svd".
+        DataError: A measurement of wrong size or type, or a noise that no regularization explains.
 
     Example:
         >>> from evnlos.optics import MatrixTransport
         >>> from evnlos.types import Plane
         >>> halves = MatrixTransport(0.5 * torch.eye(4), Plane(2, 2, 0.01), (2, 2))
-        >>> tikhonov(halves, torch.ones(2, 2), lam=0.25).image
+        >>> tikhonov(halves, torch.ones(2, 2), regularization=0.25).image
         tensor([[1., 1.],
                 [1., 1.]])
     """
-    _check(lam, rule, noise_sigma, method)
+    _check(regularization, rule, noise_sigma, method)
     problem = Problem(operator, measurement, nuisance, weight)
     if method == "cg":
-        return _by_products(problem, lam, rule, noise_sigma, prior, tolerance, max_iterations, seed)
+        return _by_products(problem, regularization, rule, noise_sigma, prior, tolerance, max_iterations, seed)
     spectrum = Spectrum(problem, prior)
-    if lam is None:
-        lam = _chosen(problem, spectrum, prior, rule, noise_sigma)
-    residual = spectrum.squared_residual(lam).sqrt()
-    return Solution(spectrum.image(lam), lam, 0, True, residual, spectrum.noise_sigma(lam), spectrum.dof(lam))
+    if regularization is None:
+        regularization = _chosen(problem, spectrum, prior, rule, noise_sigma)
+    residual = spectrum.squared_residual(regularization).sqrt()
+    return Solution(
+        spectrum.image(regularization),
+        regularization,
+        0,
+        True,
+        residual,
+        spectrum.noise_sigma(regularization),
+        spectrum.dof(regularization),
+    )
 
 
 def tikhonov_cv_error(
@@ -221,7 +236,7 @@ def tikhonov_cv_error(
     nuisance: Background | None = None,
     weight: torch.Tensor | None = None,
 ) -> float:
-    """Return the smallest mean squared error of left-out blocks over all lam: to compare models by.
+    """Return the smallest mean squared error of left-out blocks over all regularization: to compare models by.
 
     It is in the squared unit of W y, and comparable between operators, priors and backgrounds for one
     measurement and weight. Arguments as in `tikhonov`.
@@ -232,16 +247,16 @@ def tikhonov_cv_error(
     return min(_cross_validated(problem, prior, float(torch.linalg.eigvalsh(small)[-1])).errors)
 
 
-def _check(lam: float | None, rule: str, noise_sigma: float | None, method: str) -> None:
-    if lam is not None and not (np.isfinite(lam) and lam >= 0):
-        raise ConfigError(f"lam is {lam}; give 0 or more, or None and a rule")
+def _check(regularization: float | None, rule: str, noise_sigma: float | None, method: str) -> None:
+    if regularization is not None and not (np.isfinite(regularization) and regularization >= 0):
+        raise ConfigError(f"regularization is {regularization}; give 0 or more, or None and a rule")
     if method not in ("svd", "cg"):
         raise ConfigError(f"method is {method!r}; give 'svd' or 'cg'")
     if rule not in ("gcv", "discrepancy", "cv"):
         raise ConfigError(f"rule is {rule!r}; give 'gcv', 'discrepancy' or 'cv'")
-    if lam is None and rule == "discrepancy" and not (noise_sigma is not None and noise_sigma > 0):
+    if regularization is None and rule == "discrepancy" and not (noise_sigma is not None and noise_sigma > 0):
         raise ConfigError(f"noise_sigma is {noise_sigma}; the discrepancy rule needs a positive one")
-    if lam is None and rule == "cv" and method == "cg":
+    if regularization is None and rule == "cv" and method == "cg":
         raise ConfigError("rule 'cv' would solve hundreds of systems by 'cg'; use method='svd', or rule='gcv'")
 
 
@@ -253,11 +268,11 @@ def _chosen(
     if rule == "discrepancy":
         assert noise_sigma is not None  # checked above
         return spectrum.at_discrepancy(noise_sigma)
-    return _cross_validated(problem, prior, spectrum.scale).lam
+    return _cross_validated(problem, prior, spectrum.scale).regularization
 
 
 def _cross_validated(problem: Problem, prior: LinearOperator | None, scale: float) -> Choice:
-    lams = scale * _CV_GRID
+    regularizations = scale * _CV_GRID
     height, width = problem.measurement.shape[-2:]
 
     def path(part: Problem) -> Iterator[torch.Tensor]:
@@ -269,16 +284,16 @@ def _cross_validated(problem: Problem, prior: LinearOperator | None, scale: floa
         seen = vectors.mT @ (target if wide else matrix.mT @ target)
         onto = matrix.mT @ vectors if wide else vectors  # [C, r]
         onto = onto if upper is None else torch.linalg.solve_triangular(upper, onto, upper=True)
-        for lam in lams.tolist():
-            image = onto @ (seen / (values.clamp(min=0) + lam)[:, None])
+        for regularization in regularizations.tolist():
+            image = onto @ (seen / (values.clamp(min=0) + regularization)[:, None])
             yield image.mT.reshape(*part.target.shape[:-2], *part.scene_shape)
 
-    return cross_validate(problem, path, lams.tolist(), block_folds((height, width)))
+    return cross_validate(problem, path, regularizations.tolist(), block_folds((height, width)))
 
 
 def _by_products(
     problem: Problem,
-    lam: float | None,
+    regularization: float | None,
     rule: Rule,
     noise_sigma: float | None,
     prior: LinearOperator | None,
@@ -297,19 +312,25 @@ def _by_products(
     def squared_residual(weight: float) -> float:
         return float(_squared(problem(solve(weight, rhs).image) - problem.target).mean())
 
-    if lam is None:
+    if regularization is None:
         scale = operator_norm(problem, problem.blank) ** 2
         if rule == "discrepancy":
             assert noise_sigma is not None  # checked by the caller
             wanted = problem.samples * noise_sigma**2
-            lam = matching(squared_residual, wanted, scale * 1e4, relative=1e-3)
+            regularization = matching(squared_residual, wanted, scale * 1e4, relative=1e-3)
         else:
-            lam = _stochastic_gcv(problem, solve, rhs, scale, seed)
-    solved = solve(lam, rhs)
+            regularization = _stochastic_gcv(problem, solve, rhs, scale, seed)
+    solved = solve(regularization, rhs)
     residual = _squared(problem(solved.image) - problem.target).sqrt()
     sigma = float((residual.square().mean() / problem.samples).sqrt())
     return Solution(
-        solved.image, lam, solved.iterations, solved.converged, residual, sigma, history=solved.history
+        solved.image,
+        regularization,
+        solved.iterations,
+        solved.converged,
+        residual,
+        sigma,
+        history=solved.history,
     )
 
 
@@ -320,25 +341,27 @@ def _stochastic_gcv(
     scale: float,
     seed: int,
 ) -> float:
-    """Return the lam with the least GCV; the trace is a mean over random signs z of z . B x(z) (Hutchinson)."""
+    """Return the regularization with the least GCV; the trace is a mean over random signs z of z . B x(z)
+    (Hutchinson).
+    """
     generator = torch.Generator().manual_seed(derive_seed(seed, "gcv probes"))
     height, width = problem.measurement.shape[-2:]
     signs = torch.randint(0, 2, (_PROBES, height, width), generator=generator).to(problem.measurement) * 2 - 1
     backward = problem.adjoint(signs)
     known: dict[float, float] = {}
 
-    def gcv(lam: float) -> float:
-        if lam not in known:
-            left = float(_squared(problem(solve(lam, rhs).image) - problem.target).sum())
-            dof = float((solve(lam, backward).image * backward).sum()) / _PROBES
-            known[lam] = problem.samples * left / max(problem.samples - dof, 1e-9) ** 2
-        return known[lam]
+    def gcv(regularization: float) -> float:
+        if regularization not in known:
+            left = float(_squared(problem(solve(regularization, rhs).image) - problem.target).sum())
+            dof = float((solve(regularization, backward).image * backward).sum()) / _PROBES
+            known[regularization] = problem.samples * left / max(problem.samples - dof, 1e-9) ** 2
+        return known[regularization]
 
     grid = scale * _CG_GRID
-    values = [gcv(float(lam)) for lam in grid]
+    values = [gcv(float(regularization)) for regularization in grid]
     best = int(np.argmin(values))
     fine = np.geomspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], 9)
-    return float(min(fine, key=lambda lam: gcv(float(lam))))
+    return float(min(fine, key=lambda regularization: gcv(float(regularization))))
 
 
 def _squared(image: torch.Tensor) -> torch.Tensor:

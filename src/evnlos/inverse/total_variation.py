@@ -47,7 +47,7 @@ def gap(
     squared_dual: torch.Tensor,
     dual_on_target: torch.Tensor,
     back: torch.Tensor,
-    lam: float,
+    regularization: float,
     box: Box,
 ) -> float:
     """Return the primal less the dual objective; open bounds are taken at twice the image's largest value.
@@ -58,8 +58,8 @@ def gap(
         edges: grad x.
         squared_dual: |q|^2 of the data term's dual.
         dual_on_target: <q, b>.
-        back: B^T q + grad^T p, p the variation's dual, nowhere longer than lam.
-        lam: Weight of the variation.
+        back: B^T q + grad^T p, p the variation's dual, nowhere longer than regularization.
+        regularization: Weight of the variation.
         box: Bounds.
     """
     reach = 2 * float(x.abs().max()) + torch.finfo(x.dtype).tiny
@@ -67,7 +67,10 @@ def gap(
     variation = edges.square().sum(dim=-3).sqrt().sum()
     # sup over the box of -<x, K^T u>
     worst = torch.maximum(-low * back, -high * back).sum()
-    primal, dual = 0.5 * squared_residual + lam * variation, -0.5 * squared_dual - dual_on_target - worst
+    primal, dual = (
+        0.5 * squared_residual + regularization * variation,
+        -0.5 * squared_dual - dual_on_target - worst,
+    )
     return float(primal - dual)
 
 
@@ -75,7 +78,9 @@ _MARGIN = 1.05  # power iteration bounds the norm from below
 _GRADIENT_NORM = math.sqrt(8.0)
 
 
-def solve_primal_dual(problem: Problem, lam: float, settings: Settings, start: torch.Tensor | None) -> Solution:
+def solve_primal_dual(
+    problem: Problem, regularization: float, settings: Settings, start: torch.Tensor | None
+) -> Solution:
     """Return the solution by the primal-dual method, from `start` or a blank image."""
     low, high = settings.box
     gradient, b = settings.gradient, problem.target
@@ -97,11 +102,13 @@ def solve_primal_dual(problem: Problem, lam: float, settings: Settings, start: t
         x = (x_old - tau * back_old).clamp(low, high)
         image, edges = problem(x), ratio * gradient(x)
         q = (q_old + sigma * (2 * image - image_old - b)) / (1 + sigma)
-        p = shrunk(p_old + sigma * (2 * edges - edges_old), lam / ratio)
+        p = shrunk(p_old + sigma * (2 * edges - edges_old), regularization / ratio)
         back = problem.adjoint(q) + ratio * gradient.adjoint(p)
         if iteration % CHECK_EVERY == 0 or iteration == settings.max_iterations:
             left = (image - b).square().sum()
-            found = gap(x, left, edges / ratio, q.square().sum(), (q * b).sum(), back, lam, settings.box)
+            found = gap(
+                x, left, edges / ratio, q.square().sum(), (q * b).sum(), back, regularization, settings.box
+            )
             relative = found / scale
             history.append(relative)
         # The residuals of the two optimality conditions; the larger one gets the longer step.
@@ -115,7 +122,7 @@ def solve_primal_dual(problem: Problem, lam: float, settings: Settings, start: t
     residual = (image - b).square().sum(dim=(-2, -1)).sqrt()
     noise = float((residual.square().mean() / problem.samples).sqrt())
     done = relative <= settings.tolerance
-    return Solution(x, lam, iteration, done, residual, noise, history=tuple(history))
+    return Solution(x, regularization, iteration, done, residual, noise, history=tuple(history))
 
 
 _RELAXED = 1.6
@@ -123,10 +130,10 @@ _PENALTY = 10.0  # times the mean square of B's columns; measured on the photogr
 
 
 class Splitting:
-    """Alternating direction method of multipliers (Boyd et al. 2011) for one problem and any lam.
+    """Alternating direction method of multipliers (Boyd et al. 2011) for one problem and any regularization.
 
     With z = grad x and v = x for the bounds, x solves (B^T B + rho (grad^T grad + 1)) x = ..., whose inverse is
-    kept from one lam to the next.
+    kept from one regularization to the next.
 
     Args:
         problem: The problem; its matrix is made.
@@ -148,8 +155,8 @@ class Splitting:
         self._rho = max(_PENALTY * mean, torch.finfo(b.dtype).tiny)
         self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(self._normal + self._rho * smooth))
 
-    def solve(self, lam: float, start: torch.Tensor | None = None) -> Solution:
-        """Return the minimiser for one lam; without a start the search goes on from the one before."""
+    def solve(self, regularization: float, start: torch.Tensor | None = None) -> Solution:
+        """Return the minimiser for one weight; without a start the search goes on from the one before."""
         gradient, (low, high) = self.settings.gradient, self.settings.box
         if start is not None or self._state is None:
             x = self._backward.new_zeros((*self._batch, *self._shape)) if start is None else start
@@ -165,12 +172,12 @@ class Splitting:
             x = (right @ self._inverse).unflatten(-1, self._shape)
             moved = _RELAXED * gradient(x) + (1 - _RELAXED) * z + u
             x_mixed = _RELAXED * x + (1 - _RELAXED) * v
-            u = shrunk(moved, lam / self._rho)
+            u = shrunk(moved, regularization / self._rho)
             z = moved - u
             v = (x_mixed + w).clamp(low, high)
             w = w + x_mixed - v
             if iteration % CHECK_EVERY == 0 or iteration == self.settings.max_iterations:
-                relative = self._gap(v, self._rho * u, lam) / scale
+                relative = self._gap(v, self._rho * u, regularization) / scale
                 history.append(relative)
         self._state = (v, z, w, u)
         image = v.reshape(*self._batch, *self._shape)
@@ -178,30 +185,30 @@ class Splitting:
         noise = float((squared.mean() / self.samples).sqrt())
         done = relative <= self.settings.tolerance
         residual = squared.sqrt().reshape(self._batch)
-        return Solution(image, lam, iteration, done, residual, noise, history=tuple(history))
+        return Solution(image, regularization, iteration, done, residual, noise, history=tuple(history))
 
     def _squared_residual(self, v: torch.Tensor) -> torch.Tensor:
         flat = v.flatten(1)
         return (self._squares + ((flat @ self._normal - 2 * self._backward) * flat).sum(-1)).clamp(min=0)
 
-    def _gap(self, v: torch.Tensor, p: torch.Tensor, lam: float) -> float:
+    def _gap(self, v: torch.Tensor, p: torch.Tensor, regularization: float) -> float:
         """Return the gap with q = B v - b as the data term's dual."""
         gradient, flat = self.settings.gradient, v.flatten(1)
         back = (flat @ self._normal - self._backward).unflatten(-1, self._shape) + gradient.adjoint(p)
         left = self._squared_residual(v)
         on_target = (flat * self._backward).sum(-1) - self._squares
         total = left.sum()
-        return gap(v, total, gradient(v), total, on_target.sum(), back, lam, self.settings.box)
+        return gap(v, total, gradient(v), total, on_target.sum(), back, regularization, self.settings.box)
 
 
-_PATH = np.logspace(-1.5, -4, 6)  # of the lam above which the image is flat
-_ROUGHER = 10.0  # the choice of lam needs less than the image
+_PATH = np.logspace(-1.5, -4, 6)  # of the regularization above which the image is flat
+_ROUGHER = 10.0  # the choice of regularization needs less than the image
 
 
 def total_variation(
     operator: LinearOperator,
     measurement: torch.Tensor,
-    lam: float | None = None,
+    regularization: float | None = None,
     *,
     rule: Literal["cv", "discrepancy"] = "cv",
     noise_sigma: float | None = None,
@@ -214,7 +221,7 @@ def total_variation(
     tolerance: float = 1e-4,
     max_iterations: int = 5000,
 ) -> Solution:
-    """Return argmin over low <= x <= high of |P W (A x - y)|^2 / 2 + lam sum |grad x|, isotropic.
+    """Return argmin over low <= x <= high of |P W (A x - y)|^2 / 2 + regularization sum |grad x|, isotropic.
 
     Method "splitting" makes the matrix and alternates directions (Boyd et al., Found. Trends Mach. Learn. 3,
     2011), a few products with one inverse; "primal-dual" uses products with A only (Chambolle and Pock, J.
@@ -226,7 +233,7 @@ def total_variation(
     Args:
         operator: A, linear with an adjoint.
         measurement: y [..., H, W], float32 or float64.
-        lam: Weight of the variation, unit of W A times that of W y, above 0; None: by `rule`.
+        regularization: Weight of the variation, unit of W A times that of W y, above 0; None: by `rule`.
         rule: "cv" leaves out blocks of the wall; "discrepancy": the residual is what `noise_sigma` explains.
         noise_sigma: Standard deviation of a weighted sample, for "discrepancy"; the estimate that `tikhonov`
             hands back will do.
@@ -237,13 +244,13 @@ def total_variation(
         method: "splitting" or "primal-dual".
         start: First guess [..., h, w]; None is black.
         tolerance: Relative gap at which to stop.
-        max_iterations: Most iterations for one lam.
+        max_iterations: Most iterations for one regularization.
 
     Returns:
         The solution; its history holds the relative gap of every tenth iteration.
 
     Raises:
-        ConfigError: lam is not positive, the box is empty, the rule is unknown or lacks its noise.
+        ConfigError: regularization is not positive, the box is empty, the rule is unknown or lacks its noise.
         DataError: A measurement of wrong size or type.
 
     Example:
@@ -251,11 +258,11 @@ def total_variation(
         >>> from evnlos.types import Plane
         >>> steps = torch.tensor([[0.0, 0.0, 1.0, 1.0]], dtype=torch.float64)
         >>> identity = MatrixTransport(torch.eye(4), Plane(1, 4, 0.01), (1, 4))
-        >>> total_variation(identity, steps, lam=0.2, tolerance=1e-6).image.round(decimals=2)
+        >>> total_variation(identity, steps, regularization=0.2, tolerance=1e-6).image.round(decimals=2)
         tensor([[0.1000, 0.1000, 0.9000, 0.9000]], dtype=torch.float64)
     """
-    if lam is not None and not (math.isfinite(lam) and lam > 0):
-        raise ConfigError(f"lam is {lam}; give a positive number, or None and a rule")
+    if regularization is not None and not (math.isfinite(regularization) and regularization > 0):
+        raise ConfigError(f"regularization is {regularization}; give a positive number, or None and a rule")
     if not box[0] < box[1]:
         raise ConfigError(f"box is {box}; give the lowest and then the highest brightness")
     if rule not in ("cv", "discrepancy"):
@@ -264,55 +271,55 @@ def total_variation(
         raise ConfigError(f"method is {method!r}; give 'splitting' or 'primal-dual'")
     problem = Problem(operator, measurement, nuisance, weight)
     settings = Settings(box, Gradient(border), tolerance, max_iterations)
-    if lam is None:
-        start, lam = _chosen(problem, settings, method, rule, noise_sigma)
-    return next(_path(problem, [lam], settings, method, start))
+    if regularization is None:
+        start, regularization = _chosen(problem, settings, method, rule, noise_sigma)
+    return next(_path(problem, [regularization], settings, method, start))
 
 
 def _chosen(
     problem: Problem, settings: Settings, method: str, rule: str, noise_sigma: float | None
 ) -> tuple[torch.Tensor | None, float]:
     # Above about this weight no edge is worth its price.
-    lams = (float(problem.adjoint(problem.target).abs().max()) * _PATH).tolist()
+    regularizations = (float(problem.adjoint(problem.target).abs().max()) * _PATH).tolist()
     if rule == "cv":
         height, width = problem.measurement.shape[-2:]
         rough = replace(settings, tolerance=_ROUGHER * settings.tolerance)
 
         def path(part: Problem) -> Iterator[torch.Tensor]:
-            return (found.image for found in _path(part, lams, rough, method))
+            return (found.image for found in _path(part, regularizations, rough, method))
 
-        return None, cross_validate(problem, path, lams, block_folds((height, width))).lam
+        return None, cross_validate(problem, path, regularizations, block_folds((height, width))).regularization
     if noise_sigma is None or not noise_sigma > 0:
         raise ConfigError(f"noise_sigma is {noise_sigma}; the discrepancy rule needs a positive one")
     wanted = problem.samples * noise_sigma**2
     before: tuple[float, float] | None = None
     found = None
-    for found in _path(problem, lams, settings, method):
+    for found in _path(problem, regularizations, settings, method):
         left = float(found.residual.square().mean())
         if left <= wanted and before is not None:
             # Between two neighbours of the path the logarithm of the residual runs nearly along a line.
             share = math.log(wanted / left) / math.log(before[1] / left)
-            return found.image, float(found.lam * (before[0] / found.lam) ** share)
+            return found.image, float(found.regularization * (before[0] / found.regularization) ** share)
         if left <= wanted:
             break
-        before = (found.lam, left)
+        before = (found.regularization, left)
     assert found is not None  # the path is not empty
-    return found.image, found.lam
+    return found.image, found.regularization
 
 
 def _path(
     problem: Problem,
-    lams: Sequence[float],
+    regularizations: Sequence[float],
     settings: Settings,
     method: str,
     start: torch.Tensor | None = None,
 ) -> Iterator[Solution]:
-    """Yield the solutions for falling lams, each starting from the one before."""
+    """Yield the solutions for falling regularizations, each starting from the one before."""
     splitting = Splitting(problem, settings) if method == "splitting" else None
-    for lam in lams:
+    for regularization in regularizations:
         if splitting is not None:
-            found, start = splitting.solve(lam, start), None
+            found, start = splitting.solve(regularization, start), None
         else:
-            found = solve_primal_dual(problem, lam, settings, start)
+            found = solve_primal_dual(problem, regularization, settings, start)
             start = found.image
         yield found

@@ -89,18 +89,18 @@ class InputNormalization(nn.Module):
 
 
 class LinearEmbedding(nn.Module):
-    """The light path undone by ridge regressions of several strengths: [B, C, H, W] -> [B, S, H, W].
+    """The light path undone by ridge regressions of several weights: [B, C, H, W] -> [B, S, H, W].
 
     Fitted in closed form to simulated samples it carries the physics of their setup: it sees the whole wall at
     once, which convolutions would have to learn layer by layer. The weak ridge is sharp and noisy, the strong
-    one smooth; what to believe where is left to the network behind it. All strengths share one basis and one
+    one smooth; what to believe where is left to the network behind it. All ridges share one basis and one
     matrix of weights (`LinearEstimate.shrinkage`). These numbers are not trained by gradients.
 
     Args:
         channels: Channels of the input.
         size: Its height and width, pixels.
         rank: Most components of the input.
-        strengths: Ridges in units of the one that is best on unseen objects.
+        ridge_multipliers: Ridges in units of the one that is best on unseen objects.
     """
 
     mean_in: Tensor
@@ -109,14 +109,16 @@ class LinearEmbedding(nn.Module):
     weights: Tensor
     mean_out: Tensor
 
-    def __init__(self, channels: int, size: tuple[int, int], rank: int, strengths: tuple[float, ...]) -> None:
+    def __init__(
+        self, channels: int, size: tuple[int, int], rank: int, ridge_multipliers: tuple[float, ...]
+    ) -> None:
         super().__init__()
-        self.strengths, self.shape = strengths, (channels, *size)
+        self.ridge_multipliers, self.shape = ridge_multipliers, (channels, *size)
         pixels = size[0] * size[1]
         rank = min(rank, channels * pixels)
         self.register_buffer("mean_in", torch.zeros(channels * pixels))
         self.register_buffer("basis", torch.zeros(channels * pixels, rank))
-        self.register_buffer("shrinkage", torch.zeros(len(strengths), rank))
+        self.register_buffer("shrinkage", torch.zeros(len(ridge_multipliers), rank))
         self.register_buffer("weights", torch.zeros(rank, pixels))
         self.register_buffer("mean_out", torch.zeros(pixels))
 
@@ -128,7 +130,7 @@ class LinearEmbedding(nn.Module):
     @property
     def images(self) -> int:
         """Images that come out for each input."""
-        return len(self.strengths)
+        return len(self.ridge_multipliers)
 
     def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
         """Fit the linear estimate to normalized samples and take its numbers; arguments of `fit_linear`."""
@@ -141,7 +143,7 @@ class LinearEmbedding(nn.Module):
             buffer.zero_()
         self.mean_in.copy_(estimate.mean_in)
         self.basis[:, :found] = estimate.basis
-        self.shrinkage[:, :found] = torch.stack([estimate.shrinkage(s) for s in self.strengths])
+        self.shrinkage[:, :found] = torch.stack([estimate.shrinkage(s) for s in self.ridge_multipliers])
         self.weights[:found] = estimate.weights
         self.mean_out.copy_(estimate.mean_out.flatten())
 
@@ -186,20 +188,20 @@ class LinearEmbeddings(nn.Module):
         modality: What is seen; each of its G groups has an embedding.
         size: Height and width of the input, pixels.
         rank: Most components of all groups together, at least one for each.
-        strengths: As in `LinearEmbedding`, S of them.
+        ridge_multipliers: As in `LinearEmbedding`, S of them.
 
     Raises:
         ConfigError: The rank is less than the number of groups.
     """
 
     def __init__(
-        self, modality: Modality, size: tuple[int, int], rank: int, strengths: tuple[float, ...]
+        self, modality: Modality, size: tuple[int, int], rank: int, ridge_multipliers: tuple[float, ...]
     ) -> None:
         super().__init__()
         self.modality = modality
         self.groups = nn.ModuleDict(
             {
-                group.name: LinearEmbedding(group.channels, size, part, strengths)
+                group.name: LinearEmbedding(group.channels, size, part, ridge_multipliers)
                 for group, part in zip(modality.groups, modality.ranks(rank), strict=True)
             }
         )

@@ -30,7 +30,7 @@ class LinearEstimate:
         powers: Power of each coefficient, summed over the samples, [R].
         weights: From the coefficients to the picture, [R, H W].
         mean_out: Mean picture, [H, W].
-        lam: Weight of the ridge that was chosen, in units of the mean power of a component.
+        regularization: Weight of the ridge that was chosen, in units of the mean power of a component.
     """
 
     mean_in: Tensor
@@ -38,15 +38,15 @@ class LinearEstimate:
     powers: Tensor
     weights: Tensor
     mean_out: Tensor
-    lam: float
+    regularization: float
 
     def shrinkage(self, strength: float) -> Tensor:
         """Return the factors of the coefficients, [R], that make the ridge `strength` times as strong.
 
-        Along uncorrelated coefficients a ridge regression is one division each, so that those of all strengths
+        Along uncorrelated coefficients a ridge regression is one division each, so that those of all ridges
         share basis and weights: W(s) = diag((p + l) / (p + s l)) W(1), p the powers, l the ridge.
         """
-        ridge = self.lam * self.powers.mean().clamp_min(_TINY)
+        ridge = self.regularization * self.powers.mean().clamp_min(_TINY)
         return (self.powers + ridge) / (self.powers + strength * ridge)
 
     def __call__(self, inputs: Tensor) -> Tensor:
@@ -100,7 +100,10 @@ def fit_linear(
     # Each part in units of its own noise, as its own best ridge tells it: else the noise of the events would
     # hide the fine detail of the frames.
     scales = torch.tensor(
-        [float(lam * powers.mean().clamp_min(_TINY)) ** -0.5 for _, _, powers, _, lam in found]
+        [
+            float(regularization * powers.mean().clamp_min(_TINY)) ** -0.5
+            for _, _, powers, _, regularization in found
+        ]
     )
     scales = scales / scales.log().mean().exp()
     basis = torch.block_diag(*(one[1] * scale for one, scale in zip(found, scales, strict=True)))
@@ -110,8 +113,10 @@ def fit_linear(
         (inputs[:, own].float().flatten(1) - one[0]) @ one[1] * scale
         for (own, _), one, scale in zip(parts, found, scales, strict=True)
     ]
-    turned, powers, weights, lam = _regress(torch.cat(codes, dim=1), y - mean_out, folds)
-    return LinearEstimate(mean_in, basis @ turned, powers, weights, mean_out.unflatten(0, shape), lam)
+    turned, powers, weights, regularization = _regress(torch.cat(codes, dim=1), y - mean_out, folds)
+    return LinearEstimate(
+        mean_in, basis @ turned, powers, weights, mean_out.unflatten(0, shape), regularization
+    )
 
 
 def _fit(
@@ -121,8 +126,8 @@ def _fit(
     mean_in = x.mean(dim=0)
     x = x - mean_in
     basis = _main_directions(x, min(rank, *x.shape), seed)
-    turned, powers, weights, lam = _regress(x @ basis, y, folds)
-    return mean_in, basis @ turned, powers, weights, lam
+    turned, powers, weights, regularization = _regress(x @ basis, y, folds)
+    return mean_in, basis @ turned, powers, weights, regularization
 
 
 def _regress(code: Tensor, y: Tensor, folds: Tensor) -> tuple[Tensor, Tensor, Tensor, float]:
@@ -131,9 +136,9 @@ def _regress(code: Tensor, y: Tensor, folds: Tensor) -> tuple[Tensor, Tensor, Te
     powers, turn = powers.clamp_min(0).float().flip(0), turn.float().flip(1)
     code = code @ turn
     errors = sum(_left_out(code, y, folds == fold) for fold in folds.unique())
-    lam = _LAMBDAS[int(torch.as_tensor(errors).argmin())]
-    weights = (code.T @ y) / (powers + lam * powers.mean().clamp_min(_TINY))[:, None]
-    return turn, powers, weights, lam
+    regularization = _LAMBDAS[int(torch.as_tensor(errors).argmin())]
+    weights = (code.T @ y) / (powers + regularization * powers.mean().clamp_min(_TINY))[:, None]
+    return turn, powers, weights, regularization
 
 
 def _left_out(code: Tensor, y: Tensor, left: Tensor) -> Tensor:
@@ -148,8 +153,8 @@ def _left_out(code: Tensor, y: Tensor, left: Tensor) -> Tensor:
     outer = turn.T @ (kept.T @ y[~left]).double()  # [R, H W]
     aimed = (outer * (turn.T @ (rest.T @ y[left]).double())).sum(dim=1)
     square = (turn.T @ (rest.T @ rest).double() @ turn) * (outer @ outer.T)
-    strengths = torch.tensor(_LAMBDAS, dtype=torch.float64) * powers.mean().clamp_min(_TINY)
-    inverse = 1 / (powers + strengths[:, None])  # [ridges, R]
+    ridges = torch.tensor(_LAMBDAS, dtype=torch.float64) * powers.mean().clamp_min(_TINY)
+    inverse = 1 / (powers + ridges[:, None])  # [ridges, R]
     return ((inverse @ square) * inverse).sum(dim=1) - 2 * inverse @ aimed + y[left].double().square().sum()
 
 

@@ -81,7 +81,7 @@ class SequenceReconstructor(Reconstructor):
             )
         size = (sampling.height, sampling.width)
         self.normalization = InputNormalization(modality, settings.scaling)
-        self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.strengths)
+        self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.ridge_multipliers)
         self.scale = PooledScale(self.embedding.images)
         self.unet = ResidualUNet(self.embedding.images, settings)
         across = (torch.arange(side) + 0.5 - side / 2) * fine_m

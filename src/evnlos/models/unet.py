@@ -45,7 +45,7 @@ class UNetConfig(ReconstructorSettings):
     """Whose mean and size the inputs are divided by: the `dataset`'s, or each `picture`'s own."""
     rank: int = 256
     """Components of the linear embedding in front of the U-Net (0 = none: the U-Net sees the maps)."""
-    strengths: tuple[float, ...] = (0.03, 1.0, 30.0)
+    ridge_multipliers: tuple[float, ...] = (0.03, 1.0, 30.0)
     """Ridges of the linear embedding, in units of the best one; each gives the U-Net one image for each
     group of channels."""
 
@@ -57,8 +57,12 @@ class UNetConfig(ReconstructorSettings):
                 raise ConfigError(f"UNetConfig.{name} is {getattr(self, name)}; give at least 1")
         if self.rank < 0:
             raise ConfigError(f"UNetConfig.rank is {self.rank}; give 0 (no embedding) or more")
-        if self.rank and not (self.strengths and all(0 < s < float("inf") for s in self.strengths)):
-            raise ConfigError(f"UNetConfig.strengths is {self.strengths}; give one positive number or several")
+        if self.rank and not (
+            self.ridge_multipliers and all(0 < s < float("inf") for s in self.ridge_multipliers)
+        ):
+            raise ConfigError(
+                f"UNetConfig.ridge_multipliers is {self.ridge_multipliers}; give one positive number or several"
+            )
         if self.width % self.groups:
             raise ConfigError(f"UNetConfig.groups is {self.groups}; give a divisor of the width {self.width}")
         super().__post_init__()
@@ -190,7 +194,7 @@ class UNetReconstructor(Reconstructor):
         channels = modality.channels
         if settings.rank:
             size = (sampling.height, sampling.width)
-            self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.strengths)
+            self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.ridge_multipliers)
             channels = self.embedding.images
         self.unet = ResidualUNet(channels, settings)
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
 from evnlos.inverse import SequenceOperator
-from evnlos.inverse.joint import matrix_of, mean_weight, strip_of
 from evnlos.inverse.operators import Gradient, normal_matrix
+from evnlos.inverse.sequence_problem import matrix_of, mean_weight, strip_of
 from evnlos.optics import MatrixTransport
 from evnlos.setups import Setup
 from evnlos.tracking.registration import middle_of_light

@@ -7,11 +7,11 @@ from .choice import choose_and_finetune as choose_and_finetune
 from .choice import read_choice as read_choice
 from .settings import LOSSES as LOSSES
 from .settings import Training as Training
-from .settings import balanced_loss as balanced_loss
 from .settings import finetuning as finetuning
+from .settings import learning_rate_at as learning_rate_at
+from .settings import normalized_bce_mse_ssim as normalized_bce_mse_ssim
 from .settings import paper_finetuning as paper_finetuning
 from .settings import paper_loss as paper_loss
 from .settings import paper_pretraining as paper_pretraining
-from .settings import step_size as step_size
 from .train import TrainingResult as TrainingResult
 from .train import train as train

@@ -26,7 +26,7 @@ from evnlos.metrics import ssim
 from evnlos.models import Reconstructor, ReconstructorSettings, UNetConfig, describe_network
 from evnlos.tensor_file import read_sealed, sealed_bytes
 
-LossName = Literal["balanced", "paper"]
+LossName = Literal["normalized_bce_mse_ssim", "paper"]
 
 
 class Loss(Protocol):
@@ -57,7 +57,7 @@ def paper_loss(image: Tensor, truth: Tensor, light: Tensor | None = None) -> Ten
     return (image - truth).abs().mean() + (2 / structure).mean()
 
 
-def balanced_loss(image: Tensor, truth: Tensor, light: Tensor | None = None) -> Tensor:
+def normalized_bce_mse_ssim(image: Tensor, truth: Tensor, light: Tensor | None = None) -> Tensor:
     """Return cross-entropy / entropy of the mean + squared error / energy of the truth + (1 - SSIM) / 4.
 
     The first two terms are those of the best constant picture = 1, whatever share of the canvas a
@@ -78,7 +78,7 @@ def balanced_loss(image: Tensor, truth: Tensor, light: Tensor | None = None) -> 
     return cross + error + (1 - ssim(image, truth).mean()) / 4
 
 
-LOSSES: dict[LossName, Loss] = {"balanced": balanced_loss, "paper": paper_loss}
+LOSSES: dict[LossName, Loss] = {"normalized_bce_mse_ssim": normalized_bce_mse_ssim, "paper": paper_loss}
 
 
 @dataclass(frozen=True)
@@ -92,15 +92,15 @@ class Training:
     batch_size: int = 32
     """Samples a step."""
     learning_rate: float = 2e-3
-    """Adam's step size at the start."""
+    """Learning rate of Adam at the start."""
     schedule: Literal["cosine", "constant", "step"] = "cosine"
-    """How the step size falls: to zero along a cosine, not at all, or at once at `step_epoch`."""
+    """How the learning rate falls: to zero along a cosine, not at all, or at once at `step_epoch`."""
     step_epoch: int = 100
-    """Epoch after which the schedule `step` multiplies the step size by `step_factor`."""
+    """Epoch after which the schedule `step` multiplies the learning rate by `step_factor`."""
     step_factor: float = 0.5
     """Factor of the schedule `step`."""
-    loss: LossName = "balanced"
-    """`balanced` (bounded, does not collapse to black) or `paper` (L1 + 2/SSIM)."""
+    loss: LossName = "normalized_bce_mse_ssim"
+    """`normalized_bce_mse_ssim` (bounded, does not collapse to black) or `paper` (L1 + 2/SSIM)."""
     sequence_augmentations: int = 3
     """Samples of each sequence, for networks that see it whole: all time steps, every other, random ones."""
     mirror: bool = False
@@ -133,11 +133,11 @@ class Training:
         check_made(self)
 
 
-def step_size(settings: Training, progress: float) -> float:
+def learning_rate_at(settings: Training, progress: float) -> float:
     """Return Adam's step size after `progress` epochs (a fraction within an epoch is allowed).
 
     Example:
-        >>> step_size(Training(epochs=10, learning_rate=1.0, schedule="step", step_epoch=5), 7.5)
+        >>> learning_rate_at(Training(epochs=10, learning_rate=1.0, schedule="step", step_epoch=5), 7.5)
         0.5
     """
     if settings.schedule == "cosine":

@@ -20,7 +20,14 @@ from evnlos.files import claim, is_empty, write_atomically
 from evnlos.migrate import __version__, migrate
 from evnlos.models import Reconstructor, Weights, load_weights, save_weights
 from evnlos.progress import Progress, Step, silent
-from evnlos.training.settings import LOSSES, Training, light_of, load_checkpoint, save_checkpoint, step_size
+from evnlos.training.settings import (
+    LOSSES,
+    Training,
+    learning_rate_at,
+    light_of,
+    load_checkpoint,
+    save_checkpoint,
+)
 from evnlos.training.source import Live, Source, Stored, Team, half_mirrored, team, with_mirrored
 from evnlos.training.validation import confidence_of, held_out_samples, validate
 from evnlos.types import derive_seed
@@ -153,7 +160,7 @@ def _epochs(
         began, rate, total = time.perf_counter(), 0.0, torch.zeros((), device=device)
         network.train()
         for step, batch in enumerate(source.batches(epoch)):
-            rate = step_size(settings, epoch + step / source.steps)
+            rate = learning_rate_at(settings, epoch + step / source.steps)
             for group in optimiser.param_groups:
                 group["lr"] = rate
             seen, truth = (part.to(device, non_blocking=True) for part in (batch.seen, batch.truth))

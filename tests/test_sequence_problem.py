@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import Gradient, JointProblem, SequenceOperator, total_variation
-from evnlos.inverse.joint import matrix_of, strip_gram_of, strip_of
+from evnlos.inverse import Gradient, SequenceOperator, SequenceProblem, total_variation
 from evnlos.inverse.measurements import position_subsets
 from evnlos.inverse.operators import normal_matrix
+from evnlos.inverse.sequence_problem import matrix_of, strip_gram_of, strip_of
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import RadiometricSetup
@@ -59,21 +59,21 @@ def test_the_strip_is_drawn_as_the_target_draws_itself(sight) -> None:
 def test_gram_and_solution_are_those_of_the_stacked_problem(sight, static) -> None:
     whole = stacked(sight)
     weight = torch.kron(precision(static).contiguous(), torch.eye(35, dtype=torch.float64))
-    problem = JointProblem(sight, static)
+    problem = SequenceProblem(sight, static)
     torch.testing.assert_close(problem.gram, whole.mT @ weight @ whole, rtol=1e-9, atol=1e-9)
-    images, lam = random(3, *SHAPE, seed=2), 0.3
+    images, regularization = random(3, *SHAPE, seed=2), 0.3
     smooth = normal_matrix(Gradient("dark"), torch.zeros(4, 4, dtype=torch.float64))
     expected = torch.linalg.solve(
-        whole.mT @ weight @ whole + lam * smooth, whole.mT @ weight @ images.flatten()
+        whole.mT @ weight @ whole + regularization * smooth, whole.mT @ weight @ images.flatten()
     )
-    found = problem.tikhonov(images, lam)
+    found = problem.tikhonov(images, regularization)
     torch.testing.assert_close(found.image.flatten(), expected, rtol=1e-8, atol=1e-8)
     left = images.flatten() - whole @ expected
     assert float(found.residual) == pytest.approx(float(left @ weight @ left) ** 0.5, rel=1e-8)
 
 
 def test_batch_equals_loop(sight) -> None:
-    images, problem = random(2, 3, *SHAPE, seed=4), JointProblem(sight, 0.5)
+    images, problem = random(2, 3, *SHAPE, seed=4), SequenceProblem(sight, 0.5)
     both = problem.tikhonov(images, 0.1).image
     for k in range(2):
         torch.testing.assert_close(both[k], problem.tikhonov(images[k], 0.1).image)
@@ -81,7 +81,7 @@ def test_batch_equals_loop(sight) -> None:
 
 def test_what_rests_says_nothing(sight) -> None:
     images, still = random(3, *SHAPE, seed=5), random(*SHAPE, seed=6)
-    problem = JointProblem(sight, np.inf)
+    problem = SequenceProblem(sight, np.inf)
     torch.testing.assert_close(
         problem.tikhonov(images, 0.1).image,
         problem.tikhonov(images + 5 * still, 0.1).image,
@@ -96,13 +96,15 @@ def test_gcv_finds_the_weight_where_the_noise_is_white(sight) -> None:
     target = random(4, 4, seed=7)
     clean = sight(target)
     noisy = clean + 0.3 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
-    problem = JointProblem(sight)
+    problem = SequenceProblem(sight)
     chosen = problem.tikhonov(noisy)
 
-    def risk(lam: float) -> float:
-        return float((sight(problem.tikhonov(noisy, lam).image) - clean).square().sum())
+    def risk(regularization: float) -> float:
+        return float((sight(problem.tikhonov(noisy, regularization).image) - clean).square().sum())
 
-    assert risk(chosen.lam) < 1.3 * min(risk(float(lam)) for lam in np.logspace(-4, 3, 30))
+    assert risk(chosen.regularization) < 1.3 * min(
+        risk(float(regularization)) for regularization in np.logspace(-4, 3, 30)
+    )
     assert chosen.noise_sigma == pytest.approx(0.3, rel=0.2)
 
 
@@ -111,7 +113,7 @@ def test_total_variation_is_that_of_one_picture(sight) -> None:
     images = one(random(4, 4, seed=8)) + 0.1 * random(1, *SHAPE, seed=9)
     operator = MatrixTransport(one(torch.eye(16).double().reshape(16, 4, 4)).flatten(1).mT, TARGET_PLANE, SHAPE)
     expected = total_variation(operator, images[0], 0.05, box=(0.0, 1.0), border="dark", tolerance=1e-4)
-    found = JointProblem(one).total_variation(images, 0.05, tolerance=1e-4)
+    found = SequenceProblem(one).total_variation(images, 0.05, tolerance=1e-4)
     assert found.converged and expected.converged
 
     def objective(image: torch.Tensor) -> float:
@@ -137,7 +139,7 @@ def test_a_sequence_shows_more_than_a_picture() -> None:
         sight = SequenceOperator(transport, target_plane, positions[:count])
         clean = sight(truth)
         noisy = clean + 5e-3 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
-        found = JointProblem(sight, 0.0, gram).tikhonov(noisy, 4 * 5e-3**2)
+        found = SequenceProblem(sight, 0.0, gram).tikhonov(noisy, 4 * 5e-3**2)
         error[count] = float((found.image - truth).square().mean())
     assert error[8] < 0.9 * error[1]
 
@@ -162,21 +164,21 @@ def test_position_subsets_are_equally_spaced() -> None:
 
 
 def test_wrong_input_is_named(sight) -> None:
-    problem = JointProblem(sight)
+    problem = SequenceProblem(sight)
     with pytest.raises(DataError, match="real"):
         problem.tikhonov(random(2, *SHAPE))
     with pytest.raises(DataError, match="NaN"):
         problem.tikhonov(torch.full((3, *SHAPE), torch.nan))
-    with pytest.raises(ConfigError, match="lam is -1"):
+    with pytest.raises(ConfigError, match="regularization is -1"):
         problem.tikhonov(random(3, *SHAPE), -1.0)
     with pytest.raises(ConfigError, match=r"static is -0\.5"):
-        JointProblem(sight, -0.5)
+        SequenceProblem(sight, -0.5)
     with pytest.raises(DataError, match="off the strip"):
         SequenceOperator(sight.transport, TARGET_PLANE, np.array([(1.0, 0.0)]))
     with pytest.raises(DataError, match="shape"):
         SequenceOperator(sight.transport, TARGET_PLANE, np.zeros(2))
     with pytest.raises(DataError, match="nothing of the target"):
-        JointProblem(SequenceOperator(sight.transport, TARGET_PLANE, POSITIONS[:1]), np.inf)
+        SequenceProblem(SequenceOperator(sight.transport, TARGET_PLANE, POSITIONS[:1]), np.inf)
     with pytest.raises(ConfigError, match="7 positions of 6"):
         position_subsets(6, 7, 1)
 

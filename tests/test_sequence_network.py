@@ -19,7 +19,7 @@ from evnlos.training import Training
 from evnlos.types import Plane
 from watching import stopped
 
-NET = SequenceConfig(width=8, depth=1, shuffle=2, rank=24, strengths=(0.01, 1.0))
+NET = SequenceConfig(width=8, depth=1, shuffle=2, rank=24, ridge_multipliers=(0.01, 1.0))
 PLAN = Training(epochs=6, network=NET, precision="float32", batch_size=4, sequence_augmentations=2)
 PITCH_M = 0.0025
 
@@ -55,7 +55,7 @@ def test_the_mean_is_over_the_positions_that_see_a_pixel() -> None:
 
 @pytest.fixture(scope="module")
 def trained(tiny_dataset, tmp_path_factory):
-    out = tmp_path_factory.mktemp("joint") / "run"
+    out = tmp_path_factory.mktemp("sequence") / "run"
     return out, train(tiny_dataset, PLAN, out).records
 
 

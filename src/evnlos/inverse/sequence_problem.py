@@ -194,13 +194,13 @@ _GRID = torch.logspace(-12, 0, 97, dtype=torch.float64)
 _KEPT = 1e-12  # of the largest eigenvalue; what lies below is rounding
 
 
-class JointProblem:
+class SequenceProblem:
     """Find the target x behind N pictures y_k = A S_k x + b + noise, b unknown and the same in all of them.
 
     With R = A^T C^-1 A accumulated over the positions (`SequenceOperator.gram`) the pictures are looked at
-    once, and every lam costs a product of the target's size. C holds independent noise and, of standard
-    deviation `static` times the noise, a constant offset of each pixel: the camera's fixed pattern and ambient
-    light.
+    once, and every regularization costs a product of the target's size. C holds independent noise and, of
+    standard deviation `static` times the noise, a constant offset of each pixel: the camera's fixed pattern and
+    ambient light.
 
     Args:
         sight: The sequence.
@@ -229,23 +229,29 @@ class JointProblem:
 
     @property
     def scale(self) -> float:
-        """The natural unit of lam: the largest eigenvalue of the Gram matrix over that of the prior, 8."""
+        """The natural unit of regularization: the largest eigenvalue of the Gram matrix over that of the prior,
+        8.
+        """
         return float(self._eigen[0][-1]) / 8
 
-    def tikhonov(self, images: torch.Tensor, lam: float | None = None) -> Solution:
-        """Return argmin |C^-1/2 (A S x - y)|^2 + lam |grad x|^2, the target's border counted as an edge.
+    def tikhonov(self, images: torch.Tensor, regularization: float | None = None) -> Solution:
+        """Return argmin |C^-1/2 (A S x - y)|^2 + regularization |grad x|^2, the target's border counted as an
+        edge.
 
         Args:
-            images: y without known ambient light, [..., N, H, W]; leading axes are a batch, which shares lam.
-            lam: Weight of the prior, squared white levels; None: by generalised cross-validation, which takes
-                the errors of all pictures' samples to be independent.
+            images: y without known ambient light, [..., N, H, W]; leading axes are a batch, which shares
+                regularization.
+            regularization: Weight of the prior, squared white levels; None: by generalised cross-validation,
+                which takes the errors of all pictures' samples to be independent.
 
         Raises:
-            ConfigError: lam is not 0 or more.
+            ConfigError: regularization is not 0 or more.
             DataError: The pictures are not those of the sequence.
         """
-        if lam is not None and not (math.isfinite(lam) and lam >= 0):
-            raise ConfigError(f"lam is {lam}; give 0 or more, or None for generalised cross-validation")
+        if regularization is not None and not (math.isfinite(regularization) and regularization >= 0):
+            raise ConfigError(
+                f"regularization is {regularization}; give 0 or more, or None for generalised cross-validation"
+            )
         back, energy = self._seen(images)
         values, basis = self._spectrum
         seen = torch.where(values > _KEPT * values[-1], back @ basis, 0.0)  # [B, C]
@@ -257,29 +263,33 @@ class JointProblem:
         def freedom(weight: float) -> float:
             return max(self.samples - float((values / (values + weight)).sum()), 1e-9)
 
-        if lam is None:
+        if regularization is None:
             grid = (float(values[-1]) * _GRID).numpy()
-            lam = smallest(lambda weight: float(residual(weight).sum()) / freedom(weight) ** 2, grid)
-        image = (seen / (values + lam)) @ basis.mT
-        left = residual(lam)
-        sigma = float((left.mean() / freedom(lam)).sqrt())
+            regularization = smallest(lambda weight: float(residual(weight).sum()) / freedom(weight) ** 2, grid)
+        image = (seen / (values + regularization)) @ basis.mT
+        left = residual(regularization)
+        sigma = float((left.mean() / freedom(regularization)).sqrt())
         image = image.reshape(*images.shape[:-3], *self.sight.target_plane.shape)
         left = left.sqrt().reshape(images.shape[:-3])
-        return Solution(image, lam, 0, True, left, sigma, self.samples - freedom(lam))
+        return Solution(image, regularization, 0, True, left, sigma, self.samples - freedom(regularization))
 
     def total_variation(
-        self, images: torch.Tensor, lam: float, box: tuple[float, float] = (0.0, 1.0), tolerance: float = 1e-4
+        self,
+        images: torch.Tensor,
+        regularization: float,
+        box: tuple[float, float] = (0.0, 1.0),
+        tolerance: float = 1e-4,
     ) -> Solution:
-        """Return argmin over low <= x <= high of |C^-1/2 (A S x - y)|^2 / 2 + lam sum |grad x|.
+        """Return argmin over low <= x <= high of |C^-1/2 (A S x - y)|^2 / 2 + regularization sum |grad x|.
 
         Args:
             images: y without known ambient light, [..., N, H, W].
-            lam: Weight of the variation, squared white levels, above 0.
+            regularization: Weight of the variation, squared white levels, above 0.
             box: Lowest and highest brightness of a cell.
             tolerance: Relative primal-dual gap at which to stop.
 
         Raises:
-            ConfigError: lam is not positive, or the box is empty.
+            ConfigError: regularization is not positive, or the box is empty.
             DataError: The pictures are not those of the sequence.
         """
         back, energy = self._seen(images)
@@ -292,7 +302,7 @@ class JointProblem:
         found = total_variation(
             compressed,
             target.reshape(*batch, *target_plane.shape),
-            lam,
+            regularization,
             box=box,
             border="dark",
             tolerance=tolerance,
@@ -302,7 +312,13 @@ class JointProblem:
         left = left.clamp(min=0)
         sigma = float((left.mean() / self.samples).sqrt())
         return Solution(
-            found.image, lam, found.iterations, found.converged, left.sqrt(), sigma, history=found.history
+            found.image,
+            regularization,
+            found.iterations,
+            found.converged,
+            left.sqrt(),
+            sigma,
+            history=found.history,
         )
 
     def _seen(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
