@@ -513,7 +513,7 @@ class BegunError(Exception):
     [
         ["experiment", "simulation", "--writers", "1", "--workers", "1"],
         ["experiment", "conditions", "--writers", "1", "--workers", "1"],
-        ["experiment", "mismatch", "--rigs", "torch", "--seeds", "0", "--workers", "1"],
+        ["experiment", "mismatch", "--setups", "torch", "--seeds", "0", "--workers", "1"],
         ["demo", "--workers", "1"],
     ],
     ids=lambda words: words[words[0] == "experiment"],
