@@ -108,8 +108,7 @@ def test_noise_that_the_halves_do_not_share_is_no_support() -> None:
 
 def test_what_a_network_always_draws_tells_no_object() -> None:
     def with_habit(samples: NlosDataset) -> NlosDataset:
-        """Add a bar to the target at every position: in both halves of every sequence, whatever the object is.
-        """
+        """Add a bar to the target at every position: in both halves of every sequence, for any object."""
         bar = torch.zeros(32, 32)
         bar[:16, 8:16] = 0.7
         for name in dict.fromkeys(samples.names.tolist()):

@@ -32,7 +32,7 @@ LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
 """What the rendered captures show."""
 
 # Half the rank of the full experiments: half the time, as good on few objects.
-SEQUENCE_NETWORK = SequenceConfig(width=32, rank=256, strengths=(0.001, 0.01, 0.1, 1.0))
+SEQUENCE_NETWORK = SequenceConfig(width=32, rank=256, ridge_multipliers=(0.001, 0.01, 0.1, 1.0))
 """The network that the demo trains."""
 
 _TEST = ("G", "K", "4", "9")

@@ -193,7 +193,7 @@ class Reconstructor(nn.Module, ABC):
         if unlike or len(theirs) != len(ours):
             raise ConfigError(
                 f"the weights to start from have other layers ({(unlike or ['more of them'])[0]}); give the "
-                "network their width, depth, blocks, shuffle, groups and number of strengths"
+                "network their width, depth, blocks, shuffle, groups and number of ridges"
             )
         for name, value in ours.items():
             value.copy_(theirs[name])

@@ -127,9 +127,9 @@ def layers_of(setup: str, *modalities: str) -> list[str]:
 
     Example:
         >>> layers_of("generic", "frame")
-        ['generic-frame-pass']
+        ['generic-frame-sequence']
     """
-    return [f"{setup}-{modality}-{_PASS}" for modality in modalities or STANDARD_MODALITIES]
+    return [f"{setup}-{modality}-{_SEQUENCE}" for modality in modalities or STANDARD_MODALITIES]
 
 
 def published_single() -> list[str]:
