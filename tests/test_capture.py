@@ -126,7 +126,7 @@ def _edit(name: str, old: str, new: str):
 
 DAMAGE = {
     "no capture.yaml": (lambda f: (f / "capture.yaml").unlink(), "capture.yaml"),
-    "unknown key": (_edit("capture.yaml", "target_size_m", "side_m"), "size_m"),
+    "unknown key": (_edit("capture.yaml", "size_m", "side_m"), "size_m"),
     "wrong type": (_edit("capture.yaml", "width: 72", "width: wide"), "camera.width"),
     "missing events": (lambda f: (f / "events.raw").unlink(), "events.raw"),
     "empty events": (lambda f: (f / "events.raw").write_bytes(b""), "events.raw"),
