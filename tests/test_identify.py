@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evnlos.analysis.identify import counted, identify, setup_table, singular_values, verdict
-from evnlos.analysis.linearized import Bench, LinearEstimator, bars, camera_variance, finest_bars, linearized
+from evnlos.analysis.linearized import Bench, LinearEstimator, bars, finest_bars, linearized
 from evnlos.cameras import FrameCamera
 from evnlos.cli import main
 from evnlos.config import save_yaml
@@ -110,10 +110,11 @@ def test_noise_is_that_of_the_camera(level, known):
     if known:
         camera = dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0)
     frame = camera.expose(np.full((1, 200, 200), level), seed=1)[0] / camera.white
-    variance = camera_variance(torch.tensor(level, dtype=torch.float64), camera, known_pattern=known)
+    variance = camera.noise_variance(torch.tensor(level, dtype=torch.float64), known_pattern=known)
     assert float(frame.var()) == pytest.approx(float(variance), rel=0.03)
-    quarter = camera_variance(torch.tensor(level), dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0), frames=4)
-    whole = camera_variance(torch.tensor(level), dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0))
+    plain = dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0)
+    quarter = plain.noise_variance(torch.tensor(level), frames=4)
+    whole = plain.noise_variance(torch.tensor(level))
     assert float(quarter) == pytest.approx(float(whole) / 4)
 
 
@@ -217,7 +218,7 @@ def test_picard_and_picture():
     setup = linearized(setup_preset("hard"), SMALL)
     targets = handwritten_targets(SMALL.target_plane, 1)
     light = setup.ambient + setup.matrix @ targets.mean
-    whitened = setup.matrix / camera_variance(light, FrameCamera()).sqrt()[:, None]
+    whitened = setup.matrix / FrameCamera().noise_variance(light).sqrt()[:, None]
     left, values, _ = torch.linalg.svd(whitened, full_matrices=False)
     torch.testing.assert_close(one.at_camera.spectrum[:20], values[:20], rtol=1e-6, atol=1e-9)
     seen = (left.mT @ (whitened @ targets.test[targets.typical])).abs()

@@ -1,5 +1,12 @@
 """Names of `evnlos.analysis`; `__init__.py` reads this list."""
 
+from .bounds import Bounds as Bounds
+from .bounds import EventBound as EventBound
+from .bounds import SequenceBench as SequenceBench
+from .bounds import event_information as event_information
+from .bounds import frame_information as frame_information
+from .bounds import row_information as row_information
+from .bounds import sequence_bounds as sequence_bounds
 from .evaluate import BASELINES as BASELINES
 from .evaluate import CHECKS as CHECKS
 from .evaluate import Evaluation as Evaluation

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from evnlos.analysis.linearized import camera_variance
 from evnlos.data import NlosDataset, Samples, Sampling
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
@@ -61,7 +60,7 @@ class FrameOperator:
 
     def variance(self, level: Tensor) -> Tensor:
         """Return the variance of a sample pixel at a level, white levels squared: light, reading, rounding."""
-        return camera_variance(level, self._camera) / self._pixels
+        return self._camera.noise_variance(level) / self._pixels
 
 
 def consistent(

@@ -17,7 +17,6 @@ from evnlos.analysis.linearized import (
     Bench,
     LinearEstimator,
     LinearizedSetup,
-    camera_variance,
     finest_bars,
     linearized,
     scan_notes,
@@ -226,7 +225,7 @@ def identify(
     targets = handwritten_targets(bench.target_plane, bench.writers)
     singular = singular_values(seen.matrix)
     light = seen.ambient + seen.matrix @ targets.mean
-    own = camera_variance(light, setup.frame_camera, bench.frames, bench.known_pattern)
+    own = setup.frame_camera.noise_variance(light, bench.frames, bench.known_pattern)
     fixed = torch.full_like(own, (bench.fixed_noise * seen.white) ** 2 / bench.frames)
     at_camera, at_fixed = (at_noise(seen, variance, targets, seed) for variance in (own, fixed))
     warnings = []

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import torch
 
-from evnlos.cameras import FrameCamera
 from evnlos.errors import ConfigError, DataError
 from evnlos.setups import OperatorNoise, Setup
 from evnlos.types import Plane
@@ -107,36 +106,6 @@ def linearized(setup: Setup, bench: Bench = Bench()) -> LinearizedSetup:
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera gets no light from the target; move the target or the camera")
     return LinearizedSetup(matrix, setup.ambient_light().double().flatten(), bench.target_plane, setup.shape)
-
-
-def camera_variance(
-    light: torch.Tensor, camera: FrameCamera, frames: int = 1, known_pattern: bool = True
-) -> torch.Tensor:
-    """Return the variance of the frame camera's noise at a mean light: shot, read, rounding, fixed pattern.
-
-    var(E) = (E / N + (r / N)^2 + q^2) / frames + pattern, N the full well, r the read noise, q the rounding to
-    digital numbers over sqrt(12), in white levels; the pattern (sensitivity and offset) does not average out.
-
-    Args:
-        light: Mean light, white levels, [...].
-        camera: The camera.
-        frames: Frames that are averaged.
-        known_pattern: Whether the fixed pattern was measured and taken off.
-
-    Returns:
-        Variance, white levels squared, [...].
-
-    Example:
-        >>> camera = FrameCamera(full_well_e=10_000.0, read_noise_e=0.0, bit_depth=16)
-        >>> round(float(camera_variance(torch.tensor(0.25), camera)) ** 0.5, 4)
-        0.005
-    """
-    well = camera.full_well_e
-    rounding = 1 / ((camera.white - camera.black_level) * camera.gain) ** 2 / 12
-    variance = (light.clamp(min=0) / well + (camera.read_noise_e / well) ** 2 + rounding) / frames
-    if not known_pattern:
-        variance = variance + (camera.prnu * light) ** 2 + (camera.dsnu_e / well) ** 2
-    return variance
 
 
 _STEPS_AN_OCTAVE = 8

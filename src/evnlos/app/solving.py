@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from evnlos.analysis import reconstruct
 from evnlos.analysis.confidence import FrameOperator, consistent, judgement_of, why_unjudged
-from evnlos.analysis.linearized import camera_variance
 from evnlos.app.controls import COARSE, Recorded
 from evnlos.data import STANDARD_MODALITIES, Sampling, as_modality
 from evnlos.errors import DataError
@@ -154,7 +153,7 @@ def from_whole_sequence(recorded: Recorded) -> Reconstruction:
         SequenceOperator(MatrixTransport(made.dense(torch.float32), strip, shape), target_plane, places),
         _STATIC,
     )
-    variance = camera_variance(light.mean() + setup.ambient, setup.frame_camera)
+    variance = setup.frame_camera.noise_variance(light.mean() + setup.ambient)
     image = problem.tikhonov(light, _SMOOTH * float(variance)).image
     found = Target("found", image.clamp(0, 1).float().numpy(), size_m)
     fine = Sampling()

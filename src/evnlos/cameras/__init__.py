@@ -1,7 +1,7 @@
 """What a camera makes of the light on the wall: frames and events."""
 
 from evnlos.cameras.event_camera import EventCamera
-from evnlos.cameras.event_model import EVENT_MODELS, EventModel, PixelSettings
+from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, PixelSettings
 from evnlos.cameras.frame_camera import FrameCamera
 from evnlos.cameras.pixel import EventPixel, V2ePixel
 from evnlos.cameras.pixels.brownian import BrownianPixel
@@ -15,6 +15,7 @@ __all__ = [
     "BrownianPixel",
     "CelexCamera",
     "CircuitPixel",
+    "CrossingLaw",
     "EventCamera",
     "EventModel",
     "EventPixel",

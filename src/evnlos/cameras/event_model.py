@@ -15,14 +15,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, get_args
 
+import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
 from evnlos.registry import Kinded, Registry
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from evnlos.cameras.event_order import Columns, EventTensors
     from evnlos.cameras.light import Light
 
@@ -31,6 +30,9 @@ Phase = Literal["random", "rest"]
 
 MIN_THRESHOLD = 0.01
 """Smallest threshold that mismatch can leave a pixel with, log units."""
+
+_KNEE_DN = 20.0
+_KNEE_SLOPE = math.log(_KNEE_DN) / _KNEE_DN
 
 EVENT_MODELS: Registry[type[PixelSettings]] = Registry("evnlos.event_models", "event model")
 """The event models by kind."""
@@ -72,6 +74,74 @@ class LogCurve(NamedTuple):
     """Factor of the light in DN."""
     offset: float
     """What is added, DN."""
+
+
+@dataclass(frozen=True)
+class CrossingLaw:
+    """What an event of a threshold pixel says of the light, in numbers: the constants of a likelihood.
+
+    Between two events of a pixel the filtered log light P, less the leak's share, moves by +threshold_on or
+    -threshold_off, with dP/dt = bandwidth(I) (ln I - P). The error of that change has the variance
+    noise^2 + walk_variance(I) times the time between the two. Light I is in DN, 255 = white.
+
+    Args:
+        threshold_on: Mean threshold of ON events, log units.
+        threshold_off: Mean threshold of OFF events, log units.
+        threshold_sigma: Standard deviation of both over the pixels, log units.
+        curve: The pixel's logarithm.
+        leak: By how much the reference falls, log units per second.
+        leak_per_dn: What each DN of light adds to that.
+        events_hz: Events without cause, but for the leak's, hertz per pixel.
+        noise: Standard deviation of the change between two events, whatever its length, log units.
+        walk: Strengths (a, b) of a random walk and its dark light k, DN: variance (a sqrt(I) / (I + k) + b)^2
+            per second.
+        cutoff_hz: Corner frequency of the low-pass filter at white, hertz; 0 = none.
+        floor_dn: Light that its bandwidth keeps in the dark, DN.
+        exposure: DN at the pixel per DN of the light, for filter and walk.
+        starts_at_rest: Whether the first event, too, is a threshold away from a known level: that of the first
+            light.
+    """
+
+    threshold_on: float
+    threshold_off: float
+    threshold_sigma: float
+    curve: LogCurve
+    leak: float = 0.0
+    leak_per_dn: float = 0.0
+    events_hz: float = 0.0
+    noise: float = 0.0
+    walk: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    cutoff_hz: float = 0.0
+    floor_dn: float = 20.0
+    exposure: float = 1.0
+    starts_at_rest: bool = False
+
+    def level(self, light: NDArray) -> NDArray:
+        """Return the log light of light in DN, [...]."""
+        bright = np.maximum(self.curve.scale * light + self.curve.offset, 0.0)
+        return np.where(bright > _KNEE_DN, np.log(np.maximum(bright, _KNEE_DN)), bright * _KNEE_SLOPE)
+
+    def slope(self, light: NDArray) -> NDArray:
+        """Return the derivative of `level`, log units per DN, [...]."""
+        bright = np.maximum(self.curve.scale * light + self.curve.offset, 0.0)
+        return self.curve.scale * np.where(bright > _KNEE_DN, 1.0 / np.maximum(bright, _KNEE_DN), _KNEE_SLOPE)
+
+    def bandwidth(self, light: NDArray) -> NDArray:
+        """Return the filter's speed at light in DN, 1 / s, [...]; infinite without one."""
+        if self.cutoff_hz == 0:
+            return np.full(np.shape(light), math.inf)
+        speed = 2.0 * math.pi * self.cutoff_hz / (255.0 + self.floor_dn)
+        return speed * (self.exposure * np.maximum(light, 0.0) + self.floor_dn)
+
+    def fall(self, light: NDArray) -> NDArray:
+        """Return by how much the reference falls at light in DN, log units per second, [...]."""
+        return self.leak + self.leak_per_dn * self.exposure * np.maximum(light, 0.0)
+
+    def walk_variance(self, light: NDArray) -> NDArray:
+        """Return the variance that a random walk gains at light in DN, log units squared per second, [...]."""
+        photon, floor, dark = self.walk
+        seen = self.exposure * np.maximum(light, 0.0)
+        return (photon * np.sqrt(seen) / (seen + dark) + floor) ** 2
 
 
 class PixelSettings(Kinded):
@@ -117,6 +187,14 @@ class PixelSettings(Kinded):
     def log_curve(self) -> LogCurve:
         """The logarithm that the camera chooses its time steps by."""
         return LogCurve(1.0, 0.0)
+
+    def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw | None:
+        """Return what an event of such a pixel says of the light; None where no threshold is known.
+
+        Args:
+            light_dn: Typical light, DN, for noise that no simple law describes at all light levels.
+        """
+        return None
 
     @property
     def disorder_s(self) -> float:

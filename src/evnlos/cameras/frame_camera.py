@@ -161,6 +161,35 @@ class FrameCamera:
         """Digital numbers that an electron adds."""
         return (self.white - self.black_level) * self.gain / self.full_well_e
 
+    def noise_variance(self, light: torch.Tensor, frames: int = 1, known_pattern: bool = True) -> torch.Tensor:
+        """Return the variance of the noise at a mean light: shot, read, rounding, fixed pattern.
+
+        var(E) = (E / N + (r / N)^2 + q^2) / frames + pattern, N the full well, r the read noise, q the rounding
+        to digital numbers over sqrt(12), in white levels; the pattern (sensitivity and offset) does not average
+        out.
+
+        Args:
+            light: Mean light, white levels, [...].
+            frames: Frames that are averaged.
+            known_pattern: Whether the fixed pattern was measured and taken off.
+
+        Returns:
+            Variance, white levels squared, [...].
+
+        Example:
+            >>> camera = FrameCamera(full_well_e=10_000.0, read_noise_e=0.0, bit_depth=16)
+            >>> round(float(camera.noise_variance(torch.tensor(0.25))) ** 0.5, 4)
+            0.005
+        """
+        well = self.full_well_e
+        rounding = 1 / ((self.white - self.black_level) * self.gain) ** 2 / 12
+        variance = (light.clamp(min=0) / well + (self.read_noise_e / well) ** 2 + rounding) / frames
+        return variance if known_pattern else variance + self.pattern_variance(light)
+
+    def pattern_variance(self, light: torch.Tensor) -> torch.Tensor:
+        """Return the variance of the fixed pattern at a mean light [...], white levels squared."""
+        return (self.prnu * light) ** 2 + (self.dsnu_e / self.full_well_e) ** 2
+
     def expose(
         self, irradiance: ArrayLike | torch.Tensor, seed: int = 0, first_frame: int = 0
     ) -> NDArray[np.uint8 | np.uint16]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 from evnlos.cameras.event_model import (
     EVENT_MODELS,
+    CrossingLaw,
     EventModel,
     LogCurve,
     Phase,
@@ -51,6 +52,19 @@ class _ContrastPixel(ThresholdPixel):
         for name in ("cutoff_hz", "leak_rate_hz", "shot_noise_rate_hz"):
             require(self, name, 0.0, math.inf, "hertz; 0 switches it off")
         require(self, "refractory_s", 0.0, math.inf, "seconds; 0 switches it off")
+
+    def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw:
+        """Return what an event says of the light; a crossing of v2e's pixel has no noise of its own."""
+        return CrossingLaw(
+            self.threshold_on,
+            self.threshold_off,
+            self.threshold_sigma,
+            self.log_curve,
+            leak=self.threshold_on * self.leak_rate_hz,
+            events_hz=self.shot_noise_rate_hz * (1.0 - 0.75 * min((light_dn + 20.0) / 275.0, 1.0)),
+            cutoff_hz=self.cutoff_hz,
+            starts_at_rest=True,
+        )
 
 
 @EVENT_MODELS.register
@@ -148,6 +162,18 @@ class EventPixel(_ContrastPixel):
         """The logarithm that the camera chooses its time steps by."""
         curve = self.curve()
         return LogCurve(curve.scale, curve.offset)
+
+    def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw:
+        """Return what an event says of the light; see `PixelSettings.crossing_law`."""
+        hot = self.hot_pixel_fraction * self.hot_pixel_rate_hz
+        plain = super().crossing_law(self.exposure * light_dn)
+        return replace(
+            plain,
+            events_hz=plain.events_hz + hot,
+            floor_dn=self.cutoff_floor_dn,
+            exposure=self.exposure,
+            starts_at_rest=self.initial_phase == "rest",
+        )
 
     def model(
         self,

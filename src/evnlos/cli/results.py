@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from evnlos.analysis.bounds import SequenceBench
 from evnlos.analysis.linearized import Bench
 from evnlos.cli.console import Flat, Folders, result
 from evnlos.cli.parsing import say
@@ -26,6 +27,7 @@ from evnlos.tracking import Tracking
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from evnlos.analysis import Identification
     from evnlos.data import Capture
     from evnlos.tracking import Track
 
@@ -232,11 +234,16 @@ class IdentifyCommand:
     seed: int = 0
     """Seed of the one noisy picture of the figure."""
     bench: Flat[Bench] = field(default_factory=Bench)
+    bounds: bool = False
+    """Also print the expected PSNR of the best linear estimate of a moving target, from frames, from events and
+    from both, over the number of positions and for each event model; half a minute for each setup."""
+    sequence: SequenceBench = field(default_factory=SequenceBench)
 
     def run(self) -> None:
         """Identify and print."""
         from tqdm import tqdm
 
+        from evnlos.analysis.bounds import sequence_bounds
         from evnlos.analysis.identify import identify, setup_table
         from evnlos.plot.results import draw_identification, draw_setups
         from evnlos.setups import named_setup, setup_names
@@ -251,16 +258,25 @@ class IdentifyCommand:
             identify(one.setup, self.bench, one.name, self.seed)
             for one in tqdm(setups, desc="identify", unit=" setups", disable=len(setups) == 1)
         ]
+        limits = {
+            one.name: sequence_bounds(one.setup, self.sequence, one.name, self.seed)
+            for one in (setups if self.bounds else [])
+        }
+
+        def summary(one: Identification, arrays: bool) -> dict[str, Any]:
+            known = {"bounds": limits[one.name].summary()} if one.name in limits else {}
+            return one.summary(arrays=arrays) | known
+
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
             for one in found:
                 draw_identification(one, self.out / f"identify_{one.name}.png")
             if len(found) > 1:
                 draw_setups(found, self.out / "identify_setups.png")
-            curves = json.dumps([one.summary(arrays=True) for one in found], indent=1)
+            curves = json.dumps([summary(one, True) for one in found], indent=1)
             write_atomically(self.out / "identify.json", curves.encode())
         if self.json:
-            plain = [one.summary() for one in found]
+            plain = [summary(one, False) for one in found]
             print(json.dumps(plain if len(plain) > 1 else plain[0]))
             return
         print(setup_table(found))
@@ -268,6 +284,8 @@ class IdentifyCommand:
             print(f"{one.name}: {one.verdict}")
             for warning in one.warnings:
                 say(f"warning: {one.name}: {warning}")
+        for limit in limits.values():
+            print(f"\n{limit.table()}")
         if self.out is not None:
             print(f"{self.out}: figures and identify.json")
 

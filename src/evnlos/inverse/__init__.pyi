@@ -1,5 +1,10 @@
 """Names of `evnlos.inverse`; `__init__.py` reads this list."""
 
+from .event_record import EventRecord as EventRecord
+from .event_record import Levels as Levels
+from .event_record import levels_of as levels_of
+from .event_record import predicted_record as predicted_record
+from .event_record import record_of as record_of
 from .inversion import Inversion as Inversion
 from .inversion import Photograph as Photograph
 from .inversion import prepare_inversion as prepare_inversion
@@ -17,6 +22,11 @@ from .plug_and_play import train_denoiser as train_denoiser
 from .problem import Background as Background
 from .problem import Problem as Problem
 from .problem import block_folds as block_folds
+from .sequence import NormalEquations as NormalEquations
+from .sequence import PatternPrior as PatternPrior
+from .sequence import SequenceLight as SequenceLight
+from .sequence import handwritten_prior as handwritten_prior
+from .sequence import sequence_light as sequence_light
 from .sequence_problem import SequenceOperator as SequenceOperator
 from .sequence_problem import SequenceProblem as SequenceProblem
 from .tikhonov import tikhonov as tikhonov

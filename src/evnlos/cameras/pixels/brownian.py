@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from evnlos.cameras.event_model import (
     EVENT_MODELS,
+    CrossingLaw,
     EventModel,
     LogCurve,
     Phase,
@@ -440,6 +441,20 @@ class BrownianPixel(ThresholdPixel):
         """The logarithm of the light over the dark offset, which lies above the knee throughout."""
         factor = 40.0 / self.dark_dn
         return LogCurve(factor * self.exposure, 40.0)
+
+    def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw:
+        """Return what an event says of the light; its noise is that of the walk since the event before."""
+        return CrossingLaw(
+            self.threshold_on,
+            self.threshold_off,
+            self.threshold_sigma,
+            self.log_curve,
+            leak=self.threshold_on * self.leak_rate_hz,
+            leak_per_dn=self.threshold_on * self.leak_rate_per_dn_hz,
+            walk=(self.photon_noise, self.dark_noise, self.dark_dn),
+            exposure=self.exposure,
+            starts_at_rest=self.initial_phase == "rest",
+        )
 
     def drift_and_noise(self, light_dn: float) -> tuple[float, float]:
         """Return the drift by leak, log units per s, and the noise, log units per sqrt(s), in constant light.

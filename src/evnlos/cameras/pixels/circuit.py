@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from evnlos.cameras.event_model import (
     EVENT_MODELS,
+    CrossingLaw,
     EventModel,
     LogCurve,
     Phase,
@@ -365,6 +366,21 @@ class CircuitPixel(ThresholdPixel):
         noise[:, :2, :2] = inverse @ charge @ inverse.T / unit**2
         noise[:, 2, 2] = 2.0 * _CHARGE * self.follower_a / (self.follower_f * self.kappa * unit) ** 2
         return m, np.array([-load / ga, 1.0, 1.0]), self.noise_factor**2 * noise
+
+    def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw:
+        """Return what an event says of the light; noise and bandwidth are those at the light `light_dn`."""
+        current = self.dark_current_a + self.photocurrent_a_per_dn * light_dn
+        return CrossingLaw(
+            self.threshold_on,
+            self.threshold_off,
+            self.threshold_sigma,
+            self.log_curve,
+            leak=self.threshold_on * self.leak_rate_hz,
+            noise=math.sqrt(2.0) * self.noise_rms(current),
+            cutoff_hz=self.bandwidth_hz(current),
+            floor_dn=1e9,  # one bandwidth at all light
+            starts_at_rest=self.initial_phase == "rest",
+        )
 
     def noise_rms(self, current_a: float) -> float:
         """Return the standard deviation of the follower's noise, log units, at a current in ampere."""

@@ -13,7 +13,7 @@ takes, a grant of n events keeps the bus for s + n e.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from evnlos.cameras.event_camera import Wall
 from evnlos.cameras.event_model import (
     EVENT_MODELS,
+    CrossingLaw,
     EventModel,
     LogCurve,
     PixelSettings,
@@ -255,6 +256,12 @@ class ReadoutPixel(PixelSettings):
     def finest_threshold(self) -> float:
         """That of the pixel, log units."""
         return self.pixel.finest_threshold
+
+    def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw | None:
+        """Return that of the pixel; hot pixels add events without cause."""
+        law = self.pixel.crossing_law(light_dn)
+        hot = self.hot_pixel_fraction * self.hot_pixel_rate_hz
+        return None if law is None else replace(law, events_hz=law.events_hz + hot)
 
     @property
     def log_curve(self) -> LogCurve:

@@ -1,0 +1,371 @@
+"""How much of a moving target is in frames and in events: the expected PSNR of the best linear estimate.
+
+The target is Gaussian (`inverse.handwritten_prior`), everything is linearised at handwritten targets of a
+writer and of characters that the prior does not know. Frames are linear, with the camera's variance at that
+light. Each crossing of a threshold is one row: the change of filtered log light since the pixel's last event is
+the threshold, with an error of the crossing. A pixel's own thresholds are unknown within their mismatch and are
+integrated out; noise events are taken as labelled, and silences say nothing unless asked for. With H the sum of
+the information of all rows, the expected squared error is the trace of (1 + H)^-1 in the prior's coordinates.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from evnlos.cameras import EVENT_MODELS, CrossingLaw, PixelSettings
+from evnlos.data import Sampling
+from evnlos.errors import ConfigError
+from evnlos.inverse import (
+    EventRecord,
+    Levels,
+    NormalEquations,
+    PatternPrior,
+    SequenceLight,
+    handwritten_prior,
+    levels_of,
+    predicted_record,
+    sequence_light,
+)
+from evnlos.inverse.measurements import handwritten_targets, position_subsets
+from evnlos.inverse.sequence import WHITE_DN
+from evnlos.scene import LineMotion
+from evnlos.setups import Setup
+from evnlos.types import Plane
+
+_GRID = (50, 80)  # pixels at which the sensor is looked at
+_REFERENCES = "AS2"  # characters that the prior does not know
+
+
+@dataclass(frozen=True)
+class SequenceBench:
+    """How the question is put for a moving target_plane."""
+
+    travel_m: float = 0.16
+    """Length of the target's way, left to right, about the middle, metres."""
+    speed_m_s: float = 0.02
+    """Its speed, metres per second."""
+    positions: int = 40
+    """Equally spaced positions with a frame at the end of each."""
+    counts: tuple[int, ...] = (1, 2, 5, 10, 20, 40)
+    """Numbers of positions to ask for."""
+    coefficients: int = 150
+    """Coefficients of the Gaussian prior."""
+    writers: int = 6
+    """Writers whose characters are the prior."""
+    cells: int = 32
+    """Cells a side of the target plane of 80 mm."""
+    crossing_noise: float = 0.04
+    """Standard deviation of the error of a crossing beside the event model's own, log units."""
+    other_noises: tuple[float, ...] = (0.08, 0.02, 0.01)
+    """The same, tried for the setup's own event model only."""
+    silences: bool = False
+    """Whether the time without events at the end of a pixel's record counts, as a weak row."""
+    known_pattern: bool = True
+    """Whether the frame camera's fixed pattern is known; where not, it is integrated out."""
+
+    def __post_init__(self) -> None:
+        for name in ("travel_m", "speed_m_s", "crossing_noise"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"SequenceBench.{name} is {value}; give a positive number")
+        wrong = [count for count in self.counts if not 1 <= count <= self.positions]
+        if wrong or not self.counts:
+            raise ConfigError(f"SequenceBench.counts is {self.counts}; give numbers from 1 to {self.positions}")
+        if not 8 <= self.cells <= 64:
+            raise ConfigError(f"SequenceBench.cells is {self.cells}; give 8 to 64")
+
+    @property
+    def motion(self) -> LineMotion:
+        """The motion."""
+        return LineMotion((-self.travel_m / 2, 0.0), self.speed_m_s)
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the sequence, seconds."""
+        return self.travel_m / self.speed_m_s
+
+
+@dataclass(frozen=True)
+class EventBound:
+    """What the events of one event model are worth.
+
+    Args:
+        kind: Kind of the event model.
+        noise: Root mean square error of a crossing, the model's own and what was added to it, log units.
+        per_pixel: Signal events per pixel of the whole sequence, mean over the references.
+        events_db: Expected PSNR for each number of positions, dB.
+        both_db: The same from events and frames.
+    """
+
+    kind: str
+    noise: float
+    per_pixel: float
+    events_db: tuple[float, ...]
+    both_db: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What frames and events of a moving target are worth, on the standard canvas.
+
+    Args:
+        name: Name of the setup.
+        bench: How the question was put.
+        prior_db: PSNR of the prior's mean, dB.
+        frames_db: Expected PSNR from frames, for each of the bench's numbers of positions.
+        events: The event models, the setup's own first.
+    """
+
+    name: str
+    bench: SequenceBench
+    prior_db: float
+    frames_db: tuple[float, ...]
+    events: tuple[EventBound, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Return plain numbers."""
+        return asdict(self)
+
+    def table(self) -> str:
+        """Return the expected PSNR over the number of positions, in Markdown."""
+        counts = self.bench.counts
+        rows = [
+            f"| {self.name}: expected PSNR, dB, of n positions | " + " | ".join(map(str, counts)) + " |",
+            "|---" * (1 + len(counts)) + "|",
+            _row("frames", self.frames_db),
+        ]
+        for one in self.events:
+            what = f"{one.kind}, {100 * one.noise:.1f} %"
+            rows += [_row(f"events, {what}", one.events_db), _row(f"both, {what}", one.both_db)]
+        said = ", ".join(
+            f"{kind} {count:.2f}" for kind, count in {e.kind: e.per_pixel for e in self.events}.items()
+        )
+        rows.append(
+            f"\nPrior alone {self.prior_db:.2f} dB. Per cent: error of a crossing, log units. Crossings per "
+            f"pixel of the whole sequence: {said}."
+        )
+        return "\n".join(rows)
+
+
+def _row(name: str, values: tuple[float, ...]) -> str:
+    return f"| {name} | " + " | ".join(f"{value:.1f}" for value in values) + " |"
+
+
+def sequence_bounds(
+    setup: Setup, bench: SequenceBench | None = None, name: str = "setup", seed: int = 0
+) -> Bounds:
+    """Say how well a moving target can be told from frames, events, both, for each event model that applies.
+
+    A model applies if it knows its thresholds (`PixelSettings.crossing_law`): the setup's own, and all
+    registered kinds that share the parameters of its thresholds, which they take over. Events of n positions
+    are those of n positions' time about the middle; frames of n positions are spread over the whole way.
+
+    Args:
+        setup: A linear setup.
+        bench: Motion, prior and noise; None is the default.
+        name: What to call the setup.
+        seed: Seed of the noise events.
+
+    Raises:
+        ConfigError: The setup is not linear.
+    """
+    bench = bench or SequenceBench()
+    target_plane = Plane(bench.cells, bench.cells, 0.08 / bench.cells)
+    prior = handwritten_prior(target_plane, min(bench.coefficients, bench.cells**2), bench.writers)
+    grid = (min(setup.shape[0], _GRID[0]), min(setup.shape[1], _GRID[1]))
+    span = (0.0, bench.duration_s)
+    light = sequence_light(setup, prior, bench.motion.position_m, span, grid)
+    # neighbours see the same: each pixel of the grid stands for several of the sensor
+    pixels = setup.shape[0] * setup.shape[1] / (grid[0] * grid[1])
+    targets = handwritten_targets(target_plane, bench.writers)
+    chosen = [next(k for k, at in enumerate(targets.names) if at.endswith(f"_{c}")) for c in _REFERENCES]
+    scaled = prior.patterns / np.square(prior.patterns).sum(axis=0)
+    references = [(targets.test[k].numpy() - prior.mean) @ scaled for k in chosen]
+    frames = [pixels * frame_information(light, z, setup, bench) for z in references]
+    found = []
+    typical = float(light(references[0]).mean()) * WHITE_DN
+    for kind, pixel in _models(setup.pixel).items():
+        law = pixel.crossing_law(typical)
+        for noise in (bench.crossing_noise, *(bench.other_noises if pixel is setup.pixel else ())):
+            if law is None:
+                continue
+            asked = replace(bench, crossing_noise=noise)
+            each = [event_information(light, z, law, asked, seed) for z in references]
+            events = [pixels * one[0] for one in each]
+            rms, count = float(np.mean([e[1] for e in each])), float(np.mean([e[2] for e in each]))
+            both = [one + other for one, other in zip(events, frames, strict=True)]
+            found.append(EventBound(kind, rms, count, _decibel(prior, events), _decibel(prior, both)))
+    alone = _decibel(prior, [np.zeros((1, prior.count, prior.count))])[0]
+    return Bounds(name, bench, alone, _decibel(prior, frames), tuple(found))
+
+
+def frame_information(light: SequenceLight, z: np.ndarray, setup: Setup, bench: SequenceBench) -> np.ndarray:
+    """Return the information of frames at each of the bench's numbers of positions, [counts, k, k].
+
+    Args:
+        light: The light, linear in the coefficients.
+        z: Coefficients at whose light the camera's noise is taken, [k].
+        setup: Its frame camera.
+        bench: Positions, and whether the fixed pattern is known.
+    """
+    instants = np.arange(1, bench.positions + 1) * bench.duration_s / bench.positions
+    chosen = [set(position_subsets(bench.positions, count, 1)[0].tolist()) for count in bench.counts]
+    everywhere, camera, size = np.arange(len(light.left)), setup.frame_camera, (len(light.left), len(z))
+    seen = light(z)
+    totals = [NormalEquations.empty(len(z)) for _ in chosen]
+    summed, weights = np.zeros((len(chosen), *size)), np.zeros((len(chosen), len(everywhere)))
+    for k in sorted(set().union(*chosen)):
+        now = np.full(len(everywhere), instants[k])
+        rows = light.rows(everywhere, now)
+        there = torch.from_numpy(light.at(seen, everywhere, now))
+        weight = 1.0 / camera.noise_variance(there).numpy()
+        one = NormalEquations.empty(len(z))
+        one.add(rows, weight, np.zeros(len(rows)), everywhere, 0.0)
+        for n, mine in enumerate(chosen):
+            if k in mine:
+                totals[n].information += one.information
+                if not bench.known_pattern:
+                    summed[n] += rows * weight[:, None]
+                    weights[n] += weight
+    if not bench.known_pattern:
+        spread = camera.pattern_variance(torch.from_numpy(seen.mean(axis=1))).sqrt().numpy()
+        for total, parts, weight in zip(totals, summed, weights, strict=True):
+            total.subtract_offsets(parts, weight, spread)
+    return np.stack([total.information for total in totals])
+
+
+def event_information(
+    light: SequenceLight, z: np.ndarray, law: CrossingLaw, bench: SequenceBench, seed: int = 0
+) -> tuple[np.ndarray, float, float]:
+    """Return the information of events for each number of positions, the crossings' error, events per pixel.
+
+    Args:
+        light: The light.
+        z: Coefficients of the target that makes the events, [k].
+        law: Constants of the event model.
+        bench: Positions, noise of a crossing, silences.
+        seed: Seed of the noise events.
+
+    Returns:
+        float64 [counts, k, k]; root mean square error, log units; crossings per pixel.
+    """
+    levels = levels_of(light(z), light.times_s, law)
+    record = predicted_record(light, levels, law, seed)
+    variance = crossing_variance(light, z, record, law, bench.crossing_noise)
+    middle, share = bench.duration_s / 2, bench.duration_s / bench.positions / 2
+    found = []
+    for count in bench.counts:
+        first, last = middle - count * share, middle + count * share
+        inside = record.measured & (record.t_s > first) & (record.t_s <= last)
+        total = row_information(
+            light, levels, record, np.where(inside, 1.0 / variance, 0.0), law.threshold_sigma
+        )
+        if bench.silences:
+            total = total + _silence_information(light, levels, record, law, (first, last), bench)
+        found.append(total)
+    measured = record.measured
+    rms = float(np.sqrt(variance[measured].mean())) if measured.any() else math.nan
+    return np.stack(found), rms, float(measured.sum()) / len(light.left)
+
+
+def crossing_variance(
+    light: SequenceLight, z: np.ndarray, record: EventRecord, law: CrossingLaw, added: float
+) -> np.ndarray:
+    """Return the variance of each change of a record, log units squared, [N]: the model's own, and `added`."""
+    waited = record.t_s - record.t_s[record.origin]
+    seen = light.at(light(z), record.pixel, record.t_s) * WHITE_DN
+    return law.noise**2 + added**2 + law.walk_variance(seen) * np.maximum(waited, 0.0)
+
+
+def row_information(
+    light: SequenceLight,
+    levels: Levels,
+    record: EventRecord,
+    weight: np.ndarray,
+    spread: float,
+    block: int = 16_384,
+) -> np.ndarray:
+    """Return the information of a record's rows with the thresholds of each pixel integrated out, [k, k].
+
+    Args:
+        light: The light.
+        levels: Levels at which it is linearised.
+        record: The events.
+        weight: 1 / variance of each instant's change, 0 = does not count, [N].
+        spread: Mismatch of the thresholds, log units.
+        block: Rows at a time; the result does not depend on it.
+    """
+    total = NormalEquations.empty(light.right.shape[2] - 1)
+    for part, rows in record.blocks(light, levels, block):
+        counts = np.flatnonzero(weight[part] > 0)
+        group = 2 * record.pixel[part][counts] + (record.sign[part][counts] > 0)
+        counts = counts[np.argsort(group, kind="stable")]
+        group = np.sort(group)
+        total.add(rows[counts], weight[part][counts], np.zeros(len(counts)), group, spread)
+    return total.information
+
+
+def _silence_information(
+    light: SequenceLight,
+    levels: Levels,
+    record: EventRecord,
+    law: CrossingLaw,
+    window: tuple[float, float],
+    bench: SequenceBench,
+) -> np.ndarray:
+    """Return the information of "no event since": a change that is uniform between the thresholds."""
+    index = np.arange(len(record))
+    known = ((record.sign != 0) | (record.origin >= 0) | law.starts_at_rest) & (record.t_s <= window[1])
+    known &= record.t_s < light.times_s[-1]
+    last = np.full(len(light.left), -1)
+    np.maximum.at(last, record.pixel[known], index[known])
+    pixel = np.flatnonzero(last >= 0)
+    count = len(pixel)
+    ends = EventRecord(
+        np.repeat(pixel, 2),
+        np.stack([record.t_s[last[pixel]], np.full(count, window[1])], axis=1).ravel(),
+        np.tile(np.array([0, 1], np.int8), count),
+        np.stack([np.full(count, -1), 2 * np.arange(count)], axis=1).ravel(),
+    )
+    width = law.threshold_on + law.threshold_off
+    variance = width**2 / 12 + 2 * law.threshold_sigma**2 / 4 + law.noise**2 + bench.crossing_noise**2
+    weight = np.where(ends.sign > 0, 1.0 / variance, 0.0)
+    return row_information(light, levels, ends, weight, 0.0)
+
+
+def canvas_decibel(error: float, target_plane: Plane) -> float:
+    """Return the PSNR on the standard canvas of a mean squared error of the target's cells; dark elsewhere.
+
+    Args:
+        error: Mean squared error of a cell.
+        target_plane: The cells.
+    """
+    sampling = Sampling()
+    canvas = sampling.width * sampling.scored_rows * sampling.pitch_m**2
+    return -10 * math.log10(error * target_plane.height * target_plane.width * target_plane.pitch_m**2 / canvas)
+
+
+def _decibel(prior: PatternPrior, information: list[np.ndarray]) -> tuple[float, ...]:
+    """Return the PSNR of the mean error over references, for each number of positions."""
+    errors = [[prior.error(one) for one in each] for each in information]
+    return tuple(
+        round(canvas_decibel(float(value), prior.target_plane), 3) for value in np.mean(errors, axis=0)
+    )
+
+
+def _models(own: PixelSettings) -> dict[str, PixelSettings]:
+    """Return the setup's own event model, and the other kinds with its thresholds."""
+    found = {str(getattr(own, "kind", "")): own}
+    values = {item.name: getattr(own, item.name) for item in fields(own) if item.name != "kind"}  # type: ignore[arg-type]
+    for kind in EVENT_MODELS:
+        settings = EVENT_MODELS[kind]
+        names = {item.name for item in fields(settings)}  # type: ignore[arg-type]
+        if kind not in found and "threshold_on" in names & set(values):
+            other: Any = settings()
+            found[kind] = replace(other, **{name: values[name] for name in names & set(values)})
+    return found

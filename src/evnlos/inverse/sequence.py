@@ -1,0 +1,301 @@
+"""A moving target as a few numbers, and all that a camera sees of it while it moves.
+
+- A Gaussian prior over targets: mean target, and the patterns in which targets differ most.
+- The light of a moving target on every pixel at every instant: linear in the prior's coefficients, low rank.
+- Normal equations of rows that share an unknown offset by group: what thresholds or a fixed pattern leave.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn.functional import interpolate
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.inverse.measurements import handwritten_targets
+from evnlos.inverse.sequence_problem import SequenceOperator, strip_of
+from evnlos.optics import MatrixTransport
+from evnlos.setups import Setup
+from evnlos.types import Plane
+
+Array = NDArray[np.float64]
+
+WHITE_DN = 255.0
+"""Light in DN, as event pixels count it, of one white level."""
+_COARSEST = (50, 80)
+_TAIL = 1e-4
+_STEP_CELLS = 0.25
+_CHUNK = 16
+_MOST_NODES = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class PatternPrior:
+    """Targets as mean + patterns @ z with z normal, independent and of variance 1.
+
+    Args:
+        target_plane: The target's cells.
+        mean: Mean target, [n].
+        patterns: One pattern a column, each as large as targets vary along it, [n, k].
+        rest: Variance of what the patterns leave out, mean over the cells.
+    """
+
+    target_plane: Plane
+    mean: Array
+    patterns: Array
+    rest: float
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return self.patterns.shape[1]
+
+    def image(self, z: Array) -> Array:
+        """Return the target of coefficients [k], [h, w]."""
+        return (self.mean + self.patterns @ z).reshape(self.target_plane.shape)
+
+    def variance(self, covariance: Array) -> Array:
+        """Return the variance of each cell [h, w] at a covariance [k, k] of the coefficients, rest included."""
+        spread = np.einsum("nk,kl,nl->n", self.patterns, covariance, self.patterns, optimize=True)
+        return spread.reshape(self.target_plane.shape) + self.rest
+
+    def error(self, information: Array) -> float:
+        """Return the expected mean squared error of a cell after measurements with this information [k, k]."""
+        posterior = np.linalg.inv(np.eye(self.count) + information)
+        return float((posterior * (self.patterns.T @ self.patterns)).sum()) / len(self.mean) + self.rest
+
+
+@lru_cache(maxsize=2)
+def handwritten_prior(target_plane: Plane, coefficients: int = 150, writers: int = 6) -> PatternPrior:
+    """Return the Gaussian of handwritten targets by its largest patterns.
+
+    The targets are those of `handwritten_targets`: NIST-like characters without A G K S 2 4 9.
+
+    Args:
+        target_plane: Cells of the target, square.
+        coefficients: Patterns that are kept.
+        writers: Writers of the targets.
+
+    Raises:
+        ConfigError: More coefficients than cells, or none.
+    """
+    if not 1 <= coefficients <= target_plane.height * target_plane.width:
+        raise ConfigError(
+            f"coefficients is {coefficients}; give 1 to {target_plane.height * target_plane.width}, its cells"
+        )
+    targets = handwritten_targets(target_plane, writers)
+    values, axes = torch.linalg.eigh(targets.root @ targets.root.mT)
+    values, axes = values.flip(0).clamp(min=0), axes.flip(1)
+    patterns = axes[:, :coefficients] * values[:coefficients].sqrt()
+    return PatternPrior(
+        target_plane, targets.mean.numpy(), patterns.numpy(), float(values[coefficients:].sum()) / len(axes)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceLight:
+    """Light I(i, t) = still(i, t) + left(i) right(t) (1, z) of pixel i at t, in white levels.
+
+    Between two instants of `times_s` the light counts as a line.
+
+    Args:
+        left: The factor of the pixels, float64 [P, r].
+        right: That of the instants: of the mean target, then of each pattern, float64 [T, r, 1 + k].
+        still: Light without the target, float32 [P, 1], or [P, T] where something moves along.
+        times_s: Instants, [T], seconds, equally spaced.
+        shape: Size (H, W) of the images, P = H W.
+    """
+
+    left: Array
+    right: Array
+    still: NDArray[np.float32]
+    times_s: Array
+    shape: tuple[int, int]
+
+    def __call__(self, z: Array) -> Array:
+        """Return the light of a target with coefficients [k], white levels, [P, T]."""
+        return self.left @ (self.right @ np.append(1.0, z)).T + self.still
+
+    def place(self, t_s: Array) -> tuple[NDArray[np.int64], Array]:
+        """Return of instants [N] the node before, and the share of the way to the next; clipped to the ends."""
+        step = self.times_s[1] - self.times_s[0]
+        at = np.clip((t_s - self.times_s[0]) / step, 0.0, len(self.times_s) - 1.0)
+        node = np.minimum(at.astype(np.int64), len(self.times_s) - 2)
+        return node, at - node
+
+    def at(self, values: Array, pixel: NDArray[np.int64], t_s: Array) -> Array:
+        """Return values [P, T] of pixels [N] at instants [N], on a line between the nodes."""
+        node, share = self.place(t_s)
+        return (1 - share) * values[pixel, node] + share * values[pixel, node + 1]
+
+    def rows(self, pixel: NDArray[np.int64], t_s: Array) -> Array:
+        """Return the derivative of the light of pixels [N] at instants [N] by the coefficients, [N, k]."""
+        node, share = self.place(t_s)
+        found = np.empty((len(pixel), self.right.shape[2] - 1))
+        order = np.argsort(node, kind="stable")
+        starts = np.flatnonzero(np.diff(node[order], prepend=-1))
+        for mine in np.split(order, starts[1:]) if len(order) else []:
+            k = node[mine[0]]
+            left, part = self.left[pixel[mine]], share[mine, None]
+            found[mine] = (left * (1 - part)) @ self.right[k, :, 1:] + (left * part) @ self.right[k + 1, :, 1:]
+        return found
+
+
+def sequence_light(
+    setup: Setup,
+    prior: PatternPrior,
+    position_m: Callable[[Array], Array],
+    span_s: tuple[float, float],
+    shape: tuple[int, int] | None = None,
+    rank: int = 160,
+) -> SequenceLight:
+    """Return the light of a moving target on a camera.
+
+    The setup's matrix is computed for pixels of at most 50 x 80 and for the coarsest cells that its blur
+    allows, and brought to the camera's pixels by cubic interpolation: the light of a rough wall is smooth. Its
+    factors are those of the largest eigenvalues of A^T A, down to 1e-4 of the largest singular value.
+
+    Args:
+        setup: A linear setup.
+        prior: Of the target_plane.
+        position_m: The target's centre (x, y) at instants [N], seconds: metres, [N, 2].
+        span_s: First and last instant, seconds.
+        shape: Size (H, W) of the images; None is the sensor's.
+        rank: Most factors.
+
+    Raises:
+        ConfigError: The setup is not linear, or gets no light.
+        DataError: The span is empty, or the motion asks for more than 4096 instants.
+    """
+    shape = setup.shape if shape is None else shape
+    coarse = (min(shape[0], _COARSEST[0]), min(shape[1], _COARSEST[1]))
+    if not span_s[1] > span_s[0]:
+        raise DataError(
+            f"the sequence lasts from {span_s[0]} s to {span_s[1]} s; give the last after the first"
+        )
+    step = _STEP_CELLS * prior.target_plane.pitch_m
+    probes = position_m(np.linspace(*span_s, 513))
+    travel = float(np.hypot(*np.diff(probes, axis=0).T).max()) * 512
+    count = max(16, math.ceil(travel / step)) + 1
+    if count > _MOST_NODES:
+        raise DataError(
+            f"the motion of {travel:.3g} m in steps of {step:.2g} m asks for {count} instants; at most "
+            f"{_MOST_NODES}: cut the sequence"
+        )
+    times = np.linspace(*span_s, count)
+    places = position_m(times)
+    cells = setup.coarsened().target_cells()
+    pitch = prior.target_plane.pitch_m if cells is None else max(cells.pitch_m, prior.target_plane.pitch_m)
+    side = max(1, math.ceil(prior.target_plane.height * prior.target_plane.pitch_m / pitch - 1e-6))
+    strip = strip_of(places, Plane(side, side, pitch))
+    resized = setup.resized(shape)
+    matrix = resized.operator(strip, coarse).dense()
+    left, right = _factors(matrix, rank)
+    if coarse != shape:
+        images = torch.from_numpy(left.T.copy()).unflatten(1, coarse)[None]
+        fine = interpolate(images, size=shape, mode="bicubic", align_corners=False)
+        left = fine[0].flatten(1).mT.contiguous().numpy()
+    targets = np.concatenate([prior.mean[:, None], prior.patterns], axis=1).T.reshape(
+        -1, *prior.target_plane.shape
+    )
+    drawn = torch.from_numpy(np.ascontiguousarray(targets))
+    responses = np.empty((count, right.shape[0], len(targets)))
+    carrier = MatrixTransport(torch.from_numpy(right), strip, (1, right.shape[0]))
+    for start in range(0, count, _CHUNK):
+        seen = SequenceOperator(carrier, prior.target_plane, places[start : start + _CHUNK])
+        responses[start : start + _CHUNK] = seen(drawn)[..., 0, :].permute(1, 2, 0).numpy()
+    still = resized.ambient_light(shape).flatten()[:, None].numpy()
+    along = resized.companion_light(places)
+    if along is not None:
+        still = still + along.flatten(1).T.numpy()
+    return SequenceLight(left, responses, still, times, shape)
+
+
+def _factors(matrix: torch.Tensor, rank: int) -> tuple[Array, Array]:
+    """Return factors [P, r] and [r, cells] of a matrix [P, cells] by its largest singular values."""
+    values, axes = torch.linalg.eigh(matrix.mT @ matrix)
+    values, axes = values.flip(0), axes.flip(1)
+    kept = min(rank, int((values > _TAIL**2 * values[0]).sum()))
+    if not float(values[0]) > 0:
+        raise ConfigError("the camera gets no light from the target; move the target or the camera")
+    right = axes[:, :kept].mT.contiguous()
+    return (matrix @ right.mT).numpy(), right.numpy()
+
+
+@dataclass
+class NormalEquations:
+    """Sums of rows y = J z + noise + an offset for each group: information J^T C^-1 J and score J^T C^-1 y.
+
+    With weights w = 1 / variance of the rows of a group and offsets of variance s^2, C^-1 of the group is
+    W - s^2 / (1 + s^2 sum w) w w^T (Sherman and Morrison): sums by group, one division.
+
+    Args:
+        information: [k, k].
+        score: [k].
+    """
+
+    information: Array
+    score: Array
+
+    @classmethod
+    def empty(cls, count: int) -> NormalEquations:
+        """Return no information about `count` unknowns."""
+        return cls(np.zeros((count, count)), np.zeros(count))
+
+    def add(self, rows: Array, weight: Array, residual: Array, group: NDArray[np.int64], spread: float) -> None:
+        """Add rows; those of one group lie side by side, and all of them are in one call.
+
+        Args:
+            rows: J, [N, k].
+            weight: 1 / variance, [N].
+            residual: y, [N].
+            group: Number of each row's group, [N], equal ones side by side.
+            spread: s, standard deviation of the offset that a group shares; 0 = none.
+        """
+        if not len(rows):
+            return
+        weighted = rows * weight[:, None]
+        self.information += rows.T @ weighted
+        self.score += weighted.T @ residual
+        if spread > 0:
+            starts = np.flatnonzero(np.diff(group, prepend=group[0] - 1))
+            total, seen = (np.add.reduceat(column, starts) for column in (weight, weight * residual))
+            summed = np.add.reduceat(weighted, starts)  # [groups, k]
+            self.subtract_offsets(summed, total, np.full(len(total), spread), seen)
+
+    def subtract_offsets(
+        self, summed: Array, weights: Array, spread: Array, residual: Array | float = 0.0
+    ) -> None:
+        """Take away what groups with offsets do not know, after their rows were added one by one.
+
+        Args:
+            summed: Sum of w J of each group, [G, k].
+            weights: Sum of w of each group, [G].
+            spread: Standard deviation of the group's offset, [G].
+            residual: Sum of w y of each group, [G].
+        """
+        share = spread**2 / (1.0 + spread**2 * weights)
+        self.information -= summed.T @ (summed * share[:, None])
+        self.score -= summed.T @ (share * residual)
+
+
+def group_blocks(group: NDArray[np.int64], most: int) -> list[slice]:
+    """Return slices of about `most` rows that cut no group; equal numbers lie side by side.
+
+    Example:
+        >>> group_blocks(np.array([0, 0, 1, 2, 2, 2]), 2)
+        [slice(0, 2, None), slice(2, 6, None)]
+    """
+    edges = np.append(np.flatnonzero(np.diff(group)) + 1, len(group))
+    blocks, start = [], 0
+    while start < len(group):
+        end = int(edges[np.searchsorted(edges, min(start + most, len(group)))])
+        blocks.append(slice(start, end))
+        start = end
+    return blocks
