@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from evnlos.calibration import FIGURES_FILE
-from evnlos.demo import Demo, finding, mismatch_table, run_mismatch
+from evnlos.demo import Demo, finding, mismatch_table, run_demo, run_mismatch
 from evnlos.errors import CalibrationError, ConfigError
-from evnlos.experiment import Record
+from evnlos.experiment import Record, Study
 from evnlos.experiment.study import write_record
+from evnlos.models import layers_of
 
 LEFT = {
     "frames fit": {"before": 0.5, "after": 0.04, "noise": 0.03},
@@ -89,6 +90,29 @@ def test_each_setup_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
     assert [one.setup for one in found] == ["flat", "odd"] and found[1].refused == "no setup fits"
     written = (tmp_path / "out" / "mismatch.md").read_text()
     assert "| odd | refused: no setup fits |" in written and "| flat | frame |" in written
+
+
+@pytest.mark.parametrize("start", ["generic", "nowhere", ""])
+def test_the_pre_training_begins_with_layers_where_they_are_installed(tmp_path, monkeypatch, start):
+    monkeypatch.setenv("EVNLOS_WEIGHTS", str(tmp_path))
+    for name in layers_of("generic"):
+        (tmp_path / f"{name}.safetensors").touch()
+    (tmp_path / "a_A").mkdir()
+    (tmp_path / "a_A" / "capture.yaml").write_text("x: 1")
+    studies = []
+
+    def stop(study: Study, *_) -> None:
+        studies.append(study)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("evnlos.demo.run_study", stop)
+    with pytest.raises(CalibrationError, match="enough"):
+        run_demo(Demo(out=tmp_path / "out", captures=(tmp_path / "a_A",), start=start))
+    begins = {arm.name: arm.start for arm in studies[0].arms}
+    found = "generic" if start == "generic" else ""
+    assert begins == {"simulation only": found, "EPNP": found, "E2E": "", "E2E, single positions": ""}
+    plans = {arm.pretraining for arm in studies[0].arms if arm.pretraining}
+    assert {(plan.refit_embedding, plan.epochs) for plan in plans} == {(bool(found), 4 if found else 8)}
 
 
 def test_unknown_setups_and_empty_folders_are_refused(tmp_path):
