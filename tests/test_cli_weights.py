@@ -9,7 +9,7 @@ import torch
 from evnlos import train
 from evnlos.cli import main
 from evnlos.errors import DataError
-from evnlos.models import UNetConfig, load_weights, published, published_for, save_weights
+from evnlos.models import GENERIC, UNetConfig, load_weights, published, published_for, save_weights
 from evnlos.training import Training
 
 
@@ -113,6 +113,12 @@ def test_published_weights_are_whole_and_say_how_good_they_are(name: str, capsys
     loaded = load_weights(name)
     setup, modality, *kind = name.split("-")
     assert loaded.modality.name == modality and loaded.network.sees_sequence == (kind == ["sequence"])
+    if setup == GENERIC:  # layers to begin with, behind an embedding that has yet to be fitted
+        assert not any(step["data"]["origin"] == "captures" for step in loaded.history)
+        assert path.stat().st_size < 5_000_000 and len(loaded.history) >= 9
+        main(["weights"])
+        assert "layers to begin a training with" in capsys.readouterr().out
+        return
     assert loaded.confidence is not None and loaded.scores["images"] >= 160
     better = loaded.scores["overall"]["psnr_db"] - loaded.scores["baselines"]["mean"]["psnr_db"]
     assert better > 1

@@ -21,7 +21,7 @@ from evnlos.data.sampling import Sampling
 from evnlos.data.simulations import default
 from evnlos.errors import CalibrationError, ConfigError
 from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
-from evnlos.models import SequenceConfig, UNetConfig, layers_of, published
+from evnlos.models import GENERIC, SequenceConfig, UNetConfig, layers_of, published
 from evnlos.progress import Progress, ProgressBars, silent
 from evnlos.report import gather, to_text, write_report
 from evnlos.scene import FontGlyphs
@@ -52,7 +52,7 @@ class Demo:
     """Writers of the simulated characters, 36 objects each."""
     redrawn: int = 7
     """How often each known target of the captures is drawn again and simulated."""
-    start: str = "generic"
+    start: str = GENERIC
     """Setup of installed weights whose layers the pre-training begins with; empty: random ones."""
     pretrain_epochs: int | None = None
     """Epochs on the simulated sequences; by default 4 from trained layers, 8 from random ones."""

@@ -24,7 +24,7 @@ from evnlos.config import load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
 from evnlos.data.live import Place
 from evnlos.errors import ConfigError, DataError, printable
-from evnlos.models import Weights, describe_network, load_weights, published, save_weights, with_rank
+from evnlos.models import GENERIC, Weights, describe_network, load_weights, published, save_weights, with_rank
 from evnlos.models.confidence import COVERAGE
 from evnlos.progress import ProgressBars
 from evnlos.training import (
@@ -318,6 +318,12 @@ def to_text(name: str, found: dict[str, Any]) -> str:
         f"  maps {sampling.get('width')} x {sampling.get('height')}, pitch {sampling.get('pitch_m')} m, "
         f"surface {sampling.get('surface')}, tau {sampling.get('tau_s')} s",
     ]
+    if name.startswith(f"{GENERIC}-"):
+        lines.append(
+            "  layers to begin a training with, trained behind many walls: simulate your setup and give "
+            "`evnlos finetune --refit-embedding`; not for reconstructions as they are"
+        )
+        return "\n".join(lines)
     for number, step in enumerate(found["history"], start=1):
         data, plan = step.get("data", {}), step.get("settings", {})
         lines.append(

@@ -6,6 +6,7 @@ from evnlos.models.reconstructor import RECONSTRUCTORS, Reconstructor, Reconstru
 from evnlos.models.sequence import SequenceConfig, SequenceReconstructor
 from evnlos.models.unet import ResidualUNet, UNetConfig, UNetReconstructor
 from evnlos.models.weights import (
+    GENERIC,
     Weights,
     describe_network,
     layers_of,
@@ -19,6 +20,7 @@ from evnlos.models.weights import (
 )
 
 __all__ = [
+    "GENERIC",
     "RECONSTRUCTORS",
     "Confidence",
     "Judgement",

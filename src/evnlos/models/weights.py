@@ -38,6 +38,9 @@ _SETUPS_M = {"near": 0.30, "far": 0.50}
 """Distance from hidden object to wall of each setup that there are weights for, metres."""
 _SEQUENCE = "sequence"
 
+GENERIC = "generic"
+"""First part of the names of weights of many walls, whose layers a training may begin with."""
+
 
 def weights_folders() -> list[Path]:
     """Return the folders with weights, first those to be preferred; nothing is downloaded.
