@@ -163,7 +163,7 @@ def test_published_weights_say_what_they_are_in_the_words_of_today() -> None:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()["evnlos"])
         today = migrate("weights", about)
-        assert today["network"]["kind"] == ("sequence" if about.get("joint") else "unet") or "kind" in about
+        assert today["network"]["kind"] == ("sequence" if name.endswith("-sequence") else "unet")
         loaded = load_weights(path)
         assert loaded.modality.name == name.split("-")[1]
         assert loaded.network.sees_sequence == name.endswith("-sequence")
