@@ -39,7 +39,10 @@ for pattern in ("raster", "hadamard"):
     row += [rms(better.measurement.matrix.numpy() - truth)]
     errors[pattern] = row
     print(f"{pattern:28}" + "".join(f"{1e4 * value:9.2f}" for value in row), better.denoising)
-    print(f"{'':28}brightest entry {1e4 * truth.max():.0f}, {planned.shots} pictures, {planned.seconds:.0f} s")
+    print(
+        f"{'':28}brightest entry {1e4 * truth.max():.0f}, {planned.scan_frames} pictures, "
+        f"{planned.seconds:.0f} s"
+    )
 
 ratio = errors["raster"][2] / errors["hadamard"][2]
 print(f"Hadamard patterns make the noise {ratio:.1f} times smaller")

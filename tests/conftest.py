@@ -115,7 +115,7 @@ def app_weights(tmp_path_factory) -> dict[str, Path]:
 @pytest.fixture(scope="session")
 def zipped_capture(tiny_captures, tmp_path_factory) -> Path:
     """A capture folder as people zip it."""
-    path = tmp_path_factory.mktemp("zip") / "shot.zip"
+    path = tmp_path_factory.mktemp("zip") / "capture.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for one in sorted(tiny_captures[0].rglob("*")):
             archive.write(one, one.relative_to(tiny_captures[0].parent))

@@ -266,7 +266,7 @@ def all_commands(folder: Path) -> list[Command]:
         setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=sensor),
         frame_rate_hz=1.0,
     )
-    shots = [str(path) for path in render_captures(lab, folder / "lab")]
+    captures = [str(path) for path in render_captures(lab, folder / "lab")]
     settings, data, run = (str(folder / name) for name in ("tiny.yaml", "data", "run"))
     small = ("--network.width", "8", "--network.depth", "2", "--network.shuffle", "1", "--precision", "float32")
     train = ("train", "--data", data, "--epochs", "3", *small, "--out")
@@ -289,13 +289,13 @@ def all_commands(folder: Path) -> list[Command]:
         Command("simulate 1", ("simulate", "--config", settings, "--workers", "1", "--out", "OUT")),
         Command("simulate 2", ("simulate", "--config", settings, "--workers", "2", "--out", "OUT")),
         Command("train", (*train, "OUT")),
-        Command("import", ("import", *shots, *maps, "--test", "4", "--out", "OUT")),
+        Command("import", ("import", *captures, *maps, "--test", "4", "--out", "OUT")),
         *quick_commands(folder),
         Command(
             "calibrate",
             (
                 "calibrate",
-                *shots,
+                *captures,
                 "--holdout",
                 "4",
                 "--no-events",

@@ -20,7 +20,7 @@ from evnlos.calibration import (
     figures,
     fit_setup,
     fit_transport,
-    read_shots,
+    read_capture_set,
     rows_of,
     table,
     warnings_of,
@@ -184,14 +184,14 @@ def test_the_fixed_pattern_is_found_and_left_out_of_the_training_set(fit, tmp_pa
 def test_a_fit_that_fails_on_unseen_captures_is_refused(folders, tmp_path, capsys) -> None:
     """The captures to fit show a rougher wall than those held out, from which the search starts."""
     rougher = replace(LAB, setup=replace(LAB.setup, roughness=0.2), glyphs=replace(LAB.glyphs, characters="IV"))
-    shots = render_captures(rougher, tmp_path / "other")
+    capture_set = render_captures(rougher, tmp_path / "other")
     noted = yaml.safe_load((folders[0] / "capture.yaml").read_text())["setup"]
-    for folder in shots:
+    for folder in capture_set:
         edit(folder, setup=noted)  # the notes claim that nothing changed
-    shots += [folder for folder in folders if folder.name[-1] in "AL"]
+    capture_set += [folder for folder in folders if folder.name[-1] in "AL"]
     start, out = tmp_path / "start.yaml", tmp_path / "out"
     save_yaml(Calibration(start=Simulation(setup=SETUP), columns=24), start)
-    words = ["calibrate", *shots, "--out", out, "--holdout", "A", "L", "--no-events", "--config", start]
+    words = ["calibrate", *capture_set, "--out", out, "--holdout", "A", "L", "--no-events", "--config", start]
     with pytest.raises(SystemExit) as stop:
         main([str(word) for word in words])
     error = capsys.readouterr().err.splitlines()
@@ -216,15 +216,15 @@ def test_the_command_prints_and_writes(folders, tmp_path, capsys) -> None:
 
 def test_excluded_captures_are_not_even_read(copies) -> None:
     (copies[0] / "capture.yaml").write_text("no: [capture")
-    fit, held = read_shots(copies, exclude=[copies[0].name], holdout=["4"])
+    fit, held = read_capture_set(copies, exclude=[copies[0].name], holdout=["4"])
     assert copies[0].name not in fit.names + held.names
     assert held.names == ("lab_4",)
 
 
 def test_the_draw_of_the_holdout_follows_the_seed(folders) -> None:
-    draws = {read_shots(folders, share=0.34, seed=seed)[1].names for seed in range(8)}
+    draws = {read_capture_set(folders, share=0.34, seed=seed)[1].names for seed in range(8)}
     assert all(len(names) == 2 for names in draws) and len(draws) > 1
-    assert read_shots(folders, seed=3)[1].names == read_shots(folders[::-1], seed=3)[1].names
+    assert read_capture_set(folders, seed=3)[1].names == read_capture_set(folders[::-1], seed=3)[1].names
 
 
 @pytest.mark.parametrize(
@@ -240,17 +240,17 @@ def test_the_draw_of_the_holdout_follows_the_seed(folders) -> None:
 def test_unfit_captures_are_named(copies, change, words) -> None:
     edit(copies[1], **change)
     with pytest.raises(DataError, match=words) as error:
-        read_shots(copies)
+        read_capture_set(copies)
     assert copies[1].name in str(error.value) and "\n" not in str(error.value)
 
 
 def test_too_few_captures_and_unknown_names(folders) -> None:
     with pytest.raises(DataError, match=r"2 capture\(s\) are left"):
-        read_shots(folders[:2])
+        read_capture_set(folders[:2])
     with pytest.raises(DataError, match="no capture is named Z"):
-        read_shots(folders, exclude=["Z"])
+        read_capture_set(folders, exclude=["Z"])
     with pytest.raises(DataError, match="leave 2 or more to fit"):
-        read_shots(folders[:3], holdout=[f.name for f in folders[:2]])
+        read_capture_set(folders[:3], holdout=[f.name for f in folders[:2]])
     with pytest.raises(ConfigError, match="holdout_share"):
         Calibration(holdout_share=1.0)
     with pytest.raises(DataError, match=r"distance_m is '30 cm'"):
@@ -272,17 +272,17 @@ def test_frames_that_do_not_follow_the_targets_are_refused(copies) -> None:
         for path in (folder / "frames").iterdir():
             Image.fromarray(np.asarray(Image.open(path))[:, ::-1]).save(path)
     with pytest.raises(DataError, match="mirror the frames"):
-        fit_transport(read_shots(copies)[0], START, columns=24)
+        fit_transport(read_capture_set(copies)[0], START, columns=24)
     rng = np.random.default_rng(0)
     for folder in copies:
         for path in (folder / "frames").iterdir():
             Image.fromarray(rng.integers(0, 9, (50, 80)).astype(np.uint8)).save(path)
     with pytest.raises(DataError, match="explain"):
-        fit_transport(read_shots(copies)[0], START, columns=24)
+        fit_transport(read_capture_set(copies)[0], START, columns=24)
 
 
 def test_light_is_solved_for_exactly(folders) -> None:
-    fit, _ = read_shots(folders)
+    fit, _ = read_capture_set(folders)
     model = FrameModel(fit, (10, 16), every=4)
     light = torch.rand(model.frames.shape, generator=torch.Generator().manual_seed(0))
     model.frames = 0.7 * light + 0.2 * (
@@ -297,7 +297,7 @@ def test_light_is_solved_for_exactly(folders) -> None:
 
 
 def test_one_matrix_gives_what_the_walls_give(folders) -> None:
-    fit, _ = read_shots(folders)
+    fit, _ = read_capture_set(folders)
     model = FrameModel(fit, (25, 40), every=5)
     together = model.light(SETUP)
     k = 2
@@ -380,7 +380,7 @@ def test_event_statistics_count_by_hand() -> None:
 
 
 def test_light_of_recordings_follows_the_wall(folders) -> None:
-    fit, _ = read_shots(folders)
+    fit, _ = read_capture_set(folders)
     found = read_recordings(fit, SETUP, 2)
     assert [r.index for r in found] == [0, len(fit.names) - 1]
     assert found[0].times_s[[0, -1]].tolist() == [0.0, 8.0]
@@ -401,7 +401,7 @@ def test_independent_captures_are_fitted(shared_data, group, limit) -> None:
     folders = [shared_data / "captures" / f"{group}_{c}" for c in "ABHOTX"]
     if not folders[0].is_dir():
         pytest.skip(f"no captures at {folders[0].parent}")
-    fit, held = read_shots(folders, holdout=["A", "T"])
+    fit, held = read_capture_set(folders, holdout=["A", "T"])
     distance = fit.captures[0].info.setup["distance_m"]
     start = RadiometricSetup(roughness=0.1, distance_m=distance)
     found = fit_transport(fit, start, fixed=("distance_m",), columns=24, iterations=6)
@@ -469,8 +469,18 @@ def test_a_matte_wall_ends_on_the_bounds(tmp_path, capsys) -> None:
     matte = replace(
         LAB, setup=replace(LAB.setup, wall_material="lambert", sensor=SensorSize(25, 40)), frame_rate_hz=1.0
     )
-    shots = render_captures(matte, tmp_path / "shots")
-    words = ["calibrate", *shots, "--out", tmp_path / "setup", "--holdout", "4", "--no-events", "--columns", 16]
+    capture_set = render_captures(matte, tmp_path / "capture_set")
+    words = [
+        "calibrate",
+        *capture_set,
+        "--out",
+        tmp_path / "setup",
+        "--holdout",
+        "4",
+        "--no-events",
+        "--columns",
+        16,
+    ]
     main([str(word) for word in [*words, "--wall", "formula"]])
     shown = capsys.readouterr()
     assert "on the bound of the search" in shown.out

@@ -21,26 +21,26 @@ def capture(tiny_captures, tmp_path) -> Path:
 
 
 def test_a_rendered_capture_reads_back(tiny_captures) -> None:
-    shot = read_capture(tiny_captures[0])
-    assert (shot.name, shot.target.name) == ("lab_A", "A")
-    assert shot.frames.shape == (9, 48, 72)
-    np.testing.assert_array_equal(shot.frame_times_us, np.arange(9) * 1_000_000)
-    assert shot.events.shape == (48, 72)
-    assert len(shot.events) > 1000
-    np.testing.assert_allclose(shot.scene.motion.position_m(4.0), (0.0, 0.0), atol=1e-12)
+    recording = read_capture(tiny_captures[0])
+    assert (recording.name, recording.target.name) == ("lab_A", "A")
+    assert recording.frames.shape == (9, 48, 72)
+    np.testing.assert_array_equal(recording.frame_times_us, np.arange(9) * 1_000_000)
+    assert recording.events.shape == (48, 72)
+    assert len(recording.events) > 1000
+    np.testing.assert_allclose(recording.scene.motion.position_m(4.0), (0.0, 0.0), atol=1e-12)
 
 
 def test_the_standard_sample_of_a_shared_capture(shared_data) -> None:
     folder = shared_data / "captures" / "near_F"
-    shot = read_capture(folder)
-    samples = capture_samples(shot, Sampling())
+    recording = read_capture(folder)
+    samples = capture_samples(recording, Sampling())
     assert samples.frame.shape == (40, 64, 96)
     np.testing.assert_allclose(samples.time_s, np.arange(1, 41) * 0.2)
     np.testing.assert_allclose(samples.position_m[:, 0], -0.08 + 0.004 * np.arange(1, 41), atol=1e-9)
     picture = np.asarray(Image.open(folder / "frames" / "0007.png"), dtype=np.float64) / 255
     np.testing.assert_allclose(samples.frame[6], reduce_by_area(picture, (64, 96)), atol=1e-6)
     # The definition of the surface, pixel by pixel: last event of each polarity up to the frame's time.
-    t, x, y, p = shot.events.t_us, shot.events.x, shot.events.y, shot.events.p
+    t, x, y, p = recording.events.t_us, recording.events.x, recording.events.y, recording.events.p
     expected = np.zeros((2, 100, 160))
     for i in range(int(np.searchsorted(t, 1_400_000, side="right"))):
         expected[0 if p[i] else 1, y[i], x[i]] = np.exp(-(1.4e6 - t[i]) / 0.2e6)
@@ -107,11 +107,11 @@ def test_two_captures_of_one_name_are_refused_however_they_are_given(kind, tiny_
 def test_an_unknown_target_gives_samples_without_truth_but_its_motion_counts(capture) -> None:
     text = (capture / "capture.yaml").read_text()
     (capture / "capture.yaml").write_text(text.replace("  mask: target.png\n", ""))
-    shot = read_capture(capture)
-    samples = capture_samples(shot, Sampling())
+    recording = read_capture(capture)
+    samples = capture_samples(recording, Sampling())
     assert samples.truth is None and samples.frame.shape == (8, 64, 96)
-    np.testing.assert_array_equal(samples.position_m, shot.motion.position_m(samples.time_s))
-    still = replace(shot, info=replace(shot.info, motion=None))
+    np.testing.assert_array_equal(samples.position_m, recording.motion.position_m(samples.time_s))
+    still = replace(recording, info=replace(recording.info, motion=None))
     assert capture_samples(still, Sampling()).position_m is None
 
 

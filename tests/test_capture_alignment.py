@@ -79,10 +79,10 @@ def test_a_slow_steady_motion_is_refused_and_not_guessed(shared_data, name):
     """These agree with their events over a second and more: the best offset is off by up to half a second."""
     if name.startswith("far"):
         pytest.importorskip("aedat")
-    shot = read_capture(shared_data / "captures" / name)
+    recording = read_capture(shared_data / "captures" / name)
     for blocks in (1, 8):
         with pytest.raises(DataError, match="uncertain"):
-            find_offset(shot.events, shot.frames, shot.frame_times_us - 137_000, blocks=blocks)
+            find_offset(recording.events, recording.frames, recording.frame_times_us - 137_000, blocks=blocks)
 
 
 # ---------------------------------------------------------------- pixels

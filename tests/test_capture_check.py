@@ -106,11 +106,23 @@ def test_clocks_that_do_not_meet_are_named(capture) -> None:
 
 
 def test_a_new_folder_explains_itself_and_is_read_back(tmp_path, capsys) -> None:
-    main(["capture", "init", str(tmp_path / "shot"), "--width", "640", "--height", "480", "--camera", "EVK: 4"])
+    main(
+        [
+            "capture",
+            "init",
+            str(tmp_path / "recording"),
+            "--width",
+            "640",
+            "--height",
+            "480",
+            "--camera",
+            "EVK: 4",
+        ]
+    )
     assert "evnlos capture check" in capsys.readouterr().out
-    info = read_capture_info(tmp_path / "shot")
+    info = read_capture_info(tmp_path / "recording")
     assert (info.camera.width, info.camera.height, info.camera.name) == (640, 480, "EVK  4")
-    text = (tmp_path / "shot" / "capture.yaml").read_text()
+    text = (tmp_path / "recording" / "capture.yaml").read_text()
     # Every setting that is offered in a comment is one that the reader knows.
     offered = [line[2:] for line in text.splitlines() if line.startswith("# ") and ": {" in line]
     assert len(offered) >= 7
@@ -118,7 +130,7 @@ def test_a_new_folder_explains_itself_and_is_read_back(tmp_path, capsys) -> None
         (tmp_path / "capture.yaml").write_text("camera: {width: 640, height: 480}\n" + line + "\n")
         read_capture_info(tmp_path)
     with pytest.raises(DataError, match="exists"):
-        begin_capture(tmp_path / "shot", 640, 480)
+        begin_capture(tmp_path / "recording", 640, 480)
     with pytest.raises(DataError, match="0 x 480"):
         begin_capture(tmp_path / "other", 0, 480)
     (tmp_path / "file").touch()

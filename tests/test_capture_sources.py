@@ -55,11 +55,11 @@ def test_a_celex_pair(tmp_path):
     write_events(folder / "shot_EI_100M.bin", events)
     frames = np.random.default_rng(1).integers(0, 255, (3, 800, 1280)).astype(np.uint8)
     write_celex_frames(folder / "shot_F_100M.bin", frames)
-    shot = read_capture(folder)
-    np.testing.assert_array_equal(shot.frames, frames)
-    assert shot.frame_times_us.tolist() == [30_000, 130_000, 230_000]
-    assert shot.events.polarity_known is None and len(shot.events) < len(events)
-    assert any("without polarity left out" in note for note in shot.notes)
+    recording = read_capture(folder)
+    np.testing.assert_array_equal(recording.frames, frames)
+    assert recording.frame_times_us.tolist() == [30_000, 130_000, 230_000]
+    assert recording.events.polarity_known is None and len(recording.events) < len(events)
+    assert any("without polarity left out" in note for note in recording.notes)
     import_captures([folder], tmp_path / "d")
     samples, _ = read_shard(open_dataset(tmp_path / "d").shard("shot_A"))
     assert samples.frame.shape == (2, 64, 96) and samples.truth is None
@@ -69,9 +69,12 @@ def test_an_aedat4_with_frames_and_events(tmp_path):
     pytest.importorskip("aedat")
     folder = folder_of(tmp_path, events="davis.aedat4", frames="davis.aedat4")
     write_aedat4(folder / "davis.aedat4", stream(), pictures(), np.arange(6) * 200_000 + 9)
-    shot = read_capture(folder)
-    np.testing.assert_array_equal(shot.frames, pictures())
-    assert shot.events == stream() and shot.frame_times_us.tolist() == (np.arange(6) * 200_000 + 9).tolist()
+    recording = read_capture(folder)
+    np.testing.assert_array_equal(recording.frames, pictures())
+    assert (
+        recording.events == stream()
+        and recording.frame_times_us.tolist() == (np.arange(6) * 200_000 + 9).tolist()
+    )
 
 
 def test_a_raw_beside_a_folder_an_animation_or_an_array(tmp_path):
@@ -93,10 +96,10 @@ def test_a_raw_beside_a_folder_an_animation_or_an_array(tmp_path):
         folder = folder_of(tmp_path, name.split(".")[0], frames=name, alignment={"offset_us": 5_000})
         write_events(folder / "events.raw", stream())
         save(folder / name)
-        shot = read_capture(folder)
-        np.testing.assert_allclose(shot.frames / 65_535, frames / 255, atol=1e-4)
-        np.testing.assert_array_equal(shot.frame_times_us, np.arange(6) * 200_000 + 5_000)
-        assert shot.peak == 65_535
+        recording = read_capture(folder)
+        np.testing.assert_allclose(recording.frames / 65_535, frames / 255, atol=1e-4)
+        np.testing.assert_array_equal(recording.frame_times_us, np.arange(6) * 200_000 + 5_000)
+        assert recording.peak == 65_535
 
 
 def test_a_video_with_times_of_its_own(tmp_path):
@@ -111,9 +114,9 @@ def test_a_video_with_times_of_its_own(tmp_path):
                 container.mux(packet)
         for packet in video.encode():
             container.mux(packet)
-    shot = read_capture(folder)
-    np.testing.assert_allclose(shot.frames / 65_535, pictures() / 255, atol=2e-3)
-    np.testing.assert_allclose(shot.frame_times_us, np.arange(6) * 100_000, atol=1_000)
+    recording = read_capture(folder)
+    np.testing.assert_allclose(recording.frames / 65_535, pictures() / 255, atol=2e-3)
+    np.testing.assert_allclose(recording.frame_times_us, np.arange(6) * 100_000, atol=1_000)
 
 
 def test_frame_times_from_a_trigger(tmp_path):
@@ -158,13 +161,13 @@ def test_a_camera_of_its_own_with_a_grid_of_dots(tmp_path):
     light = np.exp(-((u - spot[0]) ** 2 + (v - spot[1]) ** 2) / (2 * 4.0**2))
     np.save(folder / "frames.npy", np.stack([(dark + 180 * light).astype(np.uint8)] * 3))
     write_events(folder / "events.raw", stream())
-    shot = read_capture(folder)
-    assert shot.frames.shape == (3, HEIGHT, WIDTH)
-    weight = np.clip(shot.frames[0].astype(float) - shot.frames[0].max() * 0.2, 0, None)
+    recording = read_capture(folder)
+    assert recording.frames.shape == (3, HEIGHT, WIDTH)
+    weight = np.clip(recording.frames[0].astype(float) - recording.frames[0].max() * 0.2, 0, None)
     centre = (weight * x).sum() / weight.sum(), (weight * y).sum() / weight.sum()
     np.testing.assert_allclose(centre, (40, 20), atol=0.3)
-    assert any("3 x 4 dots (rms error 0." in note for note in shot.notes)
-    assert any("dark.png" in note for note in shot.notes)
+    assert any("3 x 4 dots (rms error 0." in note for note in recording.notes)
+    assert any("dark.png" in note for note in recording.notes)
 
 
 def test_points_region_and_filters(tmp_path):
@@ -174,7 +177,7 @@ def test_points_region_and_filters(tmp_path):
     np.testing.assert_allclose(
         homography_from_points([p[:2] for p in points], [p[2:] for p in points]), matrix, atol=1e-9
     )
-    shots = []
+    recordings = []
     for name, registration in (("p", {"points": points}), ("h", {"homography": matrix.tolist()})):
         folder = folder_of(
             tmp_path, name, frames="frames.npy", registration=registration,
@@ -191,12 +194,12 @@ def test_points_region_and_filters(tmp_path):
             np.concatenate([events.columns()[n], hot.columns()[n]])[order] for n in ("t_us", "x", "y", "p")
         )
         write_events(folder / "events.raw", Events(*columns, WIDTH, HEIGHT))
-        shots.append(read_capture(folder))
-    shot = shots[0]
-    assert shot.frames.shape == (6, 30, 40) and shot.events.shape == (30, 40)
-    np.testing.assert_allclose(shot.frames, shots[1].frames, atol=1)
-    assert not ((shot.events.x == 12) & (shot.events.y == 5)).any()
-    text = "; ".join(shot.notes)
+        recordings.append(read_capture(folder))
+    recording = recordings[0]
+    assert recording.frames.shape == (6, 30, 40) and recording.events.shape == (30, 40)
+    np.testing.assert_allclose(recording.frames, recordings[1].frames, atol=1)
+    assert not ((recording.events.x == 12) & (recording.events.y == 5)).any()
+    text = "; ".join(recording.notes)
     for said in (
         "1 hot pixels",
         "without a neighbour in 100000 us",
@@ -210,9 +213,9 @@ def test_turned_frames_and_unknown_polarity(tmp_path):
     folder = folder_of(tmp_path, frames="frames.npy", frames_turned=True, events="events.h5")
     np.save(folder / "frames.npy", pictures()[:, ::-1, ::-1])
     write_events(folder / "events.h5", stream(polarity_known=np.zeros(4_000, bool)))
-    shot = read_capture(folder)
-    np.testing.assert_allclose(shot.frames / 65_535, pictures() / 255, atol=1e-4)
-    assert len(shot.events) == 4_000 and any("no polarity" in note for note in shot.notes)
+    recording = read_capture(folder)
+    np.testing.assert_allclose(recording.frames / 65_535, pictures() / 255, atol=1e-4)
+    assert len(recording.events) == 4_000 and any("no polarity" in note for note in recording.notes)
 
 
 def test_the_check_picture_shows_frame_events_and_curves(tmp_path):

@@ -35,15 +35,15 @@ def fails(capsys, *arguments: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def shots(tiny_captures, tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("shots") / "d"
+def recorded(tiny_captures, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("recorded") / "d"
     sampling = ["--sampling.height", 32, "--sampling.width", 48, "--sampling.scored-rows", 24]
     call("import", *tiny_captures, "--out", out, "--test", "4", *sampling, "--sampling.pitch-m", 0.005)
     return out
 
 
 @pytest.fixture(scope="module")
-def runs(shots, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
+def runs(recorded, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
     """Pre-trained, fine-tuned and end-to-end runs, made by the commands."""
     out = tmp_path_factory.mktemp("runs")
     found = {}
@@ -61,8 +61,8 @@ def runs(shots, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
             2,
             *NETWORK,
         )
-        call("finetune", "--weights", pre, "--data", shots, "--out", epnp, "--epochs", 2)
-        call("train", "--data", shots, "--modality", modality, "--out", e2e, "--epochs", 2, *NETWORK)
+        call("finetune", "--weights", pre, "--data", recorded, "--out", epnp, "--epochs", 2)
+        call("train", "--data", recorded, "--modality", modality, "--out", e2e, "--epochs", 2, *NETWORK)
         found |= {p.name: p for p in (pre, epnp, e2e)}
     return found
 
@@ -122,8 +122,8 @@ def test_simulate_prints_what_diffraction_does(tiny, tmp_path, capsys) -> None:
         )
 
 
-def test_import_splits(shots) -> None:
-    assert open_dataset(shots).split == {
+def test_import_splits(recorded) -> None:
+    assert open_dataset(recorded).split == {
         "train": ["lab_A", "lab_L", "lab_T"],
         "validation": [],
         "test": ["lab_4"],
@@ -146,9 +146,9 @@ def test_lab_renders_a_capture(tmp_path, capsys) -> None:
     assert len(list((tmp_path / "lab" / "lab_K" / "frames").glob("*.png"))) == 9
 
 
-def test_evaluate_prints_one_json_object(runs, shots, capsys) -> None:
+def test_evaluate_prints_one_json_object(runs, recorded, capsys) -> None:
     capsys.readouterr()
-    call("evaluate", "--weights", runs["epnp-fusion"], "--data", shots, "--json")
+    call("evaluate", "--weights", runs["epnp-fusion"], "--data", recorded, "--json")
     found = json.loads(capsys.readouterr().out)
     assert found["modality"] == "fusion"
     assert found["images"] == 8
@@ -162,7 +162,7 @@ def test_evaluate_prints_one_json_object(runs, shots, capsys) -> None:
         assert 0 < scores["psnr_db"] < 60
         assert -1 <= scores["ssim"] <= 1
         assert scores["lpips"] is None
-    call("evaluate", "--weights", runs["epnp-fusion"], "--data", shots)
+    call("evaluate", "--weights", runs["epnp-fusion"], "--data", recorded)
     assert "not available" in capsys.readouterr().out
 
 
@@ -208,27 +208,27 @@ def test_without_weights_published_ones_that_fit_are_taken(tiny_captures, tmp_pa
     assert taken[1] == "near-frame"
 
 
-def test_report_is_one_page_without_requests(runs, shots, tmp_path, capsys) -> None:
-    call("report", *runs.values(), "--data", shots, "--out", tmp_path / "report.html")
+def test_report_is_one_page_without_requests(runs, recorded, tmp_path, capsys) -> None:
+    call("report", *runs.values(), "--data", recorded, "--out", tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
     assert not re.findall(r"https?:", page.replace("http://www.w3.org/2000/svg", ""))
     # One position, a strip of truth and runs, an animation, the worst pictures of each run.
     assert page.count("<img") == (3 + len(runs)) + (1 + len(runs)) + 1 + 6 * len(runs)
     rows = (tmp_path / "report.csv").read_text().splitlines()
-    assert rows[0].split(",")[3:6] == ["all-black", "mean image", "nearest shot"]
+    assert rows[0].split(",")[3:6] == ["all-black", "mean image", "nearest neighbour"]
     assert {"simulation only frame", "E2E fusion", "EPNP frame"} <= set(rows[0].split(","))
     shown = capsys.readouterr().out
     assert "report:" in shown and "lab 4" in shown
     # The page, the CSV and `evaluate` say the same.
-    call("evaluate", "--weights", runs["e2e-fusion"], "--data", shots, "--json")
+    call("evaluate", "--weights", runs["e2e-fusion"], "--data", recorded, "--json")
     number = json.loads(capsys.readouterr().out)["overall"]["psnr_db"]
     row = dict(zip(rows[0].split(","), rows[1].split(","), strict=True))
     assert float(row["E2E fusion"]) == pytest.approx(number)
     assert f">{number:.2f}<" in page
 
 
-def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp_path, capsys) -> None:
+def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     assert "unknown command" in fails(capsys, "reconstrukt")
     assert "--port: invalid literal" in fails(capsys, "app", "--port", "abc")
@@ -241,7 +241,7 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp
     )
     assert "no dataset" in fails(capsys, "train", "--data", tmp_path, "--out", out)
     assert "does not exist" in fails(
-        capsys, "finetune", "--weights", tmp_path / "w", "--data", shots, "--out", out
+        capsys, "finetune", "--weights", tmp_path / "w", "--data", recorded, "--out", out
     )
     assert "not a folder" in fails(
         capsys, "reconstruct", tmp_path / "c", "--weights", runs["e2e-frame"], "--out", out
@@ -250,9 +250,9 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, shots, tiny_captures, tmp
     assert "does not exist" in fails(capsys, "simulate", "--config", tmp_path / "c.yaml", "--out", out)
     assert "--preset" in fails(capsys, "simulate", "--preset", "papper", "--out", out)
     (tmp_path / "c.yaml").write_text("epoch: 3\n")
-    assert "epochs" in fails(capsys, "train", "--config", tmp_path / "c.yaml", "--data", shots, "--out", out)
+    assert "epochs" in fails(capsys, "train", "--config", tmp_path / "c.yaml", "--data", recorded, "--out", out)
     assert "vgg" in fails(
-        capsys, "evaluate", "--weights", runs["e2e-frame"], "--data", shots, "--vgg", tmp_path / "vgg.pth"
+        capsys, "evaluate", "--weights", runs["e2e-frame"], "--data", recorded, "--vgg", tmp_path / "vgg.pth"
     )
     assert "pitch_m" in fails(capsys, "import", *tiny_captures, "--out", out, "--sampling.pitch-m", "nan")
     assert not out.exists()

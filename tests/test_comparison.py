@@ -102,8 +102,8 @@ def test_a_reader_that_nothing_vouches_for_is_refused(tmp_path) -> None:
 
 
 @pytest.fixture(scope="module")
-def tiny_shots(tiny_captures, tmp_path_factory):
-    out = tmp_path_factory.mktemp("memory") / "shots"
+def tiny_recorded(tiny_captures, tmp_path_factory):
+    out = tmp_path_factory.mktemp("memory") / "recorded"
     sampling = Sampling(height=32, width=48, scored_rows=24, pitch_m=0.005)
     return import_captures(tiny_captures, out, sampling, test=("4",))
 
@@ -153,12 +153,12 @@ def test_comparing_object_by_object_is_comparing_with_the_stack_of_all(together,
     assert 0 < nearer.mean() <= 1
 
 
-def test_the_truth_is_nearest_to_itself_and_a_memory_to_none(tiny_shots) -> None:
-    samples = NlosDataset(tiny_shots, "test", "fusion")
-    truth = samples.truth.float()[:, tiny_shots.sampling.scored].contiguous()
-    found = compare_with_training(truth, samples, tiny_shots, "test")
+def test_the_truth_is_nearest_to_itself_and_a_memory_to_none(tiny_recorded) -> None:
+    samples = NlosDataset(tiny_recorded, "test", "fusion")
+    truth = samples.truth.float()[:, tiny_recorded.sampling.scored].contiguous()
+    found = compare_with_training(truth, samples, tiny_recorded, "test")
     assert found is not None and found.nearer_to_truth.all() and found.nearest.shape == truth.shape
-    again = compare_with_training(found.nearest, samples, tiny_shots, "test")
+    again = compare_with_training(found.nearest, samples, tiny_recorded, "test")
     assert again is not None and not again.nearer_to_truth.any()
 
 

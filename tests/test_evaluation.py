@@ -103,8 +103,8 @@ def test_an_untrained_trunk_is_refused(files) -> None:
 
 
 def test_methods_follow_from_the_history() -> None:
-    sim, shot = {"data": {"origin": "simulation"}}, {"data": {"origin": "captures"}}
-    assert [method_of(h) for h in ([sim], [shot], [sim, shot])] == ["simulation only", "E2E", "EPNP"]
+    sim, recorded = {"data": {"origin": "simulation"}}, {"data": {"origin": "captures"}}
+    assert [method_of(h) for h in ([sim], [recorded], [sim, recorded])] == ["simulation only", "E2E", "EPNP"]
 
 
 def test_best_two_skips_the_baselines() -> None:

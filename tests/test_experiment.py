@@ -103,7 +103,7 @@ def test_a_study_is_estimated_first_and_can_be_forced(records, place, monkeypatc
 
 
 def test_networks_trained_at_a_time_are_those_trained_one_by_one(records, place, tmp_path) -> None:
-    for part in ("setups", "simulations", "shots"):
+    for part in ("setups", "simulations", "recorded"):
         shutil.copytree(place.out / part, tmp_path / part)
     study = replace(STUDY, seeds=(0,))
     watch = Watch()
@@ -129,7 +129,7 @@ def test_arms_share_what_they_have_in_common(records, place) -> None:
     names = [path.name for path in (place.out / "runs").iterdir()]
     assert len([name for name in names if "pretrained" in name]) == 2  # one a seed, for two arms
     assert len(list((place.out / "simulations").iterdir())) == 1
-    assert len(list((place.out / "shots").iterdir())) == 1
+    assert len(list((place.out / "recorded").iterdir())) == 1
 
 
 def test_arms_begin_with_installed_layers(records, place, tmp_path, monkeypatch) -> None:
@@ -159,22 +159,22 @@ def test_validation_leaves_the_test_characters_unread(place) -> None:
     study = replace(STUDY, name="choose", arms=ARMS[:1], seeds=(0,), validation=("L",))
     found = run_study(study, place)
     assert [r.split for r in found] == ["validation"]
-    shots = open_dataset(place.out / "shots" / found[0].settings["captures"])
-    assert sorted(shots.objects()) == ["lab_A", "lab_L", "lab_T"]
-    assert shots.objects("validation") == ["lab_L"]
+    recorded = open_dataset(place.out / "recorded" / found[0].settings["captures"])
+    assert sorted(recorded.objects()) == ["lab_A", "lab_L", "lab_T"]
+    assert recorded.objects("validation") == ["lab_L"]
 
 
 def test_few_shots_are_nested_and_keep_the_test(place) -> None:
     kept = []
     for count in (1, 2):
-        arm = replace(ARMS[0], name=f"{count} shots", shots=count)
+        arm = replace(ARMS[0], name=f"{count} captures", captures=count)
         found = run_study(replace(STUDY, name="few", arms=(arm,), seeds=(0,)), place)
-        shots = open_dataset(place.out / "shots" / found[0].settings["captures"])
-        assert shots.objects("test") == ["lab_4"] and len(shots.objects("train")) == count
-        kept.append(set(shots.objects("train")))
+        recorded = open_dataset(place.out / "recorded" / found[0].settings["captures"])
+        assert recorded.objects("test") == ["lab_4"] and len(recorded.objects("train")) == count
+        kept.append(set(recorded.objects("train")))
     assert kept[0] < kept[1]
-    with pytest.raises(DataError, match="9 shots"):
-        run_study(replace(STUDY, arms=(replace(ARMS[0], shots=9),)), place)
+    with pytest.raises(DataError, match="9 captures"):
+        run_study(replace(STUDY, arms=(replace(ARMS[0], captures=9),)), place)
 
 
 def test_captures_that_no_setup_fits_say_so(tiny_captures, tmp_path) -> None:
@@ -190,8 +190,8 @@ def test_wrong_plans_are_refused(tmp_path) -> None:
         Arm("x", "calibrated", None, SMALL)
     with pytest.raises(ConfigError, match="trains nothing"):
         Arm("x", "none", None, None)
-    with pytest.raises(ConfigError, match="shots is 0"):
-        Arm("x", "none", None, SMALL, shots=0)
+    with pytest.raises(ConfigError, match="captures is 0"):
+        Arm("x", "none", None, SMALL, captures=0)
     with pytest.raises(ConfigError, match="no arm"):
         Study("x")
     with pytest.raises(ConfigError, match="two arms"):
@@ -208,7 +208,7 @@ def test_presets_are_whole(name) -> None:
     assert study.name == name and study.test == ("G", "K", "4", "9") and len(study.arms) >= 2
 
 
-@pytest.mark.parametrize("name", ["frozen", "shots", "surface", "thresholds", "loss", "width"])
+@pytest.mark.parametrize("name", ["frozen", "capture-count", "surface", "thresholds", "loss", "width"])
 def test_a_study_of_single_positions_has_a_sequence_twin(name) -> None:
     single, twin = STUDIES[name]("near"), on_sequences(STUDIES[name]("near"))
     assert twin.name == f"{name}-sequence" and [a.name for a in twin.arms] == [a.name for a in single.arms]
@@ -219,7 +219,7 @@ def test_a_study_of_single_positions_has_a_sequence_twin(name) -> None:
             and first.network.width == was.network.width
             and first.epochs > was.epochs
         )
-        assert first.loss == was.loss and after.shots == before.shots and after.vary == before.vary
+        assert first.loss == was.loss and after.captures == before.captures and after.vary == before.vary
         if after.pretraining and after.finetuning:
             assert (
                 after.finetuning.freeze == before.finetuning.freeze and after.finetuning.network.kind == "unet"

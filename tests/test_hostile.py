@@ -48,9 +48,9 @@ def described(folder: Path, **settings: Any) -> Path:
 
 
 @pytest.fixture
-def shot(tiny_captures, tmp_path) -> Path:
-    shutil.copytree(tiny_captures[0], tmp_path / "shot")
-    return tmp_path / "shot"
+def capture_folder(tiny_captures, tmp_path) -> Path:
+    shutil.copytree(tiny_captures[0], tmp_path / "capture_folder")
+    return tmp_path / "capture_folder"
 
 
 def fails(words: list[str], capsys, match: str = "") -> str:
@@ -106,19 +106,19 @@ def test_yaml_that_people_write_is_read_as_before(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("name", ["capture.yaml", "frames.csv", "mask", "events", "frames.mp4", "dark"])
-def test_a_pipe_in_a_capture_is_not_waited_for(name: str, shot) -> None:
-    path = shot / name
+def test_a_pipe_in_a_capture_is_not_waited_for(name: str, capture_folder) -> None:
+    path = capture_folder / name
     if name == "mask":
-        described(shot, target={"name": "A", "mask": "mask"})
+        described(capture_folder, target={"name": "A", "mask": "mask"})
     elif name not in ("capture.yaml", "frames.csv"):
-        described(shot, **{name.removesuffix(".mp4"): name}, camera=CAMERA)
+        described(capture_folder, **{name.removesuffix(".mp4"): name}, camera=CAMERA)
     path.unlink(missing_ok=True)
     os.mkfifo(path)
     refused: list[EvnlosError] = []
 
     def read() -> None:
         try:
-            read_capture(shot)
+            read_capture(capture_folder)
         except EvnlosError as error:
             refused.append(error)
 
@@ -145,22 +145,22 @@ def test_a_pipe_on_the_command_line_is_not_waited_for(words: list[str], tmp_path
 
 @pytest.mark.parametrize("how", ["array", "picture", "table"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_frames_that_hold_no_numbers_are_refused_by_name(how: str, value: float, shot) -> None:
+def test_frames_that_hold_no_numbers_are_refused_by_name(how: str, value: float, capture_folder) -> None:
     frames = np.full((3, 48, 72), 100.0, np.float32)
     frames[1, 5, 7] = value
     if how == "array":
-        np.save(shot / "bad.npy", frames)
-        described(shot, frames="bad.npy", camera=CAMERA)
+        np.save(capture_folder / "bad.npy", frames)
+        described(capture_folder, frames="bad.npy", camera=CAMERA)
     else:
-        (shot / "many").mkdir()
+        (capture_folder / "many").mkdir()
         for number, frame in enumerate(frames):
-            Image.fromarray(frame).save(shot / "many" / f"bad_{number}.tif")
-        described(shot, frames="many", camera=CAMERA)
+            Image.fromarray(frame).save(capture_folder / "many" / f"bad_{number}.tif")
+        described(capture_folder, frames="many", camera=CAMERA)
     if how == "table":
-        (shot / "bad.csv").write_text("t_us,file\n0,many/bad_0.tif\n9,many/bad_1.tif\n")
-        described(shot, frames="bad.csv")
+        (capture_folder / "bad.csv").write_text("t_us,file\n0,many/bad_0.tif\n9,many/bad_1.tif\n")
+        described(capture_folder, frames="bad.csv")
     with pytest.raises(EvnlosError, match="NaN or infinity") as caught:
-        read_capture(shot)
+        read_capture(capture_folder)
     assert "frame 1" in str(caught.value) or "bad_1" in str(caught.value)
 
 
@@ -172,12 +172,12 @@ def test_control_characters_are_written_out() -> None:
     assert len(str(ConfigError("x" * 10**7))) < 5000
 
 
-def test_names_do_not_reach_the_terminal_raw(shot, tmp_path, capsys) -> None:
+def test_names_do_not_reach_the_terminal_raw(capture_folder, tmp_path, capsys) -> None:
     bad = "\x1b]0;x\x07\nsecond line"
-    described(shot, **{f"unknown{bad}": 1})
-    assert "\x1b" not in fails(["capture", "check", str(shot)], capsys)
+    described(capture_folder, **{f"unknown{bad}": 1})
+    assert "\x1b" not in fails(["capture", "check", str(capture_folder)], capsys)
     assert "\x1b" not in fails(["info", str(tmp_path / bad)], capsys)
-    shutil.copy(next(shot.glob("events*")), tmp_path / f"e{bad}.raw")
+    shutil.copy(next(capture_folder.glob("events*")), tmp_path / f"e{bad}.raw")
     main(["info", str(tmp_path / f"e{bad}.raw")])
     said = capsys.readouterr()
     assert "\x1b" not in said.out + said.err
@@ -322,49 +322,51 @@ HOMOGRAPHY = {"homography": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
 
 @pytest.mark.parametrize("count", [1, 40])
 @pytest.mark.parametrize("side", [13_000, 5000])
-def test_huge_pictures_are_refused_before_they_are_decoded(side: int, count: int, shot, bounded_memory) -> None:
-    _image_of(shot / "0.png", side, side)
+def test_huge_pictures_are_refused_before_they_are_decoded(
+    side: int, count: int, capture_folder, bounded_memory
+) -> None:
+    _image_of(capture_folder / "0.png", side, side)
     for number in range(1, count):
-        shutil.copy(shot / "0.png", shot / f"{number}.png")
+        shutil.copy(capture_folder / "0.png", capture_folder / f"{number}.png")
     lines = [f"{1000 * number},{number}.png" for number in range(count)]
-    (shot / "frames.csv").write_text("\n".join(["t_us,file", *lines]))
-    described(shot, registration=HOMOGRAPHY, frames="frames.csv")
+    (capture_folder / "frames.csv").write_text("\n".join(["t_us,file", *lines]))
+    described(capture_folder, registration=HOMOGRAPHY, frames="frames.csv")
     if side == 5000 and count == 1:
         return
     with pytest.raises(EvnlosError, match=r"pixels|memory"):
-        read_capture(shot)
+        read_capture(capture_folder)
 
 
-def test_a_picture_named_many_times_is_refused(shot, bounded_memory) -> None:
-    _image_of(shot / "one.png", 72, 48)
+def test_a_picture_named_many_times_is_refused(capture_folder, bounded_memory) -> None:
+    _image_of(capture_folder / "one.png", 72, 48)
     lines = [f"{number},one.png" for number in range(400_000)]
-    (shot / "frames.csv").write_text("\n".join(["t_us,file", *lines]))
+    (capture_folder / "frames.csv").write_text("\n".join(["t_us,file", *lines]))
     with pytest.raises(EvnlosError, match="name every picture once"):
-        read_capture(shot)
+        read_capture(capture_folder)
 
 
 @pytest.mark.parametrize("form", ["array", "animation"])
-def test_frames_beyond_the_memory_are_refused(form: str, shot, bounded_memory) -> None:
+def test_frames_beyond_the_memory_are_refused(form: str, capture_folder, bounded_memory) -> None:
     if form == "array":
         name = "many.npy"
-        with (shot / name).open("wb") as file:
+        with (capture_folder / name).open("wb") as file:
             head = {"descr": "|u1", "fortran_order": False, "shape": (400, 1000, 1000)}
             np.lib.format.write_array_header_1_0(file, head)
             file.truncate(file.tell() + 400_000_000)  # a hole, which takes no space
     else:
         name = "many.gif"
         many = [Image.new("L", (300, 300), number) for number in range(1, 20)]
-        Image.new("L", (300, 300)).save(shot / name, save_all=True, append_images=many)
-    described(shot, frames=name, registration=HOMOGRAPHY, camera=CAMERA)
+        Image.new("L", (300, 300)).save(capture_folder / name, save_all=True, append_images=many)
+    described(capture_folder, frames=name, registration=HOMOGRAPHY, camera=CAMERA)
     with pytest.raises(EvnlosError, match="memory"):
-        read_capture(shot, None if form == "array" else 1 << 20)
+        read_capture(capture_folder, None if form == "array" else 1 << 20)
 
 
 @pytest.mark.parametrize("sides", [(20_000, 20_000), (0, 5), (-1, 5), (10**30, 1)])
-def test_a_camera_has_a_size(sides, shot) -> None:
-    described(shot, camera={"width": sides[0], "height": sides[1]})
+def test_a_camera_has_a_size(sides, capture_folder) -> None:
+    described(capture_folder, camera={"width": sides[0], "height": sides[1]})
     with pytest.raises(EvnlosError):
-        read_capture(shot)
+        read_capture(capture_folder)
 
 
 def test_a_chunk_of_many_events_is_unpacked_once_or_refused(tmp_path) -> None:
@@ -702,10 +704,10 @@ def test_a_damaged_photograph_is_a_result_or_one_line(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("offset", [2**62 + 1, 2**63, -(2**63), 2**70])
-def test_a_clock_beyond_64_bits_is_refused(offset: int, shot) -> None:
-    described(shot, alignment={"offset_us": offset})
+def test_a_clock_beyond_64_bits_is_refused(offset: int, capture_folder) -> None:
+    described(capture_folder, alignment={"offset_us": offset})
     with pytest.raises(EvnlosError):
-        read_capture(shot)
+        read_capture(capture_folder)
 
 
 def test_the_corpus_of_findings_ends_well(tmp_path) -> None:

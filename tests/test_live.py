@@ -462,9 +462,9 @@ def test_a_frame_outlives_its_dropped_chunk() -> None:
 
 @pytest.mark.parametrize("modality", STANDARD_MODALITIES)
 def test_at_a_frame_the_live_picture_is_the_one_of_reconstruct(modality: str, tiny_captures) -> None:
-    loaded, shot = weights(modality), read_capture(tiny_captures[0])
+    loaded, capture = weights(modality), read_capture(tiny_captures[0])
     live = Engine(loaded)
-    samples = capture_samples(shot, live.sampling)
+    samples = capture_samples(capture, live.sampling)
     expected = reconstruct(loaded, samples.frame, samples.surface)
     found, events, counted = {}, 0, {}
     for part in capture_replay(tiny_captures[0], speed=10, clock=Turned()).chunks(NEVER):
@@ -472,8 +472,8 @@ def test_at_a_frame_the_live_picture_is_the_one_of_reconstruct(modality: str, ti
         events += 0 if picture is None else picture.events
         if part.frame is not None and picture is not None:
             found[part.until_us], counted[part.until_us] = picture, events
-    assert counted == {t_us: int((shot.events.t_us <= t_us).sum()) for t_us in found}
-    for k, t_us in enumerate(shot.frame_times_us[1:]):
+    assert counted == {t_us: int((capture.events.t_us <= t_us).sum()) for t_us in found}
+    for k, t_us in enumerate(capture.frame_times_us[1:]):
         np.testing.assert_allclose(found[int(t_us)].surface, samples.surface[k], atol=1e-6)
         np.testing.assert_allclose(found[int(t_us)].image, expected[k].numpy(), atol=1e-5)
 

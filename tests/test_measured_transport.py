@@ -65,7 +65,7 @@ def with_read_noise(sigma: float) -> FrameCamera:
 def record(
     folder: Path, plan: ScanPlan, matrix: np.ndarray, camera: FrameCamera, shape=SHAPE, change=None
 ) -> None:
-    """Write a plan and the pictures that `camera` takes of it; `change` may alter the light of a shot."""
+    """Write a plan and the pictures that `camera` takes of it; `change` may alter the light of a frame."""
     write_plan(plan, folder)
     save_yaml(replace(read_scan_info(folder), white_dn=65535), folder / "scan.yaml")
     rehearse_scan(folder, matrix, shape, camera, seed=7, change=change)
@@ -134,14 +134,14 @@ def test_a_plan_says_what_to_show(tmp_path) -> None:
 
 def test_estimate_follows_the_camera() -> None:
     found = small_plan(exposure_s=0.1, overhead_s=0.4).estimate()
-    assert found.seconds == pytest.approx(found.shots * 0.5)
+    assert found.seconds == pytest.approx(found.scan_frames * 0.5)
     dim = ScanCamera(full_level=0.1, read_noise_e=100.0)
     additive = estimate_scan(Patterns("raster", 787), dim, 0.01, 2, 1600, 26, 0.1)
     assert additive.other_noise < additive.noise / 8
     assert any("hadamard patterns would" in note for note in additive.notes)
     bright = ScanCamera(read_noise_e=0.0, bit_depth=16)  # a matte wall and shot noise: nothing to gain
-    shot = estimate_scan(Patterns("raster", 787), bright, 0.01, 2, 1600, 10**6, 0.1)
-    assert shot.other_noise == pytest.approx(np.sqrt(2) * shot.noise, rel=0.01)
+    scan_frame = estimate_scan(Patterns("raster", 787), bright, 0.01, 2, 1600, 10**6, 0.1)
+    assert scan_frame.other_noise == pytest.approx(np.sqrt(2) * scan_frame.noise, rel=0.01)
     for wrong in ({"pitch": 0.0}, {"display": (100, 100)}, {"repeats": 0}, {"plane": (0.001, 0.1)}):
         with pytest.raises(ConfigError):
             small_plan(**{"pattern": "raster", **wrong})
@@ -339,11 +339,11 @@ def test_bad_folders_are_refused(clean, tmp_path, how, match) -> None:
 def test_a_moved_camera_a_faded_light_and_a_gamma_are_told(tmp_path) -> None:
     matrix, quiet = setup_matrix(0.5), with_read_noise(0.002)
 
-    def moving(light, shot):
-        return np.roll(light, 1, axis=1) if shot.repeat else light
+    def moving(light, scan_frame):
+        return np.roll(light, 1, axis=1) if scan_frame.repeat else light
 
-    def fading(light, shot):
-        return light * (0.88 if shot.repeat else 1)
+    def fading(light, scan_frame):
+        return light * (0.88 if scan_frame.repeat else 1)
 
     for name, change, match in (("moved", moving, "shifted by"), ("faded", fading, r"-1[23] % of light")):
         record(tmp_path / name, small_plan(), matrix, quiet, change=change)
@@ -351,8 +351,8 @@ def test_a_moved_camera_a_faded_light_and_a_gamma_are_told(tmp_path) -> None:
             import_scan(tmp_path / name)
     plan = small_plan()
     record(tmp_path / "gamma", plan, matrix, quiet)
-    for shot in plan.shots():
-        path = tmp_path / "gamma" / shot.file
+    for scan_frame in plan.scan_frames():
+        path = tmp_path / "gamma" / scan_frame.file
         linear = np.asarray(Image.open(path)) / 65535
         Image.fromarray(np.round(65535 * linear ** (1 / 2.2)).astype(np.uint16)).save(path)
     with pytest.raises(DataError, match="gamma"):
@@ -362,8 +362,8 @@ def test_a_moved_camera_a_faded_light_and_a_gamma_are_told(tmp_path) -> None:
 def test_hot_pixels_are_left_out(tmp_path) -> None:
     plan = small_plan()
     record(tmp_path / "hot", plan, setup_matrix(0.5), with_read_noise(1e-4))
-    for shot in plan.shots():
-        path = tmp_path / "hot" / shot.file
+    for scan_frame in plan.scan_frames():
+        path = tmp_path / "hot" / scan_frame.file
         image = np.asarray(Image.open(path)).copy()
         image[10, 20] = 65535
         Image.fromarray(image).save(path)
@@ -489,7 +489,7 @@ def test_commands_from_plan_to_picture(tmp_path, capsys) -> None:
     scan, out = tmp_path / "scan", tmp_path / "setup.safetensors"
     main(["scan", "plan", str(scan), "--plane", "0.12", "0.06", "--pattern", "hadamard", "--json"])
     planned = json.loads(capsys.readouterr().out)
-    assert planned["shots"] == 2 * (79 + 3) + 5
+    assert planned["scan_frames"] == 2 * (79 + 3) + 5
     import shutil
 
     shutil.rmtree(scan)

@@ -39,7 +39,7 @@ def made(tmp_path_factory):
     draw = np.random.default_rng(0)
     sampling = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
     names, truths = ["near_G", "near_K"], []
-    folder = tmp_path_factory.mktemp("shots") / "near"
+    folder = tmp_path_factory.mktemp("recorded") / "near"
     data = Dataset(folder, "captures", sampling, {"train": [], "validation": [], "test": names})
     create_dataset(data)
     for name in names:

@@ -436,17 +436,21 @@ def test_the_command_follows_a_capture(capture, tmp_path, capsys) -> None:
 
 
 def test_a_setup_of_another_distance_or_wall_is_doubted(capture, tmp_path, capsys) -> None:
-    shot, settings = read_capture(capture[0]), Tracking(cells=10, events=False)
-    tracks = [track_capture(shot, replace(SETUP, roughness=one), settings) for one in (SETUP.roughness, 0.15)]
+    recording, settings = read_capture(capture[0]), Tracking(cells=10, events=False)
+    tracks = [
+        track_capture(recording, replace(SETUP, roughness=one), settings) for one in (SETUP.roughness, 0.15)
+    ]
     right, rough = tracks
     assert right.misfit == pytest.approx(1, abs=0.1)
     assert rough.misfit > 1.2 and (rough.frame_sigma > right.frame_sigma).mean() > 0.9
-    assert not track_doubts(shot, SETUP, right) and not track_doubts(shot, None, replace(right, misfit=None))
-    (doubt,) = track_doubts(shot, SETUP, rough)
+    assert not track_doubts(recording, SETUP, right) and not track_doubts(
+        recording, None, replace(right, misfit=None)
+    )
+    (doubt,) = track_doubts(recording, SETUP, rough)
     assert "times the noise" in doubt and "calibrate" in doubt
-    (doubt,) = track_doubts(shot, replace(SETUP, distance_m=0.5), right)
+    (doubt,) = track_doubts(recording, replace(SETUP, distance_m=0.5), right)
     assert "states a distance of 0.3 m, the setup 0.5 m" in doubt
-    assert not track_doubts(shot, replace(SETUP, distance_m=0.305), right)
+    assert not track_doubts(recording, replace(SETUP, distance_m=0.305), right)
 
 
 def test_the_command_takes_a_calibrated_folder_and_says_what_no_capture_is(capture, tmp_path, capsys) -> None:

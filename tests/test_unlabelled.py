@@ -8,7 +8,7 @@ import torch
 from scipy.stats import multivariate_normal
 
 from evnlos.calibration import Calibration, fit_setup
-from evnlos.calibration.captures import read_shots
+from evnlos.calibration.captures import read_capture_set
 from evnlos.calibration.unlabelled import CELLS, WRITERS, MovingLight, fit_unlabelled
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.measurements import handwritten_targets
@@ -67,7 +67,7 @@ def test_the_right_wall_is_the_likeliest_and_shows_the_targets() -> None:
 
 
 def test_a_setup_is_found_without_its_targets(tiny_captures, tmp_path) -> None:
-    fit, held = read_shots(tiny_captures, holdout=("4",), target_size_m=0.08)
+    fit, held = read_capture_set(tiny_captures, holdout=("4",), target_size_m=0.08)
     assert all(capture.target is None for capture in (*fit.captures, *held.captures))
     start = RadiometricSetup(roughness=0.12)  # the lab's is 0.05
     known = ("distance_m", "target_offset_m", "camera_distance_m", "camera_angle_deg", "field_of_view_deg")

@@ -79,7 +79,7 @@ def described(folder: Path, **settings: Any) -> Path:
 
 @pytest.mark.parametrize("what", ["frame", "mask", "dark", "dots", "folder of frames", "animation", "sd19"])
 def test_a_program_named_as_a_picture_is_not_run(what: str, tiny_captures, tmp_path, ghostscript) -> None:
-    folder = copied(tiny_captures[0], tmp_path / "shot")
+    folder = copied(tiny_captures[0], tmp_path / "capture_folder")
     trap = folder / "trap.png"
     trap.write_bytes(POSTSCRIPT)
     read: Callable[[Path], object] = read_capture
@@ -209,7 +209,7 @@ def test_an_event_file_reads_no_other_file(
         assert ended.value.code == 2
         assert said.count("\n") == 1
         return
-    folder = described(copied(tiny_captures[0], tmp_path / "shot"), events="leak.h5")
+    folder = described(copied(tiny_captures[0], tmp_path / "capture_folder"), events="leak.h5")
     shutil.copy("leak.h5", folder)
     read = {
         "events": lambda: read_events("leak.h5"),
@@ -248,7 +248,7 @@ def playlists(film: Path) -> dict[str, str]:
 @pytest.mark.parametrize("name", playlists(Path()))
 def test_a_playlist_shows_no_film_of_the_machine(name: str, tiny_captures, tmp_path) -> None:
     write_film(tmp_path / "film.ts")
-    folder = copied(tiny_captures[0], tmp_path / "shot")
+    folder = copied(tiny_captures[0], tmp_path / "capture_folder")
     described(folder, frames=name, camera=CAMERA)
     (folder / name).write_text(playlists(tmp_path / "film.ts")[name])
     with pytest.raises(EvnlosError, match="not a video that FFmpeg reads") as caught:
@@ -284,7 +284,7 @@ def write_with(path: Path, codec: str) -> None:
 
 
 def test_a_folder_of_frames_holds_its_own_pictures(tiny_captures, tmp_path) -> None:
-    folder = copied(tiny_captures[0], tmp_path / "shot")
+    folder = copied(tiny_captures[0], tmp_path / "capture_folder")
     (folder / "many").mkdir()
     for number in range(3):
         Image.fromarray(np.full((48, 72), 40 * number, np.uint8)).save(tmp_path / f"{number}.png")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evnlos.calibration.captures import Shots, grouped, wall_data
+from evnlos.calibration.captures import CaptureSet, grouped, wall_data
 from evnlos.calibration.wall_fit import FREEDOMS, WallState, _Unknowns, normal_equations, start_at
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
 from evnlos.calibration.wall_search import fit_wall, travelled
@@ -46,7 +46,7 @@ def operator(bent: float = 0.0) -> np.ndarray:
 WIDE = Plane(56, 96, 0.0025)  # taller than the target: room for the bar
 
 
-def shots_of(characters: str, matrix: np.ndarray, shining: float = 0.0, seed: int = 0) -> Shots:
+def capture_set_of(characters: str, matrix: np.ndarray, shining: float = 0.0, seed: int = 0) -> CaptureSet:
     """Captures of 11 frames: the target, a bar that moves along, ambient light, noise, 8 bits."""
     rng = np.random.default_rng(seed)
     glyphs = FontGlyphs(family="kalam", characters=characters)
@@ -76,14 +76,18 @@ def shots_of(characters: str, matrix: np.ndarray, shining: float = 0.0, seed: in
         light = gain * drawn.reshape(11, -1) @ matrix.T + 0.05
         noisy = np.clip(light + rng.normal(0, 0.004, light.shape), 0, 1)
         captures.append(replace(capture, frames=np.round(255 * noisy).astype(np.uint8).reshape(11, *SHAPE)))
-    return Shots(tuple(captures), 0.08)
+    return CaptureSet(tuple(captures), 0.08)
 
 
 @pytest.fixture(scope="module")
 def rendered():
     matrix = operator(bent=0.8)
     gain = 3.0 / float((matrix @ np.ones(matrix.shape[1], np.float32)).max())
-    return shots_of("ABDEHLOTX", matrix, SHINING), shots_of("KRZ4", matrix, SHINING, seed=1), gain * matrix
+    return (
+        capture_set_of("ABDEHLOTX", matrix, SHINING),
+        capture_set_of("KRZ4", matrix, SHINING, seed=1),
+        gain * matrix,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -130,8 +134,11 @@ def test_intervals_hold_the_truth(fitted):
 def test_mirrored_frames_are_refused(rendered):
     fit, held, _ = rendered
     turned = [
-        Shots(tuple(replace(c, frames=np.ascontiguousarray(c.frames[..., ::-1])) for c in shots.captures), 0.08)
-        for shots in (fit, held)
+        CaptureSet(
+            tuple(replace(c, frames=np.ascontiguousarray(c.frames[..., ::-1])) for c in capture_set.captures),
+            0.08,
+        )
+        for capture_set in (fit, held)
     ]
     with pytest.raises(DataError, match="the other way round"):
         fit_wall(turned[0], turned[1], KNOWN, columns=24)
@@ -146,7 +153,7 @@ def test_frames_that_do_not_follow_the_targets_are_refused(rendered):
         for c, t in zip(fit.captures, names, strict=True)
     )
     with pytest.raises(DataError, match="explain"):
-        fit_wall(Shots(wrong, 0.08), held, KNOWN, columns=24)
+        fit_wall(CaptureSet(wrong, 0.08), held, KNOWN, columns=24)
 
 
 def test_normal_equations_are_those_of_the_residual(rendered):

@@ -123,7 +123,7 @@ def run_demo(settings: Demo) -> Path:
 
     single = [record for record in records if record.arm in [arm.name for arm in study.arms]]
     runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
-    dataset, results = gather(runs, out / "shots" / single[0].settings["captures"])
+    dataset, results = gather(runs, out / "recorded" / single[0].settings["captures"])
     setup = named_setup(out / "setups" / study.setup) if settings.calibrate else None
     path = write_report(out / "report.html", dataset, results, notes, setup=setup)
     for note in notes:

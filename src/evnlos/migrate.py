@@ -108,10 +108,11 @@ def _renamed(values: dict[str, Any], **names: str) -> dict[str, Any]:
 def _record(values: dict[str, Any]) -> dict[str, Any]:
     """The record of an experiment."""
     values = _renamed(values, paradigm="modality", rig="setup")
-    words = (
-        str(values.get("arm", "")).replace(" joint", " sequence").replace("balanced loss", "normalized loss")
-    )
-    return values | {"arm": words} if "arm" in values else values
+    arm = str(values.get("arm", ""))
+    words = {" joint": " sequence", "balanced loss": "normalized loss", " shots": " captures"}
+    for before, now in words.items():
+        arm = arm.replace(before, now)
+    return values | {"arm": arm} if "arm" in values else values
 
 
 def _capture(values: dict[str, Any]) -> dict[str, Any]:

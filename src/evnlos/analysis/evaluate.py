@@ -145,7 +145,7 @@ def _shifted(images: Tensor, shift_px: Tensor) -> Tensor:
     return F.grid_sample(images[:, None].float(), grid, align_corners=False)[:, 0]
 
 
-BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest shot"}
+BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest neighbour"}
 """Heading of each baseline."""
 
 CHECKS = {

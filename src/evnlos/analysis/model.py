@@ -148,14 +148,14 @@ class Model:
                 sequences is not told the motion.
         """
         tracked = setup_for_track(setup) if track else None
-        shot = recording if isinstance(recording, Capture) else read_capture(recording)
-        samples = capture_samples(shot, self.weights.sampling, pattern)
+        capture = recording if isinstance(recording, Capture) else read_capture(recording)
+        samples = capture_samples(capture, self.weights.sampling, pattern)
         warnings: list[str] = []
         if tracked is not None:
             from evnlos.tracking import track_capture, track_doubts
 
-            path = track_capture(shot, tracked, pattern=pattern)
-            warnings = track_doubts(shot, tracked, path)
+            path = track_capture(capture, tracked, pattern=pattern)
+            warnings = track_doubts(capture, tracked, path)
             samples = replace(samples, position_m=path.at(samples.time_s))
         images = reconstruct(self.weights, samples.frame, samples.surface, samples.position_m)
         unjudged = why_unjudged(self.weights, samples)

@@ -1,7 +1,7 @@
 """Names of `evnlos.calibration`; `__init__.py` reads this list."""
 
-from .captures import Shots as Shots
-from .captures import read_shots as read_shots
+from .captures import CaptureSet as CaptureSet
+from .captures import read_capture_set as read_capture_set
 from .event_fit import PixelFit as PixelFit
 from .event_fit import fit_pixel as fit_pixel
 from .fit import Example as Example

@@ -23,7 +23,7 @@ FEWEST = 3
 
 
 @dataclass(frozen=True)
-class Shots:
+class CaptureSet:
     """Captures of one setup, in the order of their names.
 
     Args:
@@ -73,7 +73,7 @@ class Shots:
         return np.repeat(np.arange(len(self.captures)), [len(capture.frames) for capture in self.captures])
 
 
-def read_shots(
+def read_capture_set(
     folders: Iterable[str | Path],
     *,
     exclude: Sequence[str] = (),
@@ -81,7 +81,7 @@ def read_shots(
     share: float = 0.25,
     seed: int = 0,
     target_size_m: float | None = None,
-) -> tuple[Shots, Shots]:
+) -> tuple[CaptureSet, CaptureSet]:
     """Read the captures of one setup and split them into those to fit and those to check the fit on.
 
     Args:
@@ -120,8 +120,8 @@ def read_shots(
             f"{len(held)} of {len(chosen)} captures are held out; leave {FEWEST - 1} or more to fit"
         )
     return (
-        Shots(tuple(capture for capture in captures if capture.name not in held), side),
-        Shots(tuple(capture for capture in captures if capture.name in held), side),
+        CaptureSet(tuple(capture for capture in captures if capture.name not in held), side),
+        CaptureSet(tuple(capture for capture in captures if capture.name in held), side),
     )
 
 
@@ -248,7 +248,7 @@ class WallData:
 
 
 def wall_data(
-    shots: Shots,
+    capture_set: CaptureSet,
     columns: int,
     plane: Plane,
     *,
@@ -259,23 +259,23 @@ def wall_data(
     """Return the frames of captures at a working size, and their targets as pictures on a plane's cells.
 
     Args:
-        shots: The captures.
+        capture_set: The captures.
         columns: Columns of the working pictures, at most the sensor's.
         plane: Cells, over the whole travel.
         every: Only every n-th frame of a capture takes part.
         first: The first of them; None is the middle of the first n.
         checkered: Whether only every second pixel takes part, in the pattern of a chessboard.
     """
-    height, width = shots.shape
+    height, width = capture_set.shape
     columns = min(columns, width)
     grid = (max(8, round(columns * height / width)), columns) if columns < width else (height, width)
     begin = every // 2 if first is None else first
     frames, pictures, capture, places = [], [], [], []
-    for k, one in enumerate(shots.captures):
+    for k, one in enumerate(capture_set.captures):
         picked = np.arange(begin, len(one.frames), every)
-        frames.append(reduce_by_area(one.frames[picked] / np.float32(shots.peak), grid))
-        scene = shots.scenes[k]
-        place = scene.motion.position_m(shots.times_s(k)[picked])
+        frames.append(reduce_by_area(one.frames[picked] / np.float32(capture_set.peak), grid))
+        scene = capture_set.scenes[k]
+        place = scene.motion.position_m(capture_set.times_s(k)[picked])
         pictures.append(scene.target.rasterise(plane, place).reshape(len(picked), -1))
         capture.append(np.full(len(picked), k))
         places.append(place)
@@ -288,7 +288,7 @@ def wall_data(
     weight = 1 / (level + 0.05 * level.max() + 1e-9)
     frame, index = np.nonzero(drawn)
     return WallData(
-        shots.shape,
+        capture_set.shape,
         ((u.ravel() + 0.5) * width / grid[1] - 0.5)[keep],
         ((v.ravel() + 0.5) * height / grid[0] - 0.5)[keep],
         light,

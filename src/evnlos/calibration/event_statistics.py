@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Shots
+from evnlos.calibration.captures import CaptureSet
 from evnlos.calibration.frame_model import local_square
 from evnlos.calibration.transport_fit import Residual
 from evnlos.cameras import PixelSettings, simulate_events
@@ -64,18 +64,18 @@ class Recording:
         return simulate_events(self.light, self.times_s, pixel, seed=seed)
 
 
-def read_recordings(shots: Shots, setup: Setup, count: int) -> list[Recording]:
+def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[Recording]:
     """Render the light of `count` captures, evenly chosen, from a fitted setup.
 
     Raises:
         DataError: The sensor is so large that not even one capture's light fits in 1 GiB.
     """
-    height, width = shots.shape
-    chosen = np.unique(np.linspace(0, len(shots.captures) - 1, count).round().astype(int))
+    height, width = capture_set.shape
+    chosen = np.unique(np.linspace(0, len(capture_set.captures) - 1, count).round().astype(int))
     recordings, used = [], 0
     for k in chosen:
-        capture, scene = shots.captures[k], shots.scenes[k]
-        wall = setup.resized(shots.shape).observe(scene)
+        capture, scene = capture_set.captures[k], capture_set.scenes[k]
+        wall = setup.resized(capture_set.shape).observe(scene)
         first, last = (float(t) * 1e-6 for t in capture.frame_times_us[[0, -1]])
         steps = max(8, math.ceil((last - first) * wall.speed_px_s / _STEP_PX))
         used += 4 * (steps + 1) * height * width
@@ -185,7 +185,7 @@ Maps = dict[str, NDArray[np.float32]]
 
 
 def event_residuals(
-    shots: Shots,
+    capture_set: CaptureSet,
     recordings: Sequence[Recording],
     before: PixelSettings,
     after: PixelSettings,
@@ -195,7 +195,7 @@ def event_residuals(
     """Compare recorded events with the mean of simulated ones under the same light.
 
     Args:
-        shots: The captures.
+        capture_set: The captures.
         recordings: Light and events of some of them.
         before: Pixel of the start.
         after: Fitted pixel.
@@ -207,7 +207,7 @@ def event_residuals(
         (the standard sample's maps); their noise is that of one simulated recording against the mean. And the
         surfaces [N, 2, h, w] of camera and model by capture.
     """
-    edges = [shots.captures[r.index].frame_times_us for r in recordings]
+    edges = [capture_set.captures[r.index].frame_times_us for r in recordings]
     seen = _maps([r.events for r in recordings], edges, sampling)
     mean = {
         name: _mean_maps(recordings, pixel, edges, sampling, derive_seed(seed, "check"))
@@ -221,7 +221,7 @@ def event_residuals(
         residuals[kind] = Residual(**distance, noise=_rms(other[kind] - mean["after"][kind]) / spread)
     lengths = np.cumsum([len(e) - 1 for e in edges])[:-1]
     pairs = zip(*(np.split(m["surfaces"], lengths) for m in (seen, mean["after"])), strict=True)
-    names = [shots.names[r.index] for r in recordings]
+    names = [capture_set.names[r.index] for r in recordings]
     return residuals, dict(zip(names, pairs, strict=True))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Shots, read_shots
+from evnlos.calibration.captures import CaptureSet, read_capture_set
 from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
 from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
@@ -137,7 +137,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
             not follow the targets.
     """
     settings = Calibration() if settings is None else settings
-    fit, held = read_shots(
+    fit, held = read_capture_set(
         folders,
         exclude=settings.exclude,
         holdout=settings.holdout,
@@ -179,9 +179,9 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
         pixel = fit_pixel(recordings, start_pixel, seed=settings.seed)
         pixel = choose_pixel(pixel, recordings, there, seed=settings.seed)
         simulation = simulation.with_setup(pixel=pixel.pixel)
-        for name, (shots, found) in {"fit": (fit, recordings), "held out": (held, there)}.items():
+        for name, (capture_set, found) in {"fit": (fit, recordings), "held out": (held, there)}.items():
             events, surfaces = event_residuals(
-                shots, found, start_pixel, pixel.pixel, simulation.sampling, settings.seed
+                capture_set, found, start_pixel, pixel.pixel, simulation.sampling, settings.seed
             )
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
@@ -208,20 +208,21 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
     )
 
 
-def _is_any(settings: Calibration, fit: Shots) -> bool:
+def _is_any(settings: Calibration, fit: CaptureSet) -> bool:
     """Return whether a wall of any kind is fitted."""
     enough = settings.wall == "any" or (settings.wall == "auto" and len(fit.captures) >= _FEWEST_FOR_ANY)
     return settings.targets == "known" and enough
 
 
-def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[Setup, tuple[str, ...]]:
+def _at_known_distance(settings: Calibration, capture_set: CaptureSet) -> tuple[Setup, tuple[str, ...]]:
     """Return the start at the measured distance of target and wall, and the names of what is known."""
-    noted = shots.captures[0].info.setup.get("distance_m")
+    noted = capture_set.captures[0].info.setup.get("distance_m")
     setup = settings.start.setup
     if noted is not None:
         if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not noted > 0:
             raise DataError(
-                f"{shots.names[0]}: setup.distance_m is {noted!r}; give the metres from target to wall, above 0"
+                f"{capture_set.names[0]}: setup.distance_m is {noted!r}; give the metres from target to "
+                "wall, above 0"
             )
         if setup.default_distance_m is not None:
             setup = setup.with_parameters({"distance_m": float(noted)})
@@ -229,11 +230,11 @@ def _at_known_distance(settings: Calibration, shots: Shots) -> tuple[Setup, tupl
 
 
 def _simulation(
-    settings: Calibration, shots: Shots, setup: Setup, noise: FrameNoise, pixel: EventPixel
+    settings: Calibration, capture_set: CaptureSet, setup: Setup, noise: FrameNoise, pixel: EventPixel
 ) -> Simulation:
     """Return the start with everything that the captures tell: target, motion, length, positions, sensor."""
-    scene, start = shots.scenes[0], settings.start
-    times = shots.times_s(0)
+    scene, start = capture_set.scenes[0], settings.start
+    times = capture_set.times_s(0)
     motion = scene.motion
     assert isinstance(motion, LineMotion)  # the only motion that a capture describes
     x, y = motion.position_m(times[0])
@@ -244,11 +245,13 @@ def _simulation(
         motion=replace(motion, start_m=(float(x), float(y)), start_s=0.0),
         duration_s=float(times[-1] - times[0]),
         positions=len(times) - 1,
-        setup=replace(setup, sensor=SensorSize(*shots.shape), frame_camera=noise.camera, pixel=pixel),
+        setup=replace(setup, sensor=SensorSize(*capture_set.shape), frame_camera=noise.camera, pixel=pixel),
     )
 
 
-def _examples(held: Shots, model: FrameModel, predicted: NDArray, surfaces: Surfaces) -> tuple[Example, ...]:
+def _examples(
+    held: CaptureSet, model: FrameModel, predicted: NDArray, surfaces: Surfaces
+) -> tuple[Example, ...]:
     """Return the middle frame of some held-out captures beside the model's, and the surfaces at that frame."""
     of = held.frame_of()
     chosen = []

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Shots
+from evnlos.calibration.captures import CaptureSet
 from evnlos.cameras import FrameCamera
 from evnlos.data.cleaning import FixedPattern
 from evnlos.data.sampling import reduce_by_area
@@ -61,7 +61,7 @@ class FrameModel:
     Pixels that a frame shows at its largest number are saturated and take no part.
 
     Args:
-        shots: The captures.
+        capture_set: The captures.
         shape: Working size (h, w), pixels; frames are reduced to it by area averaging.
         every: Only every n-th frame of a capture takes part.
 
@@ -73,16 +73,16 @@ class FrameModel:
         ConfigError: `every` is below 1.
     """
 
-    def __init__(self, shots: Shots, shape: tuple[int, int], every: int = 1) -> None:
+    def __init__(self, capture_set: CaptureSet, shape: tuple[int, int], every: int = 1) -> None:
         if every < 1:
             raise ConfigError(f"every is {every}; take every frame (1) or every n-th")
         self.shape = shape
-        self._scenes = shots.scenes
-        self._times = [shots.times_s(k)[::every] for k in range(len(shots.captures))]
-        raw = np.concatenate([capture.frames[::every] for capture in shots.captures])
-        reduced = reduce_by_area(raw / np.float32(shots.peak), shape)
+        self._scenes = capture_set.scenes
+        self._times = [capture_set.times_s(k)[::every] for k in range(len(capture_set.captures))]
+        raw = np.concatenate([capture.frames[::every] for capture in capture_set.captures])
+        reduced = reduce_by_area(raw / np.float32(capture_set.peak), shape)
         self.frames = torch.from_numpy(reduced)
-        open_share = reduce_by_area((raw < shots.peak).astype(np.float32), shape)
+        open_share = reduce_by_area((raw < capture_set.peak).astype(np.float32), shape)
         self.weight = torch.from_numpy((open_share > 0.999).astype(np.float32))
         y, x = torch.linspace(-1, 1, shape[0]), torch.linspace(-1, 1, shape[1])
         self._ramp = torch.stack([torch.ones(shape), x.expand(shape), y[:, None].expand(shape)])  # [3, h, w]
@@ -190,11 +190,11 @@ def working_shape(shape: tuple[int, int], columns: int) -> tuple[int, int]:
     return min(candidates, key=lambda s: (round(abs(s[0] * width / (s[1] * height) - 1), 6), s[1]))
 
 
-def fitting_strip(setup: Setup, shots: Shots) -> Setup:
+def fitting_strip(setup: Setup, capture_set: CaptureSet) -> Setup:
     """Return the setup with room for every target of the captures on its way."""
     reach: NDArray[np.float64] = np.zeros(2)
-    for k, scene in enumerate(shots.scenes):
-        places = np.abs(scene.motion.position_m(shots.times_s(k))).max(axis=0)
+    for k, scene in enumerate(capture_set.scenes):
+        places = np.abs(scene.motion.position_m(capture_set.times_s(k))).max(axis=0)
         reach = np.maximum(reach, places + scene.target.size_m / 2)
     return setup.covering((float(2 * reach[0]), float(2 * reach[1])))
 
@@ -222,7 +222,7 @@ class FrameNoise:
     remaining: tuple[float, float]
 
 
-def fit_frame_noise(shots: Shots, model: NDArray, start: FrameCamera) -> FrameNoise:
+def fit_frame_noise(capture_set: CaptureSet, model: NDArray, start: FrameCamera) -> FrameNoise:
     """Fit full well, read noise and fixed pattern to the residual of the frames.
 
     The variance of the temporal noise is a line over the signal (photon transfer, EMVA 1288): its slope is the
@@ -231,19 +231,19 @@ def fit_frame_noise(shots: Shots, model: NDArray, start: FrameCamera) -> FrameNo
     misfit of the model takes no part. The black level is taken as 0: frames cannot tell it from ambient light.
 
     Args:
-        shots: The captures.
-        model: Predicted frames, white levels, [N, H, W], in the order of `shots.frames()`.
+        capture_set: The captures.
+        model: Predicted frames, white levels, [N, H, W], in the order of `capture_set.frames()`.
         start: Camera whose other settings are kept.
     """
-    peak = float(shots.peak)
-    frames = shots.frames().astype(np.float64)
+    peak = float(capture_set.peak)
+    frames = capture_set.frames().astype(np.float64)
     signal = model.astype(np.float64) * peak
     residual = frames - signal
     mean_signal = signal.mean(axis=0)
     swing = signal - mean_signal
     power = np.maximum((swing**2).sum(axis=0), 1e-9)
     tilt = (swing * residual).sum(axis=0) / power  # a of residual = a signal + b, for each pixel
-    noise, level = _temporal(residual - tilt * swing, signal, shots.frame_of())
+    noise, level = _temporal(residual - tilt * swing, signal, capture_set.frame_of())
     open_ = level < _OPEN * peak
     noise, level = noise[open_], level[open_]
     slope, floor = _photon_transfer(noise, level)
@@ -252,7 +252,7 @@ def fit_frame_noise(shots: Shots, model: NDArray, start: FrameCamera) -> FrameNo
     read_e = math.sqrt(max(floor - 1 / 12, 0.0)) / dn_per_e
     temporal = float(np.sqrt(np.mean(noise**2)))
     prnu, dsnu = _fixed_pattern(residual.mean(axis=0), mean_signal, tilt, power, temporal**2, len(frames))
-    exposure = shots.captures[0].info.camera.exposure_s
+    exposure = capture_set.captures[0].info.camera.exposure_s
     camera = replace(
         start,
         exposure_s=start.exposure_s if exposure is None else exposure,

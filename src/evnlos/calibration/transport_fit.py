@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Shots
+from evnlos.calibration.captures import CaptureSet
 from evnlos.calibration.frame_model import FrameModel, fitting_strip, working_shape
 from evnlos.errors import ConfigError, DataError
 from evnlos.setups import Parameter, Setup
@@ -230,7 +230,7 @@ def _near(parameter: Parameter) -> Parameter:
 
 
 def fit_transport(
-    shots: Shots,
+    capture_set: CaptureSet,
     start: Setup,
     *,
     fixed: tuple[str, ...] = (),
@@ -244,7 +244,7 @@ def fit_transport(
     Levenberg-Marquardt on small pictures and coarse cells, then on larger ones.
 
     Args:
-        shots: The captures to fit.
+        capture_set: The captures to fit.
         start: Where the search starts; its kind is the kind that is fitted.
         fixed: Names of settings that keep their values.
         columns: Columns of the working pictures, pixels; half as many in the coarse stage.
@@ -253,17 +253,17 @@ def fit_transport(
     Raises:
         DataError: The frames do not follow the targets.
     """
-    start = fitting_strip(start, shots)
+    start = fitting_strip(start, capture_set)
     start = start.with_parameters(
         values_of(start)
     )  # what follows from others is written out: it moves by itself
     parameters = parameters_of(start, fixed)
-    coarse = FrameModel(shots, working_shape(shots.shape, columns // 2), _every(shots, 400))
-    fine = FrameModel(shots, working_shape(shots.shape, columns), _every(shots, 200))
+    coarse = FrameModel(capture_set, working_shape(capture_set.shape, columns // 2), _every(capture_set, 400))
+    fine = FrameModel(capture_set, working_shape(capture_set.shape, columns), _every(capture_set, 200))
     quick, _ = _search(coarse, _scanned(coarse, start.coarsened(2.0)), parameters, iterations)
     found, error = _search(fine, quick.coarsened(), parameters, min(iterations, _FINE_STEPS))
     found = found.coarsened()
-    full = FrameModel(shots, shots.shape, _every(shots, 200))
+    full = FrameModel(capture_set, capture_set.shape, _every(capture_set, 200))
     before = start.coarsened()
     before = full.fit(full.light(before))[0].into(before)
     light, _ = full.fit(full.light(found))
@@ -342,6 +342,6 @@ def moved(setup: Setup, parameters: tuple[Parameter, ...], values: NDArray[np.fl
     )
 
 
-def _every(shots: Shots, frames: int) -> int:
+def _every(capture_set: CaptureSet, frames: int) -> int:
     """Return the stride that leaves about this many frames."""
-    return max(1, sum(len(capture.frames) for capture in shots.captures) // frames)
+    return max(1, sum(len(capture.frames) for capture in capture_set.captures) // frames)

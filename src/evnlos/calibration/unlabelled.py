@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Shots
+from evnlos.calibration.captures import CaptureSet
 from evnlos.calibration.frame_model import FrameModel, working_shape
 from evnlos.calibration.transport_fit import (
     Residual,
@@ -211,13 +211,13 @@ class UnlabelledFit:
     """
 
     optics: TransportFit
-    fitted: Shots
-    held_out: Shots
+    fitted: CaptureSet
+    held_out: CaptureSet
     check: Residual
 
 
 def fit_unlabelled(
-    fit: Shots, held: Shots, start: Setup, *, fixed: tuple[str, ...] = (), iterations: int = 25
+    fit: CaptureSet, held: CaptureSet, start: Setup, *, fixed: tuple[str, ...] = (), iterations: int = 25
 ) -> UnlabelledFit:
     """Fit a setup to sequences of unknown objects with known motion, and check it on other sequences.
 
@@ -249,24 +249,25 @@ def fit_unlabelled(
     return UnlabelledFit(optics, seen, other, Residual(before, after, known.noise / light.spread))
 
 
-def _moving(shots: Shots, frames: slice) -> MovingLight:
+def _moving(capture_set: CaptureSet, frames: slice) -> MovingLight:
     """Return what moves in some of the frames of all captures, at the working size."""
-    times = [shots.times_s(k) for k in range(len(shots.captures))]
-    places = [motion.position_m(t) for motion, t in zip(shots.motions, times, strict=True)]
+    times = [capture_set.times_s(k) for k in range(len(capture_set.captures))]
+    places = [motion.position_m(t) for motion, t in zip(capture_set.motions, times, strict=True)]
     count = min(len(one) for one in places)
     every = max(1, -(-count // _MOST_FRAMES))
     chosen = np.arange(0, count, every)[frames]
     first = places[0][chosen]
-    for name, other in zip(shots.names, places, strict=True):
+    for name, other in zip(capture_set.names, places, strict=True):
         if not np.allclose(other[chosen], first, atol=1e-3):
             raise DataError(
-                f"{name} moves in another way than {shots.names[0]}; calibrate one motion at a time"
+                f"{name} moves in another way than {capture_set.names[0]}; calibrate one motion at a time"
             )
-    shape = working_shape(shots.shape, _COLUMNS)
+    shape = working_shape(capture_set.shape, _COLUMNS)
     pictures = [
-        reduce_by_area(capture.frames[chosen] / np.float32(shots.peak), shape) for capture in shots.captures
+        reduce_by_area(capture.frames[chosen] / np.float32(capture_set.peak), shape)
+        for capture in capture_set.captures
     ]
-    return MovingLight(torch.from_numpy(np.stack(pictures)), first, shots.target_size_m, CELLS)
+    return MovingLight(torch.from_numpy(np.stack(pictures)), first, capture_set.target_size_m, CELLS)
 
 
 def _scanned(light: MovingLight, start: Setup) -> Setup:
@@ -321,14 +322,15 @@ def _missed(given: MovingLight, asked: MovingLight, setup: Setup) -> float:
     return float(away.square().mean().sqrt()) / asked.spread
 
 
-def _with_targets(shots: Shots, found: Explained) -> Shots:
+def _with_targets(capture_set: CaptureSet, found: Explained) -> CaptureSet:
     """Return the captures with the expected targets as their targets."""
-    return Shots(
+    return CaptureSet(
         tuple(
             replace(
-                capture, target=Target(capture.name, target.clamp(0, 1).float().numpy(), shots.target_size_m)
+                capture,
+                target=Target(capture.name, target.clamp(0, 1).float().numpy(), capture_set.target_size_m),
             )
-            for capture, target in zip(shots.captures, found.targets, strict=True)
+            for capture, target in zip(capture_set.captures, found.targets, strict=True)
         )
     )
 

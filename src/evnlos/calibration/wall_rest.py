@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Shots, WallData, wall_data
+from evnlos.calibration.captures import CaptureSet, WallData, wall_data
 from evnlos.calibration.wall_fit import WallState
 from evnlos.data.sampling import reduce_by_area
 from evnlos.optics.facets import MASKING, fill_facets, seen_points, target_cells
@@ -51,7 +51,7 @@ class WallRest:
     kept: tuple[str, ...]
 
 
-def rest_of(fit: Shots, held: Shots, state: WallState, plane: Plane) -> WallRest:
+def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -> WallRest:
     """Return the wall with what its pose and slopes leave, as the held-out captures want.
 
     Args:
@@ -130,9 +130,13 @@ def rest_of(fit: Shots, held: Shots, state: WallState, plane: Plane) -> WallRest
     return WallRest(wall, level, explained, tuple(kept))
 
 
-def _both(fit: Shots, held: Shots, columns: int, plane: Plane, every: int) -> tuple[WallData, WallData]:
+def _both(
+    fit: CaptureSet, held: CaptureSet, columns: int, plane: Plane, every: int
+) -> tuple[WallData, WallData]:
     """Return the data of two sets of captures over the same pixels."""
-    data, other = (wall_data(shots, columns, plane, every=every, first=every - 1) for shots in (fit, held))
+    data, other = (
+        wall_data(capture_set, columns, plane, every=every, first=every - 1) for capture_set in (fit, held)
+    )
     return data.pixels(np.isin(data.pixel, other.pixel)), other.pixels(np.isin(other.pixel, data.pixel))
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.calibration.captures import Array, Shots, WallData, wall_data
+from evnlos.calibration.captures import Array, CaptureSet, WallData, wall_data
 from evnlos.calibration.transport_fit import TransportFit
 from evnlos.calibration.wall_fit import FREEDOMS, Freedom, Progress, WallState, refine, start_at, uncertainty
 from evnlos.calibration.wall_rest import WallRest, rest_of
@@ -55,7 +55,7 @@ _CAUTION = 2.0  # on errors: slopes and pose make up for each other further than
 
 
 def search_wall(
-    shots: Shots, known: Pose, freedoms: Sequence[Freedom], plane: Plane, *, columns: int = 60
+    capture_set: CaptureSet, known: Pose, freedoms: Sequence[Freedom], plane: Plane, *, columns: int = 60
 ) -> WallSearch:
     """Find the wall and the pose that explain the frames of captures with known targets.
 
@@ -64,7 +64,7 @@ def search_wall(
     light, and whatever else moves along.
 
     Args:
-        shots: The captures.
+        capture_set: The captures.
         known: What is known of the pose.
         freedoms: The numbers that are searched, with how well they are known.
         plane: Cells of the targets' pictures, over the whole travel.
@@ -77,15 +77,15 @@ def search_wall(
     rows = max(1, round(plane.extent_m[0] / side))
     side = plane.extent_m[0] / rows
     wide = Plane(rows, math.ceil(plane.extent_m[1] / side - 1e-9), side)
-    frames = sum(len(capture.frames) for capture in shots.captures)
-    coarse = wall_data(shots, _COARSE, wide, every=max(1, frames // _COARSE_FRAMES))
+    frames = sum(len(capture.frames) for capture in capture_set.captures)
+    coarse = wall_data(capture_set, _COARSE, wide, every=max(1, frames // _COARSE_FRAMES))
     quick: list[tuple[Progress, Pose]] = []
     for state in _scanned(coarse, known)[:_TRIED]:
         prior = replace(known, target_offset_m=state.pose.target_offset_m)
         quick.append((refine(coarse, state, prior=prior, freedoms=freedoms, iterations=8), prior))
     quick.sort(key=lambda one: one[0].cost())
     best, prior = quick[0]
-    fine = wall_data(shots, columns, plane, every=max(1, frames // _FINE_FRAMES), checkered=True)
+    fine = wall_data(capture_set, columns, plane, every=max(1, frames // _FINE_FRAMES), checkered=True)
     found = refine(fine, best.state, prior=prior, freedoms=freedoms, iterations=8)
     error = uncertainty(fine, found.state, prior=prior, freedoms=freedoms)
     weights = np.array([math.exp(-0.5 * (one.cost() - best.cost())) for one, _ in quick])
@@ -166,7 +166,7 @@ class WallFit:
 
 
 def fit_wall(
-    fit: Shots, held: Shots, start: RadiometricSetup, *, fit_distance: bool = False, columns: int = 60
+    fit: CaptureSet, held: CaptureSet, start: RadiometricSetup, *, fit_distance: bool = False, columns: int = 60
 ) -> WallFit:
     """Fit a wall of any kind to captures with known targets.
 
@@ -204,12 +204,12 @@ def fit_wall(
     return WallFit(TransportFit(before, found, searched, search.error), search, rest)
 
 
-def travelled(fit: Shots, held: Shots, cell_m: float) -> Plane:
+def travelled(fit: CaptureSet, held: CaptureSet, cell_m: float) -> Plane:
     """Return the cells that hold every target of the captures on its way."""
     reach = np.zeros(2)
-    for shots in (fit, held):
-        for k, scene in enumerate(shots.scenes):
-            places = np.abs(scene.motion.position_m(shots.times_s(k))).max(axis=0)
+    for capture_set in (fit, held):
+        for k, scene in enumerate(capture_set.scenes):
+            places = np.abs(scene.motion.position_m(capture_set.times_s(k))).max(axis=0)
             reach = np.maximum(reach, places + scene.target.size_m / 2)
     columns, rows = (max(1, math.ceil(2 * float(side) / cell_m - 1e-6)) for side in reach)
     return Plane(rows, columns, cell_m)

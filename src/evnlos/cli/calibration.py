@@ -128,7 +128,9 @@ class ScanCommand:
         print(
             f"{self.folder}: {info.pattern}, {plane.height} x {plane.width} cells of {1e3 * plane.pitch_m:g} mm"
         )
-        print(f"{found.shots} pictures in frames.csv, about {minutes:.1f} min at this exposure and overhead")
+        print(
+            f"{found.scan_frames} pictures in frames.csv, about {minutes:.1f} min at this exposure and overhead"
+        )
         print(
             f"expected noise of an entry, brightest pixel: {100 * found.noise:.2g} % of the brightest one "
             f"({found.cell_level:.2g} white levels); with {found.other}: {100 * found.other_noise:.2g} %"

@@ -170,7 +170,7 @@ class CaptureCommand:
     action: Annotated[Literal["init", "check"], tyro.conf.Positional]
     """init writes capture.yaml; check reads the recording and tells what is wrong and how to mend it."""
     folder: Annotated[Path, tyro.conf.Positional]
-    """The folder of the shot."""
+    """The folder of the capture."""
     width: int = 1280
     """init: columns of the event camera's sensor, pixels."""
     height: int = 800

@@ -40,12 +40,13 @@ class ExperimentCommand:
     """Run an experiment on captures: calibrate, simulate, pre-train, fine-tune, compare; resumable."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """captures (E2E against EPNP), paper (its settings), frozen, shots, surface, thresholds, loss, width,
-    embedding, sequence (whole sequences) or objects (how many are simulated);
-    without captures: simulation (handwriting, transfer to Comic), conditions (frames against events over
-    light, noise, exposure, speed and setups), carry-over (given weights on unseen hands, other things than
-    characters, and other walls, with what their confidence says), and mismatch (the demo on walls, lenses and
-    sensors that the simulator does not describe)."""
+    """captures (E2E against EPNP), paper (its settings), frozen, capture-count, surface, thresholds, loss,
+    width, embedding, sequence (whole sequences) or objects (how many are simulated); without captures:
+    simulation (handwriting, transfer to Comic), conditions (frames against events over light, noise, exposure,
+    speed and setups), carry-over (given weights on unseen hands, other things than characters, and other walls,
+    with what their confidence says), and mismatch (the demo on walls, lenses and sensors that the simulator
+    does not describe).
+    """
     captures: Path | None = None
     """Folder of the capture folders."""
     weights: Path | None = None

@@ -112,6 +112,7 @@ _RENAMED_IN = {  # the same, of one command
     ("experiment", "--joint"): ("--sequence",),
     ("experiment", "--no-joint"): ("--no-sequence",),
 }
+_EXPERIMENTS = {"joint": "sequence", "shots": "capture-count"}  # their names before -> today's
 
 
 _MOVED = {  # beginning of the flags of a setting that moved, by command
@@ -141,9 +142,9 @@ def todays_words(verb: str, words: list[str]) -> list[str]:
             continue
         say(f"note: {flag} is now {' '.join(today)}")
         found += [*today[:-1], f"{today[-1]}{equals}{value}"]
-    if verb == "experiment" and found[:1] == ["joint"]:
-        say("note: the experiment joint is now called sequence")
-        found[0] = "sequence"
+    if verb == "experiment" and found and (name := _EXPERIMENTS.get(found[0])):
+        say(f"note: the experiment {found[0]} is now called {name}")
+        found[0] = name
     return found
 
 

@@ -1,4 +1,4 @@
-"""A capture: one real (or pseudo-real) shot as a folder of frames, events and what is known about them.
+"""A capture: one real (or pseudo-real) recording as a folder of frames, events and what is known about them.
 
 - Real recordings become the same kind of dataset as simulated ones.
 """
@@ -40,7 +40,7 @@ _MOST_US = 2**62  # of a time stamp: differences of two fit into 64 bits
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """One shot, read and checked: frames and events on the same pixels and the same clock.
+    """One capture, read and checked: frames and events on the same pixels and the same clock.
 
     Args:
         name: Name of the capture, that of its folder.
@@ -101,7 +101,7 @@ def read_capture(folder: str | Path, most_frame_bytes: int | None = None) -> Cap
     The order is: dark frame and flat field, registration, filters of the events, clock, region of interest.
 
     Args:
-        folder: The folder of one shot.
+        folder: The folder of one capture.
         most_frame_bytes: Memory that its frames may take, bytes; None = a quarter of what is free, up to 2 GiB.
 
     Raises:
@@ -266,7 +266,7 @@ def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern 
     """Return one sample for each frame but the first: the frame, and the events since the frame before.
 
     Args:
-        capture: The shot.
+        capture: The capture.
         sampling: Resolution and representation.
         pattern: Fixed pattern to take from the frames.
 

@@ -1,4 +1,4 @@
-"""Is a shot worth a day of recordings? What was recorded, in plain words, and how to mend it.
+"""Is a capture worth a day of recordings? What was recorded, in plain words, and how to mend it.
 
 - One picture a capture, for the eye: do frames and events show the same thing at the same time?
 """

@@ -1,4 +1,4 @@
-"""What `capture.yaml` says about a shot; a user writes it, everything but the camera's size has a default.
+"""What `capture.yaml` says about a capture; a user writes it, everything but the camera's size has a default.
 
 - The commented `capture.yaml` that a new capture folder begins with.
 """
@@ -65,7 +65,7 @@ class MotionInfo:
     """Direction (x to the right, y downwards)."""
     start_us: int = 0
     """Instant of the start on the events' clock, microseconds: the time stamp that ties the truth to the
-    shot."""
+    capture."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class RegistrationInfo:
     points: tuple[tuple[float, float, float, float], ...] | None = None
     """At least four of (frame x, frame y, event x, event y), pixels."""
     dots: DotsInfo | None = None
-    """A calibration shot of a grid of dots."""
+    """A calibration capture of a grid of dots."""
 
     def __post_init__(self) -> None:
         given = [name for name in ("homography", "points", "dots") if getattr(self, name) is not None]
@@ -193,7 +193,7 @@ def read_capture_info(folder: Path) -> CaptureInfo:
 
 
 _TEMPLATE = """\
-# One shot: a hidden target moves past, an event camera and a frame camera watch the wall.
+# One capture: a hidden target moves past, an event camera and a frame camera watch the wall.
 # Lines that begin with # are notes, or settings that you may need; `evnlos capture check FOLDER` reads what you
 # recorded and says what is wrong with it.
 
@@ -236,7 +236,7 @@ def begin_capture(folder: str | Path, width: int, height: int, name: str = "my c
     """Write a commented `capture.yaml` into a new or empty folder and return its path.
 
     Args:
-        folder: The folder of the shot.
+        folder: The folder of the capture.
         width: Columns of the event camera's sensor, pixels.
         height: Rows, pixels.
         name: Maker and model.
@@ -247,7 +247,7 @@ def begin_capture(folder: str | Path, width: int, height: int, name: str = "my c
     folder = Path(folder)
     path = folder / "capture.yaml"
     if folder.exists() and not folder.is_dir():
-        raise DataError(f"{folder} is a file; give a folder for the shot")
+        raise DataError(f"{folder} is a file; give a folder for the capture")
     if path.exists():
         raise DataError(f"{path} exists; edit it, or give another folder")
     if width < 1 or height < 1:

@@ -1,6 +1,6 @@
 """The sensor of a rendered laboratory: drawn once a setup, from ranges that are not the training simulator's.
 
-- Pseudo-real captures: shots that the training simulator did not make, for people without a camera.
+- Pseudo-real captures: recordings that the training simulator did not make, for people without a camera.
 """
 
 from __future__ import annotations

@@ -72,18 +72,18 @@ def frozen(setup: str) -> Study:
     return Study("frozen", setup, tuple(arms))
 
 
-def shots(setup: str) -> Study:
-    """Return the ablation of the number of real shots, with and without pre-training."""
-    arms = [Arm("EPNP 0 shots", "calibrated", PRETRAINING, None)]
+def capture_count(setup: str) -> Study:
+    """Return the ablation of the number of captures, with and without pre-training."""
+    arms = [Arm("EPNP 0 captures", "calibrated", PRETRAINING, None)]
     for count in (1, 2, 4, 8, 16, None):
-        words = f"{count or 'all'} shots"
-        # As many steps with few shots as with all: an epoch is shorter.
+        words = f"{count or 'all'} captures"
+        # As many steps with few captures as with all: an epoch is shorter.
         longer = 1 if count is None else round(28 / count)
         fine = replace(FINETUNING, epochs=FINETUNING.epochs * min(longer, 8))
         alone = replace(END_TO_END, epochs=END_TO_END.epochs * min(longer, 8))
-        arms.append(replace(_EPNP, name=f"EPNP {words}", shots=count, finetuning=fine))
-        arms.append(replace(_E2E, name=f"E2E {words}", shots=count, finetuning=alone))
-    return Study("shots", setup, tuple(arms))
+        arms.append(replace(_EPNP, name=f"EPNP {words}", captures=count, finetuning=fine))
+        arms.append(replace(_E2E, name=f"E2E {words}", captures=count, finetuning=alone))
+    return Study("capture-count", setup, tuple(arms))
 
 
 def surface(setup: str) -> Study:
@@ -223,7 +223,7 @@ STUDIES: dict[str, Callable[[str], Study]] = {
     "captures": captures,
     "paper": paper,
     "frozen": frozen,
-    "shots": shots,
+    "capture-count": capture_count,
     "surface": surface,
     "thresholds": thresholds,
     "loss": loss,

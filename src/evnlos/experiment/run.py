@@ -127,20 +127,20 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))
     networks, records = [], list[Record]()
     for arm in study.arms:
-        shots = _import(study, arm, place, progress)
+        recorded = _import(study, arm, place, progress)
         made = _simulate(study, arm, place, progress)
         for modality in study.modalities:
-            plans = [_planned(study, arm, modality, seed, made, shots, place) for seed in study.seeds]
-            networks.append((arm, shots, made, modality, plans))
+            plans = [_planned(study, arm, modality, seed, made, recorded, place) for seed in study.seeds]
+            networks.append((arm, recorded, made, modality, plans))
     if place.trainings != 1:
         every = [run for *_, plans in networks for runs, _ in plans for run in runs]
         train_together(every, place.trainings, progress)
-    for arm, shots, made, modality, plans in networks:
+    for arm, recorded, made, modality, plans in networks:
         for runs, _ in plans:
             for run in runs:
                 train_one(run, progress)
         last = [(runs[-1].out, decided) for runs, decided in plans]
-        records += score_arm(study, arm, modality, last, made, shots, place, progress)
+        records += score_arm(study, arm, modality, last, made, recorded, place, progress)
     return records
 
 
@@ -190,7 +190,7 @@ def _simulate(study: Study, arm: Arm, place: Place, progress: Progress) -> Datas
 def _chosen(study: Study, arm: Arm, place: Place) -> list[Path]:
     """Return the captures that an arm learns from and is scored on."""
     chosen = [f for f in place.captures if not (study.validation and character_of(f.name) in study.test)]
-    return chosen if arm.shots is None else _few(chosen, arm.shots, (*study.test, *study.validation))
+    return chosen if arm.captures is None else _few(chosen, arm.captures, (*study.test, *study.validation))
 
 
 def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset:
@@ -206,28 +206,28 @@ def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset
             "pattern": pattern and pattern.digest,
         }
     )
-    out = place.out / "shots" / f"{study.setup}-{key[:8]}"
+    out = place.out / "recorded" / f"{study.setup}-{key[:8]}"
     split = {"test": held, "validation": study.validation}
     return import_captures(chosen, out, arm.sampling, **split, pattern=pattern, progress=progress)
 
 
-def _few(folders: list[Path], shots: int, held_out: tuple[str, ...]) -> list[Path]:
-    """Return `shots` captures to train on, the same order for every number, and those held out."""
+def _few(folders: list[Path], count: int, held_out: tuple[str, ...]) -> list[Path]:
+    """Return `count` captures to train on, the same order for every number, and those held out."""
     train_on = [f for f in folders if character_of(f.name) not in held_out]
-    if shots > len(train_on):
-        raise DataError(f"{shots} shots are asked for, {len(train_on)} are there; ask for fewer")
+    if count > len(train_on):
+        raise DataError(f"{count} captures are required, {len(train_on)} are there; ask for fewer")
     order = np.random.default_rng(derive_seed(0, "shots")).permutation(len(train_on))
-    few = {train_on[i] for i in order[:shots]}
+    few = {train_on[i] for i in order[:count]}
     return [f for f in folders if f in few or character_of(f.name) in held_out]
 
 
 def _planned(
-    study: Study, arm: Arm, modality: str, seed: int, made: Dataset | None, shots: Dataset, place: Place
+    study: Study, arm: Arm, modality: str, seed: int, made: Dataset | None, recorded: Dataset, place: Place
 ) -> tuple[list[Run], dict[str, Any]]:
     """Return the trainings of an arm's network, each from the one before it, and what decided them."""
     runs: list[Run] = []
     begin = layers_of(arm.start, modality)[0] if arm.start else None
-    decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": shots.folder.name}
+    decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": recorded.folder.name}
     if arm.pretraining is not None:
         assert made is not None
         settings = replace(arm.pretraining, modality=modality, seed=seed)
@@ -241,12 +241,12 @@ def _planned(
     if arm.finetuning is not None:
         settings = replace(arm.finetuning, modality=modality, seed=seed)
         start = runs[-1].out if runs else begin
-        decides = {"data": shots.folder.name, "settings": to_dict(settings), "from": start and Path(start).name}
+        decides = {"data": recorded.folder.name, "settings": to_dict(settings), "from": start and Path(start).name}
         if arm.choose:
             decides["choose"] = True
         key = config_hash(decides)[:8]
         out = place.out / "runs" / f"{study.setup}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
-        runs.append(Run(shots, settings, out, start, arm.choose))
+        runs.append(Run(recorded, settings, out, start, arm.choose))
     return runs, decided
 
 

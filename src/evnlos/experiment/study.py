@@ -48,7 +48,7 @@ class Arm:
     """Choose on captures held out of the fine-tuning how much of it is taken, if any."""
     writers: int | None = None
     """Writers of the simulated characters; None is as many as the study says."""
-    shots: int | None = None
+    captures: int | None = None
     """Captures to train on; None is all that are there, otherwise the first of a seeded order."""
     sampling: Sampling = field(default_factory=Sampling)
     """Resolution and representation."""
@@ -64,9 +64,9 @@ class Arm:
             raise ConfigError(f"arm {self.name!r} trains nothing; give pre-training, fine-tuning or both")
         if self.choose and (self.pretraining is None or self.finetuning is None):
             raise ConfigError(f"arm {self.name!r}: only a fine-tuning can be chosen; give both trainings")
-        if self.shots is not None and self.shots < 1:
+        if self.captures is not None and self.captures < 1:
             raise ConfigError(
-                f"arm {self.name!r}: shots is {self.shots}; give at least 1, or leave out fine-tuning"
+                f"arm {self.name!r}: captures is {self.captures}; give at least 1, or leave out fine-tuning"
             )
 
 

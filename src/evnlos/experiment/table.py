@@ -39,7 +39,7 @@ def score_arm(
     modality: str,
     runs: list[tuple[Path, dict[str, Any]]],
     made: Dataset | None,
-    shots: Dataset,
+    recorded: Dataset,
     place: Place,
     progress: Progress,
 ) -> list[Record]:
@@ -51,14 +51,14 @@ def score_arm(
         modality: What its networks see.
         runs: Each seed's run and what decided it.
         made: The simulated dataset of the pre-training, where there is one.
-        shots: The captures.
+        recorded: The captures.
         place: Where records are kept.
         progress: Called with each new record.
     """
     folder = place.out / "records" / study.name
     there, new = names_there(folder), list[Record]()
-    samples = NlosDataset(shots, study.split, modality)
-    means = NlosDataset(shots, "train", modality).truth.float().mean(dim=0)
+    samples = NlosDataset(recorded, study.split, modality)
+    means = NlosDataset(recorded, "train", modality).truth.float().mean(dim=0)
     refined = (
         study.refine
         and study.correct_pattern
@@ -70,7 +70,7 @@ def score_arm(
         return Record(study.name, study.setup, name, modality, seed, study.split, {}, {}, {}, {}, settings)
 
     def score(blank: Record, images: Tensor, mean_image: Tensor | None) -> None:
-        found = assess(images, samples, shots, study.split, mean_image, available_lpips())
+        found = assess(images, samples, recorded, study.split, mean_image, available_lpips())
         new.append(keep_scores(blank, found, folder, progress))
 
     def score_variants(images: Tensor, seed: int, settings: dict[str, Any], mean_image: Tensor | None) -> None:
@@ -79,12 +79,12 @@ def score_arm(
             score(plain, images, mean_image)
         moved = record(f"{arm.name} + consistency", seed, settings)
         if refined and moved.name not in there:
-            score(moved, _consistent(study, arm, shots, place, images), mean_image)
+            score(moved, _consistent(study, arm, recorded, place, images), mean_image)
 
     pictures = []
     for (run, settings), seed in zip(runs, study.seeds, strict=True):
         weights = load_weights(run)
-        check_sampling(weights, shots.sampling)
+        check_sampling(weights, recorded.sampling)
         pictures.append(weights.network.infer(samples.inputs, samples.position_m, samples.names))
         score_variants(pictures[-1], seed, settings | {"run": run.name}, weights.mean_image)
     if len(runs) > 1:
@@ -92,8 +92,8 @@ def score_arm(
         score_variants(together, ENSEMBLE, {"runs": [run.name for run, _ in runs]}, means)
     if study.name != "captures":
         return new
-    for name, make in _without_network(study, arm, modality, samples, means, made, shots, place):
-        blank = record(name, 0, {"captures": shots.folder.name})
+    for name, make in _without_network(study, arm, modality, samples, means, made, recorded, place):
+        blank = record(name, 0, {"captures": recorded.folder.name})
         if blank.name not in there:
             score(blank, make(), means)
     return new
@@ -106,17 +106,17 @@ def _without_network(
     samples: NlosDataset,
     mean_image: Tensor,
     made: Dataset | None,
-    shots: Dataset,
+    recorded: Dataset,
     place: Place,
 ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
     """Yield the baselines that belong to an arm, each with what makes its pictures: linear, classical."""
     if arm.pretraining is None:
-        yield "linear, captures", lambda: _linear(shots, modality, samples)
+        yield "linear, captures", lambda: _linear(recorded, modality, samples)
     if arm.finetuning is None and made is not None:
         yield "linear, simulation", lambda: _linear(made, modality, samples)
         if modality == "frame":
             start = mean_image.expand(len(samples), -1, -1)
-            yield "classical inversion", lambda: _consistent(study, arm, shots, place, start)
+            yield "classical inversion", lambda: _consistent(study, arm, recorded, place, start)
 
 
 def _linear(data: Dataset, modality: str, samples: NlosDataset) -> Tensor:
@@ -124,11 +124,11 @@ def _linear(data: Dataset, modality: str, samples: NlosDataset) -> Tensor:
     return fit_linear(known.inputs, known.truth, known.names, modality=known.modality)(samples.inputs)
 
 
-def _consistent(study: Study, arm: Arm, shots: Dataset, place: Place, images: Tensor) -> Tensor:
+def _consistent(study: Study, arm: Arm, recorded: Dataset, place: Place, images: Tensor) -> Tensor:
     """Return pictures of the scored split after data consistency with the calibrated setup."""
     operator = _operator(place.out / "setups" / study.setup, arm.sampling)
-    names = shots.objects(study.split)
-    frames = torch.cat([torch.from_numpy(read_shard(shots.shard(name))[0].frame) for name in names])
+    names = recorded.objects(study.split)
+    frames = torch.cat([torch.from_numpy(read_shard(recorded.shard(name))[0].frame) for name in names])
     return consistent(images, frames, operator, TRUST)
 
 
@@ -235,7 +235,7 @@ def checks_table(records: list[Record]) -> str:
         name = record.arm if record.seed >= 0 else f"{record.arm}, ensemble"
         found[name, record.modality].append(record.checks)
     lines = [
-        "| | read rightly | of the true pictures | nearer to the truth than to any shot |",
+        "| | read rightly | of the true pictures | nearer to the truth than to any capture |",
         "|---|---|---|---|",
     ]
     for (arm, modality), checks in found.items():

@@ -225,13 +225,13 @@ def capture_replay(
     Raises:
         DataError: The capture is damaged.
     """
-    shot = read_capture(folder)
+    capture = read_capture(folder)
     if pattern is not None:
-        images = pattern.correct(shot.frames, shot.peak)
+        images = pattern.correct(capture.frames, capture.peak)
     else:
-        images = shot.frames / np.float32(shot.peak)
-    frames = [TimedFrame(int(t), image) for t, image in zip(shot.frame_times_us, images, strict=True)]
-    return Replay([shot.events], frames, speed=speed, clock=clock, name=str(folder))
+        images = capture.frames / np.float32(capture.peak)
+    frames = [TimedFrame(int(t), image) for t, image in zip(capture.frame_times_us, images, strict=True)]
+    return Replay([capture.events], frames, speed=speed, clock=clock, name=str(folder))
 
 
 def _address(source: str) -> tuple[str, int]:

@@ -256,7 +256,7 @@ def _checks(results: list[RunResult]) -> str:
     heads = "".join(f"<th>{html.escape(label(r))}</th>" for r in results)
     return (
         "<h2>Read, or remembered?</h2><p class=dim>The reader is a small network trained on clean glyphs of "
-        "other hands. “nearest shot” answers with the training object whose measurement is most alike.</p>"
+        "other hands. “nearest neighbour” answers with the training object whose measurement is most alike.</p>"
         f"<div class=wide><table><tr><th></th>{heads}</tr>{''.join(rows)}</table></div>"
     )
 
@@ -282,7 +282,7 @@ def _pictures(dataset: Dataset, results: list[RunResult]) -> str:
     return (
         "<h2>Pictures</h2><p class=dim>The middle position of each object. Wall frame stretched in contrast; "
         f"events as time surface ({WORDS}); reconstructions and truth from 0 to 1.</p>"
-        f"<div class=shots style='{grid}'>{''.join(f'<div>{c}</div>' for c in cells)}</div>"
+        f"<div class=tiles style='{grid}'>{''.join(f'<div>{c}</div>' for c in cells)}</div>"
     )
 
 

@@ -216,14 +216,14 @@ def reconstruct_capture(
     out = Path(out)
     if track:
         setup_for_track(setup)  # before anything is read
-    shot = read_capture(capture)
+    recording = read_capture(capture)
     if weights is None:
-        distance_m = shot.distance_m or (None if setup is None else setup.default_distance_m)
-        weights = published_for(distance_m, "frame", is_motion_known=track or shot.motion is not None)
+        distance_m = recording.distance_m or (None if setup is None else setup.default_distance_m)
+        weights = published_for(distance_m, "frame", is_motion_known=track or recording.motion is not None)
     model = load_model(weights)
     sampling = model.weights.sampling
     check_folder(out)
-    made = model.reconstruct(shot, setup, pattern, track)
+    made = model.reconstruct(recording, setup, pattern, track)
     images, samples, worth = made.images, made.samples, made.confidence
     pictures = [grey(image) for image in images]
     with new_folder(out) as draft:
@@ -236,11 +236,11 @@ def reconstruct_capture(
             if samples.truth is not None:
                 row.append(grey(samples.truth[k]))
             shown.append(strip(row, columns=4))
-        rate_hz = 1e6 / float(np.median(np.diff(shot.frame_times_us)))
+        rate_hz = 1e6 / float(np.median(np.diff(recording.frame_times_us)))
         save_animation(draft / "animation.gif", shown, rate_hz, 2)
         write_atomically(draft / "reconstruction.npy", _npy(images.numpy()))
         found: dict[str, Any] = {
-            "capture": shot.name,
+            "capture": recording.name,
             "weights": str(weights),
             "modality": model.weights.modality.name,
             "positions": len(pictures),

@@ -1,6 +1,6 @@
 """A setup's own light transport, measured with a display or a moving LED: plan, folder, import."""
 
-from evnlos.calibration.scan.folder import Patterns, ScanInfo, Shot, read_scan_info, read_shots
+from evnlos.calibration.scan.folder import Patterns, ScanFrame, ScanInfo, read_scan_frames, read_scan_info
 from evnlos.calibration.scan.frames import rehearse_scan
 from evnlos.calibration.scan.importer import ScanImport, ScanResult, import_scan
 from evnlos.calibration.scan.matrix import Denoising, PsfCheck, choose_denoising, matrix_from_psf
@@ -19,18 +19,18 @@ __all__ = [
     "PsfCheck",
     "ScanCamera",
     "ScanEstimate",
+    "ScanFrame",
     "ScanImport",
     "ScanInfo",
     "ScanPlan",
     "ScanResult",
-    "Shot",
     "choose_denoising",
     "estimate_scan",
     "import_scan",
     "lit_cells",
     "matrix_from_psf",
+    "read_scan_frames",
     "read_scan_info",
-    "read_shots",
     "rehearse_scan",
     "write_plan",
 ]

@@ -134,7 +134,7 @@ def _is_prime(number: int) -> bool:
 SCAN_FILE = "scan.yaml"
 DARK = "dark"
 _HEADER = ("pattern", "repeat", "exposure_s", "file")
-_MOST_SHOTS = 1_000_000
+_MOST_SCAN_FRAMES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class ScanInfo:
 
 
 @dataclass(frozen=True)
-class Shot:
+class ScanFrame:
     """One picture of a scan.
 
     Args:
@@ -214,17 +214,17 @@ def read_scan_info(folder: str | Path) -> ScanInfo:
     return load_yaml(ScanInfo, Path(folder) / SCAN_FILE)
 
 
-def write_shots(path: Path, shots: list[Shot]) -> None:
+def write_scan_frames(path: Path, scan_frames: list[ScanFrame]) -> None:
     """Write the table of pictures."""
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(_HEADER)
-        for shot in shots:
-            name = DARK if shot.pattern is None else shot.pattern
-            table.writerow((name, shot.repeat, f"{shot.exposure_s:g}", shot.file))
+        for scan_frame in scan_frames:
+            name = DARK if scan_frame.pattern is None else scan_frame.pattern
+            table.writerow((name, scan_frame.repeat, f"{scan_frame.exposure_s:g}", scan_frame.file))
 
 
-def read_shots(folder: str | Path, info: ScanInfo) -> list[Shot]:
+def read_scan_frames(folder: str | Path, info: ScanInfo) -> list[ScanFrame]:
     """Read and check the table of pictures: every pattern in every repeat, once, and dark frames.
 
     Raises:
@@ -239,18 +239,18 @@ def read_shots(folder: str | Path, info: ScanInfo) -> list[Shot]:
         raise DataError(f"{path} can't be read as a table: {error}") from None
     if not rows or not {"pattern", "file"} <= rows[0].keys():
         raise DataError(f"{path} holds no pictures; give a header {','.join(_HEADER)} and one line a picture")
-    shots = [_shot(path, number, row, info) for number, row in enumerate(rows, start=2)]
-    _check_complete(path, shots, info)
-    return shots
+    scan_frames = [_scan_frame(path, number, row, info) for number, row in enumerate(rows, start=2)]
+    _check_complete(path, scan_frames, info)
+    return scan_frames
 
 
-def is_main(shot: Shot, info: ScanInfo) -> bool:
+def is_main(scan_frame: ScanFrame, info: ScanInfo) -> bool:
     """Return whether a picture has the scan's own exposure; the others serve the check of linearity."""
-    return abs(shot.exposure_s - info.exposure_s) <= 1e-6 * info.exposure_s
+    return abs(scan_frame.exposure_s - info.exposure_s) <= 1e-6 * info.exposure_s
 
 
-Reader = Callable[[Shot], NDArray]
-"""From a shot to its picture, digital numbers [H, W]."""
+Reader = Callable[[ScanFrame], NDArray]
+"""From a frame to its picture, digital numbers [H, W]."""
 
 
 def frame_reader(folder: str | Path, table: str = "frames.csv") -> Reader:
@@ -265,8 +265,8 @@ def frame_reader(folder: str | Path, table: str = "frames.csv") -> Reader:
     """
     folder, first = Path(folder), {}
 
-    def read(shot: Shot) -> NDArray:
-        path = inside(folder, shot.file, table)
+    def read(scan_frame: ScanFrame) -> NDArray:
+        path = inside(folder, scan_frame.file, table)
         image = read_image(path)
         shape, kind = first.setdefault("like", (image.shape, image.dtype))
         if image.shape != shape or image.dtype != kind:
@@ -282,12 +282,12 @@ def frame_reader(folder: str | Path, table: str = "frames.csv") -> Reader:
 
 def _bounded(rows: Iterator[dict[str, str]], path: Path) -> Iterator[dict[str, str]]:
     for number, row in enumerate(rows):
-        if number >= _MOST_SHOTS:
-            raise DataError(f"{path} has more than {_MOST_SHOTS} lines; split the scan")
+        if number >= _MOST_SCAN_FRAMES:
+            raise DataError(f"{path} has more than {_MOST_SCAN_FRAMES} lines; split the scan")
         yield row
 
 
-def _shot(path: Path, line: int, row: dict[str, Any], info: ScanInfo) -> Shot:
+def _scan_frame(path: Path, line: int, row: dict[str, Any], info: ScanInfo) -> ScanFrame:
     text = str(row.get("pattern") or "").strip()
     try:
         pattern = None if text == DARK else int(text)
@@ -307,11 +307,11 @@ def _shot(path: Path, line: int, row: dict[str, Any], info: ScanInfo) -> Shot:
         )
     if not 0 < exposure <= 3600:
         raise DataError(f"{path} line {line}: exposure_s is {exposure}; give more than 0 and at most 3600 s")
-    return Shot(pattern, repeat, exposure, str(row.get("file") or ""))
+    return ScanFrame(pattern, repeat, exposure, str(row.get("file") or ""))
 
 
-def _check_complete(path: Path, shots: list[Shot], info: ScanInfo) -> None:
-    main = [shot for shot in shots if is_main(shot, info)]
+def _check_complete(path: Path, scan_frames: list[ScanFrame], info: ScanInfo) -> None:
+    main = [scan_frame for scan_frame in scan_frames if is_main(scan_frame, info)]
     found = {(s.pattern, s.repeat) for s in main if s.pattern is not None}
     lit = sum(s.pattern is not None for s in main)
     count = info.patterns.count

@@ -1,7 +1,7 @@
 """The pictures of a scan: as light, compared between repeats, and rehearsed by the simulator.
 
 - The pictures of a scan as light: dark frames taken off, saturation and linearity checked.
-- Whether the repeats of a scan agree: a camera that moved, a light that faded, a shot that differs.
+- Whether the repeats of a scan agree: a camera that moved, a light that faded, a frame that differs.
 - A planned scan recorded by the simulator instead of a camera: to try plan, exposure and import beforehand.
 """
 
@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from evnlos.calibration.scan.folder import Reader, ScanInfo, Shot, is_main, read_scan_info, read_shots
+from evnlos.calibration.scan.folder import (
+    Reader,
+    ScanFrame,
+    ScanInfo,
+    is_main,
+    read_scan_frames,
+    read_scan_info,
+)
 from evnlos.calibration.scan.plan import lit_cells
 from evnlos.cameras import FrameCamera
 from evnlos.data.sampling import reduce_by_area
@@ -53,19 +60,21 @@ class Light:
     white_dn: int
 
 
-def read_light(info: ScanInfo, shots: list[Shot], read: Reader, shape: tuple[int, int] | None = None) -> Light:
+def read_light(
+    info: ScanInfo, scan_frames: list[ScanFrame], read: Reader, shape: tuple[int, int] | None = None
+) -> Light:
     """Read all pictures, one at a time.
 
     Args:
         info: What was shown.
-        shots: The pictures.
+        scan_frames: The pictures.
         read: What reads one.
         shape: Size (H, W) to reduce them to by area averaging; None keeps the camera's.
 
     Raises:
         DataError: Frames are saturated, unlike each other or too many, or the camera is not linear.
     """
-    first = read(shots[0])
+    first = read(scan_frames[0])
     full = (int(first.shape[0]), int(first.shape[1]))
     shape = shape or full
     if shape[0] > full[0] or shape[1] > full[1] or min(shape) < 1:
@@ -80,13 +89,15 @@ def read_light(info: ScanInfo, shots: list[Shot], read: Reader, shape: tuple[int
             f"the scan takes {room / 2**30:.1f} GiB at {shape[0]} x {shape[1]} pixels, above "
             f"{_ROOM_BYTES >> 30}; give a smaller --height and --width"
         )
-    darks = [shot for shot in shots if shot.pattern is None and is_main(shot, info)]
+    darks = [
+        scan_frame for scan_frame in scan_frames if scan_frame.pattern is None and is_main(scan_frame, info)
+    ]
     stacks: dict[int, list[NDArray[np.float32]]] = {}
     blind = np.zeros(full, np.bool_)
-    for shot in darks:
-        image = read(shot)
+    for scan_frame in darks:
+        image = read(scan_frame)
         blind |= image >= white
-        stacks.setdefault(shot.repeat, []).append(_levels(image, white, shape))
+        stacks.setdefault(scan_frame.repeat, []).append(_levels(image, white, shape))
     if blind.mean() > _MOST_BAD:
         raise DataError(
             f"{100 * blind.mean():.0f} % of the pixels are saturated ({white} DN) in the dark frames; "
@@ -95,21 +106,21 @@ def read_light(info: ScanInfo, shots: list[Shot], read: Reader, shape: tuple[int
     means = {repeat: np.mean(stack, axis=0) for repeat, stack in stacks.items()}
     lit = np.empty((info.repeats, count, pixels), np.float32)
     clipped = np.zeros(full, np.bool_)
-    for shot in shots:
-        if shot.pattern is None or not is_main(shot, info):
+    for scan_frame in scan_frames:
+        if scan_frame.pattern is None or not is_main(scan_frame, info):
             continue
-        image = read(shot)
+        image = read(scan_frame)
         over = (image >= white) & ~blind
         if (share := float(over.mean())) > _SATURATED_SHARE:
             raise DataError(
-                f"{shot.file}: {100 * share:.1f} % of the pixels are saturated ({white} DN), at most "
+                f"{scan_frame.file}: {100 * share:.1f} % of the pixels are saturated ({white} DN), at most "
                 f"{100 * _SATURATED_SHARE:g} % may be; shorten exposure_s below {info.exposure_s:g} s or dim "
                 "the light"
             )
         clipped |= over
-        lit[shot.repeat, shot.pattern] = _levels(image, white, shape) - means[shot.repeat]
+        lit[scan_frame.repeat, scan_frame.pattern] = _levels(image, white, shape) - means[scan_frame.repeat]
     bad = reduce_by_area((blind | clipped)[None].astype(np.float32), shape)[0].ravel() > 0
-    linearity = _linearity(info, shots, read, white, shape)
+    linearity = _linearity(info, scan_frames, read, white, shape)
     variance, residuals = np.full(pixels, np.nan), len(darks) - len(stacks)
     if residuals > 0:
         squares = sum(((np.stack(s) - means[r]).astype(np.float64) ** 2).sum(axis=0) for r, s in stacks.items())
@@ -124,44 +135,55 @@ def _levels(image: NDArray, white: int, shape: tuple[int, int]) -> NDArray[np.fl
 
 
 def _linearity(
-    info: ScanInfo, shots: list[Shot], read: Reader, white: int, shape: tuple[int, int]
+    info: ScanInfo, scan_frames: list[ScanFrame], read: Reader, white: int, shape: tuple[int, int]
 ) -> float | None:
     """Return the light at another exposure over what a linear camera would have seen; refuse if far from 1.
 
     None where there is no such picture, or where noise leaves the ratio open.
     """
-    others = [shot for shot in shots if shot.pattern is not None and not is_main(shot, info)]
+    others = [
+        scan_frame
+        for scan_frame in scan_frames
+        if scan_frame.pattern is not None and not is_main(scan_frame, info)
+    ]
     if not others:
         return None
     main: dict[tuple[int | None, int], list[NDArray[np.float32]]] = {}
-    wanted = {None, *(shot.pattern for shot in others)}
-    for shot in shots:
-        if is_main(shot, info) and shot.pattern in wanted:
-            main.setdefault((shot.pattern, shot.repeat), []).append(_levels(read(shot), white, shape))
+    wanted = {None, *(scan_frame.pattern for scan_frame in others)}
+    for scan_frame in scan_frames:
+        if is_main(scan_frame, info) and scan_frame.pattern in wanted:
+            main.setdefault((scan_frame.pattern, scan_frame.repeat), []).append(
+                _levels(read(scan_frame), white, shape)
+            )
     weights, expected, seen = [], [], []
-    for shot in others:
-        darks = [s for s in shots if s.pattern is None and abs(s.exposure_s - shot.exposure_s) < 1e-9]
+    for scan_frame in others:
+        darks = [
+            s for s in scan_frames if s.pattern is None and abs(s.exposure_s - scan_frame.exposure_s) < 1e-9
+        ]
         if not darks:
             raise DataError(
-                f"{shot.file} was exposed for {shot.exposure_s:g} s, and no dark frame was; record one, or "
+                f"{scan_frame.file} was exposed for {scan_frame.exposure_s:g} s, and no dark frame was; "
+                "record one, or "
                 "take the line out of frames.csv"
             )
         below = np.mean([_levels(read(s), white, shape) for s in darks], axis=0)
-        seen.append(_levels(read(shot), white, shape) - below)
+        seen.append(_levels(read(scan_frame), white, shape) - below)
         # Expected from the same repeat: between repeats the light may have changed, which is another fault.
-        dark = main[None, shot.repeat]
-        full = np.mean(main[shot.pattern, shot.repeat], axis=0)
+        dark = main[None, scan_frame.repeat]
+        full = np.mean(main[scan_frame.pattern, scan_frame.repeat], axis=0)
         # Weighted by pictures with noise of their own: weighted by itself, the slope would come out too low.
-        other = (shot.repeat + 1) % info.repeats
-        if other != shot.repeat:
-            weights.append(np.mean(main[shot.pattern, other], axis=0) - np.mean(main[None, other], axis=0))
+        other = (scan_frame.repeat + 1) % info.repeats
+        if other != scan_frame.repeat:
+            weights.append(
+                np.mean(main[scan_frame.pattern, other], axis=0) - np.mean(main[None, other], axis=0)
+            )
             half = dark
         elif len(dark) > 1:
             weights.append(full - np.mean(dark[::2], axis=0))
             half = dark[1::2]
         else:
             return None
-        expected.append((full - np.mean(half, axis=0)) * (shot.exposure_s / info.exposure_s))
+        expected.append((full - np.mean(half, axis=0)) * (scan_frame.exposure_s / info.exposure_s))
     if info.repeats == 1:
         weights = [np.sum(weights, axis=0) - own for own in weights] if len(weights) > 1 else weights
     ratio, error = _ratio(*(np.stack(one, dtype=np.float64) for one in (seen, expected, weights)))
@@ -226,7 +248,7 @@ def compare_repeats(lit: NDArray[np.float32], shape: tuple[int, int]) -> Agreeme
         The comparison; None for a single repeat.
 
     Raises:
-        DataError: The camera moved, the light changed, or a shot differs; the text names it.
+        DataError: The camera moved, the light changed, or a frame differs; the text names it.
     """
     if len(lit) < 2:
         return None
@@ -307,7 +329,7 @@ def _blocks(image: NDArray, block: tuple[int, int]) -> NDArray[np.float64]:
     return cut.reshape(high, block[0], wide, block[1]).mean(axis=(1, 3))
 
 
-Change = Callable[[NDArray[np.float64], Shot], NDArray[np.float64]]
+Change = Callable[[NDArray[np.float64], ScanFrame], NDArray[np.float64]]
 
 
 def rehearse_scan(
@@ -329,7 +351,7 @@ def rehearse_scan(
         camera: Its frame camera; a picture at another exposure has light in proportion.
         ambient: Light that is always there, white levels.
         seed: Seed of the noise.
-        change: Alters the light [H, W] of a shot before the exposure: a fault to rehearse.
+        change: Alters the light [H, W] of a frame before the exposure: a fault to rehearse.
 
     Raises:
         DataError: The matrix does not fit the plan and the size.
@@ -341,15 +363,15 @@ def rehearse_scan(
             f"the matrix is {matrix.shape}; the plan and {shape[0]} x {shape[1]} pixels need "
             f"({shape[0] * shape[1]}, {info.plane.height * info.plane.width})"
         )
-    shots = read_shots(folder, info)
-    for number, shot in enumerate(shots):
-        lit = np.zeros(info.plane.shape) if shot.pattern is None else lit_cells(info, shot.pattern)
+    scan_frames = read_scan_frames(folder, info)
+    for number, scan_frame in enumerate(scan_frames):
+        lit = np.zeros(info.plane.shape) if scan_frame.pattern is None else lit_cells(info, scan_frame.pattern)
         light = (matrix @ lit.ravel()).reshape(shape) + ambient
         if change is not None:
-            light = change(light, shot)
-        light = light * (shot.exposure_s / info.exposure_s)
-        path = folder / shot.file
+            light = change(light, scan_frame)
+        light = light * (scan_frame.exposure_s / info.exposure_s)
+        path = folder / scan_frame.file
         path.parent.mkdir(parents=True, exist_ok=True)
         with new_file(path) as draft:
             Image.fromarray(camera.expose(light[None], seed=seed, first_frame=number)[0]).save(draft, "PNG")
-    return len(shots)
+    return len(scan_frames)

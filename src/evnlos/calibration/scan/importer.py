@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.scan.folder import ScanInfo, frame_reader, read_scan_info, read_shots
+from evnlos.calibration.scan.folder import ScanInfo, frame_reader, read_scan_frames, read_scan_info
 from evnlos.calibration.scan.frames import Agreement, Light, compare_repeats, read_light
 from evnlos.calibration.scan.matrix import Denoising, PsfCheck, choose_denoising, denoised, matrix_from_psf
 from evnlos.errors import ConfigError, DataError
@@ -94,7 +94,7 @@ def import_scan(folder: str | Path, settings: ScanImport | None = None) -> ScanR
     folder = Path(folder)
     info = read_scan_info(folder)
     shape = None if settings.height is None or settings.width is None else (settings.height, settings.width)
-    light = read_light(info, read_shots(folder, info), frame_reader(folder, info.frames), shape)
+    light = read_light(info, read_scan_frames(folder, info), frame_reader(folder, info.frames), shape)
     if light.bad.mean() > _MOST_BAD:
         raise DataError(
             f"{100 * light.bad.mean():.0f} % of the pixels saturate somewhere, at most {100 * _MOST_BAD:g} % "

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from evnlos.calibration.scan.folder import SCAN_FILE, Pattern, Patterns, ScanInfo, Shot, write_shots
+from evnlos.calibration.scan.folder import SCAN_FILE, Pattern, Patterns, ScanFrame, ScanInfo, write_scan_frames
 from evnlos.config import save_yaml
 from evnlos.errors import ConfigError
 from evnlos.files import new_folder
@@ -57,7 +57,7 @@ class ScanEstimate:
     """What a scan will cost and give.
 
     Args:
-        shots: Pictures, dark frames and linearity check included.
+        scan_frames: Pictures, dark frames and linearity check included.
         seconds: Time for them.
         cell_level: White levels of the brightest entry of the matrix.
         noise: Standard deviation of an entry of the brightest pixel over the brightest entry; others have less.
@@ -66,7 +66,7 @@ class ScanEstimate:
         notes: What to change.
     """
 
-    shots: int
+    scan_frames: int
     seconds: float
     cell_level: float
     noise: float
@@ -80,9 +80,9 @@ def estimate_scan(
     camera: ScanCamera,
     pitch_m: float,
     repeats: int,
-    shots: int,
+    scan_frames: int,
     darks: int,
-    seconds_a_shot: float,
+    seconds_per_frame: float,
 ) -> ScanEstimate:
     """Return time and noise of a scan.
 
@@ -95,9 +95,9 @@ def estimate_scan(
         camera: Light and noise.
         pitch_m: Side of a cell, metres.
         repeats: How often.
-        shots: Number of pictures.
+        scan_frames: Number of pictures.
         darks: Number of dark frames among them.
-        seconds_a_shot: Exposure and what passes between two pictures, seconds.
+        seconds_per_frame: Exposure and what passes between two pictures, seconds.
 
     Example:
         >>> camera = ScanCamera(full_level=0.8, full_well_e=1e9, read_noise_e=1e6, bit_depth=16)
@@ -130,7 +130,9 @@ def estimate_scan(
     light = kinds[own][1]
     if light > 0.95:
         notes.append(f"a pattern's brightest pixel reaches {light:.2f} white levels; shorten the exposure")
-    return ScanEstimate(shots, shots * seconds_a_shot, cell, noise[own], other, noise[other], tuple(notes))
+    return ScanEstimate(
+        scan_frames, scan_frames * seconds_per_frame, cell, noise[own], other, noise[other], tuple(notes)
+    )
 
 
 def effective_cells(cells: int, lobe_m: float | None, pitch_m: float) -> float:
@@ -221,7 +223,7 @@ class ScanPlan:
         listed = spread_points(plane, self.points) if self.pattern == "points" else ()
         return ScanInfo(plane, self.pattern, listed, self.repeats, self.exposure_s)
 
-    def shots(self) -> list[Shot]:
+    def scan_frames(self) -> list[ScanFrame]:
         """Return the pictures in the order in which to take them."""
         count, found = self.info().patterns.count, []
         every = self.dark_every or (64 if self.pattern == "hadamard" else 4)
@@ -236,18 +238,18 @@ class ScanPlan:
         middle = self.cells.height // 2 * self.cells.width + self.cells.width // 2
         checks = [0] if self.pattern == "points" else sorted({max(0, middle - k) for k in range(_CHECKS)})
         found += [(None, 0, half), *((k, 0, half) for k in checks)]
-        return [Shot(p, r, e, f"frames/{number:05d}.png") for number, (p, r, e) in enumerate(found)]
+        return [ScanFrame(p, r, e, f"frames/{number:05d}.png") for number, (p, r, e) in enumerate(found)]
 
     def estimate(self) -> ScanEstimate:
         """Return time and noise of the scan."""
-        shots = self.shots()
-        darks = sum(shot.pattern is None for shot in shots) - 1
+        scan_frames = self.scan_frames()
+        darks = sum(scan_frame.pattern is None for scan_frame in scan_frames) - 1
         return estimate_scan(
             self.info().patterns,
             self.camera,
             self.pitch,
             self.repeats,
-            len(shots),
+            len(scan_frames),
             darks,
             self.exposure_s + self.overhead_s,
         )
@@ -283,7 +285,7 @@ def write_plan(plan: ScanPlan, folder: str | Path, progress: Progress = silent) 
         DataError: The folder holds something already.
     """
     folder = Path(folder)
-    info, shots = plan.info(), plan.shots()
+    info, scan_frames = plan.info(), plan.scan_frames()
     shows_places = plan.display is None and plan.pattern != "hadamard"
     total, written = 3 if shows_places else info.patterns.count + 2, list[Path]()
 
@@ -294,7 +296,7 @@ def write_plan(plan: ScanPlan, folder: str | Path, progress: Progress = silent) 
     progress(Step("plan", 0, total, "files"))
     with new_folder(folder) as draft:
         (draft / "frames").mkdir()
-        write_shots(draft / info.frames, shots)
+        write_scan_frames(draft / info.frames, scan_frames)
         wrote(folder / info.frames)
         if shows_places:
             _write_places(draft / "places.csv", info.plane, measured_cells(info))
