@@ -34,7 +34,7 @@ from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.live.chunk import Source
 from evnlos.live.engine import Engine
 from evnlos.live.packet import USUAL_EVENTS, Packet, pack
-from evnlos.live.run import Pace, Run
+from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import Replay, TimedFrame
 from evnlos.live.udp import UdpSource
 from evnlos.models import UNetConfig, Weights, load_weights
@@ -126,7 +126,7 @@ def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
     else:
         source = replay(rate_hz, seconds, weights.modality.needs_frames)
         engine.begin()
-    run = Run(source, engine, Pace(rate=arguments.pictures_hz))
+    run = Run(source, engine, RateOptions(rate=arguments.pictures_hz))
     before = time.process_time()
     done = run.go().summary()
     cpu = (time.process_time() - before) / max(done["seconds"], 1e-9)
@@ -170,7 +170,7 @@ def main() -> None:
     parser.add_argument("--sources", nargs="+", choices=("replay", "udp"), default=["replay", "udp"])
     parser.add_argument("--modalities", nargs="+", choices=STANDARD_MODALITIES, default=["event", "fusion"])
     parser.add_argument("--rate-hz", "--rate", type=float, default=1e6, help="events a second")
-    parser.add_argument("--pictures-hz", type=float, default=Pace.rate, help="most pictures a second")
+    parser.add_argument("--pictures-hz", type=float, default=RateOptions.rate, help="most pictures a second")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--threads", type=int, default=2, help="threads of the network")
     parser.add_argument("--weights", help="weights or run, of the modality asked for")

@@ -16,8 +16,9 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 SLOW = {
-    "test_carry_over", "test_cluster", "test_distributed", "test_examples", "test_experiment", "test_faults",
-    "test_interop_deepinv", "test_live_training", "test_mitsuba_oracle", "test_notebooks", "test_open_core",
+    "test_cluster", "test_distributed", "test_examples", "test_experiment", "test_faults",
+    "test_generalization", "test_interop_deepinv", "test_live_training", "test_mitsuba_oracle",
+    "test_notebooks", "test_open_core",
 }  # fmt: skip
 """Files of whole studies and trainings, and of programs that they start."""
 

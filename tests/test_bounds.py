@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from evnlos.analysis import (
-    SequenceBench,
+    SequenceAnalysisSettings,
     event_information,
     frame_information,
     row_information,
@@ -31,7 +31,7 @@ from evnlos.types import Events, Plane
 
 PLATE = Plane(8, 8, 0.01)
 SETUP = RadiometricSetup(cell_m=0.01, gain=2.0, ambient=0.1, sensor=SensorSize(8, 12))
-BENCH = SequenceBench(
+SETTINGS = SequenceAnalysisSettings(
     positions=8, counts=(1, 2, 4, 8), coefficients=12, writers=1, cells=8, crossing_noise=0.03, other_noises=()
 )
 
@@ -43,7 +43,7 @@ def prior(count: int = 6, seed: int = 0) -> PatternPrior:
 
 
 def light_of(targets: PatternPrior) -> SequenceLight:
-    return sequence_light(SETUP, targets, BENCH.motion.position_m, (0.0, BENCH.duration_s))
+    return sequence_light(SETUP, targets, SETTINGS.motion.position_m, (0.0, SETTINGS.duration_s))
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_the_light_is_that_of_the_setup(light: SequenceLight) -> None:
     target = Target("drawn", ((image - image.min()) / scale).astype(np.float32), 0.08)
     flat = Target("flat", np.ones((8, 8), np.float32), 0.08)
     for k in (0, 60, len(light.times_s) - 1):
-        place = BENCH.motion.position_m(light.times_s[k])
+        place = SETTINGS.motion.position_m(light.times_s[k])
         plane = Plane(12, 40, 0.01)
         operator = SETUP.operator(plane)
         drawn = scale * target.rasterise(plane, place) + image.min() * flat.rasterise(plane, place)
@@ -197,14 +197,14 @@ def test_more_noise_or_mismatch_never_helps(light: SequenceLight) -> None:
     """Differences of information are positive semidefinite."""
 
     def information(noise: float = 0.03, **changes: float) -> np.ndarray:
-        return event_information(light, np.zeros(6), law(**changes), replace(BENCH, crossing_noise=noise))[0]
+        return event_information(light, np.zeros(6), law(**changes), replace(SETTINGS, crossing_noise=noise))[0]
 
     base = information()
     for worse in (information(noise=0.06), information(threshold_sigma=0.05), information(noise=0.03)[:-1]):
         better = base[1:] if len(worse) < len(base) else base
         for one, other in zip(better, worse, strict=True):
             assert np.linalg.eigvalsh(one - other)[0] > -1e-9 * np.abs(one).max()
-    silent = event_information(light, np.zeros(6), law(), replace(BENCH, silences=True))[0]
+    silent = event_information(light, np.zeros(6), law(), replace(SETTINGS, silences=True))[0]
     assert all(
         np.linalg.eigvalsh(a - b)[0] > -1e-9 * np.abs(a).max() for a, b in zip(silent, base, strict=True)
     )
@@ -213,7 +213,7 @@ def test_more_noise_or_mismatch_never_helps(light: SequenceLight) -> None:
 def test_an_unknown_pattern_costs_and_fades_with_its_size(light: SequenceLight) -> None:
     def information(known: bool, dsnu_e: float) -> np.ndarray:
         setup = replace(SETUP, frame_camera=FrameCamera(prnu=0.0, dsnu_e=dsnu_e))
-        return frame_information(light, np.zeros(6), setup, replace(BENCH, known_pattern=known))
+        return frame_information(light, np.zeros(6), setup, replace(SETTINGS, fpn_corrected=known))
 
     known = information(True, 100.0)
     for one, other in zip(known, information(False, 100.0), strict=True):
@@ -223,7 +223,7 @@ def test_an_unknown_pattern_costs_and_fades_with_its_size(light: SequenceLight) 
 
 
 def test_bounds_of_a_setup() -> None:
-    found = sequence_bounds(SETUP, BENCH, "small")
+    found = sequence_bounds(SETUP, SETTINGS, "small")
     assert {one.kind for one in found.events} == {"continuous", "v2e", "brownian", "circuit"}
     assert list(found.frames_db) == sorted(found.frames_db) and found.frames_db[0] > found.prior_db
     for one in found.events:
@@ -251,11 +251,11 @@ def test_a_record_knows_where_each_event_is_measured_from() -> None:
 )
 def test_bad_benches(changes: dict, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        replace(BENCH, **changes)
+        replace(SETTINGS, **changes)
 
 
 def test_the_motion_of_the_bench_is_centred() -> None:
-    assert isinstance(BENCH.motion, LineMotion)
+    assert isinstance(SETTINGS.motion, LineMotion)
     np.testing.assert_allclose(
-        BENCH.motion.position_m([0.0, BENCH.duration_s]), [[-0.08, 0], [0.08, 0]], atol=1e-12
+        SETTINGS.motion.position_m([0.0, SETTINGS.duration_s]), [[-0.08, 0], [0.08, 0]], atol=1e-12
     )

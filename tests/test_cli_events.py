@@ -15,7 +15,7 @@ from evnlos.cli.events import PixelChanges
 from evnlos.config import to_dict
 from evnlos.events import EventWriter, keep_known_polarity
 from evnlos.events.files.registry import FORMATS
-from evnlos.events.recording import Box, Cut, Recording, summarise
+from evnlos.events.recording import Box, CropOptions, Recording, summarise
 from test_cli import call, fails
 from test_video import write_animation, write_container
 
@@ -364,7 +364,7 @@ def test_a_cut_does_not_depend_on_the_blocks(tmp_path: Path, size: int, monkeypa
 
     blocks = Hdf5Source.blocks
     monkeypatch.setattr(Hdf5Source, "blocks", lambda self: blocks(self, size))
-    cut = Cut(0.4, 0.5, Box(0, 3, 40, 20))
+    cut = CropOptions(0.4, 0.5, Box(0, 3, 40, 20))
     pieces = list(Recording(tmp_path / "a.h5").pieces(cut))
     since = events.t_us - events.t_us[0]
     chosen = (since >= 400_000) & (since < 500_000) & (events.y >= 3) & (events.y < 23)
@@ -418,14 +418,14 @@ def test_wrong_previews_leave_nothing(tmp_path: Path, capsys, monkeypatch) -> No
 
 
 def test_a_window_shows_each_event_at_its_place_in_its_colour() -> None:
-    from evnlos.plot.preview import Look, preview_pictures
+    from evnlos.plot.preview import PreviewOptions, preview_pictures
 
     # Two windows of 10 ms: ON at (0, 0) and OFF at (3, 1); then an event without a polarity at (2, 0).
     known = [True, True, False]
     events = Events([0, 9_000, 20_000], [0, 3, 2], [0, 1, 0], [1, 0, 0], 4, 2, polarity_known=known)
     summary = summarise([events])
     for style in ("polarity", "surface"):
-        look = Look(style=style, frames=2, window_ms=10, side_px=64, background="light")
+        look = PreviewOptions(style=style, frames=2, window_ms=10, side_px=64, background="light")
         first, second = (
             picture[:32].reshape(2, 16, 4, 16, 3) for picture in preview_pictures([events], summary, look)
         )
@@ -442,8 +442,8 @@ def test_a_window_shows_each_event_at_its_place_in_its_colour() -> None:
 
 
 def test_large_sensors_are_added_up(tmp_path: Path) -> None:
-    from evnlos.plot.preview import Look, preview_pictures
+    from evnlos.plot.preview import PreviewOptions, preview_pictures
 
     events = random_events(20_000, width=1280, height=720)
-    pictures = preview_pictures([events], summarise([events]), Look(frames=3, side_px=320))
+    pictures = preview_pictures([events], summarise([events]), PreviewOptions(frames=3, side_px=320))
     assert {picture.shape for picture in pictures} == {(180 + 26, 320, 3)}

@@ -13,7 +13,7 @@ from evnlos import Events
 from evnlos.events.grids import OFF_RGB, ON_HEX, ON_RGB, WORDS
 from evnlos.events.recording import summarise
 from evnlos.plot.event_views import signed_pictures
-from evnlos.plot.preview import Look, preview_pictures
+from evnlos.plot.preview import PreviewOptions, preview_pictures
 from evnlos.report.pictures import polarity
 
 SOURCE = Path(evnlos.__file__).parent
@@ -57,7 +57,7 @@ def test_pictures_of_events_keep_the_grey_difference() -> None:
     assert grey(on) - grey(off) >= 50
     events = Events([0, 0], [0, 1], [0, 0], [1, 0], 2, 1)
     for background in ("dark", "light"):
-        look = Look(frames=1, side_px=64, background=background)
+        look = PreviewOptions(frames=1, side_px=64, background=background)
         (picture,) = preview_pictures([events], summarise([events]), look)
         assert grey(picture[0, 0]) - grey(picture[0, -1]) >= 50
 

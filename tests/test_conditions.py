@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from evnlos.data import Sampling, SensorSize
-from evnlos.experiment import base_simulation, conditions, conditions_table, map_conditions
+from evnlos.experiment import base_simulation, conditions, conditions_table, sweep_parameters
 from evnlos.experiment.conditions import FULL
 
 SMALL = replace(
@@ -42,7 +42,7 @@ def test_conditions_change_one_factor_and_clip_nothing() -> None:
 def test_noise_takes_from_frames_what_it_leaves_to_events(tmp_path) -> None:
     every = conditions(SMALL)
     chosen = [every[0]] + [c for c in every if c.factor == "read noise" and c.value == 300.0]
-    found = map_conditions(chosen, tmp_path, workers=1, rank=24)
+    found = sweep_parameters(chosen, tmp_path, workers=1, rank=24)
     clean, noisy = found
     assert noisy.psnr_db["frame"] < clean.psnr_db["frame"] - 0.2
     assert noisy.psnr_db["event"] == pytest.approx(clean.psnr_db["event"], abs=1e-6)
@@ -50,7 +50,7 @@ def test_noise_takes_from_frames_what_it_leaves_to_events(tmp_path) -> None:
     assert clean.event_bytes_s == pytest.approx(clean.events_per_pixel * 24 * 36 * 4 / 8.0, rel=1e-2)
     assert clean.frame_bytes_s == 100 * 24 * 36
     before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    again = map_conditions(chosen, tmp_path, workers=1, rank=24)
+    again = sweep_parameters(chosen, tmp_path, workers=1, rank=24)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
     assert conditions_table(again) == conditions_table(found)
     assert "| read noise 300 electrons |" in conditions_table(found)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from evnlos.analysis import evaluate, reconstruct
-from evnlos.analysis.confidence import FrameOperator, explained, judgement_of, light_gain, risk_coverage
+from evnlos.analysis.confidence import FrameOperator, confidence_of, explained, light_gain, risk_coverage
 from evnlos.cli import main
 from evnlos.config import load_yaml
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate_object
@@ -271,7 +271,7 @@ def test_published_weights_refuse_a_wall_that_is_not_theirs() -> None:
         config = replace(setup, setup=transport, positions=16)
         samples, _ = simulate_object(config, "writer00_K")
         images = reconstruct(weights, samples.frame, samples.surface, samples.position_m)
-        said.append(judgement_of(weights, samples, images, operator))
+        said.append(confidence_of(weights, samples, images, operator))
     own, other = said
     assert own is not None and own.measured and own.explained > 0.9
     assert other is not None and not other.measured and other.explained < 0.3
@@ -285,7 +285,11 @@ def test_reconstruct_and_evaluate_say_what_the_pictures_are_worth(
     samples = NlosDataset(tiny_dataset, "train", "frame")
     confidence = fit_confidence(network, samples, SAMPLING.canvas)
     weights = Weights(network, [], None, confidence)
-    (passed,) = [one for one in evaluate(weights, tiny_dataset, "train").worth if one.name == samples.names[0]]
+    (passed,) = [
+        one
+        for one in evaluate(weights, tiny_dataset, "train").confidence_checks
+        if one.name == samples.names[0]
+    ]
     assert passed.skill < 1 and 0 <= passed.width <= 1 and 0 <= passed.coverage <= 1
     save_weights(tmp_path / "w.safetensors", weights)
     main(["evaluate", "--weights", str(tmp_path / "w.safetensors"), "--data", str(tiny_dataset.folder)])

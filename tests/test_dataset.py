@@ -34,7 +34,7 @@ from evnlos.data.simulate import drawn_for, split_of
 from evnlos.errors import ConfigError, DataError, EvnlosError
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
-from evnlos.training.source import Stored, Team
+from evnlos.training.source import DiskSource, ProcessGroup
 from watching import Watch, stopped
 
 
@@ -220,16 +220,16 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 
 def test_a_dataset_larger_than_the_memory_is_trained_on_from_disk(tiny_dataset, monkeypatch) -> None:
-    team = Team(0, 1, torch.device("cpu"))
-    held = Stored(NlosDataset(tiny_dataset, "train", "fusion"), 32, 5, team)
+    process_group = ProcessGroup(0, 1, torch.device("cpu"))
+    held = DiskSource(NlosDataset(tiny_dataset, "train", "fusion"), 32, 5, process_group)
     monkeypatch.setattr("evnlos.data.loader.free_memory", lambda: 1000)
     samples = NlosDataset(tiny_dataset, "train", "fusion")
-    read = Stored(samples, 32, 5, team)
+    read = DiskSource(samples, 32, 5, process_group)
     for one, other in zip(held.batches(3), read.batches(3), strict=True):
         assert torch.equal(one.seen, other.seen) and torch.equal(one.truth, other.truth)
         assert (one.share, one.weight) == (other.share, other.weight)
     torch.testing.assert_close(read.mean_image(), held.mean_image(), rtol=0, atol=1e-6)
-    for one, other in zip(held.some(50), read.some(50), strict=True):
+    for one, other in zip(held.subset(50), read.subset(50), strict=True):
         assert np.array_equal(one, other)
     assert not samples.in_memory
 

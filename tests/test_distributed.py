@@ -19,7 +19,7 @@ from evnlos.errors import ConfigError
 from evnlos.models import UNetConfig
 from evnlos.training import LOSSES, Training
 from evnlos.training.settings import light_of
-from evnlos.training.source import Live, Stored, Team, team
+from evnlos.training.source import DiskSource, ProcessGroup, SimulatedSource, process_group
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 SETTINGS = Training(
@@ -53,10 +53,12 @@ def test_the_losses_of_parts_add_up_with_their_gradients(name: str) -> None:
 def test_the_parts_of_a_batch_are_the_batch_of_one_process(size: int, tiny_dataset) -> None:
     samples = NlosDataset(tiny_dataset, "train", "frame")
     cpu = torch.device("cpu")
-    alone = list(Stored(samples, 10, 3, Team(0, 1, cpu)).batches(1))
-    assert len(alone) == Stored(samples, 10, 3, Team(0, 1, cpu)).steps
+    alone = list(DiskSource(samples, 10, 3, ProcessGroup(0, 1, cpu)).batches(1))
+    assert len(alone) == DiskSource(samples, 10, 3, ProcessGroup(0, 1, cpu)).steps
     assert sum(batch.weight for batch in alone) == pytest.approx(1)
-    shared = [list(Stored(samples, 10, 3, Team(rank, size, cpu)).batches(1)) for rank in range(size)]
+    shared = [
+        list(DiskSource(samples, 10, 3, ProcessGroup(rank, size, cpu)).batches(1)) for rank in range(size)
+    ]
     for whole, *parts in zip(alone, *shared, strict=True):
         assert sum(part.share for part in parts) == pytest.approx(1)
         rows = torch.cat([part.truth for part in parts if part.share])
@@ -102,7 +104,7 @@ def test_two_processes_train_what_one_does_and_survive_a_kill(tiny_dataset, tmp_
 
 def test_a_training_without_torchrun_is_a_team_of_one(monkeypatch) -> None:
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    with team() as processes:
+    with process_group() as processes:
         assert (processes.rank, processes.size) == (0, 1)
         value = torch.ones(2)
         assert processes.total(value) is value
@@ -115,8 +117,10 @@ def test_processes_simulate_other_objects_each(tiny) -> None:
     dataset = live_dataset(replace(tiny, positions=2))
     cpu = torch.device("cpu")
     with pytest.raises(ConfigError, match="batch_size that they divide"):
-        Live(dataset, "frame", 7, 0, Team(0, 2, cpu))
-    sides = [list(Live(dataset, "frame", 6, 0, Team(rank, 2, cpu)).batches(0)) for rank in (0, 1)]
+        SimulatedSource(dataset, "frame", 7, 0, ProcessGroup(0, 2, cpu))
+    sides = [
+        list(SimulatedSource(dataset, "frame", 6, 0, ProcessGroup(rank, 2, cpu)).batches(0)) for rank in (0, 1)
+    ]
     # 13 objects: 6 each, one is left out; 2 samples each in batches of 3
     assert [len(side) for side in sides] == [4, 4]
     pictures = [np.concatenate([batch.truth.numpy() for batch in side]) for side in sides]

@@ -164,7 +164,7 @@ def test_validation_leaves_the_test_characters_unread(place) -> None:
     assert recorded.objects("validation") == ["lab_L"]
 
 
-def test_few_shots_are_nested_and_keep_the_test(place) -> None:
+def test_few_captures_are_nested_and_keep_the_test(place) -> None:
     kept = []
     for count in (1, 2):
         arm = replace(ARMS[0], name=f"{count} captures", captures=count)

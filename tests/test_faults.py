@@ -20,7 +20,7 @@ from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.data import simulate
 from evnlos.data.simulations import find_faults
-from evnlos.files import claim, is_empty
+from evnlos.files import directory_lock, is_empty
 from evnlos.progress import Step
 from watching import Watch, alive, stopped
 
@@ -157,9 +157,9 @@ def test_a_folder_has_one_run_at_a_time(tiny, tmp_path) -> None:
     simulate(tiny, folder, progress=run_a_second_time)
     assert seconds[0].returncode == 2
     assert "another process is at work" in seconds[0].stderr
-    with claim(folder):
+    with directory_lock(folder):
         pass
-    with claim(tmp_path / "new"):
+    with directory_lock(tmp_path / "new"):
         assert is_empty(tmp_path / "new")
 
 

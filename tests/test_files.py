@@ -14,7 +14,7 @@ import pytest
 
 from evnlos import Events, EvnlosError, read_events, write_events
 from evnlos.events.files.aedat4 import write_aedat4
-from evnlos.files import claim, new_file, new_folder, write_atomically
+from evnlos.files import directory_lock, new_file, new_folder, write_atomically
 
 MOST_BYTES = 40_000
 
@@ -171,13 +171,17 @@ def test_what_a_dead_process_left_goes_with_the_next(tmp_path) -> None:
 def test_shares_exclude_the_whole_and_not_each_other(tmp_path) -> None:
     """Else the whole would sweep away what a share is writing."""
     folder = tmp_path / "d"
-    with claim(folder, "1-of-2"), claim(folder, "2-of-2"):
+    with directory_lock(folder, "1-of-2"), directory_lock(folder, "2-of-2"):
         for part in ("", "1-of-2"):
-            with pytest.raises(EvnlosError, match="another process is at work"), claim(folder, part):
+            with pytest.raises(EvnlosError, match="another process is at work"), directory_lock(folder, part):
                 pass
-    with claim(folder), pytest.raises(EvnlosError, match="another process"), claim(folder, "1-of-2"):
+    with (
+        directory_lock(folder),
+        pytest.raises(EvnlosError, match="another process"),
+        directory_lock(folder, "1-of-2"),
+    ):
         pass
-    with claim(folder, "1-of-2"):
+    with directory_lock(folder, "1-of-2"):
         pass
 
 

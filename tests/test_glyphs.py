@@ -226,11 +226,11 @@ def test_sd19_objects_become_targets(sd19):
     assert left + right == pytest.approx(64, abs=1)
 
 
-def write_emnist(folder, labels=(10, 11, 10, 0), part="train", claim=None):
+def write_emnist(folder, labels=(10, 11, 10, 0), part="train", directory_lock=None):
     folder.mkdir(exist_ok=True)
     stored = np.stack([character_picture(28).T * 255] * len(labels)).astype(np.uint8)
     stem = f"emnist-byclass-{part}"
-    count = len(labels) if claim is None else claim
+    count = len(labels) if directory_lock is None else directory_lock
     with gzip.open(folder / f"{stem}-images-idx3-ubyte.gz", "wb") as file:
         file.write(struct.pack(">4I", 0x803, count, 28, 28) + stored.tobytes())
     with gzip.open(folder / f"{stem}-labels-idx1-ubyte.gz", "wb") as file:
@@ -276,10 +276,10 @@ def test_damaged_emnist_files_are_refused(tmp_path):
     images.write_bytes(b"plain bytes")
     with pytest.raises(DataError, match="damaged"):
         list(read_emnist(folder, "A"))
-    write_emnist(folder, claim=3_000_000_000)
+    write_emnist(folder, directory_lock=3_000_000_000)
     with pytest.raises(DataError, match="promises"):
         list(read_emnist(folder, "A"))
-    write_emnist(folder, claim=5)
+    write_emnist(folder, directory_lock=5)
     with pytest.raises(DataError, match="ends early"):
         list(read_emnist(folder, "A"))
     (folder / "emnist-byclass-mapping.txt").write_text("ten A\n")

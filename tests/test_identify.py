@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evnlos.analysis.identify import counted, identify, setup_table, singular_values, verdict
-from evnlos.analysis.linearized import Bench, LinearEstimator, bars, finest_bars, linearized
+from evnlos.analysis.linearized import AnalysisSettings, LinearEstimator, bars, finest_bars, linearized
 from evnlos.cameras import FrameCamera
 from evnlos.cli import main
 from evnlos.config import save_yaml
@@ -21,7 +21,7 @@ from evnlos.inverse.measurements import TEST_CHARACTERS, TRAIN_CHARACTERS, handw
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup, named_setup, setup_names, setup_preset
 
-SMALL = Bench(cells=8, height=12, width=20, writers=1)
+SMALL = AnalysisSettings(cells=8, height=12, width=20, writers=1)
 
 
 def random_problem(count: int = 12, pixels: int = 30):
@@ -110,7 +110,7 @@ def test_noise_is_that_of_the_camera(level, known):
     if known:
         camera = dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0)
     frame = camera.expose(np.full((1, 200, 200), level), seed=1)[0] / camera.white
-    variance = camera.noise_variance(torch.tensor(level, dtype=torch.float64), known_pattern=known)
+    variance = camera.noise_variance(torch.tensor(level, dtype=torch.float64), fpn_corrected=known)
     assert float(frame.var()) == pytest.approx(float(variance), rel=0.03)
     plain = dataclasses.replace(camera, prnu=0.0, dsnu_e=0.0)
     quarter = plain.noise_variance(torch.tensor(level), frames=4)
@@ -149,31 +149,34 @@ def test_the_matrix_is_the_setup_that_the_lab_renders():
         RadiometricSetup(roughness=0.3, strip_m=(0.24, 0.12), gain=0.6),
         RadiometricSetup(wall_material="lambert", lamp_m=(-0.4, 0.0, 0.05)),
     ):
-        scene, bench = target_in_the_middle(), Bench(height=12, width=20)
-        seen = linearized(setup, bench)
-        mask = torch.from_numpy(scene.target.rasterise(bench.target_plane)).double().flatten()
-        rendered = setup.resized(bench.shape).observe(scene).irradiance(4.0)
-        expected = (seen.ambient + seen.matrix @ mask).reshape(bench.shape).float()
+        scene, settings = target_in_the_middle(), AnalysisSettings(height=12, width=20)
+        seen = linearized(setup, settings)
+        mask = torch.from_numpy(scene.target.rasterise(settings.target_plane)).double().flatten()
+        rendered = setup.resized(settings.shape).observe(scene).irradiance(4.0)
+        expected = (seen.ambient + seen.matrix @ mask).reshape(settings.shape).float()
         torch.testing.assert_close(rendered, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_the_papers_matrix_is_its_wall_but_for_diffraction():
-    scene, bench = target_in_the_middle(), Bench(height=25, width=40)
+    scene, settings = target_in_the_middle(), AnalysisSettings(height=25, width=40)
     for length_m in (0.004, 0.02):
         setup = PaperSetup(tpsf_length_m=length_m, gain=0.9, field_of_view_m=0.3)
-        seen = linearized(setup, bench)
-        mask = torch.from_numpy(scene.target.rasterise(bench.target_plane)).double().flatten()
-        rendered = setup.resized(bench.shape).observe(scene).irradiance(4.0).double().flatten()
+        seen = linearized(setup, settings)
+        mask = torch.from_numpy(scene.target.rasterise(settings.target_plane)).double().flatten()
+        rendered = setup.resized(settings.shape).observe(scene).irradiance(4.0).double().flatten()
         expected = seen.ambient + seen.matrix @ mask
         assert float((rendered - expected).abs().max()) < 0.03 * float(expected.max())
 
 
 def test_a_cut_tpsf_is_told_apart():
-    cut = identify(PaperSetup(tpsf_length_m=0.02), bench=Bench(cells=16, height=20, width=32, writers=1))
+    cut = identify(
+        PaperSetup(tpsf_length_m=0.02), settings=AnalysisSettings(cells=16, height=20, width=32, writers=1)
+    )
     assert "kink" in cut.warnings[0]
     assert "rho_max 2, taper 0" in cut.warnings[0]
     faded = identify(
-        PaperSetup(tpsf_length_m=0.02, taper=1.0), bench=Bench(cells=16, height=20, width=32, writers=1)
+        PaperSetup(tpsf_length_m=0.02, taper=1.0),
+        settings=AnalysisSettings(cells=16, height=20, width=32, writers=1),
     )
     assert not faded.warnings
     assert PaperSetup().without_artifacts() == PaperSetup(rho_max=8.0, taper=0.5)
@@ -188,15 +191,15 @@ def test_prior_and_test_share_no_character():
 
 
 def test_a_sharp_setup_shows_more_than_a_matte_wall():
-    bench = Bench(cells=16, height=30, width=48, writers=1)
-    easy, matte = (identify(setup_preset(name), bench=bench, name=name) for name in ("easy", "matte"))
+    settings = AnalysisSettings(cells=16, height=30, width=48, writers=1)
+    easy, matte = (identify(setup_preset(name), settings=settings, name=name) for name in ("easy", "matte"))
     assert easy.modes > 5 * matte.modes
     assert easy.at_camera.patterns > 2 * matte.at_camera.patterns
     assert easy.at_camera.psnr_db > matte.at_camera.psnr_db + 1 > matte.mean_db + 1
-    assert easy.at_camera.patterns > easy.at_fixed.patterns
+    assert easy.at_camera.patterns > easy.at_noise_std.patterns
     assert matte.at_camera.finest_m is None
     assert "memory" in matte.verdict and "memory, not a measurement" not in easy.verdict
-    averaged = identify(setup_preset("easy"), bench=dataclasses.replace(bench, frames=100))
+    averaged = identify(setup_preset("easy"), settings=dataclasses.replace(settings, frames=100))
     assert averaged.at_camera.noise == pytest.approx(easy.at_camera.noise / 10)
     assert averaged.at_camera.patterns > easy.at_camera.patterns
     assert averaged.at_camera.finest_m < easy.at_camera.finest_m
@@ -205,7 +208,9 @@ def test_a_sharp_setup_shows_more_than_a_matte_wall():
 
 
 def test_a_post_resolves_across_itself_only():
-    found = identify(setup_preset("aperture"), bench=Bench(cells=16, height=30, width=48, writers=1))
+    found = identify(
+        setup_preset("aperture"), settings=AnalysisSettings(cells=16, height=30, width=48, writers=1)
+    )
     upright, lying = found.at_camera.stroke_m
     assert upright is not None and upright < 0.012
     assert lying is None
@@ -214,7 +219,7 @@ def test_a_post_resolves_across_itself_only():
 
 def test_picard_and_picture():
     """The coefficients of a noiseless picture, from the definition; the same seed draws the same picture."""
-    one, same, other = (identify(setup_preset("hard"), bench=SMALL, seed=seed) for seed in (0, 0, 1))
+    one, same, other = (identify(setup_preset("hard"), settings=SMALL, seed=seed) for seed in (0, 0, 1))
     setup = linearized(setup_preset("hard"), SMALL)
     targets = handwritten_targets(SMALL.target_plane, 1)
     light = setup.ambient + setup.matrix @ targets.mean
@@ -293,10 +298,10 @@ def test_bad_setup_files(tmp_path, text, match):
         ("perhaps you meant 'main-near'", lambda: named_setup("main-nera")),
         ("does not exist", lambda: named_setup("nothing.yaml")),
         ("no preset 'papr'", lambda: named_setup("simulate-papr")),
-        ("cells is 4", lambda: Bench(cells=4)),
-        ("cells is 100", lambda: Bench(cells=100)),
-        ("target_size_m is 0", lambda: Bench(target_size_m=0.0)),
-        ("fixed_noise", lambda: Bench(fixed_noise=float("nan"))),
+        ("cells is 4", lambda: AnalysisSettings(cells=4)),
+        ("cells is 100", lambda: AnalysisSettings(cells=100)),
+        ("target_size_m is 0", lambda: AnalysisSettings(target_size_m=0.0)),
+        ("noise_std", lambda: AnalysisSettings(noise_std=float("nan"))),
         ("does not see the wall", lambda: linearized(RadiometricSetup(camera_angle_deg=80.0), SMALL)),
         ("no light", lambda: linearized(PaperSetup(offset_m=(5.0, 0.0)), SMALL)),
     ],

@@ -30,8 +30,8 @@ from evnlos.live.display import Page
 from evnlos.live.engine import AreaReduction, Engine, Picture, RunningSurface, Timing
 from evnlos.live.growing import GrowingFile, open_tail
 from evnlos.live.packet import Packet, PacketError, pack, unpack, unpack_all
-from evnlos.live.run import Pace, Run, Tally, latency_table
-from evnlos.live.sources import Listening, Replay, TimedFrame, capture_replay, open_live
+from evnlos.live.run import RateOptions, Run, Tally, latency_table
+from evnlos.live.sources import Replay, SourceOptions, TimedFrame, capture_replay, open_live
 from evnlos.live.udp import UdpSender, UdpSource, send_timed
 from evnlos.models import UNetConfig, Weights, save_weights
 from evnlos.types import Events
@@ -500,7 +500,7 @@ def test_weights_that_do_not_fit_are_one_line(tmp_path: Path) -> None:
         Engine(weights(surface="context"))
     for wrong in ({"rate": 0}, {"queue_events": 0}, {"seconds": -1.0}):
         with pytest.raises(ConfigError):
-            Pace(**wrong)
+            RateOptions(**wrong)
 
 
 # Runs
@@ -518,7 +518,7 @@ class Kept:
 
 def test_a_run_makes_the_last_picture_of_all_events(engine: Engine) -> None:
     events, kept = stream(2000, 15, span_us=200_000), Kept()
-    run = Run(Replay([events], speed=2), engine, Pace(rate=200))
+    run = Run(Replay([events], speed=2), engine, RateOptions(rate=200))
     summary = run.go([kept]).summary()
     last = kept.pictures[-1]
     surface = RunningSurface(20, 30, 50_000)
@@ -550,7 +550,7 @@ def test_drops_and_the_error_of_a_source_reach_the_user(engine: Engine) -> None:
             pass
 
     kept = Kept()
-    run = Run(Flood(), engine, Pace(rate=1000, queue_events=100))
+    run = Run(Flood(), engine, RateOptions(rate=1000, queue_events=100))
     run._engine = Slow(engine)  # until the source has said all
     with pytest.raises(EventFileError, match="cable"):
         run.go([kept])
@@ -709,7 +709,7 @@ def test_a_video_on_a_full_disk_is_one_line_and_nothing_is_left(
 def test_a_run_without_a_picture_leaves_no_folder(engine: Engine, tmp_path: Path) -> None:
     write_events(tmp_path / "e.npz", stream(5))
     with pytest.raises(EventFileError, match="followed"), record.Recorder(tmp_path / "new" / "out") as recorder:
-        Run(open_live(str(tmp_path / "e.npz"), Listening(follow=True)), engine).go([recorder])
+        Run(open_live(str(tmp_path / "e.npz"), SourceOptions(follow=True)), engine).go([recorder])
     assert not (tmp_path / "new" / "out").exists()
 
 
@@ -739,7 +739,7 @@ def test_wrong_sources_are_one_line(event_weights: Path, tmp_path: Path, capsys)
         lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("evnlos")]
         assert stop.value.code == 2 and len(lines) == 1 and words in lines[0], (source, lines)
     assert not (tmp_path / "o").exists()
-    source = open_live("udp://127.0.0.1:0", Listening(idle=0))
+    source = open_live("udp://127.0.0.1:0", SourceOptions(idle=0))
     assert isinstance(source, UdpSource)
     source.close()
 

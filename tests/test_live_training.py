@@ -19,12 +19,12 @@ from evnlos.data.simulate import drawn_for, scene_of
 from evnlos.errors import ConfigError
 from evnlos.models import UNetConfig, load_weights
 from evnlos.training import Training
-from evnlos.training.source import Live, Team
+from evnlos.training.source import ProcessGroup, SimulatedSource
 from evnlos.types import derive_seed
 from watching import stopped
 
 CPU = torch.device("cpu")
-ALONE = Team(0, 1, CPU)
+ALONE = ProcessGroup(0, 1, CPU)
 SETTINGS = Training(
     epochs=2, network=UNetConfig(width=8, depth=1, shuffle=1, rank=8), precision="float32", batch_size=7
 )
@@ -37,7 +37,7 @@ def few(tiny):
     return replace(tiny, glyphs=glyphs, positions=4, duration_s=4.0, validation=0.25)
 
 
-def epoch_of(source: Live, epoch: int) -> list[tuple[bytes, bytes]]:
+def epoch_of(source: SimulatedSource, epoch: int) -> list[tuple[bytes, bytes]]:
     """Return the samples of an epoch in the order of training."""
     batches = list(source.batches(epoch))
     return [
@@ -59,7 +59,7 @@ def test_the_first_epoch_is_the_dataset_on_disk(tiny, tiny_dataset) -> None:
 
 
 def test_an_epoch_is_the_same_again_and_the_next_one_is_another(few) -> None:
-    source = Live(replace(live_dataset(few), mix=2), "event", 5, 0, ALONE)
+    source = SimulatedSource(replace(live_dataset(few), mix=2), "event", 5, 0, ALONE)
     first, again = epoch_of(source, 0), epoch_of(source, 0)
     assert first == again
     assert len(first) == 3 * few.positions
@@ -71,7 +71,8 @@ def test_an_epoch_is_the_same_again_and_the_next_one_is_another(few) -> None:
 
 def test_a_mix_is_shuffled_and_loses_nothing(few) -> None:
     kinds = {
-        mix: epoch_of(Live(replace(live_dataset(few), mix=mix), "frame", 4, 0, ALONE), 0) for mix in (1, 3)
+        mix: epoch_of(SimulatedSource(replace(live_dataset(few), mix=mix), "frame", 4, 0, ALONE), 0)
+        for mix in (1, 3)
     }
     assert sorted(kinds[1]) == sorted(kinds[3])
     assert kinds[1] != kinds[3]
@@ -100,7 +101,7 @@ def test_the_command_simulates_as_it_trains(few, tmp_path, capsys) -> None:
     save_yaml(few, tmp_path / "setup.yaml")
     arguments = ["train", "--simulate", str(tmp_path / "setup.yaml"), "--epochs", "1", "--precision", "float32"]
     arguments += [
-        "--simulate-on",
+        "--simulation-device",
         "cpu",
         "--network.width",
         "8",

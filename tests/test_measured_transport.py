@@ -12,7 +12,7 @@ from PIL import Image
 from safetensors.torch import save
 
 from evnlos.analysis.identify import identify
-from evnlos.analysis.linearized import Bench
+from evnlos.analysis.linearized import AnalysisSettings
 from evnlos.calibration.scan import (
     Patterns,
     ScanCamera,
@@ -472,15 +472,15 @@ def test_strange_files_are_refused(tmp_path) -> None:
 
 
 def test_identify_tells_the_scan_s_own_noise(noisy, clean, tmp_path) -> None:
-    bench = Bench(target_size_m=0.06, cells=12, height=60, width=96, writers=1)
-    found = identify(MeasuredSetup(file=str(clean[1]), gain=1 / SCALE), bench=bench)
-    true = identify(replace(SETUP, strip_m=(0.12, 0.06)), bench=replace(bench, height=24, width=40))
+    settings = AnalysisSettings(target_size_m=0.06, cells=12, height=60, width=96, writers=1)
+    found = identify(MeasuredSetup(file=str(clean[1]), gain=1 / SCALE), settings=settings)
+    true = identify(replace(SETUP, strip_m=(0.12, 0.06)), settings=replace(settings, height=24, width=40))
     assert found.modes == pytest.approx(true.modes, abs=3)
-    assert found.at_fixed.psnr_db == pytest.approx(true.at_fixed.psnr_db, abs=0.3)
+    assert found.at_noise_std.psnr_db == pytest.approx(true.at_noise_std.psnr_db, abs=0.3)
     assert any("10.0 mm" in warning for warning in found.warnings)
     plain = tmp_path / "plain.safetensors"
     write_measurement(plain, import_scan(noisy["raster"], ScanImport(denoise=False)).measurement)
-    rough = identify(MeasuredSetup(file=str(plain), gain=1 / SCALE), bench=bench)
+    rough = identify(MeasuredSetup(file=str(plain), gain=1 / SCALE), settings=settings)
     assert rough.modes > true.modes + 5  # noise looks like modes ...
     assert any("surely measured" in warning for warning in rough.warnings)  # ... and the report says so
 

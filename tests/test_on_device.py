@@ -21,7 +21,7 @@ from evnlos.optics import SlidingWall, View
 from evnlos.optics.wall import slide
 from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.training.source import Live, Team
+from evnlos.training.source import ProcessGroup, SimulatedSource
 from evnlos.types import Plane
 from pretend_device import PRETENDED, PretendedDevice
 from test_event_pixel_v2e import PIXELS, _video
@@ -349,14 +349,14 @@ def test_every_pixel_runs_on_a_device(name) -> None:
 
 @pytest.mark.parametrize("modality", ["frame", "event", "fusion"])
 def test_a_training_is_fed_on_its_device(small, modality) -> None:
-    source = Live(live_dataset(small), modality, 3, 0, Team(0, 1, PRETENDED))
+    source = SimulatedSource(live_dataset(small), modality, 3, 0, ProcessGroup(0, 1, PRETENDED))
     with PretendedDevice():
         first, again = (list(source.batches(1)) for _ in range(2))
         assert len(first) == source.steps == 3
         for one, other in zip(first, again, strict=True):
             assert one.seen.device == one.truth.device == PRETENDED
             assert torch.equal(one.seen.cpu(), other.seen.cpu())
-        inputs, truth, names = source.some(4)
+        inputs, truth, names = source.subset(4)
         assert inputs.device.type == truth.device.type == "cpu"
         assert len(inputs) == len(truth) == len(names) == 4
 

@@ -58,9 +58,9 @@ class Toy(Reconstructor):
         torch.nn.init.zeros_(self.conv.weight)
         torch.nn.init.zeros_(self.conv.bias)
 
-    def fit(self, some, seed, *, is_new, keep_normalization) -> None:
+    def fit(self, subset, seed, *, is_new, keep_normalization) -> None:
         if is_new:
-            self.mean.copy_(some(500)[1].float().mean(dim=0))
+            self.mean.copy_(subset(500)[1].float().mean(dim=0))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return (self.mean + torch.tanh(self.conv(x))).clamp(0.001, 0.999)

@@ -12,9 +12,9 @@ import torch
 
 from chromium import Chromium, missing
 from evnlos.analysis import Evaluation
-from evnlos.analysis.confidence import PassWorth
+from evnlos.analysis.confidence import ConfidenceCheck
 from evnlos.analysis.identify import identify
-from evnlos.analysis.linearized import Bench
+from evnlos.analysis.linearized import AnalysisSettings
 from evnlos.analysis.scores import score
 from evnlos.cli.main import main
 from evnlos.cli.verbs import command_of
@@ -69,7 +69,7 @@ def made(tmp_path_factory):
 def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None:
     data, runs = made
     setup = named_setup("main-near")
-    limits = identify(setup.setup, Bench(cells=8, height=12, width=20, writers=1), "main-near")
+    limits = identify(setup.setup, AnalysisSettings(cells=8, height=12, width=20, writers=1), "main-near")
     path = write_report(tmp_path / "report.html", data, runs, [], setup=setup, limits=limits)
     page = path.read_text()
     assert path.stat().st_size < 5e6
@@ -267,8 +267,10 @@ def test_weights_without_a_log_leave_no_empty_section(made, tmp_path) -> None:
 def test_the_page_says_how_far_to_believe_each_run(made, tmp_path) -> None:
     data, runs = made
     assert "How far to believe" not in write_report(tmp_path / "plain.html", data, runs, []).read_text()
-    said = [PassWorth("near_G", 0.62, 0.7, 0.62, True, 0.81, 0.93, 0.2), _unmeasured("near_K")]
-    on_sequences = replace(runs[0], sees_sequence=True, evaluation=replace(runs[0].evaluation, worth=said))
+    said = [ConfidenceCheck("near_G", 0.62, 0.7, 0.62, True, 0.81, 0.93, 0.2), _unmeasured("near_K")]
+    on_sequences = replace(
+        runs[0], sees_sequence=True, evaluation=replace(runs[0].evaluation, confidence_checks=said)
+    )
     page = write_report(tmp_path / "report.html", data, [*runs, on_sequences], []).read_text()
     shown = page.split("How far to believe them")[1].split("</table>")[0]
     assert "EPNP sequence frame" in shown and "E2E frame" not in shown
@@ -279,8 +281,8 @@ def test_the_page_says_how_far_to_believe_each_run(made, tmp_path) -> None:
     assert ">EPNP sequence frame</text>" in page and list(gains_of([*runs, on_sequences])) == ["frame"]
 
 
-def _unmeasured(name: str) -> PassWorth:
-    return PassWorth(name, 0.0, 0.01, None, False, -0.3, 0.99, 1.0)
+def _unmeasured(name: str) -> ConfidenceCheck:
+    return ConfidenceCheck(name, 0.0, 0.01, None, False, -0.3, 0.99, 1.0)
 
 
 def test_the_worst_pictures_are_of_several_objects() -> None:

@@ -39,8 +39,8 @@ from evnlos.tracking import (
     static_light,
     temporal_noise,
     track_capture,
-    track_doubts,
     track_frames,
+    track_warnings,
 )
 from evnlos.tracking.motion_fit import Depths, Fit
 from evnlos.tracking.registration import explained_change
@@ -443,14 +443,14 @@ def test_a_setup_of_another_distance_or_wall_is_doubted(capture, tmp_path, capsy
     right, rough = tracks
     assert right.misfit == pytest.approx(1, abs=0.1)
     assert rough.misfit > 1.2 and (rough.frame_sigma > right.frame_sigma).mean() > 0.9
-    assert not track_doubts(recording, SETUP, right) and not track_doubts(
+    assert not track_warnings(recording, SETUP, right) and not track_warnings(
         recording, None, replace(right, misfit=None)
     )
-    (doubt,) = track_doubts(recording, SETUP, rough)
-    assert "times the noise" in doubt and "calibrate" in doubt
-    (doubt,) = track_doubts(recording, replace(SETUP, distance_m=0.5), right)
-    assert "states a distance of 0.3 m, the setup 0.5 m" in doubt
-    assert not track_doubts(recording, replace(SETUP, distance_m=0.305), right)
+    (warning,) = track_warnings(recording, SETUP, rough)
+    assert "times the noise" in warning and "calibrate" in warning
+    (warning,) = track_warnings(recording, replace(SETUP, distance_m=0.5), right)
+    assert "states a distance of 0.3 m, the setup 0.5 m" in warning
+    assert not track_warnings(recording, replace(SETUP, distance_m=0.305), right)
 
 
 def test_the_command_takes_a_calibrated_folder_and_says_what_no_capture_is(capture, tmp_path, capsys) -> None:

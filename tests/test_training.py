@@ -185,11 +185,11 @@ def test_half_of_a_mirrored_batch_is_upside_down_with_its_pictures() -> None:
 
 
 def test_mirrored_samples_come_in_pairs_and_no_more_than_asked_for() -> None:
-    def some(count: int):
+    def subset(count: int):
         draw = torch.Generator().manual_seed(count)
         return torch.rand(count, 2, 4, 3, generator=draw), torch.rand(count, 4, 3), np.full(count, "a")
 
-    inputs, pictures, names = with_mirrored(some)(10)
+    inputs, pictures, names = with_mirrored(subset)(10)
     assert len(inputs) == len(pictures) == len(names) == 10
     assert torch.equal(inputs[:5].flip(-2), inputs[5:]) and torch.equal(pictures[:5].flip(-2), pictures[5:])
 

@@ -150,7 +150,9 @@ def check_folder(folder: str | Path) -> None:
 
 
 @contextmanager
-def claim(folder: str | Path, part: str = "", *, check: Callable[[], object] | None = None) -> Iterator[Path]:
+def directory_lock(
+    folder: str | Path, part: str = "", *, check: Callable[[], object] | None = None
+) -> Iterator[Path]:
     """Hold a folder for this process; make it where it is not there yet.
 
     Whoever holds the whole of it removes unfinished files of processes that were killed. Processes that hold

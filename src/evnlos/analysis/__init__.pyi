@@ -2,7 +2,7 @@
 
 from .bounds import Bounds as Bounds
 from .bounds import EventBound as EventBound
-from .bounds import SequenceBench as SequenceBench
+from .bounds import SequenceAnalysisSettings as SequenceAnalysisSettings
 from .bounds import event_information as event_information
 from .bounds import frame_information as frame_information
 from .bounds import row_information as row_information
@@ -16,7 +16,7 @@ from .evaluate import evaluate as evaluate
 from .evaluate import reconstruct as reconstruct
 from .identify import Identification as Identification
 from .identify import identify as identify
-from .linearized import Bench as Bench
+from .linearized import AnalysisSettings as AnalysisSettings
 from .model import Model as Model
 from .model import PositionsPoint as PositionsPoint
 from .model import Reconstruction as Reconstruction

@@ -42,7 +42,7 @@ _REFERENCES = "AS2"  # characters that the prior does not know
 
 
 @dataclass(frozen=True)
-class SequenceBench:
+class SequenceAnalysisSettings:
     """How the question is put for a moving target_plane."""
 
     travel_m: float = 0.16
@@ -65,19 +65,21 @@ class SequenceBench:
     """The same, tried for the setup's own event model only."""
     silences: bool = False
     """Whether the time without events at the end of a pixel's record counts, as a weak row."""
-    known_pattern: bool = True
+    fpn_corrected: bool = True
     """Whether the frame camera's fixed pattern is known; where not, it is integrated out."""
 
     def __post_init__(self) -> None:
         for name in ("travel_m", "speed_m_s", "crossing_noise"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"SequenceBench.{name} is {value}; give a positive number")
+                raise ConfigError(f"SequenceAnalysisSettings.{name} is {value}; give a positive number")
         wrong = [count for count in self.counts if not 1 <= count <= self.positions]
         if wrong or not self.counts:
-            raise ConfigError(f"SequenceBench.counts is {self.counts}; give numbers from 1 to {self.positions}")
+            raise ConfigError(
+                f"SequenceAnalysisSettings.counts is {self.counts}; give numbers from 1 to {self.positions}"
+            )
         if not 8 <= self.cells <= 64:
-            raise ConfigError(f"SequenceBench.cells is {self.cells}; give 8 to 64")
+            raise ConfigError(f"SequenceAnalysisSettings.cells is {self.cells}; give 8 to 64")
 
     @property
     def motion(self) -> LineMotion:
@@ -115,14 +117,14 @@ class Bounds:
 
     Args:
         name: Name of the setup.
-        bench: How the question was put.
+        settings: How the question was put.
         prior_db: PSNR of the prior's mean, dB.
-        frames_db: Expected PSNR from frames, for each of the bench's numbers of positions.
+        frames_db: Expected PSNR from frames, for each of the settings' numbers of positions.
         events: The event models, the setup's own first.
     """
 
     name: str
-    bench: SequenceBench
+    settings: SequenceAnalysisSettings
     prior_db: float
     frames_db: tuple[float, ...]
     events: tuple[EventBound, ...]
@@ -133,7 +135,7 @@ class Bounds:
 
     def table(self) -> str:
         """Return the expected PSNR over the number of positions, in Markdown."""
-        counts = self.bench.counts
+        counts = self.settings.counts
         rows = [
             f"| {self.name}: expected PSNR, dB, of n positions | " + " | ".join(map(str, counts)) + " |",
             "|---" * (1 + len(counts)) + "|",
@@ -157,7 +159,7 @@ def _row(name: str, values: tuple[float, ...]) -> str:
 
 
 def sequence_bounds(
-    setup: Setup, bench: SequenceBench | None = None, name: str = "setup", seed: int = 0
+    setup: Setup, settings: SequenceAnalysisSettings | None = None, name: str = "setup", seed: int = 0
 ) -> Bounds:
     """Say how well a moving target can be told from frames, events, both, for each event model that applies.
 
@@ -167,54 +169,56 @@ def sequence_bounds(
 
     Args:
         setup: A linear setup.
-        bench: Motion, prior and noise; None is the default.
+        settings: Motion, prior and noise; None is the default.
         name: What to call the setup.
         seed: Seed of the noise events.
 
     Raises:
         ConfigError: The setup is not linear.
     """
-    bench = bench or SequenceBench()
-    target_plane = Plane(bench.cells, bench.cells, 0.08 / bench.cells)
-    prior = handwritten_prior(target_plane, min(bench.coefficients, bench.cells**2), bench.writers)
+    settings = settings or SequenceAnalysisSettings()
+    target_plane = Plane(settings.cells, settings.cells, 0.08 / settings.cells)
+    prior = handwritten_prior(target_plane, min(settings.coefficients, settings.cells**2), settings.writers)
     grid = (min(setup.shape[0], _GRID[0]), min(setup.shape[1], _GRID[1]))
-    span = (0.0, bench.duration_s)
-    light = sequence_light(setup, prior, bench.motion.position_m, span, grid)
+    span = (0.0, settings.duration_s)
+    light = sequence_light(setup, prior, settings.motion.position_m, span, grid)
     # neighbours see the same: each pixel of the grid stands for several of the sensor
     pixels = setup.shape[0] * setup.shape[1] / (grid[0] * grid[1])
-    targets = handwritten_targets(target_plane, bench.writers)
+    targets = handwritten_targets(target_plane, settings.writers)
     chosen = [next(k for k, at in enumerate(targets.names) if at.endswith(f"_{c}")) for c in _REFERENCES]
     scaled = prior.patterns / np.square(prior.patterns).sum(axis=0)
     references = [(targets.test[k].numpy() - prior.mean) @ scaled for k in chosen]
-    frames = [pixels * frame_information(light, z, setup, bench) for z in references]
+    frames = [pixels * frame_information(light, z, setup, settings) for z in references]
     found = []
     typical = float(light(references[0]).mean()) * WHITE_DN
     for kind, pixel in _models(setup.pixel).items():
         law = pixel.crossing_law(typical)
-        for noise in (bench.crossing_noise, *(bench.other_noises if pixel is setup.pixel else ())):
+        for noise in (settings.crossing_noise, *(settings.other_noises if pixel is setup.pixel else ())):
             if law is None:
                 continue
-            asked = replace(bench, crossing_noise=noise)
+            asked = replace(settings, crossing_noise=noise)
             each = [event_information(light, z, law, asked, seed) for z in references]
             events = [pixels * one[0] for one in each]
             rms, count = float(np.mean([e[1] for e in each])), float(np.mean([e[2] for e in each]))
             both = [one + other for one, other in zip(events, frames, strict=True)]
             found.append(EventBound(kind, rms, count, _decibel(prior, events), _decibel(prior, both)))
     alone = _decibel(prior, [np.zeros((1, prior.count, prior.count))])[0]
-    return Bounds(name, bench, alone, _decibel(prior, frames), tuple(found))
+    return Bounds(name, settings, alone, _decibel(prior, frames), tuple(found))
 
 
-def frame_information(light: SequenceLight, z: np.ndarray, setup: Setup, bench: SequenceBench) -> np.ndarray:
-    """Return the information of frames at each of the bench's numbers of positions, [counts, k, k].
+def frame_information(
+    light: SequenceLight, z: np.ndarray, setup: Setup, settings: SequenceAnalysisSettings
+) -> np.ndarray:
+    """Return the information of frames at each of the settings' numbers of positions, [counts, k, k].
 
     Args:
         light: The light, linear in the coefficients.
         z: Coefficients at whose light the camera's noise is taken, [k].
         setup: Its frame camera.
-        bench: Positions, and whether the fixed pattern is known.
+        settings: Positions, and whether the fixed pattern is known.
     """
-    instants = np.arange(1, bench.positions + 1) * bench.duration_s / bench.positions
-    chosen = [set(position_subsets(bench.positions, count, 1)[0].tolist()) for count in bench.counts]
+    instants = np.arange(1, settings.positions + 1) * settings.duration_s / settings.positions
+    chosen = [set(position_subsets(settings.positions, count, 1)[0].tolist()) for count in settings.counts]
     everywhere, camera, size = np.arange(len(light.left)), setup.frame_camera, (len(light.left), len(z))
     seen = light(z)
     totals = [NormalEquations.empty(len(z)) for _ in chosen]
@@ -229,10 +233,10 @@ def frame_information(light: SequenceLight, z: np.ndarray, setup: Setup, bench: 
         for n, mine in enumerate(chosen):
             if k in mine:
                 totals[n].information += one.information
-                if not bench.known_pattern:
+                if not settings.fpn_corrected:
                     summed[n] += rows * weight[:, None]
                     weights[n] += weight
-    if not bench.known_pattern:
+    if not settings.fpn_corrected:
         spread = camera.pattern_variance(torch.from_numpy(seen.mean(axis=1))).sqrt().numpy()
         for total, parts, weight in zip(totals, summed, weights, strict=True):
             total.subtract_offsets(parts, weight, spread)
@@ -240,7 +244,7 @@ def frame_information(light: SequenceLight, z: np.ndarray, setup: Setup, bench: 
 
 
 def event_information(
-    light: SequenceLight, z: np.ndarray, law: CrossingLaw, bench: SequenceBench, seed: int = 0
+    light: SequenceLight, z: np.ndarray, law: CrossingLaw, settings: SequenceAnalysisSettings, seed: int = 0
 ) -> tuple[np.ndarray, float, float]:
     """Return the information of events for each number of positions, the crossings' error, events per pixel.
 
@@ -248,7 +252,7 @@ def event_information(
         light: The light.
         z: Coefficients of the target that makes the events, [k].
         law: Constants of the event model.
-        bench: Positions, noise of a crossing, silences.
+        settings: Positions, noise of a crossing, silences.
         seed: Seed of the noise events.
 
     Returns:
@@ -256,17 +260,17 @@ def event_information(
     """
     levels = levels_of(light(z), light.times_s, law)
     record = predicted_record(light, levels, law, seed)
-    variance = crossing_variance(light, z, record, law, bench.crossing_noise)
-    middle, share = bench.duration_s / 2, bench.duration_s / bench.positions / 2
+    variance = crossing_variance(light, z, record, law, settings.crossing_noise)
+    middle, share = settings.duration_s / 2, settings.duration_s / settings.positions / 2
     found = []
-    for count in bench.counts:
+    for count in settings.counts:
         first, last = middle - count * share, middle + count * share
         inside = record.measured & (record.t_s > first) & (record.t_s <= last)
         total = row_information(
             light, levels, record, np.where(inside, 1.0 / variance, 0.0), law.threshold_sigma
         )
-        if bench.silences:
-            total = total + _silence_information(light, levels, record, law, (first, last), bench)
+        if settings.silences:
+            total = total + _silence_information(light, levels, record, law, (first, last), settings)
         found.append(total)
     measured = record.measured
     rms = float(np.sqrt(variance[measured].mean())) if measured.any() else math.nan
@@ -316,7 +320,7 @@ def _silence_information(
     record: EventRecord,
     law: CrossingLaw,
     window: tuple[float, float],
-    bench: SequenceBench,
+    settings: SequenceAnalysisSettings,
 ) -> np.ndarray:
     """Return the information of "no event since": a change that is uniform between the thresholds."""
     index = np.arange(len(record))
@@ -333,7 +337,7 @@ def _silence_information(
         np.stack([np.full(count, -1), 2 * np.arange(count)], axis=1).ravel(),
     )
     width = law.threshold_on + law.threshold_off
-    variance = width**2 / 12 + 2 * law.threshold_sigma**2 / 4 + law.noise**2 + bench.crossing_noise**2
+    variance = width**2 / 12 + 2 * law.threshold_sigma**2 / 4 + law.noise**2 + settings.crossing_noise**2
     weight = np.where(ends.sign > 0, 1.0 / variance, 0.0)
     return row_information(light, levels, ends, weight, 0.0)
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from evnlos.data import NlosDataset, Samples, Sampling
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
-from evnlos.models import Confidence, Judgement, Reconstructor, Weights, halves_of, on_target_plane
+from evnlos.models import Confidence, ConfidenceReport, Reconstructor, Weights, halves_of, on_target_plane
 from evnlos.models.confidence import on_canvas
 from evnlos.setups import Setup
 from evnlos.types import Plane
@@ -211,9 +211,9 @@ def _noise(frames: Tensor, operator: FrameOperator) -> Tensor:
 
 
 @torch.inference_mode()
-def judgement_of(
+def confidence_of(
     weights: Weights, samples: Samples, images: Tensor, operator: FrameOperator | None = None
-) -> Judgement | None:
+) -> ConfidenceReport | None:
     """Return what the pictures of one sequence are worth; None where the weights or the motion do not tell.
 
     Args:
@@ -222,17 +222,17 @@ def judgement_of(
         images: The network's pictures, float32 [N, H, W].
         operator: The calibrated setup, where it is known.
     """
-    if why_unjudged(weights, samples) is not None:
+    if why_no_confidence(weights, samples) is not None:
         return None
-    assert weights.confidence is not None and samples.position_m is not None  # see why_unjudged
+    assert weights.confidence is not None and samples.position_m is not None  # see why_no_confidence
     seen = weights.modality.inputs(samples.frame, samples.surface)
     frames = torch.from_numpy(samples.frame)
     sequence = (seen, frames, images, samples.position_m)
-    return _judged(weights.network, weights.confidence, *sequence, weights.sampling.canvas, operator)
+    return _report_of(weights.network, weights.confidence, *sequence, weights.sampling.canvas, operator)
 
 
-def why_unjudged(weights: Weights, samples: Samples) -> str | None:
-    """Return in one line why `judgement_of` can't tell anything, and the cure; None where it can.
+def why_no_confidence(weights: Weights, samples: Samples) -> str | None:
+    """Return in one line why `confidence_of` can't tell anything, and the cure; None where it can.
 
     Args:
         weights: The network.
@@ -249,7 +249,7 @@ def why_unjudged(weights: Weights, samples: Samples) -> str | None:
     return f"no confidence: {why}"
 
 
-def _judged(
+def _report_of(
     network: Reconstructor,
     confidence: Confidence,
     inputs: Tensor,
@@ -258,7 +258,7 @@ def _judged(
     position_m: NDArray,
     canvas: Plane,
     operator: FrameOperator | None,
-) -> Judgement:
+) -> ConfidenceReport:
     share = None
     if operator is not None and bool(frames.any()):
         # What the sequence shows, at each position: what changes from picture to picture is not the object.
@@ -267,16 +267,16 @@ def _judged(
     return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
 
 
-def said(worth: Judgement) -> dict[str, Any]:
+def confidence_values(report: ConfidenceReport) -> dict[str, Any]:
     """Return a judgement as plain values; `explained` is there only where the setup is known."""
-    numbers = {name: round(getattr(worth, name), 4) for name in ("support", "agreement", "threshold")}
-    if worth.explained is not None:
-        numbers["explained"] = round(worth.explained, 4)
-    return numbers | {"measured": worth.measured, "verdict": worth.verdict}
+    numbers = {name: round(getattr(report, name), 4) for name in ("support", "agreement", "threshold")}
+    if report.explained is not None:
+        numbers["explained"] = round(report.explained, 4)
+    return numbers | {"measured": report.measured, "verdict": report.verdict}
 
 
 @dataclass(frozen=True)
-class PassWorth:
+class ConfidenceCheck:
     """What the confidence said of one sequence, and what was true.
 
     Args:
@@ -302,14 +302,14 @@ class PassWorth:
 
 
 @torch.inference_mode()
-def worth_of(
+def check_confidence(
     network: Reconstructor,
     confidence: Confidence,
     samples: NlosDataset,
     images: Tensor,
     canvas: Plane,
     operator: FrameOperator | None = None,
-) -> list[PassWorth]:
+) -> list[ConfidenceCheck]:
     """Compare what the confidence says of pictures with their truth, for each sequence.
 
     Args:
@@ -329,22 +329,22 @@ def worth_of(
         rows, at = torch.from_numpy(mine), samples.position_m[mine]
         inputs = samples.inputs[rows]
         sequence = (inputs, _frames(samples, inputs), images[rows], at)
-        said = _judged(network, confidence, *sequence, canvas, operator)
+        report = _report_of(network, confidence, *sequence, canvas, operator)
         true, shown = samples.truth[rows].float(), images[rows]
         average = on_canvas(confidence.mean, canvas, at)
         missed, blank = (on_target_plane((one - true).square(), canvas, at).sum() for one in (shown, average))
         # Where the resampled truth is a rounding error beyond 0 or 1, it still is 0 or 1.
-        held = ((true >= said.low - 1e-3) & (true <= said.high + 1e-3)).float()
+        held = ((true >= report.low - 1e-3) & (true <= report.high + 1e-3)).float()
         found.append(
-            PassWorth(
+            ConfidenceCheck(
                 name,
-                said.support,
-                said.agreement,
-                said.explained,
-                said.measured,
+                report.support,
+                report.agreement,
+                report.explained,
+                report.measured,
                 float(1 - missed / blank),
                 float(on_target_plane(held, canvas, at).mean()),
-                float(on_target_plane(said.high - said.low, canvas, at).mean()),
+                float(on_target_plane(report.high - report.low, canvas, at).mean()),
             )
         )
     return found

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.analysis.confidence import FrameOperator, PassWorth, worth_of
+from evnlos.analysis.confidence import ConfidenceCheck, FrameOperator, check_confidence
 from evnlos.analysis.scores import CHARACTERS, Perceptual, Scores, read_characters, score
 from evnlos.config import to_dict
 from evnlos.data import Dataset, Modality, NlosDataset, Sampling, character_of, read_shard, read_shard_index
@@ -170,8 +170,8 @@ class Evaluation:
         checks: Shares of the pictures: "read", whose character the independent reader names rightly;
             "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
             the truth than to any training picture. Only what could be found out.
-        worth: What the network's confidence said of each sequence, beside what was true; empty where it has
-            none, or a motion is unknown.
+        confidence_checks: What the network's confidence said of each sequence, beside what was true; empty
+            where it has none, or a motion is unknown.
     """
 
     images: Tensor
@@ -180,7 +180,7 @@ class Evaluation:
     scores: Scores
     baselines: dict[str, Scores]
     checks: dict[str, float] = field(default_factory=dict)
-    worth: list[PassWorth] = field(default_factory=list)
+    confidence_checks: list[ConfidenceCheck] = field(default_factory=list)
 
     def characters(self) -> list[str]:
         """Return the objects in the order of the dataset."""
@@ -201,7 +201,7 @@ class Evaluation:
             **table(self.scores),
             "baselines": {name: table(scores) for name, scores in self.baselines.items()},
             "checks": self.checks,
-            "confidence": [to_dict(one) for one in self.worth],
+            "confidence": [to_dict(one) for one in self.confidence_checks],
         }
 
 
@@ -236,8 +236,8 @@ def evaluate(
     canvas = dataset.sampling.canvas
     checks_frames = setup is not None and "frame" in weights.modality.slices
     operator = FrameOperator(setup, dataset.sampling) if setup is not None and checks_frames else None
-    worth = worth_of(weights.network, weights.confidence, samples, images, canvas, operator)
-    return replace(found, worth=worth)
+    confidence_checks = check_confidence(weights.network, weights.confidence, samples, images, canvas, operator)
+    return replace(found, confidence_checks=confidence_checks)
 
 
 def assess(

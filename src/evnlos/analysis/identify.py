@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from evnlos.analysis.linearized import (
-    Bench,
+    AnalysisSettings,
     LinearEstimator,
     LinearizedSetup,
     finest_bars,
@@ -97,7 +97,7 @@ KINK_LEVEL = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class AtNoise:
+class NoiseLevelResult:
     """What is left of a setup at one noise; figures are expectations over the noise of one picture of the wall.
 
     Args:
@@ -134,7 +134,7 @@ class Identification:
     Args:
         name: Name of the setup.
         setup: Its settings.
-        bench: How the question was put.
+        settings: How the question was put.
         singular: Singular values over the largest, float64 [n], descending.
         modes: How many of them lie above 1e-2.
         zero_db: Mean PSNR of the all-black picture, on the target plane.
@@ -142,22 +142,22 @@ class Identification:
         stroke_m: Typical stroke of the targets, metres.
         truth: The typical target, float64 [h, w].
         at_camera: At the frame camera's own noise.
-        at_fixed: At the fixed noise of the bench.
+        at_noise_std: At the fixed noise of the settings.
         verdict: The same in words.
         warnings: What makes the figures look better than they are.
     """
 
     name: str
     setup: Setup
-    bench: Bench
+    settings: AnalysisSettings
     singular: torch.Tensor
     modes: int
     zero_db: float
     mean_db: float
     stroke_m: float
     truth: torch.Tensor
-    at_camera: AtNoise
-    at_fixed: AtNoise
+    at_camera: NoiseLevelResult
+    at_noise_std: NoiseLevelResult
     verdict: str
     warnings: tuple[str, ...] = ()
 
@@ -171,10 +171,10 @@ class Identification:
             "psnr_zero_db": round(self.zero_db, 2),
             "psnr_mean_db": round(self.mean_db, 2),
             "typical_stroke_m": round(self.stroke_m, 5),
-            "bench": asdict(self.bench),
+            "analysis": asdict(self.settings),
             "settings": asdict(self.setup),
         }
-        for name, one in (("camera_noise", self.at_camera), ("fixed_noise", self.at_fixed)):
+        for name, one in (("camera_noise", self.at_camera), ("noise_std", self.at_noise_std)):
             found[name] = {
                 "rms_noise": round(one.noise, 6),
                 "patterns_above_noise": one.patterns,
@@ -192,7 +192,7 @@ class Identification:
 
 def identify(
     setup: Setup,
-    bench: Bench | None = None,
+    settings: AnalysisSettings | None = None,
     name: str = "setup",
     seed: int = 0,
 ) -> Identification:
@@ -205,7 +205,7 @@ def identify(
 
     Args:
         setup: The setup; its frame camera's noise is what counts.
-        bench: Cells, pixels and noise; None is the default, that of the table in docs/identifiability.md.
+        settings: Cells, pixels and noise; None is the default, that of the table in docs/identifiability.md.
         name: What to call the setup.
         seed: Seed of the one picture that is drawn with noise.
 
@@ -214,24 +214,25 @@ def identify(
 
     Example:
         >>> from evnlos.setups import load_setup
-        >>> found = identify(load_setup("matte-near"), bench=Bench(cells=8, height=12, width=20, writers=1))
+        >>> few = AnalysisSettings(cells=8, height=12, width=20, writers=1)
+        >>> found = identify(load_setup("matte-near"), settings=few)
         >>> found.modes
         3
     """
-    bench = bench or Bench()
-    seen = linearized(setup, bench)
+    settings = settings or AnalysisSettings()
+    seen = linearized(setup, settings)
     from evnlos.inverse.measurements import handwritten_targets
 
-    targets = handwritten_targets(bench.target_plane, bench.writers)
+    targets = handwritten_targets(settings.target_plane, settings.writers)
     singular = singular_values(seen.matrix)
     light = seen.ambient + seen.matrix @ targets.mean
-    own = setup.frame_camera.noise_variance(light, bench.frames, bench.known_pattern)
-    fixed = torch.full_like(own, (bench.fixed_noise * seen.white) ** 2 / bench.frames)
-    at_camera, at_fixed = (at_noise(seen, variance, targets, seed) for variance in (own, fixed))
+    own = setup.frame_camera.noise_variance(light, settings.frames, settings.fpn_corrected)
+    fixed = torch.full_like(own, (settings.noise_std * seen.white) ** 2 / settings.frames)
+    at_camera, at_noise_std = (result_at_noise(seen, variance, targets, seed) for variance in (own, fixed))
     warnings = []
     plain = setup.without_artifacts()
     if plain is not None:
-        wide = singular_values(linearized(plain, bench).matrix)
+        wide = singular_values(linearized(plain, settings).matrix)
         note = artifact_note(setup, plain, counted(singular, KINK_LEVEL), counted(wide, KINK_LEVEL), KINK_LEVEL)
         warnings += [note] if note else []
     noise = setup.resized(seen.shape).operator_noise(seen.target_plane)
@@ -244,21 +245,23 @@ def identify(
     return Identification(
         name,
         setup,
-        bench,
+        settings,
         singular,
         counted(singular, MODE_LEVEL),
         zero_db,
         mean_db,
         targets.stroke_m,
-        targets.test[targets.typical].reshape(bench.target_plane.shape),
+        targets.test[targets.typical].reshape(settings.target_plane.shape),
         at_camera,
-        at_fixed,
-        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, bench.target_size_m),
+        at_noise_std,
+        verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, settings.target_size_m),
         tuple(warnings),
     )
 
 
-def at_noise(seen: LinearizedSetup, variance: torch.Tensor, targets: TargetPrior, seed: int = 0) -> AtNoise:
+def result_at_noise(
+    seen: LinearizedSetup, variance: torch.Tensor, targets: TargetPrior, seed: int = 0
+) -> NoiseLevelResult:
     """Return what is left of a setup at independent noise of a given variance.
 
     Args:
@@ -282,7 +285,7 @@ def at_noise(seen: LinearizedSetup, variance: torch.Tensor, targets: TargetPrior
     backprojected = gram @ (typical - targets.mean) + whitened.mT @ noise
     strokes = [finest_bars(shapeless, cells, upright) for upright in (True, False)]
     upright, lying = (None if one is None else one * seen.target_plane.pitch_m for one in strokes)
-    return AtNoise(
+    return NoiseLevelResult(
         float(variance.mean().sqrt()),
         estimator.patterns_seen,
         _psnr(estimator.expected_error(targets.test)),
@@ -325,23 +328,23 @@ def setup_table(found: Sequence[Identification]) -> str:
     """Return one row a setup, and a line that says what holds for all of them.
 
     Args:
-        found: The setups, all on the same bench.
+        found: The setups, all with the same settings.
     """
     rows = [_HEAD]
     for one in found:
-        camera, fixed = one.at_camera, one.at_fixed
+        camera, fixed = one.at_camera, one.at_noise_std
         rows.append(
             f"| {one.name} | {one.modes} | {camera.patterns} / {fixed.patterns} "
             f"| {_bars(camera)} / {_bars(fixed)} | {camera.psnr_db:.2f} / {fixed.psnr_db:.2f} |"
         )
-    first, bench = found[0], found[0].bench
+    first, settings = found[0], found[0].settings
     rows.append(
-        f"\nOn the target plane of {1e3 * bench.target_size_m:g} mm: all-black {first.zero_db:.2f} dB, "
+        f"\nOn the target plane of {1e3 * settings.target_size_m:g} mm: all-black {first.zero_db:.2f} dB, "
         f"mean training target {first.mean_db:.2f} dB; typical stroke {1e3 * first.stroke_m:.1f} mm; "
-        f"{bench.cells} x {bench.cells} cells, {bench.height} x {bench.width} pixels."
+        f"{settings.cells} x {settings.cells} cells, {settings.height} x {settings.width} pixels."
     )
     return "\n".join(rows)
 
 
-def _bars(one: AtNoise) -> str:
+def _bars(one: NoiseLevelResult) -> str:
     return " x ".join("none" if width is None else f"{1e3 * width:.1f}" for width in one.stroke_m)

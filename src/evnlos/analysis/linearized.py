@@ -18,7 +18,7 @@ from evnlos.types import Plane
 
 
 @dataclass(frozen=True)
-class Bench:
+class AnalysisSettings:
     """How the question is put: cells of the target plane, pixels of the camera, noise."""
 
     target_size_m: float = 0.08
@@ -29,11 +29,11 @@ class Bench:
     """Rows of the camera, pixels."""
     width: int = 96
     """Columns of the camera, pixels."""
-    fixed_noise: float = 0.01
+    noise_std: float = 0.01
     """Standard deviation of the fixed noise, share of the brightest pixel while the whole target shines."""
     frames: int = 1
     """Frames that are averaged, all of the target in the same place."""
-    known_pattern: bool = True
+    fpn_corrected: bool = True
     """Whether the camera's fixed pattern was measured and taken off."""
     writers: int = 6
     """Writers whose characters are the linear estimator's prior."""
@@ -41,13 +41,15 @@ class Bench:
     def __post_init__(self) -> None:
         for name, least in (("cells", 8), ("height", 4), ("width", 4), ("frames", 1), ("writers", 1)):
             if getattr(self, name) < least:
-                raise ConfigError(f"Bench.{name} is {getattr(self, name)}; give {least} or more")
+                raise ConfigError(f"AnalysisSettings.{name} is {getattr(self, name)}; give {least} or more")
         if self.cells > 64:
-            raise ConfigError(f"Bench.cells is {self.cells}; give at most 64, the matrix grows with its square")
-        for name in ("target_size_m", "fixed_noise"):
+            raise ConfigError(
+                f"AnalysisSettings.cells is {self.cells}; give at most 64, the matrix grows with its square"
+            )
+        for name in ("target_size_m", "noise_std"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"Bench.{name} is {value}; give a positive number")
+                raise ConfigError(f"AnalysisSettings.{name} is {value}; give a positive number")
 
     @property
     def target_plane(self) -> Plane:
@@ -82,30 +84,30 @@ class LinearizedSetup:
         return float(self.matrix.sum(dim=1).max())
 
 
-def linearized(setup: Setup, bench: Bench = Bench()) -> LinearizedSetup:
+def linearized(setup: Setup, settings: AnalysisSettings = AnalysisSettings()) -> LinearizedSetup:
     """Return the linear map of a setup for a target in the middle of its path.
 
     Of a setup that is not linear it is the linear part (`Setup.linear_part`). A setup that has fewer pixels
-    than the bench asks for keeps its own.
+    than the settings ask for keeps its own.
 
     Args:
         setup: The setup.
-        bench: Cells and pixels.
+        settings: Cells and pixels.
 
     Raises:
         ConfigError: The setup is geometrically impossible, has no linear part, or gets no light.
 
     Example:
         >>> from evnlos.setups import PaperSetup
-        >>> seen = linearized(PaperSetup(gain=0.5), Bench(cells=8, height=12, width=20))
+        >>> seen = linearized(PaperSetup(gain=0.5), AnalysisSettings(cells=8, height=12, width=20))
         >>> seen.matrix.shape, 0.2 < seen.white < 0.5
         (torch.Size([240, 64]), True)
     """
-    setup = setup.resized(bench.shape)
-    matrix = setup.linear_part(bench.target_plane).dense()
+    setup = setup.resized(settings.shape)
+    matrix = setup.linear_part(settings.target_plane).dense()
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera gets no light from the target; move the target or the camera")
-    return LinearizedSetup(matrix, setup.ambient_light().double().flatten(), bench.target_plane, setup.shape)
+    return LinearizedSetup(matrix, setup.ambient_light().double().flatten(), settings.target_plane, setup.shape)
 
 
 _STEPS_AN_OCTAVE = 8

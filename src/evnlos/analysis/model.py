@@ -16,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.analysis.confidence import FrameOperator, consistent, judgement_of, light_gain, why_unjudged
+from evnlos.analysis.confidence import FrameOperator, confidence_of, consistent, light_gain, why_no_confidence
 from evnlos.analysis.evaluate import check_sampling, reconstruct
 from evnlos.data import Capture, Dataset, FixedPattern, NlosDataset, Samples, capture_samples, read_capture
 from evnlos.errors import ConfigError, DataError
 from evnlos.metrics import psnr
-from evnlos.models import Judgement, Weights, load_weights, published_setup, published_single
+from evnlos.models import ConfidenceReport, Weights, load_weights, published_setup, published_single
 from evnlos.setups import Setup, load_setup
 
 
@@ -102,7 +102,7 @@ class Reconstruction:
 
     images: Tensor
     samples: Samples
-    confidence: Judgement | None = None
+    confidence: ConfidenceReport | None = None
     warnings: list[str] = field(default_factory=list)
     light: float | None = None
     no_confidence: str | None = None
@@ -152,18 +152,18 @@ class Model:
         samples = capture_samples(capture, self.weights.sampling, pattern)
         warnings: list[str] = []
         if tracked is not None:
-            from evnlos.tracking import track_capture, track_doubts
+            from evnlos.tracking import track_capture, track_warnings
 
             path = track_capture(capture, tracked, pattern=pattern)
-            warnings = track_doubts(capture, tracked, path)
+            warnings = track_warnings(capture, tracked, path)
             samples = replace(samples, position_m=path.at(samples.time_s))
         images = reconstruct(self.weights, samples.frame, samples.surface, samples.position_m)
-        unjudged = why_unjudged(self.weights, samples)
+        unjudged = why_no_confidence(self.weights, samples)
         judge = setup
         if judge is None and unjudged is None and self._known_setup is not None:
             judge = load_setup(self._known_setup)  # an operator takes a second to make
         operator = None if judge is None else FrameOperator(judge, self.weights.sampling)
-        confidence = judgement_of(self.weights, samples, images, operator)
+        confidence = confidence_of(self.weights, samples, images, operator)
         found = Reconstruction(images, samples, confidence, warnings, no_confidence=unjudged)
         if setup is None or operator is None:
             return found

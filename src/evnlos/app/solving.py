@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.analysis import reconstruct
-from evnlos.analysis.confidence import FrameOperator, consistent, judgement_of, why_unjudged
+from evnlos.analysis.confidence import FrameOperator, confidence_of, consistent, why_no_confidence
 from evnlos.app.controls import COARSE, Recorded
 from evnlos.data import STANDARD_MODALITIES, Sampling, as_modality
 from evnlos.errors import DataError
@@ -192,10 +192,10 @@ def from_weights(
     images = pictures[:, sampling.scored].numpy()
     noun = weights.modality.noun
     saw = f"all {noun}" if weights.network.sees_sequence else f"{noun} of one time step"
-    can_judge = why_unjudged(weights, samples) is None
+    can_judge = why_no_confidence(weights, samples) is None
     operator = wall(sampling) if wall is not None and can_judge else None
-    worth = judgement_of(weights, samples, pictures, operator)
-    note = f"network: {saw}" + (f"; {worth.verdict}" if worth else "")
+    confidence = confidence_of(weights, samples, pictures, operator)
+    note = f"network: {saw}" + (f"; {confidence.verdict}" if confidence else "")
     return _scored(name, note, images, recorded, sampling)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from evnlos.analysis import Bench, Identification, identify
+from evnlos.analysis import AnalysisSettings, Identification, identify
 from evnlos.app.controls import Recorded
 from evnlos.app.solving import Reconstruction
 from evnlos.cameras import EventPixel
@@ -58,7 +58,7 @@ class Verdict:
 @lru_cache(maxsize=64)
 def _identified(setup: Setup) -> Identification:
     height, width = setup.shape
-    return identify(setup, Bench(cells=_CELLS, height=height, width=width, writers=_WRITERS))
+    return identify(setup, AnalysisSettings(cells=_CELLS, height=height, width=width, writers=_WRITERS))
 
 
 def verdict_on(simulation: Simulation) -> Verdict:

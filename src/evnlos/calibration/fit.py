@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.calibration.blind_calibration import fit_blind
 from evnlos.calibration.captures import CaptureSet, read_capture_set
 from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
 from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
 from evnlos.calibration.settings import Calibration, pens_of, training_simulation
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
-from evnlos.calibration.unlabelled import fit_unlabelled
 from evnlos.calibration.wall_search import fit_wall
 from evnlos.cameras import EventPixel
 from evnlos.cameras.pixel import continuous
@@ -152,7 +152,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
     elif settings.targets == "known":
         optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
     else:
-        found = fit_unlabelled(fit, held, start, fixed=fixed)
+        found = fit_blind(fit, held, start, fixed=fixed)
         optics, fit, held = found.optics, found.fitted, found.held_out
         residuals["every other frame held out"] = found.check
     models = {"fit": FrameModel(fit, fit.shape), "held out": FrameModel(held, held.shape)}

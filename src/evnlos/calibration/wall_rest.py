@@ -67,11 +67,11 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
     explained: dict[str, float] = {}
     kept: list[str] = []
 
-    texture, error = np.ones(len(light)), _judged(data, other, light, away)
+    texture, error = np.ones(len(light)), _remaining_error(data, other, light, away)
     floor, best, rough = _noise(other, away), error, pixel_sensitivity(data, light)
     for smooth in _SMOOTH_PX:
         name, trial = f"texture smooth over {smooth:g} pixels", _smoothed(data, *rough, smooth)[:, None]
-        after = _judged(data, other, light * trial, away * trial)
+        after = _remaining_error(data, other, light * trial, away * trial)
         explained[name] = _share(error, after, floor)
         if _better(best, after):
             texture, best, kept = trial[:, 0], after, [name]
@@ -80,7 +80,7 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
     coarse, behind = _both(fit, held, _COARSE, plane, 2)
     factor = _resized(data.image(texture, 1.0), coarse.grid).ravel()
     light, away = (state.light(d) * factor[d.pixel, None] for d in (coarse, behind))
-    error, floor = _judged(coarse, behind, light, away), _noise(behind, away)
+    error, floor = _remaining_error(coarse, behind, light, away), _noise(behind, away)
     left, right, after = correction_of(coarse, light, behind, away)
     name = "correction of the operator"
     explained[name] = _share(error, after, floor)
@@ -154,7 +154,7 @@ def _resized(pictures: Array, grid: tuple[int, int]) -> Array:
     return large.numpy().reshape(*before, *grid)
 
 
-def _judged(data: WallData, other: WallData, light: Array, away: Array) -> Array:
+def _remaining_error(data: WallData, other: WallData, light: Array, away: Array) -> Array:
     """Return the weighted squares left on each capture held out, less what the fitted ones share, [C]."""
     return _squares(other, other.seen - away - _expected(data, other, data.seen - light))
 

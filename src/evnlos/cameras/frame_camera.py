@@ -161,7 +161,7 @@ class FrameCamera:
         """Digital numbers that an electron adds."""
         return (self.white - self.black_level) * self.gain / self.full_well_e
 
-    def noise_variance(self, light: torch.Tensor, frames: int = 1, known_pattern: bool = True) -> torch.Tensor:
+    def noise_variance(self, light: torch.Tensor, frames: int = 1, fpn_corrected: bool = True) -> torch.Tensor:
         """Return the variance of the noise at a mean light: shot, read, rounding, fixed pattern.
 
         var(E) = (E / N + (r / N)^2 + q^2) / frames + pattern, N the full well, r the read noise, q the rounding
@@ -171,7 +171,7 @@ class FrameCamera:
         Args:
             light: Mean light, white levels, [...].
             frames: Frames that are averaged.
-            known_pattern: Whether the fixed pattern was measured and taken off.
+            fpn_corrected: Whether the fixed pattern was measured and taken off.
 
         Returns:
             Variance, white levels squared, [...].
@@ -184,7 +184,7 @@ class FrameCamera:
         well = self.full_well_e
         rounding = 1 / ((self.white - self.black_level) * self.gain) ** 2 / 12
         variance = (light.clamp(min=0) / well + (self.read_noise_e / well) ** 2 + rounding) / frames
-        return variance if known_pattern else variance + self.pattern_variance(light)
+        return variance if fpn_corrected else variance + self.pattern_variance(light)
 
     def pattern_variance(self, light: torch.Tensor) -> torch.Tensor:
         """Return the variance of the fixed pattern at a mean light [...], white levels squared."""

@@ -19,8 +19,8 @@ from evnlos.cli.console import Flat
 from evnlos.cli.parsing import say
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
-from evnlos.live.run import Pace, Run
-from evnlos.live.sources import Listening, open_live
+from evnlos.live.run import RateOptions, Run
+from evnlos.live.sources import SourceOptions, open_live
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class LiveCommand:
     """Threads of the network; more are quicker only where cores have nothing else to do."""
     json: bool = False
     """Print one JSON object at the end."""
-    listening: Flat[Listening] = field(default_factory=Listening)
-    pace: Flat[Pace] = field(default_factory=Pace)
+    listening: Flat[SourceOptions] = field(default_factory=SourceOptions)
+    pace: Flat[RateOptions] = field(default_factory=RateOptions)
 
     def run(self) -> None:
         """Show or record pictures until the source ends, and print how quick they were."""

@@ -21,7 +21,7 @@ from evnlos.cli.recordings import amount, look_of, refuse_existing, write_previe
 from evnlos.config import load_yaml, to_dict
 from evnlos.errors import ConfigError
 from evnlos.events import EventWriter
-from evnlos.events.recording import Cut, Recording
+from evnlos.events.recording import CropOptions, Recording
 from evnlos.types import Events
 
 
@@ -143,7 +143,7 @@ class EventsCommand:
         found = _found(self, video, pixel, clock, writer.events, on)
         if self.preview and look:
             if writer.events:
-                write_preview(Recording(self.out), Cut(), self.preview, look)
+                write_preview(Recording(self.out), CropOptions(), self.preview, look)
             else:
                 say(f"note: no events, so no {self.preview}")
         print(json.dumps(found) if self.json else _text(found))

@@ -43,14 +43,15 @@ class ExperimentCommand:
     """captures (E2E against EPNP), paper (its settings), frozen, capture-count, surface, thresholds, loss,
     width, embedding, sequence (whole sequences) or objects (how many are simulated); without captures:
     simulation (handwriting, transfer to Comic), conditions (frames against events over light, noise, exposure,
-    speed and setups), carry-over (given weights on unseen hands, other things than characters, and other walls,
-    with what their confidence says), and mismatch (the demo on walls, lenses and sensors that the simulator
-    does not describe).
+    speed and setups), generalization (given weights on unseen hands, other things than characters, and other
+    walls, with what their confidence says), and mismatch (the demo on walls, lenses and sensors that the
+    simulator does not describe).
     """
     captures: Path | None = None
     """Folder of the capture folders."""
     weights: Path | None = None
-    """Weights for carry-over, which were trained for the setup OUT/setups/NAME, NAME as for --captures-of."""
+    """Weights for generalization, which were trained for the setup OUT/setups/NAME, NAME as for --captures-of.
+    """
     out: Path = Path("experiments")
     """Folder for setups, datasets, runs, records and tables; experiments in one folder share what they can."""
     captures_of: str = "near"
@@ -92,7 +93,7 @@ class ExperimentCommand:
         alone = {
             "simulation": self._simulation,
             "conditions": self._conditions,
-            "carry-over": self._carry_over,
+            "generalization": self._generalization,
             "mismatch": self._mismatch,
         }
         alone.get(self.name, self._on_captures)()
@@ -118,7 +119,7 @@ class ExperimentCommand:
         if self.name not in STUDIES:
             raise ConfigError(
                 f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}, simulation, "
-                "conditions, carry-over, mismatch"
+                "conditions, generalization, mismatch"
             )
         if self.captures is None:
             raise ConfigError(f"the experiment {self.name} needs --captures, the folder of the capture folders")
@@ -177,34 +178,34 @@ class ExperimentCommand:
         print(text)
 
     def _conditions(self) -> None:
-        from evnlos.experiment import base_simulation, conditions, conditions_table, map_conditions
+        from evnlos.experiment import base_simulation, conditions, conditions_table, sweep_parameters
 
         chosen = conditions(base_simulation(self.writers or 2))
         with ProgressBars() as progress:
-            findings = map_conditions(
+            findings = sweep_parameters(
                 chosen, self.out / "conditions", self.workers, progress=progress, force=self.force
             )
         text = conditions_table(findings) + "\n"
         write_atomically(self.out / "conditions.md", text.encode())
         print(text)
 
-    def _carry_over(self) -> None:
-        from evnlos.experiment import carried_table, carry_over, write_carried
-        from evnlos.plot.results import draw_worth
+    def _generalization(self) -> None:
+        from evnlos.experiment import generalization, generalization_table, write_generalization
+        from evnlos.plot.results import draw_confidence
 
         weights = self.weights
         if weights is None:
-            raise ConfigError("carry-over needs --weights, a weights file or a run's folder")
+            raise ConfigError("generalization needs --weights, a weights file or a run's folder")
         setup = self.out / "setups" / self.captures_of
         with ProgressBars() as progress:
-            found = carry_over(weights, setup, self.out, self.workers, progress=progress, force=self.force)
-        name = f"carry-over-{self.captures_of}-{weights.stem}"
-        write_carried(found, self.out / f"{name}.json")
-        text = carried_table(found) + "\n"
+            found = generalization(weights, setup, self.out, self.workers, progress=progress, force=self.force)
+        name = f"generalization-{self.captures_of}-{weights.stem}"
+        write_generalization(found, self.out / f"{name}.json")
+        text = generalization_table(found) + "\n"
         write_atomically(self.out / f"{name}.md", text.encode())
         print(text)
         try:
-            draw_worth({one.name: one.worth for one in found}, self.out / f"{name}.png")
+            draw_confidence({one.name: one.confidence_checks for one in found}, self.out / f"{name}.png")
         except MissingDependencyError as error:
             say(f"no {name}.png: {error}")
 

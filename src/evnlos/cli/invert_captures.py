@@ -154,11 +154,11 @@ def _by_motion(
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
     for k, capture in enumerate(captures):
         if _is_tracked(capture, options):
-            from evnlos.tracking import track_capture, track_doubts
+            from evnlos.tracking import track_capture, track_warnings
 
             found = track_capture(capture, setup)
-            for doubt in track_doubts(capture, setup, found):
-                say(f"warning: {capture.name}: {doubt}")
+            for warning in track_warnings(capture, setup, found):
+                say(f"warning: {capture.name}: {warning}")
             motion = found.at(capture.frame_times_us[1:] * 1e-6)
         else:
             assert capture.motion is not None  # else it would be tracked

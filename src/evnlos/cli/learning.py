@@ -54,7 +54,7 @@ class TrainCommand:
     trains, other ones in each epoch, and nothing is stored."""
     workers: int = 1
     """Processes that simulate beside the training on the CPU, for --simulate; 0 = one for each core."""
-    simulate_on: Place = "device"
+    simulation_device: Place = "device"
     """Where --simulate works beside a GPU: `device` = on it, where the event model can (v2e, with a time step);
     `cpu` = in --workers processes, of which it then wants several. The physics is the same."""
     force: bool = False
@@ -76,7 +76,7 @@ class TrainCommand:
         else:
             assert self.simulate is not None
             settings = load_yaml(Simulation, self.simulate)
-            dataset = live_dataset(settings, self.workers, self.simulate_on, self.force)
+            dataset = live_dataset(settings, self.workers, self.simulation_device, self.force)
             if note := dataset.note(torch.device("cuda" if torch.cuda.is_available() else "cpu")):
                 say(f"note: {note}")
             fit(dataset, self.settings, self.out, None, self.json)
@@ -219,12 +219,12 @@ def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
     print("\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows))
     for name, share in found["checks"].items():
         print(f"{CHECKS[name]}: {share:.0%}")
-    if worth := found["confidence"]:
+    if confidence_checks := found["confidence"]:
         said = ("support", "skill", "measured", "coverage", "width")
-        mean = {key: sum(one[key] for one in worth) / len(worth) for key in said}
+        mean = {key: sum(one[key] for one in confidence_checks) / len(confidence_checks) for key in said}
         print(
             f"confidence: support {mean['support']:.0%} said, {mean['skill']:.0%} found; "
-            f"{mean['measured']:.0%} of {len(worth)} sequences said to be measured; intervals of "
+            f"{mean['measured']:.0%} of {len(confidence_checks)} sequences said to be measured; intervals of "
             f"{COVERAGE:.0%} hold {mean['coverage']:.0%} of the pixels, mean length {mean['width']:.2f}"
         )
 

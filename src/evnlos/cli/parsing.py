@@ -112,7 +112,11 @@ _RENAMED_IN = {  # the same, of one command
     ("experiment", "--joint"): ("--sequence",),
     ("experiment", "--no-joint"): ("--no-sequence",),
 }
-_EXPERIMENTS = {"joint": "sequence", "shots": "capture-count"}  # their names before -> today's
+_EXPERIMENTS = {
+    "joint": "sequence",
+    "shots": "capture-count",
+    "carry-over": "generalization",
+}  # their names before -> today's
 
 
 _MOVED = {  # beginning of the flags of a setting that moved, by command

@@ -22,8 +22,8 @@ from evnlos.cli.parsing import say
 from evnlos.errors import ConfigError, DataError, printable
 from evnlos.events import CelexOptions, EventWriter, ReadReport
 from evnlos.events.files.columns import OnError
-from evnlos.events.recording import WINDOW_US, Box, Cut, Recording, Summary, summarise
-from evnlos.plot.preview import Background, Look, Style, preview_pictures
+from evnlos.events.recording import WINDOW_US, Box, CropOptions, Recording, Summary, summarise
+from evnlos.plot.preview import Background, PreviewOptions, Style, preview_pictures
 from evnlos.types import Events
 
 EventFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
@@ -31,7 +31,7 @@ EventFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadOptions:
     """What a file does not say about itself."""
 
     width: int | None = None
@@ -48,7 +48,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Taking:
+class SelectionOptions:
     """Which events are taken."""
 
     start: float = 0.0
@@ -58,9 +58,9 @@ class Taking:
     box: tuple[int, int, int, int] | None = None
     """Part of the sensor: X Y WIDTH HEIGHT, pixels; its corner becomes pixel (0, 0)."""
 
-    def cut(self, known_polarity: bool = False) -> Cut:
+    def cut(self, known_polarity: bool = False) -> CropOptions:
         """Return the cut."""
-        return Cut(self.start, self.stop, Box(*self.box) if self.box else None, known_polarity)
+        return CropOptions(self.start, self.stop, Box(*self.box) if self.box else None, known_polarity)
 
 
 def refuse_existing(path: Path, force: bool) -> None:
@@ -104,8 +104,8 @@ class ConvertCommand:
     """Format to write where the ending does not say, e.g. EVT2 or EVT21 for .raw."""
     on_error: OnError = "strict"
     """strict: damage ends the conversion, and nothing is written; salvage: damage is left out and told."""
-    reading: Flat[Reading] = field(default_factory=Reading)
-    taking: Flat[Taking] = field(default_factory=Taking)
+    reading: Flat[ReadOptions] = field(default_factory=ReadOptions)
+    taking: Flat[SelectionOptions] = field(default_factory=SelectionOptions)
     keep_known_polarity: bool = False
     """Leave out events whose polarity the camera did not give; RAW formats cannot hold them."""
     force: bool = False
@@ -152,7 +152,7 @@ class InfoCommand:
 
     file: EventFile
     """Event file of any format that is read; it may be larger than memory."""
-    reading: Flat[Reading] = field(default_factory=Reading)
+    reading: Flat[ReadOptions] = field(default_factory=ReadOptions)
     json: bool = False
     """Print one JSON object."""
 
@@ -288,8 +288,8 @@ class PreviewCommand:
     """dark or light."""
     side: int = 480
     """About the longest side of a picture, pixels; larger sensors are added up, smaller ones magnified."""
-    reading: Flat[Reading] = field(default_factory=Reading)
-    taking: Flat[Taking] = field(default_factory=Taking)
+    reading: Flat[ReadOptions] = field(default_factory=ReadOptions)
+    taking: Flat[SelectionOptions] = field(default_factory=SelectionOptions)
 
     def run(self) -> None:
         """Read the file twice, to see how much it holds and to draw it, and write the picture."""
@@ -307,18 +307,18 @@ def look_of(
     frames: int | None = None,
     window_ms: float | None = None,
     side_px: int = 480,
-) -> Look:
+) -> PreviewOptions:
     """Return the look of a preview, checked against the ending of its file."""
     if out.suffix.lower() not in _FRAMES:
         raise ConfigError(f"{out}: a preview ends in {' or '.join(_FRAMES)}; give such a name")
     if not out.parent.is_dir():
         raise ConfigError(f"{out}: no such folder {out.parent}; create it first")
-    return Look(
+    return PreviewOptions(
         style, background, _FRAMES[out.suffix.lower()] if frames is None else frames, window_ms, side_px
     )
 
 
-def write_preview(recording: Recording, cut: Cut, out: Path, look: Look) -> int:
+def write_preview(recording: Recording, cut: CropOptions, out: Path, look: PreviewOptions) -> int:
     """Write the preview of a recording and return the size of the file, bytes."""
     from evnlos.report.pictures import save_animation, save_png, strip
 

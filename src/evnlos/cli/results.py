@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from evnlos.analysis.bounds import SequenceBench
-from evnlos.analysis.linearized import Bench
+from evnlos.analysis.bounds import SequenceAnalysisSettings
+from evnlos.analysis.linearized import AnalysisSettings
 from evnlos.cli.console import Flat, Folders, result
 from evnlos.cli.parsing import say
 from evnlos.errors import ConfigError
@@ -120,7 +120,7 @@ class TrackCommand:
         from evnlos.cli.invert_captures import linear_setup
         from evnlos.data import load_pattern, read_capture
         from evnlos.plot.results import draw_track
-        from evnlos.tracking import track_capture, track_doubts
+        from evnlos.tracking import track_capture, track_warnings
 
         capture = read_capture(self.capture)
         setup = None if self.setup is None else linear_setup(self.setup)
@@ -128,13 +128,13 @@ class TrackCommand:
         track = track_capture(capture, setup, self.settings, pattern)
         truth = true_path(capture, track.time_s) if track.unit == "m" else None
         found = figures(capture, track, truth)
-        found["warnings"] = track_doubts(capture, setup, track)
+        found["warnings"] = track_warnings(capture, setup, track)
         found["picture"] = str(draw_track(track, self.out, truth, capture.name))
         text = json.dumps({**found, "track": track.summary()})
         write_atomically(self.out.with_suffix(".json"), text.encode())
         print(json.dumps(found) if self.json else to_text(found))
-        for doubt in found["warnings"]:
-            say(f"warning: {doubt}")
+        for warning in found["warnings"]:
+            say(f"warning: {warning}")
 
 
 def true_path(capture: Capture, t_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -233,11 +233,11 @@ class IdentifyCommand:
     """Print one JSON object, or a list where several setups are asked for."""
     seed: int = 0
     """Seed of the one noisy picture of the figure."""
-    bench: Flat[Bench] = field(default_factory=Bench)
+    settings: Flat[AnalysisSettings] = field(default_factory=AnalysisSettings)
     bounds: bool = False
     """Also print the expected PSNR of the best linear estimate of a moving target, from frames, from events and
     from both, over the number of positions and for each event model; half a minute for each setup."""
-    sequence: SequenceBench = field(default_factory=SequenceBench)
+    sequence: SequenceAnalysisSettings = field(default_factory=SequenceAnalysisSettings)
 
     def run(self) -> None:
         """Identify and print."""
@@ -255,7 +255,7 @@ class IdentifyCommand:
             )
         setups = [named_setup(name) for name in names]
         found = [
-            identify(one.setup, self.bench, one.name, self.seed)
+            identify(one.setup, self.settings, one.name, self.seed)
             for one in tqdm(setups, desc="identify", unit=" setups", disable=len(setups) == 1)
         ]
         limits = {

@@ -16,7 +16,7 @@ from .live import live_dataset as live_dataset
 from .loader import MODALITIES as MODALITIES
 from .loader import STANDARD_MODALITIES as STANDARD_MODALITIES
 from .loader import ChannelGroup as ChannelGroup
-from .loader import HeldSamples as HeldSamples
+from .loader import InMemoryDataset as InMemoryDataset
 from .loader import Modality as Modality
 from .loader import NlosDataset as NlosDataset
 from .loader import as_modality as as_modality

@@ -64,7 +64,7 @@ def check_capture(capture: Capture) -> list[Finding]:
     ]
 
 
-def _judged(what: str, good: bool, bearable: bool, found: str, cure: str) -> Finding:
+def _finding(what: str, good: bool, bearable: bool, found: str, cure: str) -> Finding:
     """Return a finding with its level; the cure stands only where something is to do."""
     if good:
         return Finding(what, "good", found)
@@ -74,7 +74,7 @@ def _judged(what: str, good: bool, bearable: bool, found: str, cure: str) -> Fin
 def _light(capture: Capture) -> Iterator[Finding]:
     frames, peak = capture.frames, capture.peak
     clipped = float((frames >= peak).mean())
-    yield _judged(
+    yield _finding(
         "saturation",
         clipped < 1e-3,
         clipped < 0.02,
@@ -83,7 +83,7 @@ def _light(capture: Capture) -> Iterator[Finding]:
     )
     share = float(np.median(frames) / peak)
     dark = float((frames <= _DARK_DN).mean())
-    yield _judged(
+    yield _finding(
         "brightness",
         dark < 0.05,
         dark < 0.5,
@@ -107,7 +107,7 @@ def _movement(capture: Capture) -> Iterator[Finding]:
     moved = np.sqrt(np.maximum(variance - noise**2 * (1 + 3 * sure), 0.0))
     largest = float(np.quantile(moved, 0.95))
     ratio = largest / max(noise, 1e-6)
-    yield _judged(
+    yield _finding(
         "movement",
         ratio > 1.0,
         ratio > 0.25,
@@ -115,7 +115,7 @@ def _movement(capture: Capture) -> Iterator[Finding]:
         "check that the target moved and is lit, dim the ambient light, roughen less",
     )
     contrast = largest / max(float(np.median(frames)), 1.0)
-    yield _judged(
+    yield _finding(
         "wall contrast",
         contrast > 0.05,
         contrast > 0.01,
@@ -130,7 +130,7 @@ def _movement(capture: Capture) -> Iterator[Finding]:
     inner = moved[v:-v, u:-u]
     edge = np.concatenate([moved[:v].ravel(), moved[-v:].ravel(), moved[:, :u].ravel(), moved[:, -u:].ravel()])
     outside = float(edge.mean() / max(inner.mean(), 1e-6))
-    yield _judged(
+    yield _finding(
         "region",
         outside < 0.7,
         outside < 1.2,
@@ -144,7 +144,7 @@ def _events(capture: Capture) -> Iterator[Finding]:
     span_s = max(float(events.t_us[-1] - events.t_us[0]) * 1e-6, 1e-6)
     pixels = events.width * events.height
     rate = len(events) / span_s / pixels
-    yield _judged(
+    yield _finding(
         "event rate",
         0.05 <= rate <= 50,
         0.01 <= rate <= 200,
@@ -154,7 +154,7 @@ def _events(capture: Capture) -> Iterator[Finding]:
         else "raise the thresholds, or look for flicker and a camera that shakes",
     )
     on = float(events.p.mean())
-    yield _judged(
+    yield _finding(
         "polarity balance",
         0.25 < on < 0.75,
         0.1 < on < 0.9,
@@ -163,7 +163,7 @@ def _events(capture: Capture) -> Iterator[Finding]:
     )
     counts = np.bincount(events.y.astype(np.int64) * events.width + events.x, minlength=pixels)
     silent = float((counts == 0).mean())
-    yield _judged(
+    yield _finding(
         "silent pixels",
         silent < 0.5,
         silent < 0.9,
@@ -172,7 +172,7 @@ def _events(capture: Capture) -> Iterator[Finding]:
     )
     hot = find_hot_pixels(events)
     share = float(counts.reshape(events.shape)[hot].sum() / len(events))
-    yield _judged(
+    yield _finding(
         "hot pixels",
         share < 0.02,
         share < 0.2,
@@ -198,7 +198,7 @@ def _flicker(capture: Capture) -> Iterator[Finding]:
         found[round((low + high) / 2)] = float(line / max(around, 1e-12))
     worst = max(found, key=lambda hertz: found[hertz])
     # The power of noise is exponential: a line 30 times its median has a chance of 1e-9 a bin.
-    yield _judged(
+    yield _finding(
         "flicker",
         found[worst] < 30,
         found[worst] < 300,
@@ -211,7 +211,7 @@ def _clock(capture: Capture) -> Iterator[Finding]:
     frames, events = capture.frame_times_us, capture.events.t_us
     both = min(frames[-1], events[-1]) - max(frames[0], events[0])
     share = float(max(both, 0) / max(frames[-1] - frames[0], 1))
-    yield _judged(
+    yield _finding(
         "clock",
         share > 0.95,
         share > 0.5,
@@ -220,7 +220,7 @@ def _clock(capture: Capture) -> Iterator[Finding]:
     )
     steps = np.diff(frames)
     uneven = float(np.abs(steps - np.median(steps)).max() / max(float(np.median(steps)), 1.0))
-    yield _judged(
+    yield _finding(
         "frame times",
         uneven < 0.2,
         True,
@@ -253,7 +253,7 @@ def _offset(capture: Capture) -> Iterator[Finding]:
         )
         return
     way = "late" if lag.lag_us < 0 else "early"
-    yield _judged(
+    yield _finding(
         "clock offset",
         abs(lag.lag_us) <= lag.limit_us,
         False,

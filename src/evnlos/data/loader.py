@@ -191,7 +191,7 @@ def modality_order(name: str) -> int:
     return names.index(name) if name in names else len(names)
 
 
-class HeldSamples(torch.utils.data.Dataset):
+class InMemoryDataset(torch.utils.data.Dataset):
     """Samples in memory: item i is (input [C, h, w], picture [1, h, w]), float32.
 
     Args:
@@ -219,7 +219,7 @@ class HeldSamples(torch.utils.data.Dataset):
         return self.inputs[index].float(), self.truth[index].unsqueeze(-3).float()
 
 
-class NlosDataset(HeldSamples):
+class NlosDataset(InMemoryDataset):
     """The samples of a split: item i is (input [C, H, W], truth [1, H, W]), float32, read when it is asked for.
 
     A map-style dataset for `torch.utils.data.DataLoader`, with any number of workers: it keeps no file open

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data.sampling import Samples, Sampling
 from evnlos.errors import DataError
-from evnlos.files import claim, is_empty, write_atomically
+from evnlos.files import directory_lock, is_empty, write_atomically
 from evnlos.migrate import __version__
 from evnlos.threads import undisturbed
 from evnlos.types import Events
@@ -290,12 +290,12 @@ def claim_dataset(dataset: Dataset, part: str = "") -> Iterator[None]:
 
     Args:
         dataset: What is to be there.
-        part: Name of the share of the work, as in `claim`.
+        part: Name of the share of the work, as in `directory_lock`.
 
     Raises:
         DataError: As `check_dataset`, and then the folder stays as it is; or another process holds it.
     """
-    with claim(dataset.folder, part, check=lambda: check_dataset(dataset)):
+    with directory_lock(dataset.folder, part, check=lambda: check_dataset(dataset)):
         create_dataset(dataset)
         yield
 

@@ -49,7 +49,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Cut:
+class CropOptions:
     """What to take of a recording.
 
     Args:
@@ -94,7 +94,7 @@ class Recording:
         >>> name = tempfile.mkdtemp() + "/three.npz"
         >>> write_events(name, Events([5, 9, 12], [0, 3, 1], [1, 1, 0], [1, 0, 1], width=4, height=2))
         >>> recording = Recording(name)
-        >>> list(recording.pieces(Cut(start_s=2e-6, box=Box(1, 0, 3, 2))))
+        >>> list(recording.pieces(CropOptions(start_s=2e-6, box=Box(1, 0, 3, 2))))
         [Events(2 events, 3 x 2, 9..12 us, 50 % ON)]
     """
 
@@ -116,7 +116,7 @@ class Recording:
         """Sensor size (height, width), pixels; of some formats known when their first events were read."""
         return self.report.height, self.report.width
 
-    def pieces(self, cut: Cut | None = None) -> Iterator[Events]:
+    def pieces(self, cut: CropOptions | None = None) -> Iterator[Events]:
         """Yield the events in the order of time, as pieces of bounded size; each call reads the file anew.
 
         Args:
@@ -126,7 +126,7 @@ class Recording:
             EventFileError: In strict mode, at the first fault, after the pieces before it.
             ConfigError: The box leaves the sensor.
         """
-        cut = cut or Cut()
+        cut = cut or CropOptions()
         source, self.report = open_source(self.path, *self._options)
         first: int | None = None
         for columns in in_order(source.blocks(), self.report):
@@ -146,14 +146,14 @@ class Recording:
             if over:
                 return
 
-    def blank(self, cut: Cut | None = None) -> Events:
+    def blank(self, cut: CropOptions | None = None) -> Events:
         """Return no events on the sensor, or on the part of it, that `pieces` yields events of."""
         box = cut.box if cut else None
         height, width = self.shape if box is None else (box.height, box.width)
         return Events.empty(width, height)
 
 
-def _stretch(events: Events, first_us: int, cut: Cut) -> Events:
+def _stretch(events: Events, first_us: int, cut: CropOptions) -> Events:
     if cut.start_s == 0 and cut.stop_s is None:
         return events
     start_us = first_us + int(np.ceil(cut.start_s * 1e6))
@@ -188,7 +188,7 @@ _BYTES = {"t_us": 8, "x": 2, "y": 2, "p": 1, "adc": 2, "polarity_known": 1}
 
 
 @dataclass(frozen=True)
-class Silence:
+class EventGap:
     """A time without an event anywhere: its length and its begin after the first event, microseconds."""
 
     length_us: int = 0
@@ -225,7 +225,7 @@ class Summary:
     unknown: int
     peak_hz: float
     peak_us: int
-    longest_silence: Silence
+    longest_silence: EventGap
     silences: int
     active_pixels: int
     busiest: tuple[int, int, int] | None
@@ -304,7 +304,7 @@ def summarise(pieces: Iterable[Events]) -> Summary:
     """
     width = height = total = on = unknown = silences = 0
     first = last = 0
-    longest, peak = Silence(), _Peak()
+    longest, peak = EventGap(), _Peak()
     counts = _Counts(0)
     columns: tuple[str, ...] = ("t_us", "x", "y", "p")
     for events in pieces:
@@ -320,7 +320,7 @@ def summarise(pieces: Iterable[Events]) -> Summary:
         silences += int(np.count_nonzero(gaps > WINDOW_US))
         widest = int(np.argmax(gaps))
         if gaps[widest] > longest.length_us:
-            longest = Silence(int(gaps[widest]), int(since[widest] - gaps[widest]))
+            longest = EventGap(int(gaps[widest]), int(since[widest] - gaps[widest]))
         peak.add(since)
         where = events.y.astype(np.int64) * width + events.x
         counts.add(where)

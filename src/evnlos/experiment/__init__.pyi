@@ -1,15 +1,15 @@
 """Names of `evnlos.experiment`; `__init__.py` reads this list."""
 
-from .carry_over import CarriedOver as CarriedOver
-from .carry_over import carried_table as carried_table
-from .carry_over import carry_over as carry_over
-from .carry_over import write_carried as write_carried
 from .conditions import Condition as Condition
 from .conditions import Finding as Finding
 from .conditions import base_simulation as base_simulation
 from .conditions import conditions as conditions
 from .conditions import conditions_table as conditions_table
-from .conditions import map_conditions as map_conditions
+from .conditions import sweep_parameters as sweep_parameters
+from .generalization import GeneralizationResult as GeneralizationResult
+from .generalization import generalization as generalization
+from .generalization import generalization_table as generalization_table
+from .generalization import write_generalization as write_generalization
 from .presets import STUDIES as STUDIES
 from .presets import on_sequences as on_sequences
 from .run import Simulated as Simulated

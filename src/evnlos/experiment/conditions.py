@@ -144,7 +144,7 @@ def conditions(base: Simulation) -> list[Condition]:
     return found
 
 
-def map_conditions(
+def sweep_parameters(
     chosen: list[Condition],
     out: Path,
     workers: int = 0,

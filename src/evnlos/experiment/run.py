@@ -241,7 +241,11 @@ def _planned(
     if arm.finetuning is not None:
         settings = replace(arm.finetuning, modality=modality, seed=seed)
         start = runs[-1].out if runs else begin
-        decides = {"data": recorded.folder.name, "settings": to_dict(settings), "from": start and Path(start).name}
+        decides = {
+            "data": recorded.folder.name,
+            "settings": to_dict(settings),
+            "from": start and Path(start).name,
+        }
         if arm.choose:
             decides["choose"] = True
         key = config_hash(decides)[:8]
@@ -328,8 +332,8 @@ def run_simulated(settings: Simulated, progress: Progress = silent) -> list[Reco
                 run = settings.out / "runs" / f"paper-{arm.lower()}-{modality}-seed{seed}-{key}"
                 train_one(Run(data[source], plan, run, start), progress)
                 first = first or run
-                sets = ("nist", "comic") if arm == "pre-trained" else ("comic",)
-                for tested in sets:
+                test_sets = ("nist", "comic") if arm == "pre-trained" else ("comic",)
+                for tested in test_sets:
                     record = _record(arm, modality, seed, run, tested, decided)
                     folder = settings.out / "records" / NAME
                     if record.name not in names_there(folder):

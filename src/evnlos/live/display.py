@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.files import LOCK, check_folder, claim, is_empty, new_file
+from evnlos.files import LOCK, check_folder, directory_lock, is_empty, new_file
 from evnlos.hosts import names_this_machine
 from evnlos.live.engine import Picture
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
@@ -260,7 +260,7 @@ class Recorder:
 
     def __init__(self, folder: Path) -> None:
         self._held = ExitStack()
-        self._held.enter_context(claim(folder, check=lambda: check_folder(folder)))
+        self._held.enter_context(directory_lock(folder, check=lambda: check_folder(folder)))
         av = _pyav()
         self.path = folder / ("video.png" if av is None else "video.mp4")
         self.recorded = self.left_out = 0

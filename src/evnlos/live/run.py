@@ -130,7 +130,7 @@ _NAP_S = 0.05
 
 
 @dataclass(frozen=True)
-class Pace:
+class RateOptions:
     """How often there is a picture, and how much may wait for one."""
 
     rate: float = 100.0
@@ -173,7 +173,9 @@ class Run:
         DataError: The network needs frames and the source has none.
     """
 
-    def __init__(self, source: Source, engine: Engine, pace: Pace = Pace(), clock: Clock | None = None) -> None:
+    def __init__(
+        self, source: Source, engine: Engine, pace: RateOptions = RateOptions(), clock: Clock | None = None
+    ) -> None:
         if engine.needs_frames and not source.has_frames:
             raise DataError(
                 f"weights of the modality {engine.modality.name!r} see frames and {source.name} has none; give "

@@ -18,7 +18,7 @@ from evnlos.data.capture import read_capture
 from evnlos.data.cleaning import FixedPattern
 from evnlos.errors import ConfigError
 from evnlos.events.files.columns import cut, join, trusted_events
-from evnlos.events.recording import Cut, Recording
+from evnlos.events.recording import CropOptions, Recording
 from evnlos.live.chunk import Chunk, Clock, Source, SystemClock
 from evnlos.live.growing import GrowingFile
 from evnlos.live.udp import UdpSource
@@ -158,7 +158,7 @@ _SCHEME = "udp://"
 
 
 @dataclass(frozen=True)
-class Listening:
+class SourceOptions:
     """How a source is opened."""
 
     follow: bool = False
@@ -185,7 +185,7 @@ class Listening:
         return self.idle or None
 
 
-def open_live(source: str, how: Listening = Listening(), pattern: FixedPattern | None = None) -> Source:
+def open_live(source: str, how: SourceOptions = SourceOptions(), pattern: FixedPattern | None = None) -> Source:
     """Return a source of events by its name.
 
     Args:
@@ -208,7 +208,7 @@ def open_live(source: str, how: Listening = Listening(), pattern: FixedPattern |
     if how.follow:
         return GrowingFile(path, width=how.width, height=how.height, idle_s=how.idle_s)
     recording = Recording(path, width=how.width, height=how.height)
-    return Replay(recording.pieces(Cut(known_polarity=True)), speed=how.speed, name=str(path))
+    return Replay(recording.pieces(CropOptions(known_polarity=True)), speed=how.speed, name=str(path))
 
 
 def capture_replay(

@@ -1,6 +1,6 @@
 """Reconstructors, their closed-form parts, what their images are worth, and their weights on disk."""
 
-from evnlos.models.confidence import Confidence, Judgement, halves_of, on_target_plane
+from evnlos.models.confidence import Confidence, ConfidenceReport, halves_of, on_target_plane
 from evnlos.models.linear import LinearEstimate, fit_linear
 from evnlos.models.reconstructor import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
 from evnlos.models.sequence import SequenceConfig, SequenceReconstructor
@@ -23,7 +23,7 @@ __all__ = [
     "GENERIC",
     "RECONSTRUCTORS",
     "Confidence",
-    "Judgement",
+    "ConfidenceReport",
     "LinearEstimate",
     "Reconstructor",
     "ReconstructorSettings",

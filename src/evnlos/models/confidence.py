@@ -65,7 +65,9 @@ def on_canvas(target: Tensor, canvas: Plane, position_m: ArrayLike, size_m: floa
 COVERAGE = 0.9
 """Share of a target plane's pixels whose true level the intervals are to hold."""
 CONFIRMED = 0.7
-"""Share of the frames that pictures have to explain where the setup is known (see `Judgement.explained`)."""
+"""Share of the frames that pictures have to explain where the setup is known (see
+`ConfidenceReport.explained`).
+"""
 LEVELS = 16
 """Bins of a pixel's reconstructed level."""
 GROUPS = 3
@@ -73,7 +75,7 @@ GROUPS = 3
 
 
 @dataclass(frozen=True)
-class Judgement:
+class ConfidenceReport:
     """What one sequence of pictures is worth.
 
     Args:
@@ -132,7 +134,7 @@ class Confidence:
         empty: What the network shows where nothing of any one object was measured, as its mean difference from
             the mean target, [32, 32].
         power: Mean of |d|^2 over true targets, d what tells a target from an empty answer (see `telling`), [].
-        threshold: See `Judgement.threshold`, [].
+        threshold: See `ConfidenceReport.threshold`, [].
         edges: Agreements that separate the groups of sequences, ascending, [G - 1].
         low: Lower end of the interval for each group and level, [G, L].
         high: Upper end.
@@ -146,7 +148,7 @@ class Confidence:
     low: Tensor
     high: Tensor
 
-    def judge(self, pictures: Tensor, halves: Tensor, explained: float | None = None) -> Judgement:
+    def judge(self, pictures: Tensor, halves: Tensor, explained: float | None = None) -> ConfidenceReport:
         """Return what the pictures of a sequence are worth.
 
         Args:
@@ -155,7 +157,7 @@ class Confidence:
             explained: How much of the frames the pictures explain, where the setup is known.
         """
         agreement, threshold = float(self.agreement(halves)), float(self.threshold)
-        blank = Judgement(
+        blank = ConfidenceReport(
             agreement, threshold, torch.zeros_like(pictures), torch.ones_like(pictures), explained
         )
         if not blank.measured:

@@ -259,7 +259,7 @@ class LinearEmbeddings(nn.Module):
 def fit_input(
     normalization: InputNormalization,
     embedding: LinearEmbeddings | None,
-    some: Callable[[int], tuple[Tensor, Tensor, NDArray[np.str_]]],
+    subset: Callable[[int], tuple[Tensor, Tensor, NDArray[np.str_]]],
     seed: int,
     *,
     is_new: bool,
@@ -270,7 +270,7 @@ def fit_input(
     Args:
         normalization: Changed in place; it need not be on the CPU.
         embedding: Changed in place where the network is new.
-        some: Returns at most so many samples: inputs, true images, objects.
+        subset: Returns at most so many samples: inputs, true images, objects.
         seed: Seed of the embedding's basis.
         is_new: Whether the network has random weights.
         keep_normalization: Whether a network with weights keeps the scale that it has.
@@ -279,7 +279,7 @@ def fit_input(
     embeds = is_new and embedding is not None
     if not measures and not embeds:
         return
-    inputs, truth, names = some(MOST_SAMPLES)
+    inputs, truth, names = subset(MOST_SAMPLES)
     device = normalization.mean.device
     if measures:
         normalization.fit(inputs.float().to(device))

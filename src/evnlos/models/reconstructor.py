@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from evnlos.data import HeldSamples, Modality, NlosDataset, Sampling
+from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling
 from evnlos.errors import ConfigError, DataError
 from evnlos.registry import Kinded, Registry
 
@@ -80,11 +80,11 @@ class Reconstructor(nn.Module, ABC):
     def forward(self, x: Tensor) -> Tensor:
         """Map the inputs of training samples [B, c, h, w] to images [B, 1, h, w], 0..1."""
 
-    def fit(self, some: Callable[[int], Drawn], seed: int, *, is_new: bool, keep_normalization: bool) -> None:
+    def fit(self, subset: Callable[[int], Drawn], seed: int, *, is_new: bool, keep_normalization: bool) -> None:
         """Take from the data what is learned in closed form, before the first step of a training.
 
         Args:
-            some: Returns at most so many samples of single time steps.
+            subset: Returns at most so many samples of single time steps.
             seed: Seed of every random draw.
             is_new: Whether the weights are random; otherwise they come from an earlier training.
             keep_normalization: Whether a reconstructor with weights keeps the scale of the earlier data.
@@ -92,7 +92,7 @@ class Reconstructor(nn.Module, ABC):
 
     def training_samples(
         self, samples: NlosDataset, augmentations: int, seed: int, *, is_new: bool
-    ) -> HeldSamples:
+    ) -> InMemoryDataset:
         """Return what `forward` learns from: by default the samples of single time steps.
 
         Args:

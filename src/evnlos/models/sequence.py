@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from evnlos.data import HeldSamples, Modality, NlosDataset, Sampling, as_modality
+from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
 from evnlos.models.confidence import on_canvas
 from evnlos.models.embedding import InputNormalization, LinearEmbeddings, fit_input
@@ -93,15 +93,20 @@ class SequenceReconstructor(Reconstructor):
         """Map pooled maps [B, S, P, P] to images of the target plane [B, 1, P, P], 0..1."""
         return self.unet(self.scale(x))
 
-    def fit(self, some: Callable[[int], Drawn], seed: int, *, is_new: bool, keep_normalization: bool) -> None:
+    def fit(self, subset: Callable[[int], Drawn], seed: int, *, is_new: bool, keep_normalization: bool) -> None:
         """Fit the normalization and, where the weights are random, the linear embedding."""
         fit_input(
-            self.normalization, self.embedding, some, seed, is_new=is_new, keep_normalization=keep_normalization
+            self.normalization,
+            self.embedding,
+            subset,
+            seed,
+            is_new=is_new,
+            keep_normalization=keep_normalization,
         )
 
     def training_samples(
         self, samples: NlosDataset, augmentations: int, seed: int, *, is_new: bool
-    ) -> HeldSamples:
+    ) -> InMemoryDataset:
         """Return pooled sequences: of each object all time steps, every other one, then random subsets.
 
         Subsets have other noise and fewer angles on the same target, so that short sequences are met too.
@@ -136,7 +141,7 @@ class SequenceReconstructor(Reconstructor):
                 inputs.append(self.pooled(seen, places[kept]).half().cpu())
                 truth.append(plane)
                 names.append(name)
-        found = HeldSamples(torch.stack(inputs), torch.stack(truth), np.array(names))
+        found = InMemoryDataset(torch.stack(inputs), torch.stack(truth), np.array(names))
         if is_new:
             self.scale.fit(found.inputs)
         return found

@@ -211,10 +211,15 @@ class UNetReconstructor(Reconstructor):
         x = self.normalization(x)
         return self.unet(x if self.embedding is None else self.embedding(x))
 
-    def fit(self, some: Callable[[int], Drawn], seed: int, *, is_new: bool, keep_normalization: bool) -> None:
+    def fit(self, subset: Callable[[int], Drawn], seed: int, *, is_new: bool, keep_normalization: bool) -> None:
         """Fit the normalization and, where the weights are random, the linear embedding."""
         fit_input(
-            self.normalization, self.embedding, some, seed, is_new=is_new, keep_normalization=keep_normalization
+            self.normalization,
+            self.embedding,
+            subset,
+            seed,
+            is_new=is_new,
+            keep_normalization=keep_normalization,
         )
 
     def reduced(self, rank: int) -> Reconstructor:

@@ -32,7 +32,7 @@ _MAX_FRAMES = 500
 
 
 @dataclass(frozen=True)
-class Look:
+class PreviewOptions:
     """How a preview looks.
 
     Args:
@@ -67,7 +67,7 @@ class Look:
 
 
 def preview_pictures(
-    pieces: Iterable[Events], summary: Summary, look: Look | None = None
+    pieces: Iterable[Events], summary: Summary, look: PreviewOptions | None = None
 ) -> list[NDArray[np.uint8]]:
     """Return pictures [H, W, 3] of a recording with a line of text below: time, events, length of the window.
 
@@ -79,11 +79,11 @@ def preview_pictures(
     Example:
         >>> from evnlos.events.recording import summarise
         >>> events = Events([0, 900], [0, 3], [1, 1], [1, 0], width=4, height=2)
-        >>> pictures = preview_pictures([events], summarise([events]), Look(frames=2))
+        >>> pictures = preview_pictures([events], summarise([events]), PreviewOptions(frames=2))
         >>> len(pictures), pictures[0].shape, pictures[0][-30, 0].tolist()
         (2, (266, 480, 3), [226, 120, 0])
     """
-    look = look or Look()
+    look = look or PreviewOptions()
     if summary.width * summary.height > MOST_SENSOR_PIXELS:
         raise DataError(
             f"a sensor of {summary.width} x {summary.height} pixels is too large to draw; give --width and "
@@ -111,7 +111,7 @@ def preview_pictures(
     return pictures
 
 
-def _windows(summary: Summary, look: Look) -> list[tuple[int, int, int]]:
+def _windows(summary: Summary, look: PreviewOptions) -> list[tuple[int, int, int]]:
     """Return (end of the window before, begin, end) of each window, microseconds; begin < t <= end."""
     span = max(summary.duration_us, look.frames)
     ends = summary.first_us + np.linspace(0, span, look.frames + 1).round().astype(np.int64)

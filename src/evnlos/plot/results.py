@@ -27,7 +27,7 @@ from evnlos.tracking import Track
 from evnlos.untrusted import open_image
 
 if TYPE_CHECKING:
-    from evnlos.analysis.confidence import PassWorth
+    from evnlos.analysis.confidence import ConfidenceCheck
     from evnlos.analysis.identify import Identification
 
 
@@ -225,7 +225,7 @@ def draw_track(
 _LEAST_SKILL = -1.2  # worse sequences are drawn on this line
 
 
-def draw_worth(found: Mapping[str, Sequence[PassWorth]], path: str | Path) -> Path:
+def draw_confidence(found: Mapping[str, Sequence[ConfidenceCheck]], path: str | Path) -> Path:
     """Draw the risk-coverage curves of all sequences, and each sequence's skill over its support.
 
     Args:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from evnlos.analysis import load_model, score
-from evnlos.analysis.confidence import said
+from evnlos.analysis.confidence import confidence_values
 from evnlos.analysis.model import setup_for_track
 from evnlos.data import FixedPattern, read_capture
 from evnlos.events.grids import OFF_RGB, ON_RGB
@@ -224,7 +224,7 @@ def reconstruct_capture(
     sampling = model.weights.sampling
     check_folder(out)
     made = model.reconstruct(recording, setup, pattern, track)
-    images, samples, worth = made.images, made.samples, made.confidence
+    images, samples, confidence = made.images, made.samples, made.confidence
     pictures = [grey(image) for image in images]
     with new_folder(out) as draft:
         for k, picture in enumerate(pictures):
@@ -247,10 +247,12 @@ def reconstruct_capture(
         }
         if made.light is not None:
             found |= {"light": round(made.light, 4), "moved_by_the_setup": made.is_moved}
-        if worth is not None:
-            save_png(draft / "unsure.png", strip([grey(one) for one in worth.high - worth.low]), 2)
-            write_atomically(draft / "interval.npy", _npy(torch.stack([worth.low, worth.high]).numpy()))
-            found["confidence"] = said(worth)
+        if confidence is not None:
+            save_png(draft / "unsure.png", strip([grey(one) for one in confidence.high - confidence.low]), 2)
+            write_atomically(
+                draft / "interval.npy", _npy(torch.stack([confidence.low, confidence.high]).numpy())
+            )
+            found["confidence"] = confidence_values(confidence)
         else:
             found["no_confidence"] = made.no_confidence
     if track:

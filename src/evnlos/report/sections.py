@@ -173,21 +173,21 @@ def _text(x: float, y: float, anchor: str, words: str) -> str:
 
 def belief_section(results: list[RunResult]) -> str:
     """Return a table: support and skill of each object for each run that has a confidence, or nothing."""
-    known = [r for r in results if r.evaluation.worth]
+    known = [r for r in results if r.evaluation.confidence_checks]
     if not known:
         return ""
     heads = "".join(f"<th colspan=2>{html.escape(label(r))}</th>" for r in known)
     names = "".join("<th>support</th><th>skill</th>" for _ in known)
     rows = []
     for k, name in enumerate(known[0].evaluation.characters()):
-        sequences = [r.evaluation.worth[k] for r in known]
+        sequences = [r.evaluation.confidence_checks[k] for r in known]
         cells = "".join(
             f"<td>{f'{one.support:.0%}' if one.measured else 'nothing measured'}</td><td>{one.skill:.0%}</td>"
             for one in sequences
         )
         rows.append(f"<tr><td>{html.escape(character_of(name))}</td>{cells}</tr>")
-    held = [np.mean([one.coverage for one in r.evaluation.worth]) for r in known]
-    wide = [np.mean([one.width for one in r.evaluation.worth]) for r in known]
+    held = [np.mean([one.coverage for one in r.evaluation.confidence_checks]) for r in known]
+    wide = [np.mean([one.width for one in r.evaluation.confidence_checks]) for r in known]
     held_cells = "".join(f"<td colspan=2>{value:.0%}</td>" for value in held)
     wide_cells = "".join(f"<td colspan=2>{value:.2f}</td>" for value in wide)
     return (

@@ -4,8 +4,8 @@ from .follow import Tracking as Tracking
 from .follow import static_light as static_light
 from .follow import temporal_noise as temporal_noise
 from .follow import track_capture as track_capture
-from .follow import track_doubts as track_doubts
 from .follow import track_frames as track_frames
+from .follow import track_warnings as track_warnings
 from .motion_fit import MotionFit as MotionFit
 from .motion_fit import fit_motion as fit_motion
 from .registration import EventVelocity as EventVelocity

@@ -176,7 +176,7 @@ def track_frames(
     return _in_metres(found, by_events, times_s, small, setup, noise, settings)
 
 
-def track_doubts(capture: Capture, setup: Setup | None, track: Track) -> list[str]:
+def track_warnings(capture: Capture, setup: Setup | None, track: Track) -> list[str]:
     """Return why a track in metres may be wrong by more than it states, a line each; none where nothing is odd.
 
     Args:
@@ -184,21 +184,21 @@ def track_doubts(capture: Capture, setup: Setup | None, track: Track) -> list[st
         setup: The setup that it was followed with; None: nothing is known.
         track: What was found.
     """
-    doubts = []
+    warnings = []
     stated = capture.distance_m
     known_m = None if setup is None else setup.default_distance_m
     if known_m is not None and stated is not None and abs(stated / known_m - 1) > _SAME_DISTANCE:
-        doubts.append(
+        warnings.append(
             f"capture.yaml states a distance of {stated:g} m, the setup {known_m:g} m, more than "
             f"{100 * _SAME_DISTANCE:.0f} % apart: lengths and their deviations are wrong; take the setup of "
             "that distance"
         )
     if track.misfit is not None and track.misfit > _MOST_MISFIT:
-        doubts.append(
+        warnings.append(
             f"the setup leaves {track.misfit:.1f} times the noise in the frames, {_MOST_MISFIT:g} is the most: "
             "positions are worse than their stated deviations; calibrate this very setup (`evnlos calibrate`)"
         )
-    return doubts
+    return warnings
 
 
 def _in_pixels(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from evnlos.config import save_yaml, to_dict, write_atomically
 from evnlos.data import Dataset, NlosDataset
 from evnlos.errors import ConfigError
-from evnlos.files import claim
+from evnlos.files import directory_lock
 from evnlos.metrics import psnr
 from evnlos.models import Reconstructor, Weights, load_weights, save_weights
 from evnlos.progress import Progress, Step, silent
@@ -104,7 +104,7 @@ def choose_and_finetune(
     start = load_weights(weights)
     about = about_run(dataset, candidates[0], start)
     about |= {"candidates": [to_dict(settings) for settings in candidates], "folds": folds}
-    with claim(out, check=lambda: check_run(out, about)):
+    with directory_lock(out, check=lambda: check_run(out, about)):
         if (out / "weights.safetensors").is_file():
             return TrainingResult(out, _records(out))
         save_yaml(about, out / "run.yaml")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from evnlos.data import HeldSamples, LiveDataset, Modality, NlosDataset
+from evnlos.data import InMemoryDataset, LiveDataset, Modality, NlosDataset
 from evnlos.errors import ConfigError
 from evnlos.models import Reconstructor
 from evnlos.threads import cores
@@ -27,8 +27,8 @@ from evnlos.types import derive_seed
 
 
 @dataclass(frozen=True)
-class Team:
-    """This process and the others; a training without `torchrun` is a team of one.
+class ProcessGroup:
+    """This process and the others; a training without `torchrun` is a group of one.
 
     Args:
         rank: Number of this process, from 0; number 0 writes the run's folder.
@@ -46,7 +46,7 @@ class Team:
             dist.barrier()
 
     def total(self, value: Tensor) -> Tensor:
-        """Return the sum of the processes' values, the same on each; for a team of one the value itself."""
+        """Return the sum of the processes' values, the same on each; for a group of one the value itself."""
         if self.size > 1:
             value = value.clone()
             dist.all_reduce(value)
@@ -61,7 +61,7 @@ class Team:
 
 
 @contextmanager
-def team() -> Iterator[Team]:
+def process_group() -> Iterator[ProcessGroup]:
     """Join the processes that `torchrun` started (it sets RANK, WORLD_SIZE, LOCAL_RANK), for one training.
 
     A process that already belongs to a group of `torch.distributed` trains with that group and stays in it.
@@ -71,15 +71,15 @@ def team() -> Iterator[Team]:
     if device.type == "cuda":
         torch.cuda.set_device(device)
     if dist.is_available() and dist.is_initialized():
-        yield Team(dist.get_rank(), dist.get_world_size(), device)
+        yield ProcessGroup(dist.get_rank(), dist.get_world_size(), device)
     elif started:
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
         try:
-            yield Team(dist.get_rank(), dist.get_world_size(), device)
+            yield ProcessGroup(dist.get_rank(), dist.get_world_size(), device)
         finally:
             dist.destroy_process_group()
     else:
-        yield Team(0, 1, device)
+        yield ProcessGroup(0, 1, device)
 
 
 _READERS = 4
@@ -116,7 +116,7 @@ class Source(Protocol):
         """Return the mean of the true pictures, float32 [H, W]."""
         ...
 
-    def some(self, count: int) -> Samples:
+    def subset(self, count: int) -> Samples:
         """Return about `count` samples at most, the same in every process: inputs [n, C, H, W], pictures
         [n, H, W] and the object of each.
         """
@@ -130,7 +130,7 @@ class Source(Protocol):
         ...
 
 
-class Stored:
+class DiskSource:
     """The samples of a dataset on disk: in memory, the device's first, where they fill at most half of what is
     free; else read batch by batch in processes of their own.
 
@@ -140,25 +140,35 @@ class Stored:
         samples: The samples: positions, or sequences.
         batch_size: Samples a step, of all processes together.
         seed: Seed of the order.
-        team: The processes.
+        process_group: The processes.
     """
 
-    def __init__(self, samples: HeldSamples, batch_size: int, seed: int, team: Team) -> None:
-        self.samples, self._batch_size, self._seed, self._team = samples, batch_size, seed, team
+    def __init__(
+        self, samples: InMemoryDataset, batch_size: int, seed: int, process_group: ProcessGroup
+    ) -> None:
+        self.samples, self._batch_size, self._seed, self._process_group = (
+            samples,
+            batch_size,
+            seed,
+            process_group,
+        )
         self.steps = -(-len(samples) // batch_size)
         self._reads = isinstance(samples, NlosDataset) and not samples.fits_in_memory()
         if self._reads:
             return
         if isinstance(samples, NlosDataset):
             samples.load()
-        if team.device.type == "cuda" and samples.bytes() < torch.cuda.mem_get_info(team.device)[0] // 2:
-            samples.to(team.device)
+        if (
+            process_group.device.type == "cuda"
+            and samples.bytes() < torch.cuda.mem_get_info(process_group.device)[0] // 2
+        ):
+            samples.to(process_group.device)
 
     def batches(self, epoch: int) -> Iterator[Batch]:
         """Yield this process's part of each batch; a process that has none is given a sample of share 0."""
         order = torch.Generator().manual_seed(derive_seed(self._seed, "order", epoch))
         batches = torch.randperm(len(self.samples), generator=order).split(self._batch_size)
-        parts = [batch[self._team.rank :: self._team.size] for batch in batches]
+        parts = [batch[self._process_group.rank :: self._process_group.size] for batch in batches]
         chosen = [mine if len(mine) else batch[:1] for mine, batch in zip(parts, batches, strict=True)]
         for batch, mine, (seen, truth) in zip(batches, parts, self._taken(chosen), strict=True):
             yield Batch(seen, truth, len(mine) / len(batch), len(batch) / len(self.samples))
@@ -185,7 +195,7 @@ class Stored:
             return (total / len(self.samples)).float()  # type: ignore[union-attr]
         return self.samples.truth.float().mean(dim=0).cpu()
 
-    def some(self, count: int) -> Samples:
+    def subset(self, count: int) -> Samples:
         """Return at most `count` samples, chosen by the seed, on the CPU."""
         draw = torch.Generator().manual_seed(derive_seed(self._seed, "some"))
         chosen = torch.randperm(len(self.samples), generator=draw)[:count].sort().values
@@ -202,10 +212,14 @@ class Stored:
         if not isinstance(self.samples, NlosDataset):
             return self
         samples = network.training_samples(self.samples, augmentations, self._seed, is_new=is_new)
-        return self if samples is self.samples else Stored(samples, self._batch_size, self._seed, self._team)
+        return (
+            self
+            if samples is self.samples
+            else DiskSource(samples, self._batch_size, self._seed, self._process_group)
+        )
 
 
-class Live:
+class SimulatedSource:
     """Samples that are simulated as they are needed: epoch n is another draw, and the same one each time.
 
     The objects come in a seeded order; the samples of some of them are mixed, shuffled and cut into batches.
@@ -217,33 +231,39 @@ class Live:
         modality: What the network sees.
         batch_size: Samples a step, of all processes together.
         seed: Seed of the order.
-        team: The processes.
+        process_group: The processes.
 
     Raises:
         ConfigError: The processes cannot share a batch, or are more than the objects.
     """
 
     def __init__(
-        self, dataset: LiveDataset, modality: str | Modality, batch_size: int, seed: int, team: Team
+        self,
+        dataset: LiveDataset,
+        modality: str | Modality,
+        batch_size: int,
+        seed: int,
+        process_group: ProcessGroup,
     ) -> None:
         names = dataset.objects("train")
-        if batch_size % team.size or len(names) < team.size:
+        if batch_size % process_group.size or len(names) < process_group.size:
             raise ConfigError(
-                f"{team.size} processes can't share batches of {batch_size} of {len(names)} simulated objects; "
+                f"{process_group.size} processes can't share batches of {batch_size} of {len(names)} "
+                "simulated objects; "
                 "give a batch_size that they divide, and no more processes than objects"
             )
-        self._dataset, self._names, self._team = dataset, names, team
+        self._dataset, self._names, self._process_group = dataset, names, process_group
         self._modality = modality
-        self._size, self._seed = batch_size // team.size, seed
-        self._objects = len(names) // team.size
+        self._size, self._seed = batch_size // process_group.size, seed
+        self._objects = len(names) // process_group.size
         self.steps = -(-self._objects * dataset.simulation.positions // self._size)
 
     def batches(self, epoch: int) -> Iterator[Batch]:
         """Yield the batches that this process makes in an epoch."""
         order = torch.Generator().manual_seed(derive_seed(self._seed, "order", epoch))
-        turn = torch.randperm(len(self._names), generator=order)[: self._objects * self._team.size]
-        names = [self._names[i] for i in turn[self._team.rank :: self._team.size].tolist()]
-        made = self._dataset.stream(names, epoch, self._modality, self._team.device)
+        turn = torch.randperm(len(self._names), generator=order)[: self._objects * self._process_group.size]
+        names = [self._names[i] for i in turn[self._process_group.rank :: self._process_group.size].tolist()]
+        made = self._dataset.stream(names, epoch, self._modality, self._process_group.device)
         held: list[tuple[Tensor, Tensor]] = []
         for number, samples in enumerate(made, start=1):
             held.append(samples)
@@ -254,7 +274,7 @@ class Live:
             full = len(inputs) if number == len(names) else len(inputs) // self._size * self._size
             for mine in shuffled[:full].split(self._size):
                 weight = len(mine) / (self._objects * self._dataset.simulation.positions)
-                yield Batch(inputs[mine], truth[mine], 1 / self._team.size, weight)
+                yield Batch(inputs[mine], truth[mine], 1 / self._process_group.size, weight)
             held = [(inputs[shuffled[full:]], truth[shuffled[full:]])]
 
     def mean_image(self) -> Tensor:
@@ -262,11 +282,11 @@ class Live:
         total = sum(self._dataset.truth(name).mean(axis=0, dtype=np.float64) for name in self._names)
         return torch.from_numpy(total / len(self._names)).float()
 
-    def some(self, count: int) -> Samples:
+    def subset(self, count: int) -> Samples:
         """Return the samples of the first objects of the first epoch, of as many as `count` allows."""
         objects = max(1, min(len(self._names), count // self._dataset.simulation.positions))
         names = self._names[:: max(1, len(self._names) // objects)][:objects]  # some of every hand
-        made = list(self._dataset.stream(names, 0, self._modality, self._team.device))
+        made = list(self._dataset.stream(names, 0, self._modality, self._process_group.device))
         inputs, truth = (torch.cat(parts).cpu() for parts in zip(*made, strict=True))
         return inputs, truth[:, 0], np.repeat(names, [len(seen) for seen, _ in made])
 
@@ -288,15 +308,15 @@ def half_mirrored(seen: Tensor, truth: Tensor, seed: int) -> tuple[Tensor, Tenso
     return torch.where(turned, seen.flip(-2), seen), torch.where(turned, truth.flip(-2), truth)
 
 
-def with_mirrored(some: Callable[[int], Samples]) -> Callable[[int], Samples]:
-    """Return what draws samples as `some` does, half of them being the other half upside down.
+def with_mirrored(subset: Callable[[int], Samples]) -> Callable[[int], Samples]:
+    """Return what draws samples as `subset` does, half of them being the other half upside down.
 
     Args:
-        some: Returns at most so many samples, as `Source.some`.
+        subset: Returns at most so many samples, as `Source.subset`.
     """
 
     def both(count: int) -> Samples:
-        inputs, truth, names = some(max(1, count // 2))
+        inputs, truth, names = subset(max(1, count // 2))
         both_inputs, both_truth = (torch.cat([part, part.flip(-2)]) for part in (inputs, truth))
         return both_inputs, both_truth, np.concatenate([names, names])
 

@@ -16,7 +16,7 @@ import torch
 from evnlos.config import LONG_YAML, config_hash, differing_keys, read_yaml, save_yaml, to_dict
 from evnlos.data import Dataset, LiveDataset, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.files import claim, is_empty, write_atomically
+from evnlos.files import directory_lock, is_empty, write_atomically
 from evnlos.migrate import __version__, migrate
 from evnlos.models import Reconstructor, Weights, load_weights, save_weights
 from evnlos.progress import Progress, Step, silent
@@ -28,7 +28,15 @@ from evnlos.training.settings import (
     load_checkpoint,
     save_checkpoint,
 )
-from evnlos.training.source import Live, Source, Stored, Team, half_mirrored, team, with_mirrored
+from evnlos.training.source import (
+    DiskSource,
+    ProcessGroup,
+    SimulatedSource,
+    Source,
+    half_mirrored,
+    process_group,
+    with_mirrored,
+)
 from evnlos.training.validation import confidence_of, held_out_samples, validate
 from evnlos.types import derive_seed
 
@@ -99,10 +107,10 @@ def train(
             f"mirror is on, and a reconstructor of kind {network.kind!r} sees whole sequences, which are not "
             "mirrored; leave it off"
         )
-    with team() as processes, ExitStack() as stack:
+    with process_group() as processes, ExitStack() as stack:
         about = about_run(dataset, settings, start, processes.device)
         if processes.rank == 0:
-            stack.enter_context(claim(out, check=lambda: check_run(out, about)))
+            stack.enter_context(directory_lock(out, check=lambda: check_run(out, about)))
             if (out / "run.yaml").is_file():
                 _tell_of_threads(out)
             else:
@@ -119,7 +127,7 @@ def _epochs(
     settings: Training,
     out: Path,
     history: list[dict[str, Any]],
-    processes: Team,
+    processes: ProcessGroup,
     start: Weights | None,
     progress: Progress,
 ) -> list[dict[str, Any]]:
@@ -149,8 +157,8 @@ def _epochs(
             _write_log(metrics, log)
     else:
         keep, seed = settings.keep_normalization, settings.seed
-        some = with_mirrored(steps.some) if settings.mirror else steps.some
-        network.fit(some, seed, is_new=is_new, keep_normalization=keep)
+        subset = with_mirrored(steps.subset) if settings.mirror else steps.subset
+        network.fit(subset, seed, is_new=is_new, keep_normalization=keep)
     source = steps.for_network(network, settings.sequence_augmentations, is_new=is_new and not done)
     progress(Step(what, done, settings.epochs, "epochs"))
     processes.wait()  # nobody writes before all have read
@@ -233,12 +241,12 @@ def _check_data(dataset: Dataset, network: Reconstructor) -> None:
         )
 
 
-def _source(dataset: Dataset, network: Reconstructor, settings: Training, processes: Team) -> Source:
+def _source(dataset: Dataset, network: Reconstructor, settings: Training, processes: ProcessGroup) -> Source:
     """Return where the samples of single time steps come from."""
     if isinstance(dataset, LiveDataset):
-        return Live(dataset, network.modality, settings.batch_size, settings.seed, processes)
+        return SimulatedSource(dataset, network.modality, settings.batch_size, settings.seed, processes)
     samples = NlosDataset(dataset, "train", network.modality)
-    return Stored(samples, settings.batch_size, settings.seed, processes)
+    return DiskSource(samples, settings.batch_size, settings.seed, processes)
 
 
 def _write_log(path: Path, log: list[dict[str, Any]]) -> None:

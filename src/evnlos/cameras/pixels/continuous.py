@@ -18,14 +18,15 @@ from numba import njit
 from evnlos.cameras.event_order import grown
 from evnlos.cameras.pixels.continuous_math import (
     KNEE,
-    LINE,
+    LINEAR,
     LOG_KNEE,
-    LOG_LINE,
+    LOG_LINEAR,
     LOW_PASS,
     PIECE,
-    bend_response,
+    apply_leak,
     copy_light,
-    fall,
+    crossing_time,
+    curvature_correction,
     first_crossing,
     flag_direct,
     flag_filtered,
@@ -34,8 +35,7 @@ from evnlos.cameras.pixels.continuous_math import (
     is_smooth,
     light_of,
     log_row,
-    meet,
-    respond,
+    lowpass_step,
     response,
 )
 from evnlos.cameras.random_numbers import (
@@ -109,13 +109,15 @@ def _piece(
         decay = fast_exp(-end)
         arrival = a + per_tau * end + c * decay
         slope_start, slope_end = b - c, b - c * decay
-        arrival += bend_response(light_a, light_b, log_b - log_a, end, 1.0 / end, 1.0 - decay, rate * length)
+        arrival += curvature_correction(
+            light_a, light_b, log_b - log_a, end, 1.0 / end, 1.0 - decay, rate * length
+        )
     elif max(light_a, light_b) > KNEE:
-        kind, end = LOG_LINE, length
+        kind, end = LOG_LINEAR, length
         a, b, c = light_a, gradient, leak
         slope_start, slope_end = b / light_a + c, b / light_b + c
     else:
-        kind, end = LINE, length
+        kind, end = LINEAR, length
         a, b, c = log_a, gradient * LOG_KNEE / KNEE + leak, 0.0
         slope_start = slope_end = b
     monotone = slope_start * slope_end >= 0.0
@@ -229,7 +231,7 @@ def _cubic(
     size = on if rising else -off
     done, level = 0.0, state[0] + size - filtered
     while (rise >= level) if rising else (rise <= level):
-        done = meet(rise, slope_0, slope_1, level, done)
+        done = crossing_time(rise, slope_0, slope_1, level, done)
         state[0] += size
         state[1] = start + done * length
         level += size
@@ -262,10 +264,10 @@ def send_events(
             state[0], state[1] = now[3, i], last_event[pixel]
             state[2] = candidate[pixel] if has_shot else np.inf
             light_0, light_1, filtered_0, arrival = now[0, i], then[0, i], now[2, i], then[2, i]
-            fall = leak[pixel] * length
-            rise = arrival - filtered_0 + fall
-            slope_0 = pace * (light_0 + curve.floor) * (now[1, i] - filtered_0) + fall
-            slope_1 = pace * (light_1 + curve.floor) * (then[1, i] - arrival) + fall
+            leaked = leak[pixel] * length
+            rise = arrival - filtered_0 + leaked
+            slope_0 = pace * (light_0 + curve.floor) * (now[1, i] - filtered_0) + leaked
+            slope_1 = pace * (light_1 + curve.floor) * (then[1, i] - arrival) + leaked
             if (
                 plain
                 and state[2] >= stop
@@ -320,11 +322,11 @@ def _run_tile(
         start, stop = times[k], times[k + 1]
         copy_light(frames[k, first - origin : last - origin], curve, then[0])
         log_row(then[0], then[1])
-        fall(now[3], my_leak, stop - start, then[3])
+        apply_leak(now[3], my_leak, stop - start, then[3])
         if rate > 0.0:
             half = 0.5 * rate * (stop - start)
             gain_of(now[0], then[0], half, twice, gain)
-            respond(now[0], then[0], now[1], then[1], gain, now[2], half, twice, then[2])
+            lowpass_step(now[0], then[0], now[1], then[1], gain, now[2], half, twice, then[2])
             flag_filtered(now, then, my_leak, half, twice, stop - start, my_on, my_off, flags[:size])
         else:
             then[2] = then[1]

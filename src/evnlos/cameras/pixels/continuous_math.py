@@ -53,7 +53,7 @@ KNEE = 20.0
 LOG_KNEE = math.log(KNEE)
 KNEE_SLOPE = LOG_KNEE / KNEE
 
-LOW_PASS, LOG_LINE, LINE = 0, 1, 2
+LOW_PASS, LOG_LINEAR, LINEAR = 0, 1, 2
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -70,7 +70,7 @@ def light_of(log_value):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def bend_response(light_a, light_b, change, tau, inverse, gain, span):
+def curvature_correction(light_a, light_b, change, tau, inverse, gain, span):
     """Return what the filter's output at the end of a piece gains from the bend of the log light.
 
     The log light lies above its chord by 4 e s (1 - s), s = time / tau. With d its change over the piece and I
@@ -91,12 +91,12 @@ def bend_response(light_a, light_b, change, tau, inverse, gain, span):
 def response(kind, a, b, c, x):
     """Return the response of a piece at its own time x, and its first two derivatives there.
 
-    LOW_PASS: a + b x + c exp(-x). LOG_LINE: ln(a + b x) + c x. LINE: a + b x.
+    LOW_PASS: a + b x + c exp(-x). LOG_LINEAR: ln(a + b x) + c x. LINEAR: a + b x.
     """
     if kind == LOW_PASS:
         decay = c * fast_exp(-x)
         return a + b * x + decay, b - decay, decay
-    if kind == LOG_LINE:
+    if kind == LOG_LINEAR:
         light = a + b * x
         growth = b / light
         return fast_log(light) + c * x, growth + c, -growth * growth
@@ -184,7 +184,7 @@ def copy_light(row, curve, light):
 
 
 @njit(cache=True, error_model="numpy")
-def fall(base, leak, length, base_1):
+def apply_leak(base, leak, length, base_1):
     """Lower the references by the leak of one step."""
     for i in range(len(base)):
         base_1[i] = base[i] - leak[i] * length
@@ -198,14 +198,14 @@ def gain_of(light_0, light_1, half, twice, gain):
 
 
 @njit(cache=True, error_model="numpy")
-def respond(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, twice, filtered_1):
+def lowpass_step(light_0, light_1, logs_0, logs_1, gain, filtered_0, half, twice, filtered_1):
     """Fill the filter's output after one step on which the log light is a line in the filter's own time."""
     for i in range(len(gain)):
         tau = half * (light_0[i] + light_1[i] + twice)
         before = filtered_0[i]
         change = logs_1[i] - logs_0[i]
         inverse = 1.0 / tau
-        bend = bend_response(light_0[i], light_1[i], change, tau, inverse, gain[i], 2.0 * half)
+        bend = curvature_correction(light_0[i], light_1[i], change, tau, inverse, gain[i], 2.0 * half)
         filtered_1[i] = before + gain[i] * (logs_0[i] - before) + change * (1.0 - gain[i] * inverse) + bend
 
 
@@ -260,7 +260,7 @@ def is_monotone(rise, slope_0, slope_1):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def meet(rise, slope_0, slope_1, level, low):
+def crossing_time(rise, slope_0, slope_1, level, low):
     """Return the s in [low, 1] where a monotone cubic from 0 to `rise` on [0, 1] meets `level`.
 
     Halley's steps converge cubically; where one leads out of the bracket, the bracket is halved. The last step

@@ -59,7 +59,7 @@ class Explained:
 
 
 @dataclass(frozen=True, eq=False)
-class EvidenceTerms:
+class MarginalLikelihoodTerms:
     """The evidence of one setup for any gain g and noise variance v.
 
     y = g B x + e with B the setup's light from the target plane's cells to all frames, less its mean over the
@@ -105,7 +105,7 @@ class EvidenceTerms:
         return gain * (self.seen - gain * self.shown)
 
 
-class MovingLight:
+class FrameResiduals:
     """What moves in the frames of sequences with one known motion: each pixel's mean over the sequence is taken
     off.
 
@@ -155,18 +155,18 @@ class MovingLight:
         terms, variance = self.terms(setup), noise**2
         return Explained(terms.cost(gain, variance), gain, noise, self._targets(terms, gain, variance))
 
-    def _targets(self, terms: EvidenceTerms, gain: float, variance: float) -> torch.Tensor:
+    def _targets(self, terms: MarginalLikelihoodTerms, gain: float, variance: float) -> torch.Tensor:
         targets = self._prior.mean + terms.code(gain, variance) @ terms.turn.mT @ self._prior.root.mT
         return targets.unflatten(1, self.target_plane.shape)
 
-    def terms(self, setup: Setup) -> EvidenceTerms:
+    def terms(self, setup: Setup) -> MarginalLikelihoodTerms:
         """Return what the evidence of a setup is made of, all but gain and noise."""
         sight = self.sight(setup)
         gram = sight.gram(strip_gram_of(sight.transport), static=math.inf)
         mean, root = self._prior.mean, self._prior.root
         strength, turn = torch.linalg.eigh(root.mT @ gram @ root)
         back = sight.adjoint(self.moving).flatten(1)  # B^T y, [P, n n]
-        return EvidenceTerms(
+        return MarginalLikelihoodTerms(
             power=self.moving.square().sum(dim=(1, 2, 3)),
             both=back @ mean,
             lit=float(mean @ gram @ mean),
@@ -216,13 +216,13 @@ class UnlabelledFit:
     check: Residual
 
 
-def fit_unlabelled(
+def fit_blind(
     fit: CaptureSet, held: CaptureSet, start: Setup, *, fixed: tuple[str, ...] = (), iterations: int = 25
 ) -> UnlabelledFit:
     """Fit a setup to sequences of unknown objects with known motion, and check it on other sequences.
 
     The numbers of the optics are those that make the frames likeliest when the targets are any handwriting
-    (`MovingLight.explained`): first a scan over blur and magnification, then quasi-Newton steps (L-BFGS-B).
+    (`FrameResiduals.explained`): first a scan over blur and magnification, then quasi-Newton steps (L-BFGS-B).
 
     Args:
         fit: The captures to fit.
@@ -249,7 +249,7 @@ def fit_unlabelled(
     return UnlabelledFit(optics, seen, other, Residual(before, after, known.noise / light.spread))
 
 
-def _moving(capture_set: CaptureSet, frames: slice) -> MovingLight:
+def _moving(capture_set: CaptureSet, frames: slice) -> FrameResiduals:
     """Return what moves in some of the frames of all captures, at the working size."""
     times = [capture_set.times_s(k) for k in range(len(capture_set.captures))]
     places = [motion.position_m(t) for motion, t in zip(capture_set.motions, times, strict=True)]
@@ -267,15 +267,15 @@ def _moving(capture_set: CaptureSet, frames: slice) -> MovingLight:
         reduce_by_area(capture.frames[chosen] / np.float32(capture_set.peak), shape)
         for capture in capture_set.captures
     ]
-    return MovingLight(torch.from_numpy(np.stack(pictures)), first, capture_set.target_size_m, CELLS)
+    return FrameResiduals(torch.from_numpy(np.stack(pictures)), first, capture_set.target_size_m, CELLS)
 
 
-def _scanned(light: MovingLight, start: Setup) -> Setup:
+def _scanned(light: FrameResiduals, start: Setup) -> Setup:
     trials = (rescaled(start, magnification=a, blur=b) for a, b in _SCANS)
     return min(trials, key=lambda setup: _cost(light, setup))
 
 
-def _search(light: MovingLight, start: Setup, parameters: tuple[Parameter, ...], iterations: int) -> Setup:
+def _search(light: FrameResiduals, start: Setup, parameters: tuple[Parameter, ...], iterations: int) -> Setup:
     from scipy.optimize import minimize  # scipy loads slowly
 
     here = values_of(start)
@@ -309,14 +309,14 @@ def _search(light: MovingLight, start: Setup, parameters: tuple[Parameter, ...],
     return moved(start, parameters, middle + found.x * scale)
 
 
-def _cost(light: MovingLight, setup: Setup) -> float:
+def _cost(light: FrameResiduals, setup: Setup) -> float:
     try:
         return light.explained(setup).cost
     except ConfigError:  # a camera that can't be, e.g. one that sees past the wall: the search turns back
         return _FAR
 
 
-def _missed(given: MovingLight, asked: MovingLight, setup: Setup) -> float:
+def _missed(given: FrameResiduals, asked: FrameResiduals, setup: Setup) -> float:
     """Return how far some frames are from what others predict of them, over the spread of what moves."""
     away = asked.moving - asked.predicted(setup, given.explained(setup))
     return float(away.square().mean().sqrt()) / asked.spread
@@ -335,7 +335,7 @@ def _with_targets(capture_set: CaptureSet, found: Explained) -> CaptureSet:
     )
 
 
-def _errors(light: MovingLight, setup: Setup, parameters: tuple[Parameter, ...]) -> NDArray[np.float64]:
+def _errors(light: FrameResiduals, setup: Setup, parameters: tuple[Parameter, ...]) -> NDArray[np.float64]:
     """Return the standard error of each number, the others held, from the evidence's curvature."""
     known = values_of(setup)
     values = np.array([encoded(p, known[p.name]) for p in parameters])

@@ -11,7 +11,7 @@ from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation
 from evnlos.errors import DataError
-from evnlos.experiment.carry_over import carry_over, sets
+from evnlos.experiment.generalization import evaluation_sets, generalization
 from evnlos.models import UNetConfig, Weights, save_weights
 from evnlos.scene import DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS
@@ -27,7 +27,7 @@ SETUP = Simulation(
 
 
 def test_the_sets_change_one_thing_each() -> None:
-    found = sets(SETUP, SAMPLING, 4)
+    found = evaluation_sets(SETUP, SAMPLING, 4)
     assert set(KINDS) < set(found) and "matte wall" in found
     for name, config in found.items():
         assert config.sampling == SAMPLING and not config.vary and config.frame_camera == SETUP.frame_camera
@@ -36,7 +36,7 @@ def test_the_sets_change_one_thing_each() -> None:
         assert moved <= isinstance(config.glyphs, HandwritingGlyphs)
         assert len(config.glyphs.objects()) == (36 if "unseen" in name else 4)
     with pytest.raises(DataError, match="radiometric"):
-        sets(replace(SETUP, setup=PaperSetup()), SAMPLING, 4)
+        evaluation_sets(replace(SETUP, setup=PaperSetup()), SAMPLING, 4)
 
 
 def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypatch) -> None:
@@ -48,7 +48,7 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypa
     bare = Weights(network)
     save_weights(tmp_path / "bare.safetensors", bare)
     with pytest.raises(DataError, match="does not know what its pictures are worth"):
-        carry_over(tmp_path / "bare.safetensors", setup, tmp_path, 1)
+        generalization(tmp_path / "bare.safetensors", setup, tmp_path, 1)
     confidence = fit_confidence(network, NlosDataset(tiny_dataset, "train", "frame"), SAMPLING.canvas)
     save_weights(tmp_path / "w.safetensors", replace(bare, confidence=confidence))
 
@@ -58,8 +58,8 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypa
         icons = replace(base, glyphs=DrawingGlyphs(kinds=("icon",), each=2))
         return {"icon": icons, "dim": replace(icons, setup=dim)}
 
-    # By name: the package's attribute `carry_over` is the function, not the module.
-    monkeypatch.setattr(sys.modules["evnlos.experiment.carry_over"], "sets", two)
+    # By name: the package's attribute `generalization` is the function, not the module.
+    monkeypatch.setattr(sys.modules["evnlos.experiment.generalization"], "sets", two)
     command = ["experiment", "carry-over", "--weights", str(tmp_path / "w.safetensors"), "--rig", "lab"]
     command += ["--out", str(tmp_path), "--workers", "1"]
     with monkeypatch.context() as little:
@@ -68,14 +68,14 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypa
             main(command)
         assert "GB of memory" in capsys.readouterr().err.splitlines()[-1]
         main([*command, "--force"])
-    found = json.loads((tmp_path / "carry-over-lab-w.json").read_text())
+    found = json.loads((tmp_path / "generalization-lab-w.json").read_text())
     assert [one["name"] for one in found] == ["icon", "dim"]
     for one in found:
         assert [p["name"] for p in one["worth"]] == ["icon_000", "icon_001"]
         assert one["consistent_db"] > 0
         assert all(p["explained"] is not None and p["skill"] < 1 for p in one["worth"])
-    text = (tmp_path / "carry-over-lab-w.md").read_text()
+    text = (tmp_path / "generalization-lab-w.md").read_text()
     widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
     assert widths == {13} and "Mean skill of the best" in text
     pytest.importorskip("matplotlib")
-    assert (tmp_path / "carry-over-lab-w.png").stat().st_size > 10_000
+    assert (tmp_path / "generalization-lab-w.png").stat().st_size > 10_000

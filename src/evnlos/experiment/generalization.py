@@ -11,7 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evnlos.analysis.confidence import FrameOperator, PassWorth, consistent, risk_coverage, worth_of
+from evnlos.analysis.confidence import (
+    ConfidenceCheck,
+    FrameOperator,
+    check_confidence,
+    consistent,
+    risk_coverage,
+)
 from evnlos.calibration.transport_fit import values_of
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
@@ -29,7 +35,7 @@ from evnlos.setups import calibrated_file
 
 
 @dataclass(frozen=True)
-class CarriedOver:
+class GeneralizationResult:
     """What one network made of one set of objects and walls.
 
     Args:
@@ -38,21 +44,21 @@ class CarriedOver:
         average_db: The same of the average target, drawn where the target is, dB.
         consistent_db: The same of the network's pictures after data consistency with the set's own wall, dB;
             None for events alone.
-        worth: What the confidence said of each sequence, and what was true.
+        confidence_checks: What the confidence said of each sequence, and what was true.
     """
 
     name: str
     psnr_db: float
     average_db: float
     consistent_db: float | None
-    worth: list[PassWorth]
+    confidence_checks: list[ConfidenceCheck]
 
     def mean(self, key: str) -> float:
         """Return the mean of one number of the sequences."""
-        return float(np.mean([getattr(one, key) for one in self.worth]))
+        return float(np.mean([getattr(one, key) for one in self.confidence_checks]))
 
 
-def sets(setup: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation]:
+def evaluation_sets(setup: Simulation, sampling: Sampling, each: int) -> dict[str, Simulation]:
     """Return the sets: unseen hands, each kind of drawings, and the same hands in front of other walls.
 
     Args:
@@ -85,7 +91,7 @@ def sets(setup: Simulation, sampling: Sampling, each: int) -> dict[str, Simulati
     return found | {name: replace(base, glyphs=some, setup=other) for name, other in walls.items()}
 
 
-def carry_over(
+def generalization(
     weights: Path,
     setup: Path,
     out: Path,
@@ -93,7 +99,7 @@ def carry_over(
     each: int = 12,
     progress: Progress = silent,
     force: bool = False,
-) -> list[CarriedOver]:
+) -> list[GeneralizationResult]:
     """Run one network on all sets and return what came of each.
 
     Args:
@@ -117,8 +123,8 @@ def carry_over(
     own = load_yaml(Simulation, calibrated_file(setup))
     operator = FrameOperator(own.setup, sampling) if "frame" in loaded.modality.slices else None
     processes(workers, 1)
-    found = list[CarriedOver]()
-    for name, config in sets(own, sampling, each).items():
+    found = list[GeneralizationResult]()
+    for name, config in evaluation_sets(own, sampling, each).items():
         key = config_hash(config)[:8]
         folder = out / "simulations" / f"{setup.name}-{name.replace(' ', '-')}-{key}"
         dataset = simulate(config, folder, workers, progress=progress, force=force)
@@ -135,7 +141,7 @@ def _score(
     dataset: Dataset,
     operator: FrameOperator | None,
     own_wall: FrameOperator | None,
-) -> CarriedOver:
+) -> GeneralizationResult:
     """Score a set; `operator` is the setup that the network was trained for, `own_wall` that of the set."""
     assert weights.confidence is not None
     samples = NlosDataset(dataset, "all", weights.modality)
@@ -151,32 +157,32 @@ def _score(
     if own_wall is not None:
         frames = [torch.from_numpy(read_shard(dataset.shard(one))[0].frame) for one in dataset.objects("all")]
         consistent_db = mean_db(consistent(images, torch.cat(frames), own_wall, TRUST))
-    worth = worth_of(weights.network, weights.confidence, samples, images, canvas, operator)
-    return CarriedOver(name, mean_db(images), mean_db(average), consistent_db, worth)
+    confidence_checks = check_confidence(weights.network, weights.confidence, samples, images, canvas, operator)
+    return GeneralizationResult(name, mean_db(images), mean_db(average), consistent_db, confidence_checks)
 
 
-def write_carried(found: list[CarriedOver], path: Path) -> None:
+def write_generalization(found: list[GeneralizationResult], path: Path) -> None:
     """Write the findings, sequence by sequence, as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps([to_dict(one) for one in found], indent=1).encode())
 
 
-def carried_table(found: list[CarriedOver]) -> str:
+def generalization_table(found: list[GeneralizationResult]) -> str:
     """Return the findings as a table, and how well the support orders all sequences by their skill."""
     head = ["set", "sequences", "PSNR, dB", "+ consistency, dB", "average target, dB"]
     head += ["skill", "support", "agreement", "explained", "measured", "coverage", "width"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in found:
         moved = "-" if one.consistent_db is None else f"{one.consistent_db:.2f}"
-        row = [one.name, str(len(one.worth)), f"{one.psnr_db:.2f}", moved, f"{one.average_db:.2f}"]
+        row = [one.name, str(len(one.confidence_checks)), f"{one.psnr_db:.2f}", moved, f"{one.average_db:.2f}"]
         row += [f"{one.mean(key):.2f}" for key in ("skill", "support", "agreement")]
-        row.append("-" if one.worth[0].explained is None else f"{one.mean('explained'):.2f}")
+        row.append("-" if one.confidence_checks[0].explained is None else f"{one.mean('explained'):.2f}")
         row += [f"{one.mean(key):.0%}" for key in ("measured", "coverage")]
         lines.append(f"| {' | '.join(row)} | {one.mean('width'):.2f} |")
-    return "\n".join([*lines, "", _order([sequence for one in found for sequence in one.worth])])
+    return "\n".join([*lines, "", _order([sequence for one in found for sequence in one.confidence_checks])])
 
 
-def _order(sequences: list[PassWorth]) -> str:
+def _order(sequences: list[ConfidenceCheck]) -> str:
     support, skill = (np.array([getattr(one, key) for one in sequences]) for key in ("support", "skill"))
     risk = 1 - skill
     parts = []

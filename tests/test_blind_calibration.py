@@ -8,8 +8,8 @@ import torch
 from scipy.stats import multivariate_normal
 
 from evnlos.calibration import Calibration, fit_setup
+from evnlos.calibration.blind_calibration import CELLS, WRITERS, FrameResiduals, fit_blind
 from evnlos.calibration.captures import read_capture_set
-from evnlos.calibration.unlabelled import CELLS, WRITERS, MovingLight, fit_unlabelled
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.measurements import handwritten_targets
 from evnlos.setups import PaperSetup, RadiometricSetup
@@ -19,17 +19,17 @@ PLACES = np.stack([np.linspace(-0.06, 0.06, 7), np.zeros(7)], axis=1)
 SHAPE = (6, 10)
 
 
-def sequences(noise: float, seed: int = 0) -> tuple[MovingLight, torch.Tensor]:
+def sequences(noise: float, seed: int = 0) -> tuple[FrameResiduals, torch.Tensor]:
     """Return frames of unseen handwriting with noise in units of what moves, and the true targets."""
     draw = torch.Generator().manual_seed(seed)
-    empty = MovingLight(torch.zeros(1, 7, *SHAPE), PLACES, 0.08, CELLS)
+    empty = FrameResiduals(torch.zeros(1, 7, *SHAPE), PLACES, 0.08, CELLS)
     targets = handwritten_targets(empty.target_plane, WRITERS).test[::2].unflatten(1, empty.target_plane.shape)
     light = empty.sight(SETUP)(targets)
     light = light / light.std()
     light = light + noise * torch.randn(light.shape, generator=draw)
     # Ambient light and the pattern of the camera: still, and of any form.
     light = light + 3 * torch.rand(SHAPE, generator=draw)
-    return MovingLight(light, PLACES, 0.08, CELLS), targets
+    return FrameResiduals(light, PLACES, 0.08, CELLS), targets
 
 
 def test_the_evidence_is_that_of_the_dense_gaussian() -> None:
@@ -71,7 +71,7 @@ def test_a_setup_is_found_without_its_targets(tiny_captures, tmp_path) -> None:
     assert all(capture.target is None for capture in (*fit.captures, *held.captures))
     start = RadiometricSetup(roughness=0.12)  # the lab's is 0.05
     known = ("distance_m", "target_offset_m", "camera_distance_m", "camera_angle_deg", "field_of_view_deg")
-    found = fit_unlabelled(fit, held, start, fixed=known, iterations=4)
+    found = fit_blind(fit, held, start, fixed=known, iterations=4)
     assert found.optics.setup.roughness == pytest.approx(0.05, rel=0.1)
     assert found.check.after < found.check.before
     assert found.check.noise <= found.check.after
