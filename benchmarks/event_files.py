@@ -1,6 +1,6 @@
 """How fast do event files become arrays, next to other Python packages, on one thread?
 
-Writes the files that it reads, interleaves the packages, prints millions of events a second of processor time
+Writes the files that it reads, interleaves the packages, prints millions of events per second of processor time
 (median of the rounds) and the ratio to each rival (median of the ratios within a round). Rivals are optional:
 those that cannot be imported (pip install evutils faery) are left out.
 
@@ -153,11 +153,11 @@ def main() -> None:
         "# Event files",
         "",
         f"{arguments.events:,} events, one thread, processor time, medians of {arguments.rounds} interleaved "
-        "rounds; millions of events a second.",
+        "rounds; millions of events per second.",
         "",
         machine("numpy", "evutils", "faery"),
         "",
-        f"| file | bytes an event | {' | '.join(readers)} | ratios |\n|---|---|{'---|' * len(readers)}---|",
+        f"| file | bytes per event | {' | '.join(readers)} | ratios |\n|---|---|{'---|' * len(readers)}---|",
     ]
     print("\n".join(lines))
     with tempfile.TemporaryDirectory() as folder:

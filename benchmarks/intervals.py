@@ -38,7 +38,7 @@ from evnlos.training.validation import fit_confidence
 _GAUSSIAN = 1.645  # standard deviations that hold nine tenths
 _FLOOR = 0.003  # of the variance of an unsure pixel, as data consistency has it
 _SAME = 0.005  # deviation among networks that happen to agree
-_STEPS, _TARGETS = 1500, 32  # of the training of the network of quantiles: steps, targets a step
+_STEPS, _TARGETS = 1500, 32  # of the training of the network of quantiles: steps, targets per step
 Interval = tuple[Tensor, Tensor]
 
 

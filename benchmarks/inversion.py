@@ -52,7 +52,7 @@ def compare(gain: float, ambient: float, character: str, seed: int = 0) -> dict[
         "exact": tikhonov(exact, torch.log(bright / dark), **options),
     }
     row = {name: correlation(solution.image, last - first) for name, solution in solved.items()}
-    return row | {"events a pixel": len(events) / (SHAPE[0] * SHAPE[1])}
+    return row | {"events per pixel": len(events) / (SHAPE[0] * SHAPE[1])}
 
 
 if __name__ == "__main__":

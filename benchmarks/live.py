@@ -1,4 +1,4 @@
-"""How long from an event to its picture, live, at 160 x 100 and a million events a second; where does it go?
+"""How long from an event to its picture, live, at 160 x 100 and a million events per second; where does it go?
 
     python benchmarks/live.py                              # replay and UDP, event and fusion, two threads
     python benchmarks/live.py --threads 1 --sources replay --seconds 20
@@ -169,8 +169,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sources", nargs="+", choices=("replay", "udp"), default=["replay", "udp"])
     parser.add_argument("--modalities", nargs="+", choices=STANDARD_MODALITIES, default=["event", "fusion"])
-    parser.add_argument("--rate-hz", "--rate", type=float, default=1e6, help="events a second")
-    parser.add_argument("--pictures-hz", type=float, default=RateOptions.rate, help="most pictures a second")
+    parser.add_argument("--rate-hz", "--rate", type=float, default=1e6, help="events per second")
+    parser.add_argument("--pictures-hz", type=float, default=RateOptions.rate, help="most pictures per second")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--threads", type=int, default=2, help="threads of the network")
     parser.add_argument("--weights", help="weights or run, of the modality asked for")
@@ -185,8 +185,8 @@ def main() -> None:
     lines = [
         "# Live latency",
         "",
-        f"{WIDTH} x {HEIGHT} pixels, {arguments.rate_hz:,.0f} events a second for {arguments.seconds:.0f} s; "
-        f"at most {arguments.pictures_hz:.0f} pictures a second of {Sampling.width} x {Sampling.height}; "
+        f"{WIDTH} x {HEIGHT} pixels, {arguments.rate_hz:,.0f} events per second for {arguments.seconds:.0f} s; "
+        f"at most {arguments.pictures_hz:.0f} pictures per second of {Sampling.width} x {Sampling.height}; "
         f"{arguments.threads} threads; niceness {nice()}, load before: {load:.1f}.",
         "",
         machine(),

@@ -59,7 +59,7 @@ def watched(function: Callable, device: torch.device, spent: dict[str, float], s
 
 
 def stages(config: Simulation, names: list[str], device: torch.device, together: int) -> dict[str, float]:
-    """Return seconds an object of each stage on a device, and of all; one group warms it up."""
+    """Return seconds per object of each stage on a device, and of all; one group warms it up."""
     spent: dict[str, float] = defaultdict(float)
     groups = [names[first : first + together] for first in range(0, len(names) - together + 1, together)]
     on_device.simulate_objects_on(config, groups[0], device)
@@ -109,7 +109,7 @@ def main() -> None:
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else "no GPU"
     lines = ["# Training on samples simulated meanwhile", "", *(__doc__ or "").split("\n\n")[2:]]
     lines += [f"{machine('torch')}; {where}; {options.together} objects at a time", ""]
-    lines += ["| stage | ms an object | share |", "|---|---|---|"]
+    lines += ["| stage | ms per object | share |", "|---|---|---|"]
     lines += [f"| {stage} | {1e3 * s:.1f} | {100 * s / spent['all']:.0f} % |" for stage, s in spent.items()]
     few = names[: 1 + min(8, count - 1)]
     simulate_object(config, few[0])

@@ -73,7 +73,7 @@ def main() -> None:
     frame = np.random.default_rng(1).integers(0, 256, (1, 100, 160)).astype(np.uint8)
     edges = np.array([0, 200_000])
     print(machine())
-    print(f"{args.events} events a position, {args.threads} threads")
+    print(f"{args.events} events per position, {args.threads} threads")
     print("| modality | surface and maps, ms | network, ms | together, ms | network layer by layer, ms |")
     print("|---|---|---|---|---|")
     given = load_weights(args.weights) if args.weights else None

@@ -1,7 +1,7 @@
 """How fast do events become maps, next to other Python packages, on one thread?
 
 Times each representation of one stream on 1280 x 720, interleaved with the rivals that can be imported (pip
-install evutils tonic), and prints millions of events a second of processor time (median of the rounds) and
+install evutils tonic), and prints millions of events per second of processor time (median of the rounds) and
 ratios (median within a round). Rivals get their own kind of array, made beforehand, and return float32 as we
 do; the voxel grid of evutils counts into the nearest bin, ours shares each vote between two.
 
@@ -136,7 +136,7 @@ def main() -> None:
         "# Representations",
         "",
         f"{len(events):,} {arguments.stream} events on {WIDTH} x {HEIGHT}, one thread, processor time, medians "
-        f"of {arguments.rounds} interleaved rounds; millions of events a second.",
+        f"of {arguments.rounds} interleaved rounds; millions of events per second.",
         "",
         machine("numpy", "evutils", "tonic"),
         "",

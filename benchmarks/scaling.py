@@ -55,7 +55,7 @@ class Sweep:
     seconds: list[float]
 
     def line(self) -> tuple[float, float, float]:
-        """Return seconds that are always spent, seconds a unit, and the largest miss of that line, relative."""
+        """Return seconds that are always spent, seconds per unit, and the line's largest relative miss."""
         size, seconds = np.array(self.sizes), np.array(self.seconds)
         each, fixed = np.polyfit(size, seconds, 1, w=1 / seconds)
         return float(fixed), float(each), float(np.max(np.abs((fixed + each * size) / seconds - 1)))
@@ -129,9 +129,9 @@ def page(found: list[Sweep], rates: dict[int, float], cores: int) -> str:
         sizes = ", ".join(f"{size:,.0f}" for size in sweep.sizes)
         seconds = ", ".join(f"{value:.2f}" for value in sweep.seconds)
         fixed, each, miss = sweep.line()
-        line = f"{fixed:.2f} s + {each * 1e6:,.4g} us a unit"
+        line = f"{fixed:.2f} s + {each * 1e6:,.4g} us per unit"
         lines.append(f"| {sweep.what} ({sweep.unit}) | {sizes} | {seconds} | {line} | {100 * miss:.0f} % |")
-    lines += ["", "| processes | objects a second | times one |", "|---|---|---|"]
+    lines += ["", "| processes | objects per second | times one |", "|---|---|---|"]
     lines += [f"| {count} | {rate:.2f} | {rate / rates[1]:.2f} |" for count, rate in rates.items()]
     lines += [
         "",

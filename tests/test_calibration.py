@@ -17,7 +17,7 @@ from PIL import Image
 from evnlos.calibration import (
     Calibration,
     Residual,
-    figures,
+    calibration_values,
     fit_setup,
     fit_transport,
     read_capture_set,
@@ -420,7 +420,7 @@ def test_a_number_on_the_bound_of_the_search_is_named(fit) -> None:
     stuck = replace(fit, optics=replace(fit.optics, parameters=parameters))
     rows = rows_of(stuck, EventPixel(), FrameCamera())
     assert "on the bound of the search: 0.06" in table(rows)
-    found = figures(stuck, rows)
+    found = calibration_values(stuck, rows)
     assert found["on_bound"] == ["setup.roughness"]
     assert len(found["warnings"]) == 1 and "setup.roughness" in found["warnings"][0]
     assert "evnlos scan" in found["warnings"][0] and "\n" not in found["warnings"][0]
@@ -460,8 +460,8 @@ def test_the_gain_of_unknown_targets_is_called_arbitrary(fit) -> None:
         one = replace(fit, targets=targets)
         rows = rows_of(one, EventPixel(), FrameCamera())
         assert {row.name: row.note for row in rows}["setup.gain"] == note
-        assert figures(one, rows)["parameters"]["setup.gain"]["note"] == note
-        assert (note in table(rows)) and figures(one, rows)["targets"] == targets
+        assert calibration_values(one, rows)["parameters"]["setup.gain"]["note"] == note
+        assert (note in table(rows)) and calibration_values(one, rows)["targets"] == targets
 
 
 def test_a_matte_wall_ends_on_the_bounds(tmp_path, capsys) -> None:

@@ -151,7 +151,7 @@ def test_the_command_prints_and_its_exit_code_tells(tiny_captures, tmp_path, cap
 
 @pytest.fixture(scope="module")
 def steady(tmp_path_factory):
-    """A rendered capture at 2.5 frames a second."""
+    """A rendered capture at 2.5 frames per second."""
     lab = Lab(
         glyphs=FontGlyphs(family="kalam", characters="R"),
         setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),

@@ -97,7 +97,7 @@ def test_the_papers_settings() -> None:
     assert dataclasses.astuple(paper.pixel)[:7] == (0.15, 0.15, 0.03, 15.0, 0.01, 0.0015, 0.0)
     assert paper.pixel == EventPixel()
     assert (paper.motion.speed_m_s, paper.glyphs.target_plane.size_m) == (0.02, 0.08)
-    assert (paper.setup.tpsf_t, paper.setup.mean_free_path, paper.setup.rho_max) == (2.0, 0.8, 2.0)
+    assert (paper.setup.tpsf_t, paper.setup.mean_free_path, paper.setup.kernel_radius) == (2.0, 0.8, 2.0)
     assert (pre.epochs, pre.batch_size, pre.learning_rate, pre.step_epoch, pre.loss) == (
         200,
         16,

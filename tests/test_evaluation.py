@@ -14,7 +14,7 @@ from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.errors import DataError
 from evnlos.models import UNetConfig, Weights
 from evnlos.report.pictures import curves_svg
-from evnlos.report.sections import gains_of, lead
+from evnlos.report.sections import gains_of, summary_section
 from evnlos.report.tables import RunResult, best_two, method_of
 
 CONVOLUTIONS = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]  # places in torchvision's vgg16.features
@@ -152,6 +152,6 @@ def test_a_report_leads_with_what_is_gained() -> None:
     gain = gains_of(results)["frame"]
     assert gain.mean == pytest.approx(np.mean(errors["EPNP"]) - np.mean(errors["E2E"]))
     assert list(gains_of(results)) == ["frame"] and gains_of(results[:2]) == {}
-    page = lead(results)
+    page = summary_section(results)
     assert f"frame {gain} dB" in page and f">{np.mean(errors['EPNP']):.2f}</text>" in page
     assert "all-black" in page and page.count("<rect") == 2

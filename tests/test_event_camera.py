@@ -137,7 +137,7 @@ class Short(SlidingWall):
 def test_strips_of_another_length_are_refused() -> None:
     wall = sliding_wall((1.0, 0.0))
     wall.__class__ = Short
-    with pytest.raises(DataError, match="one time in seconds a frame"):
+    with pytest.raises(DataError, match="one time in seconds per frame"):
         EventCamera(CLEAN, time_step_s=0.01).record(wall, 0.0, 0.5)
 
 

@@ -72,7 +72,7 @@ def test_optional_columns_and_largest_sensor(suffix, tmp_path):
 
 
 def test_dense_vectors_survive_evt3(tmp_path):
-    """Whole rows at one instant are written as vectors; the file must be smaller than a word an event."""
+    """Whole rows at one instant are written as vectors; the file must be smaller than a word per event."""
     x = np.tile(np.arange(1280), 20)
     y = np.repeat(np.arange(20), 1280)
     events = Events(np.full(len(x), 5), x, y, np.ones(len(x), bool), width=1280, height=720)

@@ -310,7 +310,7 @@ def test_kernel_is_the_brute_force(pixel):
     sign=st.sampled_from([-1.0, 1.0]),
 )
 def test_monotone_cubic_meets_its_levels(rise, shares, place, sign):
-    """The cubic itself, at s, is the level whose s is asked for, from any lower start."""
+    """The cubic itself, at s, is the level whose s is requested, from any lower start."""
     rise *= sign
     first, second = (share * rise for share in shares)
 

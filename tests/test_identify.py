@@ -79,7 +79,7 @@ def test_white_prior_is_the_general_one_with_independent_cells():
 @settings(max_examples=50, deadline=None)
 @given(st.floats(0.3, 8.0), st.floats(-10.0, 10.0))
 def test_bars_are_means_over_cells(width, phase):
-    """A hundred points a cell of the square wave itself."""
+    """A hundred points per cell of the square wave itself."""
     drawn = bars(16, width, phase)
     points = (np.arange(1600) + 0.5) / 100
     wave = ((points - phase) % (2 * width) < width).reshape(16, 100).mean(axis=1)
@@ -173,13 +173,13 @@ def test_a_cut_tpsf_is_told_apart():
         PaperSetup(tpsf_length_m=0.02), settings=AnalysisSettings(cells=16, height=20, width=32, writers=1)
     )
     assert "kink" in cut.warnings[0]
-    assert "rho_max 2, taper 0" in cut.warnings[0]
+    assert "kernel_radius 2, window 0" in cut.warnings[0]
     faded = identify(
-        PaperSetup(tpsf_length_m=0.02, taper=1.0),
+        PaperSetup(tpsf_length_m=0.02, window=1.0),
         settings=AnalysisSettings(cells=16, height=20, width=32, writers=1),
     )
     assert not faded.warnings
-    assert PaperSetup().without_artifacts() == PaperSetup(rho_max=8.0, taper=0.5)
+    assert PaperSetup().without_artifacts() == PaperSetup(kernel_radius=8.0, window=0.5)
 
 
 def test_prior_and_test_share_no_character():
@@ -266,8 +266,8 @@ def test_setup_files(tmp_path):
     path = tmp_path / "setup.yaml"
     save_yaml(setup_preset("hard"), path)
     assert named_setup(path).setup == setup_preset("hard")
-    save_yaml(Simulation(setup=PaperSetup(taper=0.3)), path)
-    assert named_setup(path).setup == PaperSetup(taper=0.3)
+    save_yaml(Simulation(setup=PaperSetup(window=0.3)), path)
+    assert named_setup(path).setup == PaperSetup(window=0.3)
     lab = Lab(name="bench", setup=setup_preset("aperture"))
     save_yaml(lab, path)
     assert named_setup(path).setup == setup_preset("aperture")

@@ -254,7 +254,7 @@ BAD = [
         ),
     ),
     (
-        "needs 4 cells a side to show any shape: give at most 0.005 m",
+        "needs 4 cells per side to show any shape: give at most 0.005 m",
         lambda: small(setup={}).setup.resized((6, 9)).observe(tiny_target()),
     ),
     ("cell_m is 0", lambda: RadiometricSetup(cell_m=0.0).resized((6, 9)).observe(scene())),
@@ -262,7 +262,7 @@ BAD = [
     ("set strip_m to at least", lambda: RadiometricSetup(strip_m=(0.1, 0.08)).resized((6, 9)).observe(scene())),
     (
         "samples of 1e-06 m carry a field no farther than",
-        lambda: PaperSetup(wave_pitch_m=1e-6).resized((6, 9)).observe(scene()),
+        lambda: PaperSetup(field_step_m=1e-6).resized((6, 9)).observe(scene()),
     ),
     ("pitch_m is 0", lambda: PaperSetup(pitch_m=0.0).resized((6, 9)).observe(scene())),
     ("perhaps you meant 'matte-near'", lambda: setup_preset("mate-near")),

@@ -28,9 +28,9 @@ from evnlos.live import display as record
 from evnlos.live.chunk import Chunk, ChunkQueue
 from evnlos.live.display import Page
 from evnlos.live.engine import AreaReduction, Engine, Picture, RunningSurface, Timing
-from evnlos.live.growing import GrowingFile, open_tail
+from evnlos.live.growing_file import GrowingFile, open_tail
 from evnlos.live.packet import Packet, PacketError, pack, unpack, unpack_all
-from evnlos.live.run import RateOptions, Run, Tally, latency_table
+from evnlos.live.run import RateOptions, Run, RunStatistics, latency_table
 from evnlos.live.sources import Replay, SourceOptions, TimedFrame, capture_replay, open_live
 from evnlos.live.udp import UdpSender, UdpSource, send_timed
 from evnlos.models import UNetConfig, Weights, save_weights
@@ -530,7 +530,7 @@ def test_a_run_makes_the_last_picture_of_all_events(engine: Engine) -> None:
     assert 0 < spread["p50"] <= spread["p90"] <= spread["p99"] <= spread["max"]
     text = latency_table(summary)
     assert "2,000 events" in text and f"{spread['p50']:9.1f}" in text
-    assert run.tally.now()["pictures"] == summary["pictures"]
+    assert run.statistics.now()["pictures"] == summary["pictures"]
 
 
 def test_drops_and_the_error_of_a_source_reach_the_user(engine: Engine) -> None:
@@ -554,7 +554,7 @@ def test_drops_and_the_error_of_a_source_reach_the_user(engine: Engine) -> None:
     run._engine = Slow(engine)  # until the source has said all
     with pytest.raises(EventFileError, match="cable"):
         run.go([kept])
-    summary = run.tally.summary()
+    summary = run.statistics.summary()
     assert summary["dropped"]["events"] == 1000 - summary["events"] > 0
     text = latency_table(summary)
     assert f"dropped by the queue: {summary['dropped']['events']:,} events" in text and "7 lost packets" in text
@@ -749,8 +749,8 @@ def test_wrong_sources_are_one_line(event_weights: Path, tmp_path: Path, capsys)
 
 @pytest.fixture
 def page(engine: Engine):
-    tally = Tally(Replay([]), ChunkQueue(10))
-    with Page(tally.now, title="walk.raw, event") as shown:
+    statistics = RunStatistics(Replay([]), ChunkQueue(10))
+    with Page(statistics.now, title="walk.raw, event") as shown:
         yield shown
 
 
@@ -814,7 +814,7 @@ def test_the_stream_brings_each_new_picture_and_the_end(page: Page, engine: Engi
 
 def test_a_ninth_viewer_is_told_and_silent_ones_are_let_go(engine: Engine, monkeypatch, capfd) -> None:
     monkeypatch.setattr("evnlos.live.display._SILENT_S", 0.5)
-    with Page(Tally(Replay([]), ChunkQueue(10)).now) as page, contextlib.ExitStack() as open_ones:
+    with Page(RunStatistics(Replay([]), ChunkQueue(10)).now) as page, contextlib.ExitStack() as open_ones:
         silent = open_ones.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
         for _ in range(8):
             open_ones.enter_context(get(page.url + "stream"))

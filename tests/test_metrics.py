@@ -153,7 +153,7 @@ def test_metrics_know_the_same_and_the_worse_and_batches(metric, best: float) ->
     assert metric(truth + noise, truth)[1, 2] == pytest.approx(
         metric((truth + noise)[1, 2], truth[1, 2]).item(), abs=1e-12
     )
-    with pytest.raises(EvnlosError, match="pixels a side"):
+    with pytest.raises(EvnlosError, match="pixels per side"):
         metric(torch.zeros(5, 20), torch.zeros(5, 20))
 
 

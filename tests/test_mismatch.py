@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from evnlos.calibration import FIGURES_FILE
+from evnlos.calibration import CALIBRATION_VALUES_FILE
 from evnlos.demo import Demo, finding, mismatch_table, run_demo, run_mismatch
 from evnlos.errors import CalibrationError, ConfigError
 from evnlos.experiment import Record, Study
@@ -31,7 +31,7 @@ def keep(out: Path, seed: int, scores: dict[tuple[str, str], float], warnings: l
         write_record(record, out / "records" / "demo")
     setup = out / "setups" / "demo"
     setup.mkdir(parents=True, exist_ok=True)
-    (setup / FIGURES_FILE).write_text(
+    (setup / CALIBRATION_VALUES_FILE).write_text(
         json.dumps({"residuals": LEFT, "warnings": warnings, "expectation": "ahead"})
     )
 

@@ -19,7 +19,7 @@ from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
 from evnlos.data import Sampling, Simulation, as_modality, read_shard
 from evnlos.models import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
-from evnlos.report import gather, write_report
+from evnlos.report import collect_results, write_report
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import SensorSize, Setup, load_setup
 from evnlos.training import Training
@@ -159,7 +159,7 @@ def test_it_is_evaluated_and_reported(run, dataset, tmp_path) -> None:
     assert found.characters() == ["writer00_T"]
     assert np.isfinite(found.scores.psnr_db).all()
     assert {"zero", "mean", "nearest"} <= found.baselines.keys()
-    opened, results = gather([run.folder], dataset.folder)
+    opened, results = collect_results([run.folder], dataset.folder)
     (result,) = results
     assert result.evaluation.summary() == found.summary()
     page = write_report(tmp_path / "report.html", opened, results, []).read_text()

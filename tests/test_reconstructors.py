@@ -28,7 +28,7 @@ from evnlos.models import (
     published,
     save_weights,
 )
-from evnlos.report import gather, write_report
+from evnlos.report import collect_results, write_report
 from evnlos.training import Training
 
 RECORDS = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "experiments"
@@ -126,7 +126,7 @@ def test_a_kind_of_a_user_trains_resumes_and_is_scored(tiny_dataset, tmp_path, c
     assert json.loads(capsys.readouterr().out)["modality"] == "fusion"
     main(["weights", str(run)])
     assert "fusion, toy: one time step at a time" in capsys.readouterr().out
-    dataset, results = gather([run], tiny_dataset.folder, "validation")
+    dataset, results = collect_results([run], tiny_dataset.folder, "validation")
     assert "fusion" in write_report(tmp_path / "report.html", dataset, results, []).read_text()
     with pytest.raises(ConfigError, match="freeze names 'encoder'"):
         train(tiny_dataset, replace(QUICK, freeze=("encoder",)), tmp_path / "frozen", run)
@@ -178,6 +178,8 @@ def test_settings_of_before_load(tmp_path) -> None:
     save_yaml(old, tmp_path / "old.yaml")
     found = load_yaml(Training, tmp_path / "old.yaml")
     network = SequenceConfig(width=16, ridge_multipliers=(0.1, 1.0))
+    noted = migrate("run", {"settings": {"loss": "balanced", "network": {"kind": "unet", "strengths": [1.0]}}})
+    assert noted["settings"]["network"] == {"kind": "unet", "ridge_multipliers": [1.0]}  # so the run goes on
     assert found == Training("event", network=network, sequence_augmentations=5, keep_normalization=True)
     assert old["joint"] is True  # what was read stays as it was
     assert from_dict(Training, {"paradigm": "frame", "joint": False}) == Training()

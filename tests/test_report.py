@@ -24,8 +24,8 @@ from evnlos.data.sampling import Samples
 from evnlos.data.store import Dataset, create_dataset, write_shard
 from evnlos.plot.setup import PARTITION, setup_drawing
 from evnlos.report import RunResult, write_report
-from evnlos.report.origin import Commands
 from evnlos.report.pictures import curves_svg
+from evnlos.report.provenance import Commands
 from evnlos.report.sections import _points, _worst, gains_of, setup_section
 from evnlos.report.tables import named
 from evnlos.setups import PaperSetup, RadiometricSetup, calibrated_folder, named_setup, setup_preset

@@ -315,3 +315,11 @@ def test_files_that_speak_of_rigs_and_plates_load(tmp_path: Path) -> None:
     notes = {"camera": {"name": "c"}, "rig": {"distance_m": 0.3}}
     assert migrate("CaptureInfo", notes) == {"camera": {"name": "c"}, "setup": {"distance_m": 0.3}}
     assert migrate("Record", {"study": "captures", "rig": "near"}) == {"study": "captures", "setup": "near"}
+
+
+def test_the_paper_s_setup_of_before_loads(tmp_path: Path) -> None:
+    setup = "setup: {kind: paper, wave_pitch_m: 1.0e-5, taper: 0.5, rho_max: 6.0}\n"
+    (tmp_path / "old.yaml").write_text(f"{setup}vary: {{setup.rho_max: [2.0, 5.0]}}\n")
+    found = load_yaml(Simulation, tmp_path / "old.yaml")
+    assert found.setup == PaperSetup(field_step_m=1e-5, window=0.5, kernel_radius=6.0)
+    assert found.vary == {"setup.kernel_radius": (2.0, 5.0)}

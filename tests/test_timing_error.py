@@ -34,7 +34,7 @@ def test_chosen_steps_time_events_to_a_quarter_of_a_millisecond_rms() -> None:
     error_ms = (found[1][alike[found[0]]] - fine[1][alike[fine[0]]]) / 1000
     assert np.sqrt(np.mean(error_ms**2)) < 0.25, np.sqrt(np.mean(error_ms**2))
     assert np.percentile(np.abs(error_ms), 99) < 0.5
-    # steps of 50 ms, four pixels, are told apart
+    # steps of 50 ms, four pixels, are distinguished
     coarse = by_pixel(EventCamera(pixel, time_step_s=50e-3).record(wall, *SPAN_S, seed=1))
     same = np.bincount(coarse[0], minlength=len(alike)) == counts[0]
     coarse_ms = (coarse[1][same[coarse[0]]] - fine[1][same[fine[0]]]) / 1000

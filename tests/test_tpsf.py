@@ -81,11 +81,11 @@ def test_length_is_physical():
 
 
 def test_taper():
-    hard, soft = tpsf_kernel(0.001, 0.02), tpsf_kernel(0.001, 0.02, taper=0.5)
+    hard, soft = tpsf_kernel(0.001, 0.02), tpsf_kernel(0.001, 0.02, window=0.5)
     middle = hard.shape[0] // 2
     assert float(hard[middle, 0] / hard.max()) == pytest.approx(0.072, abs=1e-3)
     assert float(soft[middle, 0] / soft.max()) < 1e-12
-    inner = slice(middle - 20, middle + 21)  # rho <= 1, untouched by the taper
+    inner = slice(middle - 20, middle + 21)  # rho <= 1, untouched by the window
     ratio = soft[middle, inner] / hard[middle, inner]
     assert float(ratio.max() / ratio.min()) == pytest.approx(1.0, abs=1e-12)
     assert float(soft.sum()) == pytest.approx(1.0, abs=1e-14)
@@ -98,8 +98,8 @@ def test_taper():
         ("mean_free_path is", {"mean_free_path": -1.0}),
         ("pole", {"mean_free_path": 2.0}),
         ("terms", {"terms": 0}),
-        ("rho_max", {"rho_max": 0.0}),
-        ("taper", {"taper": 1.5}),
+        ("kernel_radius", {"kernel_radius": 0.0}),
+        ("window", {"window": 1.5}),
         ("points", {"points": 1}),
         ("pitch_m", {"pitch_m": math.nan}),
         ("length_m", {"length_m": 0.0}),

@@ -319,7 +319,9 @@ def test_the_step_is_that_of_target_and_places_together(depth) -> None:
             for s in state
         ]
     )
-    moving = torch.eye(4, dtype=torch.float64) - 0.8 / 4  # one offset a pixel, as large as the noise: 1 - 1 / 5
+    moving = (
+        torch.eye(4, dtype=torch.float64) - 0.8 / 4
+    )  # one offset per pixel, as large as the noise: 1 - 1 / 5
     slope = fit._slopes(image)
     frames, kinds, pixels = slope.shape
     apart = torch.block_diag(*slope).reshape(frames * kinds, frames, pixels)

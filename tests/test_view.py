@@ -84,7 +84,7 @@ def test_viewing_reproduces_a_linear_image():
 def test_area_average_keeps_the_light():
     """A coarse camera that averages sees the same light as the plane holds, wherever a point source lies."""
     plane = Plane(64, 64, 0.001)
-    view = View.affine((20, 20), 250.0)  # four samples a pixel
+    view = View.affine((20, 20), 250.0)  # four samples per pixel
     viewing = Viewing(plane, view)
     assert viewing.samples == 4
     for row, column in ((30, 31), (33, 40), (25, 26)):

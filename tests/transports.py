@@ -39,7 +39,7 @@ def _matrix(brdf: Brdf) -> MatrixTransport:
 
 
 def _reflection(source: Plane) -> DiffuseReflection:
-    return DiffuseReflection(source, tpsf_kernel(source.pitch_m, 0.015, taper=0.3))
+    return DiffuseReflection(source, tpsf_kernel(source.pitch_m, 0.015, window=0.3))
 
 
 def _chain(*steps: Callable[[Plane], Transport]) -> Transport:
@@ -52,9 +52,9 @@ def _chain(*steps: Callable[[Plane], Transport]) -> Transport:
 
 
 EXAMPLES: dict[str, Callable[[], Transport]] = {
-    "diffraction": lambda: Diffraction(_SCENE, distance_m=0.005, wave_pitch_m=2e-5),
+    "diffraction": lambda: Diffraction(_SCENE, distance_m=0.005, field_step_m=2e-5),
     "diffraction of intensity": lambda: Diffraction(
-        _SCENE, distance_m=0.005, wave_pitch_m=2e-5, result="intensity"
+        _SCENE, distance_m=0.005, field_step_m=2e-5, result="intensity"
     ),
     "diffuse reflection": lambda: _reflection(_SCENE),
     "lopsided kernel": lambda: DiffuseReflection(_SCENE, torch.arange(15.0, dtype=torch.float64).reshape(3, 5)),
@@ -71,7 +71,7 @@ EXAMPLES: dict[str, Callable[[], Transport]] = {
     ),
     "reflection, then view": lambda: _chain(_reflection, lambda plane: Viewing(plane, _AFFINE)),
     "the paper's steps": lambda: _chain(
-        lambda plane: Diffraction(plane, distance_m=0.005, wave_pitch_m=2e-5),
+        lambda plane: Diffraction(plane, distance_m=0.005, field_step_m=2e-5),
         _reflection,
         lambda plane: Viewing(plane, _OBLIQUE),
     ),

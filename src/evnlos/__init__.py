@@ -1,6 +1,6 @@
 """evnlos sees moving things around a corner with an event camera: simulate, learn, reconstruct, measure.
 
-The names of `__init__.pyi` are imported when they are asked for, so that `--version` and `evnlos doctor` need
+The names of `__init__.pyi` are imported when they are requested, so that `--version` and `evnlos doctor` need
 no PyTorch; all others are in their rooms: `evnlos.events`, `evnlos.optics`, `evnlos.cameras` and so on.
 """
 

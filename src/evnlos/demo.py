@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evnlos.calibration import FIGURES_FILE, Calibration
+from evnlos.calibration import CALIBRATION_VALUES_FILE, Calibration
 from evnlos.config import write_atomically
 from evnlos.data import STANDARD_MODALITIES
 from evnlos.data.capture import character_of
@@ -23,7 +23,7 @@ from evnlos.errors import CalibrationError, ConfigError
 from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
 from evnlos.models import GENERIC, SequenceConfig, UNetConfig, layers_of, published
 from evnlos.progress import Progress, ProgressBars, silent
-from evnlos.report import gather, to_text, write_report
+from evnlos.report import collect_results, to_text, write_report
 from evnlos.scene import FontGlyphs
 from evnlos.setups import ROOMS, named_setup
 from evnlos.training import Training
@@ -123,7 +123,7 @@ def run_demo(settings: Demo) -> Path:
 
     single = [record for record in records if record.arm in [arm.name for arm in study.arms]]
     runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
-    dataset, results = gather(runs, out / "recorded" / single[0].settings["captures"])
+    dataset, results = collect_results(runs, out / "recorded" / single[0].settings["captures"])
     setup = named_setup(out / "setups" / study.setup) if settings.calibrate else None
     path = write_report(out / "report.html", dataset, results, notes, setup=setup)
     for note in notes:
@@ -302,7 +302,9 @@ def finding(setup: str, outs: list[Path]) -> Finding:
         outs: The demo's folders.
     """
     refused = [out / _REFUSED for out in outs if (out / _REFUSED).is_file()]
-    figures = [json.loads(f.read_text()) for out in outs for f in (out / "setups").glob(f"*/{FIGURES_FILE}")]
+    figures = [
+        json.loads(f.read_text()) for out in outs for f in (out / "setups").glob(f"*/{CALIBRATION_VALUES_FILE}")
+    ]
     records: list[Record] = []
     for out in outs:
         if any((out / "records").rglob("*.json")):

@@ -26,7 +26,7 @@ def psnr(image: torch.Tensor, truth: torch.Tensor, peak: float = 1.0) -> torch.T
         peak: Largest possible value, in the images' own unit.
 
     Returns:
-        One value an image, shape [...]; infinite where the two are equal.
+        One value per image, shape [...]; infinite where the two are equal.
 
     Raises:
         DataError: The shapes differ, or a value is not finite.
@@ -56,7 +56,7 @@ def ssim(
         peak: Dynamic range of the images.
 
     Returns:
-        One value an image, shape [...].
+        One value per image, shape [...].
 
     Raises:
         DataError: The shapes differ, a value is not finite, or the image is smaller than the window.
@@ -70,7 +70,7 @@ def ssim(
     height, width = image.shape[-2:]
     if min(height, width) < window:
         raise DataError(
-            f"ssim: image is {height} x {width}; the window of {window} needs {window} pixels a side"
+            f"ssim: image is {height} x {width}; the window of {window} needs {window} pixels per side"
         )
     x = image.reshape(-1, 1, height, width) / peak  # [N, 1, H, W]
     y = truth.reshape(-1, 1, height, width) / peak  # [N, 1, H, W]
@@ -133,7 +133,7 @@ def gmsd(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> torc
         peak: Dynamic range of the images.
 
     Returns:
-        One value an image, shape [...].
+        One value per image, shape [...].
 
     Raises:
         DataError: The shapes differ, a value is not finite, or the image is too small.
@@ -146,7 +146,7 @@ def gmsd(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> torc
     image, truth = checked(image, truth)
     height, width = image.shape[-2:]
     if min(height, width) < 6:
-        raise DataError(f"gmsd: image is {height} x {width}; give at least 6 pixels a side")
+        raise DataError(f"gmsd: image is {height} x {width}; give at least 6 pixels per side")
     m1, m2 = (_magnitude(part.reshape(-1, 1, height, width) / peak) for part in (image, truth))
     similarity = (2 * m1 * m2 + _C) / (m1.square() + m2.square() + _C)
     return similarity.flatten(1).std(dim=1, correction=0).reshape(image.shape[:-2])
@@ -178,7 +178,7 @@ def haarpsi(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> t
         peak: Dynamic range of the images.
 
     Returns:
-        One value an image, shape [...]; 1 where neither image holds an edge.
+        One value per image, shape [...]; 1 where neither image holds an edge.
 
     Raises:
         DataError: The shapes differ, a value is not finite, or the image is too small.
@@ -191,7 +191,9 @@ def haarpsi(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> t
     image, truth = checked(image, truth)
     height, width = image.shape[-2:]
     if min(height, width) < HAAR_LEAST_SIDE:
-        raise DataError(f"haarpsi: image is {height} x {width}; give at least {HAAR_LEAST_SIDE} pixels a side")
+        raise DataError(
+            f"haarpsi: image is {height} x {width}; give at least {HAAR_LEAST_SIDE} pixels per side"
+        )
     x, y = (_coefficients(part.reshape(-1, 1, height, width) * (255 / peak)) for part in (image, truth))
     likeness = (2 * x * y + _HAAR_C**2) / (x * x + y * y + _HAAR_C**2)  # [N, scale, orientation, H, W]
     local = torch.sigmoid(_HAAR_ALPHA * likeness[:, :2].mean(dim=1))
@@ -226,7 +228,7 @@ def ms_ssim(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> t
 
     MS-SSIM = l_M^w_M prod_j cs_j^w_j: contrast and structure at each of M scales, each half the size of the one
     before, and luminance at the coarsest (Wang, Simoncelli and Bovik, Asilomar 2003, Eq. 7). The published five
-    weights need 161 pixels a side; on smaller images as many scales as hold the window of 11 are used, their
+    weights need 161 pixels per side; on smaller images as many scales as hold the window of 11 are used, their
     weights scaled to the sum 1, so that figures compare only between images of the same size.
 
     Args:
@@ -235,7 +237,7 @@ def ms_ssim(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> t
         peak: Dynamic range of the images.
 
     Returns:
-        One value an image, shape [...]. Negative terms count as 0.
+        One value per image, shape [...]. Negative terms count as 0.
 
     Raises:
         DataError: The shapes differ, a value is not finite, or a side has fewer than 11 pixels.
@@ -251,7 +253,7 @@ def ms_ssim(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> t
     while scales < len(_WEIGHTS) and min(height, width) >> scales >= _WINDOW:
         scales += 1
     if not scales:
-        raise DataError(f"ms_ssim: image is {height} x {width}; the window needs {_WINDOW} pixels a side")
+        raise DataError(f"ms_ssim: image is {height} x {width}; the window needs {_WINDOW} pixels per side")
     x = image.reshape(-1, 1, height, width) / peak  # [N, 1, H, W]
     y = truth.reshape(-1, 1, height, width) / peak  # [N, 1, H, W]
     result = torch.ones(len(x), dtype=x.dtype, device=x.device)

@@ -67,6 +67,8 @@ def _training(values: dict[str, Any]) -> dict[str, Any]:
     """Before, `joint` chose the network and `paradigm` what it sees."""
     values = _renamed(values, paradigm="modality", views="sequence_augmentations")
     network = values.get("network")
+    if isinstance(network, dict):
+        network = values["network"] = _network(network)
     if "joint" in values:
         kind = "sequence" if values.pop("joint") else "unet"
         values["network"] = {"kind": kind, **(network if isinstance(network, dict) else {})}
@@ -125,6 +127,11 @@ def _target(values: dict[str, Any]) -> dict[str, Any]:
     return _renamed(values, plate_m="size_m")
 
 
+def _paper_setup(values: dict[str, Any]) -> dict[str, Any]:
+    """The setup of the paper's equations."""
+    return _renamed(values, **_PAPER)
+
+
 def _network(values: dict[str, Any]) -> dict[str, Any]:
     """A network behind a linear embedding."""
     return _renamed(values, strengths="ridge_multipliers")
@@ -177,7 +184,9 @@ def _path_in_setup(path: str) -> str:
     path = path.replace("glyphs.plate.", "glyphs.target_plane.")
     section, _, rest = path.partition(".")
     if section == "transport":
-        return f"setup.{rest}"
+        return f"setup.{_PAPER.get(rest, rest)}"
+    if section == "setup":
+        return f"setup.{_PAPER.get(rest, rest)}"
     return f"setup.{path}" if section in _CAMERAS else path
 
 
@@ -194,6 +203,7 @@ def _lab_setup(values: dict[str, Any]) -> dict[str, Any]:
     return _one_setup(_pixel_has_a_kind({**_LAB_CAMERAS, **values, "transport": wall}))
 
 
+_PAPER = {"wave_pitch_m": "field_step_m", "taper": "window", "rho_max": "kernel_radius"}
 _GLYPHS = ("DrawingGlyphs", "EmnistGlyphs", "FontGlyphs", "HandwritingGlyphs", "NistGlyphs")
 _STEPS: dict[str, tuple[Step, ...]] = {
     "Simulation": (_pixel_has_a_kind, _one_setup, _several_setups),
@@ -204,6 +214,7 @@ _STEPS: dict[str, tuple[Step, ...]] = {
     "Record": (_record,),
     "CaptureInfo": (_capture,),
     "TargetInfo": (_target,),
+    "PaperSetup": (_paper_setup,),
     **dict.fromkeys(_GLYPHS, (_glyphs,)),
     **dict.fromkeys(("UNetConfig", "SequenceConfig"), (_network,)),
 }

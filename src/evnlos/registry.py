@@ -26,7 +26,7 @@ class Registry(Generic[T]):
 
     Args:
         group: Entry-point group in which installed packages offer further kinds, e.g. "evnlos.event_models";
-            an entry point's name is the kind, its object the class. It is loaded when its kind is asked for.
+            an entry point's name is the kind, its object the class. It is loaded when its kind is requested.
         what: What a kind is one of, for messages, e.g. "event model".
 
     Example:

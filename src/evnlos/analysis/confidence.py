@@ -34,7 +34,7 @@ class FrameOperator:
         sampling: Size of samples and canvas.
 
     Attributes:
-        matrix: A, float32 [h w, cells]: white levels a unit of brightness of a canvas cell.
+        matrix: A, float32 [h w, cells]: white levels per unit of brightness of a canvas cell.
         ambient: Ambient light, float32 [h w], white levels.
         rows: Rows of the canvas that hold cells; beyond them the target never is.
         sigma: Standard deviation of the noise of a sample pixel, white levels.
@@ -241,7 +241,7 @@ def why_no_confidence(weights: Weights, samples: Samples) -> str | None:
     if samples.position_m is None:
         why = "the motion is unknown; state it in capture.yaml, or give --setup and --track to find it"
     elif len(samples) < 2:
-        why = f"{len(samples)} position, 2 are the least; record a sequence"
+        why = f"{len(samples)} position, 2 are the least; record per sequence"
     elif weights.confidence is None:
         why = "these weights never learned it; take those of a whole sequence (`evnlos weights` lists them)"
     else:

@@ -149,7 +149,7 @@ BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest neig
 """Heading of each baseline."""
 
 CHECKS = {
-    "read": "characters that an independent reader names rightly",
+    "read": "characters that an independent reader names correctly",
     "read_truth": "the same on the true pictures",
     "nearer_to_truth": "pictures nearer to the truth than to any training picture",
 }
@@ -167,7 +167,7 @@ class Evaluation:
         scores: Scores of each picture.
         baselines: Scores of the all-black picture ("zero"), of the mean training picture ("mean"), and of the
             true picture of the training object whose measurement is most like this one ("nearest").
-        checks: Shares of the pictures: "read", whose character the independent reader names rightly;
+        checks: Shares of the pictures: "read", whose character the independent reader names correctly;
             "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
             the truth than to any training picture. Only what could be found out.
         confidence_checks: What the network's confidence said of each sequence, beside what was true; empty

@@ -67,7 +67,7 @@ def verdict(
         meaning = f"the rough shape is measured, {fine} are not: their detail will be memory"
     else:
         meaning = "a legible reconstruction will be the network's memory, not a measurement"
-    return f"With this wall and noise {patterns} patterns can be told apart, and {bars}: {meaning}."
+    return f"With this wall and noise {patterns} patterns can be distinguished, and {bars}: {meaning}."
 
 
 def artifact_note(setup: Setup, plain: Setup, cut: int, whole: int, level: float) -> str | None:
@@ -93,7 +93,7 @@ def artifact_note(setup: Setup, plain: Setup, cut: int, whole: int, level: float
 MODE_LEVEL = 1e-2
 """Singular values above this share of the largest count as usable modes."""
 KINK_LEVEL = 1e-4
-"""Level at which the kink of a cut tPSF is told apart from what the wall shows."""
+"""Level at which the kink of a cut tPSF is distinguished from what the wall shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +325,7 @@ _HEAD = (
 
 
 def setup_table(found: Sequence[Identification]) -> str:
-    """Return one row a setup, and a line that says what holds for all of them.
+    """Return one row per setup, and a line that says what holds for all of them.
 
     Args:
         found: The setups, all with the same settings.

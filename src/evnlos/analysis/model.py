@@ -295,7 +295,7 @@ def choices(positions: int, count: int) -> list[np.ndarray]:
         [[0, 2, 4], [1, 3, 5]]
     """
     if not 1 <= count <= positions:
-        raise DataError(f"{count} positions are asked for; a sequence has {positions}: give 1 to {positions}")
+        raise DataError(f"{count} positions are requested; a sequence has {positions}: give 1 to {positions}")
     stride = positions // count
     starts = np.unique(np.linspace(0, stride - 1, min(stride, _MOST_SUBSETS)).round().astype(int))
     return [start + stride * np.arange(count) for start in starts]

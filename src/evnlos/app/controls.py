@@ -56,7 +56,7 @@ class Controls:
     distance_m: float = 0.3
     """Distance from hidden object to wall, metres, 0.15 to 0.6."""
     speed_m_s: float = 0.02
-    """Speed of the hidden object, metres a second, 0.005 to 0.2."""
+    """Speed of the hidden object, metres per second, 0.005 to 0.2."""
     ambient: float = 0.05
     """Ambient light, white levels, 0 to 0.7."""
     frame_noise: float = 1.0

@@ -233,7 +233,7 @@ def _controls(gr: Any, opening: Controls) -> list[Any]:
         noise = slider(0.2, 10, opening.frame_noise, 0.1, "Frame noise, times the usual camera's")
         on = slider(0.03, 0.6, opening.threshold_on, 0.01, "Threshold of brighter events, log light")
         off = slider(0.03, 0.6, opening.threshold_off, 0.01, "Threshold of darker events, log light")
-        event_noise = slider(0, 2, opening.event_noise_hz, 0.01, "Event noise, events a second and pixel")
+        event_noise = slider(0, 2, opening.event_noise_hz, 0.01, "Event noise, events per pixel per second")
     return [how, character, ink, wall, rough, distance, speed, ambient, noise, on, off, event_noise]
 
 

@@ -176,7 +176,7 @@ def from_weights(
         name: What to call the network.
         weights: The network.
         wall: What has to make the frames of these pictures, for a size of samples; None: the pictures alone
-            are asked.
+            are required.
 
     Raises:
         DataError: The sequence has no frames, and the network needs them.

@@ -12,8 +12,8 @@ from .frame_model import FrameNoise as FrameNoise
 from .frame_model import Light as Light
 from .frame_model import fit_frame_noise as fit_frame_noise
 from .settings import Calibration as Calibration
-from .summary import FIGURES_FILE as FIGURES_FILE
-from .summary import figures as figures
+from .summary import CALIBRATION_VALUES_FILE as CALIBRATION_VALUES_FILE
+from .summary import calibration_values as calibration_values
 from .summary import residual_table as residual_table
 from .summary import rows_of as rows_of
 from .summary import table as table

@@ -47,7 +47,7 @@ class Explained:
 
     Args:
         cost: Negative log evidence over the number of samples; lower is better.
-        gain: White levels a unit of the setup's light.
+        gain: White levels per unit of the setup's light.
         noise: Standard deviation of a sample's noise, white levels; what the model cannot do counts as noise.
         targets: Expected target of each sequence, float64 [P, n, n]; noise makes some values leave 0..1.
     """

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 _LEVELS = 3  # classes of pixels by their mean light
 _MOVING = (0.15, 0.6)  # swings of the log light between pixels at rest, moving, and moving much
 _FLOOR = 0.05  # relative error of a figure that no model is held to
-_FEWEST = 1e-3  # events a pixel and second that count as none
+_FEWEST = 1e-3  # events per pixel per second that count as none
 _BIN_S, _BLOCK_PX = 0.4, 5
 _SHARED = ("threshold_on", "threshold_off", "leak_rate_hz")
 _MARGIN = 0.1
@@ -100,7 +100,7 @@ class ModelFit:
 def figures_of(recordings: Sequence[Recording], events: Sequence[Events]) -> tuple[Array, Array]:
     """Return figures of recordings and how many events stand behind each, [F] both.
 
-    Rates of ON and OFF events, hertz a pixel, in nine classes of pixels: by terciles of their mean light, and
+    Rates of ON and OFF events, hertz per pixel, in nine classes of pixels: by terciles of their mean light, and
     by how much the light moves; and how much the counts of neighbours scatter where it moves.
 
     Args:

@@ -26,7 +26,7 @@ class Light:
     """The linear part of a frame: frame = gain light + ambient (1 + gx x + gy y), x and y from -1 to 1.
 
     Args:
-        gain: White levels a unit of light.
+        gain: White levels per unit of light.
         ambient: Ambient light in the middle of the image, white levels.
         gradient: Relative growth of the ambient light to the right and the lower border.
     """

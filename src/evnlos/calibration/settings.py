@@ -83,7 +83,7 @@ def rough_metal() -> Calibration:
 def paper() -> Calibration:
     """Return the calibration of the paper's transport: tPSF length and shape, and an affine view."""
     start = _rough_metal()
-    transport = PaperSetup(pitch_m=1e-3, rho_max=6.0, taper=0.3, field_of_view_m=0.5)
+    transport = PaperSetup(pitch_m=1e-3, kernel_radius=6.0, window=0.3, field_of_view_m=0.5)
     return Calibration(start=Simulation(glyphs=start.glyphs, setup=transport))
 
 

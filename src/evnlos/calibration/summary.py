@@ -24,7 +24,7 @@ from evnlos.migrate import __version__
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import CALIBRATED_FILE, FittedSetup
 
-TRAINING_FILE, FIGURES_FILE = "training.yaml", "calibration.json"
+TRAINING_FILE, CALIBRATION_VALUES_FILE = "training.yaml", "calibration.json"
 TARGETS = "targets"
 """Folder, beside the setup's file, of the known targets' pictures."""
 
@@ -208,7 +208,7 @@ def _left(r: Residual) -> str:
     )
 
 
-def figures(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
+def calibration_values(fit: SetupFit, rows: list[Row]) -> dict[str, Any]:
     """Return a calibration as plain values for JSON; an unknown error is null."""
     return {
         "evnlos": __version__,
@@ -271,7 +271,9 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
     """
     check_out(out, force)
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / FIGURES_FILE, json.dumps(figures(fit, rows), indent=2).encode())
+    write_atomically(
+        out / CALIBRATION_VALUES_FILE, json.dumps(calibration_values(fit, rows), indent=2).encode()
+    )
     if fit.worse and not force:
         name = fit.worse[0]
         r = fit.residuals[name]

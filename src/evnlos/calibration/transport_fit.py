@@ -248,7 +248,7 @@ def fit_transport(
         start: Where the search starts; its kind is the kind that is fitted.
         fixed: Names of settings that keep their values.
         columns: Columns of the working pictures, pixels; half as many in the coarse stage.
-        iterations: Most steps a stage.
+        iterations: Most steps per stage.
 
     Raises:
         DataError: The frames do not follow the targets.

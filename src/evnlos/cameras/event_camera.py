@@ -41,7 +41,7 @@ class Wall(Protocol):
 
     @property
     def speed_px_s(self) -> float:
-        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        """Upper bound of the speed of the image on the sensor, pixels per second."""
         ...
 
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
@@ -51,7 +51,7 @@ class Wall(Protocol):
 
 @dataclass(frozen=True)
 class EventCamera:
-    """An array of event pixels that records a wall, choosing its own time steps from the motion.
+    """An array of event pixels that records per wall, choosing its own time steps from the motion.
 
     The wall is rendered in chunks; between two instants its light counts as a line. The camera renders probe
     instants in the middle of steps and shortens the steps until that line misses the true log light by no more
@@ -134,7 +134,7 @@ class EventCamera:
     ) -> Iterator[tuple[NDArray[np.float64], NDArray]]:
         """Yield instants and frames that continue after t0 up to t1, at most `longest` seconds apart.
 
-        All chunks are written to the same memory: each is gone when the next one is asked for.
+        All chunks are written to the same memory: each is gone when the next one is requested.
         """
         height, width = wall.shape
         most = _most_steps(wall)
@@ -212,7 +212,7 @@ def _longest_step(wall: Wall, t0: float, t1: float) -> float:
     speed = float(wall.speed_px_s)
     if not (math.isfinite(speed) and speed >= 0):
         raise ConfigError(
-            f"the wall's speed_px_s is {speed}; give a finite number of pixels a second, 0 or more"
+            f"the wall's speed_px_s is {speed}; give a finite number of pixels per second, 0 or more"
         )
     own = float(getattr(wall, "longest_step_s", math.inf))  # of light that changes without motion
     step = min((t1 - t0) / _FEWEST_STEPS, _LONGEST_SHIFT_PX / max(speed, 1e-12), own)

@@ -53,7 +53,9 @@ def check_times(times_s: ArrayLike | torch.Tensor, count: int, after_s: float = 
     except (TypeError, ValueError) as error:
         raise DataError(f"times_s is not a list of numbers ({error}); give seconds") from None
     if times.shape != (count,):
-        raise DataError(f"times_s has shape {times.shape} for {count} frames; give one time in seconds a frame")
+        raise DataError(
+            f"times_s has shape {times.shape} for {count} frames; give one time in seconds per frame"
+        )
     if not np.isfinite(times).all():
         raise DataError("times_s holds NaN or infinity; give finite seconds")
     behind = np.flatnonzero(np.diff(times, prepend=after_s) <= 0)
@@ -160,7 +162,7 @@ class Strips(Protocol):
 
 
 class StripLight:
-    """Light that is rendered for the pixels that are asked for, and forgotten.
+    """Light that is rendered for the pixels that are requested, and forgotten.
 
     Args:
         strips: The wall's light.

@@ -80,7 +80,7 @@ def _exposed(camera: FrameCamera, wall: Wall, times_s: NDArray[np.float64]) -> T
 
 @lru_cache(maxsize=4)
 def _pattern(camera: FrameCamera, shape: tuple[int, int], seed: int, device: torch.device) -> Pattern:
-    """Return electrons a unit of light, and the offset in electrons, float64 [H, W] each, on a device."""
+    """Return electrons per unit of light, and the offset in electrons, float64 [H, W] each, on a device."""
     sensitivity, offset_e = (torch.from_numpy(part).to(device) for part in camera.fixed_pattern(shape, seed))
     return camera.white_e * sensitivity, offset_e
 

@@ -41,9 +41,9 @@ class _ContrastPixel(ThresholdPixel):
     cutoff_hz: float = 15.0
     """Corner frequency of the low-pass filter at white, hertz; 0 = no filter."""
     leak_rate_hz: float = 0.01
-    """Rate of ON events from the leaking reference, hertz a pixel."""
+    """Rate of ON events from the leaking reference, hertz per pixel."""
     shot_noise_rate_hz: float = 0.0015
-    """Rate of noise events in the dark limit, ON and OFF together, hertz a pixel."""
+    """Rate of noise events in the dark limit, ON and OFF together, hertz per pixel."""
     refractory_s: float = 0.0
     """Dead time of a pixel after each of its events, seconds."""
 
@@ -83,7 +83,7 @@ class EventPixel(_ContrastPixel):
         threshold_sigma: Standard deviation of both thresholds over the pixels, log units; 0 = none.
         cutoff_hz: Corner frequency of the low-pass filter at white (255 DN), hertz; 0 = no filter. At black
             it is 20/275 of this.
-        leak_rate_hz: Rate of the ON events that the leaking reference makes, events a second a pixel.
+        leak_rate_hz: Rate of the ON events that the leaking reference makes, events per second a pixel.
         shot_noise_rate_hz: Rate of noise events, ON and OFF together, of a pixel in the dark limit, hertz.
         refractory_s: Time after an event in which a pixel cannot send another one, seconds.
         hot_pixel_fraction: Fraction of pixels that fire without cause, 0 to 1 (`mode="exact"` only).
@@ -208,8 +208,8 @@ class V2ePixel(_ContrastPixel):
         threshold_off: Mean contrast threshold of OFF events, log units.
         threshold_sigma: Standard deviation of both thresholds, log units.
         cutoff_hz: Corner frequency at white, hertz; 0 = no filter.
-        leak_rate_hz: Rate of ON events from the leaking reference, hertz a pixel.
-        shot_noise_rate_hz: Rate of noise events in the dark limit, hertz a pixel.
+        leak_rate_hz: Rate of ON events from the leaking reference, hertz per pixel.
+        shot_noise_rate_hz: Rate of noise events in the dark limit, hertz per pixel.
         refractory_s: Dead time after an event, seconds.
         pattern_seed: Seed of what belongs to the sensor; None draws it anew for each recording.
 

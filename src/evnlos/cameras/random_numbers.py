@@ -144,7 +144,7 @@ def random_normal(seed, stream, pixel, counter):
 
 @njit(cache=True, error_model="numpy")
 def normal_field(seed, stream, count):
-    """Return one normal number a pixel, float64 [count]."""
+    """Return one normal number per pixel, float64 [count]."""
     field = np.empty(count)
     for pixel in range(count):
         field[pixel] = random_normal(seed, stream, pixel, 0)

@@ -105,7 +105,7 @@ def soft_events(
     phase_width: float = 1.0,
     response: Response = "exact",
 ) -> Tensor:
-    """Return soft event counts a step and pixel, differentiable in light, thresholds and cutoff.
+    """Return soft event counts per step and pixel, differentiable in light, thresholds and cutoff.
 
     Args:
         light: Light in DN (255 = white), floating point [..., T, H, W].

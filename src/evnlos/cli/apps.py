@@ -94,7 +94,7 @@ class LiveCommand:
                 sinks = []
                 if not self.headless:
                     page = stack.enter_context(
-                        Page(run.tally.now, self.port, f"{source.name}, {engine.modality.name}")
+                        Page(run.statistics.now, self.port, f"{source.name}, {engine.modality.name}")
                     )
                     sinks.append(page)
                     say(f"{page.url} shows the pictures; Ctrl-C ends")
@@ -106,7 +106,7 @@ class LiveCommand:
                 run.go(sinks)
         finally:
             source.close()
-        summary = run.tally.summary() | {"weights": str(name), "modality": engine.modality.name}
+        summary = run.statistics.summary() | {"weights": str(name), "modality": engine.modality.name}
         if out is not None and recorder is not None:
             summary |= {"recorded": recorder.recorded, "not_recorded": recorder.left_out}
             out.mkdir(parents=True, exist_ok=True)

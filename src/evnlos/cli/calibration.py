@@ -57,7 +57,7 @@ class CalibrateCommand:
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""
         from evnlos.calibration import (
-            figures,
+            calibration_values,
             fit_setup,
             residual_table,
             rows_of,
@@ -74,7 +74,7 @@ class CalibrateCommand:
         rows = rows_of(fit, self.settings.start.pixel, self.settings.start.frame_camera)
         self.out.mkdir(parents=True, exist_ok=True)
         if self.json:
-            print(json.dumps(figures(fit, rows)))
+            print(json.dumps(calibration_values(fit, rows)))
         else:
             print(f"fitted: {' '.join(fit.fitted)}\nheld out: {' '.join(fit.held_out)}\n")
             print(f"{table(rows)}\n\n{residual_table(fit)}")

@@ -218,7 +218,7 @@ class ImportCommand:
     pattern: Path | None = None
     """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
     check_pictures: bool = True
-    """Draw one picture a capture (frame, events, both, curves over time) into the folder checks of the
+    """Draw one picture per capture (frame, events, both, curves over time) into the folder checks of the
     dataset."""
     json: bool = False
     """Print one JSON object."""

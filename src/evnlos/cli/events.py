@@ -38,9 +38,9 @@ class PixelChanges:
     cutoff_hz: float | None = None
     """Corner frequency of the low-pass filter at white, hertz; 0 = no filter."""
     leak_rate_hz: float | None = None
-    """Rate of ON events from the leaking reference, hertz a pixel."""
+    """Rate of ON events from the leaking reference, hertz per pixel."""
     shot_noise_rate_hz: float | None = None
-    """Rate of noise events in the dark limit, ON and OFF together, hertz a pixel."""
+    """Rate of noise events in the dark limit, ON and OFF together, hertz per pixel."""
     refractory_s: float | None = None
     """Dead time of a pixel after each of its events, seconds."""
     hot_pixel_fraction: float | None = None

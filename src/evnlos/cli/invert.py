@@ -41,7 +41,7 @@ class InvertCommand:
     static: float = 1.0
     """Captures: standard deviation of a pixel's constant offset over that of its noise."""
     cells: int = 24
-    """Captures: cells a side of the target plane."""
+    """Captures: cells per side of the target plane."""
     columns: int = 64
     """Captures: columns to which frames are reduced, pixels."""
     subsets: int = 1
@@ -58,7 +58,7 @@ class InvertCommand:
     no_occluder: bool = False
     """Leave the occluders out of the model."""
     bin: int | None = None
-    """Wall pixels a side to average; by default at most 48 a side are left."""
+    """Wall pixels per side to average; by default at most 48 a side are left."""
     emission_exponent: tuple[float, float] | None = None
     """Exponents of the screen's falloff, horizontal and vertical; by default the file's."""
     out: Path = Path("inversion.png")

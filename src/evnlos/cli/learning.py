@@ -252,7 +252,7 @@ class WeightsCommand:
     """Print one JSON object."""
 
     def run(self) -> None:
-        """Read the weights, print, and write the copy where one is asked for."""
+        """Read the weights, print, and write the copy where one is requested."""
         if self.half is None and (self.rank is not None or self.scores is not None):
             raise ConfigError("--rank and --scores are of a copy; give its file with --half")
         if self.weights is None:

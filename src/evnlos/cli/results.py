@@ -127,7 +127,7 @@ class TrackCommand:
         pattern = None if self.pattern is None else load_pattern(self.pattern)
         track = track_capture(capture, setup, self.settings, pattern)
         truth = true_path(capture, track.time_s) if track.unit == "m" else None
-        found = figures(capture, track, truth)
+        found = track_values(capture, track, truth)
         found["warnings"] = track_warnings(capture, setup, track)
         found["picture"] = str(draw_track(track, self.out, truth, capture.name))
         text = json.dumps({**found, "track": track.summary()})
@@ -148,7 +148,7 @@ def true_path(capture: Capture, t_s: NDArray[np.float64]) -> NDArray[np.float64]
     return scene.motion.position_m(t_s) + middle
 
 
-def figures(capture: Capture, track: Track, truth: NDArray[np.float64] | None) -> dict[str, Any]:
+def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | None) -> dict[str, Any]:
     """Return what the command prints: means, and errors where the truth is known."""
     step = track.position[-1] - track.position[0]
     found: dict[str, Any] = {
@@ -230,7 +230,7 @@ class IdentifyCommand:
     out: Path | None = None
     """Folder for a figure of each setup and identify.json with all curves."""
     json: bool = False
-    """Print one JSON object, or a list where several setups are asked for."""
+    """Print one JSON object, or a list where several setups are requested."""
     seed: int = 0
     """Seed of the one noisy picture of the figure."""
     settings: Flat[AnalysisSettings] = field(default_factory=AnalysisSettings)
@@ -311,11 +311,11 @@ class ReportCommand:
     def run(self) -> None:
         """Evaluate the runs and write the page."""
         from evnlos.analysis.identify import identify
-        from evnlos.report import gather, to_text, write_report
+        from evnlos.report import collect_results, to_text, write_report
         from evnlos.report.tables import baselines_of
         from evnlos.setups import named_setup
 
-        dataset, results = gather(list(self.runs), self.data, self.split)
+        dataset, results = collect_results(list(self.runs), self.data, self.split)
         setup = None if self.setup is None else named_setup(self.setup)
         limits = None if setup is None else identify(setup.setup, name=setup.name)
         if setup is None and dataset.origin == "simulation":

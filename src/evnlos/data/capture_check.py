@@ -1,6 +1,6 @@
 """Is a capture worth a day of recordings? What was recorded, in plain words, and how to mend it.
 
-- One picture a capture, for the eye: do frames and events show the same thing at the same time?
+- One picture per capture, for the eye: do frames and events show the same thing at the same time?
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def _events(capture: Capture) -> Iterator[Finding]:
         "event rate",
         0.05 <= rate <= 50,
         0.01 <= rate <= 200,
-        f"{rate:.2f} events a pixel and second (0.05 to 50 is safe)",
+        f"{rate:.2f} events per pixel per second (0.05 to 50 is safe)",
         "lower the thresholds, dim the ambient light, light the target more, or move it faster"
         if rate < 0.05
         else "raise the thresholds, or look for flicker and a camera that shakes",
@@ -278,7 +278,7 @@ _BINS = 200
 def check_picture(capture: Capture) -> Image.Image:
     """Return the frame at the busiest moment, the events of its interval, both overlaid, and curves over time.
 
-    The curves are the events a second and the mean change of the frames, each on its own scale: peaks of the
+    The curves are the events per second and the mean change of the frames, each on its own scale: peaks of the
     one should stand above peaks of the other.
 
     Args:
@@ -320,7 +320,7 @@ def check_picture(capture: Capture) -> Image.Image:
     at = box[0] + (times[chosen] / 1e6 - span[0]) / max(span[1] - span[0], 1e-9) * (box[2] - box[0])
     draw.line((at, box[1], at, box[3]), _LINE)
     below = box[3] + 5
-    draw.text((box[0], below), f"events a second, up to {rates.max():,.0f}", ON_RGB, font)
+    draw.text((box[0], below), f"events per second, up to {rates.max():,.0f}", ON_RGB, font)
     peak = f"{100 * changes.max():.2f}" if len(changes) else "0"
     draw.text((box[0] + 260, below), f"change from frame to frame, up to {peak} % of white", OFF_RGB, font)
     draw.text((box[2] - 170, below), f"{span[0]:.2f} s to {span[1]:.2f} s", _INK, font)

@@ -60,7 +60,7 @@ class MotionInfo:
     start_m: float | tuple[float, float]
     """Centre at `start_us` relative to the middle of the travel: along the direction, or (x, y), metres."""
     speed_m_s: float
-    """Speed, metres a second."""
+    """Speed, metres per second."""
     direction: tuple[float, float] = (1.0, 0.0)
     """Direction (x to the right, y downwards)."""
     start_us: int = 0

@@ -142,7 +142,7 @@ def _from_table(folder: Path, path: Path, size: tuple[int, int] | None, most: in
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path} can't be read as a table: {error}") from None
     if not rows or not {"t_us", "file"} <= rows[0].keys():
-        raise DataError(f"{path} holds no frames; give a header 't_us,file' and one line a frame")
+        raise DataError(f"{path} holds no frames; give a header 't_us,file' and one line per frame")
     try:
         times = np.array([int(row["t_us"]) for row in rows], dtype=np.int64)
     except (TypeError, ValueError, OverflowError):

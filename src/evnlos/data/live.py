@@ -146,7 +146,7 @@ class LiveDataset(Dataset):
     """A simulation that takes the place of a dataset on disk; make it with `live_dataset`.
 
     Epoch 0 is the dataset that `simulate` would write; epoch n has other handwriting, settings from the same
-    ranges and other noise, and is the same whenever it is asked for. The settings alone decide the physics: a
+    ranges and other noise, and is the same whenever it is requested. The settings alone decide the physics: a
     GPU simulates where the event model has a torch backend, else the CPU does.
     """
 
@@ -175,7 +175,7 @@ class LiveDataset(Dataset):
             made = self._on_device(config, list(names), device)
         else:
             tasks = [(config, name) for name in names]
-            # one process a core, shared by the processes that train on this machine
+            # one process per core, shared by the processes that train on this machine
             workers = self.workers or max(1, cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
             made = (_tensors(samples) for samples in run_in_order(_samples_of, tasks, workers))
         for maps in made:

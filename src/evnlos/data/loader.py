@@ -220,7 +220,7 @@ class InMemoryDataset(torch.utils.data.Dataset):
 
 
 class NlosDataset(InMemoryDataset):
-    """The samples of a split: item i is (input [C, H, W], truth [1, H, W]), float32, read when it is asked for.
+    """The samples of a split: item i is (input [C, H, W], truth [1, H, W]), float32, read when it is requested.
 
     A map-style dataset for `torch.utils.data.DataLoader`, with any number of workers: it keeps no file open
     and, until `load`, no map in memory, whatever its size.

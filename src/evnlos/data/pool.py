@@ -88,7 +88,7 @@ def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], work
     Args:
         function: A picklable function of one task.
         tasks: The tasks.
-        workers: Processes; 1 runs each task in this process when its result is asked for, 0 means one a core.
+        workers: Processes; 1 runs each task in this process when its result is requested, 0 means one a core.
 
     Raises:
         ConfigError: A number of workers below 0.

@@ -196,7 +196,7 @@ def find_dots(picture: NDArray, rows: int, columns: int) -> NDArray[np.float64]:
     corners. The grid may be tilted by less than 45 degrees and seen in perspective.
 
     Args:
-        picture: [H, W], brighter dots; for a blinking grid the number of events a pixel.
+        picture: [H, W], brighter dots; for a blinking grid the number of events per pixel.
         rows: Rows of dots, at least 2.
         columns: Dots a row, at least 2.
 

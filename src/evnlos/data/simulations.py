@@ -40,7 +40,7 @@ def default() -> Simulation:
         vary={
             "setup.field_of_view_m": (0.55, 0.62),
             "setup.tpsf_length_m": (0.006, 0.03),
-            "setup.rho_max": (2.0, 5.0),
+            "setup.kernel_radius": (2.0, 5.0),
             "setup.stretch": (1.0, 1.2),
             "setup.gain": (0.8, 2.4),
             "setup.ambient": (0.02, 0.1),

@@ -89,7 +89,7 @@ def suggest_tau_us(stroke_width_m: float, speed_m_s: float) -> float:
 
     Args:
         stroke_width_m: Width of the strokes of the hidden target, metres, above 0.
-        speed_m_s: Its speed, metres a second, above 0.
+        speed_m_s: Its speed, metres per second, above 0.
 
     Raises:
         DataError: A width or speed that is not positive.

@@ -207,7 +207,7 @@ class Summary:
         last_us: Time of the last event, microseconds.
         on: Events that are brighter.
         unknown: Events whose polarity the camera did not give.
-        peak_hz: Rate in the busiest window of 10 ms, events a second.
+        peak_hz: Rate in the busiest window of 10 ms, events per second.
         peak_us: Begin of that window after the first event, microseconds.
         longest_silence: The longest time without an event.
         silences: Number of times of more than 10 ms without an event.
@@ -238,7 +238,7 @@ class Summary:
 
     @property
     def rate_hz(self) -> float:
-        """Mean rate, events a second; 0 where the recording has no duration."""
+        """Mean rate, events per second; 0 where the recording has no duration."""
         return 1e6 * self.events / self.duration_us if self.duration_us else 0.0
 
     @property

@@ -128,7 +128,7 @@ def _count(x, y, p, starts, height, width, out):
 
 
 def event_histogram(events: Events, edges_us: ArrayLike | None = None) -> NDArray[np.float32]:
-    """Return the number of events a pixel and polarity.
+    """Return the number of events per pixel and polarity.
 
     Args:
         events: The stream; it is not changed.

@@ -62,8 +62,8 @@ class Finding:
         mean_db: PSNR of the mean picture, dB.
         gain_db: PSNR of events minus that of frames: mean, low and high end of the 95 % interval over objects.
         events_per_pixel: Events a pixel and sequence.
-        event_bytes_s: Data of the events, bytes a second.
-        frame_bytes_s: Data of 8-bit frames at `FRAME_RATE_HZ`, bytes a second.
+        event_bytes_s: Data of the events, bytes per second.
+        frame_bytes_s: Data of 8-bit frames at `FRAME_RATE_HZ`, bytes per second.
     """
 
     factor: str
@@ -101,7 +101,7 @@ def conditions(base: Simulation) -> list[Condition]:
     - light: share of the base's light that is left, with the same exposure.
     - read noise of the frame camera, electrons.
     - exposure of the frames, seconds; their gain is set so that the level stays.
-    - speed of the target, metres a second, over the same way; the surface's time constant follows it.
+    - speed of the target, metres per second, over the same way; the surface's time constant follows it.
     - difficulty of the setup: roughness of the metal, a matte wall, distance from target to wall, metres; the
       brightest pixel stays as bright.
     """
@@ -229,7 +229,7 @@ def conditions_table(findings: list[Finding]) -> str:
     """Return Markdown: a row a condition."""
     lines = [
         "| condition | frame dB | event dB | fusion dB | mean picture dB | event - frame dB, 95 % interval | "
-        "events a pixel | events kB/s | frames kB/s |",
+        "events per pixel | events kB/s | frames kB/s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for f in findings:

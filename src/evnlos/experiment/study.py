@@ -158,7 +158,7 @@ class Record:
         seed: Its seed; -1 for an ensemble over the seeds.
         split: What was scored.
         scores: Metric -> object -> mean over its positions.
-        positions: PSNR in dB, object -> one value a position.
+        positions: PSNR in dB, object -> one value per position.
         baselines: Baseline -> metric -> object -> mean.
         checks: Shares of pictures (see `evnlos.analysis.CHECKS`).
         settings: Everything that decided the weights.

@@ -167,7 +167,7 @@ def difference(records: list[Record], arm: str, other: str, modality: str) -> In
 
 
 def summary_table(records: list[Record], metric: str = "psnr_db") -> str:
-    """Return Markdown: a row an arm, a column a modality; mean over characters and seeds, +- over the seeds."""
+    """Return Markdown: a row per arm, a column per modality; mean over characters and seeds, +- over seeds."""
     means = means_of(records, metric)
     modalities = sorted({key[1] for key in means}, key=modality_order)
     digits = _PLACES.get(metric, 3)
@@ -189,7 +189,7 @@ def summary_table(records: list[Record], metric: str = "psnr_db") -> str:
 
 
 def character_table(records: list[Record], arms: tuple[str, ...], metric: str = "psnr_db") -> str:
-    """Return Markdown in the paper's layout: a row a character, a column for each arm and modality."""
+    """Return Markdown in the paper's layout: a row per character, a column for each arm and modality."""
     chosen = [r for r in records if r.arm in arms and r.seed >= 0]
     seen = sorted({r.modality for r in chosen}, key=modality_order)
     columns = [(a, p) for a in arms for p in seen if any(r.arm == a and r.modality == p for r in chosen)]
@@ -229,13 +229,13 @@ def gain_table(records: list[Record], arm: str = "EPNP", other: str = "E2E") -> 
 
 
 def checks_table(records: list[Record]) -> str:
-    """Return Markdown: shares of pictures that the independent reader names rightly, and that are no memory."""
+    """Return Markdown: shares of pictures whose character is recognized, and that are no memory."""
     found: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
     for record in records:
         name = record.arm if record.seed >= 0 else f"{record.arm}, ensemble"
         found[name, record.modality].append(record.checks)
     lines = [
-        "| | read rightly | of the true pictures | nearer to the truth than to any capture |",
+        "| | recognized | of the true pictures | nearer to the truth than to any capture |",
         "|---|---|---|---|",
     ]
     for (arm, modality), checks in found.items():

@@ -224,7 +224,7 @@ def block_folds(shape: tuple[int, int], *, blocks: int = 6, folds: int = 4) -> t
     """
     if folds < 2 or not 2 <= blocks <= min(shape):
         raise ConfigError(
-            f"{blocks} blocks in {folds} folds on {shape}; give 2 or more, fewer than samples a side"
+            f"{blocks} blocks in {folds} folds on {shape}; give 2 or more, fewer than samples per side"
         )
     by, bx = (torch.arange(n) * blocks // n for n in shape)
     # A stride that shares no factor with the folds would put whole columns into few folds.
@@ -241,7 +241,7 @@ def cross_validate(
 
     Args:
         problem: The problem.
-        path: From a problem to the images for `lams`, in their order; only those that are asked for are made.
+        path: From a problem to the images for `lams`, in their order; only those that are requested are made.
         regularizations: Weights of the prior to try, from the strongest to the weakest.
         folds: Fold of each sample, integers [H, W].
     """

@@ -30,7 +30,7 @@ class SequenceOperator:
     the strip's border are lost.
 
     Args:
-        transport: A, from the strip's cells to the camera, white levels a unit of brightness.
+        transport: A, from the strip's cells to the camera, white levels per unit of brightness.
         target_plane: The target plane's cells, in coordinates relative to its centre.
         positions_m: Centre (x, y) of the target at each position, [N, 2], metres.
 

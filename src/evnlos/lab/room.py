@@ -142,7 +142,7 @@ class RenderedWall:
         times_s: Instants of the key frames [K], seconds, evenly spaced, at least two; before and after them
             the light rests.
         frames: Light, white levels, float32 [K, H, W].
-        speed_px_s: Upper bound of the speed of the image, pixels a second.
+        speed_px_s: Upper bound of the speed of the image, pixels per second.
         ripple: Amplitude of the ripple, share of the light.
         ripple_hz: Its frequency, hertz.
     """
@@ -168,7 +168,7 @@ class RenderedWall:
 
     @property
     def speed_px_s(self) -> float:
-        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        """Upper bound of the speed of the image on the sensor, pixels per second."""
         return self._speed_px_s
 
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:

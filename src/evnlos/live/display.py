@@ -243,8 +243,8 @@ class _Encoder(Protocol):
 class Recorder:
     """A sink that writes a video beside the run, in a thread of its own; a context that ends with the file.
 
-    The video holds at most 25 pictures a second, at the times at which they were made. Where the encoder can't
-    follow, pictures are left out and counted.
+    The video holds at most 25 pictures per second, at the times at which they were made. Where the encoder
+    can't follow, pictures are left out and counted.
 
     Args:
         folder: Where to write `video.mp4`, or `video.png` without PyAV; new or empty.

@@ -1,4 +1,4 @@
-"""Events in UDP packets: 24 bytes of header, then 8 bytes an event, all little endian.
+"""Events in UDP packets: 24 bytes of header, then 8 bytes per event, all little endian.
 
 | bytes | header field |
 |---|---|

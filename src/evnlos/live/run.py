@@ -32,7 +32,7 @@ ROWS = {
 """What is measured of each picture, in words."""
 
 
-class Tally:
+class RunStatistics:
     """Counts what a run does, while it runs and afterwards.
 
     Args:
@@ -134,7 +134,7 @@ class RateOptions:
     """How often there is a picture, and how much may wait for one."""
 
     rate: float = 100.0
-    """Most pictures a second; one is made only when something came, and events wait for it."""
+    """Most pictures per second; one is made only when something came, and events wait for it."""
     queue_events: int = 200_000
     """Most events that wait between source and network; beyond that the oldest are dropped and counted."""
     seconds: float | None = None
@@ -142,7 +142,7 @@ class RateOptions:
 
     def __post_init__(self) -> None:
         if not 0.1 <= self.rate <= 1000:
-            raise ConfigError(f"rate is {self.rate}; give 0.1 to 1000 pictures a second")
+            raise ConfigError(f"rate is {self.rate}; give 0.1 to 1000 pictures per second")
         if self.queue_events < 1:
             raise ConfigError(f"queue_events is {self.queue_events}; give at least 1")
         if self.seconds is not None and not self.seconds > 0:
@@ -167,7 +167,7 @@ class Run:
         clock: The clock that it goes by.
 
     Attributes:
-        tally: What it did so far.
+        statistics: What it did so far.
 
     Raises:
         DataError: The network needs frames and the source has none.
@@ -185,13 +185,13 @@ class Run:
         self._clock = clock or SystemClock()
         self._queue = ChunkQueue(pace.queue_events)
         self._stop = threading.Event()
-        self.tally = Tally(source, self._queue)
+        self.statistics = RunStatistics(source, self._queue)
 
     def stop(self) -> None:
         """End the run soon; any thread may ask for it."""
         self._stop.set()
 
-    def go(self, sinks: Iterable[Sink] = ()) -> Tally:
+    def go(self, sinks: Iterable[Sink] = ()) -> RunStatistics:
         """Run until the source ends, time is up, or `stop` or Ctrl-C ends it; return what was done.
 
         Raises:
@@ -214,7 +214,7 @@ class Run:
                 picture = self._engine.see(chunks) if chunks else None
                 if picture is not None:
                     due_s = taken_s + 1 / self._pace.rate
-                    self.tally.add(picture)
+                    self.statistics.add(picture)
                     for sink in sinks:
                         sink.show(picture)
             self._queue.take(0)  # raises what ended the source
@@ -223,7 +223,7 @@ class Run:
         finally:
             self._stop.set()
             pump.join(timeout=2)
-        return self.tally
+        return self.statistics
 
     def _pump(self) -> None:
         error = None

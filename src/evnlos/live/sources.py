@@ -20,7 +20,7 @@ from evnlos.errors import ConfigError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording
 from evnlos.live.chunk import Chunk, Clock, Source, SystemClock
-from evnlos.live.growing import GrowingFile
+from evnlos.live.growing_file import GrowingFile
 from evnlos.live.udp import UdpSource
 from evnlos.types import Events
 

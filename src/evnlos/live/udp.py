@@ -194,7 +194,7 @@ class UdpSender:
     Args:
         host: Address of the receiver.
         port: Its port.
-        packet_events: Most events a packet.
+        packet_events: Most events per packet.
         start: Number of the first packet; 0 tells the receiver that a new stream begins.
 
     Raises:

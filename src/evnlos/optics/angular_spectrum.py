@@ -291,7 +291,7 @@ class Diffraction(Transport):
         source: Plane on which the scene is sampled.
         wavelength_m: Wavelength, metres.
         distance_m: Distance to the wall, metres.
-        wave_pitch_m: Pitch that the propagation sees, metres; None is the plane's own. A pitch of about 10 um
+        field_step_m: Pitch that the propagation sees, metres; None is the plane's own. A pitch of about 10 um
             gives the visible fringes of a millimetre-sized target, the physical pitch of an 8 cm target almost
             none.
         field: "intensity" takes the scene as the field itself, as the paper prints; "amplitude" its square
@@ -306,13 +306,13 @@ class Diffraction(Transport):
     source: Plane  # pyright: ignore[reportIncompatibleVariableOverride] - frozen, so narrowing is safe
     wavelength_m: float = 500e-9
     distance_m: float = 0.5
-    wave_pitch_m: float | None = None
+    field_step_m: float | None = None
     field: str = "intensity"
     result: str = "modulus"
     pad: float = 2.0
 
     def __post_init__(self) -> None:
-        check_lengths(wavelength_m=self.wavelength_m, distance_m=self.distance_m, wave_pitch_m=self.pitch_m)
+        check_lengths(wavelength_m=self.wavelength_m, distance_m=self.distance_m, field_step_m=self.pitch_m)
         for name, value, known in (
             ("field", self.field, ("intensity", "amplitude")),
             ("result", self.result, ("modulus", "intensity")),
@@ -333,7 +333,7 @@ class Diffraction(Transport):
     @property
     def pitch_m(self) -> float:
         """Pitch of the propagation, metres."""
-        return self.source.pitch_m if self.wave_pitch_m is None else self.wave_pitch_m
+        return self.source.pitch_m if self.field_step_m is None else self.field_step_m
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -303,7 +303,7 @@ class Pose:
         distortion: Relative growth of a ray's tangent at the image's left and right border (barrel above 0).
         distance_m: From the wall's plane to the middle of the travel, metres.
         target_offset_m: The middle of the travel over the wall (x, y), metres.
-        travel_slope: Growth of the target's distance with x, metres a metre.
+        travel_slope: Growth of the target's distance with x, metres per metre.
         curvature_per_m: Curvatures of the wall along x and y, 1 / metres; above 0 the borders come nearer.
     """
 

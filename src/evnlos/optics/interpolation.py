@@ -168,7 +168,7 @@ def expose_shifted(
         band: Spline coefficients at the frame's rows [H, C]; zero outside.
         starts: Column of `band` that the first tap of a row's pixel 0 reads at each instant [T]; any integers.
         taps: The four weights at each instant [T, 4].
-        gain: White levels a unit of the band.
+        gain: White levels per unit of the band.
         ambient: Ambient light [H, W], white levels.
         white: What a white level is written as.
     """
@@ -213,7 +213,8 @@ def gauss_points(count: int) -> tuple[list[float], list[float]]:
 
 
 def points_for(step: float, feature: float) -> int:
-    """Return how many points a side resolve a feature of width `feature` on cells of width `step` (same unit).
+    """Return how many points per side resolve a feature of width `feature` on cells of width `step` (same
+    unit).
 
     The error of n points on a Gaussian lobe of standard deviation `feature` stays below about 1e-3 of its peak:
     one point up to a tenth of it, two up to its width, three up to twice that, then in proportion.

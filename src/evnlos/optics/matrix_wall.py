@@ -31,14 +31,14 @@ class MatrixWall:
     the keyframes, two continuous derivatives in time); other motions multiply at every instant.
 
     Args:
-        transport: Matrix from the strip to the camera image, in white levels a unit of the mask at gain 1.
+        transport: Matrix from the strip to the camera image, in white levels per unit of the mask at gain 1.
         target: The target.
         motion: Where its centre is at every instant; positions off the strip leave the light they lost.
-        magnification_px_m: Upper bound of the image motion, pixels a metre of target motion.
+        magnification_px_m: Upper bound of the image motion, pixels per metre of target motion.
         gain: White levels, 0 or more.
         ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
         keyframe_step_m: Distance between keyframes, metres; None is half a cell, 0 multiplies at every instant.
-        travel_m: Smallest and largest x of the centre that are asked for, metres: keyframes are made for these
+        travel_m: Smallest and largest x of the centre that are requested, metres: keyframes are made for these
             alone, and other places multiplied out; None is wherever the target touches the strip.
         along: What else moves with the target's centre and shines with it, and its own matrix.
 
@@ -91,7 +91,7 @@ class MatrixWall:
 
     @property
     def speed_px_s(self) -> float:
-        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        """Upper bound of the speed of the image on the sensor, pixels per second."""
         return self.motion.speed_bound_m_s(-math.inf, math.inf) * self._magnification
 
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
@@ -156,7 +156,7 @@ class MatrixWall:
         return light
 
     def _make_keys(self) -> torch.Tensor:
-        """Return the spline's coefficients at keyframes over all places that are asked for."""
+        """Return the spline's coefficients at keyframes over all places that are requested."""
         low, high = self._travel_m
         guard = _GUARD if self._everywhere else _TAIL
         steps = math.ceil((high - low) / 2 / self._step) + guard

@@ -239,7 +239,7 @@ def light_transport_matrix(
         rows: The pixels, counted row by row, whose rows of the matrix are made.
         dtype: Floating-point type of the result; what needs no gradient is computed in float64.
         device: Device of the result.
-        compiled: Whether to use the compiled loop; None does so on the CPU when no gradient is asked for.
+        compiled: Whether to use the compiled loop; None does so on the CPU when no gradient is requested.
 
     Returns:
         Matrix [H W, h w], without unit (radiance a radiance).

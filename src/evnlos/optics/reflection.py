@@ -18,7 +18,7 @@ from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.optics.operator import LinearTransport
 from evnlos.types import Plane
 
-_MAX_KERNEL = 4097  # samples a side; larger means that the length scale and the pitch do not belong together
+_MAX_KERNEL = 4097  # samples per side; larger means that the length scale and the pitch do not belong together
 
 
 def tpsf_profile(
@@ -94,10 +94,10 @@ def tpsf_kernel(
     *,
     t: float = 2.0,
     mean_free_path: float = 0.8,
-    rho_max: float = 2.0,
+    kernel_radius: float = 2.0,
     points: int = 100,
     terms: int = 64,
-    taper: float = 0.0,
+    window: float = 0.0,
     dtype: torch.dtype = torch.float64,
 ) -> torch.Tensor:
     """Return the tPSF as a convolution kernel: a disc, divided by its own (negative) sum, so that it adds up to
@@ -106,21 +106,21 @@ def tpsf_kernel(
     Args:
         pitch_m: Distance between samples, metres.
         length_m: Length of one unit of rho on the wall, metres; by default the paper's `points` samples reach
-            from 0 to `rho_max`.
+            from 0 to `kernel_radius`.
         t: Thickness of the equivalent slab, in units of rho.
         mean_free_path: Scattering mean free path <l>, in units of rho.
-        rho_max: Radius of the disc, in units of rho.
-        points: Samples from 0 to `rho_max` when `length_m` is not given, 2 or more.
+        kernel_radius: Radius of the disc, in units of rho.
+        points: Samples from 0 to `kernel_radius` when `length_m` is not given, 2 or more.
         terms: Pairs of terms of the sum.
-        taper: Outer fraction of the radius over which the kernel is brought to zero by a raised cosine, 0..1; 0
-            is the paper's hard edge, whose kink makes the operator look better conditioned than it is.
+        window: Outer fraction of the radius over which the kernel is brought to zero by a raised cosine, 0..1;
+            0 is the paper's hard edge, whose kink makes the operator look better conditioned than it is.
         dtype: Floating-point type of the kernel.
 
     Returns:
         Kernel [k, k], k odd, non-negative, sum 1.
 
     Raises:
-        ConfigError: A parameter is out of range, or the kernel would have more than 4097 samples a side.
+        ConfigError: A parameter is out of range, or the kernel would have more than 4097 samples per side.
 
     Example:
         >>> kernel = tpsf_kernel()
@@ -130,15 +130,15 @@ def tpsf_kernel(
     check_lengths(pitch_m=pitch_m)
     if points < 2:
         raise ConfigError(f"points is {points}; the profile needs 2 or more")
-    if not rho_max > 0:
-        raise ConfigError(f"rho_max is {rho_max}; give a radius above 0")
-    if not 0 <= taper <= 1:
-        raise ConfigError(f"taper is {taper}; give a fraction of the radius, 0 to 1")
-    step = rho_max / (points - 1)  # rho a sample
+    if not kernel_radius > 0:
+        raise ConfigError(f"kernel_radius is {kernel_radius}; give a radius above 0")
+    if not 0 <= window <= 1:
+        raise ConfigError(f"window is {window}; give a fraction of the radius, 0 to 1")
+    step = kernel_radius / (points - 1)  # rho a sample
     if length_m is not None:
         check_lengths(length_m=length_m)
         step = pitch_m / length_m
-    radius = math.floor(rho_max / step * (1 + 1e-12))
+    radius = math.floor(kernel_radius / step * (1 + 1e-12))
     if 2 * radius + 1 > _MAX_KERNEL:
         raise ConfigError(
             f"the tPSF spans {2 * radius + 1} samples, above {_MAX_KERNEL}; raise pitch_m or lower length_m"
@@ -147,9 +147,9 @@ def tpsf_kernel(
     rho = (offset[:, None] ** 2 + offset**2).sqrt()
     # Few radii are distinct on a grid; the sum over k is the costly part.
     distinct, where = torch.unique(rho, return_inverse=True)
-    weight = (distinct <= rho_max * (1 + 1e-12)).to(torch.float64)
-    if taper > 0:
-        into = ((distinct / rho_max - (1 - taper)) / taper).clamp(0, 1)
+    weight = (distinct <= kernel_radius * (1 + 1e-12)).to(torch.float64)
+    if window > 0:
+        into = ((distinct / kernel_radius - (1 - window)) / window).clamp(0, 1)
         weight = weight * (0.5 + 0.5 * torch.cos(math.pi * into))
     kernel = (tpsf_profile(distinct, t, mean_free_path, terms) * weight)[where]
     total = kernel.sum()
@@ -174,8 +174,8 @@ def _check(t: float, mean_free_path: float, terms: int) -> None:
 class DiffuseReflection(LinearTransport):
     """Convolution with a kernel over the whole plane: nothing is cut off at the borders.
 
-    The result lives on a plane larger by k - 1 samples a side, with the same middle; beyond it the exact result
-    is zero. So sum(result) = sum(scene) sum(kernel).
+    The result lives on a plane larger by k - 1 samples per side, with the same middle; beyond it the exact
+    result is zero. So sum(result) = sum(scene) sum(kernel).
 
     Args:
         source: Plane on which the scene is sampled.

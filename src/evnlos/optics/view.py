@@ -69,7 +69,7 @@ class View:
 
         Args:
             shape: Size (H, W), pixels.
-            pixels_per_m: Magnification, pixels a metre of wall, above 0.
+            pixels_per_m: Magnification, pixels per metre of wall, above 0.
             rotation_rad: Turn of the image, radians, from x towards y (clockwise on the screen).
             shear: Columns that one row adds.
             stretch: Magnification along y divided by that along x, above 0.
@@ -159,10 +159,10 @@ class View:
         return torch.stack([across.norm(dim=-1), down.norm(dim=-1)], dim=-1)
 
     def magnification(self) -> float:
-        """Return the largest image motion of a wall point over the image, pixels a metre."""
+        """Return the largest image motion of a wall point over the image, pixels per metre."""
         across = self.wall_points_m(0.5, 0.0) - self.wall_points_m(-0.5, 0.0)
         down = self.wall_points_m(0.0, 0.5) - self.wall_points_m(0.0, -0.5)
-        jacobian = torch.stack([across, down], dim=-1)  # [H, W, 2, 2], metres a pixel
+        jacobian = torch.stack([across, down], dim=-1)  # [H, W, 2, 2], metres per pixel
         return float(1.0 / torch.linalg.svdvals(jacobian)[..., -1].min())
 
 

@@ -2,7 +2,7 @@
 
 - Ambient light on the wall: what is there without the hidden object.
 - A band of the wall that slides under the sensor: many frames in a few operations, on any device.
-- Light of a sliding wall for any of its pixels: no more of an image than is asked for.
+- Light of a sliding wall for any of its pixels: no more of an image than is requested.
 - The wall that the camera sees, in continuous time: an image that slides under a shift-invariant transport.
 """
 
@@ -89,7 +89,7 @@ class Strips:
         band: Spline coefficients at the camera's rows, float32 or float64 [H, C]; zero outside.
         starts: Column of the band that the first tap of a row's pixel 0 reads at each instant, [T].
         taps: The four weights at each instant, float32 [T, 4].
-        gain: White levels a unit of the band.
+        gain: White levels per unit of the band.
         ambient: Ambient light, float32 [H, W], white levels.
     """
 
@@ -100,7 +100,7 @@ class Strips:
     taps: NDArray[np.float32]
     """The four weights [T, 4]."""
     gain: float
-    """White levels a unit of the band."""
+    """White levels per unit of the band."""
     ambient: NDArray[np.float32]
     """Ambient light [H, W], white levels."""
 
@@ -122,7 +122,7 @@ class Strips:
         expose_shifted(out, first, self.band, self.starts, self.taps, self.gain, self.ambient, white)
 
 
-_MAX_CANVAS = 8192  # pixels a side
+_MAX_CANVAS = 8192  # pixels per side
 _SAME_ROWS_PX = 1e-9
 _TOGETHER_PX = 1 << 25  # pixels that a device renders in one operation
 
@@ -138,7 +138,7 @@ class Wall(Protocol):
 
     @property
     def speed_px_s(self) -> float:
-        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        """Upper bound of the speed of the image on the sensor, pixels per second."""
         ...
 
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
@@ -164,7 +164,7 @@ class SlidingWall:
         plane: Plane on which `image` is sampled.
         view: The camera's view of the wall.
         motion: Where the target's centre is at every instant.
-        gain: White levels a unit of `image`, 0 or more.
+        gain: White levels per unit of `image`, 0 or more.
         ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
 
     Raises:
@@ -192,7 +192,7 @@ class SlidingWall:
         self.ambient = ambient_map(ambient, view.shape).to(image.device)
         self._plane = plane
         work = image.to(torch.promote_types(image.dtype, torch.float32))
-        pixel = view.pixel_size_m().mean(dim=(0, 1)) / plane.pitch_m  # samples a pixel, across and down
+        pixel = view.pixel_size_m().mean(dim=(0, 1)) / plane.pitch_m  # samples per pixel, across and down
         self._margin = MARGIN + math.ceil(float(pixel.max()))
         coefficients = spline_coefficients(pad(work, (self._margin,) * 4))
         self._wall = box_average(coefficients, float(pixel[1]), float(pixel[0]))
@@ -209,7 +209,7 @@ class SlidingWall:
 
     @property
     def speed_px_s(self) -> float:
-        """Upper bound of the speed of the image on the sensor, pixels a second."""
+        """Upper bound of the speed of the image on the sensor, pixels per second."""
         # an affine view magnifies alike everywhere: one pixel tells
         view = _shifted_view(self.view, (0, 0), (1, 1)) if self.view.is_affine else self.view
         return self.motion.speed_bound_m_s(-math.inf, math.inf) * view.magnification()

@@ -166,7 +166,7 @@ def time_slices(events: Events, edges_us: NDArray[np.int64], bins: int = 240) ->
 
 
 def smaller(events: Events, side_px: int) -> Events:
-    """Return events of a large sensor on one of at most `side_px` pixels a side; blocks of pixels become one.
+    """Return events of a large sensor on one of at most `side_px` pixels per side; blocks of pixels become one.
 
     Example:
         >>> smaller(Events([1], [9], [3], [1], width=10, height=4), 5)

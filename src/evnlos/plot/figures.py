@@ -1,7 +1,7 @@
 """Figures for each stage of a sequence.
 
 - An empty matplotlib figure, or one line that says what to install.
-- Films of a sequence: one column a stage of the light path, one picture a position; NumPy and Pillow.
+- Films of a sequence: one column per stage of the light path, one picture per position; NumPy and Pillow.
 
 A figure for each stage of a sequence: wall, events in space and time, surfaces, reconstructions.
 

@@ -24,7 +24,7 @@ from evnlos.setups import Setup
 from evnlos.types import Events, Plane
 
 _WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
-_LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # told apart with every common kind of colour blindness
+_LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # distinguished with every common kind of colour blindness
 PARTITION = "hides the object (sketch)"
 """What stands beside the line that no setup's settings state."""
 _STEPS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)

@@ -2,11 +2,11 @@
 
 from evnlos.report.page import write_report
 from evnlos.report.pictures import reconstruct_capture
-from evnlos.report.tables import RunResult, gather, refuse_seen, seen_in_training, to_csv, to_text
+from evnlos.report.tables import RunResult, collect_results, refuse_seen, seen_in_training, to_csv, to_text
 
 __all__ = [
     "RunResult",
-    "gather",
+    "collect_results",
     "reconstruct_capture",
     "refuse_seen",
     "seen_in_training",

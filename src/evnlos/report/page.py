@@ -17,16 +17,16 @@ from evnlos.data import Dataset, character_of, read_shard
 from evnlos.events.grids import WORDS
 from evnlos.files import write_atomically
 from evnlos.migrate import __version__
-from evnlos.report.origin import origin_section
 from evnlos.report.pictures import curves_svg, data_uri, grey, png, polarity, stretched
+from evnlos.report.provenance import provenance_section
 from evnlos.report.sections import (
     animations_section,
     belief_section,
     failures_section,
-    lead,
     limits_section,
     setup_section,
     strips_section,
+    summary_section,
 )
 from evnlos.report.tables import (
     RunResult,
@@ -169,7 +169,7 @@ def write_report(
             f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
             _head(dataset, results, notes, split, words),
             setup_section(setup.name if setup else "", setup.setup if setup else None),
-            lead(results),
+            summary_section(results),
             *(_table(results, metric, *about, words) for metric, about in metrics.items()),
             _checks(results),
             belief_section(results),
@@ -180,7 +180,7 @@ def write_report(
             limits_section(limits),
             _curves(results),
             _optics(dataset, results),
-            origin_section(dataset, results, split, None if limits is None else setup),
+            provenance_section(dataset, results, split, None if limits is None else setup),
             words.section(list(metrics)),
             "</html>",
         ]

@@ -2,7 +2,7 @@
 
 - Curves as inline SVG: small, printable, with no requests.
 - Arrays as pictures: grey and signed maps, film strips, animations; Pillow alone.
-- The reconstructions of one capture as files: a picture a position, a film strip, an animation.
+- The reconstructions of one capture as files: a picture per position, a film strip, an animation.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def save_png(path: str | Path, picture: NDArray[np.uint8], zoom: int = 1) -> Non
 def save_animation(
     path: str | Path, pictures: Sequence[NDArray[np.uint8]], rate_hz: float, zoom: int = 1
 ) -> None:
-    """Write pictures as an animation that repeats, at most 50 pictures a second, atomically.
+    """Write pictures as an animation that repeats, at most 50 pictures per second, atomically.
 
     A file that ends in .webp is a WebP, a few times smaller and not exact; any other a GIF.
     """

@@ -107,7 +107,7 @@ def gains_of(results: list[RunResult]) -> dict[str, Interval]:
     return found
 
 
-def lead(results: list[RunResult]) -> str:
+def summary_section(results: list[RunResult]) -> str:
     """Return the first section of the page: bars of mean PSNR, and what EPNP gains over E2E in words."""
     gains = gains_of(results)
     words = "; ".join(f"{kind} {gain} dB" for kind, gain in gains.items())

@@ -34,7 +34,7 @@ class RunResult:
         sees_sequence: Whether it sees whole sequences.
         method: "simulation only" (pre-trained, no capture seen), "E2E" (captures alone) or "EPNP" (both).
         evaluation: Pictures and scores on the split.
-        log: One record an epoch.
+        log: One record per epoch.
         history: The trainings behind the weights, oldest first.
         is_published: Whether the weights come with the package, by this name.
     """
@@ -54,7 +54,9 @@ class RunResult:
         return f"sequence {self.modality}" if self.sees_sequence else self.modality
 
 
-def gather(runs: list[str | Path], data: str | Path, split: str = "test") -> tuple[Dataset, list[RunResult]]:
+def collect_results(
+    runs: list[str | Path], data: str | Path, split: str = "test"
+) -> tuple[Dataset, list[RunResult]]:
     """Evaluate runs on one split of a dataset, ordered by method and modality.
 
     Raises:

@@ -29,7 +29,7 @@ from evnlos.errors import DataError
 from evnlos.scene.glyphs import DIGITS, UPPER_CASE
 from evnlos.untrusted import open_image
 
-_MAX_SIDE = 1024  # the official images have 128 pixels a side
+_MAX_SIDE = 1024  # the official images have 128 pixels per side
 
 
 class Handwritten(NamedTuple):

@@ -373,4 +373,4 @@ class DrawingGlyphs:
 
 
 Glyphs: TypeAlias = HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs
-"""All kinds of sets, told apart by `kind` in a settings file."""
+"""All kinds of sets, distinguished by `kind` in a settings file."""

@@ -322,7 +322,7 @@ def _deform(
 
 def _bend(waves: NDArray[np.float64], u: NDArray[np.float64], v: NDArray[np.float64]) -> tuple:
     """Return a smooth displacement at (u, v), the cosine series sum of waves[j, i] cos(pi j v) cos(pi i u)."""
-    # A table and a look-up: the field is so smooth that 65 nodes a side leave errors below 1e-4 of the glyph.
+    # A table and a look-up: the field is so smooth that 65 nodes per side leave errors below 1e-4 of the glyph.
     nodes = np.linspace(0, 1, 65)
     cosine = np.cos(np.pi * np.arange(waves.shape[-1])[:, None] * nodes)  # [K, 65]
     table = np.einsum("cji,jy,ix->cyx", waves, cosine, cosine)  # [2, 65, 65]

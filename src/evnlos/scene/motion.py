@@ -38,7 +38,7 @@ class Motion(Protocol):
         ...
 
     def speed_bound_m_s(self, start_s: float, stop_s: float) -> float:
-        """Return an upper bound of the speed between two times (seconds), metres a second."""
+        """Return an upper bound of the speed between two times (seconds), metres per second."""
         ...
 
 
@@ -80,7 +80,7 @@ class LineMotion:
 
     Args:
         start_m: Centre (x, y) at `start_s`, metres, x to the right and y downwards.
-        speed_m_s: Speed, metres a second, 0 or more.
+        speed_m_s: Speed, metres per second, 0 or more.
         direction: Direction (x, y) of any length above 0.
         start_s: Time at which the centre is at `start_m`, seconds.
         z_m: Distance from target to wall, metres, above 0; None is the setup's own.
@@ -106,7 +106,7 @@ class LineMotion:
                 raise DataError(f"LineMotion.{name} is {getattr(self, name)}; give two finite numbers (x, y)")
             object.__setattr__(self, name, (float(pair[0]), float(pair[1])))
         if not (np.isfinite(self.speed_m_s) and self.speed_m_s >= 0):
-            raise DataError(f"LineMotion.speed_m_s is {self.speed_m_s}; give 0 or more metres a second")
+            raise DataError(f"LineMotion.speed_m_s is {self.speed_m_s}; give 0 or more metres per second")
         if not np.hypot(*self.direction) > 0:
             raise DataError("LineMotion.direction is (0, 0); give a direction with a length")
         if not np.isfinite(self.start_s):
@@ -124,7 +124,7 @@ class LineMotion:
         return np.asarray(self.start_m) + (_times(t_s)[..., None] - self.start_s) * velocity
 
     def speed_bound_m_s(self, start_s: float, stop_s: float) -> float:
-        """Return the speed, metres a second; it does not depend on the times (seconds)."""
+        """Return the speed, metres per second; it does not depend on the times (seconds)."""
         return float(self.speed_m_s)
 
 
@@ -190,7 +190,7 @@ class PathMotion:
         return points[left] + rise * u**2 * (3 - 2 * u) + bend
 
     def speed_bound_m_s(self, start_s: float, stop_s: float) -> float:
-        """Return an upper bound of the speed between two times (seconds), metres a second.
+        """Return an upper bound of the speed between two times (seconds), metres per second.
 
         The velocity of a cubic piece is a parabola, bounded by its Bezier coefficients: both end slopes and
         3 rise / step - slope - slope.

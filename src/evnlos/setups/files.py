@@ -30,7 +30,7 @@ class About:
     width: int
     """Columns of the camera image, pixels."""
     magnification_px_m: float
-    """Upper bound of the image motion, pixels a metre of motion of a light on the plane."""
+    """Upper bound of the image motion, pixels per metre of motion of a light on the plane."""
     exposure_s: float = 0.0
     """Exposure of the scan's frames, seconds; 0 = not stated."""
     repeats: int = 1
@@ -48,7 +48,9 @@ class About:
         if self.height < 1 or self.width < 1:
             raise ConfigError(f"the camera image is {self.height} x {self.width} pixels; each side needs 1")
         if not 0 <= self.magnification_px_m < 1e9:
-            raise ConfigError(f"magnification_px_m is {self.magnification_px_m}; give 0 to 1e9 pixels a metre")
+            raise ConfigError(
+                f"magnification_px_m is {self.magnification_px_m}; give 0 to 1e9 pixels per metre"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,7 @@ class Measurement:
     """A measured light-transport matrix.
 
     Args:
-        matrix: White levels a cell of brightness 1, that of the scan's light, float32 [H W, h w].
+        matrix: White levels per cell of brightness 1, that of the scan's light, float32 [H W, h w].
         noise: Standard deviation of an entry at each pixel, mean over the cells, float32 [H, W], white levels;
             infinity where the pixel can't be used (its row is filled in from its neighbours).
         dark: Mean frame without the scan's light, float32 [H, W], white levels: black level and ambient light.

@@ -69,7 +69,7 @@ class FittedSetup(Setup):
     target_offset_m: tuple[float, float] = (0.0, 0.0)
     """Middle of the travel over the wall (x, y), metres."""
     travel_slope: float = 0.0
-    """Growth of the target's distance along x, metres a metre."""
+    """Growth of the target's distance along x, metres per metre."""
     curvature_per_m: tuple[float, float] = (0.0, 0.0)
     """Curvatures of the wall along x and y, 1 / metres; above 0 the borders come nearer."""
     cell_m: float = 0.0025
@@ -284,7 +284,7 @@ class FittedSetup(Setup):
         return 4 * self.shape[0] * self.shape[1] * (source.height * source.width + round(keyframes))
 
     def magnification_px_m(self, shape: tuple[int, int]) -> float:
-        """Return an upper bound of the image motion, pixels a metre of the target's."""
+        """Return an upper bound of the image motion, pixels per metre of the target's."""
         return _magnification_px_m(self.pose(), shape)
 
     def _along(self, shape: tuple[int, int], device: torch.device) -> tuple[MatrixTransport, Target] | None:

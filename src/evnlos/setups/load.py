@@ -197,7 +197,7 @@ def as_in_the_paper() -> PaperSetup:
         wavelength_m=500e-9,
         tpsf_t=2.0,
         mean_free_path=0.8,
-        rho_max=2.0,
+        kernel_radius=2.0,
         sensor=SensorSize(600, 960),
         pixel=EventPixel(0.15, 0.15, 0.03, 15.0, 0.01, 0.0015, 0.0),
     )
@@ -224,7 +224,7 @@ NAMED: dict[str, Callable[[], Setup]] = {
 CALIBRATED_FILE = "setup.yaml"
 """The simulation that `evnlos calibrate` fits, in its folder."""
 _OLDER_FILE = "rig.yaml"  # its name in folders of before
-_TOLD_BY_FOLDER = ("setup", "rig", "lab", "dataset")  # files that are told apart by their folder
+_TOLD_BY_FOLDER = ("setup", "rig", "lab", "dataset")  # files that are distinguished by their folder
 
 
 def load_setup(word: str | Path) -> Setup:

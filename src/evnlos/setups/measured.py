@@ -80,7 +80,7 @@ class MeasuredSetup(Setup):
         """Return the matrix from other cells of the same plane to the camera, without `gain`, [H W, h w].
 
         A cell gets from each scanned cell the share of it that it covers: what lies within one scanned cell
-        can't be told apart.
+        can't be distinguished.
 
         Args:
             shape: Size (H, W) of the camera image, pixels; at most those of the scan.
@@ -224,7 +224,7 @@ def averaged(matrix: torch.Tensor, have: tuple[int, int], want: tuple[int, int])
         return matrix
     if want[0] > have[0] or want[1] > have[1] or min(want) < 1:
         raise ConfigError(
-            f"the scan has {have[0]} x {have[1]} pixels, {want[0]} x {want[1]} are asked for; ask for at most "
+            f"the scan has {have[0]} x {have[1]} pixels, {want[0]} x {want[1]} are requested; ask for at most "
             "those"
         )
     y, x = (_area_share(a, b).to(matrix) for a, b in zip(have, want, strict=True))
@@ -249,10 +249,10 @@ def covered(
 
 
 def image_motion_px_m(matrix: torch.Tensor, plane: Plane, shape: tuple[int, int]) -> float:
-    """Return a bound of how far the image moves when a light on the plane does, pixels a metre.
+    """Return a bound of how far the image moves when a light on the plane does, pixels per metre.
 
     The middle of the light of each row and column of cells is followed; twice the largest steady motion is
-    taken, and never less than a pixel a cell, so that no cell is stepped over.
+    taken, and never less than a pixel per cell, so that no cell is stepped over.
 
     Args:
         matrix: The measured matrix, [H W, h w].

@@ -36,7 +36,7 @@ _FINEST = 16  # samples a side of a cell, at most
 class PaperSetup(Setup):
     """The setup of the paper, steps A and B: shift-invariant, so a moving target is an image that slides."""
 
-    artifact: ClassVar[str] = "the kink at the edge of the tPSF (raise taper towards 1)"
+    artifact: ClassVar[str] = "the kink at the edge of the tPSF (raise window towards 1)"
 
     kind: Literal["paper"] = "paper"
     """Kind of this setup."""
@@ -46,7 +46,7 @@ class PaperSetup(Setup):
     """Wavelength, metres."""
     pitch_m: float = 3.125e-4
     """Distance between samples of the target, metres; 8 cm / 256 by default."""
-    wave_pitch_m: float | None = None
+    field_step_m: float | None = None
     """Pitch that the propagation sees, metres; None is the physical `pitch_m`, about 1e-5 shows fringes."""
     field: Literal["intensity", "amplitude"] = "intensity"
     """Whether the mask itself is the field, as the paper prints, or its square root."""
@@ -58,9 +58,9 @@ class PaperSetup(Setup):
     """Thickness t of the equivalent slab, units of rho."""
     mean_free_path: float = 0.8
     """Scattering mean free path <l>, units of rho."""
-    rho_max: float = 2.0
+    kernel_radius: float = 2.0
     """Radius of the tPSF's disc, units of rho."""
-    taper: float = 0.0
+    window: float = 0.0
     """Outer share of the tPSF's radius that fades to zero, 0..1; 0 is the paper's hard edge."""
     field_of_view_m: float = 0.24
     """Width of wall that the image shows (in its middle, for an oblique view), metres."""
@@ -183,7 +183,7 @@ class PaperSetup(Setup):
 
     def without_artifacts(self) -> PaperSetup | None:
         """Return the same tPSF four times as wide, faded out instead of cut: what it is without the kink."""
-        return replace(self, rho_max=4 * self.rho_max, taper=0.5) if self.taper < 1 else None
+        return replace(self, kernel_radius=4 * self.kernel_radius, window=0.5) if self.window < 1 else None
 
     def optical_values(self, target_m: float) -> dict[str, float]:
         """Return what diffraction does to a target: Fresnel number, blur in camera pixels, sampling limit.
@@ -202,7 +202,7 @@ class PaperSetup(Setup):
         return {
             "fresnel_number": fresnel_number(target_m / 2 * scale, self.wavelength_m, self.distance_m),
             "diffraction_blur_px": fringes_px * self.pitch_m * magnification,
-            "tpsf_radius_px": self.rho_max * self.tpsf_length_m * magnification,
+            "tpsf_radius_px": self.kernel_radius * self.tpsf_length_m * magnification,
             "sampling_limit_m": sampling_limit_m(source.width, self._wave_pitch_m, self.wavelength_m),
         }
 
@@ -212,17 +212,17 @@ class PaperSetup(Setup):
             self.tpsf_length_m,
             t=self.tpsf_t,
             mean_free_path=self.mean_free_path,
-            rho_max=self.rho_max,
-            taper=self.taper,
+            kernel_radius=self.kernel_radius,
+            window=self.window,
         )
 
     @property
     def _wave_pitch_m(self) -> float:
-        return self.pitch_m if self.wave_pitch_m is None else self.wave_pitch_m
+        return self.pitch_m if self.field_step_m is None else self.field_step_m
 
     def _diffraction(self, plane: Plane) -> Diffraction:
         return Diffraction(
-            plane, self.wavelength_m, self.distance_m, self.wave_pitch_m, self.field, self.result
+            plane, self.wavelength_m, self.distance_m, self.field_step_m, self.field, self.result
         )
 
 

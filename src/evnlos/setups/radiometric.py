@@ -372,7 +372,7 @@ class RadiometricSetup(Setup):
         if self.cell_m > target_size_m / _LEAST_CELLS * (1 + 1e-9):
             raise ConfigError(
                 f"cell_m is {self.cell_m:g} m; a target of {target_size_m:g} m needs {_LEAST_CELLS} "
-                f"cells a side to show any shape: give at most {target_size_m / _LEAST_CELLS:g} m"
+                f"cells per side to show any shape: give at most {target_size_m / _LEAST_CELLS:g} m"
             )
 
 

@@ -122,7 +122,7 @@ class RoomSetup(Setup):
         if not 0 < self.field_of_view_deg < 120:
             raise ConfigError(f"RoomSetup.field_of_view_deg is {self.field_of_view_deg}; give 0 to 120 degrees")
         if not 1 <= self.rays <= 256:
-            raise ConfigError(f"RoomSetup.rays is {self.rays}; give 1 to 256 rays a pixel")
+            raise ConfigError(f"RoomSetup.rays is {self.rays}; give 1 to 256 rays per pixel")
         if self.lamp is not None and not 0 < self.lamp.place_m[2] < self.distance_m:
             raise ConfigError(
                 f"RoomSetup.lamp stands {self.lamp.place_m[2]:g} m from the wall; give a place between wall "
@@ -289,7 +289,7 @@ class RoomSetup(Setup):
         return replace(self.optics(), **still)
 
     def _speed(self, scene: Scene) -> float:
-        """Return a bound of the speed of the image, pixels a second."""
+        """Return a bound of the speed of the image, pixels per second."""
         # The image of a mirror moves by a part of the way; that of a lobe by less than the target.
         tangent = 2 * math.tan(math.radians(self.field_of_view_deg) / 2) / self.shape[1]
         nearest = self.camera_distance_m * math.cos(math.radians(self.field_of_view_deg) / 2)

@@ -99,7 +99,7 @@ class Tracking:
     target_size_m: float = 0.1
     """With a setup: side of a square that surely holds the object, metres."""
     cells: int = 20
-    """With a setup: cells a side of that square."""
+    """With a setup: cells per side of that square."""
     depth: bool = False
     """With a setup: also find how far the object is from the wall in each frame."""
     degree: int = 2

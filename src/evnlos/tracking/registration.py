@@ -273,7 +273,7 @@ class EventVelocity:
 
     Args:
         time_s: Middle of each window, [M], seconds.
-        velocity: (x, y), float64 [M, 2], pixels a second, of the reduced frames.
+        velocity: (x, y), float64 [M, 2], pixels per second, of the reduced frames.
         variance: Of each component, [M, 2].
     """
 
@@ -360,7 +360,7 @@ def _log_slopes(
 
 
 def _line(counts: NDArray[np.float64], change: NDArray[np.float64]) -> tuple[float, float]:
-    """Return (events without change, events a unit of change) by least squares."""
+    """Return (events without change, events per unit of change) by least squares."""
     columns = np.stack([np.ones_like(change), change], axis=1)
     dark, slope = np.linalg.lstsq(columns, counts, rcond=None)[0].tolist()
     return max(dark, 1e-6), slope

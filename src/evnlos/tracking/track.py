@@ -42,7 +42,7 @@ class PlaneMap:
         return _terms(self._scaled(place_px)) @ self.coefficients
 
     def slope(self, place_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return d(x, y) / d(column, row), metres a pixel, [..., 2, 2]."""
+        """Return d(x, y) / d(column, row), metres per pixel, [..., 2, 2]."""
         half = 0.5
         steps = half * np.eye(2)
         return np.stack(
@@ -208,7 +208,7 @@ class Distance:
         time_s: Instants of the frames, [N], seconds.
         distance_m: Distance, [N], metres.
         distance_sigma: Its standard deviation, [N], metres.
-        retreat_m_s: Speed away from the wall, [N], metres a second; below 0 the object approaches.
+        retreat_m_s: Speed away from the wall, [N], metres per second; below 0 the object approaches.
         retreat_sigma: Its standard deviation, [N].
     """
 

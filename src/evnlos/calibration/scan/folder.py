@@ -1,6 +1,6 @@
 """A scan's folder, and the patterns that it shows.
 
-What a scan shows on the target's plane, and how cells are told apart again: raster, points, Hadamard.
+What a scan shows on the target's plane, and how cells are distinguished again: raster, points, Hadamard.
 
 Multiplexing lights about half of the cells at a time (Harwit and Sloane, Hadamard Transform Optics, 1979).
 Under noise that does not depend on the light, q patterns make the noise of a cell (q + 1) / (2 sqrt q) times
@@ -154,7 +154,7 @@ class ScanInfo:
     white_dn: int | None = None
     """Digital number at which the camera saturates, e.g. 4095; none = the largest of the picture's type."""
     frames: str = "frames.csv"
-    """Table pattern,repeat,exposure_s,file: one line a picture."""
+    """Table pattern,repeat,exposure_s,file: one line per picture."""
     image_px_per_m: tuple[tuple[float, float], tuple[float, float]] | None = None
     """points: how far the image moves, pixels, when the light moves a metre: ((column by x, column by y),
     (row by x, row by y)); found from the points where three or more do not lie on a line."""
@@ -238,7 +238,7 @@ def read_scan_frames(folder: str | Path, info: ScanInfo) -> list[ScanFrame]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path} can't be read as a table: {error}") from None
     if not rows or not {"pattern", "file"} <= rows[0].keys():
-        raise DataError(f"{path} holds no pictures; give a header {','.join(_HEADER)} and one line a picture")
+        raise DataError(f"{path} holds no pictures; give a header {','.join(_HEADER)} and one line per picture")
     scan_frames = [_scan_frame(path, number, row, info) for number, row in enumerate(rows, start=2)]
     _check_complete(path, scan_frames, info)
     return scan_frames

@@ -79,7 +79,7 @@ def read_light(
     shape = shape or full
     if shape[0] > full[0] or shape[1] > full[1] or min(shape) < 1:
         raise DataError(
-            f"{shape[0]} x {shape[1]} pixels are asked for, the pictures have {full[0]} x {full[1]}"
+            f"{shape[0]} x {shape[1]} pixels are requested, the pictures have {full[0]} x {full[1]}"
         )
     white = info.white_dn or int(np.iinfo(first.dtype).max)
     count, pixels = info.patterns.count, shape[0] * shape[1]
@@ -346,7 +346,7 @@ def rehearse_scan(
 
     Args:
         folder: A folder that `write_plan` wrote.
-        matrix: White levels a cell at the scan's exposure, [H W, cells of the plane].
+        matrix: White levels per cell at the scan's exposure, [H W, cells of the plane].
         shape: Size (H, W) of the camera image, pixels.
         camera: Its frame camera; a picture at another exposure has light in proportion.
         ambient: Light that is always there, white levels.

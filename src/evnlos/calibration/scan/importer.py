@@ -78,8 +78,8 @@ class ScanResult:
 def import_scan(folder: str | Path, settings: ScanImport | None = None) -> ScanResult:
     """Read a scan and return its light-transport matrix.
 
-    Dark frames are taken off, repeats compared and averaged, cells told apart, noise estimated per pixel from
-    the repeats, and the matrix denoised where that helps (`choose_denoising`).
+    Dark frames are taken off, repeats compared and averaged, cells distinguished, noise estimated per pixel
+    from the repeats, and the matrix denoised where that helps (`choose_denoising`).
 
     Args:
         folder: A folder with `scan.yaml` and its pictures.

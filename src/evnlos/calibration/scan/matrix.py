@@ -281,7 +281,7 @@ def _fitted(
             "scan.yaml, or measure three cells that do not lie on a line"
         )
     reach = float(np.abs(steps).max())
-    largest = float(np.hypot(*shape)) / reach  # pixels a metre: across the whole image in one step
+    largest = float(np.hypot(*shape)) / reach  # pixels per metre: across the whole image in one step
 
     def residual(p: NDArray[np.float64]) -> torch.Tensor:
         return (moved(kernel, steps @ p.reshape(2, 2).T) - seen).flatten()

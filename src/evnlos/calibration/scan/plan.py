@@ -172,7 +172,8 @@ class ScanPlan:
     points: int = 5
     """points: number of cells, the middle one first, then outwards."""
     display: tuple[int, int] | None = None
-    """Width and height of the display, pixels; none = a moving LED (places.csv) or one picture pixel a cell."""
+    """Width and height of the display, pixels; none = a moving LED (places.csv) or one picture pixel per cell.
+    """
     display_pitch: float = 0.00027
     """Side of a display pixel, metres."""
     repeats: int = 2
@@ -200,7 +201,7 @@ class ScanPlan:
             raise ConfigError(f"dark_every is {self.dark_every}, points {self.points}; give 1 or more")
         if self.display is not None:
             if not all(1 <= side <= _MOST_DISPLAY for side in self.display):
-                raise ConfigError(f"display is {self.display}; give 1 to {_MOST_DISPLAY} pixels a side")
+                raise ConfigError(f"display is {self.display}; give 1 to {_MOST_DISPLAY} pixels per side")
             needed = [round(n * self.pitch / self.display_pitch) for n in reversed(self.cells.shape)]
             if self.pitch < self.display_pitch or needed[0] > self.display[0] or needed[1] > self.display[1]:
                 raise ConfigError(
@@ -328,12 +329,12 @@ def lit_cells(info: ScanInfo, pattern: int) -> NDArray[np.bool_]:
 
 
 def _save(path: Path, plan: ScanPlan, lit: NDArray[np.bool_]) -> None:
-    """Write a picture for the display, cells in its middle, or one pixel a cell."""
+    """Write a picture for the display, cells in its middle, or one pixel per cell."""
     if plan.display is None:
         Image.fromarray(lit.astype(np.uint8) * 255).convert("1").save(path)
         return
     width, height = plan.display
-    size = plan.pitch / plan.display_pitch  # display pixels a cell, not whole in general
+    size = plan.pitch / plan.display_pitch  # display pixels per cell, not whole in general
     edges = [np.round((np.arange(n + 1) - n / 2) * size).astype(int) for n in lit.shape]
     y, x = edges[0] + height // 2, edges[1] + width // 2
     picture = np.zeros((height, width), np.uint8)

@@ -1,6 +1,6 @@
 """Arrays of pixels: thresholds, tiles and threads; the state of the continuous and of the frame-stepped pixel.
 
-- What both pixel arrays share: thresholds a pixel, tiles, threads.
+- What both pixel arrays share: thresholds per pixel, tiles, threads.
 - The array of continuous-time pixels: state, constants and noise processes of `mode="exact"`.
 - The array of frame-stepped pixels: state, constants and noise processes of `mode="v2e"`.
 """

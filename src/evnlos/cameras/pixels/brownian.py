@@ -351,7 +351,7 @@ class BrownianPixel(ThresholdPixel):
         threshold_off: The same for OFF events.
         threshold_sigma: Standard deviation of both thresholds over the pixels, log units; 0 = none.
         dark_dn: Offset k of the logarithm, DN, more than 0; k2.
-        leak_rate_hz: Rate r of the leak's ON events in the dark, hertz a pixel; k4.
+        leak_rate_hz: Rate r of the leak's ON events in the dark, hertz per pixel; k4.
         leak_rate_per_dn_hz: What each DN of light adds to that rate, hertz per DN; k5.
         photon_noise: Strength a of the noise of the light, log units times sqrt(DN / s); k3/k1.
         dark_noise: Strength b of the noise in the dark, log units per sqrt(s); k6/k1.
@@ -379,7 +379,7 @@ class BrownianPixel(ThresholdPixel):
     dark_dn: float = 20.0
     """Offset of the logarithm, DN."""
     leak_rate_hz: float = 0.1
-    """Rate of the leak's ON events in the dark, hertz a pixel."""
+    """Rate of the leak's ON events in the dark, hertz per pixel."""
     leak_rate_per_dn_hz: float = 0.005
     """What each DN of light adds to the leak's rate, hertz per DN."""
     photon_noise: float = 0.018993

@@ -263,7 +263,7 @@ class CircuitPixel(ThresholdPixel):
         kappa: Slope factor of the transistors, 0 to 1.
         early_v: V_A, volt.
         noise_factor: Factor of all noise voltages; 1 = the shot noise of the currents, 0 = none.
-        leak_rate_hz: Rate of the leak's ON events, hertz a pixel.
+        leak_rate_hz: Rate of the leak's ON events, hertz per pixel.
         refractory_s: Time after an event in which the reference follows the light, seconds.
         initial_phase: "rest" = the reference stands at the settled level, "random" = anywhere between the
             thresholds.
@@ -306,7 +306,7 @@ class CircuitPixel(ThresholdPixel):
     noise_factor: float = 1.0
     """Factor of all noise voltages; 1 = the shot noise of the currents, 0 = none."""
     leak_rate_hz: float = 0.1
-    """Rate of the leak's ON events, hertz a pixel."""
+    """Rate of the leak's ON events, hertz per pixel."""
     refractory_s: float = 0.0
     """Time after an event in which the reference follows the light, seconds."""
     initial_phase: Phase = "rest"

@@ -225,7 +225,7 @@ def _cubic(
     """Send the events of one pixel in a step on which its output is a monotone cubic.
 
     It goes from `filtered` to `filtered + rise`, the leak among it; `slope_0` and `slope_1` are its slopes at
-    both ends, log units a step. `state` (reference, last event) is updated; returns the fill of the columns.
+    both ends, log units per step. `state` (reference, last event) is updated; returns the fill of the columns.
     """
     rising = rise > 0.0
     size = on if rising else -off

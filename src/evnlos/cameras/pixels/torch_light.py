@@ -140,7 +140,7 @@ class Filter:
     ) -> None:
         self._is_bytes, self._device = is_bytes, device
         self.has_filter = rates.shape[1] > 0
-        # one number a step where all clips have the same pixels; such light alone may have 8 bits
+        # one number per step where all clips have the same pixels; such light alone may have 8 bits
         self._rates: list[float] = rates[0].tolist()
         self._each = torch.from_numpy(rates.T).to(device, dtype) if (rates != rates[:1]).any() else None
         self.relative = self.has_filter and dtype == torch.float32

@@ -164,7 +164,7 @@ def fill(
     stream: int,
     finish: Finish | None = None,
 ) -> Tensor:
-    """Fill `out` [clips, pixels] with one number a pixel, after `finish(numbers, clip, pixels)` if given."""
+    """Fill `out` [clips, pixels] with one number per pixel, after `finish(numbers, clip, pixels)` if given."""
     words, pixels = stream_word(seeds, stream, out.device), out.shape[1]
     draw = _normal if kind == "normal" else _exponential
     chunk = _CHUNK if out.device.type == "cpu" else pixels

@@ -6,9 +6,9 @@
 The frame-stepped pixel (`mode="v2e"`) as plain torch operations: whole batches of clips, on any device.
 
 Time runs in blocks of steps. In a first pass over all pixels, tile by tile so that a CPU keeps them in its
-cache, only the filter moves and its extremes over the block are kept: about six operations a step. Pixels whose
-extremes stay within the thresholds are done. Those few that may have crossed one, and those that are due for
-shot noise, go through the block once more, step by step with all rules. The host waits for the device a few
+cache, only the filter moves and its extremes over the block are kept: about six operations per step. Pixels
+whose extremes stay within the thresholds are done. Those few that may have crossed one, and those that are due
+for shot noise, go through the block once more, step by step with all rules. The host waits for the device a few
 times a block, to learn how many these are, and never within a step.
 """
 
@@ -148,7 +148,7 @@ class Refractory:
 STEPS = 32
 _TILE_CPU, _TILE_DEVICE = 16_384, 1 << 22
 _MARGIN = {torch.float64: 1e-9, torch.float32: 1e-5}
-"""How far inside a threshold a pixel still counts as one that may have crossed: far above the rounding."""
+"""How far inside a threshold per pixel still counts as one that may have crossed: far above the rounding."""
 
 
 def default_tile(device: torch.device) -> int:

@@ -193,7 +193,7 @@ def _unpack_events(events, x, adc):
 def _exchange(pixels, adc, flat, before):
     """Put each event's intensity into the map and what stood there into `before`.
 
-    The map is larger than the nearest caches, and what is written out pushes it from them: a place is asked for
+    The map is larger than the nearest caches, and what is written out pushes it from them: a place is requested
     some time before its turn. Rows are longer than four events, mostly.
     """
     count, four = np.uint64(len(pixels)), U64[4]

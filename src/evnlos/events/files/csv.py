@@ -187,7 +187,7 @@ def _typed(columns: dict[str, NDArray], is_celex: bool) -> Columns:
 
 
 class CsvSink(FileSink):
-    """A comment with sensor size and count, a line of names, and one row an event."""
+    """A comment with sensor size and count, a line of names, and one row per event."""
 
     def __init__(self, path: Path, first: Events) -> None:
         super().__init__(path)

@@ -197,7 +197,7 @@ def parse_rows(data, columns, seconds_column, values, starts, state):
 
 @njit(cache=True)
 def print_rows(values, data):
-    """Print rows of whole numbers with commas; return the bytes written. 21 bytes a number suffice."""
+    """Print rows of whole numbers with commas; return the bytes written. 21 bytes per number suffice."""
     at = 0
     digits = np.empty(20, np.uint8)
     for row in range(values.shape[0]):

@@ -1,8 +1,8 @@
 """DAT and Event Stream: formats with as many bytes for each event.
 
-- DAT, Prophesee's decoded events: a text header, two bytes, then 8 bytes an event; only read.
+- DAT, Prophesee's decoded events: a text header, two bytes, then 8 bytes per event; only read.
 
-Event Stream (`.es`) version 2, the DVS type: five bytes an event, of which the first holds time and
+Event Stream (`.es`) version 2, the DVS type: five bytes per event, of which the first holds time and
 polarity.
 
 The first byte is the time since the event before (seven bits, microseconds) and the polarity in its lowest bit;

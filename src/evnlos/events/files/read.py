@@ -365,7 +365,7 @@ def read_frames(
 
     Args:
         path: The recording; for CeleX-V mode F or a loop with pictures in it.
-        bits: 8 or 12 bits a pixel, for CeleX-V; AEDAT4 has 8, and colours become grey.
+        bits: 8 or 12 bits per pixel, for CeleX-V; AEDAT4 has 8, and colours become grey.
         fpn: CeleX-V's fixed pattern to subtract: [800, 1280] or the text file of the camera's program; the
             result is clipped to the range of `bits`.
         on_error: "strict" raises at the first fault, "salvage" returns the whole pictures (CeleX-V).

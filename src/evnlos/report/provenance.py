@@ -157,7 +157,7 @@ _MOST_NAMES = 60  # of objects that are listed one by one; a simulation has hund
 _PACKAGES = ("torch", "numpy", "numba", "h5py", "Pillow")
 
 
-def origin_section(
+def provenance_section(
     dataset: Dataset, results: list[RunResult], split: str, setup: NamedSetup | None = None
 ) -> str:
     """Return the section of environment, commands and settings; `setup` is the one that was named."""
