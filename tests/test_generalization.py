@@ -1,4 +1,4 @@
-"""What carries over: one network on other things and other walls, with what its confidence says."""
+"""Generalization: one network on other objects and other walls, with what its confidence says."""
 
 import json
 import sys
@@ -47,7 +47,7 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypa
     network = UNetConfig(width=4, depth=1, rank=0).build("frame", SAMPLING).eval()
     bare = Weights(network)
     save_weights(tmp_path / "bare.safetensors", bare)
-    with pytest.raises(DataError, match="does not know what its pictures are worth"):
+    with pytest.raises(DataError, match="holds no confidence"):
         generalization(tmp_path / "bare.safetensors", setup, tmp_path, 1)
     confidence = fit_confidence(network, NlosDataset(tiny_dataset, "train", "frame"), SAMPLING.canvas)
     save_weights(tmp_path / "w.safetensors", replace(bare, confidence=confidence))
@@ -59,7 +59,7 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypa
         return {"icon": icons, "dim": replace(icons, setup=dim)}
 
     # By name: the package's attribute `generalization` is the function, not the module.
-    monkeypatch.setattr(sys.modules["evnlos.experiment.generalization"], "sets", two)
+    monkeypatch.setattr(sys.modules["evnlos.experiment.generalization"], "evaluation_sets", two)
     command = ["experiment", "carry-over", "--weights", str(tmp_path / "w.safetensors"), "--rig", "lab"]
     command += ["--out", str(tmp_path), "--workers", "1"]
     with monkeypatch.context() as little:
@@ -71,9 +71,9 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypa
     found = json.loads((tmp_path / "generalization-lab-w.json").read_text())
     assert [one["name"] for one in found] == ["icon", "dim"]
     for one in found:
-        assert [p["name"] for p in one["worth"]] == ["icon_000", "icon_001"]
+        assert [p["name"] for p in one["confidence_checks"]] == ["icon_000", "icon_001"]
         assert one["consistent_db"] > 0
-        assert all(p["explained"] is not None and p["skill"] < 1 for p in one["worth"])
+        assert all(p["explained"] is not None and p["skill"] < 1 for p in one["confidence_checks"])
     text = (tmp_path / "generalization-lab-w.md").read_text()
     widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
     assert widths == {13} and "Mean skill of the best" in text

@@ -1,4 +1,4 @@
-"""Versions: the one of this package, and what older ones wrote in today's words.
+"""Versions: the number of this package, and files of older versions in today's names.
 
 - The package's version, read from its metadata.
 

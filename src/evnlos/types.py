@@ -1,4 +1,4 @@
-"""The nouns that every stage shares: event streams and sampled planes. Data carry their geometry.
+"""Types that every stage shares: event streams, sampled planes, and seeds derived by name.
 
 - Every random draw comes from a seed that is derived, by name, from the one the user gave.
 """

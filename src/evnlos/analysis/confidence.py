@@ -214,10 +214,10 @@ def _noise(frames: Tensor, operator: FrameOperator) -> Tensor:
 def confidence_of(
     weights: Weights, samples: Samples, images: Tensor, operator: FrameOperator | None = None
 ) -> ConfidenceReport | None:
-    """Return what the pictures of one sequence are worth; None where the weights or the motion do not tell.
+    """Return the confidence in the pictures of one sequence; None where the weights or the motion do not tell.
 
     Args:
-        weights: The network, and what it learned of its pictures' worth.
+        weights: The network and its confidence.
         samples: The sequence.
         images: The network's pictures, float32 [N, H, W].
         operator: The calibrated setup, where it is known.
@@ -314,7 +314,7 @@ def check_confidence(
 
     Args:
         network: The network.
-        confidence: What it learned of its pictures' worth.
+        confidence: Its confidence.
         samples: The sequences, all of known motion.
         images: The network's pictures of all samples, float32 [N, H, W].
         canvas: Their geometry.

@@ -1,4 +1,4 @@
-"""Does a network see, or does it remember? Reconstructions beside what the objects of its training show.
+"""Evaluating a network on a dataset: metrics, baselines, and a check against memorized training objects.
 
 - A network on a dataset: metrics a character and overall, with the baselines beside them.
 """

@@ -1,4 +1,4 @@
-"""What a setup can show at all.
+"""Identifiability and resolution of a setup: what any method can reconstruct from it, in numbers and in words.
 
 - What the figures of a setup mean, in words.
 - What a setup can show at all: singular values, patterns above the noise, finest stroke, best linear picture.
@@ -129,7 +129,7 @@ class NoiseLevelResult:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """What a setup can show at all.
+    """The result of an identifiability analysis.
 
     Args:
         name: Name of the setup.

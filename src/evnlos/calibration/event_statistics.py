@@ -1,4 +1,4 @@
-"""Figures of event recordings that a pixel's settings decide, and the light that made the recordings.
+"""Statistics of event recordings that a pixel's settings decide, beside those of simulated ones.
 
 - Recorded events beside simulated ones: maps of counts, and the time surfaces that a network sees.
 """

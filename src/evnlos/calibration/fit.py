@@ -59,7 +59,7 @@ class Example:
 
 @dataclass(frozen=True)
 class SetupFit:
-    """A calibrated simulation and what it is worth.
+    """A calibrated simulation and its residuals.
 
     Args:
         simulation: The settings that make the simulator match the setup.

@@ -88,7 +88,7 @@ class ReconstructCommand:
 
 
 def _said(confidence: dict[str, Any]) -> str:
-    """Return what there is to say of the pictures' worth, in one line."""
+    """Return the confidence in the pictures, in one line."""
     words = [confidence["verdict"]]
     if "explained" not in confidence:
         words.append("not checked against the frames: give the calibrated --setup")

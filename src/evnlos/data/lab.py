@@ -1,4 +1,4 @@
-"""The sensor of a rendered laboratory: drawn once a setup, from ranges that are not the training simulator's.
+"""Synthetic captures of a rendered laboratory, whose sensor is drawn from ranges of its own.
 
 - Pseudo-real captures: recordings that the training simulator did not make, for people without a camera.
 """

@@ -1,4 +1,4 @@
-"""Samples that are simulated as a training needs them, by processes or on a device.
+"""On-the-fly simulation: samples made as a training needs them, by processes or on a device.
 
 - Samples of objects, made on a device from the light to the maps; only the target is drawn on the CPU.
 - Samples that are simulated as a training needs them: no dataset on disk, and each epoch another draw.

@@ -1,4 +1,4 @@
-"""What a reconstructor sees, and samples ready for it.
+"""Modalities, which say what a reconstructor sees, and datasets of samples ready for it.
 
 - What a reconstructor sees: a modality is a list of named groups of channels, each made from recorded maps.
 - Samples ready for a network, on disk or in memory: what it sees is one switch, the modality.

@@ -1,4 +1,4 @@
-"""A pool of processes that survives the death of a worker: lost tasks are run again.
+"""Parallel work: a pool of processes that survives the death of a worker, or a Dask cluster.
 
 - The same tasks on a Dask cluster: many machines that share a file system.
 """

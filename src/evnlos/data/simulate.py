@@ -1,4 +1,4 @@
-"""Variation from object to object: settings drawn from ranges, so that no network learns one setup by heart.
+"""Simulated datasets: settings, their variation from object to object, and the shards that come of them.
 
 - From settings to a dataset of shards: each object is a pure function of (settings, seed, name).
 """

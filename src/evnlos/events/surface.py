@@ -1,4 +1,4 @@
-"""Compiled loops of the time surfaces; `surface_reference` says the same slowly.
+"""Time surfaces of events, and the compiled loops that fill them; `surface_reference` is the slow reference.
 
 - Time surfaces: pictures of how recently, and in what company, each pixel saw its events.
 """

@@ -112,13 +112,11 @@ def generalization(
         force: Whether to begin although the machine's memory will hardly do.
 
     Raises:
-        DataError: The weights do not know what their pictures are worth, or the setup can't be used.
+        DataError: The weights hold no confidence, or the setup can't be used.
     """
     loaded = load_weights(weights)
     if loaded.confidence is None:
-        raise DataError(
-            f"{weights} does not know what its pictures are worth; train on a dataset with a validation split"
-        )
+        raise DataError(f"{weights} holds no confidence; train on a dataset with a validation split")
     sampling = loaded.sampling
     own = load_yaml(Simulation, calibrated_file(setup))
     operator = FrameOperator(own.setup, sampling) if "frame" in loaded.modality.slices else None

@@ -1,4 +1,4 @@
-"""Reconstructors, their closed-form parts, what their images are worth, and their weights on disk."""
+"""Reconstructors, their closed-form parts, the confidence in their images, and their weights on disk."""
 
 from evnlos.models.confidence import Confidence, ConfidenceReport, halves_of, on_target_plane
 from evnlos.models.linear import LinearEstimate, fit_linear

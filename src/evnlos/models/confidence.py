@@ -1,6 +1,6 @@
-"""The target in a picture: the square that holds the hidden object, cut out wherever it is.
+"""Confidence: how much of a reconstruction the measurement supports, pixel by pixel and as a whole.
 
-- What a picture is worth: how much of it the measurement supports, and where each pixel's level lies.
+- The confidence in a picture: how much of it the measurement supports, and where each pixel's level lies.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ GROUPS = 3
 
 @dataclass(frozen=True)
 class ConfidenceReport:
-    """What one sequence of pictures is worth.
+    """How much of one sequence's pictures to believe.
 
     Args:
         agreement: Share of what tells this object from the average one that both halves of the sequence agree
@@ -149,7 +149,7 @@ class Confidence:
     high: Tensor
 
     def judge(self, pictures: Tensor, halves: Tensor, explained: float | None = None) -> ConfidenceReport:
-        """Return what the pictures of a sequence are worth.
+        """Return the confidence in the pictures of a sequence.
 
         Args:
             pictures: Pictures of all positions, float [N, H, W], 0..1.

@@ -188,7 +188,7 @@ class Weights:
         network: The reconstructor, in evaluation mode; it knows its modality and its sampling.
         history: The trainings behind it, oldest first: settings, data, version.
         mean_image: Mean of the true images of the last training, float32 [H, W]: the baseline to beat.
-        confidence: What its images are worth, learned from sequences that no training saw; None where there
+        confidence: The confidence in its images, learned from sequences that no training saw; None where there
             were none.
         scores: How good it was found to be, for published weights: data, metrics, baselines.
         is_sealed: Whether a digest vouches for the file that they were read from; not of earlier versions.

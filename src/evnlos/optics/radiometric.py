@@ -1,4 +1,4 @@
-"""The compiled loop that fills a light-transport matrix on the CPU; `radiometric` holds the slow reference.
+"""Light transport by radiometry: the matrix from a luminous plane over a wall to a camera (paper Eq. 2-3).
 
 - The light-transport matrix from a luminous plane over a wall to a camera (paper Eq. 2-3).
 - The radiometric transport without its matrix: blocks of rows are made, used and forgotten.

@@ -184,7 +184,7 @@ def reconstruct_capture(
 
     Writes `position_00.png` and on, `strip.png` (rows of positions), `animation.gif` (wall frame,
     surface, reconstruction and, where known, truth, side by side) and `reconstruction.npy` (float32
-    [N, H, W], 0..1). Where the weights know what their pictures are worth and the motion is known, also
+    [N, H, W], 0..1). Where the weights hold a confidence and the motion is known, also
     `interval.npy` (the ends of each pixel's interval, float32 [2, N, H, W]) and `unsure.png`, a strip of the
     intervals' lengths (black is sure, white is anything).
 

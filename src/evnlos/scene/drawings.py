@@ -1,4 +1,4 @@
-"""A square to draw shapes on, in units of the target plane: from -1 to 1, x to the right and y down.
+"""Drawings: a square to draw shapes on, from -1 to 1, and objects that are no characters.
 
 - Things to hide that are no characters: icons, people, vehicles, doodles, several at once, in grey levels.
 """

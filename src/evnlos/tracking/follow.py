@@ -1,4 +1,4 @@
-"""What rests in a recording: ambient light, smooth over the wall, where the moving light never is.
+"""From a recording to a track: the light that stands still taken off, then the object followed.
 
 - From a recording to a track: frames give places, events give velocities, a smoother joins them.
 """

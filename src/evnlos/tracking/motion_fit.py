@@ -1,4 +1,4 @@
-"""Approach and retreat: the setup with its target's plane at other distances.
+"""Fitting a motion: positions, and distances where they change, by the calibrated operator.
 
 - Positions by the calibrated operator: places and distances that make the frames of one target likeliest.
 """

@@ -1,6 +1,6 @@
 """What a training is watched by, and how confidence is learned from samples that it does not learn from.
 
-- Learn what a network's pictures are worth, from sequences that it was not trained on.
+- Learn the confidence in a network's pictures from sequences that it was not trained on.
 - What a training is watched by: samples that it does not learn from.
 """
 
@@ -31,7 +31,7 @@ _MIXED = 60  # sequences without an object
 
 @torch.inference_mode()
 def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) -> Confidence:
-    """Learn what pictures of a network are worth from sequences that it was not trained on.
+    """Learn the confidence in a network's pictures from sequences that it was not trained on.
 
     Agreement. With d what tells a target from the network's empty answer (`Confidence.telling`), the agreement
     is <d1, d2> / E|t|^2: d1 and d2 from the two halves of a sequence, t the same of true targets. For a network
@@ -146,7 +146,7 @@ def validate(
 def confidence_of(
     network: Reconstructor, held_out: HeldOut | None, dataset: Dataset, start: Weights | None
 ) -> Confidence | None:
-    """Return what the pictures are worth: from the validation, or as the weights that this began from say."""
+    """Return the confidence in the pictures: of the validation, or of the weights that this began with."""
     if isinstance(held_out, NlosDataset):
         is_known = not np.isnan(held_out.position_m).any()
         if is_known and len(dataset.objects("validation")) >= FEWEST:
