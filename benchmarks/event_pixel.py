@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 from evnlos.cameras import EventCamera, EventPixel, simulate_batch, simulate_events
 from evnlos.cameras.simulation import Mode
 from evnlos.data.simulations import paper
-from evnlos.optics import Wall as CameraWall
+from evnlos.optics import Irradiance as CameraWall
 from evnlos.scene import Scene
 from evnlos.types import Events, derive_seed
 from machine import machine

@@ -31,7 +31,7 @@ import numpy as np
 import torch
 
 from evnlos.data import STANDARD_MODALITIES, Sampling
-from evnlos.live.chunk import Source
+from evnlos.live.chunk import EventSource
 from evnlos.live.engine import Engine
 from evnlos.live.packet import USUAL_EVENTS, Packet, pack
 from evnlos.live.run import RateOptions, Run
@@ -119,7 +119,7 @@ def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
     rate_hz, seconds, other = arguments.rate_hz, arguments.seconds, None
     engine = Engine(weights)
     if name == "udp":
-        source: Source = UdpSource(idle_s=30)
+        source: EventSource = UdpSource(idle_s=30)
         engine.begin()
         call = [sys.executable, __file__, "--send", str(source.port), "--rate-hz", str(rate_hz)]
         other = subprocess.Popen([*call, "--seconds", str(seconds)], stdout=subprocess.PIPE, text=True)

@@ -25,7 +25,7 @@ from evnlos.cameras import EventCamera
 from evnlos.data import Simulation, make_samples
 from evnlos.data.sampling import edges_from
 from evnlos.data.simulations import paper
-from evnlos.optics import Wall
+from evnlos.optics import Irradiance
 from evnlos.scene import Scene
 from evnlos.threads import one_thread
 from machine import machine
@@ -36,7 +36,7 @@ PARTS = ("events", "frames", "maps")
 class WholeImages:
     """A wall that can be rendered in whole images only."""
 
-    def __init__(self, wall: Wall) -> None:
+    def __init__(self, wall: Irradiance) -> None:
         self._wall, self.shape, self.speed_px_s = wall, wall.shape, wall.speed_px_s
 
     def irradiance(self, t_s: ArrayLike) -> torch.Tensor:

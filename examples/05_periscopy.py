@@ -12,7 +12,7 @@ import sys
 import numpy as np
 
 from evnlos.cli.invert import correlation
-from evnlos.inverse import Background, Gradient, Problem, prepare_inversion, read_photograph, tikhonov
+from evnlos.inverse import BackgroundModel, Gradient, Problem, prepare_inversion, read_photograph, tikhonov
 from evnlos.inverse.tikhonov import Spectrum
 from evnlos.plot.results import draw_inversion
 
@@ -29,12 +29,16 @@ print(
 )
 
 panels, found = [("truth", truth)], {}
-problem = Problem(inversion.operator, inversion.measurement, Background(inversion.degree))
+problem = Problem(inversion.operator, inversion.measurement, BackgroundModel(inversion.degree))
 for name, prior in (("identity", None), ("gradient", Gradient("dark"))):
     spectrum = Spectrum(problem, prior)
     for rule in ("gcv", "cv"):
         solution = tikhonov(
-            problem.operator, problem.measurement, rule=rule, prior=prior, nuisance=problem.nuisance
+            problem.operator,
+            problem.measurement,
+            rule=rule,
+            prior=prior,
+            background_model=problem.background_model,
         )
         r = found[name, rule] = correlation(solution.image, truth)
         panels.append((f"{name}, {rule}: r = {r:.3f}", solution.image))

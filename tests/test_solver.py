@@ -8,7 +8,7 @@ import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import (
-    Background,
+    BackgroundModel,
     DenoiserTraining,
     Gradient,
     LogChange,
@@ -92,10 +92,10 @@ def test_tikhonov_with_everything_equals_the_stacked_least_squares(prior):
     operator, y = random_operator(), noise(3, 8, 9, seed=1)
     weight = torch.rand(8, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.1
     weight[0, :4] = 0
-    nuisance, regularization = Background(2), 0.05
-    found = tikhonov(operator, y, regularization, prior=prior, nuisance=nuisance, weight=weight)
+    background_model, regularization = BackgroundModel(2), 0.05
+    found = tikhonov(operator, y, regularization, prior=prior, background_model=background_model, weight=weight)
     steps = torch.eye(30).double() if prior is None else dense_matrix(prior, y.new_zeros(5, 6))
-    extra = nuisance.polynomials((8, 9)).flatten(1).mT
+    extra = background_model.polynomials((8, 9)).flatten(1).mT
     top = weight.flatten()[:, None] * torch.cat([operator.matrix, extra], 1)
     stacked = torch.cat(
         [top, math.sqrt(regularization) * torch.cat([steps, steps.new_zeros(len(steps), 6)], 1)]
@@ -104,19 +104,28 @@ def test_tikhonov_with_everything_equals_the_stacked_least_squares(prior):
     expected = torch.linalg.lstsq(stacked, right).solution[:30].mT.reshape(3, 5, 6)
     torch.testing.assert_close(found.image, expected, rtol=1e-9, atol=1e-10)
     again = tikhonov(
-        operator, y, regularization, prior=prior, nuisance=nuisance, weight=weight, method="cg", tolerance=1e-12
+        operator,
+        y,
+        regularization,
+        prior=prior,
+        background_model=background_model,
+        weight=weight,
+        method="cg",
+        tolerance=1e-12,
     )
     torch.testing.assert_close(again.image, expected, rtol=1e-7, atol=1e-9)
-    problem = Problem(operator, y, nuisance, weight)
+    problem = Problem(operator, y, background_model, weight)
     torch.testing.assert_close(found.residual, (problem(expected) - problem.target).flatten(1).norm(dim=1))
 
 
 def test_batch_equals_loop_and_inputs_stay():
     operator, y = random_operator(), noise(4, 8, 9)
     before = y.clone()
-    together = tikhonov(operator, y, 0.1, nuisance=Background(1)).image
+    together = tikhonov(operator, y, 0.1, background_model=BackgroundModel(1)).image
     for k in range(4):
-        torch.testing.assert_close(together[k], tikhonov(operator, y[k], 0.1, nuisance=Background(1)).image)
+        torch.testing.assert_close(
+            together[k], tikhonov(operator, y[k], 0.1, background_model=BackgroundModel(1)).image
+        )
     assert torch.equal(y, before)
 
 
@@ -125,13 +134,15 @@ def test_a_smooth_background_changes_nothing_once_projected_out():
     v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) / 8 for n in (8, 9)), indexing="ij")
     light = 5 + 2 * u - v + u * v + 3 * v**2
     for solve in (tikhonov, total_variation):
-        plain, lit = (solve(operator, one, 0.1, nuisance=Background(2)).image for one in (y, y + light))
+        plain, lit = (
+            solve(operator, one, 0.1, background_model=BackgroundModel(2)).image for one in (y, y + light)
+        )
         torch.testing.assert_close(plain, lit, rtol=1e-8, atol=1e-9)
 
 
 def test_problem_is_an_operator_with_an_adjoint():
     weight = torch.rand(8, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    problem = Problem(random_operator(), noise(8, 9), Background(3), weight)
+    problem = Problem(random_operator(), noise(8, 9), BackgroundModel(3), weight)
     x, y = noise(5, 6, seed=3), noise(8, 9, seed=4)
     assert float((problem(x) * y).sum()) == pytest.approx(float((x * problem.adjoint(y)).sum()), rel=1e-12)
     torch.testing.assert_close((problem.matrix @ x.flatten()).reshape(8, 9), problem(x))
@@ -266,7 +277,7 @@ def test_the_two_methods_agree(border, box):
         "border": border,
         "box": box,
         "tolerance": 1e-6,
-        "nuisance": Background(0),
+        "background_model": BackgroundModel(0),
         "max_iterations": 50_000,
     }
     one, two = (
@@ -276,7 +287,7 @@ def test_the_two_methods_agree(border, box):
     assert two.converged
 
     def objective(x):
-        problem = Problem(operator, batch, Background(0))
+        problem = Problem(operator, batch, BackgroundModel(0))
         edges = Gradient(border)(x).square().sum(-3).sqrt().sum()
         return 0.5 * float((problem(x) - problem.target).square().sum()) + 0.005 * float(edges)
 
@@ -307,13 +318,16 @@ def test_plug_and_play_with_a_quadratic_prox_is_tikhonov():
         y,
         lambda v: v * rho / (rho + regularization),
         rho,
-        nuisance=Background(1),
+        background_model=BackgroundModel(1),
         tolerance=1e-10,
         max_iterations=500,
     )
     assert found.converged
     torch.testing.assert_close(
-        found.image, tikhonov(operator, y, regularization, nuisance=Background(1)).image, rtol=1e-6, atol=1e-8
+        found.image,
+        tikhonov(operator, y, regularization, background_model=BackgroundModel(1)).image,
+        rtol=1e-6,
+        atol=1e-8,
     )
 
 
@@ -379,8 +393,8 @@ def test_log_change_counts_thresholds():
         (DataError, "real numbers", lambda: tikhonov(random_operator(), torch.zeros(8, 9).long(), 1.0)),
         (DataError, "takes", lambda: tikhonov(random_operator(), noise(8, 8), 1.0)),
         (DataError, "weight is", lambda: tikhonov(random_operator(), noise(8, 9), 1.0, weight=torch.ones(3))),
-        (DataError, "samples are left", lambda: Problem(identity(2, 2), noise(2, 2), Background(3))),
-        (ConfigError, "degree is 13", lambda: Background(13)),
+        (DataError, "samples are left", lambda: Problem(identity(2, 2), noise(2, 2), BackgroundModel(3))),
+        (ConfigError, "degree is 13", lambda: BackgroundModel(13)),
         (ConfigError, "regularization is 0", lambda: total_variation(identity(2, 2), noise(2, 2), 0.0)),
         (ConfigError, "box is", lambda: total_variation(identity(2, 2), noise(2, 2), 1.0, box=(1.0, 0.0))),
         (ConfigError, "method is", lambda: total_variation(identity(2, 2), noise(2, 2), 1.0, method="x")),

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError
-from evnlos.optics import View, Viewing
+from evnlos.optics import View, ViewOperator
 from evnlos.types import Plane
 
 OBLIQUE = View.perspective((60, 96), 0.6, math.radians(30), math.radians(30))
@@ -76,7 +76,7 @@ def test_viewing_reproduces_a_linear_image():
     view = View.affine((21, 31), 150.0, 0.2)
     y, x = torch.as_tensor(plane.y_m)[:, None], torch.as_tensor(plane.x_m)
     for samples in (1, 3):
-        seen = Viewing(plane, view, samples)(1 + 2 * x - 3 * y)
+        seen = ViewOperator(plane, view, samples)(1 + 2 * x - 3 * y)
         points = view.wall_points_m()
         torch.testing.assert_close(seen, 1 + 2 * points[..., 0] - 3 * points[..., 1])
 
@@ -85,7 +85,7 @@ def test_area_average_keeps_the_light():
     """A coarse camera that averages sees the same light as the plane holds, wherever a point source lies."""
     plane = Plane(64, 64, 0.001)
     view = View.affine((20, 20), 250.0)  # four samples per pixel
-    viewing = Viewing(plane, view)
+    viewing = ViewOperator(plane, view)
     assert viewing.samples == 4
     for row, column in ((30, 31), (33, 40), (25, 26)):
         point = torch.zeros(64, 64, dtype=torch.float64)

@@ -9,11 +9,11 @@ import torch
 from evnlos.errors import ConfigError, DataError
 from evnlos.optics import (
     DiffuseReflection,
+    Irradiance,
     MatrixTransport,
     MatrixWall,
     SlidingWall,
     View,
-    Wall,
     coarsest_keyframe_step_m,
     tpsf_kernel,
 )
@@ -144,7 +144,7 @@ def test_wall_carries_a_gradient():
 
 def test_scalar_and_array_times_agree():
     wall = SlidingWall(spot(PLANE, 0, 0).float(), PLANE, View.affine(SHAPE, 400.0), DIAGONAL, ambient=0.05)
-    assert isinstance(wall, Wall)
+    assert isinstance(wall, Irradiance)
     assert wall.irradiance(1.0).shape == SHAPE
     assert wall.irradiance([]).shape == (0, *SHAPE)
     one, many = wall.irradiance(1.0), wall.irradiance([0.2, 1.0])
@@ -276,7 +276,7 @@ def test_matrix_wall_equals_the_matrix_times_the_drawing():
     drawn = wall.target.rasterise(wall.transport.source, DIAGONAL.position_m(0.77))
     expected = 0.03 + 0.5 * wall.transport(torch.as_tensor(drawn).double())
     torch.testing.assert_close(wall.irradiance(0.77), expected.float())
-    assert isinstance(wall, Wall)
+    assert isinstance(wall, Irradiance)
     assert wall.speed_px_s == pytest.approx(2.5)
 
 

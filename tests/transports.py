@@ -21,7 +21,7 @@ from evnlos.optics import (
     Occluder,
     Transport,
     View,
-    Viewing,
+    ViewOperator,
     compose,
     lamp_radiance,
     light_transport_matrix,
@@ -58,8 +58,8 @@ EXAMPLES: dict[str, Callable[[], Transport]] = {
     ),
     "diffuse reflection": lambda: _reflection(_SCENE),
     "lopsided kernel": lambda: DiffuseReflection(_SCENE, torch.arange(15.0, dtype=torch.float64).reshape(3, 5)),
-    "affine view": lambda: Viewing(_SCENE, _AFFINE),
-    "oblique view": lambda: Viewing(_SCENE, _OBLIQUE, samples=2),
+    "affine view": lambda: ViewOperator(_SCENE, _AFFINE),
+    "oblique view": lambda: ViewOperator(_SCENE, _OBLIQUE, samples=2),
     "matte wall": lambda: _matrix(Lambert()),
     "rough metal": lambda: _matrix(GGX(0.1)),
     "brushed metal": lambda: _matrix(GGX(0.05, 0.2)),
@@ -69,10 +69,10 @@ EXAMPLES: dict[str, Callable[[], Transport]] = {
     "brushed metal, torch-lit, in blocks": lambda: LightTransport(
         _OBLIQUE, _SCENE, 0.3, GGX(0.1, 0.3), emission=lamp_radiance(_SCENE, 0.3, (0.1, 0.0, 0.1)), block=500
     ),
-    "reflection, then view": lambda: _chain(_reflection, lambda plane: Viewing(plane, _AFFINE)),
+    "reflection, then view": lambda: _chain(_reflection, lambda plane: ViewOperator(plane, _AFFINE)),
     "the paper's steps": lambda: _chain(
         lambda plane: Diffraction(plane, distance_m=0.005, field_step_m=2e-5),
         _reflection,
-        lambda plane: Viewing(plane, _OBLIQUE),
+        lambda plane: ViewOperator(plane, _OBLIQUE),
     ),
 }

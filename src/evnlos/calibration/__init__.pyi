@@ -9,7 +9,7 @@ from .fit import SetupFit as SetupFit
 from .fit import fit_setup as fit_setup
 from .frame_model import FrameModel as FrameModel
 from .frame_model import FrameNoise as FrameNoise
-from .frame_model import Light as Light
+from .frame_model import LightLevel as LightLevel
 from .frame_model import fit_frame_noise as fit_frame_noise
 from .settings import Calibration as Calibration
 from .summary import CALIBRATION_VALUES_FILE as CALIBRATION_VALUES_FILE

@@ -22,7 +22,7 @@ from evnlos.types import Plane
 
 
 @dataclass(frozen=True)
-class Light:
+class LightLevel:
     """The linear part of a frame: frame = gain light + ambient (1 + gx x + gy y), x and y from -1 to 1.
 
     Args:
@@ -100,7 +100,7 @@ class FrameModel:
         walls = [plain.observe(scene) for scene in self._scenes]
         return torch.cat([wall.irradiance(times) for wall, times in zip(walls, self._times, strict=True)])
 
-    def fit(self, light: torch.Tensor) -> tuple[Light, torch.Tensor]:
+    def fit(self, light: torch.Tensor) -> tuple[LightLevel, torch.Tensor]:
         """Return gain and ambient light that fit best, and the residual frame - model, float32 [N, h, w]."""
         ramp = self._ramp.double()
         lit = light * self.weight
@@ -117,7 +117,7 @@ class FrameModel:
         ambient = (torch.tensor([level, gx, gy]) @ self._ramp.flatten(1)).reshape(self.shape)
         residual = ((self.frames - ambient) - gain * light) * self.weight
         floor = level if abs(level) > 1e-9 else 1e-9
-        return Light(gain, level, (gx / floor, gy / floor)), residual
+        return LightLevel(gain, level, (gx / floor, gy / floor)), residual
 
     def predict(self, setup: Setup) -> torch.Tensor:
         """Return the frames that the setup, with its own gain and ambient light, predicts, [N, h, w]."""

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.cameras.event_model import PixelSettings
-from evnlos.cameras.light import WHITE_DN, StripLight, Strips
+from evnlos.cameras.light import WHITE_DN, ImageStrips, StripLight
 from evnlos.cameras.pixel import EventPixel, Mode, in_mode
 from evnlos.cameras.pixels.continuous_math import log_light
 from evnlos.cameras.simulation import EventStream
@@ -31,7 +31,7 @@ _BLOCK = 512
 _MOST_STEPS = 10_000_000
 
 
-class Wall(Protocol):
+class Irradiance(Protocol):
     """What an event camera needs to know about the light: its image at any instant, and how fast it moves."""
 
     @property
@@ -88,7 +88,9 @@ class EventCamera:
             raise ConfigError(f"EventCamera.time_step_s is {step}; give a positive number of seconds, or None")
         check_time_step(in_mode(self.pixel, self.mode), step)
 
-    def record(self, wall: Wall, t0: float, t1: float, *, seed: int = 0, threads: int | None = None) -> Events:
+    def record(
+        self, wall: Irradiance, t0: float, t1: float, *, seed: int = 0, threads: int | None = None
+    ) -> Events:
         """Return the events of the time from t0 to t1; at t0 all pixels have settled to the light.
 
         Memory is that of one chunk of frames (64 MiB), the state of the pixels and the events.
@@ -130,7 +132,7 @@ class EventCamera:
         return np.append(t0 + self.time_step_s * np.arange(1, steps), t1).astype(np.float64)
 
     def _chunks(
-        self, wall: Wall, t0: float, t1: float, longest: float
+        self, wall: Irradiance, t0: float, t1: float, longest: float
     ) -> Iterator[tuple[NDArray[np.float64], NDArray]]:
         """Yield instants and frames that continue after t0 up to t1, at most `longest` seconds apart.
 
@@ -181,7 +183,7 @@ def check_time_step(pixel: PixelSettings, time_step_s: float | None) -> None:
         )
 
 
-def _record_at(stream: EventStream, wall: Wall, times_s: NDArray[np.float64]) -> None:
+def _record_at(stream: EventStream, wall: Irradiance, times_s: NDArray[np.float64]) -> None:
     """Let the pixels see the wall at given instants: strip by strip where it can be had so, else in frames."""
     most = min(_most_steps(wall), len(times_s))
     frames = None
@@ -195,19 +197,19 @@ def _record_at(stream: EventStream, wall: Wall, times_s: NDArray[np.float64]) ->
             stream.push(_render(wall, few, frames[: len(few)]), few)
 
 
-def _strips_of(wall: Wall, times_s: NDArray[np.float64]) -> Strips | None:
+def _strips_of(wall: Irradiance, times_s: NDArray[np.float64]) -> ImageStrips | None:
     """Return the light of a wall whose class says how to render some pixels without the others (`strips`)."""
-    render: Callable[..., Strips | None] | None = getattr(type(wall), "strips", None)
+    render: Callable[..., ImageStrips | None] | None = getattr(type(wall), "strips", None)
     return render(wall, times_s) if callable(render) else None
 
 
-def _most_steps(wall: Wall) -> int:
+def _most_steps(wall: Irradiance) -> int:
     """Return how many frames are rendered together."""
     height, width = wall.shape
     return max(1, min(_CHUNK_STEPS, _CHUNK_BYTES // (4 * height * width)))
 
 
-def _longest_step(wall: Wall, t0: float, t1: float) -> float:
+def _longest_step(wall: Irradiance, t0: float, t1: float) -> float:
     """Return the step that moves the image by four pixels, at most an eighth of the recording."""
     speed = float(wall.speed_px_s)
     if not (math.isfinite(speed) and speed >= 0):
@@ -223,7 +225,7 @@ def _longest_step(wall: Wall, t0: float, t1: float) -> float:
     return step
 
 
-def _render(wall: Wall, times_s: NDArray[np.float64], out: NDArray[np.float32]) -> NDArray[np.float32]:
+def _render(wall: Irradiance, times_s: NDArray[np.float64], out: NDArray[np.float32]) -> NDArray[np.float32]:
     """Write the wall's light at `times_s` in DN to `out` [T, H, W] and return it."""
     height, width = wall.shape
     most = max(1, _RENDER_BYTES // (4 * height * width))

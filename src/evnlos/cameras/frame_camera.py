@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_camera import Wall
+from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.random_numbers import check_seed, fill_electrons
 from evnlos.config import check_made
 from evnlos.errors import ConfigError, DataError
@@ -108,7 +108,7 @@ class FrameCamera:
         """Largest digital number, 2^bit_depth - 1."""
         return 2**self.bit_depth - 1
 
-    def capture(self, wall: Wall, times_s: ArrayLike, seed: int = 0) -> NDArray[np.uint8 | np.uint16]:
+    def capture(self, wall: Irradiance, times_s: ArrayLike, seed: int = 0) -> NDArray[np.uint8 | np.uint16]:
         """Return one frame for each instant: the wall, averaged over an exposure centred there.
 
         The average is a Gauss-Legendre quadrature with 3 instants, or the wall's own where its light changes

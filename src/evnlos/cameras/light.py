@@ -145,14 +145,14 @@ class Frames:
         return self._rows, 0
 
 
-class Strips(Protocol):
+class ImageStrips(Protocol):
     """A wall's light at some instants, of which any pixels can be had without the others."""
 
     def __len__(self) -> int:
         """Number of instants."""
         ...
 
-    def __getitem__(self, instants: slice) -> Strips:
+    def __getitem__(self, instants: slice) -> ImageStrips:
         """Return the light at some of the instants."""
         ...
 
@@ -170,7 +170,7 @@ class StripLight:
 
     dtype = np.dtype(np.float32)
 
-    def __init__(self, strips: Strips) -> None:
+    def __init__(self, strips: ImageStrips) -> None:
         self._strips = strips
         self.most_px = max(1, _STRIP_BYTES // (4 * max(1, len(strips))))
 

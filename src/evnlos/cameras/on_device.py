@@ -15,7 +15,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from evnlos.cameras.event_camera import Wall
+from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.event_model import PixelSettings
 from evnlos.cameras.event_order import EventTensors
 from evnlos.cameras.frame_camera import FrameCamera, check_extremes
@@ -32,7 +32,7 @@ Pattern = tuple[Tensor, Tensor]
 _TOGETHER_PX = 1 << 22  # pixels of frames that are made in one operation
 
 
-def capture_tensors(camera: FrameCamera, wall: Wall, times_s: ArrayLike, seed: int = 0) -> Tensor:
+def capture_tensors(camera: FrameCamera, wall: Irradiance, times_s: ArrayLike, seed: int = 0) -> Tensor:
     """Return the frames of `FrameCamera.capture` on the device where the wall renders.
 
     Args:
@@ -68,7 +68,7 @@ def capture_tensors(camera: FrameCamera, wall: Wall, times_s: ArrayLike, seed: i
     return torch.cat(made)
 
 
-def _exposed(camera: FrameCamera, wall: Wall, times_s: NDArray[np.float64]) -> Tensor:
+def _exposed(camera: FrameCamera, wall: Irradiance, times_s: NDArray[np.float64]) -> Tensor:
     """Return the light averaged over each exposure, float64 [N, H, W]."""
     moments = [camera.instants(time) for time in times_s.tolist()]
     light = wall.irradiance(np.concatenate([instants for instants, _ in moments])).to(torch.float64)
@@ -174,7 +174,7 @@ def stepped(pixel: PixelSettings) -> V2ePixel:
 
 
 def record_tensors(
-    walls: Sequence[Wall],
+    walls: Sequence[Irradiance],
     times_s: ArrayLike,
     pixels: Sequence[EventPixel | V2ePixel],
     seeds: Sequence[int],

@@ -22,8 +22,8 @@ from evnlos.cameras.video_files import (
     AnimationSource,
     ArraySource,
     ContainerSource,
+    PictureSource,
     PicturesSource,
-    Source,
     Tone,
     to_light,
 )
@@ -62,7 +62,7 @@ class Video:
     slow_motion: float
     tone: Tone
     white: float
-    source: Source = field(repr=False)
+    source: PictureSource = field(repr=False)
 
     def __iter__(self) -> Iterator[tuple[float, NDArray[np.float32]]]:
         first = before = -math.inf
@@ -204,7 +204,7 @@ def check_video(video: Video, pixel: PixelSettings) -> None:
     check_memory(int(100 * pixels + 3 * _BLOCK_BYTES + 2 * 26 * noise), what, cure)
 
 
-def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Path, Source]:
+def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Path, PictureSource]:
     """Return what to call a video, and its source."""
     if not isinstance(path, (str, PathLike)):
         paths = [Path(one) for one in path]
@@ -233,7 +233,7 @@ def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Pa
     return path, ContainerSource(path)
 
 
-def _named(paths: list[Path]) -> tuple[Path, Source]:
+def _named(paths: list[Path]) -> tuple[Path, PictureSource]:
     missing = [path for path in paths if not path.is_file()]
     if missing:
         raise DataError(f"{missing[0]}: no such file; check the path")
@@ -243,7 +243,7 @@ def _named(paths: list[Path]) -> tuple[Path, Source]:
     return paths[0], PicturesSource(paths)
 
 
-def _white_of_floats(path: Path, source: Source) -> float:
+def _white_of_floats(path: Path, source: PictureSource) -> float:
     """Return 255 for floating-point pictures, unless the first looks as if 1 were white."""
     _, picture = next(source.pictures())
     if 0 < float(np.max(picture)) <= 1.0:

@@ -68,7 +68,7 @@ def _decoded(codes: NDArray, tone: Tone) -> NDArray:
     )
 
 
-class Source(Protocol):
+class PictureSource(Protocol):
     """Moving pictures on disk."""
 
     @property

@@ -35,7 +35,7 @@ from evnlos.data.simulate import (
 from evnlos.data.store import Dataset
 from evnlos.errors import ConfigError
 from evnlos.events.surface_tensors import time_surface_tensors
-from evnlos.optics import Wall
+from evnlos.optics import Irradiance
 from evnlos.scene import Scene
 from evnlos.threads import cores
 from evnlos.types import derive_seed
@@ -107,7 +107,7 @@ def bytes_of_a_wall(config: Simulation) -> int:
 
 
 def _samples(
-    drawn: Simulation, scene: Scene, wall: Wall, events: EventTensors, name: str, config: Simulation
+    drawn: Simulation, scene: Scene, wall: Irradiance, events: EventTensors, name: str, config: Simulation
 ) -> DeviceSamples:
     """Return an object's maps, given its events."""
     sampling, device = config.sampling, events.t_us.device

@@ -19,7 +19,7 @@ from .plug_and_play import DenoiserTraining as DenoiserTraining
 from .plug_and_play import ResidualDenoiser as ResidualDenoiser
 from .plug_and_play import plug_and_play as plug_and_play
 from .plug_and_play import train_denoiser as train_denoiser
-from .problem import Background as Background
+from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
 from .problem import block_folds as block_folds
 from .sequence import NormalEquations as NormalEquations

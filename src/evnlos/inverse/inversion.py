@@ -16,7 +16,7 @@ import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import Gradient, Solution
-from evnlos.inverse.problem import Background
+from evnlos.inverse.problem import BackgroundModel
 from evnlos.inverse.tikhonov import Rule, tikhonov, tikhonov_cv_error
 from evnlos.inverse.total_variation import total_variation
 from evnlos.optics import Lambert, MatrixTransport, Occluder, Patches, light_transport_matrix
@@ -258,9 +258,11 @@ class Inversion:
         Raises:
             ConfigError: The rule is not one of the solver's.
         """
-        nuisance = Background(self.degree)
+        background_model = BackgroundModel(self.degree)
         if regularization is None and rule == "discrepancy" and noise_sigma is None:
-            first = tikhonov(self.operator, self.measurement, prior=Gradient("dark"), nuisance=nuisance)
+            first = tikhonov(
+                self.operator, self.measurement, prior=Gradient("dark"), background_model=background_model
+            )
             noise_sigma = first.noise_sigma
         if solver == "tikhonov":
             return tikhonov(
@@ -270,7 +272,7 @@ class Inversion:
                 rule=rule,
                 noise_sigma=noise_sigma,
                 prior=Gradient("dark"),
-                nuisance=nuisance,
+                background_model=background_model,
             )
         if regularization is None and rule == "gcv":
             raise ConfigError("rule 'gcv' needs a linear solver; with 'tv' use 'cv', 'discrepancy' or a number")
@@ -280,7 +282,7 @@ class Inversion:
             regularization,
             rule="discrepancy" if rule == "discrepancy" else "cv",
             noise_sigma=noise_sigma,
-            nuisance=nuisance,
+            background_model=background_model,
         )
 
 
@@ -334,6 +336,8 @@ def background_errors(operator: MatrixTransport, measurement: torch.Tensor) -> t
     rows = halved(operator.matrix.mT.reshape(cells, *operator.shape)).flatten(1).mT
     coarse = MatrixTransport(rows, operator.source, (height, width))
     return tuple(
-        tikhonov_cv_error(coarse, halved(measurement), prior=Gradient("dark"), nuisance=Background(degree))
+        tikhonov_cv_error(
+            coarse, halved(measurement), prior=Gradient("dark"), background_model=BackgroundModel(degree)
+        )
         for degree in DEGREES
     )

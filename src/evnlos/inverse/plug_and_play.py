@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import LinearOperator, Solution, conjugate_gradient
-from evnlos.inverse.problem import Background, Problem
+from evnlos.inverse.problem import BackgroundModel, Problem
 from evnlos.types import derive_seed
 
 
@@ -140,7 +140,7 @@ def plug_and_play(
     denoiser: Denoiser,
     rho: float,
     *,
-    nuisance: Background | None = None,
+    background_model: BackgroundModel | None = None,
     weight: torch.Tensor | None = None,
     start: torch.Tensor | None = None,
     tolerance: float = 1e-4,
@@ -159,7 +159,7 @@ def plug_and_play(
             sigma / sqrt(rho), sigma the noise of W y.
         rho: Weight of agreement with the denoised image, squared unit of W A, above 0; scaled with the inverse
             square of the denoiser's noise level.
-        nuisance: Background to project out.
+        background_model: Background to project out.
         weight: Factor on each sample's residual [H, W], one over its noise.
         start: First guess of z; None is black.
         tolerance: |x - z| and the change of z over |z|, at which to stop.
@@ -181,7 +181,7 @@ def plug_and_play(
     """
     if not (math.isfinite(rho) and rho > 0):
         raise ConfigError(f"rho is {rho}; give a positive number")
-    problem = Problem(operator, measurement, nuisance, weight)
+    problem = Problem(operator, measurement, background_model, weight)
     data = problem.adjoint(problem.target)
     z = torch.zeros_like(data) if start is None else start.to(data)
     x, u = z, torch.zeros_like(z)

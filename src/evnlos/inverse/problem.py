@@ -19,7 +19,7 @@ _MAX_DEGREE = 12
 
 
 @dataclass(frozen=True)
-class Background:
+class BackgroundModel:
     """Light that the model does not hold: a polynomial in the wall's coordinates, fitted and thrown away.
 
     All solvers project it out of measurement and operator, so they see only what no such polynomial explains.
@@ -33,7 +33,7 @@ class Background:
         ConfigError: A degree outside that range.
 
     Example:
-        >>> Background(degree=2).polynomials((4, 5)).shape
+        >>> BackgroundModel(degree=2).polynomials((4, 5)).shape
         torch.Size([6, 4, 5])
     """
 
@@ -68,7 +68,7 @@ class Problem:
     Args:
         operator: A, linear with an adjoint.
         measurement: y, real [..., H, W]; leading axes are a batch (colours, frames).
-        nuisance: Background to project out.
+        background_model: Background to project out.
         weight: Factor on each sample's residual, [H, W], 0 or more, one over its noise; 0 leaves a sample out.
 
     Raises:
@@ -78,7 +78,7 @@ class Problem:
 
     operator: LinearOperator
     measurement: torch.Tensor
-    nuisance: Background | None = None
+    background_model: BackgroundModel | None = None
     weight: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -103,7 +103,7 @@ class Problem:
         """Number of samples that count, less the background's coefficients."""
         counted = self.measurement[..., 0, 0].new_ones(self.measurement.shape[-2:])
         counted = counted if self.weight is None else self.weight
-        degree = -1 if self.nuisance is None else self.nuisance.degree
+        degree = -1 if self.background_model is None else self.background_model.degree
         return int((counted > 0).sum()) - (degree + 1) * (degree + 2) // 2
 
     @cached_property
@@ -150,7 +150,7 @@ class Problem:
         """
         rest = self._weigh(self.measurement - self.operator(scene)).flatten(-2)  # [..., H W]
         out = held.flatten()
-        if self.nuisance is not None:
+        if self.background_model is not None:
             columns = self._columns
             known = torch.linalg.lstsq(
                 columns[~out], rest[..., ~out].reshape(-1, int((~out).sum())).mT
@@ -160,13 +160,13 @@ class Problem:
 
     @cached_property
     def _basis(self) -> torch.Tensor | None:
-        return None if self.nuisance is None else torch.linalg.qr(self._columns).Q  # [H W, K]
+        return None if self.background_model is None else torch.linalg.qr(self._columns).Q  # [H W, K]
 
     @cached_property
     def _columns(self) -> torch.Tensor:
-        assert self.nuisance is not None
+        assert self.background_model is not None
         shape = self.measurement.shape
-        columns = self.nuisance.polynomials((shape[-2], shape[-1])).to(self.measurement)
+        columns = self.background_model.polynomials((shape[-2], shape[-1])).to(self.measurement)
         return self._weigh(columns).flatten(1).mT  # [H W, K]
 
     def _weigh(self, image: torch.Tensor) -> torch.Tensor:

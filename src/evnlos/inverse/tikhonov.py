@@ -21,7 +21,7 @@ from evnlos.inverse.operators import (
     normal_matrix,
     operator_norm,
 )
-from evnlos.inverse.problem import Background, Choice, Problem, block_folds, cross_validate
+from evnlos.inverse.problem import BackgroundModel, Choice, Problem, block_folds, cross_validate
 from evnlos.types import derive_seed
 
 _GRID = np.logspace(-14, 2, 129)
@@ -165,7 +165,7 @@ def tikhonov(
     rule: Rule = "gcv",
     noise_sigma: float | None = None,
     prior: LinearOperator | None = None,
-    nuisance: Background | None = None,
+    background_model: BackgroundModel | None = None,
     weight: torch.Tensor | None = None,
     method: Literal["svd", "cg"] = "svd",
     tolerance: float = 1e-8,
@@ -186,7 +186,7 @@ def tikhonov(
             errors that neighbours share.
         noise_sigma: Standard deviation of a weighted sample, for "discrepancy".
         prior: L; None is the identity. `Gradient("dark")` asks for smooth images.
-        nuisance: Background to project out.
+        background_model: Background to project out.
         weight: Factor on each sample's residual [H, W], one over its noise.
         method: "svd" makes the matrix (every regularization is then free), "cg" uses products only.
         tolerance: Relative residual of the normal equations at which "cg" stops.
@@ -210,7 +210,7 @@ def tikhonov(
                 [1., 1.]])
     """
     _check(regularization, rule, noise_sigma, method)
-    problem = Problem(operator, measurement, nuisance, weight)
+    problem = Problem(operator, measurement, background_model, weight)
     if method == "cg":
         return _by_products(problem, regularization, rule, noise_sigma, prior, tolerance, max_iterations, seed)
     spectrum = Spectrum(problem, prior)
@@ -233,7 +233,7 @@ def tikhonov_cv_error(
     measurement: torch.Tensor,
     *,
     prior: LinearOperator | None = None,
-    nuisance: Background | None = None,
+    background_model: BackgroundModel | None = None,
     weight: torch.Tensor | None = None,
 ) -> float:
     """Return the smallest mean squared error of left-out blocks over all regularization: to compare models by.
@@ -241,7 +241,7 @@ def tikhonov_cv_error(
     It is in the squared unit of W y, and comparable between operators, priors and backgrounds for one
     measurement and weight. Arguments as in `tikhonov`.
     """
-    problem = Problem(operator, measurement, nuisance, weight)
+    problem = Problem(operator, measurement, background_model, weight)
     matrix, _ = standard_form(problem, prior)
     small = matrix @ matrix.mT if matrix.shape[0] < matrix.shape[1] else matrix.mT @ matrix
     return min(_cross_validated(problem, prior, float(torch.linalg.eigvalsh(small)[-1])).errors)

@@ -18,7 +18,7 @@ import torch
 
 from evnlos.errors import ConfigError
 from evnlos.inverse.operators import Gradient, LinearOperator, Solution, normal_matrix, operator_norm
-from evnlos.inverse.problem import Background, Problem, block_folds, cross_validate
+from evnlos.inverse.problem import BackgroundModel, Problem, block_folds, cross_validate
 
 Box = tuple[float, float]
 CHECK_EVERY = 10
@@ -214,7 +214,7 @@ def total_variation(
     noise_sigma: float | None = None,
     box: Box = (0.0, math.inf),
     border: Literal["free", "dark"] = "free",
-    nuisance: Background | None = None,
+    background_model: BackgroundModel | None = None,
     weight: torch.Tensor | None = None,
     method: Literal["splitting", "primal-dual"] = "splitting",
     start: torch.Tensor | None = None,
@@ -239,7 +239,7 @@ def total_variation(
             hands back will do.
         box: Lowest and highest brightness; infinite where there is no bound.
         border: "free", or "dark" where the image is known to be black outside.
-        nuisance: Background to project out.
+        background_model: Background to project out.
         weight: Factor on each sample's residual [H, W], one over its noise.
         method: "splitting" or "primal-dual".
         start: First guess [..., h, w]; None is black.
@@ -269,7 +269,7 @@ def total_variation(
         raise ConfigError(f"rule is {rule!r}; give 'cv' or 'discrepancy'")
     if method not in ("splitting", "primal-dual"):
         raise ConfigError(f"method is {method!r}; give 'splitting' or 'primal-dual'")
-    problem = Problem(operator, measurement, nuisance, weight)
+    problem = Problem(operator, measurement, background_model, weight)
     settings = Settings(box, Gradient(border), tolerance, max_iterations)
     if regularization is None:
         start, regularization = _chosen(problem, settings, method, rule, noise_sigma)

@@ -72,7 +72,7 @@ class Chunk:
     restart: bool = False
 
 
-class Source(Protocol):
+class EventSource(Protocol):
     """Where events come from, as they come."""
 
     name: str

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.live.chunk import ChunkQueue, Clock, Source, SystemClock
+from evnlos.live.chunk import ChunkQueue, Clock, EventSource, SystemClock
 from evnlos.live.engine import Engine, Picture
 
 _KEPT = 100_000  # pictures whose times are kept: half an hour at 50 a second, 6 MB
@@ -40,7 +40,7 @@ class RunStatistics:
         queue: The queue behind it.
     """
 
-    def __init__(self, source: Source, queue: ChunkQueue) -> None:
+    def __init__(self, source: EventSource, queue: ChunkQueue) -> None:
         self._source, self._queue = source, queue
         self._times: deque[tuple[float, ...]] = deque(maxlen=_KEPT)
         self._recent: deque[tuple[float, int, float]] = deque(maxlen=_RECENT)
@@ -174,7 +174,7 @@ class Run:
     """
 
     def __init__(
-        self, source: Source, engine: Engine, pace: RateOptions = RateOptions(), clock: Clock | None = None
+        self, source: EventSource, engine: Engine, pace: RateOptions = RateOptions(), clock: Clock | None = None
     ) -> None:
         if engine.needs_frames and not source.has_frames:
             raise DataError(

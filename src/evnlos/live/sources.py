@@ -19,7 +19,7 @@ from evnlos.data.cleaning import FixedPattern
 from evnlos.errors import ConfigError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording
-from evnlos.live.chunk import Chunk, Clock, Source, SystemClock
+from evnlos.live.chunk import Chunk, Clock, EventSource, SystemClock
 from evnlos.live.growing_file import GrowingFile
 from evnlos.live.udp import UdpSource
 from evnlos.types import Events
@@ -185,7 +185,9 @@ class SourceOptions:
         return self.idle or None
 
 
-def open_live(source: str, how: SourceOptions = SourceOptions(), pattern: FixedPattern | None = None) -> Source:
+def open_live(
+    source: str, how: SourceOptions = SourceOptions(), pattern: FixedPattern | None = None
+) -> EventSource:
     """Return a source of events by its name.
 
     Args:

@@ -21,14 +21,15 @@ from evnlos.optics.reflection import (
     tpsf_profile,
     tpsf_truncation,
 )
-from evnlos.optics.view import View, Viewing
-from evnlos.optics.wall import SlidingWall, Wall
+from evnlos.optics.view import View, ViewOperator
+from evnlos.optics.wall import Irradiance, SlidingWall
 
 __all__ = [
     "GGX",
     "Brdf",
     "Diffraction",
     "DiffuseReflection",
+    "Irradiance",
     "Lambert",
     "LightTransport",
     "LinearTransport",
@@ -39,8 +40,7 @@ __all__ = [
     "SlidingWall",
     "Transport",
     "View",
-    "Viewing",
-    "Wall",
+    "ViewOperator",
     "angular_spectrum",
     "blur_radius_px",
     "coarsest_keyframe_step_m",

@@ -169,7 +169,7 @@ class View:
 _MAX_SAMPLES = 8  # per pixel and axis
 
 
-class Viewing(LinearTransport):
+class ViewOperator(LinearTransport):
     """Bilinear sampling of a wall plane at the points that a camera's pixels see, averaged over each pixel.
 
     Outside the plane the wall is dark. With `samples` = 1 a pixel is its centre; more samples average over its

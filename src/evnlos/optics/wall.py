@@ -82,7 +82,7 @@ def slide(band: torch.Tensor, starts: torch.Tensor, taps: torch.Tensor, width: i
 
 
 @dataclass(frozen=True)
-class Strips:
+class ImageStrips:
     """A sliding wall's light at some instants, of which any pixels can be had without the others.
 
     Args:
@@ -108,9 +108,9 @@ class Strips:
         """Number of instants."""
         return len(self.starts)
 
-    def __getitem__(self, instants: slice) -> Strips:
+    def __getitem__(self, instants: slice) -> ImageStrips:
         """Return the light at some of the instants."""
-        return Strips(self.band, self.starts[instants], self.taps[instants], self.gain, self.ambient)
+        return ImageStrips(self.band, self.starts[instants], self.taps[instants], self.gain, self.ambient)
 
     def write(self, first: int, out: NDArray[np.float32], white: float = 1.0) -> None:
         """Write the irradiance of the pixels first, first + 1, ..., counted along the rows, to `out` [T, N].
@@ -128,7 +128,7 @@ _TOGETHER_PX = 1 << 25  # pixels that a device renders in one operation
 
 
 @runtime_checkable
-class Wall(Protocol):
+class Irradiance(Protocol):
     """The camera's image of the wall at every instant, before the sensor: no noise, no rounding."""
 
     @property
@@ -239,7 +239,7 @@ class SlidingWall:
                 image[k] = frame(x, y).clamp(min=0) * self.gain + self.ambient
         return image.reshape((*times.shape, *self.shape))
 
-    def strips(self, t_s: ArrayLike) -> Strips | None:
+    def strips(self, t_s: ArrayLike) -> ImageStrips | None:
         """Return the light at times `t_s` [T] for any pixels; None where only whole images can be rendered.
 
         It can be had where the view is affine, the wall lies in main memory and the target moves along the
@@ -322,7 +322,7 @@ class SlidingWall:
             light = slide(self._rows(float(down[first])), starts[some], taps[some], self.shape[1])
             image[some] = light.clamp_(min=0).mul_(self.gain).add_(self.ambient)
 
-    def _strips(self, positions_m: NDArray[np.float64]) -> Strips | None:
+    def _strips(self, positions_m: NDArray[np.float64]) -> ImageStrips | None:
         """Return the light with the target at positions [T, 2], unless they differ across the rows."""
         across, down = self._pixels(positions_m)
         if len(down) and float(np.ptp(down)) > _SAME_ROWS_PX:
@@ -331,7 +331,7 @@ class SlidingWall:
         shifts = [_taps(-shift) for shift in across.tolist()]
         starts = np.array([whole - 1 - self._low[0] for whole, _ in shifts], np.int64)
         taps = np.array([weights for _, weights in shifts], np.float32).reshape(-1, 4)
-        return Strips(band.numpy(), starts, taps, self.gain, self.ambient.numpy())
+        return ImageStrips(band.numpy(), starts, taps, self.gain, self.ambient.numpy())
 
     def _pixels(self, positions_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return how far positions [T, 2] move the image, pixels along the rows and across them."""

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
 from evnlos.errors import ConfigError
-from evnlos.optics import LinearTransport, Wall
+from evnlos.optics import Irradiance, LinearTransport
 from evnlos.optics.wall import ambient_plane
 from evnlos.registry import Kinded, Registry
 from evnlos.scene import Scene
@@ -146,7 +146,7 @@ class Setup(Kinded, ABC):
     None = the event camera chooses its steps from the motion."""
 
     @abstractmethod
-    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> Wall:
+    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> Irradiance:
         """Return the irradiance on the cameras' pixels while the scene's target moves, at any instant.
 
         Args:

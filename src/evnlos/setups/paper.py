@@ -16,7 +16,7 @@ from evnlos.optics import (
     SlidingWall,
     Transport,
     View,
-    Viewing,
+    ViewOperator,
     blur_radius_px,
     fresnel_number,
     sampling_limit_m,
@@ -149,7 +149,7 @@ class PaperSetup(Setup):
         fine = min(_FINEST, max(1, math.ceil(_SAMPLES_PER_RHO * plane.pitch_m / self.tpsf_length_m)))
         samples = Plane(plane.height * fine, plane.width * fine, plane.pitch_m / fine, plane.center_m)
         reflection = DiffuseReflection(samples, self._kernel(samples.pitch_m))
-        view = Viewing(reflection.output, self.view(self.shape))
+        view = ViewOperator(reflection.output, self.view(self.shape))
         return _LinearPart(plane, fine, reflection, view, self.gain)
 
     def parameters(self) -> tuple[Parameter, ...]:
@@ -230,7 +230,7 @@ class _LinearPart(LinearTransport):
     """Diffuse reflection and view of cells that are drawn on finer samples."""
 
     def __init__(
-        self, plane: Plane, fine: int, reflection: DiffuseReflection, view: Viewing, gain: float
+        self, plane: Plane, fine: int, reflection: DiffuseReflection, view: ViewOperator, gain: float
     ) -> None:
         self.source = plane
         self._fine, self._gain = fine, gain

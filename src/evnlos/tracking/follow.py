@@ -15,7 +15,7 @@ from evnlos.data.capture import Capture
 from evnlos.data.cleaning import FixedPattern
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import Background
+from evnlos.inverse import BackgroundModel
 from evnlos.setups import Setup
 from evnlos.tracking.motion_fit import fit_motion
 from evnlos.tracking.registration import EventVelocity, Registration, event_velocity, register
@@ -59,7 +59,7 @@ def static_light(frames: NDArray, degree: int = 2) -> NDArray[np.float64]:
         DataError: Fewer than a tenth of the pixels are free of the object.
     """
     shape = (int(frames.shape[1]), int(frames.shape[2]))
-    columns = Background(degree).polynomials(shape).numpy().reshape(-1, shape[0] * shape[1]).T  # [P, K]
+    columns = BackgroundModel(degree).polynomials(shape).numpy().reshape(-1, shape[0] * shape[1]).T  # [P, K]
     middle = np.median(frames, axis=0).ravel().astype(np.float64)
     swing = frames.max(axis=0).ravel() - middle
     used = swing <= np.quantile(swing, 0.5)

@@ -102,7 +102,7 @@ class Batch(NamedTuple):
 Samples = tuple[Tensor, Tensor, NDArray[np.str_]]
 
 
-class Source(Protocol):
+class BatchSource(Protocol):
     """Batches of any epoch, always the same for the same seed and epoch."""
 
     steps: int
@@ -122,7 +122,7 @@ class Source(Protocol):
         """
         ...
 
-    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> Source:
+    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> BatchSource:
         """Return the source of what a network learns from, where these are single time steps.
 
         Arguments as in `Reconstructor.training_samples`.
@@ -207,7 +207,7 @@ class DiskSource:
         )
         return inputs, truth, self.samples.names[chosen.numpy()]
 
-    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> Source:
+    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> BatchSource:
         """Return the source of what a network learns from."""
         if not isinstance(self.samples, NlosDataset):
             return self
@@ -290,7 +290,7 @@ class SimulatedSource:
         inputs, truth = (torch.cat(parts).cpu() for parts in zip(*made, strict=True))
         return inputs, truth[:, 0], np.repeat(names, [len(seen) for seen, _ in made])
 
-    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> Source:
+    def for_network(self, network: Reconstructor, augmentations: int, *, is_new: bool) -> BatchSource:
         """Return this: a network of single time steps learns from them as they come."""
         return self
 
@@ -312,7 +312,7 @@ def with_mirrored(subset: Callable[[int], Samples]) -> Callable[[int], Samples]:
     """Return what draws samples as `subset` does, half of them being the other half upside down.
 
     Args:
-        subset: Returns at most so many samples, as `Source.subset`.
+        subset: Returns at most so many samples, as `BatchSource.subset`.
     """
 
     def both(count: int) -> Samples:

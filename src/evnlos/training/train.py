@@ -29,10 +29,10 @@ from evnlos.training.settings import (
     save_checkpoint,
 )
 from evnlos.training.source import (
+    BatchSource,
     DiskSource,
     ProcessGroup,
     SimulatedSource,
-    Source,
     half_mirrored,
     process_group,
     with_mirrored,
@@ -241,7 +241,9 @@ def _check_data(dataset: Dataset, network: Reconstructor) -> None:
         )
 
 
-def _source(dataset: Dataset, network: Reconstructor, settings: Training, processes: ProcessGroup) -> Source:
+def _source(
+    dataset: Dataset, network: Reconstructor, settings: Training, processes: ProcessGroup
+) -> BatchSource:
     """Return where the samples of single time steps come from."""
     if isinstance(dataset, LiveDataset):
         return SimulatedSource(dataset, network.modality, settings.batch_size, settings.seed, processes)

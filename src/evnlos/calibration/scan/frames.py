@@ -36,7 +36,7 @@ _MOST_BAD = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class ScanLight:
     """What the camera received from each pattern.
 
     Args:
@@ -62,7 +62,7 @@ class Light:
 
 def read_light(
     info: ScanInfo, scan_frames: list[ScanFrame], read: Reader, shape: tuple[int, int] | None = None
-) -> Light:
+) -> ScanLight:
     """Read all pictures, one at a time.
 
     Args:
@@ -126,7 +126,7 @@ def read_light(
         squares = sum(((np.stack(s) - means[r]).astype(np.float64) ** 2).sum(axis=0) for r, s in stacks.items())
         variance = np.asarray(squares) / residuals
     dark = np.stack(list(means.values())).mean(axis=0)
-    return Light(lit, dark, variance, len(darks), bad, shape, linearity, white)
+    return ScanLight(lit, dark, variance, len(darks), bad, shape, linearity, white)
 
 
 def _levels(image: NDArray, white: int, shape: tuple[int, int]) -> NDArray[np.float32]:

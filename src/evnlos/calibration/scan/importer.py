@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.calibration.scan.folder import ScanInfo, frame_reader, read_scan_frames, read_scan_info
-from evnlos.calibration.scan.frames import Agreement, Light, compare_repeats, read_light
+from evnlos.calibration.scan.frames import Agreement, ScanLight, compare_repeats, read_light
 from evnlos.calibration.scan.matrix import Denoising, PsfCheck, choose_denoising, denoised, matrix_from_psf
 from evnlos.errors import ConfigError, DataError
 from evnlos.setups.files import About, Measurement
@@ -170,7 +170,7 @@ def import_scan(folder: str | Path, settings: ScanImport | None = None) -> ScanR
     )
 
 
-def frame_variance(light: Light) -> NDArray[np.float64]:
+def frame_variance(light: ScanLight) -> NDArray[np.float64]:
     """Return the variance of a frame at each pixel, float64 [pixels]: between repeats, or of the dark frames.
 
     The patterns of a repeat share its dark frame, so what all of them have in common is no noise of a frame.
@@ -215,7 +215,7 @@ def fill_bad(
 
 
 def _denoise(
-    info: ScanInfo, light: Light, raw: torch.Tensor, sigma: NDArray[np.float64]
+    info: ScanInfo, light: ScanLight, raw: torch.Tensor, sigma: NDArray[np.float64]
 ) -> tuple[Denoising, torch.Tensor]:
     weight = np.where(light.bad, 0.0, 1 / np.maximum(sigma, max(float(np.median(sigma)) * 1e-3, 1e-12)))
     half = info.repeats // 2
@@ -263,7 +263,7 @@ def _motion(matrix: torch.Tensor, plane: Plane, shape: tuple[int, int], check: P
     return found if check is None else max(found, float(np.linalg.norm(np.array(check.image_px_per_m), 2)))
 
 
-def _first_warnings(info: ScanInfo, light: Light) -> list[str]:
+def _first_warnings(info: ScanInfo, light: ScanLight) -> list[str]:
     found = []
     if info.repeats < 2:
         found.append("one repeat: the noise is that of the dark frames alone, and nothing can be denoised")

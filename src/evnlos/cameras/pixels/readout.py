@@ -21,7 +21,7 @@ import torch
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_camera import Wall
+from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.event_model import (
     EVENT_MODELS,
     CrossingLaw,
@@ -407,7 +407,7 @@ class FlickeringWall:
         ConfigError: A value outside its range.
     """
 
-    wall: Wall
+    wall: Irradiance
     contrast: float = 0.2
     frequency_hz: float = 100.0
 

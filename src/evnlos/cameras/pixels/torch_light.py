@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.cameras.event_camera import Wall
+from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.light import WHITE_DN
 from evnlos.errors import DataError
 
@@ -68,7 +68,7 @@ class WallLight:
 
     dtype = torch.float32
 
-    def __init__(self, walls: Sequence[Wall], times_s: NDArray[np.float64]) -> None:
+    def __init__(self, walls: Sequence[Irradiance], times_s: NDArray[np.float64]) -> None:
         height, width = walls[0].shape
         self._walls, self._times_s = walls, times_s
         self.shape: tuple[int, int, int, int] = (len(walls), len(times_s), height, width)

@@ -35,13 +35,13 @@ from evnlos.events.files.columns import (
     unreadable,
 )
 from evnlos.events.files.raw import RawSource
-from evnlos.events.files.registry import Source, find_format
+from evnlos.events.files.registry import FileSource, find_format
 from evnlos.types import Events
 
 
 def open_source(
     path: Path, on_error: OnError, width: int | None, height: int | None, celex: CelexOptions | None = None
-) -> tuple[Source, ReadReport]:
+) -> tuple[FileSource, ReadReport]:
     """Return an open file and the report that reading it fills."""
     check_on_error(on_error)
     if (width is None) != (height is None):

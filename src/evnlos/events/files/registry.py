@@ -26,7 +26,7 @@ from evnlos.untrusted import open_regular
 _SNIFFED_BYTES = 65_536
 
 
-class Source(Protocol):
+class FileSource(Protocol):
     """An open event file: checked header, events as one set of columns or block by block."""
 
     def read(self) -> Columns:
@@ -54,11 +54,13 @@ class Format:
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[bytes], bool]
-    open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None], Source]
+    open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None], FileSource]
     create: Callable[[Path, Events, Path], Sink] | None = None
 
 
-def _plain(source: Callable[[Path, ReadReport, int | None, int | None], Source]) -> Callable[..., Source]:
+def _plain(
+    source: Callable[[Path, ReadReport, int | None, int | None], FileSource],
+) -> Callable[..., FileSource]:
     """Return an opener that has no use for the options of CeleX-V."""
     return lambda path, report, width, height, _: source(path, report, width, height)
 
