@@ -210,15 +210,15 @@ def config_hash(config: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def differing_keys(ours: dict[str, Any], theirs: dict[str, Any], prefix: str = "") -> list[str]:
-    """Return 'key: theirs -> ours' for every leaf in which two nested mappings differ."""
+def differing_keys(current: dict[str, Any], stored: dict[str, Any], prefix: str = "") -> list[str]:
+    """Return 'key: stored -> current' for every leaf in which two nested mappings differ."""
     found = []
-    for key in sorted(ours.keys() | theirs.keys(), key=str):
-        mine, other = ours.get(key), theirs.get(key)
-        if isinstance(mine, dict) and isinstance(other, dict):
-            found += differing_keys(mine, other, f"{prefix}{key}.")
-        elif mine != other:
-            found.append(f"{prefix}{key}: {other!r} -> {mine!r}")
+    for key in sorted(current.keys() | stored.keys(), key=str):
+        one, other = current.get(key), stored.get(key)
+        if isinstance(one, dict) and isinstance(other, dict):
+            found += differing_keys(one, other, f"{prefix}{key}.")
+        elif one != other:
+            found.append(f"{prefix}{key}: {other!r} -> {one!r}")
     return found
 
 

@@ -133,9 +133,12 @@ class Events:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Events):
             return NotImplemented
-        mine, theirs = self.columns(), other.columns()
-        same_shape = (self.width, self.height) == (other.width, other.height) and mine.keys() == theirs.keys()
-        return same_shape and all(np.array_equal(mine[name], theirs[name]) for name in mine)
+        columns, others = self.columns(), other.columns()
+        same_shape = (self.width, self.height) == (
+            other.width,
+            other.height,
+        ) and columns.keys() == others.keys()
+        return same_shape and all(np.array_equal(columns[name], others[name]) for name in columns)
 
     def __repr__(self) -> str:
         if not len(self):

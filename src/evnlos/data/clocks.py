@@ -177,14 +177,14 @@ def agreement(
     low = np.minimum(place.astype(np.int64), len(clock_us) - 2)
     part = (place - low)[:, None]
     at_edges = sums[low] * (1 - part) + sums[low + 1] * part  # [N, B]
-    ours = np.diff(at_edges, axis=0)[whole]
-    theirs = changes[whole]
-    ours = ours - ours.mean(axis=0)
-    theirs = theirs - theirs.mean(axis=0)
-    norm = np.sqrt((ours**2).sum() * (theirs**2).sum())
+    counted = np.diff(at_edges, axis=0)[whole]
+    seen = changes[whole]
+    counted = counted - counted.mean(axis=0)
+    seen = seen - seen.mean(axis=0)
+    norm = np.sqrt((counted**2).sum() * (seen**2).sum())
     # A chance correlation of few intervals is large: it counts as if spread over all.
     share = np.sqrt(whole.mean())
-    return float((ours * theirs).sum() / norm * share) if norm > 0 else 0.0
+    return float((counted * seen).sum() / norm * share) if norm > 0 else 0.0
 
 
 def _peak(offsets: NDArray[np.int64], scores: NDArray[np.float64]) -> ClockOffset:

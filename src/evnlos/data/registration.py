@@ -37,13 +37,13 @@ def homography_from_points(source: ArrayLike, target: ArrayLike) -> NDArray[np.f
         >>> homography_from_points(corners, [(2 * x + 1, 2 * y) for x, y in corners]).round(6) + 0.0
         array([[2., 0., 1.], [0., 2., 0.], [0., 0., 1.]])
     """
-    ours, theirs = np.asarray(source, float), np.asarray(target, float)
-    if ours.shape != theirs.shape or ours.ndim != 2 or ours.shape[1:] != (2,) or len(ours) < 4:
-        raise DataError(f"points of shapes {ours.shape} and {theirs.shape}; give at least 4 pairs (x, y)")
-    if not (np.isfinite(ours).all() and np.isfinite(theirs).all()):
+    sources, targets = np.asarray(source, float), np.asarray(target, float)
+    if sources.shape != targets.shape or sources.ndim != 2 or sources.shape[1:] != (2,) or len(sources) < 4:
+        raise DataError(f"points of shapes {sources.shape} and {targets.shape}; give at least 4 pairs (x, y)")
+    if not (np.isfinite(sources).all() and np.isfinite(targets).all()):
         raise DataError("a point of the registration is not finite; give pixels")
-    a, b = _normaliser(ours), _normaliser(theirs)
-    p, q = _map(a, ours), _map(b, theirs)
+    a, b = _normaliser(sources), _normaliser(targets)
+    p, q = _map(a, sources), _map(b, targets)
     zero, one = np.zeros(len(p)), np.ones(len(p))
     rows = np.concatenate(
         [

@@ -258,8 +258,8 @@ def check_dataset(dataset: Dataset) -> bool:
     """
     path = dataset.folder / PAGE
     if path.is_file():
-        theirs = read_yaml(path, LONG_YAML)
-        differing = differing_keys(_comparable(_content(dataset)), _comparable(theirs))
+        stored = read_yaml(path, LONG_YAML)
+        differing = differing_keys(_comparable(_content(dataset)), _comparable(stored))
         if differing:
             shown = "; ".join(differing[:6]) + (
                 f"; and {len(differing) - 6} more" if len(differing) > 6 else ""

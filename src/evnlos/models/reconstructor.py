@@ -183,20 +183,20 @@ class Reconstructor(nn.Module, ABC):
         Raises:
             ConfigError: Kind, modality or the size of a layer differ.
         """
-        theirs, ours = dict(other.named_parameters()), dict(self.named_parameters())
+        given, own = dict(other.named_parameters()), dict(self.named_parameters())
         if (other.kind, other.modality.name) != (self.kind, self.modality.name):
             raise ConfigError(
                 f"the weights to start from are of kind {other.kind!r} and see {other.modality.name}; this "
                 f"network is of kind {self.kind!r} and sees {self.modality.name}: give weights like it"
             )
-        unlike = [n for n in ours if n not in theirs or theirs[n].shape != ours[n].shape]
-        if unlike or len(theirs) != len(ours):
+        unlike = [n for n in own if n not in given or given[n].shape != own[n].shape]
+        if unlike or len(given) != len(own):
             raise ConfigError(
                 f"the weights to start from have other layers ({(unlike or ['more of them'])[0]}); give the "
                 "network their width, depth, blocks, shuffle, groups and number of ridges"
             )
-        for name, value in ours.items():
-            value.copy_(theirs[name])
+        for name, value in own.items():
+            value.copy_(given[name])
 
     def reduced(self, rank: int) -> Reconstructor:
         """Return a copy whose closed-form part has fewer components, the strongest.

@@ -300,15 +300,15 @@ def _tell_of_threads(out: Path) -> None:
     if (out / "weights.safetensors").is_file():
         return
     versions = read_yaml(out / "run.yaml", LONG_YAML).get("versions")
-    theirs, ours = versions.get("threads") if isinstance(versions, dict) else None, torch.get_num_threads()
-    if theirs not in (None, ours):
+    stored, threads = versions.get("threads") if isinstance(versions, dict) else None, torch.get_num_threads()
+    if stored not in (None, threads):
         _LOG.warning(
             "warning: %s was begun with %s threads and goes on with %d: the weights will not be the same "
             "to the byte; set OMP_NUM_THREADS=%s for that",
             out,
-            theirs,
-            ours,
-            theirs,
+            stored,
+            threads,
+            stored,
         )
 
 
@@ -320,10 +320,10 @@ def check_run(out: Path, about: dict[str, Any]) -> None:
     """
     path = out / "run.yaml"
     if path.is_file():
-        theirs = migrate("run", read_yaml(path, LONG_YAML))
+        stored = migrate("run", read_yaml(path, LONG_YAML))
         differing = differing_keys(
             {key: about[key] for key in ("settings", "data")},
-            {key: theirs.get(key) for key in ("settings", "data")},
+            {key: stored.get(key) for key in ("settings", "data")},
         )
         if differing:
             raise DataError(
