@@ -1,6 +1,6 @@
 """What is reconstructed from a sequence, by solvers and by networks.
 
-- Which networks look at a sequence: the user's own, or those that come with the package and know its setup.
+- Which networks look at a sequence: the user's own, or the pretrained ones that know its setup.
 - What can be made of a sequence: two classical pictures where the setup is known, and one of each network.
 """
 

@@ -238,7 +238,7 @@ _MOST_NAMED = 8  # of more objects, the worst and the best are named
 
 @dataclass(frozen=True)
 class WeightsCommand:
-    """Show what weights see, how they were trained and on what, or list those that come with the package."""
+    """Show what weights see, how they were trained and on what, or list the pretrained ones."""
 
     weights: Annotated[Path | None, tyro.conf.Positional] = None
     """Weights file, run's folder, or name of published weights; none lists the published ones."""

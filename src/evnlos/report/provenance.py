@@ -53,7 +53,7 @@ class Commands:
         return list(dict.fromkeys([*lines, shlex.join([*words, "--out", "report.html"])]))
 
     def published(self) -> list[str]:
-        """Return the commands behind weights that come with the package, which the report needs not."""
+        """Return the commands behind pretrained weights, which the report does not need."""
         come = [r for r in self._results if r.is_published]
         return list(dict.fromkeys(line for r in come for line in self._trainings(r)))
 
@@ -169,7 +169,7 @@ def provenance_section(
     ]
     if behind := commands.published():
         parts.append(
-            "<p>Weights of these names come with the package; the report needs no training of them. They were "
+            "<p>Weights of these names are pretrained; the report needs no training of them. They were "
             f"trained so:</p>{_pre(chr(10).join(behind))}"
         )
     about: dict[str, Any] = {"dataset": {"name": dataset.folder.resolve().name, "settings": dataset.config}}

@@ -36,7 +36,7 @@ class RunResult:
         evaluation: Pictures and scores on the split.
         log: One record per epoch.
         history: The trainings behind the weights, oldest first.
-        is_published: Whether the weights come with the package, by this name.
+        is_published: Whether the weights are pretrained ones of this name.
     """
 
     name: str
@@ -108,7 +108,7 @@ def _record(line: object) -> dict[str, Any]:
 
 
 def named(run: Path) -> tuple[str, bool]:
-    """Return what weights are called, without folders, and whether they come with the package.
+    """Return what weights are called, without folders, and whether they are pretrained ones.
 
     A run is called by its folder, also where its `weights.safetensors` is given; any other file by its stem.
 
