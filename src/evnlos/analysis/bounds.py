@@ -305,7 +305,7 @@ def row_information(
         block: Rows at a time; the result does not depend on it.
     """
     total = NormalEquations.empty(light.right.shape[2] - 1)
-    for part, rows in record.blocks(light, levels, block):
+    for part, rows, _ in record.blocks(light, levels, block):
         counts = np.flatnonzero(weight[part] > 0)
         group = 2 * record.pixel[part][counts] + (record.sign[part][counts] > 0)
         counts = counts[np.argsort(group, kind="stable")]

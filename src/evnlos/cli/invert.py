@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import tyro
 
+from evnlos.cli.parsing import say
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 
@@ -46,6 +47,10 @@ class InvertCommand:
     """Captures: columns to which frames are reduced, pixels."""
     subsets: int = 1
     """Captures: choices of so many positions to average the scores over."""
+    evidence: Annotated[Literal["frames", "events", "both"] | None, tyro.conf.arg(name="from")] = None
+    """Captures: estimate the target from these by one likelihood of the whole sequence and a Gaussian prior of
+    handwriting, with the uncertainty of each cell; none = the solvers, which take frames. Events need the
+    thresholds and the optics of this very sensor: it is said where they do not fit."""
     solver: Literal["all", "tikhonov", "tv"] = "all"
     """Smooth (`tikhonov`), sharp and not below 0 (`tv`), or both and, as a control, without the occluders."""
     regularization: str = "cv"
@@ -154,6 +159,9 @@ class InvertCommand:
         from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
+        if self.evidence is not None:
+            self._estimate(setup, self.evidence)
+            return
         regularization: dict[str, float | None] = {"tikhonov": REGULARIZATION_TIKHONOV, "tv": REGULARIZATION_TV}
         if self.regularization == "gcv" and self.solver != "tikhonov":
             raise ConfigError(
@@ -187,6 +195,24 @@ class InvertCommand:
         arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
         _save_arrays(self.out, arrays)
         print_sequence(found, self.json)
+
+    def _estimate(self, setup: Path, evidence: Literal["frames", "events", "both"]) -> None:
+        from evnlos.cli.invert_sequences import estimate_captures, sequence_doubts, sequence_text
+        from evnlos.plot.results import draw_inversion
+
+        if self.positions or self.track or self.solver != "all":
+            raise ConfigError(
+                "--from takes whole sequences of known motion; leave --positions, --track, --solver"
+            )
+        found, pictures = estimate_captures(self.files, setup, evidence, self.pattern)
+        for doubt in sequence_doubts(found["rows"]):
+            say(f"warning: {doubt}")
+        found["picture"] = str(
+            draw_inversion(self.out, [(name, image[None]) for name, image in pictures.items()])
+        )
+        arrays: dict[str, Any] = {name.replace(" ", "_"): image.numpy() for name, image in pictures.items()}
+        _save_arrays(self.out, arrays)
+        print(json.dumps(found) if self.json else sequence_text(found))
 
 
 def _save_arrays(picture: Path, arrays: dict[str, Any]) -> None:

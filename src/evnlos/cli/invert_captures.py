@@ -102,7 +102,7 @@ def invert_captures(
                     found = _solve(problem, images, solver, options.regularization[solver])
                     for member, image in zip(members, found, strict=True):
                         name = captures[member].name
-                        db = _score(captures[member], image, size, motion)
+                        db = score(captures[member], image, size, motion)
                         rows.append({"capture": name, "positions": count, "solver": solver, "psnr_db": db})
                         pictures[f"{name}_{solver}_{count}"] = image
     figures = {"setup": str(options.setup), "captures": [c.name for c in captures], "rows": rows}
@@ -177,7 +177,15 @@ def _target_size_m(capture: Capture, tracked: bool) -> float:
     return 1.25 * size if tracked else size
 
 
-def _score(capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]) -> float | None:
+def score(capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]) -> float | None:
+    """Return the PSNR of a plate [cells, cells] on the standard sample, dB; None where the truth is unknown.
+
+    Args:
+        capture: The capture.
+        image: The plate.
+        size_m: Its side, metres.
+        motion: Its centre at the frames 1, 2, ..., [N, 2], metres.
+    """
     scene = capture.scene
     if scene is None:
         return None

@@ -1,5 +1,8 @@
 """Names of `evnlos.inverse`; `__init__.py` reads this list."""
 
+from .event_likelihood import LikelihoodSettings as LikelihoodSettings
+from .event_likelihood import SequenceEstimate as SequenceEstimate
+from .event_likelihood import estimate_sequence as estimate_sequence
 from .event_record import EventRecord as EventRecord
 from .event_record import Levels as Levels
 from .event_record import levels_of as levels_of
@@ -22,6 +25,7 @@ from .plug_and_play import train_denoiser as train_denoiser
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
 from .problem import block_folds as block_folds
+from .sequence import FrameTerm as FrameTerm
 from .sequence import NormalEquations as NormalEquations
 from .sequence import PatternPrior as PatternPrior
 from .sequence import SequenceLight as SequenceLight

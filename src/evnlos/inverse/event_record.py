@@ -110,10 +110,13 @@ class EventRecord:
         change = level - level[self.origin] + levels.fall[self.pixel] * (self.t_s - self.t_s[self.origin])
         return np.where(self.origin >= 0, change, np.nan)
 
-    def blocks(self, light: SequenceLight, levels: Levels, most: int = _BLOCK) -> Iterator[tuple[slice, Array]]:
-        """Yield slices of whole pixels and the derivatives of their changes by the coefficients, [n, k].
+    def blocks(
+        self, light: SequenceLight, levels: Levels, most: int = _BLOCK
+    ) -> Iterator[tuple[slice, Array, Array]]:
+        """Yield slices of whole pixels, and derivatives of changes and of rates by the coefficients, [n, k].
 
-        The filter counts as a delay there: d P(t) = d L(t - 1 / w).
+        The filter counts as a delay there: d P(t) = d L(t - 1 / w). A rate is that between two nodes of the
+        light.
 
         Args:
             light: The light.
@@ -123,10 +126,16 @@ class EventRecord:
         for block in group_blocks(self.pixel, most):
             pixel, t_s = self.pixel[block], self.t_s[block]
             then = t_s - light.at(levels.lag_s, pixel, t_s)
-            rows = light.rows(pixel, then) * light.at(levels.slope, pixel, then)[:, None]
+            node, share = light.place(then)
+            before, after = light.ends(pixel, then)
+            slope = light.at(levels.slope, pixel, then)
+            rows = ((1 - share) * slope)[:, None] * before + (share * slope)[:, None] * after
             origin = self.origin[block]
             rows -= np.where(origin[:, None] >= 0, rows[np.maximum(origin - block.start, 0)], 0.0)
-            yield block, rows
+            step = light.times_s[1] - light.times_s[0]
+            rates = (levels.slope[pixel, node + 1] / step)[:, None] * after
+            rates -= (levels.slope[pixel, node] / step)[:, None] * before
+            yield block, rows, rates
 
 
 def record_of(

@@ -2,6 +2,7 @@
 
 - A Gaussian prior over targets: mean target, and the patterns in which targets differ most.
 - The light of a moving target on every pixel at every instant: linear in the prior's coefficients, low rank.
+- What frames say of it, summed once.
 - Normal equations of rows that share an unknown offset by group: what thresholds or a fixed pattern leave.
 """
 
@@ -10,13 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
+from evnlos.cameras import FrameCamera
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.measurements import handwritten_targets
 from evnlos.inverse.sequence_problem import SequenceOperator, strip_of
@@ -136,15 +138,27 @@ class SequenceLight:
 
     def rows(self, pixel: NDArray[np.int64], t_s: Array) -> Array:
         """Return the derivative of the light of pixels [N] at instants [N] by the coefficients, [N, k]."""
-        node, share = self.place(t_s)
-        found = np.empty((len(pixel), self.right.shape[2] - 1))
+        share = self.place(t_s)[1][:, None]
+        before, after = self.ends(pixel, t_s)
+        return (1 - share) * before + share * after
+
+    def ends(self, pixel: NDArray[np.int64], t_s: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the same at the nodes before and after, [N, k] both, in single precision."""
+        node, _ = self.place(t_s)
+        left, right = self._single
+        size = (len(pixel), right.shape[2])
+        before, after = np.empty(size, np.float32), np.empty(size, np.float32)
         order = np.argsort(node, kind="stable")
         starts = np.flatnonzero(np.diff(node[order], prepend=-1))
         for mine in np.split(order, starts[1:]) if len(order) else []:
-            k = node[mine[0]]
-            left, part = self.left[pixel[mine]], share[mine, None]
-            found[mine] = (left * (1 - part)) @ self.right[k, :, 1:] + (left * part) @ self.right[k + 1, :, 1:]
-        return found
+            k, these = node[mine[0]], left[pixel[mine]]
+            before[mine], after[mine] = these @ right[k], these @ right[k + 1]
+        return before, after
+
+    @cached_property
+    def _single(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The factors in single precision, the mean plate left out: what many rows are made of."""
+        return self.left.astype(np.float32), np.ascontiguousarray(self.right[:, :, 1:], np.float32)
 
 
 def sequence_light(
@@ -283,6 +297,51 @@ class NormalEquations:
         share = spread**2 / (1.0 + spread**2 * weights)
         self.information -= summed.T @ (summed * share[:, None])
         self.score -= summed.T @ (share * residual)
+
+
+class FrameTerm:
+    """What frames say: sum over frames of J^T C^-1 J and J^T C^-1 y, once for all iterations.
+
+    The weight of a pixel is that of its mean light over the frames; J = U R_k splits into pixels and instants.
+
+    Args:
+        light: The light.
+        frames: White levels, [N, P].
+        times_s: Instants, [N], seconds.
+        camera: The frame camera.
+        known_pattern: Whether its fixed pattern was taken off; else an offset of each pixel is integrated out.
+
+    Raises:
+        DataError: The frames are not those of the light's pixels.
+    """
+
+    def __init__(
+        self, light: SequenceLight, frames: Array, times_s: Array, camera: FrameCamera, known_pattern: bool
+    ) -> None:
+        pixels = len(light.left)
+        if frames.shape != (len(times_s), pixels):
+            raise DataError(f"the frames are {frames.shape}; give [{len(times_s)}, {pixels}], one row a frame")
+        mean = torch.from_numpy(frames.mean(axis=0).astype(np.float64))
+        weight = 1.0 / camera.noise_variance(mean).numpy()
+        spread = np.zeros(pixels) if known_pattern else camera.pattern_variance(mean).sqrt().numpy()
+        node, share = light.place(times_s)
+        still = light.still.astype(np.float64)
+        response = (1 - share)[:, None, None] * light.right[node] + share[:, None, None] * light.right[node + 1]
+        everywhere = np.arange(pixels)
+        gram = light.left.T @ (light.left * weight[:, None])  # [r, r]
+        self.normal = NormalEquations.empty(response.shape[2] - 1)
+        residuals = np.zeros(pixels)
+        for k, time in enumerate(times_s):
+            dark = light.at(still, everywhere, np.full(pixels, time)) if still.shape[1] > 1 else still[:, 0]
+            residual = frames[k] - dark - light.left @ response[k, :, 0]
+            rows = response[k, :, 1:]
+            self.normal.information += rows.T @ gram @ rows
+            self.normal.score += rows.T @ (light.left.T @ (weight * residual))
+            residuals += weight * residual
+        if spread.any():
+            total = response[:, :, 1:].sum(axis=0)
+            summed = weight[:, None] * (light.left @ total)
+            self.normal.subtract_offsets(summed, len(times_s) * weight, spread, residuals)
 
 
 def group_blocks(group: NDArray[np.int64], most: int) -> list[slice]:

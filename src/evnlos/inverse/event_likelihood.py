@@ -1,0 +1,389 @@
+"""One likelihood of a whole sequence: the target from events, from frames, or from both, with its uncertainty.
+
+With z the coefficients of the Gaussian prior and L(i, t; z) the filtered log light of pixel i:
+
+- Between two events of a pixel, L (with the leak's share) moves by D = +theta_on or -theta_off, with the
+  error of a crossing. What a pixel's own thresholds differ from the mean is integrated out in closed form, by
+  polarity.
+- What is observed is a time, so its density is that of the level times |dD/dt|. Without that factor every
+  contrast that is too low looks more likely, the further a threshold may be from its mean.
+- The error of a crossing is not claimed but estimated, from events of one pixel and polarity: with the
+  factor, an error that is too large would make every contrast too high.
+- An event is a signal or noise: that density, or the rate of noise events.
+- A silence bounds L from both sides, at the instants of each gap where L is furthest up and down, by what the
+  crossings leave open of the pixel's own threshold. Where an event ends the gap, its own side is left out:
+  that it was not met before is already in the event's row.
+- Both mean thresholds and the leak are known to a few per cent only, and are estimated along.
+- Frames are linear in z, with the camera's noise, and an unknown offset of each pixel where its pattern is
+  unknown.
+
+Gauss-Newton on all of it, with the error of a crossing annealed from 0.25 to what the events show. The
+curvature at the end is the information of the estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.cameras import CrossingLaw
+from evnlos.errors import ConfigError
+from evnlos.inverse.event_record import EventRecord, Levels, levels_of
+from evnlos.inverse.sequence import WHITE_DN, Array, FrameTerm, NormalEquations, PatternPrior, SequenceLight
+
+_NUISANCES = 3  # of the mean thresholds ON and OFF, relative, and of the leak
+_LONGEST_STEP = 1.5  # of a coefficient in an iteration, standard deviations of the prior
+_FEWEST_NOISE = 0.01  # share of the events that no model explains
+_SMALLEST_NOISE = 3e-3  # that crossings are believed to have, log units
+_NEAR_NOISE = 0.05  # first error of a crossing where a start is given, log units
+_STEADY_S = 0.4  # errors of the level change in about this time
+_ACTIVE = 1e-3  # weight of a silence, in that of a threshold just met, below which it is left out
+
+
+@dataclass(frozen=True)
+class LikelihoodSettings:
+    """What the likelihood of events takes for granted."""
+
+    least_noise: float = 0.04
+    """Least standard deviation of the error of a crossing beside the event model's own, log units; how large it
+    is, the events of one pixel and polarity tell, which share a threshold."""
+    threshold_error: float = 0.05
+    """Standard deviation of both mean thresholds, relative."""
+    leak_error: float = 0.005
+    """Standard deviation of the leak, log units per second."""
+    gap_s: float = 0.4
+    """Distance of the instants at which silences are looked at, seconds."""
+    first_noise: float = 0.25
+    """Error of a crossing in the first iteration, log units."""
+    iterations: int = 12
+    """Iterations of Gauss and Newton."""
+    block: int = 16_384
+    """Instants that are looked at together: what bounds the memory. The result does not depend on it."""
+
+    def __post_init__(self) -> None:
+        for name in ("least_noise", "threshold_error", "leak_error", "gap_s", "first_noise"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ConfigError(f"LikelihoodSettings.{name} is {getattr(self, name)}; give a positive number")
+        if self.iterations < 2:
+            raise ConfigError(f"LikelihoodSettings.iterations is {self.iterations}; give 2 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceEstimate:
+    """A target with its uncertainty.
+
+    Args:
+        z: Its coefficients, [k].
+        covariance: Their covariance, [k, k].
+        image: The target, [h, w].
+        deviation: Standard deviation of each cell, [h, w].
+        expected_error: Mean squared error of a cell that the covariance says.
+        thresholds: Factors on the mean thresholds ON and OFF; 1 without events.
+        leak: What was added to the leak, log units per second.
+        noise_share: Share of the events that count as noise; NaN without events.
+        noise: Error of a crossing that the events show, beside the event model's own, log units; NaN without.
+    """
+
+    z: Array
+    covariance: Array
+    image: Array
+    deviation: Array
+    expected_error: float
+    thresholds: tuple[float, float]
+    leak: float
+    noise_share: float
+    noise: float
+
+
+def estimate_sequence(
+    light: SequenceLight,
+    prior: PatternPrior,
+    law: CrossingLaw | None = None,
+    record: EventRecord | None = None,
+    frames: FrameTerm | None = None,
+    settings: LikelihoodSettings | None = None,
+    start: Array | None = None,
+) -> SequenceEstimate:
+    """Return the target that frames, events, or both, make most likely under a Gaussian prior.
+
+    Args:
+        light: The light of the moving target.
+        prior: The prior that its coefficients belong to.
+        law: Constants of the event model; for events.
+        record: The events, with silences (`record_of`, `gap_s`); None = frames alone.
+        frames: The frames; None = events alone.
+        settings: What is taken for granted; None is the default.
+        start: Coefficients to start from, [k]; None = the prior's mean, and the frames' where there are any.
+
+    Raises:
+        ConfigError: Neither frames nor events, or events without their law.
+    """
+    if record is None and frames is None:
+        raise ConfigError("neither frames nor events; give at least one of them")
+    if record is not None and law is None:
+        raise ConfigError("events without the law of their pixels; the event model states no crossing_law")
+    settings = settings or LikelihoodSettings()
+    count = prior.count
+    own = np.eye(count)
+    if record is None or law is None:
+        assert frames is not None
+        covariance = np.asarray(np.linalg.inv(own + frames.normal.information), np.float64)
+        return _finished(
+            prior, covariance @ frames.normal.score, covariance, np.zeros(_NUISANCES), math.nan, math.nan
+        )
+    known = np.concatenate(
+        [np.ones(count), np.full(2, settings.threshold_error**-2), [settings.leak_error**-2]]
+    )
+    unknown = np.zeros(count + _NUISANCES)
+    if start is not None:
+        unknown[:count] = start
+    elif frames is not None:
+        unknown[:count] = np.linalg.solve(own + frames.normal.information, frames.normal.score)
+    first = settings.first_noise if start is None else min(settings.first_noise, _NEAR_NOISE)
+    trust = np.ones(len(record))
+    total, noise = NormalEquations.empty(len(unknown)), first
+    # The last three iterations have the final error.
+    shares = np.minimum(np.arange(settings.iterations) / max(settings.iterations - 3, 1), 1.0)
+    for share in shares:
+        least = first ** (1 - share) * settings.least_noise**share
+        total = NormalEquations.empty(len(unknown))
+        noise = _add_events(total, light, law, record, unknown, least, trust, settings.block)
+        if frames is not None:
+            total.information[:count, :count] += frames.normal.information
+            total.score[:count] += frames.normal.score - frames.normal.information @ unknown[:count]
+        total.information += np.diag(known)
+        total.score -= known * unknown
+        step = np.linalg.solve(total.information, total.score)
+        unknown = unknown + step * min(1.0, _LONGEST_STEP / max(float(np.abs(step[:count]).max()), 1e-12))
+    covariance = np.asarray(np.linalg.inv(total.information)[:count, :count], np.float64)
+    noisy = float(1.0 - trust[record.measured].mean()) if record.measured.any() else math.nan
+    return _finished(prior, unknown[:count], covariance, unknown[count:], noisy, noise)
+
+
+def _finished(
+    prior: PatternPrior, z: Array, covariance: Array, nuisances: Array, noise_share: float, noise: float
+) -> SequenceEstimate:
+    variance = prior.variance(covariance)
+    factors = (1.0 + float(nuisances[0]), 1.0 + float(nuisances[1]))
+    return SequenceEstimate(
+        z,
+        covariance,
+        prior.image(z),
+        np.sqrt(variance),
+        float(variance.mean()),
+        factors,
+        float(nuisances[2]),
+        noise_share,
+        noise,
+    )
+
+
+def _add_events(
+    total: NormalEquations,
+    light: SequenceLight,
+    law: CrossingLaw,
+    record: EventRecord,
+    unknown: Array,
+    least: float,
+    trust: Array,
+    most: int,
+) -> float:
+    """Add the rows of crossings and silences, update `trust`, and return the error of a crossing."""
+    count = len(unknown) - _NUISANCES
+    seen = light(unknown[:count])
+    levels = levels_of(seen, light.times_s, law)
+    state = _State(light, law, record, unknown[count:], least, seen, levels)
+    state.update_trust(trust)
+    scatter = state.scatter(trust)
+    noise = max(least, scatter)
+    state = _State(light, law, record, unknown[count:], noise, seen, levels)
+    state.update_trust(trust)
+    temper = state.temper(trust, max(scatter, _SMALLEST_NOISE))
+    quiet = [state.silences(sign, trust) for sign in (1, -1)]
+    steep = state.steepness(trust)
+    needed = record.measured.copy()
+    for one in quiet:
+        needed[one.at] = True
+    part, kept = record.only(needed), np.flatnonzero(needed)
+    place = np.full(len(part), -1)  # in the whole record; references alone have none
+    place[part.origin >= 0] = kept
+    crossed = np.flatnonzero(record.measured)
+    crossings = Rows(
+        crossed, record.sign[crossed], trust[crossed] / state.variance[crossed], state.residual[crossed]
+    )
+    columns = [np.concatenate(column) for column in zip(crossings, *quiet, strict=True)]
+    order = np.lexsort((columns[1], record.pixel[columns[0]]))  # by pixel, then by polarity
+    together = Rows(*(column[order] for column in columns))
+    owner = record.pixel[together.at]
+    for block, rows, rates in part.blocks(light, levels, most):
+        mine = place[block]
+        pixels = part.pixel[block]
+        here = slice(np.searchsorted(owner, pixels[0]), np.searchsorted(owner, pixels[-1], side="right"))
+        at, sign = together.at[here], together.sign[here]
+        group = 2 * owner[here] + (sign > 0)
+        named = np.flatnonzero(mine >= 0)
+        row = named[np.searchsorted(mine[named], at)]
+        extra = np.zeros((len(at), _NUISANCES))
+        extra[:, 0] = np.where(sign > 0, -law.threshold_on, 0.0)
+        extra[:, 1] = np.where(sign < 0, law.threshold_off, 0.0)
+        extra[:, 2] = state.wait[at]
+        whole = np.concatenate([rows[row], extra], axis=1)
+        total.add(whole, together.weight[here], together.residual[here], group, law.threshold_sigma)
+        events = np.flatnonzero((mine >= 0) & record.measured[np.maximum(mine, 0)])
+        at = mine[events]
+        sloping = np.zeros((len(at), len(unknown)))
+        sloping[:, :count], sloping[:, -1] = rates[events], 1.0
+        total.add(sloping, temper[at] * steep.weight[at], steep.residual[at], at, 0.0)
+    return float(noise)
+
+
+class Rows(NamedTuple):
+    """Rows of the normal equations: which instant, which threshold, 1 / variance, residual; [N] each."""
+
+    at: NDArray[np.int64]
+    sign: NDArray[np.int8]
+    weight: Array
+    residual: Array
+
+
+class _State:
+    """What a record says at one estimate: changes, residuals, slopes, and the offsets of the thresholds."""
+
+    def __init__(
+        self,
+        light: SequenceLight,
+        law: CrossingLaw,
+        record: EventRecord,
+        nuisances: Array,
+        noise: float,
+        seen: Array,
+        levels: Levels,
+    ) -> None:
+        self.light, self.law, self.record, self.seen = light, law, record, seen
+        self.theta = law.threshold_on * (1 + nuisances[0]), law.threshold_off * (1 + nuisances[1])
+        self.wait = record.t_s - record.t_s[record.origin]
+        self.change = record.change(light, levels) + nuisances[2] * self.wait
+        self.residual = np.where(record.sign > 0, self.theta[0], -self.theta[1]) - self.change
+        self.noise = math.hypot(noise, law.noise)
+        walk = law.walk_variance(light.at(seen, record.pixel, record.t_s) * WHITE_DN)
+        self.variance = self.noise**2 + walk * np.maximum(self.wait, 0.0)
+        self.group = 2 * record.pixel + (record.sign > 0)
+        node, _ = light.place(record.t_s)
+        step = light.times_s[1] - light.times_s[0]
+        rate = (levels.value[record.pixel, node + 1] - levels.value[record.pixel, node]) / step
+        self.rate = rate + levels.fall[record.pixel] + nuisances[2]
+        self.blur = noise / _STEADY_S
+
+    def offsets(self, trust: Array) -> tuple[Array, Array]:
+        """Return mean and variance of what each group's threshold is off by, times its sign."""
+        measured = np.flatnonzero(self.record.measured)
+        of, size = self.group[measured], 2 * len(self.light.left)
+        weight = trust[measured] / self.variance[measured]
+        spread = self.law.threshold_sigma**2
+        variance = np.asarray(spread / (1.0 + spread * np.bincount(of, weight, size)), np.float64)
+        mean = -variance * np.bincount(of, weight * self.residual[measured], size)
+        return np.asarray(mean, np.float64), variance
+
+    def scatter(self, trust: Array) -> float:
+        """Return the error of a crossing, log units, from what the events of a group differ by."""
+        measured = np.flatnonzero(self.record.measured)
+        of, size = self.group[measured], 2 * len(self.light.left)
+        weight, residual = trust[measured], self.residual[measured]
+        sums = np.bincount(of, weight, size)
+        mean = np.bincount(of, weight * residual, size) / np.maximum(sums, 1e-12)
+        freedom = float(np.maximum(sums - 1.0, 0.0).sum())
+        several = (sums > 1.0)[of]
+        square = float((weight * (residual - mean[of]) ** 2)[several].sum())
+        return math.sqrt(max(square / max(freedom, 1.0) - self.law.noise**2, 0.0))
+
+    def temper(self, trust: Array, scatter: float) -> Array:
+        """Return by how much the rows of each event are weaker than their scatter says, [N], 0..1.
+
+        An error above that of the data tempers the likelihood, and the density in time has to follow: a group
+        of n events has n - 1 degrees of freedom of the variance noise^2, and one of noise^2 / n + mismatch^2.
+        """
+        measured = np.flatnonzero(self.record.measured)
+        of, size = self.group[measured], 2 * len(self.light.left)
+        sums = np.maximum(np.bincount(of, trust[measured], size), 1.0)
+        own, seen, spread = self.noise**2, min(scatter, self.noise) ** 2, self.law.threshold_sigma**2
+        shared = (spread + seen / sums) / (spread + own / sums)
+        return ((shared + (sums - 1.0) * seen / own) / sums)[self.group]
+
+    def update_trust(self, trust: Array) -> None:
+        """Bring the probability of a signal up to date: its density in time against the noise events' rate."""
+        measured = np.flatnonzero(self.record.measured)
+        if not len(measured):
+            return
+        offset, variance = (column[self.group[measured]] for column in self.offsets(trust))
+        spread = self.variance[measured] + variance
+        away = self.residual[measured] + offset
+        signal = np.exp(-0.5 * away**2 / spread) / np.sqrt(2 * math.pi * spread)
+        signal *= _upward(self.record.sign[measured] * self.rate[measured], self.blur)[0]
+        duration = self.light.times_s[-1] - self.light.times_s[0]
+        least = _FEWEST_NOISE * len(measured) / (duration * len(self.light.left))
+        trust[measured] = signal / (signal + 0.5 * max(self.law.events_hz, least))
+
+    def steepness(self, trust: Array) -> Rows:
+        """Return the rows of log |dD/dt|, the density of an event in time over that in its level, [N] each."""
+        _, slope, bend = _upward(self.record.sign * self.rate, self.blur)
+        bend = np.maximum(bend, 1e-12)
+        everything = np.arange(len(self.record))
+        residual = np.where(self.record.measured, self.record.sign * slope / bend, 0.0)
+        weight = np.where(self.record.measured, trust * bend, 0.0)
+        return Rows(everything, self.record.sign, weight, residual)
+
+    def silences(self, sign: int, trust: Array) -> Rows:
+        """Return the rows of what was not met: of each gap the instant nearest to the threshold of a sign.
+
+        With y the distance to the pixel's own threshold, normal with mean m and variance v given the crossings,
+        the probability of none is Phi(m / s), s^2 = v + noise^2. Its slope g and its curvature h in m are those
+        of an observation of y: at m + g / h, with the precision h / (1 - h v).
+        """
+        record = self.record
+        quiet = np.flatnonzero((record.sign == 0) & (record.origin >= 0))
+        ends = np.zeros(len(record), np.int8)
+        crossed = np.flatnonzero(record.measured)
+        ends[record.origin[crossed]] = record.sign[crossed]
+        free = quiet[ends[record.origin[quiet]] != sign]
+        order = free[np.lexsort((-sign * self.change[free], record.origin[free]))]
+        at = order[np.diff(record.origin[order], prepend=-1) != 0]
+        offset, variance = (column[2 * record.pixel[at] + (sign > 0)] for column in self.offsets(trust))
+        theta = self.theta[0 if sign > 0 else 1]
+        room = theta + sign * offset - sign * self.change[at]
+        width = np.sqrt(variance + self.noise**2)
+        scaled = torch.from_numpy(room / width)
+        ratio = torch.exp(-0.5 * scaled**2 - torch.special.log_ndtr(scaled)).numpy() / math.sqrt(2 * math.pi)
+        bend = np.clip(ratio * (ratio + scaled.numpy()), 0.0, 1.0)
+        near = bend > _ACTIVE
+        at, room, width, variance, ratio, bend = (c[near] for c in (at, room, width, variance, ratio, bend))
+        curve = bend / width**2
+        precision = curve / np.maximum(1.0 - curve * variance, 1e-6)
+        seen = room + ratio / width / curve  # y as if it were observed
+        residual = sign * (theta - seen) - self.change[at]
+        return Rows(at, np.full(len(at), sign, np.int8), precision, residual)
+
+
+def _upward(rate: Array, blur: float) -> tuple[Array, Array, Array]:
+    """Return E of max(rate + blur n, 0), n normal, and slope and negative curvature of its logarithm.
+
+    Args:
+        rate: Rate towards the threshold, log units per second.
+        blur: Standard deviation of what is not known of it.
+    """
+    scaled = torch.from_numpy(np.maximum(rate / blur, -30.0))
+    below = torch.special.ndtr(scaled).numpy()
+    density = np.exp(-0.5 * scaled.numpy() ** 2) / math.sqrt(2 * math.pi)
+    # far below zero the sum of the two cancels: the tail's own form is density / scaled^2
+    whole = np.where(
+        scaled.numpy() < -5,
+        density / np.maximum(scaled.numpy() ** 2 + 2, 1.0),
+        scaled.numpy() * below + density,
+    )
+    whole = np.maximum(whole, 1e-300)
+    slope = below / whole
+    return blur * whole, slope / blur, np.clip(slope**2 - density / whole, 0.0, None) / blur**2

@@ -1,0 +1,187 @@
+"""The likelihood of a whole sequence: unbiased on simulated sensors, near the bound, its intervals cover."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from evnlos.analysis import SequenceAnalysisSettings, event_information
+from evnlos.cameras import EventPixel, FrameCamera, simulate_events
+from evnlos.cli import main
+from evnlos.errors import ConfigError, DataError
+from evnlos.inverse import (
+    EventRecord,
+    FrameTerm,
+    LikelihoodSettings,
+    PatternPrior,
+    SequenceEstimate,
+    SequenceLight,
+    estimate_sequence,
+    record_of,
+    sequence_light,
+)
+from evnlos.setups import RadiometricSetup, SensorSize
+from evnlos.types import Plane
+
+COUNT = 24
+PIXEL = EventPixel(0.12, 0.14, 0.02, 60.0, 0.02, 0.05)
+SETUP = RadiometricSetup(cell_m=0.01, gain=0.8, ambient=0.08, sensor=SensorSize(20, 32), pixel=PIXEL)
+BENCH = SequenceAnalysisSettings(positions=20, counts=(20,), cells=8, crossing_noise=0.04)
+SEQUENCES, EXACT = 6, 0.003  # the error of a crossing in a pixel that has none, interpolation included
+
+
+@cache
+def prior() -> PatternPrior:
+    """Smooth random targets: the light stays above 0 for nearly all that the prior holds."""
+    y, x = np.mgrid[0:8, 0:8].reshape(2, -1)
+    distance = np.hypot(y[:, None] - y, x[:, None] - x)
+    values, axes = np.linalg.eigh(0.16 * np.exp(-((distance / 1.2) ** 2)))
+    patterns = axes[:, ::-1][:, :COUNT] * np.sqrt(values[::-1][:COUNT])
+    return PatternPrior(Plane(8, 8, 0.01), np.full(64, 0.5), patterns, 0.0)
+
+
+@cache
+def light() -> SequenceLight:
+    return sequence_light(SETUP, prior(), BENCH.motion.position_m, (0.0, BENCH.duration_s))
+
+
+def truth(seed: int) -> np.ndarray:
+    return np.random.default_rng([seed, 9]).standard_normal(COUNT)
+
+
+def recorded(seed: int, pixel: EventPixel = PIXEL) -> EventRecord:
+    """The events of the project's own continuous pixel, with mismatch, filter, leak and noise events."""
+    frames = 255 * np.maximum(light()(truth(seed)), 1e-3).T.reshape(-1, *light().shape)
+    events = simulate_events(frames.astype(np.float32), light().times_s, pixel, seed=seed)
+    return record_of(events, pixel.crossing_law(40.0), (0.0, BENCH.duration_s), 0.4)
+
+
+def photographed(seed: int, camera: FrameCamera, known: bool) -> FrameTerm:
+    times = light().times_s[4::4]
+    frames = camera.expose(np.maximum(light()(truth(seed))[:, 4::4], 0.0).T.reshape(-1, *light().shape), seed)
+    levels = frames.reshape(len(times), -1) / camera.white
+    return FrameTerm(light(), levels, times, camera, known)
+
+
+@cache
+def estimated(seed: int, least_noise: float = EXACT) -> SequenceEstimate:
+    settings = LikelihoodSettings(least_noise=least_noise)
+    return estimate_sequence(light(), prior(), PIXEL.crossing_law(40.0), recorded(seed), settings=settings)
+
+
+def error(found: SequenceEstimate, seed: int) -> float:
+    return float(np.square(found.image - prior().image(truth(seed))).mean())
+
+
+@pytest.mark.parametrize(("least_noise", "behind_db"), [(EXACT, 1.0), (0.04, 0.0)])
+def test_events_reach_the_bound_and_their_intervals_cover(least_noise: float, behind_db: float) -> None:
+    """With the error that crossings have, and with a larger one that is taken for granted."""
+    law, bench = PIXEL.crossing_law(40.0), replace(BENCH, crossing_noise=least_noise)
+    seeds = range(SEQUENCES)
+    bound = [prior().error(event_information(light(), truth(s), law, bench, s)[0][0]) for s in seeds]
+    found = [estimated(s, least_noise) for s in seeds]
+    reached = [error(one, s) for s, one in enumerate(found)]
+    assert 10 * np.log10(np.mean(reached) / np.mean(bound)) < behind_db
+    away = [np.abs(one.image - prior().image(truth(s))) / one.deviation for s, one in enumerate(found)]
+    assert 0.84 < np.mean(np.array(away) < 1.645) < 0.97
+    assert 0.75 < np.mean([one.expected_error for one in found]) / np.mean(reached) < 1.33
+
+
+def test_nothing_is_biased() -> None:
+    """Neither contrast nor thresholds drift, and the few events without cause are found."""
+    pairs = [(estimated(s).z, truth(s)) for s in range(SEQUENCES)]
+    contrast = sum(float(z @ true) for z, true in pairs) / sum(float(z @ z) for z, _ in pairs)
+    assert contrast == pytest.approx(1.0, abs=0.06)  # of the truth on the estimate: shrinkage is no bias
+    factors = np.array([estimated(s).thresholds for s in range(SEQUENCES)])
+    np.testing.assert_allclose(factors.mean(axis=0), 1.0, atol=0.03)
+    assert abs(np.mean([estimated(s).leak for s in range(SEQUENCES)])) < 2e-3
+    assert 0.0 < np.mean([estimated(s).noise_share for s in range(SEQUENCES)]) < 0.1
+
+
+def test_it_stays_at_the_truth() -> None:
+    """Started there it ends where it ends from the prior's mean, as near to the truth as the bound allows."""
+    for seed in range(3):
+        found = estimate_sequence(
+            light(),
+            prior(),
+            PIXEL.crossing_law(40.0),
+            recorded(seed),
+            settings=LikelihoodSettings(least_noise=EXACT),
+            start=truth(seed),
+        )
+        assert error(found, seed) < 2.5 * found.expected_error
+        assert error(found, seed) < 1.5 * error(estimated(seed), seed)
+
+
+def test_a_pixel_without_noise_shows_nearly_everything() -> None:
+    ideal = EventPixel(0.12, 0.14, 0.0, 0.0, 0.0, 0.0)
+    settings = LikelihoodSettings(least_noise=EXACT)
+    found = estimate_sequence(light(), prior(), ideal.crossing_law(), recorded(0, ideal), settings=settings)
+    assert found.noise == pytest.approx(0.003, rel=0.1)
+    assert error(found, 0) < 2.0 * found.expected_error < 0.02 * np.square(prior().patterns).sum() / 64
+
+
+def test_frames_are_the_textbook_estimate() -> None:
+    """Against dense algebra over all samples, with the pattern's offsets in the covariance."""
+    camera = FrameCamera(prnu=0.0, dsnu_e=60.0, full_well_e=4000.0, read_noise_e=8.0, pattern_seed=3)
+    times = light().times_s[4::20]
+    chosen = np.arange(0, 640, 40)
+    part = replace(light(), left=light().left[chosen], still=light().still[chosen], shape=(1, len(chosen)))
+    frames = camera.expose(part(truth(1))[:, 4::20].T.reshape(-1, 1, len(chosen)), 1)
+    levels = frames.reshape(len(times), -1) / camera.white
+    term = FrameTerm(part, levels, times, camera, False)
+    mean = torch.from_numpy(levels.mean(axis=0))
+    pixel, at = np.tile(np.arange(len(chosen)), len(times)), np.repeat(times, len(chosen))
+    rows, still = part.rows(pixel, at), part.at(part(np.zeros(COUNT)), pixel, at)
+    covariance = np.diag(np.tile(camera.noise_variance(mean).numpy(), len(times)))
+    covariance += np.where(pixel[:, None] == pixel, camera.pattern_variance(mean).numpy()[pixel], 0.0)
+    weighed = np.linalg.solve(covariance, np.column_stack([rows, levels.ravel() - still]))
+    np.testing.assert_allclose(term.normal.information, rows.T @ weighed[:, :-1], rtol=1e-4, atol=1e-2)
+    found = estimate_sequence(part, prior(), frames=term)
+    expected = np.linalg.solve(np.eye(COUNT) + rows.T @ weighed[:, :-1], rows.T @ weighed[:, -1])
+    np.testing.assert_allclose(found.z, expected, atol=1e-4)
+
+
+def test_both_know_no_less_than_either() -> None:
+    camera = FrameCamera(full_well_e=3000.0, read_noise_e=30.0)
+    pairs = []
+    for seed in range(4):
+        term = photographed(seed, camera, False)
+        frames = estimate_sequence(light(), prior(), frames=term)
+        both = estimate_sequence(
+            light(),
+            prior(),
+            PIXEL.crossing_law(40.0),
+            recorded(seed),
+            term,
+            LikelihoodSettings(least_noise=EXACT),
+        )
+        assert both.expected_error < min(frames.expected_error, 1.02 * estimated(seed).expected_error)
+        pairs.append([error(one, seed) for one in (both, frames, estimated(seed))])
+    both_error, *alone = np.mean(pairs, axis=0)
+    assert both_error < 1.05 * min(alone)
+
+
+def test_the_result_does_not_depend_on_blocks() -> None:
+    settings = LikelihoodSettings(block=37, least_noise=EXACT)
+    found = estimate_sequence(light(), prior(), PIXEL.crossing_law(40.0), recorded(0), settings=settings)
+    np.testing.assert_allclose(found.z, estimated(0).z, atol=1e-5)
+
+
+def test_what_is_refused() -> None:
+    with pytest.raises(ConfigError, match="neither frames nor events"):
+        estimate_sequence(light(), prior())
+    with pytest.raises(ConfigError, match="without the law"):
+        estimate_sequence(light(), prior(), record=recorded(0))
+    with pytest.raises(ConfigError, match="positive"):
+        LikelihoodSettings(gap_s=0.0)
+    with pytest.raises(DataError, match="one row a frame"):
+        FrameTerm(light(), np.zeros((2, 3)), np.zeros(2), FrameCamera(), True)
+
+
+def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["invert", "shot", "--setup", "main-near", "--from", "events", "--positions", "3"])
+    assert "--from takes whole sequences" in capsys.readouterr().err
