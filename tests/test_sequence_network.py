@@ -53,6 +53,20 @@ def test_the_mean_is_over_the_positions_that_see_a_pixel() -> None:
         net.pooled(inputs, places + 1.0)
 
 
+def test_subsets_are_pooled_as_one_by_one() -> None:
+    net = network()
+    torch.manual_seed(1)
+    for buffer in net.embedding.buffers():
+        buffer.copy_(torch.randn_like(buffer))
+    inputs, places = torch.randn(70, 1, 64, 96), 0.05 * torch.randn(70, 2)
+    kept = (torch.rand(5, 70) < 0.4).float()
+    together = net.pooled_subsets(inputs, places, kept)
+    for some, found in zip(kept.bool(), together, strict=True):
+        torch.testing.assert_close(found, net.pooled(inputs[some], places[some]), rtol=1e-4, atol=1e-3)
+    with pytest.raises(DataError, match="off the canvas"):
+        net.pooled_subsets(inputs, places, kept * torch.tensor([[1.0], [1], [0], [1], [1]]))
+
+
 @pytest.fixture(scope="module")
 def trained(tiny_dataset, tmp_path_factory):
     out = tmp_path_factory.mktemp("sequence") / "run"

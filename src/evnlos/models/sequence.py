@@ -135,13 +135,14 @@ class SequenceReconstructor(Reconstructor):
                 )
             places = torch.from_numpy(samples.position_m[mine])
             plane = self.plane_of(samples.truth[torch.from_numpy(mine)], places).half()
+            kept = torch.zeros(augmentations, len(mine))
             for number in range(augmentations):
-                kept = torch.from_numpy(_subset(number, len(mine), draw))
-                seen = samples.inputs[torch.from_numpy(mine)[kept]].to(device)
-                inputs.append(self.pooled(seen, places[kept]).half().cpu())
-                truth.append(plane)
-                names.append(name)
-        found = InMemoryDataset(torch.stack(inputs), torch.stack(truth), np.array(names))
+                kept[number, _subset(number, len(mine), draw)] = 1
+            seen = samples.inputs[torch.from_numpy(mine)].to(device)
+            inputs.append(self.pooled_subsets(seen, places, kept).half().cpu())
+            truth += augmentations * [plane]
+            names += augmentations * [name]
+        found = InMemoryDataset(torch.cat(inputs), torch.stack(truth), np.array(names))
         if is_new:
             self.scale.fit(found.inputs)
         return found
@@ -158,7 +159,6 @@ class SequenceReconstructor(Reconstructor):
         copy.settings = replace(copy.settings, rank=rank)
         return copy
 
-    @torch.no_grad()
     def pooled(self, inputs: Tensor, position_m: Tensor) -> Tensor:
         """Return the mean of the embedded time steps as the target plane sees them, [S, P, P].
 
@@ -169,15 +169,33 @@ class SequenceReconstructor(Reconstructor):
         Raises:
             DataError: The plane is off the canvas at all time steps.
         """
+        return self.pooled_subsets(inputs, position_m, torch.ones(1, len(inputs)))[0]
+
+    @torch.no_grad()
+    def pooled_subsets(self, inputs: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
+        """Return `pooled` of subsets of the time steps, [K, S, P, P]; each step is embedded once for all of them.
+
+        Args:
+            inputs: What was recorded at N time steps, [N, C, H, W].
+            position_m: The plane's centre on the canvas, (x, y) in metres, [N, 2].
+            kept: 1 where a subset has a time step, else 0, float32 [K, N].
+
+        Raises:
+            DataError: The plane is off the canvas at all time steps of a subset.
+        """
         total = seen = torch.zeros((), device=inputs.device)
-        for part, at in zip(inputs.split(64), position_m.split(64), strict=True):
-            light, count = self._from_plane(self.embedding(self.normalization(part.float())), at)
-            total, seen = total + light, seen + count
-        if not bool(seen.any()):
+        for start in range(0, len(inputs), 64):
+            part = slice(start, start + 64)
+            embedded = self.embedding(self.normalization(inputs[part].float()))
+            light, inside = self._from_plane(embedded, position_m[part])
+            weights = kept[:, part].to(light)
+            total = total + torch.tensordot(weights, light, dims=1)
+            seen = seen + torch.tensordot(weights, inside.to(light), dims=1)
+        if not bool((seen > 0).flatten(1).any(dim=1).all()):
             raise DataError(
                 "the target plane is off the canvas at every time step; give positions within the travel"
             )
-        return total / seen.clamp_min(1)
+        return total / seen[:, None].clamp_min(1)
 
     def on_canvas(self, plane: Tensor, position_m: Tensor) -> Tensor:
         """Return the target plane on the canvas at each position.
@@ -195,16 +213,16 @@ class SequenceReconstructor(Reconstructor):
 
     def plane_of(self, images: Tensor, position_m: Tensor) -> Tensor:
         """Return the plane [P, P] that images [N, H, W] of all positions show, their mean: what to learn."""
-        light, seen = self._from_plane(images[:, None].float(), position_m)
-        return light[0] / seen.clamp_min(1)
+        light, inside = self._from_plane(images[:, None].float(), position_m)
+        return light.sum(dim=0)[0] / inside.sum(dim=0).clamp_min(1)
 
     def _from_plane(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the sum of images [N, S, H, W] as the plane sees them, [S, P, P], and how many, [P, P]."""
+        """Return images [N, S, H, W] as the plane sees them, [N, S, P, P], and where it does, bool [N, P, P]."""
         place = self._place_m + position_m.float().cpu()[:, None, None]  # [N, P, P, 2]
         grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
         inside = (grid.abs() <= 1).all(dim=-1)  # [N, P, P]
         moved = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
-        return (moved * inside[:, None]).sum(dim=0), inside.sum(dim=0)
+        return moved * inside[:, None], inside
 
     @classmethod
     def today(cls, name: str, modality: Modality) -> str:
