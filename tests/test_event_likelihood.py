@@ -75,9 +75,11 @@ def error(found: SequenceEstimate, seed: int) -> float:
     return float(np.square(found.image - prior().image(truth(seed))).mean())
 
 
-@pytest.mark.parametrize(("least_noise", "behind_db"), [(EXACT, 1.0), (0.04, 0.0)])
-def test_events_reach_the_bound_and_their_intervals_cover(least_noise: float, behind_db: float) -> None:
-    """With the error that crossings have, and with a larger one that is taken for granted."""
+@pytest.mark.parametrize(("least_noise", "behind_db", "widest"), [(EXACT, 1.0, 1.33), (0.04, 0.0, 2.0)])
+def test_events_reach_the_bound_and_their_intervals_cover(
+    least_noise: float, behind_db: float, widest: float
+) -> None:
+    """With the error that crossings have, and with a larger one that is assumed, which is too cautious."""
     law, bench = PIXEL.crossing_law(40.0), replace(BENCH, crossing_noise=least_noise)
     seeds = range(SEQUENCES)
     bound = [prior().error(event_information(light(), truth(s), law, bench, s)[0][0]) for s in seeds]
@@ -86,7 +88,7 @@ def test_events_reach_the_bound_and_their_intervals_cover(least_noise: float, be
     assert 10 * np.log10(np.mean(reached) / np.mean(bound)) < behind_db
     away = [np.abs(one.image - prior().image(truth(s))) / one.deviation for s, one in enumerate(found)]
     assert 0.84 < np.mean(np.array(away) < 1.645) < 0.97
-    assert 0.75 < np.mean([one.expected_error for one in found]) / np.mean(reached) < 1.33
+    assert 0.75 < np.mean([one.expected_error for one in found]) / np.mean(reached) < widest
 
 
 def test_nothing_is_biased() -> None:
@@ -102,7 +104,8 @@ def test_nothing_is_biased() -> None:
 
 def test_it_stays_at_the_truth() -> None:
     """Started there it ends where it ends from the prior's mean, as near to the truth as the bound allows."""
-    for seed in range(3):
+    errors, expected = [], []
+    for seed in range(SEQUENCES):
         found = estimate_sequence(
             light(),
             prior(),
@@ -111,8 +114,10 @@ def test_it_stays_at_the_truth() -> None:
             settings=LikelihoodSettings(least_noise=EXACT),
             start=truth(seed),
         )
-        assert error(found, seed) < 2.5 * found.expected_error
         assert error(found, seed) < 1.5 * error(estimated(seed), seed)
+        errors.append(error(found, seed))
+        expected.append(found.expected_error)
+    assert np.mean(errors) < 1.33 * np.mean(expected)
 
 
 def test_a_pixel_without_noise_shows_nearly_everything() -> None:

@@ -32,7 +32,7 @@ from evnlos.inverse import (
     sequence_light,
 )
 from evnlos.inverse.measurements import handwritten_targets, position_subsets
-from evnlos.inverse.sequence import WHITE_DN
+from evnlos.inverse.sequence_light import WHITE_DN
 from evnlos.scene import LineMotion
 from evnlos.setups import Setup
 from evnlos.types import Plane

@@ -23,7 +23,7 @@ from evnlos.inverse import (
     record_of,
     sequence_light,
 )
-from evnlos.inverse.sequence import WHITE_DN
+from evnlos.inverse.sequence_light import WHITE_DN
 from evnlos.types import Plane
 
 _CELLS, _COEFFICIENTS = 32, 120

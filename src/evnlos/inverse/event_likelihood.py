@@ -13,7 +13,7 @@ With z the coefficients of the Gaussian prior and L(i, t; z) the filtered log li
 - A silence bounds L from both sides, at the instants of each gap where L is furthest up and down, by what the
   crossings leave open of the pixel's own threshold. Where an event ends the gap, its own side is left out:
   that it was not met before is already in the event's row.
-- Both mean thresholds and the leak are known to a few per cent only, and are estimated along.
+- The leak is known to a few per cent only and is estimated along; so are both mean thresholds where asked.
 - Frames are linear in z, with the camera's noise, and an unknown offset of each pixel where its pattern is
   unknown.
 
@@ -34,9 +34,17 @@ from numpy.typing import NDArray
 from evnlos.cameras import CrossingLaw
 from evnlos.errors import ConfigError
 from evnlos.inverse.event_record import EventRecord, Levels, levels_of
-from evnlos.inverse.sequence import WHITE_DN, Array, FrameTerm, NormalEquations, PatternPrior, SequenceLight
+from evnlos.inverse.sequence_light import (
+    WHITE_DN,
+    Array,
+    FrameTerm,
+    NormalEquations,
+    PatternPrior,
+    SequenceLight,
+)
 
 _NUISANCES = 3  # of the mean thresholds ON and OFF, relative, and of the leak
+_KNOWN = 1e-6  # relative error of a threshold that is not estimated
 _LONGEST_STEP = 1.5  # of a coefficient in an iteration, standard deviations of the prior
 _FEWEST_NOISE = 0.01  # share of the events that no model explains
 _SMALLEST_NOISE = 3e-3  # that crossings are believed to have, log units
@@ -52,8 +60,9 @@ class LikelihoodSettings:
     least_noise: float = 0.04
     """Least standard deviation of the error of a crossing beside the event model's own, log units; how large it
     is, the events of one pixel and polarity tell, which share a threshold."""
-    threshold_error: float = 0.05
-    """Standard deviation of both mean thresholds, relative."""
+    threshold_error: float = 0.0
+    """Standard deviation of both mean thresholds, relative; 0 = those of the setup. Where a third of the
+    events is noise, thresholds that are left free drift below half of the true ones, and contrast with them."""
     leak_error: float = 0.005
     """Standard deviation of the leak, log units per second."""
     gap_s: float = 0.4
@@ -66,7 +75,11 @@ class LikelihoodSettings:
     """Instants that are looked at together: what bounds the memory. The result does not depend on it."""
 
     def __post_init__(self) -> None:
-        for name in ("least_noise", "threshold_error", "leak_error", "gap_s", "first_noise"):
+        if not (math.isfinite(self.threshold_error) and self.threshold_error >= 0):
+            raise ConfigError(
+                f"LikelihoodSettings.threshold_error is {self.threshold_error}; give 0 or a positive number"
+            )
+        for name in ("least_noise", "leak_error", "gap_s", "first_noise"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"LikelihoodSettings.{name} is {getattr(self, name)}; give a positive number")
         if self.iterations < 2:
@@ -136,9 +149,8 @@ def estimate_sequence(
         return _finished(
             prior, covariance @ frames.normal.score, covariance, np.zeros(_NUISANCES), math.nan, math.nan
         )
-    known = np.concatenate(
-        [np.ones(count), np.full(2, settings.threshold_error**-2), [settings.leak_error**-2]]
-    )
+    error = max(settings.threshold_error, _KNOWN)
+    known = np.concatenate([np.ones(count), np.full(2, error**-2), [settings.leak_error**-2]])
     unknown = np.zeros(count + _NUISANCES)
     if start is not None:
         unknown[:count] = start

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.cameras import CrossingLaw
-from evnlos.inverse.sequence import WHITE_DN, Array, SequenceLight, group_blocks
+from evnlos.inverse.sequence_light import WHITE_DN, Array, SequenceLight, group_blocks
 from evnlos.types import Events
 
 _BLOCK = 16_384  # rows at a time: what bounds the memory

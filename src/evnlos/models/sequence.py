@@ -173,7 +173,7 @@ class SequenceReconstructor(Reconstructor):
 
     @torch.no_grad()
     def pooled_subsets(self, inputs: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
-        """Return `pooled` of subsets of the time steps, [K, S, P, P]; each step is embedded once for all of them.
+        """Return `pooled` of subsets of the time steps, [K, S, P, P]; each step is embedded once for all.
 
         Args:
             inputs: What was recorded at N time steps, [N, C, H, W].
@@ -217,7 +217,7 @@ class SequenceReconstructor(Reconstructor):
         return light.sum(dim=0)[0] / inside.sum(dim=0).clamp_min(1)
 
     def _from_plane(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Return images [N, S, H, W] as the plane sees them, [N, S, P, P], and where it does, bool [N, P, P]."""
+        """Return images [N, S, H, W] as seen from the plane, [N, S, P, P], and where, bool [N, P, P]."""
         place = self._place_m + position_m.float().cpu()[:, None, None]  # [N, P, P, 2]
         grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
         inside = (grid.abs() <= 1).all(dim=-1)  # [N, P, P]
