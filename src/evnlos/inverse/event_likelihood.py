@@ -17,8 +17,7 @@ With z the coefficients of the Gaussian prior and L(i, t; z) the filtered log li
 - Frames are linear in z, with the camera's noise, and an unknown offset of each pixel where its pattern is
   unknown.
 
-Gauss-Newton on all of it, with the error of a crossing annealed from 0.25 to what the events show. The
-curvature at the end is the information of the estimate.
+Gauss-Newton on it, the error of a crossing annealed from 0.25; the curvature is the estimate's information.
 """
 
 from __future__ import annotations
