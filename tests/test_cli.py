@@ -13,7 +13,9 @@ from PIL import Image
 from evnlos import open_dataset
 from evnlos.cli import VERBS, main
 from evnlos.config import save_yaml
-from evnlos.models import published_for
+from evnlos.data import Sampling
+from evnlos.models import Weights, published_for, save_weights
+from evnlos.models.sequence import SequenceConfig
 
 NETWORK = ["--network.width", "8", "--network.depth", "2"]
 
@@ -228,9 +230,33 @@ def test_report_is_one_page_without_requests(runs, recorded, tmp_path, capsys) -
     assert f">{number:.2f}<" in page
 
 
+def test_a_misspelt_command_names_the_nearest(capsys) -> None:
+    for word, meant in (("reconstrct", "reconstruct"), ("Simulate", "simulate"), ("calibrat", "calibrate")):
+        said = fails(capsys, word)
+        assert f"unknown command {word!r}; did you mean {meant!r}?" in said and "finetune" not in said
+
+
+def test_captures_that_are_not_there_match_nothing(tmp_path, capsys) -> None:
+    said = fails(capsys, "demo", "--out", tmp_path / "none", "--captures", tmp_path / "nope" / "*")
+    assert "nope/* matches nothing; give capture folders" in said and not (tmp_path / "none").exists()
+
+
+def test_one_picture_of_a_whole_recording_is_shown_once(tiny_captures, tmp_path, capsys) -> None:
+    sampling = Sampling(height=24, width=36, scored_rows=18)
+    network = SequenceConfig(width=4, depth=1, rank=4).build("frame", sampling).eval()
+    save_weights(tmp_path / "w.safetensors", Weights(network))
+    call("reconstruct", tiny_captures[0], "--weights", tmp_path / "w.safetensors", "--out", tmp_path / "r")
+    assert "all positions show one picture" in capsys.readouterr().out
+    with (
+        Image.open(tmp_path / "r" / "picture.png") as once,
+        Image.open(tmp_path / "r" / "position_00.png") as one,
+    ):
+        assert once.size == (2 * one.width, 2 * one.height)
+
+
 def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, tmp_path, capsys) -> None:
     out = tmp_path / "out"
-    assert "unknown command" in fails(capsys, "reconstrukt")
+    assert "unknown command 'zzz'; give one of demo, simulate" in fails(capsys, "zzz")
     assert "--port: invalid literal" in fails(capsys, "app", "--port", "abc")
     assert "Unrecognized options: --prot, 3; Perhaps you meant: --port INT" in fails(
         capsys, "app", "--prot", "3"

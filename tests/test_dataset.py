@@ -6,18 +6,20 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
-from evnlos.config import save_yaml
+from evnlos.config import config_hash, save_yaml
 from evnlos.data import (
+    Dataset,
     NlosDataset,
     Samples,
     Simulation,
@@ -31,6 +33,7 @@ from evnlos.data import (
 )
 from evnlos.data.pool import run_tasks
 from evnlos.data.simulate import drawn_for, split_of
+from evnlos.data.simulations import find_faults, repair
 from evnlos.errors import ConfigError, DataError, EvnlosError
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
@@ -91,6 +94,26 @@ def test_a_run_goes_on_where_it_was(tiny, tiny_dataset, tmp_path) -> None:
     assert simulate(tiny, folder, progress=watch).missing() == []
     assert not set(first) & set(watch.results)
     assert contents(folder) == contents(tiny_dataset.folder)
+
+
+def test_a_dataset_that_an_older_version_began_is_taken_up_and_stays_whole(tiny, tmp_path) -> None:
+    folder = tmp_path / "old"
+    (first,) = stopped(simulate, tiny, folder, after=1)
+    page = yaml.safe_load((folder / "dataset.yaml").read_text())
+    config = page["config"]
+    config["glyphs"]["plate"] = config["glyphs"].pop("target_plane")
+    config["rigs"] = config.pop("setups")
+    open_dataset(folder).shard(first).unlink()  # its hash is that of today's words
+    old = {key: value for key, value in page.items() if key in {item.name for item in fields(Dataset)}}
+    save_yaml({**old, "config_hash": config_hash(config)}, folder / "dataset.yaml")
+    with pytest.raises(DataError, match=r"other settings \(config.seed: 0 -> 1\)"):
+        simulate(replace(tiny, seed=1), folder)
+    simulate(tiny, folder)
+    found = open_dataset(folder)
+    assert find_faults(found) == [] and len(found.objects()) == 16
+    found.shard(first).unlink()
+    repair(found, find_faults(found))
+    assert find_faults(open_dataset(folder)) == []
 
 
 def test_a_killed_run_leaves_no_half_shard(tiny, tiny_dataset, tmp_path) -> None:

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,10 +19,12 @@ import pytest
 from evnlos import Events, EvnlosError, open_dataset, write_events
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.data import simulate
-from evnlos.data.simulations import find_faults
+from evnlos.data import SensorSize, Simulation, simulate, simulate_object
+from evnlos.data.simulate import drawn_for
+from evnlos.data.simulations import estimate, find_faults
 from evnlos.files import directory_lock, is_empty
 from evnlos.progress import Step
+from evnlos.setups import RadiometricSetup
 from watching import Watch, alive, stopped
 
 COMMAND = [sys.executable, "-m", "evnlos"]
@@ -143,6 +146,38 @@ def test_a_dry_run_says_what_it_would_take_and_writes_nothing(settings, tiny_dat
     assert f"objects: {len(tiny_dataset.objects())}" in out
     assert {line.split(":")[0] for line in out.splitlines()} == {"objects", "time", "disk", "memory"}
     assert not (tmp_path / "d").exists()
+
+
+def test_a_dry_run_counts_the_walls_that_are_drawn(tmp_path, monkeypatch) -> None:
+    """Every draw of the optics is prepared anew; that takes longer than the objects before it."""
+    spent, seen = [0.0], set[Simulation]()
+
+    def simulated(config: Simulation, name: str):
+        wall = drawn_for(config, name).setup
+        spent[0] += 1 if wall in seen else 20
+        seen.add(wall)
+        return samples, events
+
+    walls = {"setup.roughness": (0.05, 0.1)}
+    config = Simulation(
+        setup=RadiometricSetup(cell_m=0.02, sensor=SensorSize(12, 20)), positions=1, vary=walls, setups=2
+    )
+    samples, events = simulate_object(config, config.glyphs.objects()[0])
+    monkeypatch.setattr("evnlos.data.simulations.simulate_object", simulated)
+    monkeypatch.setattr("evnlos.data.simulations.time.process_time", lambda: spent[0])
+    found = estimate(config, workers=3)
+    objects = len(config.glyphs.objects())
+    assert (found.cpu_s, found.preparation_s, found.walls) == (1, 19, 6)
+    lines = found.lines(tmp_path)
+    assert "walls: 6 to prepare, 19.00 s of CPU each" in lines
+    assert f"time: about {(objects + 6 * 19) / 180:.0f} min with 3 processes" in " ".join(lines)
+    assert estimate(replace(config, setups=0), workers=3).walls == objects
+    assert estimate(replace(config, vary={}), workers=3).preparation_s == 0
+
+
+def test_a_dry_run_needs_no_module_that_windows_lacks(tiny, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert "memory: not known on this system" in estimate(tiny, workers=1).lines(tmp_path)
 
 
 def test_a_folder_has_one_run_at_a_time(tiny, tmp_path) -> None:

@@ -1,10 +1,12 @@
 """What an import costs: a room brings what it needs and no more, and a start can be interrupted at any time."""
 
+import ast
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -54,6 +56,17 @@ def test_events_need_neither_torch_nor_optics_nor_networks(tmp_path) -> None:
 def test_the_pixel_needs_neither_optics_nor_networks() -> None:
     found = loaded("from evnlos.cameras import EventPixel, simulate_events\nEventPixel()")
     assert not found & {f"evnlos.{room}" for room in ROOMS}
+
+
+def test_no_module_needs_what_windows_lacks_to_be_imported() -> None:
+    posix = {"fcntl", "grp", "pwd", "resource", "termios"}
+    for path in Path(evnlos.__file__).parent.rglob("*.py"):
+        for node in ast.parse(
+            path.read_text(encoding="utf-8")
+        ).body:  # not what stands in functions and in `try`
+            names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not posix & set(names), path
 
 
 @pytest.mark.parametrize("delay_s", [0.15, 0.4, 0.8])

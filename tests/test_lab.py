@@ -122,6 +122,34 @@ def test_more_characters_may_be_added_but_no_other_setup(rendered):
     assert content(rendered / "near_A") == before
 
 
+OLD_LAB = """\
+lab:
+  name: near
+  glyphs:
+    kind: font
+    family: kalam
+    characters: L
+    plate: {size_m: 0.08, size_px: 256}
+  frame_rate_hz: 1.0
+  transport: {kind: radiometric, cell_m: 0.01, gain: 0.7, ambient: 0.06, ambient_gradient: [0.0, 0.0]}
+  sensor: {height: 24, width: 36}
+  spread:
+    pixel.threshold_on: [0.18, 0.28]
+"""
+
+
+def test_a_folder_of_an_older_version_is_taken_up(tmp_path):
+    lab = small(
+        name="near",
+        glyphs=FontGlyphs(family="kalam", characters="L"),
+        spread={"setup.pixel.threshold_on": (0.18, 0.28)},
+    )
+    (tmp_path / "lab.yaml").write_text(OLD_LAB)
+    with pytest.raises(DataError, match=r"begun with other settings \(seed: 0 -> 1\)"):
+        render_captures(dataclasses.replace(lab, seed=1), tmp_path, [])
+    assert render_captures(lab, tmp_path, []) == []
+
+
 def test_other_glyphs_keep_their_whole_name(tmp_path):
     lab = small(glyphs=HandwritingGlyphs(characters="A", writers=1))
     assert [path.name for path in render_captures(lab, tmp_path / "o")] == ["lab_writer00_A"]

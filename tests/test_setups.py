@@ -18,7 +18,7 @@ from evnlos.data.lab import Lab, lab_of
 from evnlos.errors import ConfigError, DataError
 from evnlos.migrate import migrate
 from evnlos.optics.facets import SlopeTable
-from evnlos.scene import LineMotion, PathMotion, Pose, Scene, Target
+from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion, Pose, Scene, Target
 from evnlos.setups import (
     FittedSetup,
     MeasuredSetup,
@@ -264,6 +264,41 @@ def test_files_of_older_versions_load(tmp_path: Path) -> None:
     assert load_setup(tmp_path / "lab.yaml").pixel.threshold_on == 0.22
     lab = from_dict(Lab, {"transport": {"kind": "radiometric", "roughness": 0.2}})
     assert lab.setup.pixel == Lab().setup.pixel and lab.setup.frame_camera == Lab().setup.frame_camera
+
+
+@pytest.mark.parametrize("make", [_measured, _fitted])
+def test_a_setup_whose_folder_is_moved_loads(make: Any, tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    (first / "targets").mkdir()
+    setup = make(first)
+    glyphs = HandwritingGlyphs(known=str(first / "targets"), redrawn=2)
+    whole = Simulation(setup=setup, glyphs=glyphs)
+    save_yaml(whole, first / "training.yaml")
+    save_yaml(to_dict(whole), first / "older.yaml")  # with the absolute names of before
+    save_yaml(setup, first / "setup.yaml")
+    assert str(first) in (first / "older.yaml").read_text()
+    assert str(first) not in (first / "training.yaml").read_text() + (first / "setup.yaml").read_text()
+    for name in ("training.yaml", "older.yaml"):
+        assert load_yaml(Simulation, first / name) == whole
+    first.rename(second)
+    for name in ("training.yaml", "older.yaml"):
+        moved = load_yaml(Simulation, second / name)
+        assert moved.setup == replace(setup, file=str(second / Path(setup.file).name))
+        assert moved.glyphs == replace(glyphs, known=str(second / "targets"))
+    for word in (second, second / "setup.yaml", second / "older.yaml"):
+        assert load_setup(word) == moved.setup
+        assert load_setup(word).ambient_light().shape == SHAPE  # from the file that was moved
+    # A name that leads to nothing beside the file is left to the working directory, as before.
+    (second / "other.yaml").write_text("kind: measured\nfile: elsewhere.safetensors\n")
+    assert load_setup(second / "other.yaml") == MeasuredSetup(file="elsewhere.safetensors")
+
+
+def test_another_file_under_the_name_of_a_fitted_wall_is_refused(tmp_path: Path) -> None:
+    setup = _fitted(tmp_path)
+    save_yaml(replace(setup, checksum="0" * 16), tmp_path / "setup.yaml")
+    with pytest.raises(ConfigError, match=r"checksum|another"):
+        load_setup(tmp_path).ambient_light()
 
 
 def test_the_lab_takes_any_setup(tmp_path: Path) -> None:

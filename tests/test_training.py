@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from evnlos import EvnlosError, evaluate, train
+from evnlos.config import to_dict
 from evnlos.data import NlosDataset
 from evnlos.errors import ConfigError, DataError
 from evnlos.models import ResidualUNet, UNetConfig, load_weights, save_weights
 from evnlos.models.sequence import SequenceConfig
 from evnlos.training import LOSSES, Training, learning_rate_at, normalized_bce_mse_ssim, paper_loss
 from evnlos.training.source import half_mirrored, with_mirrored
+from evnlos.training.train import check_run
 from evnlos.training.validation import validate
 
 SMALL = UNetConfig(width=8, depth=2, shuffle=1, rank=0)
@@ -206,3 +208,14 @@ def test_sequences_are_not_mirrored(tiny_dataset, tmp_path) -> None:
     with pytest.raises(ConfigError, match="whole sequences, which are not mirrored"):
         run(tiny_dataset, replace(QUICK, mirror=True, network=SequenceConfig()), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_run_that_an_older_version_began_is_taken_up(tmp_path) -> None:
+    settings = Training(modality="frame", network=SequenceConfig(ridge_multipliers=(0.5, 2.0)), epochs=3)
+    (tmp_path / "run.yaml").write_text(
+        "settings:\n  paradigm: frame\n  network: {kind: sequence, strengths: [0.5, 2.0]}\n  epochs: 3\n"
+        "data: {name: near}\n"
+    )
+    check_run(tmp_path, {"settings": to_dict(settings), "data": {"name": "near"}})
+    with pytest.raises(DataError, match=r"settings.epochs: 3 -> 4"):
+        check_run(tmp_path, {"settings": to_dict(replace(settings, epochs=4)), "data": {"name": "near"}})

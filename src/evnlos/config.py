@@ -48,6 +48,8 @@ UNSIGNED = (
 )  # fmt: skip
 """What the names of numbers end in that are never negative."""
 _NO_UNIT, _MOST_COUNT = (1e-30, 1e30), 2**63 - 1
+BESIDE = types.MappingProxyType({"beside": True})
+"""Metadata of a field that names a file or folder; in a YAML file it is relative to that file's folder."""
 LONG_YAML = 1 << 26
 """Bytes of a YAML file that names every object of a dataset, at most."""
 
@@ -70,7 +72,9 @@ def to_dict(config: Any) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
-def from_dict(cls: type[T], values: dict[str, Any], *, source: str = "the configuration") -> T:
+def from_dict(
+    cls: type[T], values: dict[str, Any], *, source: str = "the configuration", folder: Path | None = None
+) -> T:
     """Build the dataclass `cls` from nested dictionaries, refusing unknown keys and wrong types.
 
     Args:
@@ -78,6 +82,7 @@ def from_dict(cls: type[T], values: dict[str, Any], *, source: str = "the config
         values: Keys are field names, today's or those of older versions (`evnlos.migrate`); fields that are
             left out keep their defaults.
         source: What to call the values in an error, e.g. the file they came from.
+        folder: Where names of files (fields marked `BESIDE`) are looked up; None leaves them as they are.
 
     Raises:
         ConfigError: An unknown key (the nearest field is named), a wrong type, or a value outside its range.
@@ -89,7 +94,7 @@ def from_dict(cls: type[T], values: dict[str, Any], *, source: str = "the config
             f"{source} holds a {type(values).__name__}; give a mapping of setting names to values"
         )
     try:
-        values = _migrated(cls, values)
+        values = _migrated(cls, values, folder)
     except ConfigError as error:  # a kind that nobody knows
         raise ConfigError(f"{source}: {error}") from None
     _refuse_unknown(cls, values, source, "")
@@ -129,12 +134,15 @@ def _shown(value: Any) -> str:
 
 
 def load_yaml(cls: type[T], path: str | Path) -> T:
-    """Read the dataclass `cls` from a YAML file.
+    """Read the dataclass `cls` from a YAML file; names of files in it are relative to its folder.
+
+    A name that is not found there may be relative to the working directory; an absolute one that is gone is
+    looked for beside the YAML file, so that a folder may be moved.
 
     Raises:
         ConfigError: The file is missing, is not YAML, or its content does not fit `cls`.
     """
-    return from_dict(cls, read_yaml(path), source=str(path))
+    return from_dict(cls, read_yaml(path), source=str(path), folder=Path(path).parent)
 
 
 def read_yaml(path: str | Path, most_bytes: int = _MOST_BYTES) -> dict[str, Any]:
@@ -194,8 +202,13 @@ def _check_plain(text: str, most: int) -> None:
 
 
 def save_yaml(config: Any, path: str | Path) -> None:
-    """Write a configuration dataclass (or a plain mapping) as YAML, atomically."""
-    values = to_dict(config) if dataclasses.is_dataclass(config) else config
+    """Write a configuration dataclass (or a plain mapping) as YAML, atomically.
+
+    Files of a dataclass that lie in the YAML file's folder are named relative to it.
+    """
+    values = config
+    if dataclasses.is_dataclass(config):
+        values = _relative(config, to_dict(config), Path(path).parent.resolve())
     text = yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     write_atomically(path, text.encode())
 
@@ -222,8 +235,43 @@ def differing_keys(current: dict[str, Any], stored: dict[str, Any], prefix: str 
     return found
 
 
-def _migrated(cls: Any, values: Any) -> Any:
-    """Return the values with every nested mapping in the names of this version."""
+def _relative(config: Any, values: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a dataclass's mapping in which names of files in `folder` are relative to it."""
+    found = dict(values)
+    for field in dataclasses.fields(config):
+        here = getattr(config, field.name)
+        if dataclasses.is_dataclass(here):
+            found[field.name] = _relative(here, values[field.name], folder)
+        elif here and _names_file(field) and (path := Path(here).resolve()).is_relative_to(folder):
+            found[field.name] = path.relative_to(folder).as_posix()
+    return found
+
+
+def _names_file(field: dataclasses.Field[Any]) -> bool:
+    return field.metadata.get("beside", False)
+
+
+def _found_from(folder: Path, name: Any) -> Any:
+    """Return the absolute path of a file that a YAML file in `folder` names; else the name as it is."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        return name
+    path = Path(name)
+    if path.is_absolute():
+        beside = folder / path.name
+        return name if _is_there(path) or not _is_there(beside) else str(beside.resolve())
+    beside = folder / path
+    return str(beside.resolve()) if _is_there(beside) else name
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that no file can have
+        return False
+
+
+def _migrated(cls: Any, values: Any, folder: Path | None = None) -> Any:
+    """Return the values with all nested mappings in the names of today, its files as seen from `folder`."""
     candidates = _dataclasses_in(cls, values)
     if not candidates or not isinstance(values, dict):
         return values
@@ -233,7 +281,12 @@ def _migrated(cls: Any, values: Any) -> Any:
         chosen = next((one for one in candidates if getattr(one, "kind", None) == kind), chosen)
     values = migrate(chosen.__name__, values)
     hints = typing.get_type_hints(chosen)
-    return {key: _migrated(hints[key], value) if key in hints else value for key, value in values.items()}
+    if folder is not None and dataclasses.is_dataclass(chosen):
+        files = {field.name for field in dataclasses.fields(chosen) if _names_file(field)}
+        values = {key: _found_from(folder, value) if key in files else value for key, value in values.items()}
+    return {
+        key: _migrated(hints[key], value, folder) if key in hints else value for key, value in values.items()
+    }
 
 
 def _refuse_unknown(cls: Any, values: Any, source: str, prefix: str) -> None:

@@ -36,7 +36,8 @@ class InvertCommand:
     positions: tuple[int, ...] = ()
     """Captures: how many of the frames 1, 2, ... to use, equally spaced; none = all, several = a curve."""
     pattern: Path | None = None
-    """Captures: the camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup."""
+    """Captures: the camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup. By
+    default that of a calibrated --setup."""
     track: bool = False
     """Captures: find the motion in the recording also where capture.yaml states it."""
     static: float = 1.0

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from evnlos.calibration.scan.importer import fill_bad
 from evnlos.cli.parsing import say
-from evnlos.data import Capture, load_pattern, read_capture
+from evnlos.data import Capture, pattern_of, read_capture
 from evnlos.data.frame_sources import read_image
 from evnlos.data.sampling import Sampling
 from evnlos.errors import ConfigError
@@ -76,7 +76,7 @@ def invert_captures(
     clock = time.perf_counter()
     setup = linear_setup(options.setup)
     captures = [read_capture(folder) for folder in folders]
-    pattern = None if options.pattern is None else load_pattern(options.pattern)
+    pattern = pattern_of(options.setup, options.pattern)
     height, width = captures[0].frames.shape[1:]
     if any(capture.frames.shape != captures[0].frames.shape for capture in captures):
         raise ConfigError(

@@ -60,13 +60,12 @@ class ReconstructCommand:
 
     def run(self) -> None:
         """Reconstruct and print where the pictures are."""
-        from evnlos.data import load_pattern
+        from evnlos.data import pattern_of
         from evnlos.report import reconstruct_capture
         from evnlos.setups import calibrated_folder, load_setup
 
         folder = calibrated_folder(self.setup) if self.setup else None
-        source = self.pattern or folder
-        pattern = load_pattern(source) if source else None
+        pattern = pattern_of(folder, self.pattern)
         setup = load_setup(folder) if folder else None
         found = reconstruct_capture(
             self.capture, self.weights, self.out, pattern=pattern, setup=setup, track=self.track
@@ -77,6 +76,12 @@ class ReconstructCommand:
             print(json.dumps(found | {"out": str(self.out)}))
             return
         print(f"{self.out}: {found['positions']} positions of {found['capture']} by {found['weights']}")
+        if found["one_picture"]:
+            how = "found" if self.track else "stated"
+            print(
+                "all positions show one picture, made from the whole recording and drawn where the motion was "
+                f"{how}; picture.png shows it once"
+            )
         if not found.get("moved_by_the_setup", True):
             print(
                 f"the light is {found['light']:.2f} x that of the setup: its gain is not this capture's, the "
@@ -108,7 +113,8 @@ class TrackCommand:
     """Setup of the capture (a file, or the folder that `evnlos calibrate` wrote): positions in metres; without
     it they are in image pixels."""
     pattern: Path | None = None
-    """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup."""
+    """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup. By default that
+    of a calibrated --setup."""
     out: Path = Path("track.png")
     """The picture; the numbers go to the same name with .json."""
     json: bool = False
@@ -118,13 +124,13 @@ class TrackCommand:
     def run(self) -> None:
         """Follow, print, write the picture."""
         from evnlos.cli.invert_captures import linear_setup
-        from evnlos.data import load_pattern, read_capture
+        from evnlos.data import pattern_of, read_capture
         from evnlos.plot.results import draw_track
         from evnlos.tracking import track_capture, track_warnings
 
         capture = read_capture(self.capture)
         setup = None if self.setup is None else linear_setup(self.setup)
-        pattern = None if self.pattern is None else load_pattern(self.pattern)
+        pattern = pattern_of(self.setup, self.pattern)
         track = track_capture(capture, setup, self.settings, pattern)
         truth = true_path(capture, track.time_s) if track.unit == "m" else None
         found = track_values(capture, track, truth)
@@ -254,10 +260,9 @@ class IdentifyCommand:
                 f"no setup given; give a settings file, --all, or names: {', '.join(setup_names())}"
             )
         setups = [named_setup(name) for name in names]
-        found = [
-            identify(one.setup, self.settings, one.name, self.seed)
-            for one in tqdm(setups, desc="identify", unit=" setups", disable=len(setups) == 1)
-        ]
+        # `disable=False` would overrule TQDM_DISABLE.
+        shown = setups if len(setups) == 1 else tqdm(setups, desc="identify", unit=" setups")
+        found = [identify(one.setup, self.settings, one.name, self.seed) for one in shown]
         limits = {
             one.name: sequence_bounds(one.setup, self.sequence, one.name, self.seed)
             for one in (setups if self.bounds else [])

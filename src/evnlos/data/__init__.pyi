@@ -10,6 +10,7 @@ from .capture_info import CaptureInfo as CaptureInfo
 from .cleaning import PATTERN_FILE as PATTERN_FILE
 from .cleaning import FixedPattern as FixedPattern
 from .cleaning import load_pattern as load_pattern
+from .cleaning import pattern_of as pattern_of
 from .cleaning import save_pattern as save_pattern
 from .live import LiveDataset as LiveDataset
 from .live import live_dataset as live_dataset

@@ -250,5 +250,28 @@ def load_pattern(path: str | Path) -> FixedPattern:
     return FixedPattern(sensitivity, offset)
 
 
+def pattern_of(setup: str | Path | None, pattern: str | Path | None = None) -> FixedPattern | None:
+    """Return the fixed pattern that a setup stands for to every command: the one in its calibrated folder.
+
+    Args:
+        setup: Word of a setup (see `load_setup`): a calibrated folder, a settings file in it, or any other
+            word; None for no setup.
+        pattern: A file or folder with another pattern, which wins.
+
+    Returns:
+        The pattern; None where neither has any.
+
+    Raises:
+        DataError: As of `load_pattern`.
+    """
+    if pattern is not None:
+        return load_pattern(pattern)
+    if setup is None:
+        return None
+    folder = Path(setup) if Path(setup).is_dir() else Path(setup).parent
+    names_folder = folder == Path(setup) or Path(setup).suffix in (".yaml", ".yml")
+    return load_pattern(folder) if names_folder and (folder / PATTERN_FILE).is_file() else None
+
+
 PATTERN_FILE = "pattern.safetensors"
 """Name of the file in a setup's folder."""

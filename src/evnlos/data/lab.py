@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from evnlos.cameras import EventPixel, FrameCamera
-from evnlos.config import check_made, differing_keys, read_yaml, save_yaml, to_dict
+from evnlos.config import check_made, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data.pool import processes, run_tasks
 from evnlos.data.simulate import check_ranges, check_sequences, sequence_bytes, varied
 from evnlos.errors import ConfigError, DataError
@@ -230,7 +230,9 @@ def _record(lab: Lab, drawn: Lab, out: Path) -> None:
     path, asked = out / "lab.yaml", to_dict(lab)
     if path.is_file():
         before = read_yaml(path).get("lab")
-        differing = differing_keys(asked, before) if isinstance(before, dict) else ["lab: missing"]
+        differing = ["lab: missing"]
+        if isinstance(before, dict):
+            differing = differing_keys(asked, to_dict(from_dict(Lab, before, source=str(path))))
         differing = [line for line in differing if not line.startswith("glyphs.characters:")]
         if differing:
             raise DataError(

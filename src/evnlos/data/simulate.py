@@ -184,7 +184,7 @@ def drawn_for(config: Simulation, name: str) -> Simulation:
 
     Gain and ambient light cost nothing, so they are always the object's own.
     """
-    optics = {path: ends for path, ends in config.vary.items() if config.setups and _needs_a_matrix(path)}
+    optics = {path: ends for path, ends in config.vary.items() if config.setups and needs_a_matrix(path)}
     others = {path: ends for path, ends in config.vary.items() if path not in optics}
     if optics:
         group = derive_seed(config.seed, name, "rig") % config.setups
@@ -192,7 +192,8 @@ def drawn_for(config: Simulation, name: str) -> Simulation:
     return varied(config, others, config.seed, name)
 
 
-def _needs_a_matrix(path: str) -> bool:
+def needs_a_matrix(path: str) -> bool:
+    """Return whether a varied setting, by its dotted name, is one of the optics: each draw is prepared anew."""
     section, name, *_ = path.split(".")
     return section == "setup" and name not in (*LIGHT_FIELDS, *CAMERA_FIELDS)
 
@@ -351,7 +352,7 @@ def simulate(
         config_hash=config_hash(config),
         optics=config.optics(),
     )
-    with claim_dataset(dataset, f"{first}-of-{stride}" if stride > 1 else ""):
+    with claim_dataset(dataset, f"{first}-of-{stride}" if stride > 1 else "", Simulation) as dataset:
         share_names = set(config.glyphs.objects()[first - 1 :: stride])
         missing = [name for name in dataset.missing() if name in share_names]
         what, total, there = (

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
 import sys
 import tempfile
@@ -19,7 +18,7 @@ from pathlib import Path
 from evnlos.config import config_hash, from_dict
 from evnlos.data.pool import processes
 from evnlos.data.sampling import Sampling
-from evnlos.data.simulate import Simulation, simulate, simulate_object
+from evnlos.data.simulate import Simulation, needs_a_matrix, simulate, simulate_object
 from evnlos.data.store import PAGE, Dataset, claim_dataset, is_page_changed, read_shard, write_shard
 from evnlos.errors import ConfigError, DataError
 from evnlos.progress import Progress, Step, silent
@@ -129,15 +128,19 @@ class Estimate:
 
     Args:
         objects: Objects to simulate here.
-        cpu_s: CPU time of one object, seconds, the first one's preparation left out.
+        cpu_s: CPU time of one object, seconds, preparation left out.
+        preparation_s: CPU time to prepare one wall that `vary` draws, seconds; 0 where it draws none.
+        walls: Walls to prepare, each process its own.
         shard_bytes: Size of one shard.
-        worker_bytes: Peak memory of the process that simulated it.
+        worker_bytes: Peak memory of the process that simulated it; 0 where the system does not say.
         workers: Processes.
         events: Events of the object.
     """
 
     objects: int
     cpu_s: float
+    preparation_s: float
+    walls: int
     shard_bytes: int
     worker_bytes: int
     workers: int
@@ -147,17 +150,24 @@ class Estimate:
         """Return what a user wants to know before the start."""
         place = next(path for path in (out, *out.resolve().parents) if path.is_dir())
         free = shutil.disk_usage(place).free
-        wall_s = self.objects * self.cpu_s / self.workers
+        seconds = (self.objects * self.cpu_s + self.walls * self.preparation_s) / self.workers
+        prepared = (
+            [f"walls: {self.walls} to prepare, {self.preparation_s:.2f} s of CPU each"] if self.walls else []
+        )
+        memory = _size(self.workers * self.worker_bytes) if self.worker_bytes else "not known on this system"
         return [
             f"objects: {self.objects}, {self.cpu_s:.2f} s of CPU and {self.events:,} events each",
-            f"time: about {_clock(wall_s)} with {self.workers} processes of one thread on as many free cores",
+            *prepared,
+            f"time: about {_clock(seconds)} with {self.workers} processes of one thread on as many free cores",
             f"disk: about {_size(self.objects * self.shard_bytes)}; {_size(free)} are free",
-            f"memory: about {_size(self.workers * self.worker_bytes)}",
+            f"memory: {'about ' if self.worker_bytes else ''}{memory}",
         ]
 
 
 def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 1)) -> Estimate:
     """Simulate the middle object of a share twice, the first time to compile and to fill caches.
+
+    Where `vary` draws walls, it is simulated before a wall of another draw, too, to see what that one takes.
 
     Args:
         config: The settings.
@@ -175,6 +185,13 @@ def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 
     at_once = processes(workers, len(names))
     name = names[len(names) // 2]
     simulate_object(config, name)
+    walls = _walls(config, len(names), at_once)
+    fresh = 0.0
+    if walls:
+        began = time.process_time()
+        simulate_object(replace(config, seed=config.seed + 1), name)
+        fresh = time.process_time() - began
+        simulate_object(config, name)  # which the other wall may have pushed out of the caches
     began = time.process_time()
     samples, events = simulate_object(config, name)
     with tempfile.TemporaryDirectory() as folder:
@@ -182,9 +199,25 @@ def estimate(config: Simulation, workers: int = 0, share: tuple[int, int] = (1, 
         write_shard(path, samples, {"object": name}, events if config.keep_events else None)
         size = path.stat().st_size
     spent = time.process_time() - began
+    prepared = max(fresh - spent, 0.0) if walls else 0.0
+    return Estimate(len(names), spent, prepared, walls, size, _peak_bytes(), at_once, len(events))
+
+
+def _walls(config: Simulation, objects: int, workers: int) -> int:
+    """Return how many walls that `vary` draws all processes together prepare, at most."""
+    if not any(needs_a_matrix(path) for path in config.vary):
+        return 0
+    return min(config.setups * workers, objects) if config.setups else objects
+
+
+def _peak_bytes() -> int:
+    """Return the most memory that this process has held, bytes; 0 where the system does not say."""
+    try:
+        import resource  # not on Windows
+    except ImportError:
+        return 0
     unit = 1 if sys.platform == "darwin" else 1024
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-    return Estimate(len(names), spent, size, peak, at_once, len(events))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def _clock(seconds: float) -> str:
@@ -269,7 +302,7 @@ def repair(
             f"{dataset.folder} holds captures; delete the {len(faults)} faulty shards and import again"
         )
     config = from_dict(Simulation, dataset.config, source=str(dataset.folder / PAGE))
-    if config_hash(config) != dataset.config_hash or is_page_changed(dataset):
+    if config_hash(dataset.config) != dataset.config_hash or is_page_changed(dataset):
         raise DataError(
             f"{dataset.folder / PAGE} was changed: its settings no longer fit their hash "
             f"{dataset.config_hash}; restore it, or simulate into a new folder"

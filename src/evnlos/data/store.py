@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -250,8 +250,12 @@ class Dataset:
 _KEYS = {item.name for item in fields(Dataset)} - {"folder"} | {_DIGEST}
 
 
-def check_dataset(dataset: Dataset) -> bool:
+def check_dataset(dataset: Dataset, settings: type[Any] | None = None) -> bool:
     """Return whether the folder holds the dataset already, begun with the same settings; write nothing.
+
+    Args:
+        dataset: What is to be there.
+        settings: Class of its settings, so that those of an older version are compared in today's words.
 
     Raises:
         DataError: The folder holds a dataset of other settings (the differing keys are named), or other files.
@@ -259,6 +263,8 @@ def check_dataset(dataset: Dataset) -> bool:
     path = dataset.folder / PAGE
     if path.is_file():
         stored = read_yaml(path, LONG_YAML)
+        if settings is not None and isinstance(stored.get("config"), dict):
+            stored["config"] = to_dict(from_dict(settings, stored["config"], source=str(path)))
         differing = differing_keys(_comparable(_content(dataset)), _comparable(stored))
         if differing:
             shown = "; ".join(differing[:6]) + (
@@ -271,33 +277,44 @@ def check_dataset(dataset: Dataset) -> bool:
     return False
 
 
-def create_dataset(dataset: Dataset) -> Dataset:
+def create_dataset(dataset: Dataset, settings: type[Any] | None = None) -> Dataset:
     """Create the folder and `dataset.yaml`, or take up a folder that was begun with the same settings.
+
+    Args:
+        dataset: What is to be there.
+        settings: As of `check_dataset`.
+
+    Returns:
+        The dataset, with the hash that the folder was begun with, maybe by an older version.
 
     Raises:
         DataError: As `check_dataset`.
     """
-    if not check_dataset(dataset):
-        dataset.folder.mkdir(parents=True, exist_ok=True)
-        content = _content(dataset)
-        save_yaml(content | {_DIGEST: config_hash(content)}, dataset.folder / PAGE)
+    if check_dataset(dataset, settings):
+        return replace(dataset, config_hash=open_dataset(dataset.folder).config_hash)
+    dataset.folder.mkdir(parents=True, exist_ok=True)
+    content = _content(dataset)
+    save_yaml(content | {_DIGEST: config_hash(content)}, dataset.folder / PAGE)
     return dataset
 
 
 @contextmanager
-def claim_dataset(dataset: Dataset, part: str = "") -> Iterator[None]:
+def claim_dataset(dataset: Dataset, part: str = "", settings: type[Any] | None = None) -> Iterator[Dataset]:
     """Hold a dataset's folder for this process, and create the dataset there or take it up.
 
     Args:
         dataset: What is to be there.
         part: Name of the share of the work, as in `directory_lock`.
+        settings: As of `check_dataset`.
+
+    Yields:
+        The dataset, as of `create_dataset`.
 
     Raises:
         DataError: As `check_dataset`, and then the folder stays as it is; or another process holds it.
     """
-    with directory_lock(dataset.folder, part, check=lambda: check_dataset(dataset)):
-        create_dataset(dataset)
-        yield
+    with directory_lock(dataset.folder, part, check=lambda: check_dataset(dataset, settings)):
+        yield create_dataset(dataset, settings)
 
 
 def open_dataset(folder: str | Path) -> Dataset:

@@ -186,7 +186,8 @@ def reconstruct_capture(
     surface, reconstruction and, where known, truth, side by side) and `reconstruction.npy` (float32
     [N, H, W], 0..1). Where the weights hold a confidence and the motion is known, also
     `interval.npy` (the ends of each pixel's interval, float32 [2, N, H, W]) and `unsure.png`, a strip of the
-    intervals' lengths (black is sure, white is anything).
+    intervals' lengths (black is sure, white is anything). Of a network that sees whole sequences, whose picture
+    is one, `picture.png` shows it once, large, with the ends of its interval beside it where there are any.
 
     Args:
         capture: A capture folder; its target may be unknown.
@@ -203,8 +204,10 @@ def reconstruct_capture(
             known, stays where the capture states it.
 
     Returns:
-        Capture, weights, modality, number of positions; where the truth is known, the mean scores; where it can
-        be told, the confidence: support, threshold, measured, verdict and, where a setup is known, explained;
+        Capture, weights, modality, number of positions, and whether all of them show one picture, which was
+        made from the whole recording and is drawn where the motion was stated or found; where the truth is
+        known, the mean scores; where it can be told, the confidence: support, threshold, measured, verdict and,
+        where a setup is known, explained;
         else no_confidence, which says why. With a setup also `light`, the capture's brightness in that of the
         setup, and whether the pictures were moved; with `track` the warnings of the track.
 
@@ -226,10 +229,15 @@ def reconstruct_capture(
     made = model.reconstruct(recording, setup, pattern, track)
     images, samples, confidence = made.images, made.samples, made.confidence
     pictures = [grey(image) for image in images]
+    is_one = model.weights.network.sees_sequence
     with new_folder(out) as draft:
         for k, picture in enumerate(pictures):
             save_png(draft / f"position_{k:02d}.png", picture, zoom)
         save_png(draft / "strip.png", strip(pictures), 2)
+        if is_one:
+            middle = len(pictures) // 2
+            ends = [] if confidence is None else [confidence.low[middle], confidence.high[middle]]
+            save_png(draft / "picture.png", strip([pictures[middle], *map(grey, ends)]), 2 * zoom)
         shown = []
         for k, picture in enumerate(pictures):
             row = [stretched(samples.frame[k]), polarity(samples.surface[k]), picture]
@@ -244,6 +252,7 @@ def reconstruct_capture(
             "weights": str(weights),
             "modality": model.weights.modality.name,
             "positions": len(pictures),
+            "one_picture": is_one,
         }
         if made.light is not None:
             found |= {"light": round(made.light, 4), "moved_by_the_setup": made.is_moved}

@@ -14,6 +14,7 @@ from typing import Literal, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from evnlos.config import BESIDE
 from evnlos.errors import ConfigError
 from evnlos.scene.databases import list_emnist, list_sd19, read_emnist_images, read_sd19_image
 from evnlos.scene.drawings import KINDS, drawing
@@ -100,7 +101,7 @@ class HandwritingGlyphs:
     characters: str = UPPER_CASE
     strokes: Strokes = field(default_factory=Strokes)
     target_plane: TargetPlane = field(default_factory=TargetPlane)
-    known: str = ""
+    known: str = field(default="", metadata=BESIDE)
     redrawn: int = 0
 
     def __post_init__(self) -> None:

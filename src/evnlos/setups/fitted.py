@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from evnlos.config import BESIDE
 from evnlos.errors import ConfigError
 from evnlos.optics import MatrixTransport, MatrixWall, coarsest_keyframe_step_m
 from evnlos.optics.angular_spectrum import check_lengths
@@ -36,7 +37,7 @@ class FittedSetup(Setup):
 
     kind: Literal["fitted"] = "fitted"
     """Kind of this setup."""
-    file: str = ""
+    file: str = field(default="", metadata=BESIDE)
     """The fitted wall, a .safetensors file of `evnlos calibrate`."""
     checksum: str = ""
     """First 16 digits of the file's SHA-256; empty = not checked."""

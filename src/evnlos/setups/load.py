@@ -359,4 +359,4 @@ def _in_file(path: Path) -> Setup:
         raise ConfigError(f"{path}: setup is {values!r}; give a mapping with the kind of the setup")
     # A lab's sensor is drawn once; what was drawn stands beside the ranges.
     values = {**values, **{name: drawn[name] for name in CAMERA_FIELDS if name in drawn}}
-    return from_dict(Setup, values, source=str(path))  # type: ignore[type-abstract] - its kind is concrete
+    return from_dict(Setup, values, source=str(path), folder=path.parent)  # type: ignore[type-abstract] - its kind is concrete

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.config import BESIDE
 from evnlos.errors import ConfigError
 from evnlos.optics import MatrixTransport, MatrixWall
 from evnlos.optics.wall import ambient_plane
@@ -34,7 +35,7 @@ class MeasuredSetup(Setup):
     """Brightness and exposure of the hidden object over those of the scan's light; 1 = the same."""
     ambient: float = 0.0
     """Ambient light on top of the dark frames' in the middle of the image, white levels."""
-    file: str = ""
+    file: str = field(default="", metadata=BESIDE)
     """The measured matrix, a .safetensors file of `evnlos scan import`."""
     checksum: str = ""
     """First 16 digits of the file's SHA-256, as the import prints them; empty = not checked."""

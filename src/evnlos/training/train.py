@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from evnlos.config import LONG_YAML, config_hash, differing_keys, read_yaml, save_yaml, to_dict
+from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data import Dataset, LiveDataset, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import directory_lock, is_empty, write_atomically
@@ -321,6 +321,8 @@ def check_run(out: Path, about: dict[str, Any]) -> None:
     path = out / "run.yaml"
     if path.is_file():
         stored = migrate("run", read_yaml(path, LONG_YAML))
+        if isinstance(stored.get("settings"), dict):
+            stored["settings"] = to_dict(from_dict(Training, stored["settings"], source=str(path)))
         differing = differing_keys(
             {key: about[key] for key in ("settings", "data")},
             {key: stored.get(key) for key in ("settings", "data")},
