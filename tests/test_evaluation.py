@@ -1,5 +1,6 @@
 """Scores: boxes, baselines, LPIPS from files, tables and curves."""
 
+import dataclasses
 import hashlib
 
 import numpy as np
@@ -14,7 +15,7 @@ from evnlos.data import STANDARD_MODALITIES, Sampling
 from evnlos.errors import DataError
 from evnlos.models import UNetConfig, Weights
 from evnlos.report.pictures import curves_svg
-from evnlos.report.sections import gains_of, summary_section
+from evnlos.report.sections import gains_of, losses_of, summary_section
 from evnlos.report.tables import RunResult, best_two, method_of
 
 CONVOLUTIONS = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]  # places in torchvision's vgg16.features
@@ -154,4 +155,14 @@ def test_a_report_leads_with_what_is_gained() -> None:
     assert list(gains_of(results)) == ["frame"] and gains_of(results[:2]) == {}
     page = summary_section(results)
     assert f"frame {gain} dB" in page and f">{np.mean(errors['EPNP']):.2f}</text>" in page
+    assert "Fine-tuning harmed" not in page
+    # What fine-tuning lost against simulation alone is said beside the gain.
+    better = dataclasses.replace(results[-1], name="sim", method="simulation only")
+    worse = [dataclasses.replace(one, method="EPNP") for one in results[:2]]
+    before, after = float(errors["EPNP"][1].mean()), float(np.mean(errors["E2E"]))
+    assert losses_of([better, *worse]) == [
+        f"Fine-tuning harmed frame: {before:.2f} dB with simulation only, {after:.2f} dB after it. "
+        "Use the weights from before, or fewer epochs."
+    ]
+    assert "Fine-tuning harmed frame" in summary_section([better, *worse, *results[:2]])
     assert "all-black" in page and page.count("<rect") == 2

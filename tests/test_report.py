@@ -133,7 +133,16 @@ def test_every_command_of_the_page_is_one_that_the_program_takes(made, monkeypat
     assert "# sim-2.yaml: settings of hash ab12 of 1 simulated objects" in again  # `sim` is another one
     assert "evnlos simulate --config sim-2.yaml --out sim-2" in again and "--data sim-2" in again
     assert "evnlos train --simulate live.yaml" in again and "evnlos import near_A --out near-2" in again
-    assert "--pattern pattern.safetensors" in "\n".join(Commands(coarse, [run], "test").again())
+    seen = replace(coarse, split={"train": ["near_A", "near_B"], "validation": [], "test": ["near_G"]})
+    lines = Commands(seen, [run], "test").again()
+    assert lines[0] == "evnlos calibrate near_A near_B --out calibrated"
+    assert "evnlos import near_A near_B near_G --out near --test near_G --pattern calibrated" in lines[1]
+    # A pre-training that is a run of the page, too, is listed once, under its own name.
+    before = replace(run, name="before", history=STEPS[:1])
+    lines = Commands(data, [before, file, replace(file, name="second")], "test").again()
+    assert sum(line.startswith("evnlos train") for line in lines) == 1
+    for name in ("mine", "second"):
+        assert f"evnlos finetune --data old --weights before --config {name}.yaml --out {name}" in lines
 
 
 def test_report_and_reconstruct_take_a_calibrated_folder_and_say_what_else(tmp_path, capsys) -> None:
@@ -174,7 +183,15 @@ def test_the_page_explains_its_words_and_fits_a_phone_and_paper(made, tmp_path) 
     shown = (
         "return [...document.querySelectorAll('details pre')].map(one => one.getBoundingClientRect().height)"
     )
+    many = [replace(made[1][0], name=f"run-{k}") for k in range(11)]  # three columns and one for each run
+    wide_page = write_report(tmp_path / "wide.html", made[0], many, [])
     with Chromium(tmp_path / "profile") as browser:
+        browser.open(wide_page.as_uri())
+        browser.devtools(
+            "Emulation.setDeviceMetricsOverride", width=1280, height=800, deviceScaleFactor=1, mobile=False
+        )
+        hidden = "const one = document.querySelector('.tiles'); return one.scrollWidth - one.clientWidth"
+        assert browser.run(hidden) <= 0
         browser.open(path.as_uri())
         browser.devtools(
             "Emulation.setDeviceMetricsOverride", width=390, height=800, deviceScaleFactor=1, mobile=True

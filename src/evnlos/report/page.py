@@ -278,7 +278,7 @@ def _pictures(dataset: Dataset, results: list[RunResult]) -> str:
             f"<img alt='{html.escape(text)} of {html.escape(name)}' src='{data_uri(png(picture))}'>"
             for text, picture in zip(texts, shown, strict=True)
         ]
-    grid = f"grid-template-columns:4.5rem repeat({len(heads) - 1},100px)"
+    grid = f"grid-template-columns:4.5rem repeat({len(heads) - 1},minmax(56px,100px))"
     return (
         "<h2>Pictures</h2><p class=dim>The middle position of each object. Wall frame stretched in contrast; "
         f"events as time surface ({WORDS}); reconstructions and truth from 0 to 1.</p>"

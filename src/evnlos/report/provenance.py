@@ -22,6 +22,7 @@ from evnlos.migrate import __version__
 from evnlos.report.tables import RunResult
 from evnlos.setups import NamedSetup
 
+_SETUP = "calibrated"  # the folder whose fixed pattern is taken from the frames
 _LIVE = "live"  # what a simulation is called that is made while the network trains
 
 
@@ -59,7 +60,7 @@ class Commands:
 
     def files(self) -> dict[str, Any]:
         """Return the settings in each file that the commands read, as far as they are known."""
-        known = {f"{out}.yaml": step.get("settings", {}) for r in self._results for out, step in _steps(r)}
+        known = {f"{out}.yaml": step.get("settings", {}) for r in self._results for out, step in self._steps(r)}
         if self._dataset.origin == "simulation":
             known[f"{self._here}.yaml"] = self._dataset.config
         return known
@@ -70,9 +71,14 @@ class Commands:
             return [shlex.join(["evnlos", "simulate", "--config", f"{self._here}.yaml", "--out", self._here])]
         split = self._dataset.split
         held = [word for key in ("validation", "test") for word in _flag(key, split.get(key, []))]
+        calibrated = []
         if self._dataset.config.get("pattern"):
-            held += ["--pattern", "pattern.safetensors"]
-        return [self._imported(self._dataset.objects(), self._here, held)]
+            shown = [name for key, names in split.items() if key != "test" for name in names]
+            calibrated = [
+                shlex.join(["evnlos", "calibrate", *(shown or self._dataset.objects()), "--out", _SETUP])
+            ]
+            held += ["--pattern", _SETUP]
+        return [*calibrated, self._imported(self._dataset.objects(), self._here, held)]
 
     def _imported(self, captures: list[str], out: str, more: list[str]) -> str:
         words = ["evnlos", "import", *captures, "--out", out, *more, *_sampling_flags(self._dataset.sampling)]
@@ -81,7 +87,7 @@ class Commands:
     def _trainings(self, result: RunResult) -> Iterator[str]:
         """Yield what makes the data of each training behind a run, and trains."""
         before = None
-        for out, step in _steps(result):
+        for out, step in self._steps(result):
             name = self._name_of(step["data"])
             if name == _LIVE:
                 yield _unknown_settings(name, step["data"])
@@ -93,6 +99,18 @@ class Commands:
             words += ["--weights", before] if before else []
             yield shlex.join([*words, "--config", f"{out}.yaml", "--out", out])
             before = out
+
+    def _steps(self, result: RunResult) -> list[tuple[str, dict[str, Any]]]:
+        """Return each training behind a run with the folder that it is to go to; the last is the run's own.
+
+        A run of the report that is behind another one keeps its name there: it is trained once.
+        """
+        found = []
+        for k, step in enumerate(result.history, start=1):
+            behind = (r.name for r in self._results if r.history == result.history[:k])
+            own = result.name if k == len(result.history) else f"{result.name}-{k}"
+            found.append((own if k == len(result.history) else next(behind, own), step))
+        return found
 
     def _data_of(self, name: str, data: dict[str, Any]) -> Iterator[str]:
         """Yield what makes the data of a training, as its weights tell it; nothing for the report's own."""
@@ -123,13 +141,6 @@ class Commands:
         same = (data["name"], data["origin"]) == (self._here, self._dataset.origin)
         known = data.get("config_hash") in (None, self._dataset.config_hash)
         return same and known and set(data.get("train", [])) <= set(self._dataset.objects())
-
-
-def _steps(result: RunResult) -> list[tuple[str, dict[str, Any]]]:
-    """Return each training behind a run with the folder that it is to go to; the last is the run's own."""
-    last = len(result.history)
-    numbered = enumerate(result.history, start=1)
-    return [(result.name if k == last else f"{result.name}-{k}", step) for k, step in numbered]
 
 
 def _unknown_settings(name: str, data: dict[str, Any]) -> str:

@@ -116,7 +116,25 @@ def summary_section(results: list[RunResult]) -> str:
         if words
         else ""
     )
-    return f"<h2>What is gained</h2>{said}{_bars(results)}"
+    lost = "".join(f"<p>{html.escape(line)}</p>" for line in losses_of(results))
+    return f"<h2>What is gained</h2>{said}{lost}{_bars(results)}"
+
+
+def losses_of(results: list[RunResult]) -> list[str]:
+    """Return a line for each kind of network that fine-tuning made worse than simulation alone, mean PSNR."""
+    found = []
+    for kind in _kinds(results):
+        mean = {
+            method: float(np.mean([r.evaluation.scores.psnr_db for r in runs]))
+            for method in ("simulation only", "EPNP")
+            if (runs := [r for r in results if (r.method, r.kind) == (method, kind)])
+        }
+        if len(mean) == 2 and mean["EPNP"] < mean["simulation only"]:
+            found.append(
+                f"Fine-tuning harmed {kind}: {mean['simulation only']:.2f} dB with simulation only, "
+                f"{mean['EPNP']:.2f} dB after it. Use the weights from before, or fewer epochs."
+            )
+    return found
 
 
 def _kinds(results: list[RunResult]) -> list[str]:
