@@ -65,6 +65,16 @@ def test_a_celex_pair(tmp_path):
     assert samples.frame.shape == (2, 64, 96) and samples.truth is None
 
 
+def test_frames_that_are_not_finite_are_refused(tmp_path):
+    folder = folder_of(tmp_path, events="e.h5", frames="f.npy")
+    write_events(folder / "e.h5", stream())
+    images = pictures().astype(np.float32)
+    images[2, 3, 4] = np.nan
+    np.save(folder / "f.npy", images)
+    with pytest.raises(EvnlosError, match=r"f\.npy: frame 2 holds NaN or infinity"):
+        read_capture(folder)
+
+
 def test_an_aedat4_with_frames_and_events(tmp_path):
     pytest.importorskip("aedat")
     folder = folder_of(tmp_path, events="davis.aedat4", frames="davis.aedat4")

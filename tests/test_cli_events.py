@@ -245,6 +245,9 @@ def test_info_shows_damage_and_never_refuses_it(tmp_path: Path, capsys) -> None:
     call("info", tmp_path / "cut.raw")
     shown = capsys.readouterr().out
     assert "1 truncated" in shown and "39,999 in" in shown
+    assert "(evnlos convert --on-error salvage)" in fails(
+        capsys, "convert", tmp_path / "cut.raw", tmp_path / "cut.h5"
+    )
     call("info", tmp_path / "cut.raw", "--json")
     assert json.loads(capsys.readouterr().out)["faults"] == {"truncated": 1}
     write_events(tmp_path / "none.h5", Events.empty(4, 3))
@@ -253,6 +256,8 @@ def test_info_shows_damage_and_never_refuses_it(tmp_path: Path, capsys) -> None:
     (tmp_path / "text.h5").write_text("no recording")
     assert "no known event format" in fails(capsys, "info", tmp_path / "text.h5")
     assert "no such file" in fails(capsys, "info", tmp_path / "absent.h5")
+    assert f"{tmp_path} is a folder; give a file in it" in fails(capsys, "info", tmp_path)
+    assert "is not a regular file but a device or a pipe" in fails(capsys, "info", "/dev/null")
     assert "both or neither" in fails(capsys, "info", tmp_path / "a.raw", "--width", 40)
 
 

@@ -93,6 +93,12 @@ def test_wrong_batches():
         event_batch([stream(0)], "picture")
     with pytest.raises(DataError, match="bins"):
         event_batch([stream(0)], "histogram", bins=3)
+    with pytest.raises(DataError, match=r"^voxel needs bins=; give e\.g\. bins=5$"):
+        event_batch([stream(0)], "voxel")
+    with pytest.raises(DataError, match=r"^surface needs tau_us=; give e\.g\. tau_us=30000$"):
+        event_batch([stream(0)], "surface")
+    assert event_batch([stream(0)], "voxel", bins=5).shape == (1, 5, 9, 13)
+    assert event_batch([stream(0)], "surface", tau_us=30_000).shape == (1, 2, 9, 13)
 
 
 def slow_intensity(events: Events, edges, carry: bool, empty: float):

@@ -22,6 +22,12 @@ def test_the_papers_settings_are_the_default():
     assert pixel_preset("paper") == EventPixel()
 
 
+def test_capital_letters_do_not_matter():
+    assert pixel_preset("DAVIS346") == pixel_preset("davis346")
+    with pytest.raises(ConfigError, match="did you mean 'davis346'"):
+        pixel_preset("DAVIS364")
+
+
 def test_a_wrong_name_names_the_nearest():
     with pytest.raises(ConfigError, match="davis346"):
         pixel_preset("davis364")

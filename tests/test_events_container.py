@@ -73,6 +73,19 @@ def test_selection_keeps_optional_columns():
         events[0]  # type: ignore[index]
 
 
+def test_an_array_of_events_has_a_field_for_each_column():
+    events = four()
+    found = np.asarray(events)
+    assert found.shape == (4,) and list(found.dtype.names) == list(events.columns())
+    for name, column in events.columns().items():
+        np.testing.assert_array_equal(found[name], column)
+        assert found[name].dtype == column.dtype
+    assert np.array(events[:0]).shape == (0,)
+    if np.lib.NumpyVersion(np.__version__) >= "2.0.0":
+        with pytest.raises(ValueError, match="is a copy"):
+            np.array(events, copy=False)
+
+
 def test_equality_sees_geometry_and_columns():
     assert four() == four()
     assert four() != four()[:3]

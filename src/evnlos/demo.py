@@ -141,7 +141,9 @@ def _captures_in(given: tuple[Path, ...]) -> list[Path]:
         inside = (
             [path] if (path / "capture.yaml").is_file() else [f.parent for f in path.glob("*/capture.yaml")]
         )
-        if not inside and (path.is_dir() or not path.exists()):
+        if not inside and not path.exists():
+            raise ConfigError(f"{path} matches nothing; give capture folders, or the folder above them")
+        if not inside and path.is_dir():
             raise ConfigError(f"{path} holds no capture.yaml; give capture folders, or the folder above them")
         found += inside
     if given and not found:

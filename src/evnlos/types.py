@@ -9,7 +9,7 @@ import hashlib
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from evnlos.errors import DataError
 
@@ -129,6 +129,24 @@ class Events:
             raise DataError(f"Events[{index}] is one event; give a slice, a mask or an array of indices")
         chosen = {name: column[index] for name, column in self.columns().items()}
         return Events(width=self.width, height=self.height, **chosen)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray:
+        """Return the events as one structured array with a field for each column: t_us, x, y, p, ...
+
+        Args:
+            dtype: Type to cast the array to, as in `np.asarray`.
+            copy: False is refused: the columns lie apart in memory.
+
+        Raises:
+            ValueError: `copy` is False.
+        """
+        if copy is False:
+            raise ValueError("the columns of Events lie apart; an array of them is a copy")
+        columns = self.columns()
+        found = np.empty(len(self), [(name, column.dtype) for name, column in columns.items()])
+        for name, column in columns.items():
+            found[name] = column
+        return found if dtype is None else found.astype(dtype)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Events):

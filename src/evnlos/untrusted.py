@@ -82,6 +82,15 @@ class ElsewhereError(ValueError):
     """A file's content lies, or may lie, in another file."""
 
 
+def no_file(path: Path) -> str:
+    """Return why a path that is not a regular file can't be read, and the cure."""
+    if path.is_dir():
+        return f"{path} is a folder; give a file in it"
+    if path.exists():
+        return f"{path} is not a regular file but a device or a pipe; copy it into a file first"
+    return f"{path}: no such file; check the path"
+
+
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     """Open a plain file for reading; a pipe, device or folder is refused, and never waited for.
 

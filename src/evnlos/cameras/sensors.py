@@ -120,7 +120,7 @@ PRESETS: dict[str, Callable[[], EventPixel | BrownianPixel]] = {
 
 
 def pixel_preset(name: str) -> EventPixel | BrownianPixel:
-    """Return the preset of this name.
+    """Return the preset of this name, in small or capital letters.
 
     Raises:
         ConfigError: There is no such preset; the nearest is named.
@@ -129,11 +129,11 @@ def pixel_preset(name: str) -> EventPixel | BrownianPixel:
         >>> pixel_preset("davis346").threshold_on
         0.1337
     """
-    if name not in PRESETS:
-        near = difflib.get_close_matches(name, PRESETS, n=1)
+    if name.lower() not in PRESETS:
+        near = difflib.get_close_matches(name.lower(), PRESETS, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"give one of {', '.join(PRESETS)}"
         raise ConfigError(f"there is no pixel preset {name!r}; {hint}")
-    return PRESETS[name]()
+    return PRESETS[name.lower()]()
 
 
 def _brighter(contrast: float) -> float:

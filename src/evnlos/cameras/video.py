@@ -29,7 +29,7 @@ from evnlos.cameras.video_files import (
 )
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events
-from evnlos.untrusted import MOST_SENSOR_PIXELS, check_memory
+from evnlos.untrusted import MOST_SENSOR_PIXELS, check_memory, no_file
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
 _ANIMATIONS = (".gif", ".png", ".apng", ".webp")
@@ -225,7 +225,7 @@ def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Pa
             raise DataError(f"{path}: no file fits that pattern; check the path")
         return path, _named(found)[1]
     if not path.is_file():
-        raise DataError(f"{path}: no such file; check the path")
+        raise DataError(no_file(path))
     if path.suffix.lower() == ".npy":
         return path, ArraySource(path)
     if path.suffix.lower() in (*_ANIMATIONS, *_PICTURES):
@@ -236,7 +236,7 @@ def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Pa
 def _named(paths: list[Path]) -> tuple[Path, PictureSource]:
     missing = [path for path in paths if not path.is_file()]
     if missing:
-        raise DataError(f"{missing[0]}: no such file; check the path")
+        raise DataError(no_file(missing[0]))
     paths = sorted(
         paths, key=lambda path: [int(s) if s.isdigit() else s for s in re.split(r"(\d+)", str(path))]
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import signal
 import sys
@@ -42,7 +43,7 @@ def main(argv: list[str] | None = None) -> None:
     try:
         with _terminable():
             if verb not in VERBS:
-                raise ConfigError(f"unknown command {verb!r}; give one of {', '.join(VERBS)}")
+                raise ConfigError(_unknown(verb))
             command = _command(verb, rest)
             LOG.debug("%s", command)
             with redirect_stdout(cast(TextIO, PlainOutput(sys.stdout))):
@@ -99,6 +100,12 @@ def _terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _unknown(verb: str) -> str:
+    near = difflib.get_close_matches(verb.lower()[:40], VERBS, n=1)
+    cure = f"did you mean {near[0]!r}?" if near else f"give one of {', '.join(VERBS)}"
+    return f"unknown command {printable(verb[:80])!r}; {cure}"
 
 
 def _command(verb: str, rest: list[str]) -> Any:

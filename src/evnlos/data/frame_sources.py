@@ -54,7 +54,7 @@ def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
     if not path.is_relative_to(folder.resolve()):
         raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
     if not there:
-        raise DataError(f"{path} does not exist; {folder / by} names it")
+        raise DataError(f"{path} does not exist; {folder / by} names it, or leaves its name to the default")
     return path
 
 
@@ -128,6 +128,8 @@ def _from_video(folder: Path, path: Path, info: CaptureInfo, most: int) -> Frame
     times_s, images = [], []
     for time_s, light in video:
         _check_size(path, (len(images) + 1) * light.size * 2, most)
+        if not np.isfinite(light).all():
+            raise DataError(f"{path}: frame {len(images)} holds NaN or infinity; give finite values")
         times_s.append(time_s)
         images.append(np.clip(np.round(light * (65_535 / 255)), 0, 65_535).astype(np.uint16))
     if not images:

@@ -42,6 +42,9 @@ _MAKERS: dict[str, Callable[..., NDArray]] = {
     "intensity": lambda events, **options: intensity_map(events, **options),
 }
 
+_NEEDED = {"voxel": {"bins": 5}, "surface": {"tau_us": 30_000}}
+"""Options without a default, with an example of each."""
+
 
 def event_batch(
     streams: Sequence[Events],
@@ -81,6 +84,10 @@ def event_batch(
         if events.shape != streams[0].shape:
             raise DataError(f"sensors of {streams[0].shape} and {events.shape} pixels; batch one size")
     make = _MAKERS[representation]
+    lacking = [name for name in _NEEDED.get(representation, {}) if name not in options]
+    if lacking:
+        example = ", ".join(f"{name}={_NEEDED[representation][name]}" for name in lacking)
+        raise DataError(f"{representation} needs {'= and '.join(lacking)}=; give e.g. {example}")
     batch: torch.Tensor | None = None
     for number, events in enumerate(streams):
         try:

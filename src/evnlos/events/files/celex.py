@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 from evnlos.errors import ConfigError, DataError, EventFileError
 from evnlos.events.files import celex_kernels as slots
 from evnlos.events.files.celex_kernels import DECODERS, EVENTS_A_GROUP, GROUP_BYTES, HEIGHT, SCRATCH, WIDTH
-from evnlos.events.files.columns import Columns, OnError, ReadReport, allocate, cut, shorten, unreadable
+from evnlos.events.files.columns import (
+    SALVAGE,
+    Columns,
+    OnError,
+    ReadReport,
+    allocate,
+    cut,
+    shorten,
+    unreadable,
+)
 
 # Ticks are 1024 / D microseconds; D for clocks of 10, 20, ... 100 MHz.
 _DIVISORS = (80, 80, 90, 80, 100, 120, 140, 80, 90, 100)
@@ -69,7 +78,6 @@ HEADER_BYTES = 12
 PICTURE_BYTES = WIDTH * HEIGHT * 3 // 2
 _MAX_PAYLOAD = PICTURE_BYTES + 1  # the longest that the camera sends; the last byte is the kind
 _FULL_PICTURE = 3  # a mode
-_SALVAGE = 'read it with on_error="salvage"'
 _IMU_BYTES = 32
 
 
@@ -139,13 +147,13 @@ def walk_packages(file: FileIO, header: CelexHeader, report: ReadReport) -> Iter
         if not 1 < length <= _MAX_PAYLOAD and len(head) == 4:
             found = f"a package of {length} bytes"
             report.fault(
-                "unknown", at, found, f"2 to {_MAX_PAYLOAD} are possible: {_SALVAGE}", lost_bytes=size - at
+                "unknown", at, found, f"2 to {_MAX_PAYLOAD} are possible: {SALVAGE}", lost_bytes=size - at
             )
             return
         after = at + 4 + length
         if after > size or len(head) < 4:
             found = f"a package of {length} bytes, {size - at - len(head)} are left"
-            report.fault("truncated", at, found, f"copy the file again or {_SALVAGE}", lost_bytes=size - at)
+            report.fault("truncated", at, found, f"copy the file again or {SALVAGE}", lost_bytes=size - at)
             return
         file.seek(after - 1)
         is_picture = file.read(1) == b"\0"
@@ -156,18 +164,18 @@ def walk_packages(file: FileIO, header: CelexHeader, report: ReadReport) -> Iter
             after += 12 + _IMU_BYTES * samples
             if after > size or host_time is None:
                 found = f"{samples} IMU samples behind a package"
-                report.fault("truncated", at, found, f"copy the file again or {_SALVAGE}", lost_bytes=size - at)
+                report.fault("truncated", at, found, f"copy the file again or {SALVAGE}", lost_bytes=size - at)
                 return
         if is_picture and length != _MAX_PAYLOAD:
             found = f"a full picture of {length - 1} bytes"
-            report.fault("unknown", at, found, f"{PICTURE_BYTES} are one: {_SALVAGE}", lost_bytes=length)
+            report.fault("unknown", at, found, f"{PICTURE_BYTES} are one: {SALVAGE}", lost_bytes=length)
         else:
             yield Package(at + 4, length - 1, is_picture, host_time)
         at, count = after, count + 1
     if header.packages and count != header.packages:
         kind = "truncated" if count < header.packages else "count"
         found = f"{count} packages where the header announces {header.packages}"
-        cure = f"after a crash give celex=CelexOptions(event_format={header.event_format}), or {_SALVAGE}"
+        cure = f"after a crash give celex=CelexOptions(event_format={header.event_format}), or {SALVAGE}"
         report.fault(kind, size, found, cure)
 
 
@@ -227,7 +235,7 @@ class CelexSource:
         if left:
             found = f"a package that ends {left} bytes into a group of {GROUP_BYTES[format]}"
             self.report.fault(
-                "left_over", package.offset + package.length - left, found, _SALVAGE, lost_bytes=left
+                "left_over", package.offset + package.length - left, found, SALVAGE, lost_bytes=left
             )
         adc = out.get("adc", out["x"])  # format 2 has none and writes none
         count = DECODERS[format](
@@ -249,7 +257,7 @@ class CelexSource:
             if state[slot]:
                 offset = package.offset + int(state[first])
                 self.report.fault(
-                    kind, offset, found, f"the file is damaged there: {_SALVAGE}", count=int(state[slot])
+                    kind, offset, found, f"the file is damaged there: {SALVAGE}", count=int(state[slot])
                 )
                 state[slot] = 0
         return int(count)

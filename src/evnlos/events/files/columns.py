@@ -22,6 +22,10 @@ from evnlos.types import Events
 OnError = Literal["strict", "salvage"]
 
 
+SALVAGE = 'read it with on_error="salvage" (evnlos convert --on-error salvage)'
+"""Cure of a damaged file, in Python and on the command line."""
+
+
 def check_on_error(on_error: str) -> None:
     """Raise unless `on_error` is "strict" or "salvage"."""
     if on_error not in ("strict", "salvage"):
@@ -253,7 +257,7 @@ class ColumnCheck:
                     report.fault("out_of_range", offset, found, cure, count=many)
                 elif many:
                     found = f"event {number} at {columns['t_us'][first]} us is earlier than the one before it"
-                    cure = 'sort the file by time or read with on_error="salvage"'
+                    cure = f"sort the file by time or {SALVAGE}"
                     report.fault("backwards", offset, found, cure, count=many)
         self._events += count
         if outside:

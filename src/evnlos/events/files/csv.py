@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.events.files.celex import CelexOptions, clock_from_name, tick_divisor
-from evnlos.events.files.columns import ColumnCheck, Columns, FileSink, ReadReport, join, unreadable
+from evnlos.events.files.columns import SALVAGE, ColumnCheck, Columns, FileSink, ReadReport, join, unreadable
 from evnlos.events.files.csv_rows import FAULTS, FIRST_FAULT, MAX_LINE, find_layout, parse_rows, print_rows
 from evnlos.types import Events
 
@@ -53,7 +53,7 @@ class UnwrapTimes:
 
 
 _BLOCK_BYTES = 1 << 20
-_SALVAGE = 'repair the line or read with on_error="salvage"'
+_SALVAGE = f"repair the line or {SALVAGE}"
 _LIMITS = {"x": (0, 65_535), "y": (0, 65_535), "adc": (0, 65_535), "p": (-1, 1), "polarity_known": (0, 1)}
 
 

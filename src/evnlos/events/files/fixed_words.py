@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.events.files.columns import Columns, ReadReport, allocate, cut, join, unreadable
+from evnlos.events.files.columns import SALVAGE, Columns, ReadReport, allocate, cut, join, unreadable
 from evnlos.events.files.raw import parse_raw_header, raw_format_names, raw_geometry, read_raw_header
 from evnlos.events.files.words import (
     BACKWARDS,
@@ -166,7 +166,7 @@ _EVENT_BYTES = 5
 _BLOCK_BYTES = 1 << 20
 _TYPES = ("generic", "DVS", "ATIS", "display", "colour")
 _DVS = 1
-_SALVAGE = 'the file is damaged there: read it with on_error="salvage"'
+_SALVAGE = f"the file is damaged there: {SALVAGE}"
 TIME, OUTSIDE, FIRST_OUTSIDE = range(3)  # slots of the state
 
 
@@ -250,7 +250,7 @@ class EsSource:
                 yield cut(out, 0, count)
         if tail:
             found = f"the file ends {len(tail)} bytes into an event of {_EVENT_BYTES}"
-            cure = 'the file was cut: copy it again or read it with on_error="salvage"'
+            cure = f"the file was cut: copy it again or {SALVAGE}"
             report.fault("truncated", offset, found, cure, lost_bytes=len(tail))
 
     def read(self) -> Columns:

@@ -18,7 +18,7 @@ import numpy as np
 
 from evnlos.errors import DataError
 from evnlos.events.files import evt2, evt3
-from evnlos.events.files.columns import FileSink, ReadReport
+from evnlos.events.files.columns import SALVAGE, FileSink, ReadReport
 from evnlos.events.files.words import WordCodec, WordSource
 from evnlos.types import Events
 
@@ -96,7 +96,7 @@ def read_raw_header(file: BinaryIO, report: ReadReport) -> RawHeader:
     file.seek(0)
     header = parse_raw_header(file.read(_MAX_HEADER_BYTES))
     for offset, found in header.faults:
-        report.fault("header", offset, found, 'repair the header or read with on_error="salvage"')
+        report.fault("header", offset, found, f"repair the header or {SALVAGE}")
     file.seek(header.size)
     return header
 
@@ -227,7 +227,7 @@ class RawSource(WordSource):
                 "header",
                 0,
                 f"the header names {' and '.join(names)}",
-                'repair the header or read with on_error="salvage"',
+                f"repair the header or {SALVAGE}",
             )
         name = next(name for name in names if name in CODECS)
         report.format = name
@@ -249,7 +249,7 @@ class RawSource(WordSource):
             size = self.path.stat().st_size
             kind = "truncated" if self._decoded < self._announced else "count"
             found = f"{self._decoded} events where the header announces {self._announced}"
-            self.report.fault(kind, size, found, 'copy the file again or read it with on_error="salvage"')
+            self.report.fault(kind, size, found, f"copy the file again or {SALVAGE}")
 
 
 def _is_swapped(path: Path, header: RawHeader) -> bool:

@@ -37,6 +37,7 @@ from evnlos.events.files.columns import (
 from evnlos.events.files.raw import RawSource
 from evnlos.events.files.registry import FileSource, find_format
 from evnlos.types import Events
+from evnlos.untrusted import no_file
 
 
 def open_source(
@@ -337,7 +338,7 @@ def read_timed_frames(
     path = Path(path)
     check_on_error(on_error)
     if not path.is_file():
-        raise EventFileError(f"{path}: no such file; check the path")
+        raise EventFileError(no_file(path))
     options = celex or CelexOptions()
     with path.open("rb") as file:
         start = file.read(64)

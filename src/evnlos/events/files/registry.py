@@ -21,7 +21,7 @@ from evnlos.events.files.celex import CelexOptions
 from evnlos.events.files.columns import Columns, ReadReport, Sink, unreadable
 from evnlos.files import new_file
 from evnlos.types import Events
-from evnlos.untrusted import open_regular
+from evnlos.untrusted import no_file, open_regular
 
 _SNIFFED_BYTES = 65_536
 
@@ -127,7 +127,7 @@ def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format
         EventFileError: The file is absent, empty, or of no known format.
     """
     if not path.is_file():
-        raise EventFileError(f"{path}: no such file; check the path")
+        raise EventFileError(no_file(path))
     with open_regular(path) as file:
         start = file.read(_SNIFFED_BYTES)
     if not start:

@@ -16,7 +16,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.events.files.columns import Columns, ReadReport, allocate, cut, enlarge, shorten, unreadable
+from evnlos.events.files.columns import (
+    SALVAGE,
+    Columns,
+    ReadReport,
+    allocate,
+    cut,
+    enlarge,
+    shorten,
+    unreadable,
+)
 
 # Slots of the int64 state array.
 CLOCK, NEWEST, BASE, STARTED, ROW, COLUMN, POLARITY, TRIGGERS = range(8)
@@ -61,7 +70,7 @@ _FOUND = (
     "an event ({word:#x}) earlier than the one before it",
     "a clock that runs backwards ({word:#x})",
 )
-_SALVAGE = 'the file is damaged there: read it with on_error="salvage"'
+_SALVAGE = f"the file is damaged there: {SALVAGE}"
 
 
 @dataclass(frozen=True)
@@ -149,7 +158,7 @@ class WordSource:
     def _finish_words(self) -> None:
         if self._left:
             offset = self.start + self.words * self.codec.dtype.itemsize
-            cure = 'the file was cut: copy it again or read it with on_error="salvage"'
+            cure = f"the file was cut: copy it again or {SALVAGE}"
             found = f"the file ends {self._left} bytes into a word of {self.codec.dtype.itemsize}"
             self.report.fault("truncated", offset, found, cure, lost_bytes=self._left)
 
