@@ -14,4 +14,5 @@ from .settings import paper_finetuning as paper_finetuning
 from .settings import paper_loss as paper_loss
 from .settings import paper_pretraining as paper_pretraining
 from .train import TrainingResult as TrainingResult
+from .train import check_run as check_run
 from .train import train as train
