@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import MISSING, fields, is_dataclass, replace
 from types import FrameType
-from typing import Any, TextIO, cast
+from typing import Any, NoReturn, TextIO, cast
 
 from evnlos.cli.parsing import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen, parse, todays_words
 from evnlos.cli.verbs import VERBS, command_of, summary_of
@@ -40,8 +40,9 @@ def main(argv: list[str] | None = None) -> None:
         print(__version__)
         return
     verb, rest = arguments[0], todays_words(arguments[0], arguments[1:])
+    wishes = list[int]()  # signals that asked for the end
     try:
-        with _terminable():
+        with _terminable(wishes):
             if verb not in VERBS:
                 raise ConfigError(_unknown(verb))
             command = _command(verb, rest)
@@ -49,18 +50,18 @@ def main(argv: list[str] | None = None) -> None:
             with redirect_stdout(cast(TextIO, PlainOutput(sys.stdout))):
                 command.run()
             sys.stdout.flush()  # a full disk behind it is told while the exit code can say so
-    except EvnlosError as error:
-        LOG.debug("where the error came from", exc_info=True)
-        print(f"evnlos {verb}: error: {error}", file=sys.stderr)
-        sys.exit(2)
     except BrokenPipeError:
         sys.exit(1)
     except KeyboardInterrupt as stop:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # once is enough
-        how, number = ("terminated", 143) if isinstance(stop, _Terminated) else ("interrupted", 130)
-        print(f"evnlos {verb}: {how}; run the same command again to go on", file=sys.stderr)
-        sys.exit(number)
+        _end(verb, signal.SIGTERM if isinstance(stop, _Terminated) else signal.SIGINT)
     except Exception as error:
+        if wishes:  # a library that was interrupted while it was imported says so in its own way
+            LOG.debug("where the error came from", exc_info=True)
+            _end(verb, wishes[-1])
+        if isinstance(error, EvnlosError):
+            LOG.debug("where the error came from", exc_info=True)
+            print(f"evnlos {verb}: error: {error}", file=sys.stderr)
+            sys.exit(2)
         fault = fault_behind(error)
         if fault is not None:
             text = f"{fault.name} is {fault.found}; {fault.cure} (evnlos doctor looks at all that is needed)"
@@ -75,31 +76,55 @@ def main(argv: list[str] | None = None) -> None:
         sys.exit(2)
 
 
+def _end(verb: str, number: int) -> NoReturn:
+    """End as a signal wished, with one line and the exit code that shells give such an end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # once is enough
+    how = "terminated" if number == signal.SIGTERM else "interrupted"
+    print(f"evnlos {verb}: {how}; run the same command again to go on", file=sys.stderr)
+    sys.exit(128 + number)
+
+
 class _Terminated(KeyboardInterrupt):
     """The process was asked to end by SIGTERM, and does so as if by Ctrl-C."""
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
-    """Raise `_Terminated` at SIGTERM, so that workers end and half-written files go."""
+def _terminable(wishes: list[int]) -> Iterator[None]:
+    """Raise `KeyboardInterrupt` at Ctrl-C and `_Terminated` at SIGTERM, so that workers end and part files go.
 
-    def end(number: int, frame: FrameType | None) -> None:
-        while frame is not None:
-            if frame.f_code.co_name == "__del__":  # what is raised there is printed and lost: a moment later
-                threading.Timer(0.02, os.kill, (os.getpid(), number)).start()
-                return
-            frame = frame.f_back
-        raise _Terminated
+    What is raised in a callback of the interpreter (`__del__`, a weak reference's) is lost there: then the
+    signal is sent again a moment later.
+
+    Args:
+        wishes: Each signal that comes is appended.
+    """
+
+    def end(number: int, _: FrameType | None) -> None:
+        wishes.append(number)
+        raise _Terminated if number == signal.SIGTERM else KeyboardInterrupt
+
+    def lost(what: sys.UnraisableHookArgs) -> None:
+        if not (wishes and issubclass(what.exc_type, KeyboardInterrupt)):
+            hook(what)
+            return
+        again = threading.Timer(0.02, os.kill, (os.getpid(), wishes[-1]))
+        again.daemon = True
+        again.start()
 
     is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+    handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if not is_main or any(signal.getsignal(number) is not usual for number, usual in handlers.items()):
         yield
         return
-    signal.signal(signal.SIGTERM, end)
+    hook, sys.unraisablehook = sys.unraisablehook, lost
+    for number in handlers:
+        signal.signal(number, end)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        sys.unraisablehook = hook
+        for number, usual in handlers.items():
+            signal.signal(number, usual)
 
 
 def _unknown(verb: str) -> str:
