@@ -114,7 +114,7 @@ def test_the_command_simulates_as_it_trains(few, tmp_path, capsys) -> None:
     assert "1 epochs" in capsys.readouterr().out
     (line,) = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     assert json.loads(line)["epoch"] == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["setup.yaml", "run"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "setup.yaml"]
     assert not list(tmp_path.rglob("*.h5"))
 
 

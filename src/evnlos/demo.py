@@ -100,12 +100,8 @@ def run_demo(settings: Demo) -> Path:
             folders = render_captures(
                 lab, out / "captures", workers=settings.workers, progress=progress, force=settings.force
             )
-    if settings.start and not all(name in published() for name in layers_of(settings.start)):
-        notes.append(
-            f"The layers {settings.start!r} are not installed (evnlos-weights brings them): the pre-training "
-            "began with random ones, and needs twice the epochs for less."
-        )
-        settings = replace(settings, start="")
+    settings, lacking = _with_layers(settings)
+    notes += lacking
     study = _study(settings, _held_out(folders, settings.test))
     place = replace(place, captures=tuple(sorted(folders)))
     try:
@@ -132,6 +128,20 @@ def run_demo(settings: Demo) -> Path:
     print(gain_table(records))
     print(f"report: {path} ({time.perf_counter() - began:.0f} s)")
     return path
+
+
+def _with_layers(settings: Demo) -> tuple[Demo, list[str]]:
+    """Return the settings without layers to begin with where there are none like them, and why."""
+    if not settings.start:
+        return settings, []
+    if not all(name in published() for name in layers_of(settings.start)):
+        why = f"The layers {settings.start!r} are not installed (evnlos-weights brings them)"
+    elif settings.width != SEQUENCE_NETWORK.width:
+        why = f"The layers {settings.start!r} have {SEQUENCE_NETWORK.width} channels, not {settings.width}"
+    else:
+        return settings, []
+    why += ": the pre-training began with random ones, and needs twice the epochs for less."
+    return replace(settings, start=""), [why]
 
 
 def _captures_in(given: tuple[Path, ...]) -> list[Path]:

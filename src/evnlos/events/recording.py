@@ -300,7 +300,7 @@ def summarise(pieces: Iterable[Events]) -> Summary:
     Example:
         >>> found = summarise([Events([0, 10, 30_010], [1, 1, 0], [0, 0, 0], [1, 0, 1], 2, 1)])
         >>> found.on, found.busiest, found.peak_hz, found.longest_silence, found.memory_bytes
-        (2, (1, 0, 2), 200.0, Silence(length_us=30000, start_us=10), 39)
+        (2, (1, 0, 2), 200.0, EventGap(length_us=30000, start_us=10), 39)
     """
     width = height = total = on = unknown = silences = 0
     first = last = 0
