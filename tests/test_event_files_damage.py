@@ -77,7 +77,7 @@ def test_empty_missing_folder(tmp_path):
     assert "empty" in one_error(tmp_path / "empty.raw")
     with pytest.raises(EventFileError, match="no such file"):
         read_events(tmp_path / "none.raw")
-    with pytest.raises(EventFileError, match="no such file"):
+    with pytest.raises(EventFileError, match="is a folder"):
         read_events(tmp_path)
     with pytest.raises(EventFileError, match="on_error"):
         read_events(tmp_path / "empty.raw", on_error="ignore")  # type: ignore[arg-type]
