@@ -354,6 +354,32 @@ def test_workers_end_with_their_parent(number, to_all: bool, moment: str, settin
     assert not list(folder.glob(".*.part"))
 
 
+def test_in_the_background_of_a_script_ctrl_c_is_ignored_and_sigterm_is_not(settings, tmp_path) -> None:
+    folder = tmp_path / "d"
+    command = [*COMMAND, "simulate", "--config", str(settings), "--workers", "2", "--out", str(folder)]
+    deaf = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=deaf
+    )
+    for delay_s in (0.05, 0.3, 0.8):  # as it starts, too
+        time.sleep(delay_s)
+        process.send_signal(signal.SIGINT)
+    deadline = time.monotonic() + 90
+    while not list(folder.glob("*.h5")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.2)
+    assert process.poll() is None
+    process.terminate()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM, err
+    assert "terminated; run the same command again" in err and "Traceback" not in err
+    until = time.monotonic() + 20
+    while alive(process.pid) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not alive(process.pid)
+
+
 AHEAD = """
 import time
 from evnlos.data.pool import run_in_order

@@ -12,20 +12,26 @@ def main() -> None:
         wishes.append(True)
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, end)
+    is_heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not in a script's background
     try:
+        if is_heard:
+            signal.signal(signal.SIGINT, end)
         from evnlos.cli import main as run
-    except BaseException:  # an interrupted import may end in any error
-        if not wishes:
-            raise
-        print("evnlos: interrupted", file=sys.stderr)
-        sys.exit(130)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
+
+        if is_heard:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        if wishes:  # a library kept the interruption to itself
+            raise KeyboardInterrupt
         run()
     except KeyboardInterrupt:
-        print("evnlos: interrupted", file=sys.stderr)
-        sys.exit(130)
+        pass
+    except Exception:  # an interrupted import may end in any error
+        if not wishes:
+            raise
+    else:
+        return
+    print("evnlos: interrupted", file=sys.stderr)
+    sys.exit(130)
 
 
 if __name__ == "__main__":

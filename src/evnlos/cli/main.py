@@ -93,7 +93,8 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
     """Raise `KeyboardInterrupt` at Ctrl-C and `_Terminated` at SIGTERM, so that workers end and part files go.
 
     What is raised in a callback of the interpreter (`__del__`, a weak reference's) is lost there: then the
-    signal is sent again a moment later.
+    signal is sent again a moment later. A signal that is ignored (Ctrl-C in the background of a script) or that
+    somebody else handles stays so.
 
     Args:
         wishes: Each signal that comes is appended.
@@ -112,8 +113,9 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
         again.start()
 
     is_main = threading.current_thread() is threading.main_thread()
-    handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    if not is_main or any(signal.getsignal(number) is not usual for number, usual in handlers.items()):
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    handlers = {number: how for number, how in usual.items() if is_main and signal.getsignal(number) is how}
+    if not handlers:
         yield
         return
     hook, sys.unraisablehook = sys.unraisablehook, lost
@@ -123,8 +125,8 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = hook
-        for number, usual in handlers.items():
-            signal.signal(number, usual)
+        for number, how in handlers.items():
+            signal.signal(number, how)
 
 
 def _unknown(verb: str) -> str:
