@@ -188,7 +188,7 @@ def test_the_result_does_not_depend_on_blocks(light: SequenceLight) -> None:
     levels = levels_of(light(np.zeros(6)), light.times_s, plain)
     record = predicted_record(light, levels, plain, seed=5)
     weight = np.where(record.measured, 400.0, 0.0)
-    found = [row_information(light, levels, record, weight, 0.02, block) for block in (1, 50, 10**6)]
+    found = [row_information(light, levels, record, weight[None], 0.02, block)[0] for block in (1, 50, 10**6)]
     for one in found[1:]:
         np.testing.assert_allclose(one, found[0], rtol=0, atol=1e-6 * np.abs(found[0]).max())
 
@@ -197,14 +197,14 @@ def test_more_noise_or_mismatch_never_helps(light: SequenceLight) -> None:
     """Differences of information are positive semidefinite."""
 
     def information(noise: float = 0.03, **changes: float) -> np.ndarray:
-        return event_information(light, np.zeros(6), law(**changes), replace(SETTINGS, crossing_noise=noise))[0]
+        return event_information(light, np.zeros(6), law(**changes), SETTINGS, [noise])[0][0]
 
     base = information()
     for worse in (information(noise=0.06), information(threshold_sigma=0.05), information(noise=0.03)[:-1]):
         better = base[1:] if len(worse) < len(base) else base
         for one, other in zip(better, worse, strict=True):
             assert np.linalg.eigvalsh(one - other)[0] > -1e-9 * np.abs(one).max()
-    silent = event_information(light, np.zeros(6), law(), replace(SETTINGS, silences=True))[0]
+    silent = event_information(light, np.zeros(6), law(), replace(SETTINGS, silences=True))[0][0]
     assert all(
         np.linalg.eigvalsh(a - b)[0] > -1e-9 * np.abs(a).max() for a, b in zip(silent, base, strict=True)
     )

@@ -82,7 +82,7 @@ def test_events_reach_the_bound_and_their_intervals_cover(
     """With the error that crossings have, and with a larger one that is assumed, which is too cautious."""
     law, bench = PIXEL.crossing_law(40.0), replace(BENCH, crossing_noise=least_noise)
     seeds = range(SEQUENCES)
-    bound = [prior().error(event_information(light(), truth(s), law, bench, s)[0][0]) for s in seeds]
+    bound = [prior().error(event_information(light(), truth(s), law, bench, seed=s)[0][0, 0]) for s in seeds]
     found = [estimated(s, least_noise) for s in seeds]
     reached = [error(one, s) for s, one in enumerate(found)]
     assert 10 * np.log10(np.mean(reached) / np.mean(bound)) < behind_db

@@ -21,12 +21,9 @@ from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation, simulate
 from evnlos.demo import SEQUENCE_NETWORK
 from evnlos.models import layers_of, load_weights, save_weights, with_rank
 from evnlos.progress import ProgressBars
-from evnlos.scene import HandwritingGlyphs, LineMotion
-from evnlos.scene.handwriting import Strokes
+from evnlos.scene import DIGITS, UPPER_CASE, HandwritingGlyphs, LineMotion, Strokes
 from evnlos.setups import RadiometricSetup
 from evnlos.training import Training, train
-
-CHARACTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
 
 
 def wall(number: int, writers: int) -> Simulation:
@@ -60,7 +57,7 @@ def wall(number: int, writers: int) -> Simulation:
     )
     return Simulation(
         glyphs=HandwritingGlyphs(
-            characters=CHARACTERS,
+            characters=UPPER_CASE + DIGITS,
             writers=writers,
             first_writer=number % 4 * writers,
             strokes=Strokes(faces="both"),

@@ -11,6 +11,7 @@ the information of all rows, the expected squared error is the trace of (1 + H)^
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 import torch
 
 from evnlos.cameras import EVENT_MODELS, CrossingLaw, PixelSettings
+from evnlos.cameras.light import WHITE_DN
 from evnlos.data import Sampling
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
@@ -32,7 +34,6 @@ from evnlos.inverse import (
     sequence_light,
 )
 from evnlos.inverse.measurements import handwritten_targets, position_subsets
-from evnlos.inverse.sequence_light import WHITE_DN
 from evnlos.scene import LineMotion
 from evnlos.setups import Setup
 from evnlos.types import Plane
@@ -193,13 +194,14 @@ def sequence_bounds(
     typical = float(light(references[0]).mean()) * WHITE_DN
     for kind, pixel in _models(setup.pixel).items():
         law = pixel.crossing_law(typical)
-        for noise in (settings.crossing_noise, *(settings.other_noises if pixel is setup.pixel else ())):
-            if law is None:
-                continue
-            asked = replace(settings, crossing_noise=noise)
-            each = [event_information(light, z, law, asked, seed) for z in references]
-            events = [pixels * one[0] for one in each]
-            rms, count = float(np.mean([e[1] for e in each])), float(np.mean([e[2] for e in each]))
+        if law is None:
+            continue
+        noises = (settings.crossing_noise, *(settings.other_noises if pixel is setup.pixel else ()))
+        each = [event_information(light, z, law, settings, noises, seed) for z in references]
+        count = float(np.mean([one[2] for one in each]))
+        for n in range(len(noises)):
+            events = [pixels * one[0][n] for one in each]
+            rms = float(np.mean([one[1][n] for one in each]))
             both = [one + other for one, other in zip(events, frames, strict=True)]
             found.append(EventBound(kind, rms, count, _decibel(prior, events), _decibel(prior, both)))
     alone = _decibel(prior, [np.zeros((1, prior.count, prior.count))])[0]
@@ -244,74 +246,76 @@ def frame_information(
 
 
 def event_information(
-    light: SequenceLight, z: np.ndarray, law: CrossingLaw, settings: SequenceAnalysisSettings, seed: int = 0
-) -> tuple[np.ndarray, float, float]:
-    """Return the information of events for each number of positions, the crossings' error, events per pixel.
+    light: SequenceLight,
+    z: np.ndarray,
+    law: CrossingLaw,
+    settings: SequenceAnalysisSettings,
+    noises: Sequence[float] | None = None,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the information of events for each error of a crossing and each number of positions.
 
     Args:
         light: The light.
         z: Coefficients of the target that makes the events, [k].
         law: Constants of the event model.
         settings: Positions, noise of a crossing, silences.
+        noises: Errors of a crossing beside the law's own, log units; None = that of the settings.
         seed: Seed of the noise events.
 
     Returns:
-        float64 [counts, k, k]; root mean square error, log units; crossings per pixel.
+        float64 [noises, counts, k, k]; root mean square error of a crossing, log units, [noises]; crossings per
+        pixel.
     """
-    levels = levels_of(light(z), light.times_s, law)
+    noises = (settings.crossing_noise,) if noises is None else noises
+    seen = light(z)
+    levels = levels_of(seen, light.times_s, law)
     record = predicted_record(light, levels, law, seed)
-    variance = crossing_variance(light, z, record, law, settings.crossing_noise)
-    middle, share = settings.duration_s / 2, settings.duration_s / settings.positions / 2
-    found = []
-    for count in settings.counts:
-        first, last = middle - count * share, middle + count * share
-        inside = record.measured & (record.t_s > first) & (record.t_s <= last)
-        total = row_information(
-            light, levels, record, np.where(inside, 1.0 / variance, 0.0), law.threshold_sigma
-        )
-        if settings.silences:
-            total = total + _silence_information(light, levels, record, law, (first, last), settings)
-        found.append(total)
     measured = record.measured
-    rms = float(np.sqrt(variance[measured].mean())) if measured.any() else math.nan
-    return np.stack(found), rms, float(measured.sum()) / len(light.left)
-
-
-def crossing_variance(
-    light: SequenceLight, z: np.ndarray, record: EventRecord, law: CrossingLaw, added: float
-) -> np.ndarray:
-    """Return the variance of each change of a record, log units squared, [N]: the model's own, and `added`."""
-    waited = record.t_s - record.t_s[record.origin]
-    seen = light.at(light(z), record.pixel, record.t_s) * WHITE_DN
-    return law.noise**2 + added**2 + law.walk_variance(seen) * np.maximum(waited, 0.0)
+    middle, share = settings.duration_s / 2, settings.duration_s / settings.positions / 2
+    windows = [(middle - count * share, middle + count * share) for count in settings.counts]
+    weights, rms = [], []
+    for noise in noises:
+        variance = record.variance(light, seen, law, noise)
+        rms.append(math.sqrt(variance[measured].mean()) if measured.any() else math.nan)
+        for first, last in windows:
+            inside = measured & (record.t_s > first) & (record.t_s <= last)
+            weights.append(np.where(inside, 1.0 / variance, 0.0))
+    found = row_information(light, levels, record, np.stack(weights), law.threshold_sigma)
+    found = found.reshape(len(noises), len(windows), *found.shape[1:])
+    if settings.silences:
+        for n, noise in enumerate(noises):
+            for k, window in enumerate(windows):
+                found[n, k] += _silence_information(light, levels, record, law, window, noise)
+    return found, np.array(rms), float(measured.sum()) / len(light.left)
 
 
 def row_information(
     light: SequenceLight,
     levels: Levels,
     record: EventRecord,
-    weight: np.ndarray,
+    weights: np.ndarray,
     spread: float,
     block: int = 16_384,
 ) -> np.ndarray:
-    """Return the information of a record's rows with the thresholds of each pixel integrated out, [k, k].
+    """Return the information of a record's rows with the thresholds of each pixel integrated out, [W, k, k].
 
     Args:
         light: The light.
         levels: Levels at which it is linearised.
         record: The events.
-        weight: 1 / variance of each instant's change, 0 = does not count, [N].
+        weights: 1 / variance of each instant's change, 0 = does not count, once or for several cases, [W, N].
         spread: Mismatch of the thresholds, log units.
         block: Rows at a time; the result does not depend on it.
     """
-    total = NormalEquations.empty(light.right.shape[2] - 1)
+    totals = [NormalEquations.empty(light.right.shape[2] - 1) for _ in weights]
     for part, rows, _ in record.blocks(light, levels, block):
-        counts = np.flatnonzero(weight[part] > 0)
-        group = 2 * record.pixel[part][counts] + (record.sign[part][counts] > 0)
-        counts = counts[np.argsort(group, kind="stable")]
-        group = np.sort(group)
-        total.add(rows[counts], weight[part][counts], np.zeros(len(counts)), group, spread)
-    return total.information
+        group = 2 * record.pixel[part] + (record.sign[part] > 0)
+        order = np.argsort(group, kind="stable")
+        for total, weight in zip(totals, weights, strict=True):
+            counts = order[weight[part][order] > 0]
+            total.add(rows[counts], weight[part][counts], np.zeros(len(counts)), group[counts], spread)
+    return np.stack([total.information for total in totals])
 
 
 def _silence_information(
@@ -320,7 +324,7 @@ def _silence_information(
     record: EventRecord,
     law: CrossingLaw,
     window: tuple[float, float],
-    settings: SequenceAnalysisSettings,
+    noise: float,
 ) -> np.ndarray:
     """Return the information of "no event since": a change that is uniform between the thresholds."""
     index = np.arange(len(record))
@@ -337,9 +341,9 @@ def _silence_information(
         np.stack([np.full(count, -1), 2 * np.arange(count)], axis=1).ravel(),
     )
     width = law.threshold_on + law.threshold_off
-    variance = width**2 / 12 + 2 * law.threshold_sigma**2 / 4 + law.noise**2 + settings.crossing_noise**2
+    variance = width**2 / 12 + 2 * law.threshold_sigma**2 / 4 + law.noise**2 + noise**2
     weight = np.where(ends.sign > 0, 1.0 / variance, 0.0)
-    return row_information(light, levels, ends, weight, 0.0)
+    return row_information(light, levels, ends, weight[None], 0.0)[0]
 
 
 def canvas_decibel(error: float, target_plane: Plane) -> float:

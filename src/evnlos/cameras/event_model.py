@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, get_args
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,10 @@ Phase = Literal["random", "rest"]
 MIN_THRESHOLD = 0.01
 """Smallest threshold that mismatch can leave a pixel with, log units."""
 
-_KNEE_DN = 20.0
-_KNEE_SLOPE = math.log(_KNEE_DN) / _KNEE_DN
+KNEE_DN = 20.0
+"""Light below which v2e's logarithm is a line, DN."""
+KNEE_SLOPE = math.log(KNEE_DN) / KNEE_DN
+"""Its slope there, log units per DN."""
 
 EVENT_MODELS: Registry[type[PixelSettings]] = Registry("evnlos.event_models", "event model")
 """The event models by kind."""
@@ -119,12 +121,12 @@ class CrossingLaw:
     def level(self, light: NDArray) -> NDArray:
         """Return the log light of light in DN, [...]."""
         bright = np.maximum(self.curve.scale * light + self.curve.offset, 0.0)
-        return np.where(bright > _KNEE_DN, np.log(np.maximum(bright, _KNEE_DN)), bright * _KNEE_SLOPE)
+        return np.where(bright > KNEE_DN, np.log(np.maximum(bright, KNEE_DN)), bright * KNEE_SLOPE)
 
     def slope(self, light: NDArray) -> NDArray:
         """Return the derivative of `level`, log units per DN, [...]."""
         bright = np.maximum(self.curve.scale * light + self.curve.offset, 0.0)
-        return self.curve.scale * np.where(bright > _KNEE_DN, 1.0 / np.maximum(bright, _KNEE_DN), _KNEE_SLOPE)
+        return self.curve.scale * np.where(bright > KNEE_DN, 1.0 / np.maximum(bright, KNEE_DN), KNEE_SLOPE)
 
     def bandwidth(self, light: NDArray) -> NDArray:
         """Return the filter's speed at light in DN, 1 / s, [...]; infinite without one."""
@@ -237,6 +239,13 @@ class ThresholdPixel(PixelSettings):
     def finest_threshold(self) -> float:
         """The smaller of the two mean thresholds, log units."""
         return min(self.threshold_on, self.threshold_off)
+
+    def _law(self, **changes: Any) -> CrossingLaw:
+        """Return the crossing law of the thresholds, the logarithm and the leak, if there is one."""
+        leak = self.threshold_on * getattr(self, "leak_rate_hz", 0.0)
+        plain = CrossingLaw(self.threshold_on, self.threshold_off, self.threshold_sigma, self.log_curve, leak)
+        at_rest = getattr(self, "initial_phase", "rest") == "rest"
+        return replace(plain, starts_at_rest=at_rest, **changes)
 
 
 def require(owner: object, name: str, low: float, high: float, unit: str) -> None:

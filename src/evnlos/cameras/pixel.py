@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from evnlos.cameras.event_model import (
     EVENT_MODELS,
+    KNEE_DN,
     CrossingLaw,
     EventModel,
     LogCurve,
@@ -55,16 +56,8 @@ class _ContrastPixel(ThresholdPixel):
 
     def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw:
         """Return what an event says of the light; a crossing of v2e's pixel has no noise of its own."""
-        return CrossingLaw(
-            self.threshold_on,
-            self.threshold_off,
-            self.threshold_sigma,
-            self.log_curve,
-            leak=self.threshold_on * self.leak_rate_hz,
-            events_hz=self.shot_noise_rate_hz * (1.0 - 0.75 * min((light_dn + 20.0) / 275.0, 1.0)),
-            cutoff_hz=self.cutoff_hz,
-            starts_at_rest=True,
-        )
+        noise_hz = self.shot_noise_rate_hz * (1.0 - 0.75 * min((light_dn + 20.0) / 275.0, 1.0))
+        return self._law(events_hz=noise_hz, cutoff_hz=self.cutoff_hz)
 
 
 @EVENT_MODELS.register
@@ -148,13 +141,13 @@ class EventPixel(_ContrastPixel):
 
     def curve(self) -> Curve:
         """Return the pixel's logarithm as its kernels take it."""
-        from evnlos.cameras.pixels.continuous_math import KNEE, Curve
+        from evnlos.cameras.pixels.continuous_math import Curve
 
         exposure, floor = float(self.exposure), float(self.cutoff_floor_dn)
         if self.logarithm == "lin-log":
             return Curve(exposure, 0.0, floor, 1.0, 0.0)
         dark = float(self.dark_dn)
-        stretch = 2.0 * KNEE / dark  # all light above the knee
+        stretch = 2.0 * KNEE_DN / dark  # all light above the knee
         return Curve(stretch * exposure, stretch * dark, stretch * (floor - dark), stretch, dark)
 
     @property
@@ -172,7 +165,6 @@ class EventPixel(_ContrastPixel):
             events_hz=plain.events_hz + hot,
             floor_dn=self.cutoff_floor_dn,
             exposure=self.exposure,
-            starts_at_rest=self.initial_phase == "rest",
         )
 
     def model(

@@ -29,7 +29,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from evnlos.cameras.event_model import MIN_THRESHOLD
+from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE, MIN_THRESHOLD
 from evnlos.cameras.light import check_times
 from evnlos.errors import ConfigError, DataError
 
@@ -39,8 +39,6 @@ Response = Literal["exact", "euler"]
 """The response to log light that is a line within the step, or v2e's recurrence."""
 Kind = Literal["sum", "last"]
 """What a surface keeps: all events, decayed, or the last one."""
-
-_KNEE = 20.0
 
 
 def filter_output(
@@ -78,7 +76,7 @@ def filter_output(
     if response not in get_args(Response):
         raise ConfigError(f'response is {response!r}; give "exact" or "euler"')
     _require("cutoff_hz", cutoff_hz, 0.0)
-    logs = torch.where(light <= _KNEE, light * (math.log(_KNEE) / _KNEE), light.clamp(min=_KNEE).log())
+    logs = torch.where(light <= KNEE_DN, light * KNEE_SLOPE, light.clamp(min=KNEE_DN).log())
     if not isinstance(cutoff_hz, Tensor) and cutoff_hz == 0:
         return logs
     rates = 2 * math.pi * cutoff_hz * (light + 20.0) / 275.0

@@ -173,16 +173,16 @@ def _is_tracked(capture: Capture, options: SequenceOptions) -> bool:
 
 def _target_size_m(capture: Capture, tracked: bool) -> float:
     # A tracked position is that of the light's middle, which need not be the target's.
-    size = 0.08 if capture.info.target is None else capture.info.target.size_m
+    size = capture.info.target_size_m
     return 1.25 * size if tracked else size
 
 
 def score(capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]) -> float | None:
-    """Return the PSNR of a plate [cells, cells] on the standard sample, dB; None where the truth is unknown.
+    """Return the PSNR of a picture [cells, cells] on the standard sample, dB; None where the truth is unknown.
 
     Args:
         capture: The capture.
-        image: The plate.
+        image: The target plane.
         size_m: Its side, metres.
         motion: Its centre at the frames 1, 2, ..., [N, 2], metres.
     """

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from evnlos.analysis.bounds import canvas_decibel
+from evnlos.cameras.light import WHITE_DN
 from evnlos.cli.invert_captures import linear_setup, score
 from evnlos.data import Capture, load_pattern, read_capture
 from evnlos.errors import ConfigError
@@ -23,7 +24,6 @@ from evnlos.inverse import (
     record_of,
     sequence_light,
 )
-from evnlos.inverse.sequence_light import WHITE_DN
 from evnlos.types import Plane
 
 _CELLS, _COEFFICIENTS = 32, 120
@@ -58,7 +58,7 @@ def estimate_captures(
             raise ConfigError(
                 f"{folder}: the motion is unknown; state it in capture.yaml (`evnlos track` finds it)"
             )
-        size = 0.08 if capture.info.target is None else capture.info.target.size_m
+        size = capture.info.target_size_m
         prior = handwritten_prior(Plane(_CELLS, _CELLS, size / _CELLS), _COEFFICIENTS)
         span = (float(capture.frame_times_us[0]) * 1e-6, float(capture.frame_times_us[-1]) * 1e-6)
         shape = (capture.events.height, capture.events.width)

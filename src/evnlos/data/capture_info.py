@@ -177,6 +177,11 @@ class CaptureInfo:
     setup: dict[str, Any] = field(default_factory=dict)
     """Notes about the setup: distance_m, wall, ambient."""
 
+    @property
+    def target_size_m(self) -> float:
+        """Side of the target plane, metres: the given one, or the usual one where none is."""
+        return TargetInfo.size_m if self.target is None else self.target.size_m
+
 
 def read_capture_info(folder: Path) -> CaptureInfo:
     """Read the `capture.yaml` of a folder.

@@ -34,7 +34,6 @@ from evnlos.cameras import CrossingLaw
 from evnlos.errors import ConfigError
 from evnlos.inverse.event_record import EventRecord, Levels, levels_of
 from evnlos.inverse.sequence_light import (
-    WHITE_DN,
     Array,
     FrameTerm,
     NormalEquations,
@@ -281,8 +280,7 @@ class _State:
         self.change = record.change(light, levels) + nuisances[2] * self.wait
         self.residual = np.where(record.sign > 0, self.theta[0], -self.theta[1]) - self.change
         self.noise = math.hypot(noise, law.noise)
-        walk = law.walk_variance(light.at(seen, record.pixel, record.t_s) * WHITE_DN)
-        self.variance = self.noise**2 + walk * np.maximum(self.wait, 0.0)
+        self.variance = record.variance(light, seen, law, noise)
         self.group = 2 * record.pixel + (record.sign > 0)
         node, _ = light.place(record.t_s)
         step = light.times_s[1] - light.times_s[0]

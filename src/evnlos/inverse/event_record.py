@@ -15,7 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.cameras import CrossingLaw
-from evnlos.inverse.sequence_light import WHITE_DN, Array, SequenceLight, group_blocks
+from evnlos.cameras.light import WHITE_DN
+from evnlos.inverse.sequence_light import Array, SequenceLight, group_blocks
 from evnlos.types import Events
 
 _BLOCK = 16_384  # rows at a time: what bounds the memory
@@ -109,6 +110,19 @@ class EventRecord:
         level = light.at(levels.value, self.pixel, self.t_s)
         change = level - level[self.origin] + levels.fall[self.pixel] * (self.t_s - self.t_s[self.origin])
         return np.where(self.origin >= 0, change, np.nan)
+
+    def variance(self, light: SequenceLight, seen: Array, law: CrossingLaw, noise: float) -> Array:
+        """Return the variance of each change, log units squared, [N]: the event model's own, and an error's.
+
+        Args:
+            light: The light.
+            seen: Its white levels, [P, T].
+            law: The pixel's constants.
+            noise: Standard deviation of the error of a crossing beside the model's own, log units.
+        """
+        waited = np.maximum(self.t_s - self.t_s[self.origin], 0.0)
+        walk = law.walk_variance(light.at(seen, self.pixel, self.t_s) * WHITE_DN)
+        return law.noise**2 + noise**2 + walk * waited
 
     def blocks(
         self, light: SequenceLight, levels: Levels, most: int = _BLOCK

@@ -28,8 +28,6 @@ from evnlos.types import Plane
 
 Array = NDArray[np.float64]
 
-WHITE_DN = 255.0
-"""Light in DN, as event pixels count it, of one white level."""
 _COARSEST = (50, 80)
 _TAIL = 1e-4
 _STEP_CELLS = 0.25
@@ -157,7 +155,7 @@ class SequenceLight:
 
     @cached_property
     def _single(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The factors in single precision, the mean plate left out: what many rows are made of."""
+        """The factors in single precision, the mean target left out: what many rows are made of."""
         return self.left.astype(np.float32), np.ascontiguousarray(self.right[:, :, 1:], np.float32)
 
 

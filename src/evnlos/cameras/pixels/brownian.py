@@ -444,16 +444,10 @@ class BrownianPixel(ThresholdPixel):
 
     def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw:
         """Return what an event says of the light; its noise is that of the walk since the event before."""
-        return CrossingLaw(
-            self.threshold_on,
-            self.threshold_off,
-            self.threshold_sigma,
-            self.log_curve,
-            leak=self.threshold_on * self.leak_rate_hz,
+        return self._law(
             leak_per_dn=self.threshold_on * self.leak_rate_per_dn_hz,
             walk=(self.photon_noise, self.dark_noise, self.dark_dn),
             exposure=self.exposure,
-            starts_at_rest=self.initial_phase == "rest",
         )
 
     def drift_and_noise(self, light_dn: float) -> tuple[float, float]:

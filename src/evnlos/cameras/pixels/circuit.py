@@ -370,16 +370,10 @@ class CircuitPixel(ThresholdPixel):
     def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw:
         """Return what an event says of the light; noise and bandwidth are those at the light `light_dn`."""
         current = self.dark_current_a + self.photocurrent_a_per_dn * light_dn
-        return CrossingLaw(
-            self.threshold_on,
-            self.threshold_off,
-            self.threshold_sigma,
-            self.log_curve,
-            leak=self.threshold_on * self.leak_rate_hz,
+        return self._law(
             noise=math.sqrt(2.0) * self.noise_rms(current),
             cutoff_hz=self.bandwidth_hz(current),
             floor_dn=1e9,  # one bandwidth at all light
-            starts_at_rest=self.initial_phase == "rest",
         )
 
     def noise_rms(self, current_a: float) -> float:

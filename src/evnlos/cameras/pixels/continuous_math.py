@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE
 from evnlos.cameras.random_numbers import fast_exp, fast_log
 
 
@@ -49,9 +50,8 @@ class Curve(NamedTuple):
     """Light in darkness, DN at the pixel."""
 
 
-KNEE = 20.0
+KNEE = KNEE_DN
 LOG_KNEE = math.log(KNEE)
-KNEE_SLOPE = LOG_KNEE / KNEE
 
 LOW_PASS, LOG_LINEAR, LINEAR = 0, 1, 2
 

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.cameras.event_camera import Irradiance
+from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE
 from evnlos.cameras.light import WHITE_DN
 from evnlos.errors import DataError
 
-_KNEE = 20.0
-_SLOPE = math.log(_KNEE) / _KNEE
 _AHEAD = 32  # instants rendered at a time, at least
 _AHEAD_PX = 1 << 22  # pixels of a wall's instants, about
 
@@ -105,7 +104,7 @@ def lin_log(light: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
     By way of float64 with v2e's rounding to 1e-8, which float32 does not resolve.
     """
     light = light.to(dtype)
-    logs = torch.where(light <= _KNEE, light * _SLOPE, light.clamp(min=_KNEE).log_())
+    logs = torch.where(light <= KNEE_DN, light * KNEE_SLOPE, light.clamp(min=KNEE_DN).log_())
     if dtype == torch.float32:
         return logs
     return logs.mul_(1e8).round_().div_(1e8).to(torch.float32)
