@@ -135,27 +135,38 @@ def _regress(code: Tensor, y: Tensor, folds: Tensor) -> tuple[Tensor, Tensor, Te
     powers, turn = torch.linalg.eigh((code.T @ code).double())
     powers, turn = powers.clamp_min(0).float().flip(0), turn.float().flip(1)
     code = code @ turn
-    errors = sum(_left_out(code, y, folds == fold) for fold in folds.unique())
+    parts = []  # of each fold: C^T C [R, R] and C^T Y [R, H W]
+    for fold in folds.unique():
+        own = folds == fold
+        part = code[own]
+        parts.append(((part.T @ part).double(), (part.T @ y[own]).double()))
+    gram, outer = (torch.stack(column).sum(dim=0) for column in zip(*parts, strict=True))
+    errors = sum(_left_out(gram - own, outer - aim, own, aim) for own, aim in parts)
     regularization = _LAMBDAS[int(torch.as_tensor(errors).argmin())]
-    weights = (code.T @ y) / (powers + regularization * powers.mean().clamp_min(_TINY))[:, None]
+    weights = outer.float() / (powers + regularization * powers.mean().clamp_min(_TINY))[:, None]
     return turn, powers, weights, regularization
 
 
-def _left_out(code: Tensor, y: Tensor, left: Tensor) -> Tensor:
-    """Return the squared error on the samples left out, for each ridge of the grid, float64.
+def _left_out(gram: Tensor, outer: Tensor, left_gram: Tensor, left_outer: Tensor) -> Tensor:
+    """Return the squared error on samples left out, less their sum |Y|^2, for each ridge, float64.
 
     In the eigenvectors of the other samples' Gram matrix each ridge is a diagonal, and ||C W - Y||^2 needs no
     more than matrices of the code's size.
+
+    Args:
+        gram: C^T C of the other samples, float64 [R, R].
+        outer: Their C^T Y, float64 [R, H W].
+        left_gram: C^T C of those left out.
+        left_outer: Their C^T Y.
     """
-    kept, rest = code[~left], code[left]
-    powers, turn = torch.linalg.eigh((kept.T @ kept).double())
+    powers, turn = torch.linalg.eigh(gram)
     powers = powers.clamp_min(0)
-    outer = turn.T @ (kept.T @ y[~left]).double()  # [R, H W]
-    aimed = (outer * (turn.T @ (rest.T @ y[left]).double())).sum(dim=1)
-    square = (turn.T @ (rest.T @ rest).double() @ turn) * (outer @ outer.T)
+    turned = turn.T @ outer  # [R, H W]
+    aimed = (turned * (turn.T @ left_outer)).sum(dim=1)
+    square = (turn.T @ left_gram @ turn) * (turned @ turned.T)
     ridges = torch.tensor(_LAMBDAS, dtype=torch.float64) * powers.mean().clamp_min(_TINY)
     inverse = 1 / (powers + ridges[:, None])  # [ridges, R]
-    return ((inverse @ square) * inverse).sum(dim=1) - 2 * inverse @ aimed + y[left].double().square().sum()
+    return ((inverse @ square) * inverse).sum(dim=1) - 2 * inverse @ aimed
 
 
 def _main_directions(x: Tensor, rank: int, seed: int) -> Tensor:

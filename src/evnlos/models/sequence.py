@@ -84,9 +84,10 @@ class SequenceReconstructor(Reconstructor):
         self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.ridge_multipliers)
         self.scale = PooledScale(self.embedding.images)
         self.unet = ResidualUNet(self.embedding.images, settings)
-        across = (torch.arange(side) + 0.5 - side / 2) * fine_m
+        # On the CPU wherever the layers are: the first arithmetic on the device "meta" imports for seconds.
+        across = (torch.arange(side, device="cpu") + 0.5 - side / 2) * fine_m
         self._place_m = torch.stack(torch.meshgrid(across, across, indexing="xy"), dim=-1)  # [P, P, 2]
-        self._canvas_m = torch.tensor([size[1], size[0]]) * sampling.pitch_m
+        self._canvas_m = torch.tensor([size[1], size[0]], device="cpu") * sampling.pitch_m
         self._side_m = side * fine_m
 
     def forward(self, x: Tensor) -> Tensor:
