@@ -182,14 +182,15 @@ class Simulation:
 def drawn_for(config: Simulation, name: str) -> Simulation:
     """Return the settings that `vary` draws for an object; those of the optics are shared by `setups` groups.
 
-    Gain and ambient light cost nothing, so they are always the object's own.
+    Gain and ambient light cost nothing, so they are always the object's own. Nothing varies in what is returned.
     """
     optics = {path: ends for path, ends in config.vary.items() if config.setups and needs_a_matrix(path)}
     others = {path: ends for path, ends in config.vary.items() if path not in optics}
+    drawn = dataclasses.replace(config, vary={})  # else the ends of all ranges would be tried at each draw
     if optics:
         group = derive_seed(config.seed, name, "rig") % config.setups
-        config = varied(config, optics, config.seed, f"rig {group}")  # the word decides the seed, so it stays
-    return varied(config, others, config.seed, name)
+        drawn = varied(drawn, optics, config.seed, f"rig {group}")  # the word decides the seed, so it stays
+    return varied(drawn, others, config.seed, name)
 
 
 def needs_a_matrix(path: str) -> bool:

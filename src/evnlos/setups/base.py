@@ -329,8 +329,8 @@ class Setup(Kinded, ABC):
 
     def optics(self: S) -> S:
         """Return wall and geometry alone, with default light and cameras: equal where the light paths are."""
-        fresh = {item: getattr(type(self)(), item) for item in (*LIGHT_FIELDS, *CAMERA_FIELDS)}
-        return replace(self, **fresh)
+        fresh = type(self)()
+        return replace(self, **{item: getattr(fresh, item) for item in (*LIGHT_FIELDS, *CAMERA_FIELDS)})
 
 
 def is_camera(path: str) -> bool:
