@@ -33,6 +33,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -400,10 +401,17 @@ def datagrams_of(content: bytes) -> list[bytes]:
     return found
 
 
+@cache
+def listener() -> Engine:
+    """Return what makes pictures of packets; one for all inputs, for each tracing of a network keeps memory."""
+    network = UNetConfig(width=4, depth=1, shuffle=1, rank=0).build("event", Sampling(8, 8, 0.01, 8))
+    return Engine(Weights(network))
+
+
 def listen(datagrams: list[bytes]) -> object:
     """Let `live` hear packets, and look at what it makes of them."""
-    network = UNetConfig(width=4, depth=1, shuffle=1, rank=0).build("event", Sampling(8, 8, 0.01, 8))
-    engine, source = Engine(Weights(network)), UdpSource(idle_s=0.02)
+    engine, source = listener(), UdpSource(idle_s=0.02)
+    engine.begin()
     until = time.monotonic() + 0.5
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for data in datagrams:
