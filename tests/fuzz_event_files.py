@@ -199,11 +199,11 @@ def main() -> None:
         while time.monotonic() < end:
             data = waiting.pop() if waiting else mutate(draw, corpus)
             path = _place(Path(folder), data)
-            before, start = len(tracer.lines), time.monotonic()
+            before, start = len(tracer.lines), time.process_time()  # the machine may be busy elsewhere
             sys.settrace(tracer)
             try:
                 signature = examine(path)
-                assert time.monotonic() - start < _SLOW_S, f"took {time.monotonic() - start:.0f} s"
+                assert time.process_time() - start < _SLOW_S, f"took {time.process_time() - start:.0f} s"
             except Exception as error:
                 sys.settrace(None)
                 failures += 1

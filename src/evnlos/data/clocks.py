@@ -213,14 +213,14 @@ def _peak(offsets: NDArray[np.int64], scores: NDArray[np.float64]) -> ClockOffse
 
 LEAST_AGREEMENT, LEAST_RATIO = 0.2, 1.2
 """Agreement below which nothing is told, and how far one order of the frames must be ahead of the other."""
-_THRESHOLDS = (0.05, 0.1, 0.15, 0.2, 0.3)  # log units
+_THRESHOLDS = (0.1, 0.15, 0.2, 0.3)  # log units: what sensors are set to
 _CELLS = 24  # along the longer side
 _PHASES = 8  # pixels of a cell, their references spread evenly over the dead zone
 _STEPS = 8  # of the light between two frames
 _MOST_FRAMES, _MOST_BINS, _FINEST_BIN_US = 400, 4_000, 5_000
 _LAGS = 201
 _LOBE, _SHARE_OF_LOBE = 0.9, 0.1
-_NEARLY = 0.9  # of the best threshold's agreement
+_NEARLY = 0.7  # of the best threshold's agreement: low thresholds agree best whatever the sensor's is
 _FEWEST_FRAMES = 6
 _DARK_SHARE = 1e-3  # of the peak
 
@@ -231,8 +231,8 @@ class ClockLag:
 
     Args:
         lag_us: What to add to the frames' times, microseconds.
-        limit_us: What can be told, microseconds: half a time between frames, or a tenth of the lobe's width
-            where that is more.
+        limit_us: What can be told, microseconds: the largest of half a time between frames, a tenth of the
+            lobe's width, and half of what the lag differs by between likely thresholds.
         agreement: Correlation at that lag, -1..1.
         backwards: Greatest correlation of the frames in reversed order, -1..1.
     """
@@ -259,7 +259,8 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
     `find_offset` compares changes of the light, which events of a slowly changing wall follow late. Here
     pixels with a threshold are led along the frames' light, and what they would send is compared with what was
     sent, so that the lateness is on both sides. The lag is the middle of the lobe's top, a mean over those of
-    five thresholds that agree nearly as well as the best one: a threshold too high makes it too early.
+    four thresholds that agree nearly as well as the best one: a threshold too high makes it too early, one too
+    low too late.
 
     Args:
         events: The events.
@@ -293,7 +294,8 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
     backwards = curve(expected_counts(level[::-1], _THRESHOLDS[best]))
     near = [_middle(lags, one) for one in curves if one.max() >= _NEARLY * top]
     lag, width = np.mean(near, axis=0)
-    limit = max(0.5 * float(np.median(np.diff(times_us))), _SHARE_OF_LOBE * float(width))
+    left_open = 0.5 * float(np.ptp([middle for middle, _ in near]))
+    limit = max(0.5 * float(np.median(np.diff(times_us))), _SHARE_OF_LOBE * float(width), left_open)
     return ClockLag(round(float(lag)), round(limit), top, float(backwards.max()))
 
 

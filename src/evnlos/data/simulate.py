@@ -182,7 +182,7 @@ class Simulation:
 def drawn_for(config: Simulation, name: str) -> Simulation:
     """Return the settings that `vary` draws for an object; those of the optics are shared by `setups` groups.
 
-    Gain and ambient light cost nothing, so they are always the object's own. Nothing varies in what is returned.
+    Gain and ambient light cost nothing, so they are always the object's own. What is returned varies no more.
     """
     optics = {path: ends for path, ends in config.vary.items() if config.setups and needs_a_matrix(path)}
     others = {path: ends for path, ends in config.vary.items() if path not in optics}
