@@ -22,7 +22,7 @@ import pytest
 import chromium
 from evnlos import Events, hosts
 from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, drawn, picked, simulate_sequence
-from evnlos.app.page import simulated
+from evnlos.app.page import Wanted, build_page, simulated
 from evnlos.app.serve import Server, middleware, running
 from evnlos.app.solving import Networks, from_each_frame, from_weights, from_whole_sequence, own_networks
 from evnlos.app.views import event_views, found_views, message_box, seen_views, verdict_on
@@ -155,6 +155,33 @@ def test_a_sheet_holds_every_position_and_asks_nobody(app_sequence, app_weights)
         assert len(view.pictures) == (1 if view.cursor else 40)
         assert view.pictures.dtype == np.uint8 and view.pictures.any()
         assert len(view.captions) in (0, 40)
+
+
+def test_a_number_beside_a_slider_keeps_to_its_ends(tmp_path) -> None:
+    gradio = pytest.importorskip("gradio")
+
+    async def build() -> object:  # in a loop, or Gradio makes one and leaves it open
+        return build_page(gradio, ("", ""), Controls(), Networks({}), tmp_path, 10_000)
+
+    page = asyncio.run(build())
+    sliders = [one for one in page.blocks.values() if isinstance(one, gradio.Slider)]
+    assert len(sliders) > 5
+    for one in sliders:
+        assert one.preprocess(1e6) == one.maximum and one.preprocess(-1e6) == one.minimum
+
+
+def test_what_comes_of_a_removed_upload_is_not_shown() -> None:
+    wanted = Wanted(most=2)
+    wanted.note("one", "a.raw")
+    assert wanted.is_still("one", "a.raw")
+    wanted.note("one", None)
+    assert not wanted.is_still("one", "a.raw") and wanted.is_still("one", None)
+    wanted.note("one", "b.raw")
+    assert not wanted.is_still("one", "a.raw") and wanted.is_still("one", "b.raw")
+    wanted.note("two", "c.raw")
+    wanted.note("three", "d.raw")
+    assert wanted.is_still("one", "a.raw")  # forgotten
+    assert not wanted.is_still("two", "a.raw")
 
 
 def test_a_message_is_text() -> None:

@@ -55,6 +55,16 @@
     }
   }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-sequence"] });
 
+  // A number typed beside a slider keeps to the slider's ends.
+  document.addEventListener("change", (event) => {
+    const box = event.target, range = box.closest?.(".block")?.querySelector("input[type=range]");
+    if (box.type !== "number" || !range || box.value === "") return;
+    const kept = Math.min(Math.max(Number(box.value), Number(range.min)), Number(range.max));
+    if (kept === Number(box.value)) return;
+    box.value = kept;
+    box.dispatchEvent(new Event("input", { bubbles: true }));
+  });
+
   // Drawing: strokes on a canvas; what is sent is its ink on 32 x 32 pixels, as hexadecimal digits.
   const SIDE = 32, WIDTH = 18, STEP = 6;
   const nib = { x: 96, y: 96, down: false };

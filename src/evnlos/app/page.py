@@ -98,6 +98,28 @@ def opening_verdict(controls: Controls) -> str:
     return verdict_box(verdict_on(controls.simulation()))
 
 
+class Wanted:
+    """Which upload each visitor looks at: what comes of a file that was removed meanwhile is not shown.
+
+    Args:
+        most: Visitors to remember; of others every result is shown.
+    """
+
+    def __init__(self, most: int = 1000) -> None:
+        self._most, self._paths = most, dict[str, str | None]()
+
+    def note(self, visitor: str, path: str | None) -> None:
+        """Remember a visitor's file, or that there is none."""
+        self._paths.pop(visitor, None)
+        self._paths[visitor] = path
+        while len(self._paths) > self._most:
+            del self._paths[next(iter(self._paths))]
+
+    def is_still(self, visitor: str, path: str | None) -> bool:
+        """Return whether a file is the one that its visitor looks at."""
+        return self._paths.get(visitor, path) == path
+
+
 def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networks) -> tuple[str, str]:
     """Return (sheet, message) of an uploaded file; whatever is wrong with it is a message of one line.
 
@@ -108,7 +130,7 @@ def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networ
         networks: The page's networks.
     """
     if not path:
-        return "", message_box("no file yet: choose a recording, or a capture folder as a zip", wrong=False)
+        return "", message_box(_NO_FILE, wrong=False)
     try:
         recorded = read_upload_apart(path, scratch, limit_bytes)
         found, refused = [], []
@@ -144,6 +166,7 @@ def _without_folder(text: str, path: str, scratch: Path) -> str:
     return text
 
 
+_NO_FILE = "no file yet: choose a recording, or a capture folder as a zip"
 _PICK, _DRAW = "Pick a character", "Draw one"
 _METAL, _MATTE = "rough metal", "matte white paint"
 _FONT = ("system-ui", "sans-serif")
@@ -187,10 +210,24 @@ def build_page(
             control.change(run, controls, [pictures, verdict], trigger_mode="always_last", **quiet)
         # The page opens with a sequence that is there already; only its verdict may still be on its way.
         page.load(lambda: opening_verdict(opening), None, verdict, **quiet)
+        wanted = Wanted()
+
+        def begin(path: str | None, request: Any) -> tuple[str, str]:
+            wanted.note(request.session_hash, path)
+            return "", message_box("reading ..." if path else _NO_FILE, wrong=False)
+
+        def read(path: str | None, request: Any) -> tuple[Any, Any]:
+            found = uploaded(path, scratch, limit, networks)
+            return found if wanted.is_still(request.session_hash, path) else (gr.skip(), gr.skip())
+
+        for step in (begin, read):
+            step.__annotations__["request"] = gr.Request  # Gradio hands it to who names it
+        file.change(begin, file, [shown, message], queue=False, trigger_mode="multiple", **quiet)
         file.change(
-            lambda path: uploaded(path, scratch, limit, networks),
+            read,
             file,
             [shown, message],
+            trigger_mode="multiple",
             show_progress="minimal",
             show_progress_on=message,
             api_visibility="private",
@@ -208,7 +245,12 @@ def theme(gradio: Any) -> Any:
 
 def _controls(gr: Any, opening: Controls) -> list[Any]:
     def slider(low: float, high: float, value: float, step: float, label: str, info: str = "") -> Any:
-        return gr.Slider(low, high, value=value, step=step, label=label, info=info or None)
+        made = gr.Slider(low, high, value=value, step=step, label=label, info=info or None)
+        checked = made.preprocess
+        made.preprocess = lambda given: checked(
+            min(max(given, low), high)
+        )  # typed into the box; page.js shows it
+        return made
 
     with gr.Group():
         how = gr.Radio([_PICK, _DRAW], value=_PICK, label="Hidden object")
