@@ -512,6 +512,13 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
             "position 30 of 40"
         )
         assert browser.run("return document.querySelector('.ev-position').value") == "29"
+        # A number typed beside a slider keeps to the slider's ends.
+        box = "document.querySelector('input[type=number][aria-label*=\"Wall roughness\"]')"
+        before = browser.run(f"return {sequence_of}")
+        typed = "b.value = 5; for (const t of ['input', 'change']) b.dispatchEvent(new Event(t, {bubbles: true}))"
+        browser.run(f"const b = {box}; {typed}")
+        browser.wait(f"return {box}.value === '0.3'")
+        browser.wait(f"return {sequence_of} !== {json.dumps(before)}")
         # Playing moves by itself.
         browser.run("document.querySelector('.ev-play').click()")
         browser.wait("return !document.querySelector('.ev-now').textContent.startsWith('position 30 ')")
