@@ -115,6 +115,7 @@ class Part:
 
 _EXTRAS = {
     "aedat": ("aedat", "reads AEDAT4 recordings"),
+    "zstandard": ("ros", "reads packed ROS recordings"),
     "av": ("video", "reads and writes videos"),
     "matplotlib": ("plot", "draws figures"),
     "mitsuba": ("lab", "checks the optics against a path tracer"),

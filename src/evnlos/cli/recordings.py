@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,13 +38,15 @@ class ReadOptions:
     """Sensor width, pixels, where the file does not say or is wrong; give both or neither."""
     height: int | None = None
     """Sensor height, pixels."""
+    topic: str | None = None
+    """Stream to read, of a file with several topics or cameras; `evnlos info` lists them."""
     celex: CelexOptions = field(default_factory=CelexOptions)
     """What a CeleX-V recording does not say."""
 
     def open(self, path: Path, on_error: OnError) -> Recording:
         """Return the recording, its start checked."""
         celex = None if self.celex == CelexOptions() else self.celex
-        return Recording(path, on_error, width=self.width, height=self.height, celex=celex)
+        return Recording(path, on_error, width=self.width, height=self.height, celex=celex, topic=self.topic)
 
 
 @dataclass(frozen=True)
@@ -177,6 +179,8 @@ def describe(size: int, report: ReadReport, summary: Summary) -> dict[str, Any]:
     return {
         "file": str(report.path),
         "format": report.format,
+        "topic": report.topic or None,
+        "streams": [asdict(stream) for stream in report.streams],
         "bytes": size,
         "width": report.width,
         "height": report.height,
@@ -223,8 +227,24 @@ def to_text(name: str, found: dict[str, Any]) -> str:
     rows += [
         ("", f"first at {line.removeprefix(f'{name}: ').split('; ')[0]}") for line in found["first_faults"]
     ]
+    rows = [*_stream_rows(found), *rows]
     lines = [f"{name}: {found['format']}, {amount(found['bytes'], 'B')}"]
     return "\n".join(map(printable, lines + [f"  {title:<10}{text}" for title, text in rows]))
+
+
+def _stream_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return one row for each stream of the file; that which the other rows are about has a mark."""
+    rows = []
+    for stream in found["streams"]:
+        count = "" if stream["count"] is None else f", {stream['count']:,} messages"
+        mark = ", read here" if stream["name"] == found["topic"] else ""
+        rows.append(
+            (
+                "streams" if not rows else "",
+                f"{stream['name']}: {stream['kind']} ({stream['type']}{count}){mark}",
+            )
+        )
+    return rows
 
 
 def _event_rows(found: dict[str, Any]) -> list[tuple[str, str]]:

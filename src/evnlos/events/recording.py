@@ -83,6 +83,7 @@ class Recording:
         width: Sensor width, pixels, where the file does not say or is wrong; give both or neither.
         height: Sensor height, pixels.
         celex: What a CeleX-V recording does not say about itself.
+        topic: Name of the stream, of a file that holds several.
 
     Raises:
         EventFileError: The file is absent, of no known format, or damaged at its start.
@@ -106,9 +107,10 @@ class Recording:
         width: int | None = None,
         height: int | None = None,
         celex: CelexOptions | None = None,
+        topic: str | None = None,
     ) -> None:
         self.path = Path(path)
-        self._options = (on_error, width, height, celex)
+        self._options = (on_error, width, height, celex, topic)
         self.report: ReadReport = open_source(self.path, *self._options)[1]
 
     @property

@@ -141,7 +141,9 @@ class Aedat4Source:
         return join(list(self.blocks()))
 
 
-def read_aedat4_frames(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+def read_aedat4_frames(
+    path: Path, report: ReadReport, topic: str | None
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """Return the pictures of the first frame stream as grey [T, H, W], and their times [T], microseconds.
 
     Raises:

@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.errors import EventFileError
+from evnlos.events.files.streams import Stream
 from evnlos.types import Events
 
 OnError = Literal["strict", "salvage"]
@@ -49,10 +50,13 @@ class ReadReport:
         triggers: External trigger edges seen.
         skipped: Events before the first row or time of a recording that starts in the middle; no fault.
         faults: How many faults of each kind: "truncated", "left_over", "out_of_range", "backwards",
-            "undated", "unknown", "header", "checksum", "count".
+            "undated", "unknown", "header", "checksum", "count", "clock" (a jump that bit errors of the camera's
+            clock make), "lost" (messages that never reached the file).
         first: One line on the first fault of each kind, with its byte offset.
         bytes_left_over: Bytes that could not be used.
         truncated: Whether the file ends before it should.
+        streams: All streams, of a file that can hold several.
+        topic: Name of the stream that is read, of such a file.
     """
 
     path: Path
@@ -68,6 +72,8 @@ class ReadReport:
     first: dict[str, str] = field(default_factory=dict)
     bytes_left_over: int = 0
     truncated: bool = False
+    streams: tuple[Stream, ...] = ()
+    topic: str = ""
 
     def set_geometry(self, width: object, height: object, source: str, offset: int = 0) -> None:
         """Take over a sensor size and where it comes from.

@@ -1,10 +1,12 @@
-"""HDF5 with the columns of DSEC (events/x, y, t, p) and an index of milliseconds; chunks have checksums.
+"""HDF5 with columns of events: DSEC (events/x, y, t, p), M3ED (prophesee/left/x), EVIMO (events_t, events_xy).
 
-- Writing HDF5 with the columns of DSEC piece by piece; all metadata and chunks carry checksums.
+Any group with such columns is a stream. Times are whole microseconds, after `t_offset` where there is one, or
+seconds as floating-point numbers. Prophesee's own files, with the group CD, are read by `ecf`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,14 +17,22 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.events.files.columns import ColumnCheck, Columns, ReadReport, unreadable
-from evnlos.threads import undisturbed
-from evnlos.types import Events
+from evnlos.events.files.ecf import EcfSource, is_prophesee
+from evnlos.events.files.streams import Stream, choose_stream
 from evnlos.untrusted import ElsewhereError, check_memory, open_hdf5, stored
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _MAX_RATIO = 1100  # deflate and lzf shrink a chunk at most that much
 _MOST_CHUNK_BYTES = 1 << 26
 _NAMES = {"t_us": "t", "x": "x", "y": "y", "p": "p"}
+_ALIASES = {
+    "t_us": ("t", "ts", "t_us", "timestamps"),
+    "x": ("x", "xs", "xy"),
+    "y": ("y", "ys", "xy"),
+    "p": ("p", "ps", "pol", "polarity", "polarities"),
+}
+_PREFIXES = ("", "events_", "dataset_events_")  # of columns beside others in one group (EVIMO)
+_MOST_DEEP, _MOST_GROUPS = 4, 500  # of a search for columns
 _EVENT_BYTES = 26  # of an event as columns, and as what is stored
 _OPTIONAL = ("adc", "polarity_known")
 _H5_ERRORS = (
@@ -63,38 +73,114 @@ def _h5_errors(path: Path) -> Iterator[None]:
         raise unreadable(path, 0, f"HDF5 cannot read it ({found})", cure) from None
 
 
-class Hdf5Source:
-    """An open HDF5 file of events."""
+@contextmanager
+def _opened(path: Path, chunk_bytes: int = 0) -> Iterator[h5py.File]:
+    with _h5_errors(path), open_hdf5(path, chunk_bytes) as file:
+        yield file
 
-    def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
+
+def open_hdf5_events(
+    path: Path, report: ReadReport, width: int | None, height: int | None, topic: str | None
+) -> Hdf5Source | EcfSource:
+    """Return the source of an HDF5 file, by what is in it: Prophesee's group CD, or columns.
+
+    Args:
+        path: The file.
+        report: Takes what is wrong.
+        width: Sensor width, pixels; None = the file's.
+        height: Sensor height, pixels.
+        topic: Name of the group with the columns, of a file with several; None = the only one.
+    """
+    report.format = "HDF5"
+    with _opened(path) as file:
+        is_ecf = is_prophesee(file)
+    if is_ecf:
+        return EcfSource(path, report, _opened, width, height, topic)
+    return Hdf5Source(path, report, width, height, topic)
+
+
+def _column_names(group: h5py.Group) -> dict[str, str] | None:
+    """Return the name of each column in a group, None where it holds no events."""
+    for prefix in _PREFIXES:
+        found = {}
+        for column, aliases in _ALIASES.items():
+            names = [prefix + alias for alias in aliases if prefix + alias in group]
+            names = [name for name in names if not isinstance(group.get(name, getlink=True), h5py.HardLink)
+                     or isinstance(group[name], h5py.Dataset)]  # fmt: skip
+            if names:
+                found[column] = names[0]
+        if len(found) == len(_ALIASES):
+            return found
+    return None
+
+
+def _tables(file: h5py.File) -> dict[str, dict[str, str]]:
+    """Return the groups that hold columns of events, by their path, and the names of the columns."""
+    found: dict[str, dict[str, str]] = {}
+    waiting: list[tuple[str, h5py.Group]] = [("", file)]
+    seen = 0
+    while waiting and seen < _MOST_GROUPS:
+        place, group = waiting.pop(0)
+        seen += 1
+        names = _column_names(group)
+        if names is not None:
+            found[place] = names
+            continue
+        for name in group:
+            link = group.get(name, getlink=True)
+            inside = group[name] if isinstance(link, h5py.HardLink) else None
+            if isinstance(inside, h5py.Group) and place.count("/") < _MOST_DEEP:
+                waiting.append((f"{place}/{name}".lstrip("/"), inside))
+    return found
+
+
+class Hdf5Source:
+    """Columns of events in an open HDF5 file."""
+
+    def __init__(
+        self, path: Path, report: ReadReport, width: int | None, height: int | None, topic: str | None = None
+    ) -> None:
         self.path, self.report = path, report
-        report.format = "HDF5"
         self._chunk_bytes = 0
-        with _h5_errors(path), open_hdf5(path) as file:
+        with _opened(path) as file:
+            stored(file, "events")  # a link there is told as what it is
+            tables = _tables(file)
+            if not tables:
+                cure = "columns x, y, t, p of events are read, in any group"
+                raise unreadable(path, 0, "an HDF5 file without columns of events", cure)
+            report.streams = tuple(Stream(name or "/", "events", "HDF5 columns") for name in tables)
+            report.topic = choose_stream(path, report.streams, topic, "events", report.strict).name
+            self._group = report.topic.strip("/")
+            self._stored_names = tables[self._group]
             self._count = self._check_layout(file)
             self._t_offset = self._offset(file)
             self._geometry(file, width, height)
 
-    def _datasets(self, file: h5py.File) -> dict[str, h5py.Dataset]:
-        group = stored(file, "events")
+    def _holder(self, file: h5py.File) -> h5py.Group:
+        group = stored(file, self._group) if self._group else file
         if not isinstance(group, h5py.Group):
-            if isinstance(stored(file, "CD"), h5py.Group):
-                raise unreadable(
-                    self.path,
-                    0,
-                    "Prophesee's HDF5 (group CD, ECF codec)",
-                    "convert it to RAW with the camera maker's tools",
-                )
-            raise unreadable(
-                self.path, 0, "an HDF5 file without a group 'events'", "DSEC columns events/{x,y,t,p} are read"
-            )
-        datasets = {name: stored(group, key) for name, key in _NAMES.items()}
+            raise unreadable(self.path, 0, f"{self._group} is no group", _CURE)
+        return group
+
+    def _called(self, name: str) -> str:
+        """Return what a column is called in the file."""
+        return f"{self._group}/{self._stored_names.get(name, name)}".lstrip("/")
+
+    def _datasets(self, file: h5py.File) -> dict[str, h5py.Dataset]:
+        group = self._holder(file)
+        datasets = {name: stored(group, key) for name, key in self._stored_names.items()}
         datasets |= {name: stored(group, name) for name in _OPTIONAL if name in group}
         for name, dataset in datasets.items():
-            if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.kind not in "iub":
-                raise unreadable(
-                    self.path, 0, f"events/{_NAMES.get(name, name)} is not a 1-D column of integers", _CURE
-                )
+            is_pair = self._stored_names.get(name, "").endswith("xy")
+            kinds = "iubf" if name == "t_us" else "iub"
+            if (
+                not isinstance(dataset, h5py.Dataset)
+                or dataset.dtype.kind not in kinds
+                or (dataset.shape[1:] != ((2,) if is_pair else ()))
+                or dataset.ndim == 0
+            ):
+                what = "pairs" if is_pair else "a 1-D column"
+                raise unreadable(self.path, 0, f"{self._called(name)} is not {what} of integers", _CURE)
         return datasets  # type: ignore[return-value]
 
     def _check_layout(self, file: h5py.File) -> int:
@@ -103,20 +189,21 @@ class Hdf5Source:
         for name, dataset in self._datasets(file).items():
             lengths[name] = int(dataset.shape[0])
             stored = dataset.id.get_storage_size()
-            need = lengths[name] * dataset.dtype.itemsize
-            chunk = dataset.chunks[0] * dataset.dtype.itemsize if dataset.chunks is not None else 0
+            need = dataset.size * dataset.dtype.itemsize
+            chunk = math.prod(dataset.chunks) * dataset.dtype.itemsize if dataset.chunks is not None else 0
             self._chunk_bytes = max(self._chunk_bytes, chunk)
             if chunk > _MOST_CHUNK_BYTES:
-                found = f"events/{_NAMES.get(name, name)} has chunks of {chunk / 1e6:.0f} MB"
+                found = f"{self._called(name)} has chunks of {chunk / 1e6:.0f} MB"
                 raise unreadable(self.path, 0, found, "write it in smaller ones (h5repack -l CHUNK=65536)")
             missing = (
-                dataset.chunks is not None and dataset.id.get_num_chunks() * dataset.chunks[0] < lengths[name]
+                dataset.chunks is not None
+                and dataset.id.get_num_chunks() * math.prod(dataset.chunks) < dataset.size
             )
             if missing or need > stored * _MAX_RATIO:
                 raise unreadable(
                     self.path,
                     0,
-                    f"events/{_NAMES.get(name, name)} announces {need} bytes, {stored} are stored",
+                    f"{self._called(name)} announces {need} bytes, {stored} are stored",
                     _CURE,
                 )
         if len(set(lengths.values())) != 1:
@@ -124,7 +211,7 @@ class Hdf5Source:
         return lengths["t_us"]
 
     def _offset(self, file: h5py.File) -> int:
-        for place in ("t_offset", "events/t_offset"):
+        for place in dict.fromkeys(("t_offset", f"{self._group}/t_offset".lstrip("/"))):
             dataset = stored(file, place)
             if isinstance(dataset, h5py.Dataset) and dataset.size == 1 and dataset.dtype.kind in "iu":
                 return int(dataset[()].item())
@@ -135,14 +222,18 @@ class Hdf5Source:
     def _geometry(self, file: h5py.File, width: int | None, height: int | None) -> None:
         if width is not None:
             return self.report.set_geometry(width, height, "caller")
-        for holder in (stored(file, "events"), file):
-            if holder is not None and "width" in holder.attrs and "height" in holder.attrs:
+        for holder in (self._holder(file), file):
+            if "width" in holder.attrs and "height" in holder.attrs:
                 return self.report.set_geometry(holder.attrs["width"], holder.attrs["height"], "header")
+        resolution = stored(self._holder(file), "calib/resolution")  # M3ED: width, height
+        if isinstance(resolution, h5py.Dataset) and resolution.shape == (2,) and resolution.dtype.kind in "iu":
+            return self.report.set_geometry(*resolution[:].tolist(), "header")
         largest = {"x": 0, "y": 0}
         datasets = self._datasets(file)
         for start in range(0, self._count, 1 << 20):
             for name in largest:
-                largest[name] = max(largest[name], int(datasets[name][start : start + (1 << 20)].max()))
+                values = _entries_of(datasets[name], name, start, min(start + (1 << 20), self._count))
+                largest[name] = max(largest[name], int(values.max()))
         return self.report.set_geometry(largest["x"] + 1, largest["y"] + 1, "events")
 
     def _entries(self, name: str, dataset: h5py.Dataset, start: int, stop: int) -> NDArray:
@@ -155,9 +246,7 @@ class Hdf5Source:
             _read_into(narrow, dataset, start, stop)
             _widen(narrow, self._t_offset, times)
             return times
-        values = np.empty(count, dataset.dtype)
-        _read_into(values, dataset, start, stop)
-        return self._column(name, values)
+        return self._column(name, _entries_of(dataset, name, start, stop))
 
     def _column(self, name: str, values: NDArray) -> NDArray:
         if name in ("p", "polarity_known"):
@@ -165,24 +254,32 @@ class Hdf5Source:
                 return values
             least = 0 if values.dtype.kind == "u" or not values.size else int(values.min())
             if least < -1 or (values.size and int(values.max()) > 1):
-                raise unreadable(self.path, 0, "events/p holds more than 0/1 or -1/+1", _CURE)
+                raise unreadable(self.path, 0, f"{self._called(name)} holds more than 0/1 or -1/+1", _CURE)
             return values.view(np.bool_) if values.dtype == np.uint8 else values > 0
         if name != "t_us":
             if values.dtype != np.uint16 and values.size:
                 self._refuse_outside(name, values, 0, 65_535)
             return values.astype(np.uint16, copy=False)
+        if values.dtype.kind == "f":
+            values = self._microseconds(values)
         if not self._t_offset or not values.size:
             self._refuse_outside(name, values, -(2**63), 2**63 - 1)
             return values.astype(np.int64, copy=False)
         self._refuse_outside(name, values, -(2**63) - self._t_offset, 2**63 - 1 - self._t_offset)
         return np.add(values, self._t_offset, dtype=np.int64)
 
+    def _microseconds(self, seconds: NDArray) -> NDArray[np.int64]:
+        """Return times in seconds as whole microseconds."""
+        if not (np.abs(seconds) < 2**61 / 1e6).all():
+            raise unreadable(self.path, 0, f"{self._called('t_us')} holds no times in seconds", _CURE)
+        return np.rint(seconds.astype(np.float64) * 1e6).astype(np.int64)
+
     def _refuse_outside(self, name: str, values: NDArray, low: int, high: int) -> None:
         info = np.iinfo(values.dtype) if values.dtype != np.bool_ else None
         if info is None or not values.size or (low <= info.min and info.max <= high):
             return  # whatever the column holds, it is inside
         if not (low <= int(values.min()) and int(values.max()) <= high):
-            raise unreadable(self.path, 0, f"events/{_NAMES.get(name, name)} leaves {low}..{high}", _CURE)
+            raise unreadable(self.path, 0, f"{self._called(name)} leaves {low}..{high}", _CURE)
 
     def blocks(self, size: int = 1 << 17) -> Iterator[Columns]:
         """Yield columns of at most `size` events."""
@@ -201,6 +298,15 @@ class Hdf5Source:
             _EVENT_BYTES * self._count, f"{self.path}: {self._count:,} events", "cut it with evnlos convert"
         )
         return next(self.blocks(max(self._count, 1)), {})
+
+
+def _entries_of(dataset: h5py.Dataset, name: str, start: int, stop: int) -> NDArray:
+    """Return the entries start..stop of a column, or of one of two columns that are stored as pairs."""
+    if dataset.ndim == 2:
+        return dataset[start:stop, 0 if name == "x" else 1]
+    values = np.empty(stop - start, dataset.dtype)
+    _read_into(values, dataset, start, stop)
+    return values
 
 
 def _read_into(values: NDArray, dataset: h5py.Dataset, start: int, stop: int) -> None:
@@ -224,165 +330,3 @@ def _stored_at(dataset: h5py.Dataset, number: int) -> int:
         return (dataset.id.get_offset() or 0) + number * dataset.dtype.itemsize
     start = number // dataset.chunks[0] * dataset.chunks[0]
     return dataset.id.get_chunk_info_by_coord((start,)).byte_offset or 0
-
-
-_CHUNK = 65_536
-_MAX_INDEX_MS = 1 << 24  # 4.7 hours; a longer index would be larger than the events of a sparse recording
-_PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
-
-
-class _Storage:
-    """The file beneath HDF5, for which every write succeeds.
-
-    The library can't give up a file that it failed to write: it tries again at every close, at last when the
-    process ends, and crashes there. So the first failure is kept for the sink to raise, and no more is written.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("wb+", buffering=0)
-        self.failure: OSError | None = None
-        self.read, self.readinto = self._file.read, self._file.readinto
-        self.seek, self.tell, self.flush = self._file.seek, self._file.tell, self._file.flush
-
-    def write(self, content: memoryview) -> int:
-        """Write all of it, or note why not."""
-        left = memoryview(content).cast("B")
-        try:
-            while len(left) and self.failure is None:
-                left = left[self._file.write(left) :]
-        except OSError as error:
-            self.failure = error
-        return len(content)
-
-    def truncate(self, size: int | None = None) -> int:
-        """Set the file's size, or note why not."""
-        try:
-            return self._file.truncate(size)
-        except OSError as error:
-            self.failure = self.failure or error
-            return size or 0
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-class Hdf5Sink:
-    """An HDF5 file that grows: columns events/{x, y, t, p}, `ms_to_idx` and `t_offset`."""
-
-    def __init__(self, path: Path, first: Events) -> None:
-        start = int(first.t_us[0]) if len(first) else 0
-        self._wide = first.duration_us >= 2**32 or not -(2**62) < start < 2**62
-        self._t_offset = 0 if self._wide else start
-        self._events, self._last = 0, 0
-        self._storage = _Storage(path)
-        with undisturbed():
-            self._file = h5py.File(self._storage, "w", libver=("v110", "v110"))
-            self._group = self._file.create_group("events")
-            self._group.attrs["width"], self._group.attrs["height"] = first.width, first.height
-        self._columns: dict[str, h5py.Dataset] = {}
-        self._index: h5py.Dataset | None = None
-
-    def append(self, events: Events) -> None:
-        """Write a piece; the first decides how large a chunk is."""
-        with self._told():
-            self._append(events)
-
-    def _append(self, events: Events) -> None:
-        if len(events) and not self._wide and int(events.t_us[-1]) - self._t_offset >= 2**32:
-            self._widen()
-        # A difference of 64 bits: times that are far apart do not fit the narrow column, and are wide already.
-        t_us = events.t_us if self._wide else (events.t_us - self._t_offset).astype(np.uint32)
-        columns = {"x": events.x, "y": events.y, "t": t_us, "p": events.p.astype(np.uint8)}
-        for name in ("adc", "polarity_known"):
-            column = getattr(events, name)
-            if column is not None:
-                columns[name] = column.astype(np.uint8 if column.dtype == np.bool_ else column.dtype)
-        for name, column in columns.items():
-            if name not in self._columns:
-                self._columns[name] = _create(self._group, name, column.dtype, len(column))
-            _extend(self._columns[name], column)
-        if len(events) and not self._wide:
-            self._extend_index(t_us)
-        self._events += len(events)
-
-    def _extend_index(self, t_us: NDArray) -> None:
-        """Note the index of the first event not earlier than each millisecond after `t_offset`."""
-        known = 0 if self._index is None else len(self._index)
-        self._last = int(t_us[-1]) // 1000
-        if self._last >= _MAX_INDEX_MS:
-            return
-        starts = np.searchsorted(t_us, np.arange(known, self._last + 1, dtype=np.int64) * 1000)
-        indices = starts.astype(np.uint64) + np.uint64(self._events)
-        if self._index is None:
-            self._index = _create(self._file, "ms_to_idx", indices.dtype, len(indices) + 1)
-        _extend(self._index, indices)
-
-    def _widen(self) -> None:
-        """Put times of 64 bits in place of those of 32, which hold 71 minutes."""
-        self._wide = True
-        if "t" in self._columns:
-            narrow = self._columns["t"]
-            wide = _create(self._group, "t_wide", np.dtype(np.int64), _CHUNK)
-            for start in range(0, len(narrow), _CHUNK):
-                _extend(wide, narrow[start : start + _CHUNK].astype(np.int64) + self._t_offset)
-            del self._group["t"]
-            self._group.move("t_wide", "t")
-            self._columns["t"] = wide
-        if self._index is not None:
-            del self._file["ms_to_idx"]
-            self._index = None
-        self._t_offset = 0
-
-    def finish(self) -> None:
-        """Complete the index and the offset."""
-        with self._told():
-            self._complete()
-            self._file.close()  # here: what the library cannot write is an error before the file gets its name
-
-    def _complete(self) -> None:
-        if self._index is not None and self._last >= _MAX_INDEX_MS:
-            del self._file["ms_to_idx"]
-        elif not self._wide:
-            if self._index is None:
-                self._index = _create(self._file, "ms_to_idx", np.dtype(np.uint64), 2)
-            missing = self._last + 2 - len(self._index)
-            _extend(self._index, np.full(missing, self._events, np.uint64))
-        _put_compact(self._file, "t_offset", self._t_offset)
-
-    def close(self) -> None:
-        """Close the file."""
-        with undisturbed():
-            self._file.close()
-        self._storage.close()
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Raise what the storage noted, also where the library stumbles over what was not written."""
-        try:
-            with undisturbed():
-                yield
-        finally:
-            if self._storage.failure is not None:
-                raise self._storage.failure
-
-
-def _create(group: h5py.Group, name: str, dtype: np.dtype, expected: int) -> h5py.Dataset:
-    chunk = (max(1, min(_CHUNK, expected)),)
-    return group.create_dataset(name, (0,), dtype, chunks=chunk, maxshape=(None,), **_PACKED)
-
-
-def _extend(dataset: h5py.Dataset, values: NDArray) -> None:
-    count = len(dataset)
-    dataset.resize(count + len(values), axis=0)
-    dataset[count:] = values
-
-
-def _put_compact(file: h5py.File, name: str, value: int) -> None:
-    """Store one number inside the object header, which has a checksum; a plain scalar has none."""
-    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    layout.set_layout(h5py.h5d.COMPACT)
-    layout.set_obj_track_times(False)  # the same events give the same bytes
-    space = h5py.h5s.create(h5py.h5s.SCALAR)
-    dataset = h5py.h5d.create(file.id, name.encode(), h5py.h5t.NATIVE_INT64, space, layout)
-    dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.array(value, np.int64))

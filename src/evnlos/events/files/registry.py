@@ -14,11 +14,28 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evnlos.errors import DataError, EventFileError
-from evnlos.events.files import aedat4, celex, celex_write, csv, csv_rows, fixed_words, hdf5, npz, raw
+from evnlos.events.files import (
+    aedat4,
+    celex,
+    celex_write,
+    csv,
+    csv_rows,
+    fixed_words,
+    hdf5,
+    hdf5_write,
+    mcap,
+    npz,
+    raw,
+    ros,
+    ros_bags,
+)
 from evnlos.events.files.celex import CelexOptions
 from evnlos.events.files.columns import Columns, ReadReport, Sink, unreadable
+from evnlos.events.files.ros_messages import ZSTD
+from evnlos.events.files.streams import refuse_topic
 from evnlos.files import new_file
 from evnlos.types import Events
 from evnlos.untrusted import no_file, open_regular
@@ -46,23 +63,40 @@ class Format:
         name: Its name, as `write_events(format=...)` takes it.
         suffixes: File name endings, lower case with the dot.
         sniff: Whether the first bytes of a file (64 KiB at most) are of this format.
-        open: Opens a file: (path, report, width, height, celex options).
+        open: Opens a file: (path, report, width, height, celex options, topic).
         create: Begins a file: (path, first piece of the events, the name that it will get); None where the
             format is only read.
+        frames: Reads its frames and their times, microseconds: (path, report, topic); None where it has none.
     """
 
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[bytes], bool]
-    open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None], FileSource]
+    open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None, str | None], FileSource]
     create: Callable[[Path, Events, Path], Sink] | None = None
+    frames: Callable[[Path, ReadReport, str | None], tuple[NDArray, NDArray[np.int64]]] | None = None
 
 
 def _plain(
     source: Callable[[Path, ReadReport, int | None, int | None], FileSource],
 ) -> Callable[..., FileSource]:
-    """Return an opener that has no use for the options of CeleX-V."""
-    return lambda path, report, width, height, _: source(path, report, width, height)
+    """Return an opener of a format with one stream, which has no use for the options of CeleX-V."""
+
+    def opened(path, report, width, height, _, topic):
+        refuse_topic(path, path.suffix or "this format", topic)
+        return source(path, report, width, height)
+
+    return opened
+
+
+def _of_streams(source: Callable[..., FileSource]) -> Callable[..., FileSource]:
+    """Return an opener of a format with several streams."""
+    return lambda path, report, width, height, _, topic: source(path, report, width, height, topic)
+
+
+def _celex(path, report, width, height, options, topic):
+    refuse_topic(path, "CeleX-V", topic)
+    return celex.CelexSource(path, report, width, height, options)
 
 
 def _raw(name: str) -> Format:
@@ -75,13 +109,25 @@ def _raw(name: str) -> Format:
     )
 
 
+def _ros(
+    name: str, suffixes: tuple[str, ...], signature: bytes, container: Callable[..., ros.Container]
+) -> Format:
+    def opened(path, report, width, height, _, topic):
+        return ros.RosSource(container(path, report), path, report, width, height, topic)
+
+    def frames(path, report, topic):
+        return ros.read_ros_frames(container(path, report), path, report, topic)
+
+    return Format(name, suffixes, lambda start: start.startswith(signature), opened, frames=frames)
+
+
 FORMATS = (
     Format(
         "HDF5",
         (".h5", ".hdf5"),
         lambda start: start.startswith(hdf5.SIGNATURE),
-        _plain(hdf5.Hdf5Source),
-        lambda path, first, _: hdf5.Hdf5Sink(path, first),
+        _of_streams(hdf5.open_hdf5_events),
+        lambda path, first, _: hdf5_write.Hdf5Sink(path, first),
     ),
     Format(
         "NPZ",
@@ -101,13 +147,17 @@ FORMATS = (
         lambda start: start.startswith(aedat4.SIGNATURE),
         _plain(aedat4.Aedat4Source),
         lambda path, first, _: aedat4.Aedat4Sink(path, first),
+        aedat4.read_aedat4_frames,
     ),
-    Format("CELEX", (".bin",), celex.sniff_celex, celex.CelexSource, celex_write.CelexSink),
+    _ros("DB3", (".db3",), ros_bags.DB3_SIGNATURE, ros_bags.Db3File),
+    _ros("MCAP", (".mcap",), mcap.SIGNATURE, mcap.McapFile),
+    _ros("BAG", (".bag",), ros_bags.BAG_SIGNATURE, ros_bags.BagFile),
+    Format("CELEX", (".bin",), celex.sniff_celex, _celex, celex_write.CelexSink),
     Format(  # read as CELEX: the header tells the event formats apart
         "CELEX0",
         (),
         lambda _: False,
-        celex.CelexSource,
+        _celex,
         lambda path, first, target: celex_write.CelexSink(path, first, target, event_format=0),
     ),
     Format(
@@ -137,6 +187,8 @@ def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format
     for format in FORMATS:
         if format.sniff(start):
             return format
+    if start.startswith(ZSTD):
+        raise unreadable(path, 0, "a file packed by zstd as a whole", "unpack it first: zstd -d FILE")
     known = ", ".join(format.name for format in FORMATS if format.suffixes)
     raise unreadable(
         path, 0, f"no known event format starts with {start[:8].hex(' ')}", f"these are read: {known}"

@@ -92,6 +92,35 @@ class WordCodec:
     most_events: int = 1
 
 
+def report_faults(
+    report: ReadReport,
+    state: NDArray[np.int64],
+    words: NDArray,
+    codec: WordCodec,
+    locate: Callable[[int], int],
+) -> None:
+    """Pass the faults that a kernel noted to the report, the earliest first, and forget them.
+
+    Args:
+        report: Takes them.
+        state: The kernel's state.
+        words: The block that it decoded.
+        codec: How.
+        locate: Gives the byte of the file where a word of the block stands.
+    """
+    counts = state[FAULTS : FAULTS + 2 * len(KINDS) : 2]
+    indices = state[FAULTS + 1 : FAULTS + 2 * len(KINDS) : 2]
+    for kind in sorted(np.flatnonzero(counts), key=lambda kind: indices[kind]):
+        word = int(words[indices[kind]]) & ((1 << 8 * codec.dtype.itemsize) - 1)
+        found = _FOUND[kind].format(word=word, kind=(word >> codec.kind_shift) & 15)
+        cure = _SALVAGE
+        if KINDS[kind] == "out_of_range":
+            cure = f"the sensor is {report.width} x {report.height}; give width= and height="
+        # A clock fault is counted as one; the events that it misplaces are dropped by their order.
+        report.fault(KINDS[kind], locate(int(indices[kind])), found, cure, count=int(counts[kind]))
+    state[FAULTS:STATE_SIZE] = 0
+
+
 class WordSource:
     """The words of an open file, decoded block by block."""
 
@@ -132,24 +161,11 @@ class WordSource:
             words, state, out["t_us"], out["x"], out["y"], out["p"], report.width, report.height
         )
         if state[FAULTS:STATE_SIZE:2].any():
-            self._report_faults(words, first)
+            itemsize = self.codec.dtype.itemsize
+            report_faults(
+                report, state, words, self.codec, lambda index: self.start + (first + index) * itemsize
+            )
         return count
-
-    def _report_faults(self, words: NDArray, first: int) -> None:
-        """Pass the faults that the kernel noted to the report, the earliest first."""
-        state, itemsize = self._state, self.codec.dtype.itemsize
-        counts = state[FAULTS : FAULTS + 2 * len(KINDS) : 2]
-        indices = state[FAULTS + 1 : FAULTS + 2 * len(KINDS) : 2]
-        for kind in sorted(np.flatnonzero(counts), key=lambda kind: indices[kind]):
-            word = int(words[indices[kind]]) & ((1 << 8 * itemsize) - 1)
-            offset = self.start + (first + int(indices[kind])) * itemsize
-            found = _FOUND[kind].format(word=word, kind=(word >> self.codec.kind_shift) & 15)
-            cure = _SALVAGE
-            if KINDS[kind] == "out_of_range":
-                cure = f"the sensor is {self.report.width} x {self.report.height}; give width= and height="
-            # A clock fault is counted as one; the events that it misplaces are dropped by their order.
-            self.report.fault(KINDS[kind], offset, found, cure, count=int(counts[kind]))
-        state[FAULTS:STATE_SIZE] = 0
 
     def _finish(self) -> None:
         self.report.triggers = int(self._state[TRIGGERS])

@@ -1,0 +1,146 @@
+"""External triggers: edges that another instrument, such as a frame camera, put into a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from evnlos.errors import EventFileError
+from evnlos.events.files import evt2, evt3
+from evnlos.events.files.columns import OnError, unreadable
+from evnlos.events.files.raw import RawSource
+from evnlos.events.files.read import open_source
+
+CLOCK, BASE, STARTED = range(3)  # slots of the state
+
+
+@dataclass(frozen=True, eq=False)
+class Triggers:
+    """External trigger edges in the order of the file.
+
+    Args:
+        t_us: Times, int64 [N], microseconds, on the events' clock.
+        channel: Number of the input, uint8 [N].
+        rising: True for a rising edge, bool [N].
+    """
+
+    t_us: NDArray[np.int64]
+    channel: NDArray[np.uint8]
+    rising: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+
+@njit(cache=True)
+def _triggers_2(words, state, turn, t_us, channel, rising):
+    """Collect from 32-bit words: kind 10 has six bits of time, the input in bits 8-12, the level in bit 0."""
+    count = 0
+    for index in range(len(words)):
+        word = np.int64(words[index])
+        kind = word >> 28
+        if kind == 8:
+            high = word & 0xFFFFFFF
+            if state[STARTED] and state[CLOCK] - high > turn // 2:
+                state[BASE] += turn << 6
+            state[CLOCK], state[STARTED] = high, 1
+        elif kind == 10 and state[STARTED]:
+            t_us[count] = state[BASE] + (state[CLOCK] << 6) + ((word >> 22) & 0x3F)
+            channel[count] = (word >> 8) & 0x1F
+            rising[count] = (word & 1) == 1
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _triggers_3(words, state, turn, t_us, channel, rising):
+    """Collect from 16-bit words: kind 10 has the input in bits 8-11, the level in bit 0, the clock as time."""
+    count = 0
+    for index in range(len(words)):
+        word = np.int64(words[index])
+        kind = word >> 12
+        if kind == 8:
+            high = word & 0xFFF
+            old = state[CLOCK] >> 12
+            if state[STARTED] and old - high > turn // 2:
+                state[BASE] += turn << 12
+            if high != old or not state[STARTED]:
+                state[CLOCK] = high << 12
+            state[STARTED] = 1
+        elif kind == 6:
+            state[CLOCK] = (state[CLOCK] & ~np.int64(0xFFF)) | (word & 0xFFF)
+        elif kind == 10 and state[STARTED]:
+            t_us[count] = state[BASE] + state[CLOCK]
+            channel[count] = (word >> 8) & 0xF
+            rising[count] = (word & 1) == 1
+            count += 1
+    return count
+
+
+@runtime_checkable
+class _Words(Protocol):
+    """A source of EVT2, EVT2.1 or EVT3 words."""
+
+    def words_of_file(self) -> Iterator[NDArray]: ...
+
+
+@runtime_checkable
+class _Edges(Protocol):
+    """A source that knows its edges: (times [us], channels, whether rising)."""
+
+    def edges(self) -> Iterator[tuple[NDArray, NDArray, NDArray]]: ...
+
+
+def read_triggers(
+    path: str | PathLike[str], on_error: OnError = "strict", *, topic: str | None = None
+) -> Triggers:
+    """Return the external trigger edges of a recording that holds some.
+
+    Prophesee RAW (EVT2, EVT2.1, EVT3) and HDF5, EVT3 packets of ROS, and AEDAT 2.0 and 3.1 do. A frame camera
+    whose exposure output is wired to the event camera gives its frames' times that way: the rising edges of its
+    channel are the starts of the exposures. AEDAT 2.0 does not say which edge it saw: all count as rising.
+
+    Args:
+        path: The file.
+        on_error: "strict" raises at the first fault of the file, "salvage" reads what is good.
+        topic: Name of the stream of events, of a file that holds several.
+
+    Raises:
+        EventFileError: The file is damaged or of a format without triggers.
+    """
+    source, report = open_source(Path(path), on_error, None, None, None, topic)
+    try:
+        if isinstance(source, _Words):
+            parts = list(_from_words(source, report.format))
+        elif isinstance(source, _Edges):
+            parts = list(source.edges())
+        else:
+            found, cure = f"{report.format} without external triggers", "they are read from Prophesee RAW files"
+            raise unreadable(Path(path), 0, found, f"{cure}, ROS packets of EVT3, and AEDAT 2.0 and 3.1")
+    except OSError as error:
+        raise EventFileError(f"{path}: reading failed ({error.strerror}); copy the file again") from None
+    if not parts:
+        return Triggers(np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.bool_))
+    t_us, channel, rising = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return Triggers(t_us + (source.t0_us if isinstance(source, RawSource) else 0), channel, rising)
+
+
+def _from_words(source: _Words, format: str) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
+    state = np.zeros(3, np.int64)
+    for words in source.words_of_file():
+        kernel, turn = _triggers_3, evt3.WRAP_US >> 12
+        if format in ("EVT2", "EVT21"):
+            kernel, turn = _triggers_2, evt2.WRAP_US >> 6
+        if format == "EVT21":  # its fields lie in one half of the word, as those of EVT2, but narrower
+            is_swapped = isinstance(source, RawSource) and source.is_swapped
+            words = np.ascontiguousarray(words.view(np.uint32)[0 if is_swapped else 1 :: 2])
+        out = np.empty(len(words), np.int64), np.empty(len(words), np.uint8), np.empty(len(words), np.bool_)
+        count = kernel(words, state, turn, *out)
+        yield out[0][:count].copy(), out[1][:count].copy(), out[2][:count].copy()
