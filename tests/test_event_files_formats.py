@@ -257,7 +257,7 @@ def test_celex_refusals(tmp_path):
         CelexOptions(clock_mhz=55)
     with pytest.raises(DataError):
         write_celex_frames(tmp_path / "f.bin", np.zeros((1, 2, 2), np.uint8))
-    with pytest.raises(EventFileError, match="bin"):
+    with pytest.raises(EventFileError, match="no known event format"):
         path = tmp_path / "n.h5"
         path.write_bytes(b"hello")
         read_frames(path)
@@ -340,3 +340,81 @@ def test_damaged_text(text, said, tmp_path):
     with pytest.raises(EventFileError, match=said) as raised:
         read_events(path)
     assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
+
+
+# ---------------------------------------------------------------- EVT3: bit errors of the clock
+
+
+def evt3_recording(path, seed: int = 0, repeats: int = 1) -> Events:
+    """Write EVT3 as a camera does, its TIME_HIGH several times in each 4 ms, and return the events."""
+    draw = np.random.default_rng(seed)
+    times = 11_000_000 + np.sort(draw.integers(0, 12_000_000, 60_000))  # across a turn of the clock
+    columns = (
+        draw.integers(0, 1280, len(times)),
+        draw.integers(0, 720, len(times)),
+        draw.integers(0, 2, len(times)),
+    )
+    events = Events(times, *columns, width=1280, height=720)
+    write_events(path, events, format="EVT3")
+    data = path.read_bytes().replace(b"% events 60000", b"% note   60000")
+    head = data.index(b"% end\n") + 6
+    words = np.frombuffer(data[head:], "<u2")
+    is_low = words >> 12 == 6
+    high = words[np.maximum.accumulate(np.where(words >> 12 == 8, np.arange(len(words)), 0))]
+    counts = np.where(is_low, repeats, 1)
+    out = np.repeat(np.where(is_low, high, words), counts)
+    last = np.cumsum(counts) - 1
+    out[last] = words  # before each TIME_LOW the TIME_HIGH once more
+    path.write_bytes(data[:head] + out.tobytes())
+    assert read_events(path) == events
+    return events
+
+
+@pytest.mark.parametrize("repeats", [1, 2])
+def test_bit_errors_of_the_evt3_clock_are_named_and_mended(repeats, tmp_path):
+    path = tmp_path / "camera.raw"
+    events = evt3_recording(path, repeats=repeats)
+    data = path.read_bytes()
+    head = data.index(b"% end\n") + 6
+    words = np.frombuffer(data[head:], "<u2")
+    places = np.flatnonzero(words >> 12 == 8)
+    draw = np.random.default_rng(1)
+    tried = 0
+    for place in draw.choice(places[5:-5], 60, replace=False).tolist():
+        bit = int(draw.integers(4, 12))  # 16 steps and more: what lies nearer may be another good time
+        damaged = words.copy()
+        damaged[place] ^= 1 << bit
+        path.write_bytes(data[:head] + damaged.tobytes())
+        with pytest.raises(EventFileError, match=r"jumps and comes back.*16\.77 s.*salvage"):
+            read_events(path)
+        found, report = read_events_report(path)
+        assert report.faults == {"clock": 1}
+        np.testing.assert_array_equal(found.t_us, events.t_us)
+        tried += 1
+    assert tried == 60
+
+
+def test_a_clock_error_at_the_end_of_a_block_is_seen_in_the_next(tmp_path):
+    from evnlos.events.files.evt3 import bound_evt3, decode_evt3
+    from evnlos.events.files.words import FAULTS, new_state
+
+    events = evt3_recording(tmp_path / "a.raw", repeats=2)
+    data = (tmp_path / "a.raw").read_bytes()
+    words = np.frombuffer(data[data.index(b"% end\n") + 6 :], "<u2").copy()
+    place = int(np.flatnonzero(words >> 12 == 8)[900])
+    words[place] ^= 1 << 11
+    state, times = new_state(), []
+    for block in (words[: place + 1], words[place + 1 :]):
+        t, x, y, p = (np.empty(bound_evt3(block), kind) for kind in (np.int64, np.uint16, np.uint16, np.bool_))
+        count = decode_evt3(block, state, t, x, y, p, 1280, 720)
+        times.append(t[:count])
+    assert state[FAULTS:].any()
+    assert np.concatenate(times)[-1] == events.t_us[-1] % 2**24 + 2**24 * (events.t_us[-1] // 2**24)
+
+
+def test_long_silences_are_no_clock_errors(tmp_path):
+    draw = np.random.default_rng(0)
+    gaps = np.cumsum(draw.choice([5, 10**4, 10**6, 2**24 - 3, 2**24, 2**24 + 9_000, 10**8], 400))
+    events = Events(gaps, np.zeros(400, int), np.zeros(400, int), np.ones(400, bool), 8, 8)
+    write_events(tmp_path / "a.raw", events, format="EVT3")
+    assert read_events(tmp_path / "a.raw") == events

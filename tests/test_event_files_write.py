@@ -18,7 +18,7 @@ from evnlos.events import (
     write_aedat4,
     write_events,
 )
-from evnlos.events.files import hdf5 as hdf5_write
+from evnlos.events.files import hdf5_write
 from evnlos.events.files import registry as write
 from evnlos.types import Events
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from evnlos.errors import DataError, EventFileError, MissingDependencyError
 from evnlos.events.files.columns import ColumnCheck, Columns, FileSink, ReadReport, join, unreadable
+from evnlos.events.files.ros_messages import grey_of
 from evnlos.files import new_file
 from evnlos.types import Events
 from evnlos.untrusted import Child
@@ -163,7 +164,7 @@ def read_aedat4_frames(
                 break
             height, width, channels = struct.unpack("<3q", decoder.take(24))
             pixels = np.frombuffer(decoder.take(height * width * channels), np.uint8)
-            frames.append(_grey(pixels.reshape(height, width, channels)))  # [H, W]
+            frames.append(grey_of(pixels.reshape(height, width, channels)))  # [H, W]
             times.append(t_us)
             if frames[-1].shape != frames[0].shape:
                 found = (
@@ -173,14 +174,6 @@ def read_aedat4_frames(
     if not frames:
         raise unreadable(path, 0, "an AEDAT4 file whose frame stream is empty", "record frames as well")
     return np.stack(frames), np.array(times, np.int64)
-
-
-def _grey(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return [H, W] of [H, W, channels]: grey as it is, colours by ITU-R BT.601, transparency left out."""
-    if pixels.shape[2] < 3:
-        return pixels[:, :, 0]
-    weights = np.array([0.299, 0.587, 0.114])
-    return np.round(pixels[:, :, :3] @ weights).astype(np.uint8)
 
 
 _SIGNATURE = b"#!AER-DAT4.0\r\n"

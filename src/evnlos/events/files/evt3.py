@@ -17,6 +17,7 @@ from evnlos.events.files.words import (
     CHUNK,
     CLOCK,
     CLOCK_BACK,
+    CLOCK_JUMP,
     COLUMN,
     JITTER_US,
     NEWEST,
@@ -104,6 +105,12 @@ WRAP_US = 1 << 24
 _HIGH_TURN = 1 << 12
 SLACK = 12
 _ROW_SEEN, _BASE_SEEN = 8, 9  # further slots of the state
+_OLD_HIGH, _OLD_BASE = (
+    10,
+    11,
+)  # clock before a jump of which it is not known yet whether it comes back; high + 1, 0 = none
+_NEAR = 10  # steps of TIME_HIGH, 4.096 ms each, that a clock makes in a recording without long silences
+_MOST_WRONG = 3  # clock words in a row that a bit error spoils
 
 
 @cache
@@ -130,24 +137,78 @@ def bound_evt3(words: NDArray[np.uint16]) -> int:
 
 
 @njit(cache=True)
-def _decode_carefully(words, first, state, t_us, x, y, p, width, height):
-    """Decode word by word and note every fault; `first` is the number of the first word in its block."""
+def _likeliest(wrong, high, span, is_low_back):
+    """Return the one of high..high + span that the fewest wrong bits make `wrong`.
+
+    Of equal ones it is `high` itself, or, where the low part of the time began anew, the next.
+    """
+    best, fewest = high, 99
+    for step in range(span + 1):
+        value = (high + step) & 0xFFF
+        bits, count = value ^ wrong, 0
+        while bits:
+            bits &= bits - 1
+            count += 1
+        if count < fewest or (count == fewest and step == 1 and is_low_back):
+            best, fewest = value, count
+    return best
+
+
+@njit(cache=True)
+def mend_clock(words, index, high, low):
+    """Return the high part of the time where the TIME_HIGH at `index` is a bit error of the camera.
+
+    It is one where the clock jumps there, and the next clock words stand where it was. A turn of the clock
+    is no such jump, nor are the two words 0xfff and 0x000 by which a writer tells of a turn without events.
+
+    Args:
+        words: EVT3 words.
+        index: Number of the TIME_HIGH.
+        high: High part of the time before it.
+        low: Low part of the time before it.
+
+    Returns:
+        The right high part; -1 where the word is good, -2 where that is to be seen in words that follow.
+    """
+    new = np.int64(words[index]) & 0xFFF
+    if (new - high) & 0xFFF <= _NEAR:
+        return -1
+    if new == 0xFFF and index + 1 < len(words) and words[index + 1] == 0x8000:
+        return -1
+    wrong, next_low = 1, np.int64(-1)
+    for place in range(index + 1, len(words)):
+        kind, value = words[place] >> 12, np.int64(words[place]) & 0xFFF
+        if kind == 6 and next_low < 0:
+            next_low = value
+        elif kind == 8:
+            if (value - high) & 0xFFF <= _NEAR:
+                return _likeliest(new, high, (value - high) & 0xFFF, 0 <= next_low < low - JITTER_US)
+            wrong += 1
+            if wrong > _MOST_WRONG or (value - new) & 0xFFF > 1:
+                return -1
+    return -2
+
+
+@njit(cache=True)
+def _decode_carefully(words, first, stop, state, t_us, x, y, p, width, height):
+    """Decode the words first..stop one by one and note every fault."""
     clock, newest, base = state[CLOCK], state[NEWEST], state[BASE]  # clock = high << 12 | low
     row, column, polarity = state[ROW], state[COLUMN], state[POLARITY] != 0
     started, row_seen, base_seen = state[STARTED] != 0, state[_ROW_SEEN] != 0, state[_BASE_SEEN] != 0
     never = np.iinfo(np.int64).min
     time = max(base + clock, newest)
     count = 0
-    for index in range(len(words)):
+    old_high, old_base = state[_OLD_HIGH] - 1, state[_OLD_BASE]
+    for index in range(first, stop):
         word = np.int64(words[index])
         kind = word >> 12
         if kind == 2:
             if not (started and row_seen):
-                note(state, UNDATED, first + index)
+                note(state, UNDATED, index)
                 continue
             at = word & 0x7FF  # a single event leaves the base of the vectors where it is
             if at >= width or row >= height:
-                note(state, OUT_OF_RANGE, first + index)
+                note(state, OUT_OF_RANGE, index)
                 continue
             t_us[count] = time
             x[count] = at
@@ -162,13 +223,13 @@ def _decode_carefully(words, first, state, t_us, x, y, p, width, height):
             span = 12 if kind == 4 else 8
             bits = word & ((1 << span) - 1)
             if not (started and row_seen and base_seen):
-                note(state, UNDATED, first + index)
+                note(state, UNDATED, index)
                 continue
             at = column
             while bits:
                 if bits & 1:
                     if at >= width or row >= height:
-                        note(state, OUT_OF_RANGE, first + index)
+                        note(state, OUT_OF_RANGE, index)
                     else:
                         t_us[count] = time
                         x[count] = at
@@ -187,17 +248,29 @@ def _decode_carefully(words, first, state, t_us, x, y, p, width, height):
             if kind == 6:
                 new = word & 0xFFF
                 if (clock & 0xFFF) - new > JITTER_US:
-                    note(state, BACKWARDS, first + index)
+                    note(state, BACKWARDS, index)
                     newest = never
                 clock = (clock & ~np.int64(0xFFF)) | new
             else:
                 new = word & 0xFFF
                 high = clock >> 12
+                if old_high >= 0 and (new - old_high) & 0xFFF <= _NEAR:
+                    note(state, CLOCK_JUMP, index)
+                    base, high, clock = old_base, old_high, old_high << 12
+                    newest, old_high = never, -1
+                elif started:
+                    old_high = -1
+                    right = mend_clock(words, index, high, clock & 0xFFF)
+                    if right >= 0:
+                        note(state, CLOCK_JUMP, index)
+                        new = right
+                    elif right == -2:
+                        old_high, old_base = high, base
                 if started and new < high:
                     if high - new > _HIGH_TURN // 2:
                         base += WRAP_US
                     else:
-                        note(state, CLOCK_BACK, first + index)
+                        note(state, CLOCK_BACK, index)
                         newest = never  # one fault, not one more for each event behind it
                 if new != high or not started:
                     clock = new << 12
@@ -207,17 +280,18 @@ def _decode_carefully(words, first, state, t_us, x, y, p, width, height):
             time = base + clock
             if time < newest:
                 if time < newest - JITTER_US:
-                    note(state, BACKWARDS, first + index)
+                    note(state, BACKWARDS, index)
                     newest = never
                 else:
                     time = newest
         elif kind == 10:
             state[TRIGGERS] += 1
         elif kind != 7 and kind != 14 and kind != 15:
-            note(state, UNKNOWN, first + index)
+            note(state, UNKNOWN, index)
     state[CLOCK], state[NEWEST], state[BASE], state[STARTED] = clock, newest, base, started
     state[ROW], state[COLUMN], state[POLARITY] = row, column, polarity
     state[_ROW_SEEN], state[_BASE_SEEN] = row_seen, base_seen
+    state[_OLD_HIGH], state[_OLD_BASE] = old_high + 1, old_base
     return count
 
 
@@ -240,7 +314,8 @@ def _decode_chunk(words, state, places, counts, t_us, x, y, p, width, height):
     newest, base = state[NEWEST], state[BASE]
     high, low = base + (state[CLOCK] & ~np.int64(0xFFF)), state[CLOCK] & 0xFFF
     row, column, polarity = np.uint16(state[ROW]), state[COLUMN], state[POLARITY] != 0
-    unusual, base_seen = (state[STARTED] == 0) | (state[_ROW_SEEN] == 0), state[_BASE_SEEN] != 0
+    unusual = (state[STARTED] == 0) | (state[_ROW_SEEN] == 0) | (state[_OLD_HIGH] != 0)
+    base_seen = state[_BASE_SEEN] != 0
     time = max(high + low, newest)
     count = np.uint64(0)
     for index in range(len(words)):
@@ -283,7 +358,7 @@ def _decode_chunk(words, state, places, counts, t_us, x, y, p, width, height):
             base_seen = True
         elif kind == 8:
             new = base + (value << 12)
-            unusual |= new < high
+            unusual |= (new < high) | (new > high + (_NEAR << 12))
             low = low if new == high else np.int64(0)
             high = new
             time = max(high + low, newest)
@@ -305,7 +380,7 @@ def _decode_block(words, state, places, counts, t_us, x, y, p, width, height):
         out = t_us[count:], x[count:], y[count:], p[count:]
         found = _decode_chunk(chunk, state, places, counts, *out, width, height)
         if found < 0:
-            found = _decode_carefully(chunk, first, state, *out, width, height)
+            found = _decode_carefully(words, first, first + len(chunk), state, *out, width, height)
         count += found
     return count
 

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from evnlos.errors import DataError, EventFileError
 from evnlos.events.files import (
+    aedat,
+    aedat3,
     aedat4,
     celex,
     celex_write,
@@ -94,9 +96,14 @@ def _of_streams(source: Callable[..., FileSource]) -> Callable[..., FileSource]:
     return lambda path, report, width, height, _, topic: source(path, report, width, height, topic)
 
 
-def _celex(path, report, width, height, options, topic):
-    refuse_topic(path, "CeleX-V", topic)
-    return celex.CelexSource(path, report, width, height, options)
+def _celex(source: Callable[..., FileSource]) -> Callable[..., FileSource]:
+    """Return an opener of a format with one stream and the options of CeleX-V."""
+
+    def opened(path, report, width, height, options, topic):
+        refuse_topic(path, path.suffix or "this format", topic)
+        return source(path, report, width, height, options)
+
+    return opened
 
 
 def _raw(name: str) -> Format:
@@ -149,22 +156,36 @@ FORMATS = (
         lambda path, first, _: aedat4.Aedat4Sink(path, first),
         aedat4.read_aedat4_frames,
     ),
+    Format(
+        "AEDAT2",
+        (".aedat",),
+        lambda start: start.startswith(aedat.SIGNATURE),
+        _plain(aedat.Aedat2Source),
+        frames=aedat.read_aedat2_frames,
+    ),
+    Format(
+        "AEDAT3",
+        (".aedat",),
+        lambda start: start.startswith(aedat3.SIGNATURE),
+        _of_streams(aedat3.Aedat3Source),
+        frames=aedat3.read_aedat3_frames,
+    ),
     _ros("DB3", (".db3",), ros_bags.DB3_SIGNATURE, ros_bags.Db3File),
     _ros("MCAP", (".mcap",), mcap.SIGNATURE, mcap.McapFile),
     _ros("BAG", (".bag",), ros_bags.BAG_SIGNATURE, ros_bags.BagFile),
-    Format("CELEX", (".bin",), celex.sniff_celex, _celex, celex_write.CelexSink),
+    Format("CELEX", (".bin",), celex.sniff_celex, _celex(celex.CelexSource), celex_write.CelexSink),
     Format(  # read as CELEX: the header tells the event formats apart
         "CELEX0",
         (),
         lambda _: False,
-        _celex,
+        _celex(celex.CelexSource),
         lambda path, first, target: celex_write.CelexSink(path, first, target, event_format=0),
     ),
     Format(
         "CSV",
         (".csv", ".txt"),
         lambda start: csv_rows.find_layout(start) is not None,
-        csv.CsvSource,
+        _celex(csv.CsvSource),
         lambda path, first, _: csv.CsvSink(path, first),
     ),
 )

@@ -55,13 +55,8 @@ class BagFile:
         counts: dict[int, int] = {}
         start = quiet._index_start()
         if start is not None:
-            for op, fields, data, _ in quiet._records_of_file(start):
-                if op == _OP_CONNECTION:
-                    quiet._connect(fields, data, connections)
-                elif op == _OP_CHUNK_INFO:
-                    for at in range(0, len(data) // 8 * 8, 8):
-                        number, count = struct.unpack_from("<II", data, at)
-                        counts[number] = counts.get(number, 0) + count
+            with suppress(ValueError):  # a damaged index is not needed
+                quiet._read_index(start, connections, counts)
         if not connections or not quiet.report.clean:
             connections, counts = {}, {}
             for _ in BagFile(self.path, ReadReport(self.path, strict=False))._walk(connections, frozenset()):
@@ -83,6 +78,16 @@ class BagFile:
             start = int.from_bytes(fields.get("index_pos", b""), "little")
             return start if op == _OP_HEADER and 0 < start < self._size else None
         return None
+
+    def _read_index(self, start: int, connections: dict[int, Topic], counts: dict[int, int]) -> None:
+        """Fill the connections, and messages per connection, from the index at byte `start`."""
+        for op, fields, data, _ in self._records_of_file(start):
+            if op == _OP_CONNECTION:
+                self._connect(fields, data, connections)
+            elif op == _OP_CHUNK_INFO:
+                for at in range(0, len(data) // 8 * 8, 8):
+                    number, count = struct.unpack_from("<II", data, at)
+                    counts[number] = counts.get(number, 0) + count
 
     def _walk(self, connections: dict[int, Topic], names: frozenset[str]) -> Iterator[Message]:
         announced: int | None = None

@@ -125,7 +125,7 @@ class Packet:
         if self.encoding == "mono":
             count = _decode_mono(words, self.time_base, *columns)
         elif self.encoding == "libcaer":
-            count = _decode_libcaer(words, self.time_base, *columns)
+            count = decode_libcaer(words, self.time_base, True, *columns)
         else:
             count, unknown = _decode_compressed(words, self.time_base, *columns)
         return cut(out, 0, count), int(unknown)
@@ -143,14 +143,27 @@ def _decode_mono(words, base_ns, t_us, x, y, p):
 
 
 @njit(cache=True)
-def _decode_libcaer(words, base_ns, t_us, x, y, p):
-    """Decode iniVation's events of 8 bytes; their clock of 31 bits may turn over once inside a packet."""
+def decode_libcaer(words, base_ns, turns, t_us, x, y, p):
+    """Decode iniVation's events of 8 bytes, without the invalid ones.
+
+    Args:
+        words: uint64 [N].
+        base_ns: Added to all times, nanoseconds.
+        turns: Whether the clock of 31 bits may turn over inside the packet.
+        t_us: Takes the times, int64 [N], microseconds.
+        x: Takes the columns, pixels.
+        y: Takes the rows, pixels.
+        p: Takes the polarities.
+
+    Returns:
+        The number of events.
+    """
     count, turn, before = 0, np.int64(0), np.int64(0)
     for index in range(len(words)):
         word = np.int64(words[index])
         if word & 1:
             stamp = (word >> 32) & 0x7FFFFFFF
-            if before - stamp > 1 << 30:
+            if turns and before - stamp > 1 << 30:
                 turn += 1 << 31
             before = stamp
             t_us[count] = (base_ns + 1000 * (stamp + turn)) // 1000
@@ -282,10 +295,10 @@ def image_of(message: Message) -> tuple[int, NDArray]:
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, : width * size * samples]
     values: Any = np.ascontiguousarray(rows).view((">" if is_big else "<") + f"u{size}")
     values = values.astype(f"u{size}").reshape(height, width, samples)
-    return stamp_ns, _grey(values, encoding.startswith("b") and samples > 1)
+    return stamp_ns, grey_of(values, encoding.startswith("b") and samples > 1)
 
 
-def _grey(values: NDArray, is_blue_first: bool) -> NDArray:
+def grey_of(values: NDArray, is_blue_first: bool = False) -> NDArray:
     """Return [H, W] of [H, W, samples]; colours by ITU-R BT.601, transparency left out."""
     if values.shape[2] == 1:
         return values[:, :, 0]

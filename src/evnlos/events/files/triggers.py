@@ -69,6 +69,8 @@ def _triggers_3(words, state, turn, t_us, channel, rising):
         if kind == 8:
             high = word & 0xFFF
             old = state[CLOCK] >> 12
+            right = evt3.mend_clock(words, index, old, state[CLOCK] & 0xFFF) if state[STARTED] else -1
+            high = right if right >= 0 else high
             if state[STARTED] and old - high > turn // 2:
                 state[BASE] += turn << 12
             if high != old or not state[STARTED]:

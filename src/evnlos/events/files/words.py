@@ -30,8 +30,8 @@ from evnlos.events.files.columns import (
 # Slots of the int64 state array.
 CLOCK, NEWEST, BASE, STARTED, ROW, COLUMN, POLARITY, TRIGGERS = range(8)
 FAULTS = 16  # two slots a kind: how many, index of the first word
-UNKNOWN, UNDATED, OUT_OF_RANGE, BACKWARDS, CLOCK_BACK = range(5)
-KINDS = ("unknown", "undated", "out_of_range", "backwards", "backwards")
+UNKNOWN, UNDATED, OUT_OF_RANGE, BACKWARDS, CLOCK_BACK, CLOCK_JUMP = range(6)
+KINDS = ("unknown", "undated", "out_of_range", "backwards", "backwards", "clock")
 STATE_SIZE = 32
 
 # Words that are decoded at once, on the assumption that nothing is wrong with them; they stay in the cache.
@@ -69,6 +69,7 @@ _FOUND = (
     "an event outside the sensor ({word:#x})",
     "an event ({word:#x}) earlier than the one before it",
     "a clock that runs backwards ({word:#x})",
+    "a clock that jumps and comes back, up to 16.77 s: a bit error of the camera's TIME_HIGH ({word:#x})",
 )
 _SALVAGE = f"the file is damaged there: {SALVAGE}"
 
@@ -116,6 +117,8 @@ def report_faults(
         cure = _SALVAGE
         if KINDS[kind] == "out_of_range":
             cure = f"the sensor is {report.width} x {report.height}; give width= and height="
+        elif KINDS[kind] == "clock":
+            cure = f"its events get their times back: {SALVAGE}"
         # A clock fault is counted as one; the events that it misplaces are dropped by their order.
         report.fault(KINDS[kind], locate(int(indices[kind])), found, cure, count=int(counts[kind]))
     state[FAULTS:STATE_SIZE] = 0
