@@ -17,6 +17,7 @@ import argparse
 import logging
 import os
 import re
+import struct
 import sys
 import tempfile
 import time
@@ -29,8 +30,10 @@ os.environ["NUMBA_CACHE_DIR"] = str(
 )  # never mixed with the fast ones
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import h5py
 import numpy as np
 
+from ecf_files import write_ecf
 from evnlos.errors import EventFileError
 from evnlos.events import (
     CelexOptions,
@@ -45,6 +48,20 @@ from evnlos.events import (
 )
 from evnlos.events.files import aedat4
 from evnlos.types import Events
+from ros_files import (
+    IMAGE,
+    PACKET,
+    Cdr,
+    Recording,
+    Ros1,
+    bag_bytes,
+    event_array,
+    image,
+    mcap_bytes,
+    mono,
+    packet,
+    write_db3,
+)
 
 _SLOW_S = 10.0
 _MOST_BYTES = 20_000
@@ -84,9 +101,71 @@ def seeds(folder: Path) -> Iterator[bytes]:
     yield b"Event Stream\2\0\0\1" + bytes([64, 1, 240, 0]) + b"".join(
         bytes([3, k, 0, k, 0]) + b"\xff" * (k % 3) for k in range(60)
     )  # fmt: skip
+    yield from ros_seeds(folder, small)
+    yield from aedat_seeds()
+    for form in ("packed", "pairs", "masks"):
+        yield write_ecf(folder / "ecf.h5", small, form).read_bytes()
+    with h5py.File(folder / "m3ed.h5", "w", libver="latest") as file:
+        for side in ("left", "right"):
+            for name, column in (("x", x), ("y", y), ("t", t / 1e6), ("p", p)):
+                file[f"prophesee/{side}/{name}"] = column
+    yield (folder / "m3ed.h5").read_bytes()
     yield "\n".join(
         f"{b},{a},{200 + k},{k % 2},{k * 9}" for k, (a, b) in enumerate(zip(x, y, strict=True))
     ).encode()
+
+
+def ros_seeds(folder: Path, events: Events) -> Iterator[bytes]:
+    """Yield ROS recordings of every container, encoding and message."""
+    write_events(folder / "words.raw", events, format="EVT3")
+    data = (folder / "words.raw").read_bytes()
+    words = data[data.index(b"% end\n") + 6 :]
+    picture = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    for make in (Cdr, Ros1):
+        packed = mono(events.t_us * 1000, events.x, events.y, events.p)
+        libcaer = struct.pack("<IiIi", 3 << 17 | 2 << 2 | 3, 5, 1, 7)
+        compressed = struct.pack("<6H", 0x1005, 0x2003, 0x3802, 0x1007, 0x4000 | 40, 0x5081)
+        columns = ([k * 1000 for k in range(4)], [1, 2, 3, 4], [4, 3, 2, 1], [1, 0, 1, 0])
+        messages: Recording = []
+        for k, (encoding, payload) in enumerate(
+            (
+                ("mono", packed),
+                ("libcaer", libcaer),
+                ("libcaer_cmp", compressed),
+                ("evt3", words),
+                ("evt3", words),
+            )
+        ):
+            data = packet(payload, encoding, k, k * 10**9, (1280, 720), make)
+            messages.append((f"/{encoding}", PACKET, k, data))
+        messages.append(("/dvs", "dvs_msgs/msg/EventArray", 9, event_array(*columns, make=make)))
+        messages.append(("/image", IMAGE, 10, image(7, picture, make=make)))
+        for chosen in (messages, messages[:1], messages[3:5], messages[-2:], messages[-1:]):
+            if make is Ros1:
+                yield from (bag_bytes(chosen), bag_bytes(chosen, "bz2"), bag_bytes(chosen, index=False))
+                continue
+            yield from (mcap_bytes(chosen), mcap_bytes(chosen, crc=False))
+            (folder / "a.db3").unlink(missing_ok=True)
+            yield write_db3(folder / "a.db3", chosen, page=512).read_bytes()
+    write_events(folder / "a.mcap", events)
+    yield (folder / "a.mcap").read_bytes()
+
+
+def aedat_seeds() -> Iterator[bytes]:
+    """Yield AEDAT 2.0 and 3.1 with events, frames and inputs."""
+    for chip in ("DAVIS240C", "DVS128"):
+        words = [(k << 22 | k << 12 | 1 << 11, k) for k in range(40)] + [(1 << 31 | 1, 50), (1 << 10, 60)]
+        head = f"#!AER-DAT2.0\r\n# AEChip: {chip}\r\n".encode()
+        yield head + b"".join(struct.pack(">II", *pair) for pair in words)
+    head = b"#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 0: DAVIS240C\r\n#Source 1: DVS128\r\n#!END-HEADER\r\n"
+    events = b"".join(struct.pack("<Ii", k << 17 | k << 2 | 1, k) for k in range(20))
+    frame = struct.pack("<Iiiiiiiii", 3, 1, 2, 3, 4, 4, 3, 0, 0) + bytes(24)
+    special = struct.pack("<Ii", 5, 9)
+    for sources in (head, head.replace(b"#Source 1: DVS128\r\n", b"")):
+        yield sources + b"".join(
+            struct.pack("<hhiiiiii", kind, 0, size, 4, 1, len(data) // size, len(data) // size, 1) + data
+            for kind, size, data in ((1, 8, events), (2, 60, frame), (0, 8, special))
+        )
 
 
 def mutate(draw: np.random.Generator, corpus: list[bytes]) -> bytes:

@@ -95,8 +95,9 @@ Recording = list[tuple[str, str, int, bytes]]
 """Topic, type, time of receipt [ns], message."""
 
 
-def write_db3(path: Path, messages: Recording) -> Path:
+def write_db3(path: Path, messages: Recording, page: int = 4096) -> Path:
     base = sqlite3.connect(path)
+    base.execute(f"PRAGMA page_size = {page}")
     base.execute(
         "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL,"
         "serialization_format TEXT NOT NULL,offered_qos_profiles TEXT NOT NULL)"

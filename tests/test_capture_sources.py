@@ -1,6 +1,7 @@
 """Loose recordings as a laboratory produces them become captures: every source of frames, clock and pixels."""
 
 import struct
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,12 @@ import yaml
 from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
+from evnlos.cli import main
 from evnlos.data import check_picture, read_shard
 from evnlos.data.registration import homography_from_points
 from evnlos.events import write_aedat4, write_celex_frames, write_events
 from evnlos.types import Events
+from ros_files import IMAGE, PACKET, Cdr, Recording, Ros1, event_array, image, write_bag, write_mcap
 
 WIDTH, HEIGHT = 64, 48
 
@@ -85,6 +88,73 @@ def test_an_aedat4_with_frames_and_events(tmp_path):
         recording.events == stream()
         and recording.frame_times_us.tolist() == (np.arange(6) * 200_000 + 9).tolist()
     )
+
+
+def davis_bag(path: Path, topics=("/davis/events", "/davis/image_raw")) -> None:
+    """Write a ROS 1 bag of a DAVIS: 2 s of events, 6 frames."""
+    events, frames = stream(), pictures()
+    messages: Recording = []
+    for start in range(0, len(events), 500):
+        one = events[start : start + 500]
+        data = event_array((one.t_us * 1000).tolist(), one.x.tolist(), one.y.tolist(), one.p.tolist())
+        messages.append((topics[0], "dvs_msgs/EventArray", int(one.t_us[-1]) * 1000, data))
+    for k, frame in enumerate(frames):
+        stamp = (k * 200_000 + 9) * 1000
+        messages.append((topics[1], "sensor_msgs/Image", stamp, image(stamp, frame, make=Ros1)))
+    write_bag(path, sorted(messages, key=lambda message: message[2]))
+
+
+@pytest.mark.parametrize("name", ["shot_A.bag", "shot_A.aedat4"])
+def test_one_file_of_events_and_frames_is_imported_by_one_command(name, tmp_path, capsys):
+    path = tmp_path / name
+    if name.endswith(".bag"):
+        davis_bag(path)
+    else:
+        pytest.importorskip("aedat")
+        write_aedat4(path, stream(), pictures(), np.arange(6) * 200_000 + 9)
+    recording = read_capture(path)
+    assert recording.name == "shot_A" and recording.events == stream()
+    np.testing.assert_array_equal(recording.frames, pictures())
+    assert recording.frame_times_us.tolist() == (np.arange(6) * 200_000 + 9).tolist()
+    main(["import", str(path), "--out", str(tmp_path / "d"), "--no-check-pictures"])
+    samples, _ = read_shard(open_dataset(tmp_path / "d").shard("shot_A"))
+    assert samples.frame.shape == (5, 64, 96)
+    main(["import", str(path), "--out", str(tmp_path / "d"), "--no-check-pictures"])  # nothing is left to do
+
+
+def test_topics_of_a_capture_are_chosen(tmp_path):
+    folder = folder_of(tmp_path, events="a.bag", frames="a.bag", events_topic="/davis/events")
+    davis_bag(folder / "a.bag")
+    assert read_capture(folder).events == stream()
+    other = folder_of(tmp_path, "shot_B", events="a.bag", frames="a.bag", frames_topic="/none")
+    davis_bag(other / "a.bag")
+    with pytest.raises(EvnlosError, match="give one of: /davis/image_raw"):
+        read_capture(other)
+
+
+def test_frames_beside_evt3_come_on_the_clock_of_the_sensor(tmp_path):
+    """The packets' stamps say how ROS time becomes the sensor's: EVT3 has a clock of its own."""
+    events, frames = stream(), pictures()
+    write_events(tmp_path / "words.raw", events)
+    data = (tmp_path / "words.raw").read_bytes()
+    words = np.frombuffer(data[data.index(b"% end\n") + 6 :], "<u2")
+    starts = [*np.flatnonzero(words >> 12 == 8)[::20].tolist(), len(words)]
+    offset_us = 1_700_000_000_000_000
+    messages: Recording = []
+    for seq, (start, stop) in enumerate(pairwise(starts)):
+        part = words[start:stop]
+        low = int(part[np.flatnonzero(part >> 12 == 6)[0]] & 0xFFF)
+        stamp = (offset_us + (int(part[0] & 0xFFF) << 12 | low)) * 1000
+        head = Cdr().header(stamp, "cam").put("I", HEIGHT).put("I", WIDTH).put("Q", seq).put("Q", 0)
+        message = head.text("evt3").put("B", 0).data(part.tobytes()).message()
+        messages.append(("/events", PACKET, stamp, message))
+    for k, frame in enumerate(frames):
+        stamp = (offset_us + k * 200_000 + 9) * 1000
+        messages.append(("/image", IMAGE, stamp, image(stamp, frame)))
+    write_mcap(tmp_path / "shot_C.mcap", messages)
+    recording = read_capture(tmp_path / "shot_C.mcap")
+    assert recording.events == events
+    assert recording.frame_times_us.tolist() == (np.arange(6) * 200_000 + 9).tolist()
 
 
 def test_a_raw_beside_a_folder_an_animation_or_an_array(tmp_path):

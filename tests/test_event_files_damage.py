@@ -17,6 +17,7 @@ WRITABLE = [
     ("EVT2", ".raw"),
     ("EVT21", ".raw"),
     ("CSV", ".csv"),
+    ("MCAP", ".mcap"),
 ]
 RAW = ("EVT2", "EVT21", "EVT3")
 CHECKSUMMED = {"HDF5", "NPZ"}

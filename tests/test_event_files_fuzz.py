@@ -22,6 +22,7 @@ FILES = [
     "e_EI_100M.bin",
     "e_EO_70M.bin",
     "e.dat",
+    "e.mcap",
 ]
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

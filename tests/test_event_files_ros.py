@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evnlos.errors import EventFileError, MissingDependencyError
+from evnlos.errors import DataError, EventFileError, MissingDependencyError
 from evnlos.events import (
     iter_events,
     read_events,
@@ -375,3 +375,46 @@ def test_independent_readers_agree_on_the_containers(tmp_path):
     with write_mcap(tmp_path / "a.mcap", messages).open("rb") as file:
         found = [message.data for _, _, message in reader.NonSeekingReader(file).iter_messages()]
     assert found == [data for *_, data in messages]
+
+
+# ---------------------------------------------------------------- written
+
+
+def test_written_mcap_comes_back_and_independent_readers_see_all(tmp_path):
+    draw = np.random.default_rng(0)
+    times = np.sort(draw.integers(0, 30_000_000, 100_000))
+    times[50_000:] += 10_000_000  # a silence
+    columns = (
+        draw.integers(0, 128, len(times)),
+        draw.integers(0, 96, len(times)),
+        draw.integers(0, 2, len(times)),
+    )
+    events = Events(times, *columns, width=128, height=96)
+    path = tmp_path / "a.mcap"
+    write_events(path, (events[start : start + 7_000] for start in range(0, len(events), 7_000)))
+    found, report = read_events_report(path, "strict")
+    assert found == events
+    assert [(one.name, one.kind) for one in report.streams] == [
+        ("/event_camera/events", "events"), ("/event_camera/image", "other"),
+    ]  # fmt: skip
+    with pytest.raises(EventFileError, match="no stream of frames"):
+        read_timed_frames(path)  # images of events are no camera's frames
+    reader = pytest.importorskip("mcap.reader")
+    with path.open("rb") as file:
+        seeking = reader.make_reader(file, validate_crcs=True)
+        summary = seeking.get_summary()
+        stamps = [(channel.topic, message.log_time) for _, channel, message in seeking.iter_messages()]
+    assert {channel.topic for channel in summary.channels.values()} == {topic for topic, _ in stamps}
+    assert len(stamps) == summary.statistics.message_count and len(summary.chunk_indexes) >= 1
+    assert [stamp for _, stamp in stamps] == sorted(stamp for _, stamp in stamps)
+
+
+def test_what_mcap_cannot_hold_is_refused(tmp_path):
+    for times in ([-1], [2**31 * 10**6]):
+        with pytest.raises(DataError, match="MCAP packets hold times"):
+            write_events(tmp_path / "a.mcap", Events(times, [0], [0], [True], 4, 4))
+    with pytest.raises(DataError, match="65536 x 32768"):
+        write_events(tmp_path / "a.mcap", Events.empty(10, 40_000))
+    write_events(tmp_path / "empty.mcap", Events.empty(10, 20))
+    assert read_events(tmp_path / "empty.mcap") == Events.empty(10, 20)
+    assert not list(tmp_path.glob("a.mcap*"))

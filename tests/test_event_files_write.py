@@ -32,6 +32,7 @@ FILES = [
     "e_EI_100M.bin",
     "e_EO_70M.bin",
     "e.aedat4",
+    "e.mcap",
 ]
 
 
@@ -104,7 +105,7 @@ def test_index_of_milliseconds_is_the_same_in_pieces(tmp_path, monkeypatch):
             np.testing.assert_array_equal(file["ms_to_idx"], expected)
 
 
-@pytest.mark.parametrize("file", ["e.h5", "e.npz", "evt3.raw", "e.csv", "e_EO_70M.bin", "e.aedat4"])
+@pytest.mark.parametrize("file", ["e.h5", "e.npz", "evt3.raw", "e.csv", "e_EO_70M.bin", "e.aedat4", "e.mcap"])
 def test_a_stream_without_events(file, tmp_path):
     if file.endswith(".aedat4"):
         pytest.importorskip("aedat")
@@ -133,7 +134,7 @@ def test_pieces_that_do_not_fit_leave_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("file", ["e.h5", "e.npz", "evt3.raw", "e.aedat4"])
+@pytest.mark.parametrize("file", ["e.h5", "e.npz", "evt3.raw", "e.aedat4", "e.mcap"])
 def test_memory_does_not_grow_with_the_stream(file, tmp_path):
     def stream(count):
         for k in range(count):

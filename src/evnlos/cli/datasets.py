@@ -205,12 +205,16 @@ class CaptureCommand:
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """Turn captures (folders with capture.yaml, events and frames) into a dataset to train and test on."""
+    """Turn captures (folders with capture.yaml, or ROS bags and AEDAT files) into a dataset to train on."""
 
     captures: Folders
-    """Capture folders."""
+    """Capture folders; or recordings that hold events and frames of one camera (ROS bag, AEDAT)."""
     out: Path
     """Folder of the dataset."""
+    topic: str | None = None
+    """Stream of the events, of a recording with several; `evnlos info` lists them."""
+    frames_topic: str | None = None
+    """Stream of the frames, of a recording with several."""
     test: tuple[str, ...] = ()
     """Captures or characters that are held out for testing, e.g. G K 4 9."""
     validation: tuple[str, ...] = ()
@@ -235,6 +239,8 @@ class ImportCommand:
                 test=self.test,
                 validation=self.validation,
                 pattern=load_pattern(self.pattern) if self.pattern else None,
+                events_topic=self.topic,
+                frames_topic=self.frames_topic,
                 look=self._look,
                 progress=progress,
             )

@@ -86,7 +86,7 @@ class EventsCommand:
     video: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
     """Video file (mp4, avi, mkv, ...), GIF, APNG, WebP, pictures or a folder of them, .npy [T, H, W(, 3)]."""
     out: Path
-    """The event file; its ending says the format: .h5, .npz, .raw (EVT3), .aedat4, .csv."""
+    """The event file; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv."""
     pixel: str = "davis346"
     """paper, v2e_clean, v2e_noisy, davis346, prophesee_gen3, prophesee_gen4, celex_v, voltmeter_dvs346,
     voltmeter_dvs240, or a YAML file with the settings of any event model (`kind`)."""

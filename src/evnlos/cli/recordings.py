@@ -101,7 +101,8 @@ class ConvertCommand:
     file: EventFile
     """Event file of any format that is read; it may be larger than memory."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """The file to write; its ending says the format: .h5, .npz, .raw (EVT3), .aedat4, .csv, ..._100M.bin."""
+    """The file to write; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv,
+    ..._100M.bin."""
     format: str | None = None
     """Format to write where the ending does not say, e.g. EVT2 or EVT21 for .raw."""
     on_error: OnError = "strict"

@@ -95,14 +95,22 @@ class Capture:
         return Scene(self.target, motion, duration_s=max(float(self.frame_times_us[-1]) * 1e-6, 1e-6))
 
 
-def read_capture(folder: str | Path, most_frame_bytes: int | None = None) -> Capture:
-    """Read a capture folder: `capture.yaml`, the event file, the frames and the target's mask.
+def read_capture(
+    folder: str | Path,
+    most_frame_bytes: int | None = None,
+    *,
+    events_topic: str | None = None,
+    frames_topic: str | None = None,
+) -> Capture:
+    """Read a capture folder (`capture.yaml`, event file, frames, mask), or one file of events and frames.
 
     The order is: dark frame and flat field, registration, filters of the events, clock, region of interest.
 
     Args:
-        folder: The folder of one capture.
+        folder: The folder of one capture; or a ROS bag or AEDAT file with events and frames of one camera.
         most_frame_bytes: Memory that its frames may take, bytes; None = a quarter of what is free, up to 2 GiB.
+        events_topic: Stream of the events, of a file that holds several.
+        frames_topic: Stream of its frames.
 
     Raises:
         DataError: A file is missing, a frame has another size than the camera, or clock or pixels do not fit.
@@ -111,9 +119,10 @@ def read_capture(folder: str | Path, most_frame_bytes: int | None = None) -> Cap
         MissingDependencyError: A file needs an optional package.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not folder.is_dir() and not folder.is_file():
         raise DataError(f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)")
-    info = read_capture_info(folder)
+    info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic)
+    name, folder = _name_of(folder), folder.parent if folder.is_file() else folder
     series = read_frame_series(folder, info, most_frame_bytes)
     notes = [f"{len(series.images)} frames from {series.what}"]
     events, told = _read_events(folder, info)
@@ -132,14 +141,19 @@ def read_capture(folder: str | Path, most_frame_bytes: int | None = None) -> Cap
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
     target = _read_target(folder, info.target)
     return Capture(
-        folder.name, info, events, np.ascontiguousarray(frames), times_us, target, tuple(map(printable, notes))
+        name, info, events, np.ascontiguousarray(frames), times_us, target, tuple(map(printable, notes))
     )
+
+
+def _name_of(path: Path) -> str:
+    """Return the name of a capture: that of its folder, or of its file without the ending."""
+    return path.stem if path.is_file() else path.name
 
 
 def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
     path, camera = inside(folder, info.events), info.camera
     options = CelexOptions(clock_mhz=camera.clock_mhz) if camera.clock_mhz is not None else None
-    events = read_events(path, width=camera.width, height=camera.height, celex=options)
+    events = read_events(path, width=camera.width, height=camera.height, celex=options, topic=info.events_topic)
     if not len(events):
         raise DataError(f"{path} holds no event; check the camera's thresholds and the recording")
     notes = [f"{len(events):,} events from {path.name}"]
@@ -226,7 +240,7 @@ def _place_in_time(
     """Return the frames' times on the events' clock."""
     alignment = info.alignment
     if alignment.trigger_channel is not None:
-        triggers = read_triggers(inside(folder, info.events))
+        triggers = read_triggers(inside(folder, info.events), topic=info.events_topic)
         chosen = triggers.t_us[triggers.rising & (triggers.channel == alignment.trigger_channel)]
         if len(chosen) != len(frames):
             raise DataError(
@@ -292,19 +306,23 @@ def import_captures(
     test: Iterable[str] = (),
     validation: Iterable[str] = (),
     pattern: FixedPattern | None = None,
+    events_topic: str | None = None,
+    frames_topic: str | None = None,
     look: Callable[[Capture], None] | None = None,
     progress: Progress = silent,
 ) -> Dataset:
     """Import capture folders as a dataset, or what is missing of it, and return it.
 
     Args:
-        folders: Capture folders; the folder's name becomes the object's name, the part behind the last
-            underscore its character (`near_R` -> R).
+        folders: Capture folders, or files with events and frames; the name without its ending becomes the
+            object's, the part behind the last underscore its character (`near_R` -> R).
         out: The dataset's folder; new, or begun with the same captures and settings.
         sampling: Resolution and representation.
         test: Names of captures, or characters, that are held out for testing.
         validation: The same for validation.
         pattern: Fixed pattern of the frame camera, to be taken from all frames.
+        events_topic: Stream of the events, of files that hold several.
+        frames_topic: Stream of their frames.
         look: Called with each capture that was read, before its samples are made: to tell of it, or to draw it.
         progress: Called when the work begins and as each shard is in place, with the capture's name.
 
@@ -315,7 +333,7 @@ def import_captures(
         DataError: No folder, two captures of one name, or a held-out name that no capture has.
     """
     given = [Path(folder).resolve() for folder in folders]
-    paths = {path.name: path for path in given}
+    paths = {_name_of(path): path for path in given}
     if not paths:
         raise DataError("no captures given; name at least one capture folder")
     if len(paths) != len(given):
@@ -323,18 +341,19 @@ def import_captures(
     split = _split(list(paths), list(test), list(validation))
     # Read every description first: a wrong folder is an error before anything is written.
     for path in paths.values():
-        if not (path / "capture.yaml").is_file():
+        if not path.is_file() and not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
-    described = {name: config_hash(read_capture_info(path)) for name, path in sorted(paths.items())}
+    topics = {"events_topic": events_topic, "frames_topic": frames_topic}
+    described = {name: _digest(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
     config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
-    captures: dict[str, Capture] = {first.name: read_capture(first)}
+    captures: dict[str, Capture] = {_name_of(first): read_capture(first, **topics)}
     with claim_dataset(dataset):
         what, total, missing = f"import {dataset.folder.name}", len(paths), dataset.missing()
         progress(Step(what, total - len(missing), total, "captures"))
         for done, name in enumerate(missing, start=total - len(missing) + 1):
-            capture = captures.pop(name, None) or read_capture(paths[name])
+            capture = captures.pop(name, None) or read_capture(paths[name], **topics)
             if look is not None:
                 look(capture)
             samples = capture_samples(capture, sampling, pattern)
@@ -343,6 +362,15 @@ def import_captures(
             write_shard(dataset.shard(name), samples, attributes)
             progress(Step(what, done, total, "captures", name))
     return dataset
+
+
+def _digest(info: CaptureInfo) -> str:
+    """Return the hash of a description; settings of files with several streams count where they are made."""
+    values = to_dict(info)
+    for key in ("events_topic", "frames_topic"):
+        if values[key] is None:
+            del values[key]
+    return config_hash(values)
 
 
 def character_of(name: str) -> str:

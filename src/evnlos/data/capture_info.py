@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError, DataError
+from evnlos.events.recording import Recording
 from evnlos.files import write_atomically
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
@@ -154,8 +155,12 @@ class CaptureInfo:
     events: str = "events.raw"
     """The event file, as the camera wrote it."""
     frames: str = "frames.csv"
-    """Frames: a table t_us,file; a video; a folder of pictures; an AEDAT4 file; a CeleX-V recording of mode
-    F."""
+    """Frames: a table t_us,file; a video; a folder of pictures; an AEDAT file or ROS bag, also the same file as
+    `events`; a CeleX-V recording of mode F."""
+    events_topic: str | None = None
+    """Stream of the event file, where it holds several (topics of a ROS bag); `evnlos info` lists them."""
+    frames_topic: str | None = None
+    """Stream of the frames, where their file holds several."""
     frames_turned: bool = False
     """Whether the frames are turned by 180 degrees against the events, as the CeleX-V program exports them."""
     target: TargetInfo | None = None
@@ -183,18 +188,40 @@ class CaptureInfo:
         return TargetInfo.size_m if self.target is None else self.target.size_m
 
 
-def read_capture_info(folder: Path) -> CaptureInfo:
-    """Read the `capture.yaml` of a folder.
+def read_capture_info(
+    folder: Path, *, events_topic: str | None = None, frames_topic: str | None = None
+) -> CaptureInfo:
+    """Read the `capture.yaml` of a folder, or describe one file that holds events and frames.
+
+    Args:
+        folder: The folder; or a recording of a camera with both kinds of pixels (ROS bag, AEDAT).
+        events_topic: Stream of the events of a file that holds several.
+        frames_topic: Stream of its frames.
 
     Raises:
-        ConfigError: It is missing, or has an unknown key or a wrong type.
+        ConfigError: The description is missing, or has an unknown key or a wrong type.
+        EventFileError: The file is damaged or holds no events.
     """
+    if folder.is_file():
+        return _info_of_recording(folder, events_topic, frames_topic)
     path = folder / "capture.yaml"
     if not path.is_file():
         inside = sorted(one.parent.name for one in folder.glob("*/capture.yaml"))
         held = f" (it holds {len(inside)} captures, such as {inside[0]})" if inside else ""
         raise ConfigError(f"{folder} holds no capture.yaml; give the folder of one capture{held}")
     return from_dict(CaptureInfo, read_yaml(path), source=str(path))
+
+
+def _info_of_recording(path: Path, events_topic: str | None, frames_topic: str | None) -> CaptureInfo:
+    """Describe a recording that holds events and frames of the same pixels and on the same clock."""
+    recording = Recording(path, topic=events_topic)
+    if not recording.report.geometry_from:  # of some formats known with their first events
+        next(recording.pieces(), None)
+    height, width = recording.shape
+    camera = CameraInfo(width, height, name=recording.report.format)
+    return CaptureInfo(
+        camera, events=path.name, frames=path.name, events_topic=events_topic, frames_topic=frames_topic
+    )
 
 
 _TEMPLATE = """\
@@ -211,7 +238,7 @@ camera:
   # clock_mhz: 100           # CeleX-V only, where the file's name does not say it
 
 events: events.raw           # as the camera wrote it; the format is found from its content
-frames: frames               # a folder of pictures, a video, a table t_us,file, or an AEDAT4 file
+frames: frames               # a folder of pictures, a video, a table t_us,file, an AEDAT file or a ROS bag
 # frames_turned: true        # pictures that the CeleX-V program exported are turned by 180 degrees
 
 # Clocks. Leave out where both files share one; otherwise one of:

@@ -17,7 +17,7 @@ from evnlos.errors import DataError
 from evnlos.events import read_timed_frames
 from evnlos.untrusted import check_memory, memory_left, open_image, open_regular
 
-_RECORDINGS = (".aedat4", ".bin")
+_RECORDINGS = (".aedat4", ".aedat", ".bag", ".db3", ".mcap", ".bin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ def read_frame_series(folder: Path, info: CaptureInfo, most_bytes: int | None = 
     if path.suffix.lower() == ".csv":
         return _from_table(folder, path, size, most)
     if path.suffix.lower() in _RECORDINGS:
-        found = read_timed_frames(path)
+        found = read_timed_frames(path, topic=info.frames_topic)
         times = found.t_us if found.t_us is not None else _at_rate(path, len(found.images), info)
         series = FrameSeries(found.images, times, path.name)
     else:

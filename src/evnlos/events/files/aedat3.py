@@ -101,11 +101,8 @@ class Aedat3Source:
                     found = f"the file ends {len(head)} bytes into a packet's header"
                     return self.report.fault("truncated", at, found, _CURE, lost_bytes=len(head))
                 kind, source, size, _, turns, capacity, count, valid = _HEAD.unpack(head)
-                if (
-                    min(size, count, valid, kind) < 0
-                    or not 0 <= turns < _MOST_TURNS
-                    or valid > count > capacity
-                ):
+                is_sound = min(size, kind) >= 0 and 0 <= turns < _MOST_TURNS
+                if not (is_sound and 0 <= valid <= count <= capacity):
                     found = f"a packet of {count} events of {size} bytes, {valid} of them valid"
                     return self.report.fault("left_over", at, found, _CURE, lost_bytes=left)
                 length = size * count

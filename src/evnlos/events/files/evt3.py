@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from evnlos.events.files.evt3_clock import NEAR, mend_clock
 from evnlos.events.files.words import (
     BACKWARDS,
     BASE,
@@ -109,8 +110,7 @@ _OLD_HIGH, _OLD_BASE = (
     10,
     11,
 )  # clock before a jump of which it is not known yet whether it comes back; high + 1, 0 = none
-_NEAR = 10  # steps of TIME_HIGH, 4.096 ms each, that a clock makes in a recording without long silences
-_MOST_WRONG = 3  # clock words in a row that a bit error spoils
+_DENSE = 12  # clock words in a row that were near the one before: only a camera's clock that runs on can jump
 
 
 @cache
@@ -137,59 +137,6 @@ def bound_evt3(words: NDArray[np.uint16]) -> int:
 
 
 @njit(cache=True)
-def _likeliest(wrong, high, span, is_low_back):
-    """Return the one of high..high + span that the fewest wrong bits make `wrong`.
-
-    Of equal ones it is `high` itself, or, where the low part of the time began anew, the next.
-    """
-    best, fewest = high, 99
-    for step in range(span + 1):
-        value = (high + step) & 0xFFF
-        bits, count = value ^ wrong, 0
-        while bits:
-            bits &= bits - 1
-            count += 1
-        if count < fewest or (count == fewest and step == 1 and is_low_back):
-            best, fewest = value, count
-    return best
-
-
-@njit(cache=True)
-def mend_clock(words, index, high, low):
-    """Return the high part of the time where the TIME_HIGH at `index` is a bit error of the camera.
-
-    It is one where the clock jumps there, and the next clock words stand where it was. A turn of the clock
-    is no such jump, nor are the two words 0xfff and 0x000 by which a writer tells of a turn without events.
-
-    Args:
-        words: EVT3 words.
-        index: Number of the TIME_HIGH.
-        high: High part of the time before it.
-        low: Low part of the time before it.
-
-    Returns:
-        The right high part; -1 where the word is good, -2 where that is to be seen in words that follow.
-    """
-    new = np.int64(words[index]) & 0xFFF
-    if (new - high) & 0xFFF <= _NEAR:
-        return -1
-    if new == 0xFFF and index + 1 < len(words) and words[index + 1] == 0x8000:
-        return -1
-    wrong, next_low = 1, np.int64(-1)
-    for place in range(index + 1, len(words)):
-        kind, value = words[place] >> 12, np.int64(words[place]) & 0xFFF
-        if kind == 6 and next_low < 0:
-            next_low = value
-        elif kind == 8:
-            if (value - high) & 0xFFF <= _NEAR:
-                return _likeliest(new, high, (value - high) & 0xFFF, 0 <= next_low < low - JITTER_US)
-            wrong += 1
-            if wrong > _MOST_WRONG or (value - new) & 0xFFF > 1:
-                return -1
-    return -2
-
-
-@njit(cache=True)
 def _decode_carefully(words, first, stop, state, t_us, x, y, p, width, height):
     """Decode the words first..stop one by one and note every fault."""
     clock, newest, base = state[CLOCK], state[NEWEST], state[BASE]  # clock = high << 12 | low
@@ -198,7 +145,7 @@ def _decode_carefully(words, first, stop, state, t_us, x, y, p, width, height):
     never = np.iinfo(np.int64).min
     time = max(base + clock, newest)
     count = 0
-    old_high, old_base = state[_OLD_HIGH] - 1, state[_OLD_BASE]
+    old_high, old_base, dense = state[_OLD_HIGH] - 1, state[_OLD_BASE], state[_DENSE]
     for index in range(first, stop):
         word = np.int64(words[index])
         kind = word >> 12
@@ -254,18 +201,19 @@ def _decode_carefully(words, first, stop, state, t_us, x, y, p, width, height):
             else:
                 new = word & 0xFFF
                 high = clock >> 12
-                if old_high >= 0 and (new - old_high) & 0xFFF <= _NEAR:
+                if old_high >= 0 and (new - old_high) & 0xFFF <= NEAR:
                     note(state, CLOCK_JUMP, index)
                     base, high, clock = old_base, old_high, old_high << 12
                     newest, old_high = never, -1
                 elif started:
                     old_high = -1
-                    right = mend_clock(words, index, high, clock & 0xFFF)
+                    right = mend_clock(words, index, high, clock & 0xFFF, dense)
                     if right >= 0:
                         note(state, CLOCK_JUMP, index)
                         new = right
                     elif right == -2:
                         old_high, old_base = high, base
+                dense = dense + 1 if (new - high) & 0xFFF <= NEAR else 0
                 if started and new < high:
                     if high - new > _HIGH_TURN // 2:
                         base += WRAP_US
@@ -291,7 +239,7 @@ def _decode_carefully(words, first, stop, state, t_us, x, y, p, width, height):
     state[CLOCK], state[NEWEST], state[BASE], state[STARTED] = clock, newest, base, started
     state[ROW], state[COLUMN], state[POLARITY] = row, column, polarity
     state[_ROW_SEEN], state[_BASE_SEEN] = row_seen, base_seen
-    state[_OLD_HIGH], state[_OLD_BASE] = old_high + 1, old_base
+    state[_OLD_HIGH], state[_OLD_BASE], state[_DENSE] = old_high + 1, old_base, dense
     return count
 
 
@@ -315,7 +263,7 @@ def _decode_chunk(words, state, places, counts, t_us, x, y, p, width, height):
     high, low = base + (state[CLOCK] & ~np.int64(0xFFF)), state[CLOCK] & 0xFFF
     row, column, polarity = np.uint16(state[ROW]), state[COLUMN], state[POLARITY] != 0
     unusual = (state[STARTED] == 0) | (state[_ROW_SEEN] == 0) | (state[_OLD_HIGH] != 0)
-    base_seen = state[_BASE_SEEN] != 0
+    base_seen, dense = state[_BASE_SEEN] != 0, state[_DENSE]
     time = max(high + low, newest)
     count = np.uint64(0)
     for index in range(len(words)):
@@ -358,7 +306,8 @@ def _decode_chunk(words, state, places, counts, t_us, x, y, p, width, height):
             base_seen = True
         elif kind == 8:
             new = base + (value << 12)
-            unusual |= (new < high) | (new > high + (_NEAR << 12))
+            unusual |= (new < high) | (new > high + (NEAR << 12))
+            dense += 1
             low = low if new == high else np.int64(0)
             high = new
             time = max(high + low, newest)
@@ -369,6 +318,7 @@ def _decode_chunk(words, state, places, counts, t_us, x, y, p, width, height):
         return np.int64(-1)
     state[CLOCK], state[NEWEST] = (high - base) | low, newest
     state[ROW], state[COLUMN], state[POLARITY], state[_BASE_SEEN] = row, column, polarity, base_seen
+    state[_DENSE] = dense
     return events
 
 

@@ -29,6 +29,7 @@ from evnlos.events.files import (
     hdf5,
     hdf5_write,
     mcap,
+    mcap_write,
     npz,
     raw,
     ros,
@@ -117,7 +118,10 @@ def _raw(name: str) -> Format:
 
 
 def _ros(
-    name: str, suffixes: tuple[str, ...], signature: bytes, container: Callable[..., ros.Container]
+    name: str,
+    signature: bytes,
+    container: Callable[..., ros.Container],
+    create: Callable[[Path, Events, Path], Sink] | None = None,
 ) -> Format:
     def opened(path, report, width, height, _, topic):
         return ros.RosSource(container(path, report), path, report, width, height, topic)
@@ -125,7 +129,8 @@ def _ros(
     def frames(path, report, topic):
         return ros.read_ros_frames(container(path, report), path, report, topic)
 
-    return Format(name, suffixes, lambda start: start.startswith(signature), opened, frames=frames)
+    suffix = f".{name.lower()}"
+    return Format(name, (suffix,), lambda start: start.startswith(signature), opened, create, frames)
 
 
 FORMATS = (
@@ -170,9 +175,9 @@ FORMATS = (
         _of_streams(aedat3.Aedat3Source),
         frames=aedat3.read_aedat3_frames,
     ),
-    _ros("DB3", (".db3",), ros_bags.DB3_SIGNATURE, ros_bags.Db3File),
-    _ros("MCAP", (".mcap",), mcap.SIGNATURE, mcap.McapFile),
-    _ros("BAG", (".bag",), ros_bags.BAG_SIGNATURE, ros_bags.BagFile),
+    _ros("DB3", ros_bags.DB3_SIGNATURE, ros_bags.Db3File),
+    _ros("MCAP", mcap.SIGNATURE, mcap.McapFile, lambda path, first, _: mcap_write.McapSink(path, first)),
+    _ros("BAG", ros_bags.BAG_SIGNATURE, ros_bags.BagFile),
     Format("CELEX", (".bin",), celex.sniff_celex, _celex(celex.CelexSource), celex_write.CelexSink),
     Format(  # read as CELEX: the header tells the event formats apart
         "CELEX0",
@@ -375,7 +380,8 @@ def write_events(
         events: The events, or pieces of one stream in the order of time, such as `iter_events` yields: memory
             is then bounded by the largest piece.
         format: Name of the format, such as "EVT2"; by default the suffix decides: .h5 and .hdf5 HDF5 with
-            DSEC columns, .npz NPZ, .raw EVT3, .csv CSV, .bin CeleX-V (name it ..._100M.bin).
+            DSEC columns, .npz NPZ, .raw EVT3, .csv CSV, .mcap MCAP with images for viewers,
+            .bin CeleX-V (name it ..._100M.bin).
 
     Raises:
         EventFileError: No writable format has that suffix or name, or the folder cannot be written.

@@ -6,6 +6,7 @@ words; before the first whole time, and after packets that were lost, events hav
 
 from __future__ import annotations
 
+import logging
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ from evnlos.events.files.columns import (
     join,
     unreadable,
 )
+from evnlos.events.files.evt3 import WRAP_US
 from evnlos.events.files.mcap import Message, Topic
 from evnlos.events.files.raw import CODECS
 from evnlos.events.files.ros_messages import ARRAYS, IMAGES, PACKETS, EventArray, Packet, image_of
@@ -32,7 +34,9 @@ from evnlos.events.files.streams import Stream, StreamKind, choose_stream
 from evnlos.events.files.words import FAULTS, STATE_SIZE, TRIGGERS, new_state, report_faults
 from evnlos.untrusted import check_memory
 
+_LOG = logging.getLogger("evnlos")
 _BLOCK_BYTES = 1 << 20
+_STAMPS = 200  # packets whose stamps are looked at
 _CURE = f"the message is damaged: copy the file again or {SALVAGE}"
 _FOREIGN = 0x7000  # an EVT3 word that decoders pass
 _EVENTLESS = frozenset({0, 3})  # kinds of EVT3 words that only say where: rows and bases of vectors
@@ -284,4 +288,34 @@ def read_ros_frames(
             check_memory(4 * len(images) * image.nbytes, what, "leave frames out (ros2 bag convert)")
     if not images:
         raise EventFileError(f"{path}: topic {report.topic} holds no whole image; record it again")
-    return np.stack(images), np.array(times, np.int64)
+    return np.stack(images), np.array(times, np.int64) - _sensor_offset(container, path, report)
+
+
+def _sensor_offset(container: Container, path: Path, report: ReadReport) -> int:
+    """Return what to take from ROS times to get the events' clock, microseconds.
+
+    EVT3 has the sensor's own clock, all other events have ROS times. The stamp of a packet is the ROS time of
+    its first event: the median over the first packets is the offset.
+    """
+    topics = [stream.name for stream in report.streams if stream.type in PACKETS]
+    offsets: list[int] = []
+    turns, before = 0, 0
+    for message in container.messages(frozenset(topics if len(topics) == 1 else [])):
+        try:
+            packet = Packet(message)
+        except ValueError:
+            continue
+        if packet.encoding != "evt3" or len(offsets) == _STAMPS:
+            break
+        words = np.frombuffer(packet.events, "<u2", len(packet.events) // 2)
+        highs = np.flatnonzero(words >> 12 == 8)
+        lows = np.flatnonzero(words >> 12 == 6)
+        lows = lows[lows > highs[0]] if len(highs) else lows[:0]
+        if len(lows):
+            clock = int(words[highs[0]] & 0xFFF) << 12 | int(words[lows[0]] & 0xFFF)
+            turns += clock < before - WRAP_US // 2
+            before = clock
+            offsets.append(packet.stamp_ns // 1000 - turns * WRAP_US - clock)
+    if len(topics) > 1:
+        _LOG.warning("%s: %d topics of events: the frames keep the time of ROS", path, len(topics))
+    return int(np.median(offsets)) if offsets else 0

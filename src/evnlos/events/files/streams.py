@@ -51,17 +51,19 @@ def choose_stream(
     names = ", ".join(stream.name for stream in fitting[:_MOST_NAMES])
     if not fitting:
         held = ", ".join(f"{stream.name} ({stream.type})" for stream in streams[:_MOST_NAMES]) or "nothing"
-        raise EventFileError(f"{path}: holds no stream of {kind}; it holds {held}: record {kind} as well")
+        raise EventFileError(
+            f"{path}: byte 0: holds no stream of {kind}; it holds {held}; record {kind} as well"
+        )
     if topic is not None:
         exact = [stream for stream in fitting if stream.name == topic]
         ends = exact or [stream for stream in fitting if stream.name.endswith("/" + topic.strip("/"))]
         if len(ends) != 1:
             raise EventFileError(
-                f"{path}: topic {topic!r} is {len(ends)} streams of {kind}; give one of: {names}"
+                f"{path}: byte 0: topic {topic!r} is {len(ends)} streams of {kind}; give one of: {names}"
             )
         return ends[0]
     if len(fitting) > 1:
-        told = f"{path}: holds {len(fitting)} streams of {kind}; give topic= (--topic), one of: {names}"
+        told = f"{path}: byte 0: holds {len(fitting)} streams of {kind}; give topic= (--topic), one of: {names}"
         if is_strict:
             raise EventFileError(told)
         _LOG.warning("%s; took %s", told, fitting[0].name)
@@ -71,4 +73,6 @@ def choose_stream(
 def refuse_topic(path: Path, name: str, topic: str | None) -> None:
     """Raise where a topic is named for a format that holds one stream."""
     if topic is not None:
-        raise EventFileError(f"{path}: {name} holds one stream, topic {topic!r} is none of it; leave topic out")
+        raise EventFileError(
+            f"{path}: byte 0: {name} holds one stream, topic {topic!r} is none of it; leave topic out"
+        )

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from evnlos.errors import EventFileError
 from evnlos.events.files import evt2, evt3
 from evnlos.events.files.columns import OnError, unreadable
+from evnlos.events.files.evt3_clock import mend_clock
 from evnlos.events.files.raw import RawSource
 from evnlos.events.files.read import open_source
 
-CLOCK, BASE, STARTED = range(3)  # slots of the state
+CLOCK, BASE, STARTED, DENSE = range(4)  # slots of the state
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +70,9 @@ def _triggers_3(words, state, turn, t_us, channel, rising):
         if kind == 8:
             high = word & 0xFFF
             old = state[CLOCK] >> 12
-            right = evt3.mend_clock(words, index, old, state[CLOCK] & 0xFFF) if state[STARTED] else -1
+            right = mend_clock(words, index, old, state[CLOCK] & 0xFFF, state[DENSE])
             high = right if right >= 0 else high
+            state[DENSE] = state[DENSE] + 1 if (high - old) & 0xFFF <= 1 else 0
             if state[STARTED] and old - high > turn // 2:
                 state[BASE] += turn << 12
             if high != old or not state[STARTED]:
@@ -135,7 +137,7 @@ def read_triggers(
 
 
 def _from_words(source: _Words, format: str) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    state = np.zeros(3, np.int64)
+    state = np.zeros(4, np.int64)
     for words in source.words_of_file():
         kernel, turn = _triggers_3, evt3.WRAP_US >> 12
         if format in ("EVT2", "EVT21"):
