@@ -173,6 +173,7 @@ def bag_bytes(messages: Recording, compression: str = "none", per_chunk: int = 2
     count = 0
     for start in range(0, len(messages), per_chunk):
         body = b""
+        entries: dict[int, bytes] = {}
         for topic, kind, t_ns, data in messages[start : start + per_chunk]:
             if topic not in numbers:
                 numbers[topic] = len(numbers)
@@ -183,6 +184,7 @@ def bag_bytes(messages: Recording, compression: str = "none", per_chunk: int = 2
                 body += connection
                 connections += connection
             stamp = struct.pack("<II", t_ns // 10**9, t_ns % 10**9)
+            entries[numbers[topic]] = entries.get(numbers[topic], b"") + stamp + struct.pack("<I", len(body))
             body += _fields(op=b"\2", conn=struct.pack("<I", numbers[topic]), time=stamp)
             body += struct.pack("<I", len(data)) + data
         packed = packed_by(compression, body)
@@ -190,6 +192,10 @@ def bag_bytes(messages: Recording, compression: str = "none", per_chunk: int = 2
         places.append((len(chunks), {number: held.count(number) for number in held}))
         chunks += _fields(op=b"\5", compression=compression.encode(), size=struct.pack("<I", len(body)))
         chunks += struct.pack("<I", len(packed)) + packed
+        for number, data in entries.items():
+            many = struct.pack("<I", len(data) // 12)
+            about = {"ver": b"\1\0\0\0", "conn": struct.pack("<I", number), "count": many}
+            chunks += _fields(op=b"\4", **about) + struct.pack("<I", len(data)) + data
         count += 1
     first = b"#ROSBAG V2.0\n"
 

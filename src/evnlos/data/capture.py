@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -343,7 +344,7 @@ def import_captures(
     for path in paths.values():
         if not path.is_file() and not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
-    topics = {"events_topic": events_topic, "frames_topic": frames_topic}
+    topics: dict[str, Any] = {"events_topic": events_topic, "frames_topic": frames_topic}
     described = {name: _digest(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
     config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))

@@ -25,8 +25,8 @@ from evnlos.events.files.columns import (
     Columns,
     ReadReport,
     allocate,
+    collect,
     cut,
-    join,
     unreadable,
 )
 from evnlos.untrusted import check_memory, open_regular
@@ -188,7 +188,7 @@ class Aedat2Source:
 
     def read(self) -> Columns:
         """Return all events."""
-        return join(list(self.blocks()))
+        return collect(self.blocks(), self.path.stat().st_size)
 
     def edges(self) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
         """Yield times [us], channels and levels of the external inputs; the file does not tell edges apart."""

@@ -23,8 +23,8 @@ from evnlos.events.files.columns import (
     Columns,
     ReadReport,
     allocate,
+    collect,
     cut,
-    join,
     unreadable,
 )
 from evnlos.events.files.ros_messages import decode_libcaer, grey_of
@@ -49,7 +49,7 @@ class _Packet(NamedTuple):
     at: int
     turns: int
     size: int
-    count: int
+    events: int
     data: bytes
 
 
@@ -129,8 +129,8 @@ class Aedat3Source:
                 found = f"polarity events of {packet.size} bytes instead of 8"
                 self.report.fault("left_over", packet.at, found, _CURE, lost_bytes=len(packet.data))
                 continue
-            words = np.frombuffer(packet.data, "<u8", packet.count)
-            out = allocate(packet.count)
+            words = np.frombuffer(packet.data, "<u8", packet.events)
+            out = allocate(packet.events)
             columns = out["t_us"], out["x"], out["y"], out["p"]
             count = decode_libcaer(words, (packet.turns << 31) * 1000, False, *columns)
             if count:
@@ -139,7 +139,7 @@ class Aedat3Source:
 
     def read(self) -> Columns:
         """Return all valid events."""
-        return join(list(self.blocks()))
+        return collect(self.blocks(), self.path.stat().st_size)
 
     def _inputs(self, packet: _Packet) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Return times and levels of the edges in a packet of special events."""
@@ -162,7 +162,7 @@ class Aedat3Source:
     def frames(self) -> Iterator[tuple[int, NDArray[np.uint16]]]:
         """Yield the middle of the exposure [us] and the grey picture, uint16 [H, W], of each valid frame."""
         for packet in self._packets((_FRAME,)):
-            for index in range(packet.count):
+            for index in range(packet.events):
                 data = packet.data[index * packet.size : (index + 1) * packet.size]
                 try:
                     frame = _frame(data, packet.turns)

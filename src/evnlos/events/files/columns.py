@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from evnlos.errors import EventFileError
 from evnlos.events.files.streams import Stream
 from evnlos.types import Events
+from evnlos.untrusted import memory_left
 
 OnError = Literal["strict", "salvage"]
 
@@ -190,6 +191,30 @@ def join(blocks: list[Columns]) -> Columns:
     if len(blocks) == 1:
         return blocks[0]
     return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+
+
+def collect(blocks: Iterable[Columns], size: int) -> Columns:
+    """Return many blocks as one; each is let go as soon as it is copied.
+
+    Args:
+        blocks: Blocks with the same columns.
+        size: Length of the file, bytes: a guess of the events that it holds.
+    """
+    columns: Columns = {}
+    count, room = 0, max(min(size, memory_left() // 64), 1 << 16)
+    for block in blocks:
+        many = len(block["t_us"])
+        if not columns:
+            columns = allocate(room, block)  # pages that no event reaches are never used
+        if count + many > room:
+            room = max(2 * room, count + many)
+            enlarge(columns, count, room)
+        for name, column in columns.items():
+            column[count : count + many] = block[name]
+        count += many
+    columns = columns or allocate(1)
+    shorten(columns, count)
+    return columns
 
 
 def trusted_events(columns: Columns, width: int, height: int) -> Events:

@@ -21,8 +21,8 @@ from evnlos.events.files.columns import (
     Columns,
     ReadReport,
     allocate,
+    collect,
     cut,
-    join,
     unreadable,
 )
 from evnlos.events.files.streams import refuse_topic
@@ -386,7 +386,7 @@ class EcfSource:
 
     def read(self) -> Columns:
         """Return all events."""
-        return join(list(self.blocks()))
+        return collect(self.blocks(), self._path.stat().st_size)
 
     def edges(self) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
         """Yield times [us], channels and levels of the external triggers."""

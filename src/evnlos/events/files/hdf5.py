@@ -227,7 +227,7 @@ class Hdf5Source:
                 return self.report.set_geometry(holder.attrs["width"], holder.attrs["height"], "header")
         resolution = stored(self._holder(file), "calib/resolution")  # M3ED: width, height
         if isinstance(resolution, h5py.Dataset) and resolution.shape == (2,) and resolution.dtype.kind in "iu":
-            return self.report.set_geometry(*resolution[:].tolist(), "header")
+            return self.report.set_geometry(int(resolution[0]), int(resolution[1]), "header")
         largest = {"x": 0, "y": 0}
         datasets = self._datasets(file)
         for start in range(0, self._count, 1 << 20):

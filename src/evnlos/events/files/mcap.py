@@ -33,7 +33,7 @@ class Topic(NamedTuple):
     name: str
     type: str
     coding: str
-    count: int | None = None
+    messages: int | None = None
     is_rendered: bool = False
 
 
@@ -96,9 +96,9 @@ class McapFile:
             counts = {}
         found: dict[str, Topic] = {}
         for number, topic in self._channels.items():
-            before = found[topic.name].count or 0 if topic.name in found else 0
+            before = found[topic.name].messages or 0 if topic.name in found else 0
             count = counts.get(number)
-            found[topic.name] = topic._replace(count=before + count if count is not None else None)
+            found[topic.name] = topic._replace(messages=before + count if count is not None else None)
         return list(found.values())
 
     def messages(self, names: frozenset[str]) -> Iterator[Message]:

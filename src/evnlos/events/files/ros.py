@@ -22,8 +22,8 @@ from evnlos.events.files.columns import (
     Columns,
     ReadReport,
     allocate,
+    collect,
     cut,
-    join,
     unreadable,
 )
 from evnlos.events.files.evt3 import WRAP_US
@@ -35,7 +35,7 @@ from evnlos.events.files.words import FAULTS, STATE_SIZE, TRIGGERS, new_state, r
 from evnlos.untrusted import check_memory
 
 _LOG = logging.getLogger("evnlos")
-_BLOCK_BYTES = 1 << 20
+_BLOCK_BYTES = 1 << 18  # its events stay in the cache until they are copied
 _STAMPS = 200  # packets whose stamps are looked at
 _CURE = f"the message is damaged: copy the file again or {SALVAGE}"
 _FOREIGN = 0x7000  # an EVT3 word that decoders pass
@@ -65,7 +65,7 @@ def streams_of(topics: Iterable[Topic]) -> tuple[Stream, ...]:
             kind = "events"
         elif topic.type in IMAGES and not topic.is_rendered:
             kind = "frames"
-        found.append(Stream(topic.name, kind, topic.type, topic.count))
+        found.append(Stream(topic.name, kind, topic.type, topic.messages))
     return tuple(found)
 
 
@@ -150,7 +150,7 @@ class RosSource:
 
     def read(self) -> Columns:
         """Return all events of the topic."""
-        return join(list(self.blocks()))
+        return collect(self.blocks(), self.path.stat().st_size)
 
     def words_of_file(self) -> Iterator[NDArray]:
         """Yield blocks of the topic's EVT3 words, from the first whole time on."""

@@ -63,9 +63,9 @@ class BagFile:
                 pass
         found: dict[str, Topic] = {}
         for number, topic in connections.items():
-            before = found[topic.name].count or 0 if topic.name in found else 0
+            before = found[topic.name].messages or 0 if topic.name in found else 0
             count = before + counts[number] if number in counts else None
-            found[topic.name] = topic._replace(count=count)
+            found[topic.name] = topic._replace(messages=count)
         return list(found.values())
 
     def messages(self, names: frozenset[str]) -> Iterator[Message]:
