@@ -213,6 +213,8 @@ def _decode_carefully(words, first, stop, state, t_us, x, y, p, width, height):
                         new = right
                     elif right == -2:
                         old_high, old_base = high, base
+                        if 0 < high - new <= _HIGH_TURN // 2:
+                            new = high  # backwards: a fault in any case, of which the next clock word tells
                 dense = dense + 1 if (new - high) & 0xFFF <= NEAR else 0
                 if started and new < high:
                     if high - new > _HIGH_TURN // 2:
