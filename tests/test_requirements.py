@@ -49,6 +49,8 @@ def test_what_the_package_imports_is_declared() -> None:
         "starlette",
         "dask",
         "distributed",
+        "lz4",
+        "zstandard",
     }
     of_required = {"llvmlite": "numba", "pydantic_core": "pydantic"}  # they bring them
     undeclared = {}
