@@ -16,6 +16,7 @@ VERBS: dict[str, str] = {
     "lab": "datasets.LabCommand",
     "calibrate": "calibration.CalibrateCommand",
     "scan": "calibration.ScanCommand",
+    "pixel": "pixel.PixelCommand",
     "train": "learning.TrainCommand",
     "finetune": "learning.FinetuneCommand",
     "weights": "learning.WeightsCommand",

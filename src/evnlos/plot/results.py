@@ -5,6 +5,7 @@
 - The check picture of an imported scan; needs matplotlib.
 - The path of a hidden object and its speed; needs matplotlib.
 - Can the confidence be trusted? What is left when the least supported sequences go, and support against skill.
+- A fitted event pixel: what was recorded beside what its model makes.
 - What a setup can show, drawn: singular values, Picard plot, modes, and the best linear picture.
 """
 
@@ -29,6 +30,7 @@ from evnlos.untrusted import open_image
 if TYPE_CHECKING:
     from evnlos.analysis.confidence import ConfidenceCheck
     from evnlos.analysis.identify import Identification
+    from evnlos.calibration.pixel_report import KnownLightFit
 
 
 def draw_calibration(fit: SetupFit, path: str | Path) -> None:
@@ -72,6 +74,51 @@ def draw_calibration(fit: SetupFit, path: str | Path) -> None:
         packed = BytesIO()
         picture.convert("RGB").quantize(200).save(packed, "PNG", optimize=True)
     write_atomically(path, packed.getvalue())
+
+
+def draw_pixel_fit(fit: KnownLightFit, path: str | Path) -> None:
+    """Draw predictive checks of a fitted event pixel: counts, intervals, all checks, noise against light.
+
+    Args:
+        fit: The fit, with checks.
+        path: PNG file to write.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    assert fit.predicted is not None
+    figure = new_figure((11.0, 7.0))
+    axes = figure.subplots(2, 2)
+    for axis, (edges, seen, made), name in (
+        (axes[0, 0], fit.predicted.counts, "events per pixel"),
+        (axes[0, 1], fit.predicted.intervals, "log10 of the interval, s"),
+    ):
+        low, high = np.quantile(made, (0.05, 0.95), axis=0)
+        axis.stairs(high, edges, baseline=low, fill=True, color="0.75", label="model, 5 to 95 %")
+        axis.stairs(seen, edges, color="C1", label="recorded, held-out pixels")
+        axis.set(xlabel=name, ylabel="share")
+        axis.legend(frameon=False, fontsize=8)
+    checks = fit.predicted.checks
+    place = np.arange(len(checks))
+    spread = [max(one.high - one.low, 1e-9) for one in checks]
+    score = [(c.recorded - 0.5 * (c.low + c.high)) / s for c, s in zip(checks, spread, strict=True)]
+    axes[1, 0].scatter(np.clip(score, -3, 3), place, c=["k" if one.passed else "C3" for one in checks], s=12)
+    axes[1, 0].axvspan(-0.5, 0.5, color="0.85")
+    names = [f"{one.name}, {one.recording}"[:60] for one in checks]
+    axes[1, 0].set_yticks(place, names, fontsize=max(3, min(7, 180 // max(len(checks), 1))))
+    axes[1, 0].set(xlabel="recorded, in 90 % ranges of the model (red: p beyond 0.01)")
+    lights = [one.light_dn for one in fit.lights]
+    for label, pairs in (
+        ("ON", [one.on_hz for one in fit.lights]),
+        ("OFF", [one.off_hz for one in fit.lights]),
+    ):
+        middle, low, high = np.array(pairs).T
+        axes[1, 1].errorbar(
+            lights, middle, [middle - low, high - middle], marker="o", ms=3, label=f"noise {label}"
+        )
+    axes[1, 1].set(xscale="symlog", xlabel="light, DN", ylabel="rate, Hz per pixel")
+    axes[1, 1].legend(frameon=False, fontsize=8)
+    save_figure(figure, path, dpi=100)
 
 
 def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]]) -> Path:

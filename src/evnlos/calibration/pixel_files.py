@@ -1,0 +1,181 @@
+"""Files of recordings under known light: manifests, event files, captures, frames, and doubts about the light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.calibration.pixel_light import KnownLight, LitEvents
+from evnlos.cameras.event_model import require
+from evnlos.cameras.light import WHITE_DN
+from evnlos.cameras.video import open_video
+from evnlos.config import load_yaml
+from evnlos.data.capture import read_capture
+from evnlos.data.frame_sources import inside
+from evnlos.errors import ConfigError, DataError
+from evnlos.events import read_events, read_timed_frames
+from evnlos.events.recording import Box
+from evnlos.types import Events
+
+_DARKEST, _BRIGHTEST = 0.02, 0.97  # of white, between which a frame counts as linear
+_LAMPS_HZ = (100.0, 120.0)
+
+
+@dataclass(frozen=True)
+class LitFile:
+    """A recording and its light, as a manifest names them."""
+
+    file: str
+    """Event file, or capture folder with events and registered frames; relative to the manifest."""
+    light: KnownLight = field(default_factory=KnownLight)
+    """Its light; of a capture folder, frames."""
+    start_s: float = 0.0
+    """Begin of what counts, seconds after the first event."""
+    stop_s: float | None = None
+    """End of what counts; None = the last event."""
+    box: tuple[int, int, int, int] | None = None
+    """Part of the sensor under that light: X Y WIDTH HEIGHT, pixels."""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Recordings of one sensor, each with its light: `pixel_fit.yaml`."""
+
+    recordings: tuple[LitFile, ...]
+    """The recordings; they share one sensor and its settings."""
+    white: float = WHITE_DN
+    """The level that counts as 255 DN: levels may be lux or any linear unit."""
+
+    def __post_init__(self) -> None:
+        if not self.recordings:
+            raise ConfigError("the manifest lists no recordings; give at least one")
+        require(self, "white", 1e-9, 1e12, "in the unit of the levels")
+
+
+def read_manifest(path: Path, light: KnownLight | None = None, white: float = WHITE_DN) -> Manifest:
+    """Return the recordings that a path names: a manifest, an event file, or a capture folder.
+
+    Args:
+        path: A YAML file with `recordings`, an event file, or the folder of a capture.
+        light: Light of an event file or capture; None = unknown, of a capture its frames.
+        white: The level that counts as 255 DN.
+
+    Raises:
+        ConfigError: The manifest does not fit, or light is stated beside it.
+    """
+    if path.suffix in (".yaml", ".yml"):
+        if light is not None:
+            raise ConfigError(f"{path} states the light of its recordings; leave --light out")
+        found = load_yaml(Manifest, path)
+        for one in found.recordings:
+            inside(path.parent, one.file, path.name)
+        return replace(
+            found, recordings=tuple(replace(one, file=str(path.parent / one.file)) for one in found.recordings)
+        )
+    if light is None:
+        light = KnownLight("frames" if path.is_dir() else "unknown")
+    return Manifest((LitFile(str(path), light),), white)
+
+
+def read_lit_events(one: LitFile, white: float = WHITE_DN) -> LitEvents:
+    """Read a recording and its light.
+
+    Args:
+        one: What the manifest says of it.
+        white: The level that counts as 255 DN.
+
+    Raises:
+        DataError: No events, frames of another size, or a box outside the sensor.
+        EventFileError: The event file can't be read.
+    """
+    path, known = Path(one.file), one.light
+    frames = times = None
+    if path.is_dir():
+        capture = read_capture(path)
+        events = capture.events
+        if known.kind == "frames":
+            frames = capture.frames.astype(np.float32) * np.float32(WHITE_DN / capture.peak)
+            times = capture.frame_times_us * 1e-6
+    else:
+        events = read_events(path)
+        if known.kind == "frames":
+            frames, times = _frames_of(path, known, events)
+    if not len(events):
+        raise DataError(f"{path} holds no events; record longer, or a scene that moves")
+    first = float(events.t_us[0]) * 1e-6
+    if frames is not None and times is not None:
+        if frames.shape[1:] != events.shape:
+            high, wide = frames.shape[1:]
+            raise DataError(
+                f"{path}: frames are {wide} x {high} pixels, the events' sensor {events.width} x "
+                f"{events.height}; register the frames, or give a capture folder with a registration"
+            )
+        low, high_s = first + one.start_s, first + (math.inf if one.stop_s is None else one.stop_s)
+        kept = (times >= low) & (times <= high_s)
+        if kept.sum() < 3:
+            raise DataError(f"{path}: {int(kept.sum())} frames in the time of the events; 3 or more are needed")
+        frames, times = frames[kept], times[kept]
+        first, last = float(times[0]), float(times[-1])
+        times = times - first
+    else:
+        last = float(events.t_us[-1]) * 1e-6 if one.stop_s is None else first + one.stop_s
+        first += one.start_s
+    low_us, high_us = round(first * 1e6), round(last * 1e6)
+    events = events[(events.t_us >= low_us) & (events.t_us <= high_us)]
+    if not len(events) or high_us - low_us < 1000:
+        raise DataError(f"{path}: {len(events)} events in {(high_us - low_us) * 1e-6:g} s of it; choose more")
+    events = Events(events.t_us - low_us, events.x, events.y, events.p, events.width, events.height)
+    chosen = np.ones(events.shape, np.bool_)
+    if one.box is not None:
+        box = Box(*one.box)
+        if box.x + box.width > events.width or box.y + box.height > events.height:
+            raise ConfigError(f"{path}: the box {one.box} leaves the {events.width} x {events.height} sensor")
+        chosen[:] = False
+        chosen[box.y : box.y + box.height, box.x : box.x + box.width] = True
+    if frames is not None:
+        chosen &= (frames.min(axis=0) >= _DARKEST * WHITE_DN) & (frames.max(axis=0) <= _BRIGHTEST * WHITE_DN)
+    known = replace(known, level=known.level * WHITE_DN / white)
+    return LitEvents(path.name, events, known, (high_us - low_us) * 1e-6, chosen, frames, times)
+
+
+def _frames_of(path: Path, known: KnownLight, events: Events) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return frames in DN and their times on the events' clock, seconds."""
+    if not known.frames:
+        found = read_timed_frames(path)
+        if found.t_us is None:
+            raise DataError(f"{path}: its frames carry no times; give them as --light frames FILE")
+        peak = float(np.iinfo(found.images.dtype).max)
+        return found.images.astype(np.float32) * np.float32(WHITE_DN / peak), found.t_us * 1e-6
+    video = open_video(known.frames, fps=known.fps)
+    pairs = list(video)
+    start = float(events.t_us[0]) * 1e-6 + known.first_frame_s if len(events) else 0.0
+    times = start + np.array([time for time, _ in pairs])
+    return np.stack([light for _, light in pairs]).astype(np.float32), times
+
+
+def doubts_of(one: LitEvents) -> list[str]:
+    """Return what speaks against the stated light of a recording, a line each.
+
+    Constant light whose event rate varies much more than Poisson counts in twentieths of the recording, and a
+    line at 100 or 120 Hz, which lamps on the mains make.
+    """
+    found, time_s = [], one.events.t_us * 1e-6
+    count = len(time_s)
+    if one.light.kind == "static":
+        bins = np.histogram(time_s, 20, (0.0, one.seconds))[0]
+        excess = math.sqrt(max(float(bins.var() - bins.mean()), 0.0)) / max(float(bins.mean()), 1e-9)
+        if excess > 0.3 and bins.mean() >= 10:
+            found.append(
+                f"{one.name}: the event rate varies by {100 * excess:.0f} % over the recording; its light was not "
+                "constant, or the scene moved"
+            )
+    if one.light.kind in ("static", "unknown") and count > 100 and one.seconds > 0.1:
+        for hertz in _LAMPS_HZ:
+            line = abs(np.exp(2j * np.pi * hertz * time_s).mean())
+            if line > max(0.1, 5 / math.sqrt(count)):
+                found.append(f"{one.name}: events come at {hertz:.0f} Hz (strength {line:.2f}); lamps flicker")
+    return found

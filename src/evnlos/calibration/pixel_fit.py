@@ -1,0 +1,388 @@
+"""Fitting an event pixel to recordings under known light: the posterior of its settings, for several models.
+
+With s the means over the pixels of the statistics of `pixel_statistics`, m(u) what a model makes of them on
+average, and u its free numbers on a scale on which their range is a standard normal prior,
+
+    log p(u | s) = -1/2 (s - m(u))^T C^-1 (s - m(u)) - 1/2 u^T u,
+
+C from the scatter of the pixels (a synthetic likelihood: Wood, Nature 466, 2010). An ensemble of simulations is
+driven towards s by Kalman updates (Iglesias, Law and Stuart, Inverse Problems 29, 2013) whose tolerance falls from
+step to step; around what it finds, m is a quadratic polynomial fitted to simulations, each with mismatch and noise of
+its own, and the posterior is sampled. Where the model explains s no better than chance allows, C is as it is; where
+it explains it worse, C is widened by the excess.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.calibration.event_models import Free
+from evnlos.calibration.pixel_light import LitRecording
+from evnlos.calibration.pixel_posterior import NEAR, Surface, clipped, updated
+from evnlos.calibration.pixel_statistics import (
+    Array,
+    Binning,
+    Scale,
+    binning_of,
+    scale_of,
+    simulated_events,
+    statistics_of,
+)
+from evnlos.cameras import BrownianPixel, CircuitPixel, EventPixel, PixelSettings
+from evnlos.errors import ConfigError, DataError
+from evnlos.progress import Progress, Step, silent
+from evnlos.types import derive_seed
+
+MISMATCH = "mismatch"
+"""Free number of a candidate: standard deviation of the thresholds over the mean of the two."""
+_FLOORS = (0.6, 0.2, 0.07, 0.025)  # tolerances of the ensemble's updates, on the scale of the statistics
+_ROUNDS = 5
+_SHARED = 1.6  # standard deviations of the last simulations within which earlier ones are used again
+_NARROWED = 1.7  # mean ratio of their standard deviations to those asked for, above which another round follows
+_REPLICATES = 4
+_STEP_S = 1.5e-4  # of a circuit pixel with the default follower
+_CIRCUIT_STEPS = 4_000_000  # of pixels and time, in one simulation
+_CIRCUIT_PX = 96
+
+_THRESHOLDS = (
+    Free("threshold_on", 0.03, 1.5, 0.05),
+    Free("threshold_off", 0.03, 1.5, 0.05),
+    Free(MISMATCH, 0.003, 0.6, 0.2),
+)
+_NOISE = Free("shot_noise_rate_hz", 1e-3, 100.0, 0.1)
+_LEAK = Free("leak_rate_hz", 1e-3, 20.0, 0.1)
+CANDIDATES: dict[str, tuple[PixelSettings, tuple[Free, ...]]] = {
+    "continuous": (
+        EventPixel(),
+        (*_THRESHOLDS, Free("cutoff_hz", 1.0, 5000.0, 0.1), _LEAK, _NOISE),
+    ),
+    "continuous, true logarithm": (
+        EventPixel(logarithm="true", dark_dn=1.0, cutoff_floor_dn=1.0),
+        (*_THRESHOLDS, Free("cutoff_hz", 1.0, 5000.0, 0.1), _LEAK, _NOISE, Free("dark_dn", 0.02, 60.0, 0.2)),
+    ),
+    "brownian": (
+        BrownianPixel(dark_noise=0.0),
+        (
+            *_THRESHOLDS,
+            Free("dark_dn", 0.2, 100.0, 0.2),
+            _LEAK,
+            Free("leak_rate_per_dn_hz", 1e-5, 0.3, 0.2),
+            Free("photon_noise", 3e-3, 3.0, 0.1),
+        ),
+    ),
+    "circuit": (
+        CircuitPixel(),
+        (
+            *_THRESHOLDS,
+            Free("photocurrent_a_per_dn", 1e-17, 3e-14, 0.2),
+            _LEAK,
+            Free("noise_factor", 0.2, 5.0, 0.1),
+        ),
+    ),
+}
+"""Event models that may be fitted: a start, and the free numbers with the range in which they are looked for."""
+
+
+@dataclass(frozen=True)
+class PixelFitSettings:
+    """How a pixel is fitted."""
+
+    models: tuple[str, ...] = tuple(CANDIDATES)
+    """Models to fit and compare: continuous; continuous, true logarithm; brownian; circuit (takes minutes)."""
+    pixels: int = 800
+    """Pixels that are fitted; half as many are held out."""
+    most_s: float = 30.0
+    """What is taken of each recording, seconds from its start."""
+    ensemble: int = 20
+    """Simulations of each of the four steps of the search."""
+    simulations: int = 60
+    """Simulations around the result, from which its uncertainty comes."""
+    checks: int = 40
+    """Simulations of each predictive check."""
+    seed: int = 0
+    """Seed of every draw."""
+
+    def __post_init__(self) -> None:
+        if unknown := [name for name in self.models if name not in CANDIDATES]:
+            raise ConfigError(f"there is no model {unknown[0]!r} to fit; give some of {', '.join(CANDIDATES)}")
+        if not self.models:
+            raise ConfigError("no model to fit; give one at least")
+        least = {"pixels": 48, "ensemble": 12, "simulations": 30, "checks": 10}
+        for name, low in least.items():
+            if getattr(self, name) < low:
+                raise ConfigError(f"PixelFitSettings.{name} is {getattr(self, name)}; give at least {low}")
+        if not self.most_s > 0:
+            raise ConfigError(f"PixelFitSettings.most_s is {self.most_s}; give a positive number of seconds")
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A number with its uncertainty.
+
+    Args:
+        name: Its name.
+        value: Median of the posterior.
+        low: Its 2.5 % quantile.
+        high: Its 97.5 % quantile.
+        state: "identified", "at most" (not told from none; `high` bounds it) or "not identified": the interval
+            is more than half as wide as the range in which it was looked for.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    state: str
+
+
+@dataclass(frozen=True, eq=False)
+class Panels:
+    """Recorded statistics of fitted pixels, and how they are taken.
+
+    Args:
+        recordings: Light and events.
+        binnings: Bins of each recording.
+        statistics: Recorded statistics [N, K].
+        scale: Scale of their means.
+    """
+
+    recordings: tuple[LitRecording, ...]
+    binnings: tuple[Binning, ...]
+    statistics: Array
+    scale: Scale
+
+    def simulate(self, pixel: PixelSettings, seed: int) -> Array:
+        """Return the statistics of simulated pixels, [N, K]."""
+        events = simulated_events(self.recordings, pixel, seed)
+        return statistics_of(self.recordings, self.binnings, events)
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateFit:
+    """An event model that was fitted.
+
+    Args:
+        name: Name in `CANDIDATES`.
+        pixel: The pixel at the median of the posterior; what is not told from none is none.
+        free: What was fitted.
+        draws: Posterior draws on the normal scale, [S, P].
+        estimates: Each free number, and the standard deviation of the thresholds.
+        misfit: Squared distance of the statistics from the model's, over their number; 1 is chance.
+        correlation: Posterior correlation of the free numbers, [P, P].
+    """
+
+    name: str
+    pixel: PixelSettings
+    free: tuple[Free, ...]
+    draws: Array
+    estimates: tuple[Estimate, ...]
+    misfit: float
+    correlation: Array = field(repr=False)
+
+    def drawn(self, index: int) -> PixelSettings:
+        """Return the pixel of a posterior draw."""
+        return pixel_at(CANDIDATES[self.name][0], self.free, self.draws[index % len(self.draws)])
+
+
+def panels_of(recordings: Sequence[LitRecording], like: Panels | None = None) -> Panels:
+    """Return the statistics of recordings; those held out are binned and scaled as those fitted.
+
+    Args:
+        recordings: Light and events of pixels.
+        like: The fitted pixels, for those held out.
+
+    Raises:
+        DataError: The recordings hold too few events to say anything.
+    """
+    binnings = tuple(binning_of(one) for one in recordings)
+    if like is not None:
+        binnings = tuple(
+            replace(own, intervals_s=other.intervals_s, windows_s=other.windows_s, lag_s=other.lag_s)
+            for own, other in zip(binnings, like.binnings, strict=True)
+        )
+    events = sum(len(one.events) for one in recordings)
+    if events < 100:
+        raise DataError(f"the chosen pixels hold {events} events; 100 or more are needed: record longer")
+    statistics = statistics_of(recordings, binnings, [one.events for one in recordings])
+    return Panels(tuple(recordings), binnings, statistics, scale_of(statistics))
+
+
+def value_of(free: Free, u: NDArray | float) -> Array:
+    """Return a free number at normal positions: its range is uniform on its own (logarithmic) scale."""
+    share = 0.5 * (1.0 + torch.erf(torch.as_tensor(np.asarray(u, np.float64)) / math.sqrt(2.0)).numpy())
+    low, high = (math.log(free.low), math.log(free.high)) if free.log else (free.low, free.high)
+    return np.exp(low + share * (high - low)) if free.log else low + share * (high - low)
+
+
+def position_of(free: Free, value: float) -> float:
+    """Return the normal position of a free number; inverse of `value_of`."""
+    low, high, at = (math.log(n) if free.log else n for n in (free.low, free.high, value))
+    return NormalDist().inv_cdf(min(max((at - low) / (high - low), 1e-4), 1 - 1e-4))
+
+
+def pixel_at(start: PixelSettings, free: Sequence[Free], u: Array) -> PixelSettings:
+    """Return a pixel whose free numbers stand at normal positions u [P]."""
+    changes: dict[str, Any] = {one.name: float(value_of(one, u[k])) for k, one in enumerate(free)}
+    ratio = changes.pop(MISMATCH, None)
+    if ratio is not None:
+        changes["threshold_sigma"] = ratio * 0.5 * (changes["threshold_on"] + changes["threshold_off"])
+    return replace(start, **changes)  # type: ignore[type-var]
+
+
+def shortened(name: str, recordings: Sequence[LitRecording]) -> list[LitRecording]:
+    """Return what of the recordings a model is fitted to: of those for a circuit, fewer pixels and seconds.
+
+    Args:
+        name: Name in `CANDIDATES`.
+        recordings: Light and events.
+    """
+    total = sum(float(one.times_s[-1]) for one in recordings)
+    pixels = recordings[0].light.shape[2]
+    if name != "circuit" or total / _STEP_S * pixels <= _CIRCUIT_STEPS:
+        return list(recordings)
+    few = min(pixels, max(_CIRCUIT_PX, int(_CIRCUIT_STEPS * _STEP_S / total)))
+    seconds = _CIRCUIT_STEPS * _STEP_S / few / len(recordings)
+    return [_part(one, few, seconds) for one in recordings]
+
+
+def _part(recording: LitRecording, pixels: int, seconds: float) -> LitRecording:
+    count = int(np.searchsorted(recording.times_s, seconds, "right"))
+    times, light = recording.times_s[:count], recording.light[:count, :, :pixels]
+    if count < 2 or times[-1] < min(seconds, recording.times_s[-1]):
+        end = min(seconds, float(recording.times_s[-1]))
+        share = np.float32(
+            (end - recording.times_s[count - 1])
+            / np.diff(recording.times_s)[min(count, len(recording.times_s) - 1) - 1]
+        )
+        following = recording.light[min(count, len(recording.times_s) - 1), :, :pixels]
+        times = np.append(times, end)
+        light = np.concatenate([light, (light[-1] + share * (following - light[-1]))[None]])
+    events = recording.events
+    kept = (events.x < pixels) & (events.t_us <= round(float(times[-1]) * 1e6))
+    few = replace(events[kept], width=pixels)
+    crossing = None if recording.crossing_s is None else recording.crossing_s[:pixels]
+    return replace(recording, light=np.ascontiguousarray(light), times_s=times, events=few, crossing_s=crossing)
+
+
+def fit_candidate(
+    name: str,
+    panels: Panels,
+    settings: PixelFitSettings,
+    refractory_s: float = 0.0,
+    progress: Progress = silent,
+) -> CandidateFit:
+    """Fit one event model.
+
+    Args:
+        name: Name in `CANDIDATES`.
+        panels: Recorded statistics.
+        settings: How to fit.
+        refractory_s: Dead time of the pixels, seconds, for models that have one.
+        progress: Called after each simulation.
+    """
+    start, free = CANDIDATES[name]
+    if hasattr(start, "refractory_s"):
+        start = replace(start, refractory_s=refractory_s)  # type: ignore[type-var]
+    free = within_reach(free, panels)
+    seed = derive_seed(settings.seed, "pixel fit", name)
+    draw = np.random.default_rng(seed)
+    scale, target = panels.scale, panels.scale.of(panels.statistics)
+    total = len(_FLOORS) * settings.ensemble + _ROUNDS * settings.simulations
+    done = 0
+
+    def run(u: Array) -> Array:
+        nonlocal done
+        found = panels.simulate(pixel_at(start, free, u), derive_seed(seed, "simulation", done))
+        done += 1
+        progress(Step(f"fit {name}", done, total, "simulations"))
+        return found
+
+    progress(Step(f"fit {name}", 0, total, "simulations"))
+    own = scale.covariance(panels.statistics, panels.statistics.mean(axis=0))
+    ensemble = 0.9 * draw.standard_normal((settings.ensemble, len(free)))
+    for floor in _FLOORS:
+        made = np.stack([scale.of(run(u)) for u in ensemble])
+        ensemble = updated(ensemble, made, target, own + floor**2 * np.eye(len(target)), draw)
+    centre, spread = ensemble.mean(axis=0), np.cov(ensemble.T) + 0.05**2 * np.eye(len(free))
+    draws, misfit = ensemble, math.nan
+    tried, seen = np.zeros((0, len(free))), np.zeros((0, len(target)))
+    for _ in range(_ROUNDS):
+        scatter = clipped(NEAR**2 * spread, 0.005, 0.7)
+        design = (
+            centre + draw.standard_normal((settings.simulations, len(free))) @ np.linalg.cholesky(scatter).T
+        )
+        design = np.clip(design, -3.2, 3.2)
+        seen = np.concatenate([seen, [scale.of(run(u)) for u in design]])
+        tried = np.concatenate([tried, design])
+        away = np.linalg.solve(np.linalg.cholesky(scatter), (tried - centre).T)
+        near = (away**2).sum(axis=0) < _SHARED**2 * len(free)  # those of earlier rounds, too
+        covariance = _covariance(panels, partial(pixel_at, start, free), centre, seed)
+        surface = Surface.fitted(tried[near], seen[near], centre, scatter)
+        draws, misfit = surface.posterior(target, covariance, draw)
+        before, centre, spread = centre, draws.mean(axis=0), np.cov(draws.T)
+        shift = (centre - before) @ np.linalg.solve(scatter, centre - before)
+        narrowed = np.linalg.slogdet(scatter)[1] - np.linalg.slogdet(NEAR**2 * spread)[1]
+        if shift < 0.5 * len(free) and narrowed < 2.0 * len(free) * math.log(_NARROWED):
+            break
+    progress(Step(f"fit {name}", total, total, "simulations"))
+    estimates = tuple(_estimate(one, draws[:, k]) for k, one in enumerate(free))
+    pixel = pixel_at(start, free, np.median(draws, axis=0))
+    for one in estimates:
+        if one.state == "at most" and one.name in ("leak_rate_hz", "shot_noise_rate_hz", "leak_rate_per_dn_hz"):
+            pixel = replace(pixel, **{one.name: 0.0})  # type: ignore[type-var]
+    if isinstance(pixel, EventPixel):
+        pixel = replace(pixel, initial_phase=None)
+    sigma = [pixel_at(start, free, u).threshold_sigma for u in draws[:: max(1, len(draws) // 256)]]
+    ratio = next(one for one in estimates if one.name == MISMATCH)
+    low, middle, high = np.quantile(sigma, (0.025, 0.5, 0.975))
+    estimates += (Estimate("threshold_sigma", float(middle), float(low), float(high), ratio.state),)
+    return CandidateFit(name, pixel, free, draws, estimates, misfit, np.corrcoef(draws.T))
+
+
+def within_reach(free: Sequence[Free], panels: Panels) -> tuple[Free, ...]:
+    """Return free numbers whose noise rates stay within ten times the highest rate that a recording has."""
+    pixels = panels.statistics.shape[0]
+    rate = max(len(one.events) / pixels / float(one.times_s[-1]) for one in panels.recordings)
+    most = {"shot_noise_rate_hz": 10 * rate, "leak_rate_hz": 3 * rate}
+    return tuple(
+        replace(one, high=min(one.high, max(most[one.name], 20 * one.low))) if one.name in most else one
+        for one in free
+    )
+
+
+def _covariance(panels: Panels, pixel: Callable[[Array], PixelSettings], centre: Array, seed: int) -> Array:
+    """Return the covariance of the recorded means: of pixels about what the model expects of each."""
+    made = [panels.simulate(pixel(centre), derive_seed(seed, "covariance", k)) for k in range(_REPLICATES)]
+    expected = np.mean(made, axis=0)
+    about = panels.statistics.mean(axis=0)
+    recorded = panels.scale.covariance(panels.statistics - expected, about)
+    model = np.mean([panels.scale.covariance(one - expected, about) for one in made], axis=0)
+    # Differences from a mean of R draws hold (R + 1) / R, or (R - 1) / R, of the variance of one.
+    half = 0.5 * recorded * _REPLICATES / (_REPLICATES + 1) + 0.5 * model * _REPLICATES / (_REPLICATES - 1)
+    return half + np.diag((0.1 * panels.scale.unit / np.sqrt(about**2 + panels.scale.unit**2)) ** 2)
+
+
+def _estimate(free: Free, draws: Array) -> Estimate:
+    low, middle, high = np.quantile(draws, (0.025, 0.5, 0.975))
+    shares = [NormalDist().cdf(float(u)) for u in (low, high)]
+    state = "identified"
+    if shares[1] - shares[0] > 0.5:
+        state = "not identified"
+    elif shares[0] < 0.05 and free.name in (
+        MISMATCH,
+        "leak_rate_hz",
+        "shot_noise_rate_hz",
+        "leak_rate_per_dn_hz",
+    ):
+        state = "at most"
+    values = [float(value_of(free, u)) for u in (middle, low, high)]
+    return Estimate(free.name, *values, state)

@@ -1,0 +1,228 @@
+"""What a recording says of each pixel, in numbers, for recorded and for simulated events alike.
+
+Pixels do not see each other. Given the light, the numbers of one pixel are a draw that owes nothing to those of
+another, mismatch included, so their scatter over the pixels is the covariance of their mean. That makes the
+likelihood of the mean (a synthetic likelihood, Wood, Nature 466, 2010) without a formula for the pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evnlos.calibration.event_statistics import simulated
+from evnlos.calibration.pixel_light import LitRecording
+from evnlos.cameras import PixelSettings
+from evnlos.types import Events, derive_seed
+
+Array = NDArray[np.float64]
+
+_QUANTILES = (0.02, 0.15, 0.5, 0.85)  # of the intervals, between which they are counted
+_SWINGS = (0.15, 0.6)  # ranges of log light between pixels at rest, moving, and moving much
+_FEWEST_PX = 24  # pixels of a class
+_SCALE = 3.0  # standard deviations of a mean up to which it is taken as it is, and beyond by its logarithm
+
+
+@dataclass(frozen=True, eq=False)
+class Binning:
+    """How the numbers of one recording are taken, the same for recorded and simulated events.
+
+    Args:
+        intervals_s: Edges of the interval bins, seconds.
+        groups: Group of each pixel by light and motion, int [N].
+        group_count: Number of groups.
+        windows_s: With an edge: edges of the times around its passage, seconds.
+        lag_s: With frames: how much earlier the light is looked at for the second time, seconds.
+    """
+
+    intervals_s: Array
+    groups: NDArray[np.int64]
+    group_count: int
+    windows_s: Array
+    lag_s: float
+
+
+def binning_of(recording: LitRecording) -> Binning:
+    """Choose bins from a recording's own events and light."""
+    pixels = recording.light.shape[2]
+    index, time_s, on = _columns(recording, recording.events)
+    gaps = _intervals(index, time_s, on)[1]
+    edges = np.unique(np.quantile(gaps, _QUANTILES)) if len(gaps) >= 50 else np.zeros(0)
+    groups, windows, lag = np.zeros(pixels, np.int64), np.zeros(0), 0.0
+    if recording.known.kind == "edge":
+        passed = _passage(recording, index, time_s, on)
+        windows = np.unique(np.quantile(passed, (0.1, 0.3, 0.5, 0.7, 0.9))) if len(passed) >= 20 else windows
+    if recording.known.kind == "frames":
+        light = recording.light[:, 0]
+        swing = np.ptp(np.log(np.maximum(light, 1e-3)), axis=0)
+        motion = np.digitize(swing, _SWINGS)
+        mean = light.mean(axis=0)
+        for kind in range(len(_SWINGS) + 1):
+            here = motion == kind
+            if here.any():
+                groups[here] = 2 * kind + (mean[here] > np.median(mean[here]))
+        _, groups, counts = np.unique(groups, return_inverse=True, return_counts=True)
+        if counts.min() < _FEWEST_PX:
+            groups = np.where(np.isin(groups, np.flatnonzero(counts < _FEWEST_PX)), counts.argmax(), groups)
+            groups = np.unique(groups, return_inverse=True)[1]
+        lag = 2.0 * float(np.median(np.diff(recording.times_s)))
+    return Binning(edges, groups, int(groups.max()) + 1, windows, lag)
+
+
+def statistics_of(
+    recordings: Sequence[LitRecording], binnings: Sequence[Binning], events: Sequence[Events]
+) -> Array:
+    """Return numbers of each pixel, [N, K]: K grows with the recordings and their groups of pixels.
+
+    Of each recording: counts of ON and OFF events, their roots and the root of their product (the roots' means
+    tell how counts scatter, so mismatch); pairs of successive events of unlike sign; intervals in bins; and
+    when the events come: under a sine or square wave two harmonics of each polarity, with an edge the time
+    around its passage, with frames the log light then and a little earlier.
+
+    Args:
+        recordings: Light of the pixels, and the instants that count.
+        binnings: Bins of each recording.
+        events: Recorded or simulated events of each.
+    """
+    blocks = []
+    for recording, binning, found in zip(recordings, binnings, events, strict=True):
+        block = _block(recording, binning, found)
+        if binning.group_count > 1:
+            block = _by_group(block, binning)
+        blocks.append(block)
+    return np.concatenate(blocks, axis=1)
+
+
+def _by_group(block: Array, binning: Binning) -> Array:
+    pixels, width = block.shape
+    wide = np.zeros((pixels, binning.group_count, width))
+    share = np.bincount(binning.groups, minlength=binning.group_count) / pixels
+    wide[np.arange(pixels), binning.groups] = block / share[binning.groups, None]
+    return wide.reshape(pixels, -1)
+
+
+def _block(recording: LitRecording, binning: Binning, events: Events) -> Array:
+    pixels = recording.light.shape[2]
+    index, time_s, on = _columns(recording, events)
+    count_on = np.bincount(index[on], minlength=pixels).astype(np.float64)
+    count_off = np.bincount(index[~on], minlength=pixels).astype(np.float64)
+    columns = [count_on, count_off, np.sqrt(count_on), np.sqrt(count_off), np.sqrt(count_on * count_off)]
+    where, gaps, unlike = _intervals(index, time_s, on)
+    columns.append(np.bincount(where[unlike], minlength=pixels))
+    if len(binning.intervals_s):
+        place = np.digitize(gaps, binning.intervals_s)
+        bins = len(binning.intervals_s) + 1
+        columns += list(np.bincount(where * bins + place, minlength=pixels * bins).reshape(pixels, bins).T[:-1])
+    for mark in _marks(recording, binning, index, time_s, on):
+        columns += [np.bincount(index[chosen], mark[chosen], minlength=pixels) for chosen in (on, ~on)]
+    return np.stack(columns, axis=1).astype(np.float64)
+
+
+def _columns(recording: LitRecording, events: Events) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+    """Return pixel, time in seconds and polarity of the events that count, ordered by pixel and time."""
+    kept = events.t_us > recording.settled_us
+    index, time_us, on = events.x[kept].astype(np.int64), events.t_us[kept], events.p[kept]
+    order = np.lexsort((time_us, index))
+    return index[order], time_us[order] * 1e-6, on[order]
+
+
+def _intervals(
+    index: NDArray[np.int64], time_s: Array, on: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+    """Return pixel, length and unlike polarity of successive events of one pixel."""
+    same = np.diff(index) == 0
+    return index[1:][same], np.diff(time_s)[same], (on[1:] != on[:-1])[same]
+
+
+def _marks(
+    recording: LitRecording, binning: Binning, index: NDArray[np.int64], time_s: Array, on: NDArray[np.bool_]
+) -> list[Array]:
+    """Return what each event says of its time, [E] each."""
+    known = recording.known
+    if known.kind in ("sine", "square") and len(index):
+        phase = 2.0 * math.pi * known.frequency_hz * time_s
+        # When the modulation began is not known: phases count from that of all events together.
+        phase = phase - np.angle((np.where(on, 1.0, -1.0) * np.exp(1j * phase)).sum())
+        return [np.cos(phase), np.sin(phase), np.cos(2 * phase), np.sin(2 * phase)]
+    if known.kind in ("sine", "square"):
+        return [np.zeros(0)] * 4
+    if known.kind == "edge" and len(binning.windows_s):
+        place = np.digitize(_passage(recording, index, time_s, on), binning.windows_s)
+        return [(place == k).astype(np.float64) for k in range(len(binning.windows_s))]
+    if known.kind == "frames":
+        light = np.log(recording.light[:, 0].astype(np.float64) + 1.0)
+        light -= light.mean(axis=0)
+        return [_at(light, recording.times_s, time_s - lag, index) for lag in (0.0, binning.lag_s)]
+    return []
+
+
+def _passage(recording: LitRecording, index: NDArray[np.int64], time_s: Array, on: NDArray[np.bool_]) -> Array:
+    """Return the times since the edge passed, seconds; zero is the median of the events of its sign."""
+    assert recording.crossing_s is not None
+    passed = time_s - recording.crossing_s[index]
+    sign = on == (recording.known.ratio > 1)
+    if not sign.any():
+        return passed
+    low, high = np.quantile(passed[sign], (0.25, 0.75))
+    near = sign & (passed >= low) & (passed <= high)
+    return passed - float(np.median(passed[near]))
+
+
+def _at(values: Array, times: Array, instants: Array, place: NDArray[np.int64]) -> Array:
+    """Return values [T, N] of pixels `place` [E] at `instants` [E], on lines between the times [T]."""
+    after = np.clip(np.searchsorted(times, instants, "left"), 1, len(times) - 1)
+    share = np.clip((instants - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0)
+    return values[after - 1, place] * (1.0 - share) + values[after, place] * share
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """How means become numbers in which a fit is nearly linear: asinh(mean / unit).
+
+    Args:
+        unit: [K].
+        kept: Statistics that say anything, bool [K].
+    """
+
+    unit: Array
+    kept: NDArray[np.bool_]
+
+    def of(self, statistics: Array) -> Array:
+        """Return the scaled means of the statistics of pixels [N, K], float64 [kept]."""
+        return np.arcsinh(statistics.mean(axis=0) / self.unit)[self.kept]
+
+    def covariance(self, statistics: Array, about: Array) -> Array:
+        """Return the covariance of scaled means [kept, kept], from the scatter of pixels [N, K].
+
+        Args:
+            statistics: Of each pixel, or their differences from what was expected of it.
+            about: Means at which the scale is taken, [K].
+        """
+        slope = 1.0 / np.sqrt(about**2 + self.unit**2)
+        deviation = ((statistics - statistics.mean(axis=0)) * slope)[:, self.kept]
+        return deviation.T @ deviation / (len(statistics) - 1) / len(statistics)
+
+
+def scale_of(statistics: Array) -> Scale:
+    """Return the scale for the recorded statistics of pixels, [N, K]."""
+    pixels = len(statistics)
+    error = statistics.std(axis=0) / math.sqrt(pixels)
+    return Scale(_SCALE * np.maximum(error, 1.0 / pixels), np.ones(statistics.shape[1], np.bool_))
+
+
+def simulated_events(recordings: Sequence[LitRecording], pixel: PixelSettings, seed: int) -> list[Events]:
+    """Return simulated events of one sensor: its mismatch is the same in all recordings.
+
+    Args:
+        recordings: Light of the pixels.
+        pixel: Their settings; they have long seen the first light.
+        seed: Seed of mismatch and noise.
+    """
+    sensor = replace(  # type: ignore[type-var]
+        pixel, pattern_seed=derive_seed(seed, "sensor"), initial_phase="random"
+    )
+    return simulated(recordings, sensor, seed)
