@@ -2,10 +2,10 @@
 
     python benchmarks/pixel_fit_coverage.py --draws 40 --out coverage.jsonl
 
-For each model, pixels of settings drawn at random see a slow and a fast sine (2 and 20 Hz, contrast 0.7 about 60
-DN) and two constant levels (5 and 120 DN); the model is fitted, and each interval either holds the truth or does not.
-"At most" holds what is below its bound; what is "not identified" claims nothing and is counted apart. Each draw is
-a line in the file as soon as it is done, so that the run may be stopped and continued.
+For each model, pixels of settings drawn at random see a slow and a fast sine (2 and 20 Hz, contrast 0.7 about
+60 DN) and two constant levels (5 and 120 DN); the model is fitted, and each interval either holds the truth or
+does not. "At most" holds what is below its bound; what is "not identified" claims nothing and is counted apart.
+Each draw is a line in the file as soon as it is done, so that the run may be stopped and continued.
 """
 
 import argparse
@@ -97,9 +97,8 @@ def table(lines: list[dict]) -> str:
             width = np.median([(high - low) / value for _, value, low, high, _ in told]) if told else math.nan
             hits, tries = hits + inside, tries + len(told)
             rows.append(f"{name:12} {key:24} {inside:6} {len(told):3} {len(mine) - len(told):15} {width:21.3f}")
-        rows.append(
-            f"{name:12} {'all':24} {hits:6} {tries:3}  = {100 * hits / max(tries, 1):.1f} % of {len(mine)} draws"
-        )
+        share = 100 * hits / max(tries, 1)
+        rows.append(f"{name:12} {'all':24} {hits:6} {tries:3}  = {share:.1f} % of {len(mine)} draws")
     return "\n".join(rows)
 
 

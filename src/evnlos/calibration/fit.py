@@ -20,7 +20,7 @@ from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noi
 from evnlos.calibration.settings import Calibration, pens_of, training_simulation
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
 from evnlos.calibration.wall_search import fit_wall
-from evnlos.cameras import EventPixel
+from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
 from evnlos.data.simulate import Simulation
 from evnlos.errors import DataError
@@ -169,14 +169,16 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
     residuals[_WITHOUT_PATTERN] = replace(
         residuals["frames held out"], before=residuals["frames held out"].after, after=corrected
     )
-    start_pixel = continuous(settings.start.pixel)
+    start_pixel: PixelSettings = settings.start.pixel
+    if settings.events:
+        start_pixel = continuous(start_pixel)
     simulation = _simulation(settings, fit, optics.setup, noise, start_pixel)
     pixel: PixelFit | None = None
     surfaces: Surfaces = {}
     if settings.events:
         recordings = read_recordings(fit, optics.setup, settings.event_captures)
         there = read_recordings(held, optics.setup, settings.event_captures)
-        pixel = fit_pixel(recordings, start_pixel, seed=settings.seed)
+        pixel = fit_pixel(recordings, continuous(start_pixel), seed=settings.seed)
         pixel = choose_pixel(pixel, recordings, there, seed=settings.seed)
         simulation = simulation.with_setup(pixel=pixel.pixel)
         for name, (capture_set, found) in {"fit": (fit, recordings), "held out": (held, there)}.items():
@@ -230,7 +232,7 @@ def _at_known_distance(settings: Calibration, capture_set: CaptureSet) -> tuple[
 
 
 def _simulation(
-    settings: Calibration, capture_set: CaptureSet, setup: Setup, noise: FrameNoise, pixel: EventPixel
+    settings: Calibration, capture_set: CaptureSet, setup: Setup, noise: FrameNoise, pixel: PixelSettings
 ) -> Simulation:
     """Return the start with everything that the captures tell: target, motion, length, positions, sensor."""
     scene, start = capture_set.scenes[0], settings.start

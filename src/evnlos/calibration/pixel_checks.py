@@ -1,8 +1,8 @@
-"""Is a fitted pixel believable: models compared on pixels held out, predictive checks, and what each pixel says.
+"""Is a fitted pixel believable: models compared on pixels held out, and predictive checks.
 
 - The likelihood of pixels held out, by model.
 - Posterior predictive checks: numbers that the fit did not take as such, recorded and simulated.
-- The refractory period, noise and bandwidth against light, and maps of each pixel's thresholds.
+- The refractory period, and noise and bandwidth against light.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ _DRAWS = 12  # posterior draws whose simulations stand for a model
 _RESAMPLES = 200
 _UNLIKELY = 0.01
 _FEWEST_PAIRS = 30  # intervals that are all alike before they count as the refractory period
+_FINE_TICKS = 5  # ticks of the time stamps that a refractory period must last to be told from them
 _PILE = 5.0  # times as many intervals at the shortest as just above it
 _STATIC_S, _STATIC_PX = 10.0, 200
 _CIRCUIT_S, _CIRCUIT_PX = 1.0, 64
@@ -95,16 +96,29 @@ class AtLight:
     bandwidth_hz: tuple[float, float, float]
 
 
+def tick_of(events: Events) -> int:
+    """Return what all time stamps but for one in a hundred are multiples of, microseconds; 1 = nothing coarser.
+
+    Args:
+        events: A recording.
+    """
+    steps = np.diff(np.unique(events.t_us))
+    if len(steps) < 50:
+        return 1
+    tick = int(np.quantile(steps, 0.01))
+    return tick if tick > 1 and float((steps % tick == 0).mean()) > 0.99 else 1
+
+
 def refractory_of(events: Sequence[Events]) -> Estimate:
     """Return the refractory period, from how the shortest intervals pile up.
 
-    A pixel whose light has moved by more than a threshold while it was blind sends its next event at the end of the
-    refractory period, so many intervals are alike. Where they do not pile up, only a bound is known.
+    A pixel whose light has moved by more than a threshold while it was blind sends its next event at the end of
+    the refractory period, so many intervals are alike. Where they do not pile up, only a bound is known.
 
     Args:
         events: Recordings of one sensor.
     """
-    shortest = shortest_interval_s(events)
+    shortest, tick_us = shortest_interval_s(events), max(tick_of(one) for one in events)
     if not math.isfinite(shortest):
         return Estimate("refractory_s", 0.0, 0.0, math.inf, "not identified")
     gaps = []
@@ -116,7 +130,7 @@ def refractory_of(events: Sequence[Events]) -> Estimate:
     base = shortest * 1e6
     pile = every[(every >= 0.98 * base - 1) & (every <= 1.05 * base + 1)]
     above = np.count_nonzero((every > 1.05 * base + 1) & (every <= 1.12 * base + 3))
-    if len(pile) < _FEWEST_PAIRS or len(pile) < _PILE * max(above, 1) or base < 3:
+    if len(pile) < _FEWEST_PAIRS or len(pile) < _PILE * max(above, 1) or base < _FINE_TICKS * tick_us:
         return Estimate("refractory_s", 0.0, 0.0, shortest, "at most")
     low, middle, high = np.quantile(pile, (0.025, 0.5, 0.975))
     return Estimate(
@@ -129,8 +143,8 @@ def compared(
 ) -> tuple[Comparison, ...]:
     """Return the likelihood of held-out pixels under each model, the best first.
 
-    The statistics' mean is normal: around the mean of simulations with posterior draws, with the covariance that the
-    model gives to it and that of the draws.
+    The statistics' mean is normal: around the mean of simulations with posterior draws, with the
+    covariance that the model gives to it and that of the draws.
 
     Args:
         fits: The fitted models.

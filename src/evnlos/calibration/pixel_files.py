@@ -1,10 +1,11 @@
-"""Files of recordings under known light: manifests, event files, captures, frames, and doubts about the light."""
+"""Files of recordings under known light: manifests, event files, captures, frames; doubts about the light."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from evnlos.types import Events
 
 _DARKEST, _BRIGHTEST = 0.02, 0.97  # of white, between which a frame counts as linear
 _LAMPS_HZ = (100.0, 120.0)
+_LINE = 3.0  # times the strength of the frequencies beside it that makes a line
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def read_lit_events(one: LitFile, white: float = WHITE_DN) -> LitEvents:
     return LitEvents(path.name, events, known, (high_us - low_us) * 1e-6, chosen, frames, times)
 
 
-def _frames_of(path: Path, known: KnownLight, events: Events) -> tuple[NDArray, NDArray[np.float64]]:
+def _frames_of(path: Path, known: KnownLight, events: Events) -> tuple[NDArray, NDArray[np.floating[Any]]]:
     """Return frames in DN and their times on the events' clock, seconds."""
     if not known.frames:
         found = read_timed_frames(path)
@@ -170,12 +172,17 @@ def doubts_of(one: LitEvents) -> list[str]:
         excess = math.sqrt(max(float(bins.var() - bins.mean()), 0.0)) / max(float(bins.mean()), 1e-9)
         if excess > 0.3 and bins.mean() >= 10:
             found.append(
-                f"{one.name}: the event rate varies by {100 * excess:.0f} % over the recording; its light was not "
-                "constant, or the scene moved"
+                f"{one.name}: the event rate varies by {100 * excess:.0f} % over the recording; its light was "
+                "not constant, or the scene moved"
             )
     if one.light.kind in ("static", "unknown") and count > 100 and one.seconds > 0.1:
         for hertz in _LAMPS_HZ:
-            line = abs(np.exp(2j * np.pi * hertz * time_s).mean())
-            if line > max(0.1, 5 / math.sqrt(count)):
-                found.append(f"{one.name}: events come at {hertz:.0f} Hz (strength {line:.2f}); lamps flicker")
+            strength = [
+                float(abs(np.exp(2j * np.pi * (hertz + shift / one.seconds) * time_s).mean()))
+                for shift in (0, -8, -6, -4, 4, 6, 8)
+            ]
+            if strength[0] > max(0.1, 5 / math.sqrt(count), _LINE * max(strength[1:])):
+                found.append(
+                    f"{one.name}: events come at {hertz:.0f} Hz (strength {strength[0]:.2f}); lamps flicker"
+                )
     return found

@@ -6,16 +6,16 @@ average, and u its free numbers on a scale on which their range is a standard no
     log p(u | s) = -1/2 (s - m(u))^T C^-1 (s - m(u)) - 1/2 u^T u,
 
 C from the scatter of the pixels (a synthetic likelihood: Wood, Nature 466, 2010). An ensemble of simulations is
-driven towards s by Kalman updates (Iglesias, Law and Stuart, Inverse Problems 29, 2013) whose tolerance falls from
-step to step; around what it finds, m is a quadratic polynomial fitted to simulations, each with mismatch and noise of
-its own, and the posterior is sampled. Where the model explains s no better than chance allows, C is as it is; where
-it explains it worse, C is widened by the excess.
+driven towards s by Kalman updates (Iglesias, Law and Stuart, Inverse Problems 29, 2013) whose tolerance falls
+from step to step; around what it finds, m is a quadratic polynomial fitted to simulations, each with mismatch
+and noise of its own, and the posterior is sampled. Where the model explains s as well as chance allows, C is as
+it is; where it explains it worse, C is widened by the excess.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import NormalDist
@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.calibration.event_models import Free
-from evnlos.calibration.pixel_light import LitRecording
+from evnlos.calibration.pixel_light import LitRecording, part_of
 from evnlos.calibration.pixel_posterior import NEAR, Surface, clipped, updated
 from evnlos.calibration.pixel_statistics import (
     Array,
@@ -45,9 +45,12 @@ from evnlos.types import derive_seed
 MISMATCH = "mismatch"
 """Free number of a candidate: standard deviation of the thresholds over the mean of the two."""
 _FLOORS = (0.6, 0.2, 0.07, 0.025)  # tolerances of the ensemble's updates, on the scale of the statistics
-_ROUNDS = 5
+_LEAST = (0.3, 0.12, 0.05, 0.02, 0.008, 0.004)  # least scatter of the last rounds: wide first
 _SHARED = 1.6  # standard deviations of the last simulations within which earlier ones are used again
 _NARROWED = 1.7  # mean ratio of their standard deviations to those asked for, above which another round follows
+_MAY_BE_NONE = (MISMATCH, "leak_rate_hz", "shot_noise_rate_hz", "leak_rate_per_dn_hz")
+_STUCK = 0.6  # misfit at which an attempt may have ended beside the likeliest place
+_ATTEMPTS = 3
 _REPLICATES = 4
 _STEP_S = 1.5e-4  # of a circuit pixel with the default follower
 _CIRCUIT_STEPS = 4_000_000  # of pixels and time, in one simulation
@@ -89,7 +92,7 @@ CANDIDATES: dict[str, tuple[PixelSettings, tuple[Free, ...]]] = {
         ),
     ),
 }
-"""Event models that may be fitted: a start, and the free numbers with the range in which they are looked for."""
+"""Event models that may be fitted: a start, and the free numbers with the range that is searched."""
 
 
 @dataclass(frozen=True)
@@ -173,15 +176,17 @@ class CandidateFit:
     Args:
         name: Name in `CANDIDATES`.
         pixel: The pixel at the median of the posterior; what is not told from none is none.
+        start: The settings that were not fitted, the refractory period among them.
         free: What was fitted.
         draws: Posterior draws on the normal scale, [S, P].
         estimates: Each free number, and the standard deviation of the thresholds.
-        misfit: Squared distance of the statistics from the model's, over their number; 1 is chance.
+        misfit: Mean squared distance of the statistics from the model's, in standard errors; 1 is chance.
         correlation: Posterior correlation of the free numbers, [P, P].
     """
 
     name: str
     pixel: PixelSettings
+    start: PixelSettings
     free: tuple[Free, ...]
     draws: Array
     estimates: tuple[Estimate, ...]
@@ -190,7 +195,7 @@ class CandidateFit:
 
     def drawn(self, index: int) -> PixelSettings:
         """Return the pixel of a posterior draw."""
-        return pixel_at(CANDIDATES[self.name][0], self.free, self.draws[index % len(self.draws)])
+        return pixel_at(self.start, self.free, self.draws[index % len(self.draws)])
 
 
 def panels_of(recordings: Sequence[LitRecording], like: Panels | None = None) -> Panels:
@@ -251,26 +256,7 @@ def shortened(name: str, recordings: Sequence[LitRecording]) -> list[LitRecordin
         return list(recordings)
     few = min(pixels, max(_CIRCUIT_PX, int(_CIRCUIT_STEPS * _STEP_S / total)))
     seconds = _CIRCUIT_STEPS * _STEP_S / few / len(recordings)
-    return [_part(one, few, seconds) for one in recordings]
-
-
-def _part(recording: LitRecording, pixels: int, seconds: float) -> LitRecording:
-    count = int(np.searchsorted(recording.times_s, seconds, "right"))
-    times, light = recording.times_s[:count], recording.light[:count, :, :pixels]
-    if count < 2 or times[-1] < min(seconds, recording.times_s[-1]):
-        end = min(seconds, float(recording.times_s[-1]))
-        share = np.float32(
-            (end - recording.times_s[count - 1])
-            / np.diff(recording.times_s)[min(count, len(recording.times_s) - 1) - 1]
-        )
-        following = recording.light[min(count, len(recording.times_s) - 1), :, :pixels]
-        times = np.append(times, end)
-        light = np.concatenate([light, (light[-1] + share * (following - light[-1]))[None]])
-    events = recording.events
-    kept = (events.x < pixels) & (events.t_us <= round(float(times[-1]) * 1e6))
-    few = replace(events[kept], width=pixels)
-    crossing = None if recording.crossing_s is None else recording.crossing_s[:pixels]
-    return replace(recording, light=np.ascontiguousarray(light), times_s=times, events=few, crossing_s=crossing)
+    return [part_of(one, few, seconds) for one in recordings]
 
 
 def fit_candidate(
@@ -289,63 +275,94 @@ def fit_candidate(
         refractory_s: Dead time of the pixels, seconds, for models that have one.
         progress: Called after each simulation.
     """
-    start, free = CANDIDATES[name]
+    start, free = CANDIDATES[name][0], within_reach(CANDIDATES[name][1], panels)
     if hasattr(start, "refractory_s"):
         start = replace(start, refractory_s=refractory_s)  # type: ignore[type-var]
-    free = within_reach(free, panels)
-    seed = derive_seed(settings.seed, "pixel fit", name)
-    draw = np.random.default_rng(seed)
-    scale, target = panels.scale, panels.scale.of(panels.statistics)
-    total = len(_FLOORS) * settings.ensemble + _ROUNDS * settings.simulations
-    done = 0
-
-    def run(u: Array) -> Array:
-        nonlocal done
-        found = panels.simulate(pixel_at(start, free, u), derive_seed(seed, "simulation", done))
-        done += 1
-        progress(Step(f"fit {name}", done, total, "simulations"))
-        return found
-
-    progress(Step(f"fit {name}", 0, total, "simulations"))
-    own = scale.covariance(panels.statistics, panels.statistics.mean(axis=0))
-    ensemble = 0.9 * draw.standard_normal((settings.ensemble, len(free)))
-    for floor in _FLOORS:
-        made = np.stack([scale.of(run(u)) for u in ensemble])
-        ensemble = updated(ensemble, made, target, own + floor**2 * np.eye(len(target)), draw)
-    centre, spread = ensemble.mean(axis=0), np.cov(ensemble.T) + 0.05**2 * np.eye(len(free))
-    draws, misfit = ensemble, math.nan
-    tried, seen = np.zeros((0, len(free))), np.zeros((0, len(target)))
-    for _ in range(_ROUNDS):
-        scatter = clipped(NEAR**2 * spread, 0.005, 0.7)
-        design = (
-            centre + draw.standard_normal((settings.simulations, len(free))) @ np.linalg.cholesky(scatter).T
-        )
-        design = np.clip(design, -3.2, 3.2)
-        seen = np.concatenate([seen, [scale.of(run(u)) for u in design]])
-        tried = np.concatenate([tried, design])
-        away = np.linalg.solve(np.linalg.cholesky(scatter), (tried - centre).T)
-        near = (away**2).sum(axis=0) < _SHARED**2 * len(free)  # those of earlier rounds, too
-        covariance = _covariance(panels, partial(pixel_at, start, free), centre, seed)
-        surface = Surface.fitted(tried[near], seen[near], centre, scatter)
-        draws, misfit = surface.posterior(target, covariance, draw)
-        before, centre, spread = centre, draws.mean(axis=0), np.cov(draws.T)
-        shift = (centre - before) @ np.linalg.solve(scatter, centre - before)
-        narrowed = np.linalg.slogdet(scatter)[1] - np.linalg.slogdet(NEAR**2 * spread)[1]
-        if shift < 0.5 * len(free) and narrowed < 2.0 * len(free) * math.log(_NARROWED):
-            break
-    progress(Step(f"fit {name}", total, total, "simulations"))
+    search = _Search(name, panels, settings, start, free, progress)
+    found = [search.attempt(0)]
+    while found[-1][1] > _STUCK and len(found) < _ATTEMPTS:
+        found.append(search.attempt(len(found)))
+    draws, _ = min(found, key=lambda one: one[1])
+    misfit = search.misfit(draws.mean(axis=0))
     estimates = tuple(_estimate(one, draws[:, k]) for k, one in enumerate(free))
     pixel = pixel_at(start, free, np.median(draws, axis=0))
     for one in estimates:
-        if one.state == "at most" and one.name in ("leak_rate_hz", "shot_noise_rate_hz", "leak_rate_per_dn_hz"):
+        if one.state == "at most" and one.name in _MAY_BE_NONE[1:]:
             pixel = replace(pixel, **{one.name: 0.0})  # type: ignore[type-var]
     if isinstance(pixel, EventPixel):
         pixel = replace(pixel, initial_phase=None)
-    sigma = [pixel_at(start, free, u).threshold_sigma for u in draws[:: max(1, len(draws) // 256)]]
-    ratio = next(one for one in estimates if one.name == MISMATCH)
-    low, middle, high = np.quantile(sigma, (0.025, 0.5, 0.975))
-    estimates += (Estimate("threshold_sigma", float(middle), float(low), float(high), ratio.state),)
-    return CandidateFit(name, pixel, free, draws, estimates, misfit, np.corrcoef(draws.T))
+    on, off, ratio = (value_of(one, draws[:, k]) for k, one in enumerate(free[:3]))
+    low, middle, high = (float(q) for q in np.quantile(ratio * 0.5 * (on + off), (0.025, 0.5, 0.975)))
+    estimates += (Estimate("threshold_sigma", middle, low, high, estimates[2].state),)
+    return CandidateFit(name, pixel, start, free, draws, estimates, misfit, np.asarray(np.corrcoef(draws.T)))
+
+
+class _Search:
+    """Attempts to find the posterior of a model: an ensemble to come near, polynomials to be exact."""
+
+    def __init__(
+        self,
+        name: str,
+        panels: Panels,
+        settings: PixelFitSettings,
+        start: PixelSettings,
+        free: Sequence[Free],
+        progress: Progress,
+    ) -> None:
+        self._name, self._panels, self._settings = name, panels, settings
+        self._pixel, self._size, self._progress = partial(pixel_at, start, free), len(free), progress
+        self._target = panels.scale.of(panels.statistics)
+        self._seed = derive_seed(settings.seed, "pixel fit", name)
+        self._done, self._total = 0, 0
+
+    def _means(self, u: Array) -> Array:
+        """Return the scaled means of simulations at positions [M, P], [M, K]."""
+        found = []
+        for one in u:
+            seed = derive_seed(self._seed, "simulation", self._done)
+            found.append(self._panels.scale.of(self._panels.simulate(self._pixel(one), seed)))
+            self._done += 1
+            self._progress(Step(f"fit {self._name}", self._done, self._total, "simulations"))
+        return np.stack(found)
+
+    def attempt(self, number: int) -> tuple[Array, float]:
+        """Return posterior draws [S, P], and the misfit of the likeliest."""
+        panels, settings, target, size = self._panels, self._settings, self._target, self._size
+        draw = np.random.default_rng(derive_seed(self._seed, "attempt", number))
+        self._total += len(_FLOORS) * settings.ensemble + len(_LEAST) * settings.simulations
+        self._progress(Step(f"fit {self._name}", self._done, self._total, "simulations"))
+        own = panels.scale.covariance(panels.statistics, panels.statistics.mean(axis=0))
+        ensemble = 0.9 * draw.standard_normal((settings.ensemble, size))
+        for floor in _FLOORS:
+            error = own + floor**2 * np.eye(len(target))
+            ensemble = updated(ensemble, self._means(ensemble), target, error, draw)
+        centre, spread = ensemble.mean(axis=0), np.cov(ensemble.T) + 0.05**2 * np.eye(size)
+        draws, miss = ensemble, math.inf
+        tried, seen = np.zeros((0, size)), np.zeros((0, len(target)))
+        for least in _LEAST:
+            scatter = clipped(NEAR**2 * spread, least, 0.7)
+            root = np.linalg.cholesky(scatter)
+            design = np.clip(centre + draw.standard_normal((settings.simulations, size)) @ root.T, -3.2, 3.2)
+            tried, seen = np.concatenate([tried, design]), np.concatenate([seen, self._means(design)])
+            away = np.linalg.solve(root, (tried - centre).T)
+            near = (away**2).sum(axis=0) < _SHARED**2 * size  # those of earlier rounds, too
+            covariance = _covariance(panels, self._pixel(centre), self._seed)[0]
+            draws, miss = Surface.fitted(tried[near], seen[near], centre, scatter).posterior(
+                target, covariance, draw
+            )
+            before, centre, spread = centre, draws.mean(axis=0), np.cov(draws.T)
+            shift = (centre - before) @ np.linalg.solve(scatter, centre - before)
+            narrowed = np.linalg.slogdet(scatter)[1] - np.linalg.slogdet(NEAR**2 * spread)[1]
+            if shift < 0.5 * size and narrowed < 2.0 * size * math.log(_NARROWED):
+                break
+        self._progress(Step(f"fit {self._name}", self._total, self._total, "simulations"))
+        return draws, miss
+
+    def misfit(self, u: Array) -> float:
+        """Return the mean squared distance of the statistics from simulations at u, in standard errors."""
+        covariance, expected = _covariance(self._panels, self._pixel(u), derive_seed(self._seed, "misfit"))
+        miss = self._target - self._panels.scale.of(expected)
+        return float(np.mean(miss**2 / (np.diag(covariance) * (1.0 + 1.0 / _REPLICATES))))
 
 
 def within_reach(free: Sequence[Free], panels: Panels) -> tuple[Free, ...]:
@@ -359,16 +376,17 @@ def within_reach(free: Sequence[Free], panels: Panels) -> tuple[Free, ...]:
     )
 
 
-def _covariance(panels: Panels, pixel: Callable[[Array], PixelSettings], centre: Array, seed: int) -> Array:
-    """Return the covariance of the recorded means: of pixels about what the model expects of each."""
-    made = [panels.simulate(pixel(centre), derive_seed(seed, "covariance", k)) for k in range(_REPLICATES)]
+def _covariance(panels: Panels, pixel: PixelSettings, seed: int) -> tuple[Array, Array]:
+    """Return the covariance of the recorded means about what a model expects of each pixel, and that."""
+    made = [panels.simulate(pixel, derive_seed(seed, "covariance", k)) for k in range(_REPLICATES)]
     expected = np.mean(made, axis=0)
     about = panels.statistics.mean(axis=0)
     recorded = panels.scale.covariance(panels.statistics - expected, about)
     model = np.mean([panels.scale.covariance(one - expected, about) for one in made], axis=0)
     # Differences from a mean of R draws hold (R + 1) / R, or (R - 1) / R, of the variance of one.
     half = 0.5 * recorded * _REPLICATES / (_REPLICATES + 1) + 0.5 * model * _REPLICATES / (_REPLICATES - 1)
-    return half + np.diag((0.1 * panels.scale.unit / np.sqrt(about**2 + panels.scale.unit**2)) ** 2)
+    least = np.diag((0.1 * panels.scale.unit / np.sqrt(about**2 + panels.scale.unit**2)) ** 2)
+    return half + least, expected
 
 
 def _estimate(free: Free, draws: Array) -> Estimate:
@@ -377,12 +395,7 @@ def _estimate(free: Free, draws: Array) -> Estimate:
     state = "identified"
     if shares[1] - shares[0] > 0.5:
         state = "not identified"
-    elif shares[0] < 0.05 and free.name in (
-        MISMATCH,
-        "leak_rate_hz",
-        "shot_noise_rate_hz",
-        "leak_rate_per_dn_hz",
-    ):
+    elif shares[0] < 0.05 and free.name in _MAY_BE_NONE:
         state = "at most"
-    values = [float(value_of(free, u)) for u in (middle, low, high)]
-    return Estimate(free.name, *values, state)
+    value, least, most = (float(value_of(free, u)) for u in (middle, low, high))
+    return Estimate(free.name, value, least, most, state)

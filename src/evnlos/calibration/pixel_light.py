@@ -1,6 +1,6 @@
 """Recordings under known light: what a fit of the event pixel starts from.
 
-A recording tells of a pixel what its light tells. The light is known in one of five ways (`KnownLight`): constant,
+The light is known in one of five ways (`KnownLight`): constant,
 a sine, a square wave, an edge that moves over the sensor, or frames of the same pixels. Light is in DN, 255 =
 white. Chosen pixels stand side by side in one row: light [T, 1, N], events on a sensor of N x 1 pixels, so that
 whole pixels can be left out or held out.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +45,9 @@ class KnownLight:
     """The light of a recording.
 
     Args:
-        kind: static: constant. sine, square: level (1 +- contrast). edge: the light goes from level / sqrt(ratio)
-            to level sqrt(ratio) where the edge passes, once. frames: the video or the frames of the capture.
-            unknown: it is not known, and no threshold is either.
+        kind: static: constant. sine, square: level (1 +- contrast). edge: the light goes from level /
+            sqrt(ratio) to level sqrt(ratio) where the edge passes, once. frames: the video, or the frames of
+            the capture. unknown: it is not known, and no threshold is either.
         level: Light, on the scale of `white`; of a modulation its mean.
         frequency_hz: Frequency of the modulation, hertz.
         contrast: Its amplitude, a fraction of the level, above 0 and below 1.
@@ -151,7 +151,7 @@ class LitEvents:
     seconds: float
     inside: NDArray[np.bool_]
     frames: NDArray[np.float32] | None = None
-    frame_times_s: NDArray[np.float64] | None = None
+    frame_times_s: NDArray[np.floating[Any]] | None = None
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ def lit_recording(one: LitEvents, pixels: NDArray[np.int64], most_s: float) -> L
     crossing = None
     if one.frames is not None and one.frame_times_s is not None:
         count = max(3, min(len(one.frame_times_s), int(np.searchsorted(one.frame_times_s, seconds, "right"))))
-        times = one.frame_times_s[:count]
+        times = np.asarray(one.frame_times_s[:count], np.float64)
         light = one.frames[:count, y, x]
         seconds = float(times[-1])
     elif known.kind == "edge":
@@ -256,6 +256,28 @@ def lit_recording(one: LitEvents, pixels: NDArray[np.int64], most_s: float) -> L
     few = Events(events.t_us[kept], column[kept].astype(np.uint16), row, events.p[kept], len(pixels), 1)
     lit = np.ascontiguousarray(light[:, None, :], np.float32)
     return LitRecording(lit, times, few, known=known, crossing_s=crossing)
+
+
+def part_of(recording: LitRecording, pixels: int, seconds: float) -> LitRecording:
+    """Return the first pixels and seconds of a recording.
+
+    Args:
+        recording: Light and events.
+        pixels: Pixels at most.
+        seconds: Seconds at most.
+    """
+    end = min(seconds, float(recording.times_s[-1]))
+    count = int(np.searchsorted(recording.times_s, end, "right"))
+    times, light = recording.times_s[:count], recording.light[:count, :, :pixels]
+    if times[-1] < end:
+        share = np.float32((end - times[-1]) / (recording.times_s[count] - times[-1]))
+        following = recording.light[count, :, :pixels]
+        times = np.append(times, end)
+        light = np.concatenate([light, (light[-1] + share * (following - light[-1]))[None]])
+    kept = (recording.events.x < pixels) & (recording.events.t_us <= round(end * 1e6))
+    few = replace(recording.events[kept], width=pixels)
+    crossing = None if recording.crossing_s is None else recording.crossing_s[:pixels]
+    return replace(recording, light=np.ascontiguousarray(light), times_s=times, events=few, crossing_s=crossing)
 
 
 def waveform(known: KnownLight, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

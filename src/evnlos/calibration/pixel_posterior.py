@@ -1,12 +1,13 @@
 """Finding the posterior of a few numbers from simulations: an ensemble to come near, a polynomial to be exact.
 
 - Ensemble Kalman updates drive a cloud of positions towards what was observed.
-- A quadratic polynomial stands for the simulation around the result, and a random walk draws from the posterior.
+- A quadratic polynomial stands for the simulation around the result; a random walk draws from the posterior.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from evnlos.calibration.pixel_statistics import Array
 NEAR = 1.5
 """Standard deviations of the posterior by which the last simulations scatter."""
 _REACH = 3.0  # standard deviations of these simulations beyond which the polynomial is not believed
-_CHAINS, _SWEEPS = 64, 400
+_CHAINS, _SWEEPS = 64, 240
 _KEPT = 2048  # posterior draws
 
 
@@ -71,50 +72,67 @@ class Surface:
 
     def posterior(self, target: Array, covariance: Array, draw: np.random.Generator) -> tuple[Array, float]:
         """Return posterior draws [S, P], and the misfit: squared distance over its degrees of freedom."""
+        # What the polynomial misses counts as noise of each statistic: on the safe side, as many are alike.
         missed = np.maximum(np.diag(self.residual) - np.diag(covariance), 0.0)
-        error = covariance * (1.0 + self.error) + np.diag(missed) * (1.0 + self.error)
+        error = (covariance + np.diag(missed)) * (1.0 + self.error)
         white = np.linalg.inv(np.linalg.cholesky(error)).T
         aim, terms = target @ white, self.terms @ white
         full = len(terms) > 1 + 2 * len(self.centre)
 
-        def score(u: Array, widening: float) -> tuple[Array, Array]:
+        size, freedom = len(self.centre), max(len(target) - len(self.centre), 1)
+
+        def miss_of(u: Array) -> Array:
             v = np.linalg.solve(self.root, (u - self.centre).T).T
             powers = _powers(v) if full else np.concatenate([np.ones((len(v), 1)), v, v * v], axis=1)
-            distance = ((aim - powers @ terms) ** 2).sum(axis=1)
-            far = np.linalg.norm(v, axis=1) / math.sqrt(u.shape[1])
-            outside = np.where(far > _REACH, 1e3 * (far - _REACH) ** 2, 0.0) + 1e3 * np.maximum(
-                abs(u) - 3.5, 0
-            ).sum(1)
-            return -0.5 * distance / widening - 0.5 * (u**2).sum(axis=1) - outside, distance
+            return aim - powers @ terms
 
-        size = len(self.centre)
-        at = self.centre + 0.5 * draw.standard_normal((_CHAINS, size)) @ self.root.T
-        widening, step = 1.0, self.root * (2.4 / math.sqrt(size) / NEAR)
+        def score(u: Array, widening: float) -> Array:
+            far = np.linalg.norm(np.linalg.solve(self.root, (u - self.centre).T), axis=0) / math.sqrt(size)
+            outside = np.maximum(far - _REACH, 0.0) ** 2 + np.maximum(abs(u) - 3.5, 0.0).sum(axis=1)
+            distance = (miss_of(u) ** 2).sum(axis=1)
+            return -0.5 * distance / widening - 0.5 * (u**2).sum(axis=1) - 1e3 * outside
+
+        best, slope = self._best(miss_of, score)
+        misfit = float((miss_of(best[None]) ** 2).sum()) / freedom
+        widening = max(1.0, misfit)
+        step = np.linalg.cholesky(np.linalg.inv(slope.T @ slope / widening + np.eye(size)))
+        at = best + draw.standard_normal((_CHAINS, size)) @ step.T
         kept: list[Array] = []
-        freedom = max(len(target) - size, 1)
-        for phase in range(4):
-            now, distance = score(at, widening)
-            kept = []
+        for _ in range(2):
+            now, kept = score(at, widening), []
             for sweep in range(_SWEEPS):
-                factor = math.exp(draw.normal(-0.5, 0.8))
+                factor = 2.4 / math.sqrt(size) * math.exp(draw.normal(-0.3, 0.7))
                 trial = at + factor * draw.standard_normal(at.shape) @ step.T
-                value, far = score(trial, widening)
+                value = score(trial, widening)
                 taken = np.log(draw.random(len(at))) < value - now
                 at, now = np.where(taken[:, None], trial, at), np.where(taken, value, now)
-                distance = np.where(taken, far, distance)
-                if sweep >= _SWEEPS // 2:
+                if sweep >= _SWEEPS // 3:
                     kept.append(at.copy())
             every = np.concatenate(kept)
-            step = np.linalg.cholesky(np.cov(every.T) + 1e-8 * np.eye(size)) * (2.4 / math.sqrt(size))
-            if phase < 2:  # the best point decides whether the model explains the statistics
-                widening = max(1.0, float(distance.min()) / freedom)
-                at = (
-                    at[draw.integers(0, len(at), len(at))]
-                    if phase
-                    else at[np.argsort(-now)[np.arange(len(at)) % 16]]
-                )
+            step = np.linalg.cholesky(np.cov(every.T) + 1e-10 * np.eye(size))
         every = np.concatenate(kept)
-        return every[:: max(1, len(every) // _KEPT)], float(distance.min()) / freedom
+        return every[:: max(1, len(every) // _KEPT)], misfit
+
+    def _best(
+        self, miss_of: Callable[[Array], Array], score: Callable[[Array, float], Array]
+    ) -> tuple[Array, Array]:
+        """Return the likeliest position by Gauss and Newton, and the slope of what is missed there, [K, P]."""
+        at, damping = self.centre.copy(), 1e-2
+        small = 1e-3 * self.root
+
+        def slope_at(u: Array) -> Array:
+            change = miss_of(u + small.T) - miss_of(u - small.T)  # along the scatter's axes
+            return np.linalg.solve(2.0 * small.T, change).T
+
+        for _ in range(40):
+            slope, miss = slope_at(at), miss_of(at[None])[0]
+            curve = slope.T @ slope + np.eye(len(at))
+            step = np.linalg.solve(curve + damping * np.diag(np.diag(curve)), -slope.T @ miss - at)
+            if score((at + step)[None], 1.0)[0] > score(at[None], 1.0)[0]:
+                at, damping = at + step, max(damping / 5, 1e-9)
+            else:
+                damping = min(damping * 6, 1e9)
+        return at, slope_at(at)
 
 
 def _powers(v: Array) -> Array:

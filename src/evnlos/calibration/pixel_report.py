@@ -21,6 +21,7 @@ from evnlos.calibration.pixel_checks import (
     numbers_of,
     predicted,
     refractory_of,
+    tick_of,
 )
 from evnlos.calibration.pixel_files import Manifest, doubts_of, read_lit_events
 from evnlos.calibration.pixel_fit import (
@@ -63,6 +64,7 @@ UNITS = {
 }
 """Unit of each number."""
 _BAD_FIT = 2.0
+_COARSE_US = 20
 _LEVELS_OF_FRAMES = (0.1, 0.5, 0.9)
 
 
@@ -126,6 +128,12 @@ def fit_known_light(
     progress(Step("read", len(sources), len(sources), "recordings"))
     warnings = [line for one in sources for line in doubts_of(one)]
     refractory = refractory_of([one.events for one in sources])
+    ticks = {one.name: tick_of(one.events) for one in sources}
+    warnings += [
+        f"{name}: time stamps are multiples of {tick} us; shorter intervals say nothing"
+        for name, tick in ticks.items()
+        if tick > _COARSE_US
+    ]
     panel = choose_panel(sources, settings.pixels, settings.seed)
     hot_rate = _hot_rate(sources, panel.hot)
     seconds = {one.name: one.seconds for one in sources}
@@ -136,8 +144,8 @@ def fit_known_light(
     known = [one for one in sources if one.light.kind != "unknown"]
     if not known:
         warnings.append(
-            "the light of no recording is known: thresholds, mismatch, bandwidth, leak and noise against light are "
-            "not identified; give --light, a capture folder with frames, or a manifest"
+            "the light of no recording is known: thresholds, mismatch, bandwidth, leak and noise against light "
+            "are not identified; give --light, a capture folder with frames, or a manifest"
         )
         return KnownLightFit(
             None, None, (), (), refractory, None, (), None, observed, int(panel.hot.sum()), hot_rate,
@@ -174,8 +182,8 @@ def fit_known_light(
         share = float(panel.hot.mean())
         pixel = ReadoutPixel(pixel, event_s=0.0, hot_pixel_fraction=share, hot_pixel_rate_hz=hot_rate)
     return KnownLightFit(
-        pixel, best, tuple(fits), ranking, refractory, checks, lights, maps, observed, int(panel.hot.sum()), hot_rate,
-        manifest.white, seconds, tuple(warnings),
+        pixel, best, tuple(fits), ranking, refractory, checks, lights, maps, observed, int(panel.hot.sum()),
+        hot_rate, manifest.white, seconds, tuple(warnings),
     )  # fmt: skip
 
 
@@ -293,10 +301,8 @@ def lines_of_fit(fit: KnownLightFit) -> list[str]:
         lines.insert(0, f"{fit.best.name}: value (95 % interval), misfit {fit.best.misfit:.2f} (1 is chance)")
     for one in fit.lights:
         corner = f"{one.bandwidth_hz[0]:.3g} Hz" if math.isfinite(one.bandwidth_hz[0]) else "none in this model"
-        lines.append(
-            f"  at {one.light_dn:6.3g} DN: noise ON {one.on_hz[0]:.3g} ({one.on_hz[1]:.3g} to {one.on_hz[2]:.3g}) Hz, OFF "
-            f"{one.off_hz[0]:.3g} ({one.off_hz[1]:.3g} to {one.off_hz[2]:.3g}) Hz; bandwidth {corner}"
-        )
+        on, off = (f"{mid:.3g} ({low:.3g} to {high:.3g}) Hz" for mid, low, high in (one.on_hz, one.off_hz))
+        lines.append(f"  at {one.light_dn:6.3g} DN: noise ON {on}, OFF {off}; bandwidth {corner}")
     if len(fit.compared) > 1:
         lines.append("held-out pixels, log likelihood behind the best model:")
         for one in fit.compared:
@@ -312,7 +318,7 @@ def lines_of_fit(fit: KnownLightFit) -> list[str]:
         failed = [one for one in checks if not one.passed]
         lines.append(f"predictive checks: {len(checks) - len(failed)} of {len(checks)} pass")
         lines += [
-            f"  fails: {one.name} of {one.recording}: {one.recorded:.4g}, the model {one.low:.4g} to {one.high:.4g}"
+            f"  fails: {one.name} of {one.recording}: {one.recorded:.4g}, model {one.low:.4g} to {one.high:.4g}"
             for one in failed[:8]
         ]
     for name, numbers in fit.observed.items():

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from evnlos.calibration.pixel_light import LitRecording
 from evnlos.cameras import PixelSettings
 from evnlos.types import Events, derive_seed
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 _QUANTILES = (0.02, 0.15, 0.5, 0.85)  # of the intervals, between which they are counted
 _SWINGS = (0.15, 0.6)  # ranges of log light between pixels at rest, moving, and moving much
@@ -222,7 +223,6 @@ def simulated_events(recordings: Sequence[LitRecording], pixel: PixelSettings, s
         pixel: Their settings; they have long seen the first light.
         seed: Seed of mismatch and noise.
     """
-    sensor = replace(  # type: ignore[type-var]
-        pixel, pattern_seed=derive_seed(seed, "sensor"), initial_phase="random"
-    )
+    settled = {"pattern_seed": derive_seed(seed, "sensor"), "initial_phase": "random"}
+    sensor: PixelSettings = replace(pixel, **settled)  # type: ignore[type-var]
     return simulated(recordings, sensor, seed)

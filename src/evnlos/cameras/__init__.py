@@ -7,7 +7,7 @@ from evnlos.cameras.pixel import EventPixel, V2ePixel
 from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.circuit import CircuitPixel
 from evnlos.cameras.pixels.readout import FlickeringWall, ReadoutPixel
-from evnlos.cameras.sensors import CelexCamera, pixel_preset
+from evnlos.cameras.sensors import CelexCamera, load_pixel, pixel_preset
 from evnlos.cameras.simulation import EventStream, simulate_batch, simulate_events
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "PixelSettings",
     "ReadoutPixel",
     "V2ePixel",
+    "load_pixel",
     "pixel_preset",
     "simulate_batch",
     "simulate_events",

@@ -26,6 +26,7 @@ import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.readout import ReadoutPixel
 from evnlos.cameras.random_numbers import check_seed
 from evnlos.cameras.simulation import simulate_events
+from evnlos.config import load_yaml
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events
 
@@ -134,6 +136,25 @@ def pixel_preset(name: str) -> EventPixel | BrownianPixel:
         hint = f"did you mean {near[0]!r}?" if near else f"give one of {', '.join(PRESETS)}"
         raise ConfigError(f"there is no pixel preset {name!r}; {hint}")
     return PRESETS[name.lower()]()
+
+
+def load_pixel(word: str) -> PixelSettings:
+    """Return the pixel that a preset's name or a YAML file means: the one resolver of `--pixel`.
+
+    Args:
+        word: Name of a preset, or path of a file (.yaml) with the settings of any event model, as `evnlos pixel
+            fit` writes it.
+
+    Raises:
+        ConfigError: There is no such preset, or the file does not fit.
+
+    Example:
+        >>> load_pixel("paper").threshold_on
+        0.15
+    """
+    if Path(word).suffix in (".yaml", ".yml"):
+        return load_yaml(PixelSettings, word)
+    return pixel_preset(word)
 
 
 def _brighter(contrast: float) -> float:

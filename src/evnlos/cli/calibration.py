@@ -16,6 +16,7 @@ import tyro
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.calibration.settings import PRESETS, Calibration
+from evnlos.cameras import load_pixel
 from evnlos.cli.console import Flat, Folders, Presets
 from evnlos.cli.parsing import say
 from evnlos.config import to_dict
@@ -43,6 +44,9 @@ class CalibrateCommand:
     setup: str | None = None
     """Where the search starts, of the kind that is fitted: a name, a settings file, or a folder of
     `calibrate`."""
+    pixel: str | None = None
+    """The camera's event pixel, known from `evnlos pixel fit`: its YAML file or a preset's name. It is kept,
+    and not fitted behind the wall."""
     force: bool = False
     """Write the setup file also where the fit fails on the held-out captures, or where one exists."""
     json: bool = False
@@ -53,6 +57,13 @@ class CalibrateCommand:
     def with_setup(settings: Calibration, word: str) -> Calibration:
         """Return the calibration that starts from the setup of `--setup`."""
         return replace(settings, start=replace(settings.start, setup=load_setup(word)))
+
+    @staticmethod
+    def with_pixel(settings: Calibration, word: str) -> Calibration:
+        """Return the calibration that keeps the pixel of `--pixel`."""
+        start = settings.start
+        start = replace(start, setup=replace(start.setup, pixel=load_pixel(word)))
+        return replace(settings, start=start, events=False)
 
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""

@@ -20,6 +20,7 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 from tqdm import tqdm
 
+from evnlos.cameras import load_pixel
 from evnlos.cli.console import Flat, Folders, Presets, result
 from evnlos.cli.parsing import say
 from evnlos.data import (
@@ -61,6 +62,9 @@ class SimulateCommand:
     """The setup instead of the preset's: a name (main-near, matte-far, ...), a settings file, a folder that
     `evnlos calibrate` wrote, or a file of `evnlos scan import`. A name leaves the cameras to the preset; ranges
     over the preset's wall are dropped."""
+    pixel: str | None = None
+    """The event pixel instead of the setup's: a preset's name, or a YAML file, as `evnlos pixel fit`
+    writes it."""
     workers: int = 0
     """Processes; 0 = one for each core."""
     shard: str = "1/1"
@@ -89,6 +93,13 @@ class SimulateCommand:
             if not path.startswith("setup.") or is_camera(path)
         }
         return replace(settings, setup=setup, vary=over_cameras)
+
+    @staticmethod
+    def with_pixel(settings: Simulation, word: str) -> Simulation:
+        """Return the simulation with the pixel of `--pixel`, without the ranges over its settings."""
+        setup = replace(settings.setup, pixel=load_pixel(word))
+        vary = {path: ends for path, ends in settings.vary.items() if not path.startswith("setup.pixel")}
+        return replace(settings, setup=setup, vary=vary)
 
     def run(self) -> None:
         """Simulate, with a progress bar over the objects."""

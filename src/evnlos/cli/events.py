@@ -14,11 +14,11 @@ from tqdm import tqdm
 
 from evnlos.cameras.event_model import Phase, PixelSettings
 from evnlos.cameras.pixel import EventPixel, Logarithm, Mode
-from evnlos.cameras.sensors import pixel_preset
+from evnlos.cameras.sensors import load_pixel
 from evnlos.cameras.video import Tone, Video, check_video, open_video, video_events
 from evnlos.cli.parsing import say
 from evnlos.cli.recordings import amount, look_of, refuse_existing, write_preview
-from evnlos.config import load_yaml, to_dict
+from evnlos.config import to_dict
 from evnlos.errors import ConfigError
 from evnlos.events import EventWriter
 from evnlos.events.recording import CropOptions, Recording
@@ -121,7 +121,7 @@ class EventsCommand:
         if self.preview is not None:
             refuse_existing(self.preview, self.force)
         look = look_of(self.preview) if self.preview else None
-        pixel = self.changes.applied(_pixel(self.pixel))
+        pixel = self.changes.applied(load_pixel(self.pixel))
         writer = EventWriter(self.out, format=self.format)
         video = open_video(
             self.video,
@@ -158,12 +158,6 @@ class _Clock:
         for time_s, light in tqdm(video, total=video.frames, desc=name, unit=" frames", leave=False):
             self.frames, self.last_s = self.frames + 1, time_s
             yield time_s, light
-
-
-def _pixel(name: str) -> PixelSettings:
-    if Path(name).suffix in (".yaml", ".yml"):
-        return load_yaml(PixelSettings, name)
-    return pixel_preset(name)
 
 
 def _found(

@@ -144,7 +144,7 @@ def _command(verb: str, rest: list[str]) -> Any:
 
 
 def _defaults(command: type[Any], rest: list[str]) -> Any:
-    """Return the command with the settings of --preset, --config and --setup as defaults of the flags."""
+    """Return the command with what --preset, --config, --setup and --pixel name as defaults of the flags."""
     presets = getattr(command, "PRESETS", None)
     if presets is None:
         return None
@@ -161,6 +161,9 @@ def _defaults(command: type[Any], rest: list[str]) -> Any:
     word = _flag(rest, "--setup")
     if word is not None and hasattr(command, "with_setup"):
         settings = command.with_setup(settings, word)
+    word = _flag(rest, "--pixel")
+    if word is not None and hasattr(command, "with_pixel"):
+        settings = command.with_pixel(settings, word)
     settings = _of_kinds(settings, rest)
     required = {
         item.name: tyro.MISSING

@@ -77,15 +77,7 @@ def draw_calibration(fit: SetupFit, path: str | Path) -> None:
 
 
 def draw_pixel_fit(fit: KnownLightFit, path: str | Path) -> None:
-    """Draw predictive checks of a fitted event pixel: counts, intervals, all checks, noise against light.
-
-    Args:
-        fit: The fit, with checks.
-        path: PNG file to write.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """Draw a fit's predictive checks (counts, intervals, all of them) and noise against light as a PNG file."""
     assert fit.predicted is not None
     figure = new_figure((11.0, 7.0))
     axes = figure.subplots(2, 2)
@@ -99,24 +91,17 @@ def draw_pixel_fit(fit: KnownLightFit, path: str | Path) -> None:
         axis.set(xlabel=name, ylabel="share")
         axis.legend(frameon=False, fontsize=8)
     checks = fit.predicted.checks
-    place = np.arange(len(checks))
-    spread = [max(one.high - one.low, 1e-9) for one in checks]
-    score = [(c.recorded - 0.5 * (c.low + c.high)) / s for c, s in zip(checks, spread, strict=True)]
-    axes[1, 0].scatter(np.clip(score, -3, 3), place, c=["k" if one.passed else "C3" for one in checks], s=12)
-    axes[1, 0].axvspan(-0.5, 0.5, color="0.85")
+    middles = [(c.recorded - 0.5 * (c.low + c.high)) / max(c.high - c.low, 1e-9) for c in checks]
+    colours = ["k" if one.passed else "C3" for one in checks]
+    axes[1, 0].scatter(np.clip(middles, -3, 3), range(len(checks)), c=colours, s=12)
     names = [f"{one.name}, {one.recording}"[:60] for one in checks]
-    axes[1, 0].set_yticks(place, names, fontsize=max(3, min(7, 180 // max(len(checks), 1))))
+    axes[1, 0].set_yticks(range(len(checks)), names, fontsize=max(3, min(7, 180 // max(len(checks), 1))))
     axes[1, 0].set(xlabel="recorded, in 90 % ranges of the model (red: p beyond 0.01)")
-    lights = [one.light_dn for one in fit.lights]
-    for label, pairs in (
-        ("ON", [one.on_hz for one in fit.lights]),
-        ("OFF", [one.off_hz for one in fit.lights]),
-    ):
-        middle, low, high = np.array(pairs).T
-        axes[1, 1].errorbar(
-            lights, middle, [middle - low, high - middle], marker="o", ms=3, label=f"noise {label}"
-        )
-    axes[1, 1].set(xscale="symlog", xlabel="light, DN", ylabel="rate, Hz per pixel")
+    for sign in ("on", "off"):
+        middle, low, high = np.array([getattr(one, f"{sign}_hz") for one in fit.lights]).T
+        lights = [one.light_dn for one in fit.lights]
+        axes[1, 1].errorbar(lights, middle, [middle - low, high - middle], marker="o", ms=3, label=sign.upper())
+    axes[1, 1].set(xscale="symlog", xlabel="light, DN", ylabel="events without cause, Hz per pixel")
     axes[1, 1].legend(frameon=False, fontsize=8)
     save_figure(figure, path, dpi=100)
 

@@ -1,0 +1,219 @@
+"""`evnlos pixel fit`: an event pixel from recordings under known light, and what these do not tell."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evnlos.calibration import (
+    KnownLight,
+    LitRecording,
+    Manifest,
+    PixelFitSettings,
+    fit_candidate,
+    fit_known_light,
+    panels_of,
+    simulated_events,
+    waveform,
+)
+from evnlos.calibration.pixel_checks import refractory_of, tick_of
+from evnlos.calibration.pixel_files import LitFile, doubts_of, read_lit_events, read_manifest
+from evnlos.calibration.pixel_fit import CANDIDATES, MISMATCH, pixel_at, position_of, shortened, value_of
+from evnlos.cameras import BrownianPixel, EventPixel, PixelSettings, load_pixel, simulate_events
+from evnlos.cli import main
+from evnlos.config import load_yaml, save_yaml
+from evnlos.errors import ConfigError, DataError
+from evnlos.events import write_events
+from evnlos.types import Events
+
+QUICK = PixelFitSettings(("continuous",), pixels=80, ensemble=16, simulations=36, checks=12)
+LIGHTS = (
+    (KnownLight("sine", 60.0, 2.0, 0.7), 2.0),
+    (KnownLight("sine", 60.0, 20.0, 0.7), 0.3),
+    (KnownLight("static", 5.0), 5.0),
+    (KnownLight("static", 120.0), 5.0),
+)
+TRUTHS = {
+    "continuous": EventPixel(0.2, 0.27, 0.02, 60.0, 0.2, 1.0),
+    "brownian": BrownianPixel(0.2, 0.25, 0.015, 10.0, 0.2, 0.005, 0.3, 0.0),
+}
+
+
+def recorded(pixel: PixelSettings, seed: int, pixels: int = 80) -> list[LitRecording]:
+    """Return what a row of pixels records under `LIGHTS`."""
+    found = []
+    for light, seconds in LIGHTS:
+        times, level = waveform(light, seconds)
+        lit = np.repeat(level[:, None].astype(np.float32), pixels, axis=1)[:, None]
+        found.append(LitRecording(np.ascontiguousarray(lit), times, Events.empty(pixels, 1), known=light))
+    events = simulated_events(found, pixel, seed)
+    return [replace(one, events=sent) for one, sent in zip(found, events, strict=True)]
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_simulated_truth_comes_back_within_its_intervals(name: str) -> None:
+    """Two draws: of some 14 intervals at 95 %, one in twenty may miss, and few miss by much."""
+    truth, missed = TRUTHS[name], 0
+    for seed in (1, 2):
+        fit = fit_candidate(name, panels_of(recorded(truth, seed)), replace(QUICK, seed=seed))
+        for one in fit.estimates:
+            if one.name == MISMATCH or one.state == "not identified":
+                continue
+            value = getattr(truth, one.name)
+            missed += not (one.low if one.state == "identified" else 0.0) <= value <= one.high
+        assert fit.pixel.threshold_on == pytest.approx(truth.threshold_on, rel=0.05)
+        assert fit.pixel.threshold_off == pytest.approx(truth.threshold_off, rel=0.05)
+    assert missed <= 3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A manifest and recordings of a small sensor with a refractory period."""
+    path = tmp_path_factory.mktemp("recordings")
+    truth = EventPixel(0.2, 0.26, 0.02, 80.0, 0.15, 0.8, 1e-3, pattern_seed=4)
+    listed = []
+    for k, (light, seconds) in enumerate(
+        ((KnownLight("square", 70.0, 4.0, 0.85), 1.5), (KnownLight("static", 8.0), 5.0))
+    ):
+        times, level = waveform(light, seconds)
+        frames = np.repeat(level.astype(np.float32), 24 * 24).reshape(len(times), 24, 24)
+        write_events(path / f"r{k}.npz", simulate_events(frames, times, truth, seed=k))
+        listed.append(LitFile(f"r{k}.npz", light))
+    save_yaml(Manifest(tuple(listed)), path / "pixel_fit.yaml")
+    return path
+
+
+def test_the_command_writes_a_pixel_that_other_commands_take(folder, tmp_path, capsys) -> None:
+    out = tmp_path / "fit"
+    words = [
+        "--models",
+        "continuous",
+        "--pixels",
+        "80",
+        "--ensemble",
+        "16",
+        "--simulations",
+        "36",
+        "--checks",
+        "12",
+    ]
+    main(["pixel", "fit", str(folder / "pixel_fit.yaml"), "--out", str(out), *words])
+    shown = capsys.readouterr().out
+    assert "threshold_on" in shown and "predictive checks" in shown
+    values = json.loads((out / "pixel_fit.json").read_text())
+    found = {one["name"]: one for one in values["estimates"]}
+    assert found["refractory_s"]["value"] == pytest.approx(1e-3, abs=3e-6)
+    assert found["threshold_on"]["value"] == pytest.approx(0.2, rel=0.06)
+    assert {one["name"] for one in values["checks"]} >= {"ON / OFF", "share of alternating pairs"}
+    maps = np.load(out / "pixel_maps.npz")
+    assert maps["threshold_on"].shape == (24, 24) and (maps["error_on"] > 0).all()
+    assert set(values["maps"]["state"]) <= {"identified", "not identified"}
+    pixel = load_yaml(PixelSettings, out / "pixel.yaml")
+    assert pixel == load_pixel(str(out / "pixel.yaml"))
+    np.save(tmp_path / "video.npy", np.linspace(20, 200, 8)[:, None, None] * np.ones((8, 6, 6)))
+    main(["events", str(tmp_path / "video.npy"), "--fps", "50", "--pixel", str(out / "pixel.yaml"),
+          "--out", str(tmp_path / "e.npz")])  # fmt: skip
+    assert (tmp_path / "e.npz").exists()
+    with pytest.raises(SystemExit) as stop:
+        main(["pixel", "fit", str(folder / "pixel_fit.yaml"), "--out", str(out), *words])
+    assert stop.value.code == 2 and "--force" in capsys.readouterr().err
+
+
+def test_the_settings_of_other_commands_take_the_pixel(tmp_path) -> None:
+    from evnlos.calibration import Calibration
+    from evnlos.cli.calibration import CalibrateCommand
+    from evnlos.cli.datasets import SimulateCommand
+    from evnlos.data import Simulation
+
+    save_yaml(BrownianPixel(0.21, 0.22), tmp_path / "pixel.yaml")
+    word = str(tmp_path / "pixel.yaml")
+    assert SimulateCommand.with_pixel(Simulation(), word).pixel == BrownianPixel(0.21, 0.22)
+    kept = CalibrateCommand.with_pixel(Calibration(), word)
+    assert kept.start.pixel == BrownianPixel(0.21, 0.22) and not kept.events
+
+
+def test_unknown_light_identifies_no_threshold(folder) -> None:
+    found = fit_known_light(Manifest((LitFile(str(folder / "r0.npz")),)))
+    assert found.pixel is None and found.refractory.state == "identified"
+    assert any("not identified" in line for line in found.warnings)
+
+
+def test_the_scale_of_a_number_and_its_inverse() -> None:
+    for start, free in CANDIDATES.values():
+        u = np.linspace(-1, 1, len(free))
+        pixel = pixel_at(start, free, u)
+        for k, one in enumerate(free):
+            value = float(value_of(one, u[k]))
+            assert position_of(one, value) == pytest.approx(u[k], abs=1e-9)
+            if one.name != MISMATCH:
+                assert getattr(pixel, one.name) == pytest.approx(value)
+
+
+def test_a_circuit_sees_less_of_long_recordings() -> None:
+    long = [replace(one, times_s=np.array([0.0, 50.0, 100.0])) for one in recorded(EventPixel(), 1, 200)[2:]]
+    short = shortened("circuit", long)
+    assert shortened("continuous", long) == long
+    assert short[0].light.shape[2] == 96 and short[0].times_s[-1] < 10
+    assert short[0].events.width == 96 and short[0].light.shape[0] == len(short[0].times_s)
+
+
+def test_time_stamps_on_a_grid_are_no_refractory_period() -> None:
+    draw = np.random.default_rng(0)
+    times = np.sort(draw.integers(0, 2000, 20_000)) * 1000
+    place = draw.integers(0, 8, (2, 20_000))
+    events = Events(times, place[0], place[1], draw.random(20_000) < 0.5, 8, 8)
+    assert tick_of(events) == 1000
+    assert refractory_of([events]).state != "identified"
+
+
+def test_light_that_moves_is_not_called_constant() -> None:
+    times = np.sort(np.random.default_rng(0).integers(0, 500_000, 4000))
+    events = Events(times, times % 8, times % 7, times % 2 == 0, 8, 8)
+    still = KnownLight("static", 10.0)
+    from evnlos.calibration.pixel_light import LitEvents
+
+    assert any("not" in line for line in doubts_of(LitEvents("a", events, still, 2.0, np.ones((8, 8), bool))))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("sinus", "3"), "give one of"),
+        (("sine", "3"), "1 values"),
+        (("sine", "3", "x"), "not all are numbers"),
+        (("sine", "3", "1.5"), "contrast is 1.5"),
+        (("edge", "1", "100"), "above or below 1"),
+        (("static", "-1"), "level is -1"),
+    ],
+)
+def test_wrong_light_is_one_line(words, said) -> None:
+    with pytest.raises(ConfigError, match=said):
+        KnownLight.of(words)
+
+
+def test_wrong_input_is_one_line(folder, tmp_path) -> None:
+    with pytest.raises(ConfigError, match="leave --light out"):
+        read_manifest(folder / "pixel_fit.yaml", KnownLight("static"))
+    with pytest.raises(ConfigError, match="lists no recordings"):
+        Manifest(())
+    with pytest.raises(ConfigError, match="leaves the"):
+        read_lit_events(LitFile(str(folder / "r0.npz"), KnownLight("static"), box=(20, 0, 10, 4)))
+    with pytest.raises(DataError, match="register the frames"):
+        np.save(tmp_path / "small.npy", np.full((5, 8, 8), 90.0))
+        read_lit_events(
+            LitFile(str(folder / "r0.npz"), KnownLight("frames", frames=str(tmp_path / "small.npy"), fps=5.0))
+        )
+    with pytest.raises(ConfigError, match="no model 'v2e'"):
+        PixelFitSettings(("v2e",))
+    write_events(tmp_path / "few.npz", Events([1, 5000], [0, 1], [0, 1], [1, 0], 40, 40))
+    with pytest.raises(DataError, match="100 or more"):
+        fit_known_light(Manifest((LitFile(str(tmp_path / "few.npz"), KnownLight("static")),)), QUICK)
+
+
+@pytest.mark.parametrize("name", ["faery_dvs.es", "expelliarmus_evt2_sample.raw", "faery_evt2.raw"])
+def test_real_recordings_without_known_light(shared_data, name: str) -> None:
+    path = shared_data / "recordings" / name
+    found = fit_known_light(Manifest((LitFile(str(path)),)), QUICK)
+    assert found.pixel is None and found.refractory.state != "identified"
+    assert not any("flicker" in line for line in found.warnings)
