@@ -313,7 +313,7 @@ class _Search:
         self._pixel, self._size, self._progress = partial(pixel_at, start, free), len(free), progress
         self._target = panels.scale.of(panels.statistics)
         self._seed = derive_seed(settings.seed, "pixel fit", name)
-        self._done, self._total = 0, 0
+        self._done = self._total = 0
 
     def _means(self, u: Array) -> Array:
         """Return the scaled means of simulations at positions [M, P], [M, K]."""
@@ -367,8 +367,7 @@ class _Search:
 
 def within_reach(free: Sequence[Free], panels: Panels) -> tuple[Free, ...]:
     """Return free numbers whose noise rates stay within ten times the highest rate that a recording has."""
-    pixels = panels.statistics.shape[0]
-    rate = max(len(one.events) / pixels / float(one.times_s[-1]) for one in panels.recordings)
+    rate = max(len(one.events) / len(panels.statistics) / float(one.times_s[-1]) for one in panels.recordings)
     most = {"shot_noise_rate_hz": 10 * rate, "leak_rate_hz": 3 * rate}
     return tuple(
         replace(one, high=min(one.high, max(most[one.name], 20 * one.low))) if one.name in most else one
