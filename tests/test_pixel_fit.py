@@ -7,21 +7,31 @@ import numpy as np
 import pytest
 
 from evnlos.calibration import (
+    CANDIDATES,
+    MISMATCH,
     KnownLight,
+    LitFile,
     LitRecording,
     Manifest,
     PixelFitSettings,
+    doubts_of,
     fit_candidate,
     fit_known_light,
     panels_of,
+    pixel_at,
+    position_of,
+    read_lit_events,
+    read_manifest,
+    refractory_of,
+    shortened,
     simulated_events,
+    tick_of,
+    value_of,
     waveform,
 )
-from evnlos.calibration.pixel_checks import refractory_of, tick_of
-from evnlos.calibration.pixel_files import LitFile, doubts_of, read_lit_events, read_manifest
-from evnlos.calibration.pixel_fit import CANDIDATES, MISMATCH, pixel_at, position_of, shortened, value_of
 from evnlos.cameras import BrownianPixel, EventPixel, PixelSettings, load_pixel, simulate_events
 from evnlos.cli import main
+from evnlos.cli.verbs import command_of
 from evnlos.config import load_yaml, save_yaml
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
@@ -122,14 +132,12 @@ def test_the_command_writes_a_pixel_that_other_commands_take(folder, tmp_path, c
 
 def test_the_settings_of_other_commands_take_the_pixel(tmp_path) -> None:
     from evnlos.calibration import Calibration
-    from evnlos.cli.calibration import CalibrateCommand
-    from evnlos.cli.datasets import SimulateCommand
     from evnlos.data import Simulation
 
     save_yaml(BrownianPixel(0.21, 0.22), tmp_path / "pixel.yaml")
     word = str(tmp_path / "pixel.yaml")
-    assert SimulateCommand.with_pixel(Simulation(), word).pixel == BrownianPixel(0.21, 0.22)
-    kept = CalibrateCommand.with_pixel(Calibration(), word)
+    assert command_of("simulate").with_pixel(Simulation(), word).pixel == BrownianPixel(0.21, 0.22)
+    kept = command_of("calibrate").with_pixel(Calibration(), word)
     assert kept.start.pixel == BrownianPixel(0.21, 0.22) and not kept.events
 
 
@@ -171,7 +179,7 @@ def test_light_that_moves_is_not_called_constant() -> None:
     times = np.sort(np.random.default_rng(0).integers(0, 500_000, 4000))
     events = Events(times, times % 8, times % 7, times % 2 == 0, 8, 8)
     still = KnownLight("static", 10.0)
-    from evnlos.calibration.pixel_light import LitEvents
+    from evnlos.calibration import LitEvents
 
     assert any("not" in line for line in doubts_of(LitEvents("a", events, still, 2.0, np.ones((8, 8), bool))))
 
