@@ -515,7 +515,7 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
         # A number typed beside a slider keeps to the slider's ends.
         box = "document.querySelector('input[type=number][aria-label*=\"Wall roughness\"]')"
         before = browser.run(f"return {sequence_of}")
-        typed = "b.value = 5; for (const t of ['input', 'change']) b.dispatchEvent(new Event(t, {bubbles: true}))"
+        typed = "b.value = 5; for (const t of ['input', 'change']) b.dispatchEvent(new Event(t, {bubbles: 1}))"
         browser.run(f"const b = {box}; {typed}")
         browser.wait(f"return {box}.value === '0.3'")
         browser.wait(f"return {sequence_of} !== {json.dumps(before)}")
