@@ -95,7 +95,7 @@ def test_each_setup_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
 @pytest.mark.parametrize("start", ["generic", "nowhere", ""])
 def test_the_pre_training_begins_with_layers_where_they_are_installed(tmp_path, monkeypatch, start):
     monkeypatch.setenv("EVNLOS_WEIGHTS", str(tmp_path))
-    for name in layers_of("generic", "frame", "fusion"):
+    for name in layers_of("generic"):
         (tmp_path / f"{name}.safetensors").touch()
     (tmp_path / "a_A").mkdir()
     (tmp_path / "a_A" / "capture.yaml").write_text("x: 1")
@@ -108,17 +108,11 @@ def test_the_pre_training_begins_with_layers_where_they_are_installed(tmp_path, 
     monkeypatch.setattr("evnlos.demo.run_study", stop)
     with pytest.raises(CalibrationError, match="enough"):
         run_demo(Demo(out=tmp_path / "out", captures=(tmp_path / "a_A",), start=start))
-    study = studies[0]
-    begins = {(arm.name, seen): arm.start for arm in study.arms for seen in study.seen_by(arm)}
-    layered = ("frame", "fusion") if start == "generic" else ()
-    for seen in ("frame", "event", "fusion"):
-        found = start if seen in layered else ""
-        assert begins["simulation only", seen] == begins["EPNP", seen] == found
-        assert begins["E2E", seen] == begins["E2E, single positions", seen] == ""
-    for arm in study.arms:
-        if arm.pretraining is not None:
-            plan, is_layered = arm.pretraining, bool(arm.start)
-            assert (plan.refit_embedding, plan.epochs) == (is_layered, 4 if is_layered else 8)
+    begins = {arm.name: arm.start for arm in studies[0].arms}
+    found = "generic" if start == "generic" else ""
+    assert begins == {"simulation only": found, "EPNP": found, "E2E": "", "E2E, single positions": ""}
+    plans = {arm.pretraining for arm in studies[0].arms if arm.pretraining}
+    assert {(plan.refit_embedding, plan.epochs) for plan in plans} == {(bool(found), 4 if found else 8)}
 
 
 def test_unknown_setups_and_empty_folders_are_refused(tmp_path):

@@ -53,8 +53,7 @@ class Demo:
     redrawn: int = 7
     """How often each known target of the captures is drawn again and simulated."""
     start: str = GENERIC
-    """Setup of installed weights whose layers the pre-training begins with, where there are some of what is
-    seen; empty: random ones."""
+    """Setup of installed weights whose layers the pre-training begins with; empty: random ones."""
     pretrain_epochs: int | None = None
     """Epochs on the simulated sequences; by default 4 from trained layers, 8 from random ones."""
     finetune_epochs: int = 12
@@ -101,9 +100,9 @@ def run_demo(settings: Demo) -> Path:
             folders = render_captures(
                 lab, out / "captures", workers=settings.workers, progress=progress, force=settings.force
             )
-    layered, lacking = _layered(settings)
+    settings, lacking = _with_layers(settings)
     notes += lacking
-    study = _study(settings, layered, _held_out(folders, settings.test))
+    study = _study(settings, _held_out(folders, settings.test))
     place = replace(place, captures=tuple(sorted(folders)))
     try:
         with ProgressBars() as progress:
@@ -131,18 +130,18 @@ def run_demo(settings: Demo) -> Path:
     return path
 
 
-def _layered(settings: Demo) -> tuple[tuple[str, ...], list[str]]:
-    """Return the modalities whose pre-training begins with trained layers, and why none does, if so."""
+def _with_layers(settings: Demo) -> tuple[Demo, list[str]]:
+    """Return the settings without layers to begin with where there are none like them, and why."""
     if not settings.start:
-        return (), []
-    there = tuple(one for one in STANDARD_MODALITIES if layers_of(settings.start, one)[0] in published())
-    if not there:
+        return settings, []
+    if not all(name in published() for name in layers_of(settings.start)):
         why = f"The layers {settings.start!r} are not installed (evnlos-weights brings them)"
     elif settings.width != SEQUENCE_NETWORK.width:
         why = f"The layers {settings.start!r} have {SEQUENCE_NETWORK.width} channels, not {settings.width}"
     else:
-        return there, []
-    return (), [f"{why}: the pre-training began with random ones, and needs twice the epochs."]
+        return settings, []
+    why += ": the pre-training began with random ones, and needs twice the epochs for less."
+    return replace(settings, start=""), [why]
 
 
 def _captures_in(given: tuple[Path, ...]) -> list[Path]:
@@ -171,35 +170,34 @@ def _of_calibration(setup: Path) -> list[str]:
     return [*notes, f"{found['expectation']}."] if "expectation" in found else notes
 
 
-def _study(settings: Demo, layered: tuple[str, ...], test: list[str]) -> Study:
+def _study(settings: Demo, test: list[str]) -> Study:
     """Return the comparison of E2E and EPNP, with one seed."""
     single = Training(network=UNetConfig(width=settings.width), epochs=settings.single_epochs)
-    plan = Training(batch_size=16, network=replace(SEQUENCE_NETWORK, width=settings.width))
+    network = replace(SEQUENCE_NETWORK, width=settings.width)
+    plan = Training(batch_size=16, network=network)
+    # Trained layers need less time and smaller steps; validation characters chose both.
+    epochs, rate = (4, 1e-3) if settings.start else (8, plan.learning_rate)
+    before = replace(
+        plan,
+        epochs=settings.pretrain_epochs or epochs,
+        learning_rate=rate,
+        sequence_augmentations=2,
+        refit_embedding=bool(settings.start),
+    )
     # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
     after = replace(plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True)
     alone = replace(plan, epochs=settings.e2e_epochs)
     source = "calibrated" if settings.calibrate else "uncalibrated"
     # Of the time surfaces, the one that validation characters are seen best in.
     sampling = Sampling(surface="hots", radius=1)
-    # Trained layers need less time and smaller steps; validation characters chose both.
-    trained = replace(plan, epochs=settings.pretrain_epochs or 4, learning_rate=1e-3, refit_embedding=True)
-    random = replace(plan, epochs=settings.pretrain_epochs or 8)
-    others = tuple(one for one in STANDARD_MODALITIES if one not in layered)
-    ways = [(layered, settings.start, trained), (others, "", random)]
-    simulated = []
-    for seen, start, before in ways:
-        shared = {"start": start, "modalities": seen, "sampling": sampling}
-        before = replace(before, sequence_augmentations=2)
-        if seen:
-            simulated.append(Arm("simulation only", source, before, None, **shared))
-            simulated.append(Arm("EPNP", source, before, after, choose=True, **shared))
     return Study(
         "demo",
         "demo",
         (
+            Arm("simulation only", source, before, None, settings.start, sampling=sampling),
             Arm("E2E, single positions", "none", None, single, sampling=sampling),
             Arm("E2E", "none", None, alone, sampling=sampling),
-            *simulated,
+            Arm("EPNP", source, before, after, settings.start, choose=True, sampling=sampling),
         ),
         seeds=(settings.seed,),
         test=tuple(test),

@@ -129,7 +129,7 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
     for arm in study.arms:
         recorded = _import(study, arm, place, progress)
         made = _simulate(study, arm, place, progress)
-        for modality in study.seen_by(arm):
+        for modality in study.modalities:
             plans = [_planned(study, arm, modality, seed, made, recorded, place) for seed in study.seeds]
             networks.append((arm, recorded, made, modality, plans))
     if place.trainings != 1:

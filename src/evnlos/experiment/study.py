@@ -44,8 +44,6 @@ class Arm:
     start: str = ""
     """Setup of installed weights of sequences; the arm's first training begins with their layers. Empty: with
     random ones."""
-    modalities: tuple[str, ...] = ()
-    """What its networks see, of what the study names; empty: all of that."""
     choose: bool = False
     """Choose on captures held out of the fine-tuning how much of it is taken, if any."""
     writers: int | None = None
@@ -109,15 +107,11 @@ class Study:
     def __post_init__(self) -> None:
         if not self.arms or not self.modalities or not self.seeds:
             raise ConfigError(f"the study {self.name!r} has no arm, no modality or no seed")
-        networks = [f"{arm.name} ({seen})" for arm in self.arms for seen in self.seen_by(arm)]
-        if len(set(networks)) != len(networks):
-            raise ConfigError(f"the study {self.name!r} has two arms of one name among {', '.join(networks)}")
+        names = [arm.name for arm in self.arms]
+        if len(set(names)) != len(names):
+            raise ConfigError(f"the study {self.name!r} has two arms of one name among {', '.join(names)}")
         if set(self.test) & set(self.validation):
             raise ConfigError("a character is for testing or for validation, not for both")
-
-    def seen_by(self, arm: Arm) -> tuple[str, ...]:
-        """Return the modalities that an arm is run for."""
-        return tuple(one for one in self.modalities if not arm.modalities or one in arm.modalities)
 
     @property
     def split(self) -> str:
