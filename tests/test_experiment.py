@@ -92,6 +92,19 @@ def test_a_second_run_does_nothing_again(records, place) -> None:
     assert after == before
 
 
+def test_other_networks_under_the_name_of_a_record_are_scored_anew(records, place, tmp_path) -> None:
+    """After a change of the settings the folder still holds the records of before."""
+    arm = replace(ARMS[0], finetuning=replace(SMALL, epochs=2))
+    study = replace(STUDY, arms=(arm,), seeds=(0,), refine=False)
+    kept = tmp_path / "out"
+    shutil.copytree(place.out, kept)
+    (new,) = [one for one in run_study(study, replace(place, out=kept)) if one.arm == arm.name]
+    (old,) = [one for one in records if one.name == new.name]
+    (now,) = [one for one in read_records(kept / "records") if one.name == new.name]
+    assert now.settings["run"] == new.settings["run"] != old.settings["run"]
+    assert run_study(study, replace(place, out=kept)) == []
+
+
 def test_a_study_is_estimated_first_and_can_be_forced(records, place, monkeypatch) -> None:
     def refuse(*_: object) -> None:
         raise DataError("needs 9 GB of memory")

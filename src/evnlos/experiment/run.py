@@ -23,7 +23,7 @@ from evnlos.data.capture import character_of
 from evnlos.data.pool import processes, run_tasks
 from evnlos.data.simulations import default, paper
 from evnlos.errors import CalibrationError, DataError, MissingDependencyError
-from evnlos.experiment.study import Arm, Place, Record, Study, keep_scores, names_there, slug
+from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there, slug
 from evnlos.experiment.table import score_arm
 from evnlos.models import layers_of, load_weights
 from evnlos.progress import Progress, Step, silent
@@ -336,7 +336,7 @@ def run_simulated(settings: Simulated, progress: Progress = silent) -> list[Reco
                 for tested in test_sets:
                     record = _record(arm, modality, seed, run, tested, decided)
                     folder = settings.out / "records" / NAME
-                    if record.name not in names_there(folder):
+                    if not is_scored(record, records_there(folder)):
                         found = evaluate(load_weights(run), data[tested], "test", available_lpips())
                         records.append(keep_scores(record, found, folder, progress))
     return records

@@ -220,9 +220,22 @@ def keep_scores(blank: Record, evaluation: Evaluation, folder: Path, progress: P
     return record
 
 
-def names_there(folder: Path) -> set[str]:
-    """Return the names of the records that a folder holds; none where it is not there."""
-    return {record.name for record in read_records(folder)} if any(folder.glob("*.json")) else set()
+def records_there(folder: Path) -> dict[str, Record]:
+    """Return the records that a folder holds, by name; none where it is not there."""
+    return {record.name: record for record in read_records(folder)} if any(folder.glob("*.json")) else {}
+
+
+def is_scored(blank: Record, there: dict[str, Record]) -> bool:
+    """Return whether the record of a name is there, and scores the same networks on the same captures.
+
+    Args:
+        blank: A record without its scores.
+        there: The records that are there, by name.
+    """
+    kept = there.get(blank.name)
+    return kept is not None and all(
+        kept.settings.get(key) == blank.settings.get(key) for key in ("run", "runs", "captures")
+    )
 
 
 def write_record(record: Record, folder: Path) -> Path:

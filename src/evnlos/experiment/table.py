@@ -21,7 +21,7 @@ from evnlos.analysis.confidence import FrameOperator, consistent
 from evnlos.analysis.scores import Interval, paired_difference
 from evnlos.data import Dataset, NlosDataset, Sampling, as_modality, character_of, modality_order, read_shard
 from evnlos.errors import DataError
-from evnlos.experiment.study import Arm, Place, Record, Study, keep_scores, names_there
+from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there
 from evnlos.models import fit_linear, load_weights
 from evnlos.progress import Progress
 from evnlos.setups import load_setup
@@ -43,7 +43,7 @@ def score_arm(
     place: Place,
     progress: Progress,
 ) -> list[Record]:
-    """Score what an arm gave, and return the new records; records that are there are kept.
+    """Score what an arm gave, and return the new records; those of the same networks that are there are kept.
 
     Args:
         study: The study.
@@ -56,7 +56,7 @@ def score_arm(
         progress: Called with each new record.
     """
     folder = place.out / "records" / study.name
-    there, new = names_there(folder), list[Record]()
+    there, new = records_there(folder), list[Record]()
     samples = NlosDataset(recorded, study.split, modality)
     means = NlosDataset(recorded, "train", modality).truth.float().mean(dim=0)
     refined = (
@@ -75,10 +75,10 @@ def score_arm(
 
     def score_variants(images: Tensor, seed: int, settings: dict[str, Any], mean_image: Tensor | None) -> None:
         plain = record(arm.name, seed, settings)
-        if plain.name not in there:
+        if not is_scored(plain, there):
             score(plain, images, mean_image)
         moved = record(f"{arm.name} + consistency", seed, settings)
-        if refined and moved.name not in there:
+        if refined and not is_scored(moved, there):
             score(moved, _consistent(study, arm, recorded, place, images), mean_image)
 
     pictures = []
@@ -94,7 +94,7 @@ def score_arm(
         return new
     for name, make in _without_network(study, arm, modality, samples, means, made, recorded, place):
         blank = record(name, 0, {"captures": recorded.folder.name})
-        if blank.name not in there:
+        if not is_scored(blank, there):
             score(blank, make(), means)
     return new
 
