@@ -67,6 +67,12 @@ def place(tiny_captures, tmp_path_factory) -> Place:
     return Place(tuple(tiny_captures), out, workers=1)
 
 
+@pytest.fixture
+def apart(place, tmp_path) -> Place:
+    """A copy of the place as it is, for a test whose runs no other test shall see."""
+    return replace(place, out=Path(shutil.copytree(place.out, tmp_path / "apart")))
+
+
 @pytest.fixture(scope="module")
 def records(place) -> list[Record]:
     return run_study(STUDY, place)
@@ -92,17 +98,15 @@ def test_a_second_run_does_nothing_again(records, place) -> None:
     assert after == before
 
 
-def test_other_networks_under_the_name_of_a_record_are_scored_anew(records, place, tmp_path) -> None:
+def test_other_networks_under_the_name_of_a_record_are_scored_anew(records, apart) -> None:
     """After a change of the settings the folder still holds the records of before."""
     arm = replace(ARMS[0], finetuning=replace(SMALL, epochs=2))
     study = replace(STUDY, arms=(arm,), seeds=(0,), refine=False)
-    kept = tmp_path / "out"
-    shutil.copytree(place.out, kept)
-    (new,) = [one for one in run_study(study, replace(place, out=kept)) if one.arm == arm.name]
+    (new,) = [one for one in run_study(study, apart) if one.arm == arm.name]
     (old,) = [one for one in records if one.name == new.name]
-    (now,) = [one for one in read_records(kept / "records") if one.name == new.name]
+    (now,) = [one for one in read_records(apart.out / "records") if one.name == new.name]
     assert now.settings["run"] == new.settings["run"] != old.settings["run"]
-    assert run_study(study, replace(place, out=kept)) == []
+    assert run_study(study, apart) == []
 
 
 def test_a_study_is_estimated_first_and_can_be_forced(records, place, monkeypatch) -> None:
@@ -145,20 +149,18 @@ def test_arms_share_what_they_have_in_common(records, place) -> None:
     assert len(list((place.out / "recorded").iterdir())) == 1
 
 
-def test_arms_begin_with_installed_layers(records, place, tmp_path, monkeypatch) -> None:
-    shutil.copytree(place.out, tmp_path / "out")  # others count what lies there
-    place = replace(place, out=tmp_path / "out")
-    trained = next(path for path in (place.out / "runs").iterdir() if "pretrained" in path.name)
+def test_arms_begin_with_installed_layers(records, apart, tmp_path, monkeypatch) -> None:
+    trained = next(path for path in (apart.out / "runs").iterdir() if "pretrained" in path.name)
     monkeypatch.setenv("EVNLOS_WEIGHTS", str(tmp_path))
     (name,) = layers_of("any", "fusion")
     before = replace(SMALL, refit_embedding=True)
     arms = (Arm("from layers", "calibrated", before, SMALL, "any", sampling=SAMPLING),)
     study = replace(STUDY, name="layers", arms=arms, seeds=(0,))
     with pytest.raises(DataError, match=name):
-        run_study(study, place)
+        run_study(study, apart)
     shutil.copy(trained / "weights.safetensors", tmp_path / f"{name}.safetensors")
-    (record,) = [r for r in run_study(study, place) if r.arm == "from layers" and r.seed == 0]
-    assert [len(load_weights(place.out / "runs" / record.settings["run"]).history)] == [3]
+    (record,) = [r for r in run_study(study, apart) if r.arm == "from layers" and r.seed == 0]
+    assert [len(load_weights(apart.out / "runs" / record.settings["run"]).history)] == [3]
 
 
 def test_an_ensemble_is_the_mean_of_its_pictures(records) -> None:
@@ -170,26 +172,26 @@ def test_an_ensemble_is_the_mean_of_its_pictures(records) -> None:
         assert (error[arm, -1] <= members * (1 + 1e-3)).all()
 
 
-def test_validation_leaves_the_test_characters_unread(place) -> None:
+def test_validation_leaves_the_test_characters_unread(apart) -> None:
     study = replace(STUDY, name="choose", arms=ARMS[:1], seeds=(0,), validation=("L",))
-    found = run_study(study, place)
+    found = run_study(study, apart)
     assert [r.split for r in found] == ["validation"]
-    recorded = open_dataset(place.out / "recorded" / found[0].settings["captures"])
+    recorded = open_dataset(apart.out / "recorded" / found[0].settings["captures"])
     assert sorted(recorded.objects()) == ["lab_A", "lab_L", "lab_T"]
     assert recorded.objects("validation") == ["lab_L"]
 
 
-def test_few_captures_are_nested_and_keep_the_test(place) -> None:
+def test_few_captures_are_nested_and_keep_the_test(apart) -> None:
     kept = []
     for count in (1, 2):
         arm = replace(ARMS[0], name=f"{count} captures", captures=count)
-        found = run_study(replace(STUDY, name="few", arms=(arm,), seeds=(0,)), place)
-        recorded = open_dataset(place.out / "recorded" / found[0].settings["captures"])
+        found = run_study(replace(STUDY, name="few", arms=(arm,), seeds=(0,)), apart)
+        recorded = open_dataset(apart.out / "recorded" / found[0].settings["captures"])
         assert recorded.objects("test") == ["lab_4"] and len(recorded.objects("train")) == count
         kept.append(set(recorded.objects("train")))
     assert kept[0] < kept[1]
     with pytest.raises(DataError, match="9 captures"):
-        run_study(replace(STUDY, arms=(replace(ARMS[0], captures=9),)), place)
+        run_study(replace(STUDY, arms=(replace(ARMS[0], captures=9),)), apart)
 
 
 def test_captures_that_no_setup_fits_say_so(tiny_captures, tmp_path) -> None:
