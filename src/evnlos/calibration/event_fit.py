@@ -14,6 +14,8 @@ from evnlos.calibration.event_models import MODELS, fit_model, is_better, misfit
 from evnlos.calibration.event_statistics import (
     Recording,
     Regions,
+    by_pixel,
+    intervals,
     moments,
     regions_of,
     simulated,
@@ -252,11 +254,5 @@ def shortest_interval_s(events: Sequence[Events], share: float = 1e-3) -> float:
         events: Recordings.
         share: Share of the pairs that noise may put closer together.
     """
-    gaps = []
-    for found in events:
-        pixel = found.y.astype(np.int64) * found.width + found.x
-        order = np.lexsort((found.t_us, pixel))
-        step = np.diff(found.t_us[order])
-        gaps.append(step[np.diff(pixel[order]) == 0])
-    every = np.concatenate(gaps)
+    every = np.concatenate([intervals(*by_pixel(one))[1] for one in events])
     return float(np.quantile(every, share)) * 1e-6 if len(every) else math.inf

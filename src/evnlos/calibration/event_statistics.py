@@ -173,6 +173,24 @@ def count_map(events: Events, polarity: bool, after_us: int) -> NDArray[np.int64
     return np.bincount(flat, minlength=events.width * events.height).reshape(events.height, events.width)
 
 
+def by_pixel(
+    events: Events, after_us: int = -1
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return flat pixel [E], time [E, us] and ON [E] of the events after an instant, by pixel, then by time."""
+    late = events.t_us > after_us
+    pixel = events.y[late].astype(np.int64) * events.width + events.x[late]
+    order = np.lexsort((events.t_us[late], pixel))
+    return pixel[order], events.t_us[late][order], events.p[late][order]
+
+
+def intervals(
+    pixel: NDArray[np.int64], t_us: NDArray[np.int64], on: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return pixel, length [us] and unlike polarity of successive events of one pixel, from `by_pixel`."""
+    same = np.diff(pixel) == 0
+    return pixel[1:][same], np.diff(t_us)[same], (on[1:] != on[:-1])[same]
+
+
 def simulated(recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> list[Events]:
     """Return simulated events of all recordings; the same seed draws the same mismatch and noise."""
     return [r.simulate(pixel, derive_seed(seed, "calibration", k)) for k, r in enumerate(recordings)]

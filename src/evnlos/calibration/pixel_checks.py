@@ -15,7 +15,7 @@ from statistics import NormalDist
 import numpy as np
 
 from evnlos.calibration.event_fit import shortest_interval_s
-from evnlos.calibration.event_statistics import count_map
+from evnlos.calibration.event_statistics import by_pixel, count_map, intervals
 from evnlos.calibration.pixel_fit import CandidateFit, Estimate, Panels, PixelFitSettings
 from evnlos.calibration.pixel_light import KnownLight, LitRecording, waveform
 from evnlos.calibration.pixel_statistics import Array, simulated_events
@@ -30,7 +30,6 @@ _FINE_TICKS = 5  # ticks of the time stamps that a refractory period must last t
 _PILE = 5.0  # times as many intervals at the shortest as just above it
 _STATIC_S, _STATIC_PX = 10.0, 200
 _CIRCUIT_S, _CIRCUIT_PX = 1.0, 64
-_TOLD = 0.3  # share of a map's variance that events must explain
 _BINS = 24
 
 
@@ -121,12 +120,7 @@ def refractory_of(events: Sequence[Events]) -> Estimate:
     shortest, tick_us = shortest_interval_s(events), max(tick_of(one) for one in events)
     if not math.isfinite(shortest):
         return Estimate("refractory_s", 0.0, 0.0, math.inf, "not identified")
-    gaps = []
-    for found in events:
-        pixel = found.y.astype(np.int64) * found.width + found.x
-        order = np.lexsort((found.t_us, pixel))
-        gaps.append(np.diff(found.t_us[order])[np.diff(pixel[order]) == 0])
-    every = np.concatenate(gaps).astype(np.float64)
+    every = np.concatenate([intervals(*by_pixel(one))[1] for one in events]).astype(np.float64)
     base = shortest * 1e6
     pile = every[(every >= 0.98 * base - 1) & (every <= 1.05 * base + 1)]
     above = np.count_nonzero((every > 1.05 * base + 1) & (every <= 1.12 * base + 3))
@@ -195,11 +189,7 @@ def numbers_of(recording: LitRecording, events: Events) -> dict[str, float]:
     on = float(count_map(events, True, recording.settled_us).sum())
     total = float(count.sum())
     hottest = np.sort(count)[-max(1, len(count) // 100) :].sum()
-    kept = events.t_us > recording.settled_us
-    order = np.lexsort((events.t_us[kept], events.x[kept]))
-    where, times, sign = events.x[kept][order], events.t_us[kept][order], events.p[kept][order]
-    same = where[1:] == where[:-1]
-    gaps, unlike = np.diff(times)[same], (sign[1:] != sign[:-1])[same]
+    _, gaps, unlike = intervals(*by_pixel(events, recording.settled_us))
     return {
         "rate, Hz per pixel": total / len(count) / max(recording.seconds, 1e-9),
         "variance / mean of counts": float(count.var() / max(count.mean(), 1e-9)),
@@ -285,11 +275,8 @@ def _totals(recordings: Sequence[LitRecording], events: Sequence[Events]) -> Arr
 
 
 def _gaps(events: Sequence[Events]) -> Array:
-    found = []
-    for one in events:
-        order = np.lexsort((one.t_us, one.x))
-        found.append(np.diff(one.t_us[order])[np.diff(one.x[order].astype(np.int64)) == 0])
-    return np.log10(np.maximum(np.concatenate(found), 1)) - 6
+    found = np.concatenate([intervals(*by_pixel(one))[1] for one in events])
+    return np.log10(np.maximum(found, 1)) - 6
 
 
 def at_lights(fit: CandidateFit, levels_dn: Sequence[float], seed: int) -> tuple[AtLight, ...]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from evnlos.calibration.event_statistics import count_map
 from evnlos.calibration.pixel_checks import (
     AtLight,
     Comparison,
@@ -192,10 +193,8 @@ def _hot_rate(sources: Sequence[LitEvents], hot: Any) -> float:
     if not hot.any():
         return 0.0
     seconds = sum(one.seconds for one in sources)
-    counts = np.zeros(hot.shape)
-    for one in sources:
-        np.add.at(counts, (one.events.y, one.events.x), 1)
-    return float(np.median(counts[hot])) / seconds
+    counts = sum(count_map(one.events, sign, -1) for one in sources for sign in (True, False))
+    return float(np.median(counts[hot])) / seconds  # type: ignore[index]
 
 
 def _levels(recordings: Sequence[LitRecording]) -> list[float]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.calibration.event_statistics import simulated
+from evnlos.calibration.event_statistics import by_pixel, intervals, simulated
 from evnlos.calibration.pixel_light import LitRecording
 from evnlos.cameras import PixelSettings
 from evnlos.types import Events, derive_seed
@@ -50,8 +50,8 @@ class Binning:
 def binning_of(recording: LitRecording) -> Binning:
     """Choose bins from a recording's own events and light."""
     pixels = recording.light.shape[2]
-    index, time_s, on = _columns(recording, recording.events)
-    gaps = _intervals(index, time_s, on)[1]
+    index, t_us, on = by_pixel(recording.events, recording.settled_us)
+    time_s, gaps = t_us * 1e-6, intervals(index, t_us, on)[1] * 1e-6
     edges = np.unique(np.quantile(gaps, _QUANTILES)) if len(gaps) >= 50 else np.zeros(0)
     groups, windows, lag = np.zeros(pixels, np.int64), np.zeros(0), 0.0
     if recording.known.kind == "edge":
@@ -108,35 +108,20 @@ def _by_group(block: Array, binning: Binning) -> Array:
 
 def _block(recording: LitRecording, binning: Binning, events: Events) -> Array:
     pixels = recording.light.shape[2]
-    index, time_s, on = _columns(recording, events)
+    index, t_us, on = by_pixel(events, recording.settled_us)
+    time_s = t_us * 1e-6
     count_on = np.bincount(index[on], minlength=pixels).astype(np.float64)
     count_off = np.bincount(index[~on], minlength=pixels).astype(np.float64)
     columns = [count_on, count_off, np.sqrt(count_on), np.sqrt(count_off), np.sqrt(count_on * count_off)]
-    where, gaps, unlike = _intervals(index, time_s, on)
+    where, gaps_us, unlike = intervals(index, t_us, on)
     columns.append(np.bincount(where[unlike], minlength=pixels))
     if len(binning.intervals_s):
-        place = np.digitize(gaps, binning.intervals_s)
+        place = np.digitize(gaps_us * 1e-6, binning.intervals_s)
         bins = len(binning.intervals_s) + 1
         columns += list(np.bincount(where * bins + place, minlength=pixels * bins).reshape(pixels, bins).T[:-1])
     for mark in _marks(recording, binning, index, time_s, on):
         columns += [np.bincount(index[chosen], mark[chosen], minlength=pixels) for chosen in (on, ~on)]
     return np.stack(columns, axis=1).astype(np.float64)
-
-
-def _columns(recording: LitRecording, events: Events) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """Return pixel, time in seconds and polarity of the events that count, ordered by pixel and time."""
-    kept = events.t_us > recording.settled_us
-    index, time_us, on = events.x[kept].astype(np.int64), events.t_us[kept], events.p[kept]
-    order = np.lexsort((time_us, index))
-    return index[order], time_us[order] * 1e-6, on[order]
-
-
-def _intervals(
-    index: NDArray[np.int64], time_s: Array, on: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
-    """Return pixel, length and unlike polarity of successive events of one pixel."""
-    same = np.diff(index) == 0
-    return index[1:][same], np.diff(time_s)[same], (on[1:] != on[:-1])[same]
 
 
 def _marks(
@@ -186,25 +171,23 @@ class Scale:
 
     Args:
         unit: [K].
-        kept: Statistics that say anything, bool [K].
     """
 
     unit: Array
-    kept: NDArray[np.bool_]
 
     def of(self, statistics: Array) -> Array:
-        """Return the scaled means of the statistics of pixels [N, K], float64 [kept]."""
-        return np.arcsinh(statistics.mean(axis=0) / self.unit)[self.kept]
+        """Return the scaled means of the statistics of pixels [N, K], float64 [K]."""
+        return np.arcsinh(statistics.mean(axis=0) / self.unit)
 
     def covariance(self, statistics: Array, about: Array) -> Array:
-        """Return the covariance of scaled means [kept, kept], from the scatter of pixels [N, K].
+        """Return the covariance of scaled means [K, K], from the scatter of pixels [N, K].
 
         Args:
             statistics: Of each pixel, or their differences from what was expected of it.
             about: Means at which the scale is taken, [K].
         """
         slope = 1.0 / np.sqrt(about**2 + self.unit**2)
-        deviation = ((statistics - statistics.mean(axis=0)) * slope)[:, self.kept]
+        deviation = (statistics - statistics.mean(axis=0)) * slope
         return deviation.T @ deviation / (len(statistics) - 1) / len(statistics)
 
 
@@ -212,7 +195,7 @@ def scale_of(statistics: Array) -> Scale:
     """Return the scale for the recorded statistics of pixels, [N, K]."""
     pixels = len(statistics)
     error = statistics.std(axis=0) / math.sqrt(pixels)
-    return Scale(_SCALE * np.maximum(error, 1.0 / pixels), np.ones(statistics.shape[1], np.bool_))
+    return Scale(_SCALE * np.maximum(error, 1.0 / pixels))
 
 
 def simulated_events(recordings: Sequence[LitRecording], pixel: PixelSettings, seed: int) -> list[Events]:

@@ -34,6 +34,10 @@ def check_on_error(on_error: str) -> None:
         raise EventFileError(f'on_error is {on_error!r}; give "strict" or "salvage"')
 
 
+MOST_DEFLATED = 1100
+"""How many times deflate and lzf shrink data at most; a file that announces more is lying."""
+
+
 @dataclass
 class ReadReport:
     """What was found in one event file.

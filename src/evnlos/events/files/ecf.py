@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.events.files.columns import (
+    MOST_DEFLATED,
     SALVAGE,
     ColumnCheck,
     Columns,
@@ -25,7 +26,6 @@ from evnlos.events.files.columns import (
     cut,
     unreadable,
 )
-from evnlos.events.files.streams import refuse_topic
 from evnlos.untrusted import stored
 
 FILTER = 0x8ECF
@@ -47,6 +47,21 @@ def _u16(data, at):
 @njit(cache=True)
 def _u32(data, at):
     return _u16(data, at) | _u16(data, at + 2) << 16
+
+
+@njit(cache=True)
+def _run(data, at, word, low, most):
+    """Return the run in the `low` bits of a word, or behind it where all of them are set, and the place behind.
+
+    A fault is a negative place.
+    """
+    run = word & low
+    if run == low:
+        if at + 2 > len(data):
+            return run, -_SHORT
+        run = _u16(data, at)
+        at += 2
+    return run, at if run <= most else -_OVERRUN
 
 
 @njit(cache=True)
@@ -78,31 +93,37 @@ def _decode_times(data, at, t_us):
             time += difference
             continue
         time += byte >> 4
-        run = byte & 15
-        if run == 15:
-            if at + 2 > size:
-                return -_SHORT
-            run = _u16(data, at)
-            at += 2
-        if filled + run > count:
-            return -_OVERRUN
+        run, at = _run(data, at, byte, 15, count - filled)
+        if at < 0:
+            return at
         t_us[filled : filled + run] = time
         filled += run
     return at
 
 
 @njit(cache=True)
+def _four(words, width, values):
+    """Unpack four values of 3/4 `width` bits from three words: three in the upper ends, one in the rest."""
+    low = width // 4
+    rest = (np.int64(1) << low) - 1
+    a, b, c = words[0], words[1], words[2]
+    values[0] = a >> low
+    values[1] = (a & rest) | (b >> (2 * low)) << low
+    values[2] = (b & ((np.int64(1) << (2 * low)) - 1)) | (c >> (3 * low)) << (2 * low)
+    values[3] = c & ((np.int64(1) << (3 * low)) - 1)
+
+
+@njit(cache=True)
 def _decode_packed(data, at, x, y, p):
-    """Decode groups of four events in three words of 32 bits; the last group is whole."""
+    """Decode groups of four events (y, x, p) in three words of 32 bits; the last group is whole."""
     groups = (len(x) + 3) // 4
     if at + 12 * groups > len(data):
         return -_SHORT
-    values = np.empty(4, np.int64)
+    values, words = np.empty(4, np.int64), np.empty(3, np.int64)
     for group in range(groups):
-        a, b, c = _u32(data, at), _u32(data, at + 4), _u32(data, at + 8)
+        words[0], words[1], words[2] = _u32(data, at), _u32(data, at + 4), _u32(data, at + 8)
         at += 12
-        values[0], values[1] = a >> 8, (a & 0xFF) | (b >> 16) << 8
-        values[2], values[3] = (b & 0xFFFF) | (c >> 24) << 16, c & 0xFFFFFF
+        _four(words, 32, values)
         for place in range(min(4, len(x) - 4 * group)):
             value, index = values[place], 4 * group + place
             y[index] = (value >> 12) & 0x7FF
@@ -118,15 +139,9 @@ def _decode_rows(data, at, y):
         if at + 2 > len(data):
             return -_SHORT
         word = _u16(data, at)
-        at += 2
-        run = word & 31
-        if run == 31:
-            if at + 2 > len(data):
-                return -_SHORT
-            run = _u16(data, at)
-            at += 2
-        if filled + run > len(y):
-            return -_OVERRUN
+        run, at = _run(data, at + 2, word, 31, len(y) - filled)
+        if at < 0:
+            return at
         y[filled : filled + run] = word >> 5
         filled += run
     return at
@@ -134,16 +149,15 @@ def _decode_rows(data, at, y):
 
 @njit(cache=True)
 def _decode_pairs(data, at, x, p):
-    """Decode (x, p) of four events in three words of 16 bits; the last group is whole."""
+    """Decode groups of four (x, p) in three words of 16 bits; the last group is whole."""
     groups = (len(x) + 3) // 4
     if at + 6 * groups > len(data):
         return -_SHORT
-    values = np.empty(4, np.int64)
+    values, words = np.empty(4, np.int64), np.empty(3, np.int64)
     for group in range(groups):
-        a, b, c = _u16(data, at), _u16(data, at + 2), _u16(data, at + 4)
+        words[0], words[1], words[2] = _u16(data, at), _u16(data, at + 2), _u16(data, at + 4)
         at += 6
-        values[0], values[1] = a >> 4, (a & 15) | (b >> 8) << 4
-        values[2], values[3] = (b & 0xFF) | (c >> 12) << 8, c & 0xFFF
+        _four(words, 16, values)
         for place in range(min(4, len(x) - 4 * group)):
             x[4 * group + place] = (values[place] >> 1) & 0x7FF
             p[4 * group + place] = (values[place] & 1) != 0
@@ -175,15 +189,9 @@ def _decode_signs(data, at, p):
         if at + 1 > len(data):
             return -_SHORT
         byte = np.int64(data[at])
-        at += 1
-        run = byte & 127
-        if run == 127:
-            if at + 2 > len(data):
-                return -_SHORT
-            run = _u16(data, at)
-            at += 2
-        if filled + run > len(p):
-            return -_OVERRUN
+        run, at = _run(data, at + 1, byte, 127, len(p) - filled)
+        if at < 0:
+            return at
         p[filled : filled + run] = byte > 127
         filled += run
     return at
@@ -284,7 +292,7 @@ class EcfEvents:
             )
             raise unreadable(self.path, 0, found, "the file is damaged or not complete: copy it again")
         stored_bytes = self.dataset.id.get_storage_size()
-        if not self._is_coded and self.count * self.dataset.dtype.itemsize > stored_bytes * 1100:
+        if not self._is_coded and self.count * self.dataset.dtype.itemsize > stored_bytes * MOST_DEFLATED:
             found = f"CD/events announces {self.count} events, {stored_bytes} bytes are stored"
             raise unreadable(self.path, 0, found, "the file is damaged or not complete: copy it again")
 
@@ -334,7 +342,7 @@ class EcfEvents:
         names = set(dataset.dtype.names or ()) if isinstance(dataset, h5py.Dataset) else set()
         if not isinstance(dataset, h5py.Dataset) or not {"p", "t", "id"} <= names or dataset.ndim != 1:
             raise unreadable(self.path, 0, "EXT_TRIGGER/events is no table of p, t, id", "export it again")
-        if dataset.shape[0] * dataset.dtype.itemsize > dataset.id.get_storage_size() * 1100:
+        if dataset.shape[0] * dataset.dtype.itemsize > dataset.id.get_storage_size() * MOST_DEFLATED:
             raise unreadable(self.path, 0, "EXT_TRIGGER/events announces more than is stored", "copy it again")
         rows = dataset[:]
         return rows["t"].astype(np.int64) - self.shift_us, rows["id"].astype(np.uint8), rows["p"] != 0
@@ -360,7 +368,6 @@ class EcfSource:
         opened: Opens the file and turns what h5py raises into one line.
         width: Sensor width, pixels; None = the file's.
         height: Sensor height, pixels.
-        topic: Must be None: the file holds one stream.
     """
 
     def __init__(
@@ -370,9 +377,7 @@ class EcfSource:
         opened: Callable,
         width: int | None,
         height: int | None,
-        topic: str | None,
     ) -> None:
-        refuse_topic(path, "Prophesee's HDF5", topic)
         self._options, self._opened, self._report = (width, height), opened, report
         self._path = path
         with opened(path) as file:

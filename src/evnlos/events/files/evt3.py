@@ -106,10 +106,8 @@ WRAP_US = 1 << 24
 _HIGH_TURN = 1 << 12
 SLACK = 12
 _ROW_SEEN, _BASE_SEEN = 8, 9  # further slots of the state
-_OLD_HIGH, _OLD_BASE = (
-    10,
-    11,
-)  # clock before a jump of which it is not known yet whether it comes back; high + 1, 0 = none
+# Clock before a jump of which it is not known yet whether it comes back; high + 1, 0 = none.
+_OLD_HIGH, _OLD_BASE = 10, 11
 _DENSE = 12  # clock words in a row that were near the one before: only a camera's clock that runs on can jump
 
 

@@ -43,6 +43,7 @@ def read_timed_frames(
     options = celex or CelexOptions()
     format = find_format(path, options)
     report = ReadReport(path, strict=on_error == "strict", format=format.name)
+    format.check_topic(path, topic)
     if format.frames is not None:
         return Frames(*format.frames(path, report, topic))
     if format.name != "CELEX":

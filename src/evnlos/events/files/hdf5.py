@@ -16,13 +16,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.events.files.columns import ColumnCheck, Columns, ReadReport, unreadable
+from evnlos.events.files.columns import MOST_DEFLATED, ColumnCheck, Columns, ReadReport, unreadable
 from evnlos.events.files.ecf import EcfSource, is_prophesee
-from evnlos.events.files.streams import Stream, choose_stream
+from evnlos.events.files.streams import Stream, choose_stream, refuse_topic
 from evnlos.untrusted import ElsewhereError, check_memory, open_hdf5, stored
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_MAX_RATIO = 1100  # deflate and lzf shrink a chunk at most that much
 _MOST_CHUNK_BYTES = 1 << 26
 _NAMES = {"t_us": "t", "x": "x", "y": "y", "p": "p"}
 _ALIASES = {
@@ -95,7 +94,8 @@ def open_hdf5_events(
     with _opened(path) as file:
         is_ecf = is_prophesee(file)
     if is_ecf:
-        return EcfSource(path, report, _opened, width, height, topic)
+        refuse_topic(path, "Prophesee's HDF5", topic)
+        return EcfSource(path, report, _opened, width, height)
     return Hdf5Source(path, report, width, height, topic)
 
 
@@ -199,7 +199,7 @@ class Hdf5Source:
                 dataset.chunks is not None
                 and dataset.id.get_num_chunks() * math.prod(dataset.chunks) < dataset.size
             )
-            if missing or need > stored * _MAX_RATIO:
+            if missing or need > stored * MOST_DEFLATED:
                 raise unreadable(
                     self.path,
                     0,

@@ -37,6 +37,16 @@ class Topic(NamedTuple):
     is_rendered: bool = False
 
 
+def topics_of(connections: dict[int, Topic], counts: dict[int, int]) -> list[Topic]:
+    """Return the topics of numbered connections, of which several may share a name, with their messages."""
+    found: dict[str, Topic] = {}
+    for number, topic in connections.items():
+        before = found[topic.name].messages or 0 if topic.name in found else 0
+        count = before + counts[number] if number in counts else None
+        found[topic.name] = topic._replace(messages=count)
+    return list(found.values())
+
+
 class Message(NamedTuple):
     """A message: its topic, byte of the file where it (or its chunk) stands, its time of receipt, its bytes."""
 
@@ -94,12 +104,7 @@ class McapFile:
             ):
                 pass
             counts = {}
-        found: dict[str, Topic] = {}
-        for number, topic in self._channels.items():
-            before = found[topic.name].messages or 0 if topic.name in found else 0
-            count = counts.get(number)
-            found[topic.name] = topic._replace(messages=before + count if count is not None else None)
-        return list(found.values())
+        return topics_of(self._channels, counts)
 
     def messages(self, names: frozenset[str]) -> Iterator[Message]:
         """Yield the messages of the named topics in the order of the file."""

@@ -12,7 +12,7 @@ from typing import IO
 
 import numpy as np
 
-from evnlos.events.files.columns import DTYPES, ColumnCheck, Columns, ReadReport, unreadable
+from evnlos.events.files.columns import DTYPES, MOST_DEFLATED, ColumnCheck, Columns, ReadReport, unreadable
 from evnlos.types import Events
 from evnlos.untrusted import NUMPY_ERRORS, check_memory
 
@@ -21,7 +21,6 @@ _CURE = "the file is damaged or not complete: copy it again"
 _REQUIRED = ("t_us", "x", "y", "p")
 _OPTIONAL = ("adc", "polarity_known")
 _ALIASES = {"t": "t_us"}
-_MAX_RATIO = 1100  # deflate
 _EVENT_BYTES = 39  # of an event as columns, as what is stored, and as bytes that are read
 
 
@@ -51,7 +50,7 @@ class _Member:
             )
         if (
             self._file.tell() + size != info.file_size
-            or info.file_size > _MAX_RATIO * info.compress_size + 4096
+            or info.file_size > MOST_DEFLATED * info.compress_size + 4096
         ):
             raise unreadable(path, info.header_offset, f"array {self.name} announces {size} bytes", _CURE)
 

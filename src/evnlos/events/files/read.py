@@ -43,7 +43,9 @@ def open_source(
             raise EventFileError(f"{name}={side}; give 1 to 65536 pixels")
     report = ReadReport(path, strict=on_error == "strict")
     try:
-        source = find_format(path, celex).open(path, report, width, height, celex, topic)
+        format = find_format(path, celex)
+        format.check_topic(path, topic)
+        source = format.open(path, report, width, height, celex, topic)
     except OSError as error:
         raise EventFileError(f"{path}: cannot be opened ({error.strerror}); check its permissions") from None
     return source, report

@@ -70,6 +70,7 @@ class Format:
         create: Begins a file: (path, first piece of the events, the name that it will get); None where the
             format is only read.
         frames: Reads its frames and their times, microseconds: (path, report, topic); None where it has none.
+        has_streams: Whether a file may hold several streams, of which `topic` names one.
     """
 
     name: str
@@ -78,18 +79,19 @@ class Format:
     open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None, str | None], FileSource]
     create: Callable[[Path, Events, Path], Sink] | None = None
     frames: Callable[[Path, ReadReport, str | None], tuple[NDArray, NDArray[np.int64]]] | None = None
+    has_streams: bool = False
+
+    def check_topic(self, path: Path, topic: str | None) -> None:
+        """Raise EventFileError where a topic is named for a file that holds one stream."""
+        if not self.has_streams:
+            refuse_topic(path, path.suffix or self.name, topic)
 
 
 def _plain(
     source: Callable[[Path, ReadReport, int | None, int | None], FileSource],
 ) -> Callable[..., FileSource]:
     """Return an opener of a format with one stream, which has no use for the options of CeleX-V."""
-
-    def opened(path, report, width, height, _, topic):
-        refuse_topic(path, path.suffix or "this format", topic)
-        return source(path, report, width, height)
-
-    return opened
+    return lambda path, report, width, height, _celex, _topic: source(path, report, width, height)
 
 
 def _of_streams(source: Callable[..., FileSource]) -> Callable[..., FileSource]:
@@ -99,12 +101,7 @@ def _of_streams(source: Callable[..., FileSource]) -> Callable[..., FileSource]:
 
 def _celex(source: Callable[..., FileSource]) -> Callable[..., FileSource]:
     """Return an opener of a format with one stream and the options of CeleX-V."""
-
-    def opened(path, report, width, height, options, topic):
-        refuse_topic(path, path.suffix or "this format", topic)
-        return source(path, report, width, height, options)
-
-    return opened
+    return lambda path, report, width, height, options, _: source(path, report, width, height, options)
 
 
 def _raw(name: str) -> Format:
@@ -130,7 +127,7 @@ def _ros(
         return ros.read_ros_frames(container(path, report), path, report, topic)
 
     suffix = f".{name.lower()}"
-    return Format(name, (suffix,), lambda start: start.startswith(signature), opened, create, frames)
+    return Format(name, (suffix,), lambda start: start.startswith(signature), opened, create, frames, True)
 
 
 FORMATS = (
@@ -140,6 +137,7 @@ FORMATS = (
         lambda start: start.startswith(hdf5.SIGNATURE),
         _of_streams(hdf5.open_hdf5_events),
         lambda path, first, _: hdf5_write.Hdf5Sink(path, first),
+        has_streams=True,
     ),
     Format(
         "NPZ",
@@ -174,6 +172,7 @@ FORMATS = (
         lambda start: start.startswith(aedat3.SIGNATURE),
         _of_streams(aedat3.Aedat3Source),
         frames=aedat3.read_aedat3_frames,
+        has_streams=True,
     ),
     _ros("DB3", ros_bags.DB3_SIGNATURE, ros_bags.Db3File),
     _ros("MCAP", mcap.SIGNATURE, mcap.McapFile, lambda path, first, _: mcap_write.McapSink(path, first)),

@@ -15,7 +15,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from evnlos.events.files.columns import SALVAGE, ReadReport, unreadable
-from evnlos.events.files.mcap import Message, Topic
+from evnlos.events.files.mcap import Message, Topic, topics_of
 from evnlos.events.files.unpacking import MOST_CHUNK_BYTES, unpack
 from evnlos.untrusted import open_regular
 
@@ -61,12 +61,7 @@ class BagFile:
             connections, counts = {}, {}
             for _ in BagFile(self.path, ReadReport(self.path, strict=False))._walk(connections, frozenset()):
                 pass
-        found: dict[str, Topic] = {}
-        for number, topic in connections.items():
-            before = found[topic.name].messages or 0 if topic.name in found else 0
-            count = before + counts[number] if number in counts else None
-            found[topic.name] = topic._replace(messages=count)
-        return list(found.values())
+        return topics_of(connections, counts)
 
     def messages(self, names: frozenset[str]) -> Iterator[Message]:
         """Yield the messages of the named topics in the order of the file."""
