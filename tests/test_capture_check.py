@@ -149,15 +149,17 @@ def test_the_command_prints_and_its_exit_code_tells(tiny_captures, tmp_path, cap
     assert stop.value.code == 2 and "capture.yaml" in capsys.readouterr().err
 
 
+STEADY = Lab(
+    glyphs=FontGlyphs(family="kalam", characters="R"),
+    setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),
+    frame_rate_hz=2.5,
+)
+
+
 @pytest.fixture(scope="module")
 def steady(tmp_path_factory):
     """A rendered capture at 2.5 frames per second."""
-    lab = Lab(
-        glyphs=FontGlyphs(family="kalam", characters="R"),
-        setup=RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72)),
-        frame_rate_hz=2.5,
-    )
-    return read_capture(render_captures(lab, tmp_path_factory.mktemp("steady"))[0])
+    return read_capture(render_captures(STEADY, tmp_path_factory.mktemp("steady"))[0])
 
 
 @pytest.mark.parametrize(("shift_us", "way"), [(350_000, "late"), (-350_000, "early"), (3_000_000, "late")])
@@ -169,6 +171,19 @@ def test_frames_on_a_shifted_clock_are_found_with_the_cure(steady, shift_us, way
     assert found.level == "bad" and f"too {way}" in found.found
     stated = int(found.cure.split("offset_us: ")[1].split("}")[0])
     assert stated == pytest.approx(-shift_us, abs=200_000)
+
+
+@pytest.mark.parametrize("leak_hz", [0.0, 0.1])
+def test_a_polarity_of_a_far_higher_threshold_is_no_clock_offset(tmp_path, leak_hz) -> None:
+    pixel = replace(STEADY.setup.pixel, threshold_on=0.12, threshold_off=1.4, leak_rate_hz=leak_hz)
+    lab = replace(STEADY, setup=replace(STEADY.setup, pixel=pixel), frame_rate_hz=5.0, spread={})
+    capture = read_capture(render_captures(lab, tmp_path)[0])
+    assert capture.events.p.mean() > 0.9
+    assert levels(capture)["clock offset"] == "good"
+    for shift_us, way in ((500_000, "late"), (-500_000, "early")):
+        shifted = replace(capture, frame_times_us=capture.frame_times_us + shift_us)
+        found = {one.what: one for one in check_capture(shifted)}["clock offset"]
+        assert found.level == "bad" and f"too {way}" in found.found
 
 
 def test_frames_in_reversed_order_are_found(steady) -> None:

@@ -214,6 +214,7 @@ def _peak(offsets: NDArray[np.int64], scores: NDArray[np.float64]) -> ClockOffse
 LEAST_AGREEMENT, LEAST_RATIO = 0.2, 1.2
 """Agreement below which nothing is told, and how far one order of the frames must be ahead of the other."""
 _THRESHOLDS = (0.1, 0.15, 0.2, 0.3)  # log units: what sensors are set to
+_EVEN, _MOST_UNEVEN = 2.0, 20.0  # of ON to OFF events: a ratio that says nothing, and the largest used
 _CELLS = 24  # along the longer side
 _PHASES = 8  # pixels of a cell, their references spread evenly over the dead zone
 _STEPS = 8  # of the light between two frames
@@ -231,8 +232,9 @@ class ClockLag:
 
     Args:
         lag_us: What to add to the frames' times, microseconds.
-        limit_us: What can be told, microseconds: the largest of half a time between frames, a tenth of the
-            lobe's width, and half of what the lag differs by between likely thresholds.
+        limit_us: What can be told, microseconds: the largest of half a time between frames (a whole one where
+            one polarity alone tells it, from one flank of the light), a tenth of the lobe's width, and half of
+            what the lag differs by between likely thresholds.
         agreement: Correlation at that lag, -1..1.
         backwards: Greatest correlation of the frames in reversed order, -1..1.
     """
@@ -260,7 +262,8 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
     pixels with a threshold are led along the frames' light, and what they would send is compared with what was
     sent, so that the lateness is on both sides. The lag is the middle of the lobe's top, a mean over those of
     four thresholds that agree nearly as well as the best one: a threshold too high makes it too early, one too
-    low too late.
+    low too late. Where one polarity is much the more frequent, either its threshold is the lower one by that
+    ratio, or noise and leak send the surplus; what agrees better counts.
 
     Args:
         events: The events.
@@ -288,23 +291,45 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
         found = np.array([agreement(expected, times + lag, clock, sums) for lag in lags])
         return np.nan_to_num(found, nan=-1.0)
 
-    curves = [curve(expected_counts(level, threshold)) for threshold in _THRESHOLDS]
-    tops = np.array([one.max() for one in curves])
-    best, top = int(np.argmax(tops)), float(tops.max())
-    backwards = curve(expected_counts(level[::-1], _THRESHOLDS[best]))
+    courses = []
+    for ratio_on, ratio_off in _ratios(events):
+        pairs = [(lower * ratio_on, lower * ratio_off) for lower in _THRESHOLDS]
+        curves = [curve(expected_counts(level, *pair)) for pair in pairs]
+        courses.append((max(one.max() for one in curves), pairs, curves))
+    top, pairs, curves = max(courses, key=lambda course: course[0])
+    best = int(np.argmax([one.max() for one in curves]))
+    backwards = curve(expected_counts(level[::-1], *pairs[best]))
     near = [_middle(lags, one) for one in curves if one.max() >= _NEARLY * top]
     lag, width = np.mean(near, axis=0)
     left_open = 0.5 * float(np.ptp([middle for middle, _ in near]))
-    limit = max(0.5 * float(np.median(np.diff(times_us))), _SHARE_OF_LOBE * float(width), left_open)
-    return ClockLag(round(float(lag)), round(limit), top, float(backwards.max()))
+    between = float(np.median(np.diff(times_us)))
+    is_even = pairs[0][0] == pairs[0][1]
+    limit = max((0.5 if is_even else 1.0) * between, _SHARE_OF_LOBE * float(width), left_open)
+    return ClockLag(round(float(lag)), round(limit), float(top), float(backwards.max()))
 
 
-def expected_counts(level: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
-    """Return what pixels with a threshold send while their light goes from frame to frame, a pixel's mean.
+def _ratios(events: Events) -> list[tuple[float, float]]:
+    """Return the ratios (ON, OFF) of the thresholds to the lower of both that the polarities allow."""
+    on = np.count_nonzero(events.p)
+    ratio = (on + 1) / (len(events) - on + 1)
+    uneven = min(max(ratio, 1 / ratio), _MOST_UNEVEN)
+    if uneven < _EVEN:
+        return [(1.0, 1.0)]
+    return [(1.0, 1.0), (1.0, uneven) if ratio > 1 else (uneven, 1.0)]
+
+
+def expected_counts(
+    level: NDArray[np.float64], threshold_on: float, threshold_off: float | None = None
+) -> NDArray[np.float64]:
+    """Return what pixels with thresholds send while their light goes from frame to frame, a pixel's mean.
+
+    A pixel that has waited is anywhere between its thresholds, but never further from the lower one than by
+    that: leak and noise take it there.
 
     Args:
         level: Logarithm of the cells' light, [N, B]; straight between frames.
-        threshold: Of either polarity, log units, above 0.
+        threshold_on: Of ON events, log units, above 0.
+        threshold_off: Of OFF events, log units, above 0; by default that of ON events.
 
     Returns:
         ON less OFF events of each interval and cell, [N - 1, B].
@@ -313,16 +338,21 @@ def expected_counts(level: NDArray[np.float64], threshold: float) -> NDArray[np.
         >>> expected_counts(np.array([[0.0], [0.4], [0.4], [0.0]]), 0.1).round(2).ravel().tolist()
         [3.5, 0.0, -3.0]
     """
-    phase = (2 * np.arange(_PHASES) + 1) / _PHASES - 1  # -1..1 of the threshold
-    reference = level[0][:, None] + threshold * phase
-    start = [reference.mean(axis=1)]
-    for before, after in itertools.pairwise(level):
+    off = threshold_on if threshold_off is None else threshold_off
+    lower = min(threshold_on, off)
+    phase = (2 * np.arange(_PHASES) + 1) / _PHASES - 1  # -1..1 of the lower threshold
+    if threshold_on != off:
+        phase = 0.5 * (phase - 1) if threshold_on < off else 0.5 * (phase + 1)
+    reference = level[0][:, None] + lower * phase
+    sent = np.zeros((len(level) - 1, level.shape[1]))
+    for k, (before, after) in enumerate(itertools.pairwise(level)):
         for part in np.arange(1, _STEPS + 1) / _STEPS:
             away = (before + (after - before) * part)[:, None] - reference
-            reference = reference + threshold * np.trunc(away / threshold)
-        start.append(reference.mean(axis=1))
-    sent: NDArray[np.float64] = np.diff(np.array(start), axis=0)
-    return sent / threshold
+            up = np.floor(np.maximum(away, 0.0) / threshold_on)
+            down = np.floor(np.maximum(-away, 0.0) / off)
+            reference = reference + threshold_on * up - off * down
+            sent[k] += (up - down).mean(axis=1)
+    return sent
 
 
 def _levels(frames: NDArray, grid: tuple[int, int]) -> NDArray[np.float64]:
