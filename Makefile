@@ -6,13 +6,17 @@ READY := $(VENV)/.ready
 CAPTURES ?=
 DEMO ?= demo
 
-.PHONY: demo test check bench dist clean
+.PHONY: demo test thorough check bench dist clean
 
 demo: $(READY)
 	$(BIN)/evnlos demo --out $(DEMO) $(if $(strip $(CAPTURES)),--captures $(CAPTURES))
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q
+
+# With the tests that take long and repeat at another instant or format what a quicker one tests.
+thorough: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q --thorough
 
 check: $(READY)
 	$(BIN)/ruff format --check src tests benchmarks examples tools

@@ -23,15 +23,58 @@ SLOW = {
 """Files of whole studies and trainings, and of programs that they start."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what takes long, what needs a GPU, and what needs the real data."""
+THOROUGH = (
+    "test_app.py::test_drawings_and_uploads_in_a_real_browser",
+    "test_app_upload.py::test_a_recording_is_shown[.csv]",
+    "test_app_upload.py::test_a_recording_is_shown[.h5]",
+    "test_app_upload.py::test_a_recording_is_shown[.npz]",
+    "test_cluster.py::test_a_killed_worker_costs_nothing_but_time",
+    "test_cluster.py::test_the_command_starts_a_cluster_of_its_own",
+    "test_command_line.py::test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows[ascii]",
+    "test_distributed.py::test_two_processes_survive_a_kill",
+    "test_experiment.py::test_the_papers_simulated_experiment_runs_on_a_small_scale",
+    "test_faults.py::test_a_killed_conversion_ends_with_the_same_bytes[.csv]",
+    "test_faults.py::test_a_killed_conversion_ends_with_the_same_bytes[.npz]",
+    "test_faults.py::test_a_killed_import_ends_with_the_same_bytes[2]",
+    "test_faults.py::test_a_killed_import_ends_with_the_same_bytes[4]",
+    "test_faults.py::test_a_killed_training_ends_with_the_same_bytes[1-0]",
+    "test_faults.py::test_a_killed_training_ends_with_the_same_bytes[2-0]",
+    "test_faults.py::test_a_killed_training_ends_with_the_same_bytes[6-2]",
+    "test_faults.py::test_workers_end_with_their_parent[15-False-at work]",
+    "test_faults.py::test_workers_end_with_their_parent[15-False-starting]",
+    "test_faults.py::test_workers_end_with_their_parent[9-False-starting]",
+    "test_mitsuba_oracle.py::test_two_per_cent_of_gain_are_found[GGX 0.3, post]",
+    "test_tracking.py::test_approach_and_retreat_are_found[0.0]",
+)
+"""Tests, or files of them, that take long and repeat at another instant or format what a quicker one tests."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Take `--thorough`."""
+    parser.addoption("--thorough", action="store_true", help="run also what takes long and seldom breaks")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what takes long, what needs a GPU, and what needs the real data; leave out the thorough tests."""
+    everything = config.args_source is not pytest.Config.ArgsSource.ARGS  # none named on the command line
+    there = {item.nodeid.removeprefix("tests/") for item in items}
+    lost = [name for name in THOROUGH if everything and "::" in name and name not in there]
+    if lost:
+        raise pytest.UsageError(f"THOROUGH names tests that are not there: {lost}")
     for item in items:
+        name = item.nodeid.removeprefix("tests/")
+        if name in THOROUGH or name.partition("::")[0] in THOROUGH:
+            item.add_marker(pytest.mark.thorough)
         if item.path.stem in SLOW:
             item.add_marker(pytest.mark.slow)
         if "shared_data" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.shared)
         if "cuda" in item.name:
             item.add_marker(pytest.mark.gpu)
+    if everything and not config.getoption("--thorough"):
+        left_out = [item for item in items if item.get_closest_marker("thorough")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
 
 
 @pytest.fixture(scope="session")

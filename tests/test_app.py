@@ -12,6 +12,8 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -459,16 +461,25 @@ def strangers(addresses: list[str], home: str) -> list[str]:
     ]
 
 
-def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
+@contextmanager
+def browsed(folder: Path) -> Iterator[tuple[str, chromium.Chromium]]:
+    """Give the address of a page that is served, and a browser."""
     if importlib.util.find_spec("gradio") is None:
         pytest.skip("gradio is not installed: pip install 'evnlos[app]'")
     if chromium.missing():
         pytest.skip(f"{chromium.missing()}: apt-get install chromium chromium-driver")
-    asked: list[str] = []
     with (
-        chromium.page(tmp_path, "--columns", "24", "--upload-mb", "2") as home,
-        chromium.Chromium(tmp_path / "profile") as browser,
+        chromium.page(folder, "--columns", "24", "--upload-mb", "2") as home,
+        chromium.Chromium(folder / "profile") as browser,
     ):
+        yield home, browser
+
+
+SEQUENCE_OF = "document.querySelector('.ev-sheet').dataset.sequence"
+
+
+def test_the_page_in_a_real_browser(tmp_path) -> None:
+    with browsed(tmp_path) as (home, browser):
         assert urlsplit(home).hostname == "127.0.0.1"
         with pytest.raises(urllib.error.HTTPError) as stop:
             urllib.request.urlopen(urllib.request.Request(home, headers={"Host": "evil.example"}), timeout=60)
@@ -502,26 +513,40 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
         )
         browser.wait("return !document.querySelector('.ev-verdict').textContent.includes('Looking at it')")
         # A control simulates another sequence, looked at where the last one was.
-        sequence_of = "document.querySelector('.ev-sheet').dataset.sequence"
         label = "Ambient light"
-        before = browser.run(f"return {sequence_of}")
+        before = browser.run(f"return {SEQUENCE_OF}")
         browser.run(f"document.querySelector('input[type=range][aria-label*=\"{label}\"]').focus()")
         browser.press("\ue014\ue014")  # right
-        browser.wait(f"return {sequence_of} !== {json.dumps(before)}")
+        browser.wait(f"return {SEQUENCE_OF} !== {json.dumps(before)}")
         assert browser.run("return document.querySelector('.ev-now').textContent").startswith(
             "position 30 of 40"
         )
         assert browser.run("return document.querySelector('.ev-position').value") == "29"
         # A number typed beside a slider keeps to the slider's ends.
         box = "document.querySelector('input[type=number][aria-label*=\"Wall roughness\"]')"
-        before = browser.run(f"return {sequence_of}")
+        before = browser.run(f"return {SEQUENCE_OF}")
         typed = "b.value = 5; for (const t of ['input', 'change']) b.dispatchEvent(new Event(t, {bubbles: 1}))"
         browser.run(f"const b = {box}; {typed}")
         browser.wait(f"return {box}.value === '0.3'")
-        browser.wait(f"return {sequence_of} !== {json.dumps(before)}")
+        browser.wait(f"return {SEQUENCE_OF} !== {json.dumps(before)}")
+        asked = browser.requests()
+        complaints = [one for one in browser.complaints() if "SEVERE" in one]
+    assert len(asked) > 20 and strangers(asked, home) == []
+    assert complaints == []
+
+
+def test_drawings_and_uploads_in_a_real_browser(zipped_capture, tmp_path) -> None:
+    asked: list[str] = []
+    with browsed(tmp_path) as (home, browser):
+        browser.open(home)
+        browser.wait(
+            "return document.querySelector('.ev-play') && !document.querySelector('.ev-before')"
+            " && document.querySelector('.ev-now').textContent"
+        )
         # Playing moves by itself.
         browser.run("document.querySelector('.ev-play').click()")
-        browser.wait("return !document.querySelector('.ev-now').textContent.startsWith('position 30 ')")
+        place = json.dumps(browser.run("return document.querySelector('.ev-now').textContent"))
+        browser.wait(f"return document.querySelector('.ev-now').textContent !== {place}")
         browser.run("document.querySelector('.ev-play').click()")
         # A drawing becomes the hidden object.
         browser.run("document.querySelector('input[type=radio][value=\"Draw one\"]').click()")
@@ -530,9 +555,9 @@ def test_the_page_in_a_real_browser(zipped_capture, tmp_path) -> None:
             "const b = document.querySelector('.ev-pen').getBoundingClientRect();"
             " return b.width && [b.left, b.top]"
         )
-        before = browser.run(f"return {sequence_of}")
+        before = browser.run(f"return {SEQUENCE_OF}")
         browser.drag([(int(x) + 40, int(y) + 40), (int(x) + 150, int(y) + 150)])
-        browser.wait(f"return {sequence_of} !== {json.dumps(before)}")
+        browser.wait(f"return {SEQUENCE_OF} !== {json.dumps(before)}")
         # An upload is shown; one that is too large is refused.
         asked += browser.requests()
         browser.run(

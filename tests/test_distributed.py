@@ -66,13 +66,19 @@ def test_the_parts_of_a_batch_are_the_batch_of_one_process(size: int, tiny_datas
         assert found == sorted(row.sum().item() for row in whole.truth)
 
 
-def test_two_processes_train_what_one_does_and_survive_a_kill(tiny_dataset, tmp_path) -> None:
-    log = train(tiny_dataset, SETTINGS, tmp_path / "one").records
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
+QUIET = {"env": ENVIRONMENT, "capture_output": True, "text": True, "timeout": 240}
+
+
+def two_processes(dataset) -> list[str]:
+    """Return the command that trains with two processes, less its folder."""
     command = [*TORCHRUN, "-m", "evnlos", "train", *FLAGS, "--epochs", "2"]
-    command += ["--data", str(tiny_dataset.folder), "--out"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    quiet = {"env": environment, "capture_output": True, "text": True, "timeout": 240}
-    done = subprocess.run([*command, str(tmp_path / "two")], **quiet)
+    return [*command, "--data", str(dataset.folder), "--out"]
+
+
+def test_two_processes_train_what_one_does(tiny_dataset, tmp_path) -> None:
+    log = train(tiny_dataset, SETTINGS, tmp_path / "one").records
+    done = subprocess.run([*two_processes(tiny_dataset), str(tmp_path / "two")], **QUIET)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("2 epochs") == 1  # one process speaks
     records = [json.loads(line) for line in (tmp_path / "two" / "metrics.jsonl").read_text().splitlines()]
@@ -83,9 +89,13 @@ def test_two_processes_train_what_one_does_and_survive_a_kill(tiny_dataset, tmp_
     moved = max((one[name] - two[name]).abs().max().item() for name in one)
     assert moved < 1e-4
 
+
+def test_two_processes_survive_a_kill(tiny_dataset, tmp_path) -> None:
+    command = two_processes(tiny_dataset)
+    subprocess.run([*command, str(tmp_path / "two")], check=True, **QUIET)
     process = subprocess.Popen(
         [*command, str(tmp_path / "killed")],
-        env=environment,
+        env=ENVIRONMENT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
@@ -96,7 +106,7 @@ def test_two_processes_train_what_one_does_and_survive_a_kill(tiny_dataset, tmp_
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert not (tmp_path / "killed" / "weights.safetensors").exists()
-    again = subprocess.run([*command, str(tmp_path / "killed")], **quiet)
+    again = subprocess.run([*command, str(tmp_path / "killed")], **QUIET)
     assert again.returncode == 0, again.stderr
     two, killed = ((tmp_path / name / "weights.safetensors").read_bytes() for name in ("two", "killed"))
     assert two == killed

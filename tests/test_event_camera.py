@@ -1,13 +1,16 @@
 """The event camera on a wall in continuous time: its own steps against fine ones, memory, laws, bad input."""
 
+import importlib
 import tracemalloc
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
+from numba.core.dispatcher import Dispatcher
 
 from evnlos import EventCamera, EventPixel, EvnlosError, simulate_events
+from evnlos.cameras import BrownianPixel, CircuitPixel, V2ePixel
 from evnlos.errors import DataError
 from evnlos.optics import SlidingWall, View
 from evnlos.scene import LineMotion
@@ -206,3 +209,22 @@ def test_bad_input(wall, times, says: str) -> None:
 def test_bad_settings(settings: dict) -> None:
     with pytest.raises(EvnlosError):
         EventCamera(CLEAN, **settings)
+
+
+@pytest.mark.parametrize(
+    ("name", "pixel"),
+    [
+        ("continuous", EventPixel()),
+        ("v2e", V2ePixel()),
+        ("brownian", BrownianPixel()),
+        ("circuit", CircuitPixel()),
+    ],
+)
+def test_no_loop_is_compiled_a_second_time_for_a_counter_that_begins_at_zero(name, pixel) -> None:
+    """Numba compiles what a loop calls twice where a literal is passed first: half of a first call's time."""
+    frames = np.random.default_rng(0).uniform(20, 200, (6, 5, 7)).astype(np.float32)
+    simulate_events(frames, 0.01 * np.arange(6), pixel)
+    module = importlib.import_module(f"evnlos.cameras.pixels.{name}")
+    compiled = {key: one.signatures for key, one in vars(module).items() if isinstance(one, Dispatcher)}
+    assert any(compiled.values())
+    assert [key for key, found in compiled.items() if "Literal" in str(found)] == []

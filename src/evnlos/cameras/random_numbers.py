@@ -172,7 +172,7 @@ def exponential_field(seed, stream, count):
 @cache
 def jitter_table() -> NDArray[np.float32]:
     """Return the table of 1 - 0.1 n, n normal, of which each block of pixels reads a random stretch a step."""
-    normal = normal_field(0, STREAM_LEAK_JITTER, JITTER_SIZE)
+    normal = normal_field(np.uint64(0), STREAM_LEAK_JITTER, JITTER_SIZE)
     normal = (normal - normal.mean()) / normal.std()
     table = 1.0 - 0.1 * normal
     ring = np.concatenate([table, table[:BLOCK]]).astype(np.float32)

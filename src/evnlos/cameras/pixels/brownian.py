@@ -285,7 +285,7 @@ def run_tiles(frames, origin, times, first, last, tile_px, state, on, off, law):
     Returns three columns: time stamp in microseconds, pixel, polarity.
     """
     out = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_)
-    count = 0
+    count = np.int64(0)
     for start in range(first, last, tile_px):
         out, count = run_tile(
             out, count, frames, origin, times, start, min(start + tile_px, last), state, on, off, law

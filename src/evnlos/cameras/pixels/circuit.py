@@ -221,7 +221,7 @@ def run_frames(frames, origin, times, steps, first, last, state, tables, which, 
     Returns three columns: time stamp in microseconds, pixel, polarity.
     """
     out = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_)
-    count, kick = 0, np.empty(3)
+    count, kick = np.int64(0), np.empty(3)
     for k in range(len(frames)):
         length = times[k + 1] - times[k]
         w = which[k]

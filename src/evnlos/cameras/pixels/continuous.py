@@ -334,7 +334,7 @@ def _run_tile(
         if soonest < stop:
             for i in range(size):
                 flags[i] |= candidate[first + i] < stop
-        at = 0
+        at = np.int64(0)
         while at < size:
             count, at = send_events(
                 out_time, out_pixel, out_on, count, at, flag_words, flags, now, then, start, stop, first,
@@ -364,7 +364,7 @@ def run_tiles(
     is a `Curve`. Returns three columns: time stamp in microseconds, pixel, polarity.
     """
     out = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_)
-    count = 0
+    count = np.int64(0)
     for start in range(first, last, tile_px):
         out, count = _run_tile(
             out, count, frames, origin, times, start, min(start + tile_px, last), light, filtered, base,

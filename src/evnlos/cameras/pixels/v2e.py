@@ -222,7 +222,7 @@ def run_tiles(
     it is when a threshold is crossed: the caller decides which events pass.
     """
     out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024, np.int8)
-    count = 0
+    count = np.int64(0)
     for start in range(first, last, tile_px):
         out, count = _run_tile(
             out, count, frames, origin, start, min(start + tile_px, last), lp, base, on, off, step_on, step_off,
