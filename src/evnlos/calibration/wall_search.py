@@ -199,6 +199,7 @@ def fit_wall(
     before = _setup(
         _plain(first, plane, fit.shape), known, rest.ambient, folder / "start.safetensors", strip, fit.shape
     )
+    before = replace(before, cell_m=_SEARCH_CELL_M)  # what the fit is compared with, and nothing else
     every = {p.name: p for p in before.parameters()}
     searched = tuple(every[freedom.name] for freedom in freedoms)
     return WallFit(TransportFit(before, found, searched, search.error), search, rest)

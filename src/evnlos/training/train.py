@@ -41,6 +41,7 @@ from evnlos.training.validation import confidence_of, held_out_samples, validate
 from evnlos.types import derive_seed
 
 _LOG = logging.getLogger("evnlos")
+_CHECKPOINT_S = 5.0  # a checkpoint after the first epoch, then no more often: it may take longer than an epoch
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +78,10 @@ def train(
 
     From random weights this is pre-training (on simulation) or the end-to-end baseline (on captures);
     from `weights` it is fine-tuning. The run's folder holds `run.yaml` (settings, data, versions),
-    `metrics.jsonl`, a checkpoint after each epoch, and in the end `weights.safetensors`. A run that was
-    killed goes on when it is started again, and ends with the same bytes if it has as many threads. Processes
-    that `torchrun` started share each batch: the gradient is that of one process, up to the order of its sums.
+    `metrics.jsonl`, a checkpoint after the first epoch and then every five seconds, and in the end
+    `weights.safetensors`. A run that was killed goes on when it is started again, and ends with the same bytes
+    if it has as many threads. Processes that `torchrun` started share each batch: the gradient is that of one
+    process, up to the order of its sums.
 
     Args:
         dataset: Where the samples are, or a simulation that makes them meanwhile; the split `validation` is
@@ -164,6 +166,7 @@ def _epochs(
     processes.wait()  # nobody writes before all have read
     joined = processes.joined(network)
     run = torch.compile(joined) if settings.compile else joined
+    saved = time.monotonic()
     for epoch in range(done, settings.epochs):
         began, rate, total = time.perf_counter(), 0.0, torch.zeros((), device=device)
         network.train()
@@ -194,7 +197,9 @@ def _epochs(
         record["seconds"] = round(time.perf_counter() - began, 2)
         log.append(record)
         if leads:
-            save_checkpoint(checkpoint, network, optimiser, epoch + 1, log, key)
+            if epoch == done or time.monotonic() - saved >= _CHECKPOINT_S:
+                save_checkpoint(checkpoint, network, optimiser, epoch + 1, log, key)
+                saved = time.monotonic()
             _write_log(metrics, log)
         progress(Step(what, epoch + 1, settings.epochs, "epochs", record))
     if leads:
