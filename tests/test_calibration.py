@@ -485,3 +485,10 @@ def test_a_matte_wall_ends_on_the_bounds(tmp_path, capsys) -> None:
     shown = capsys.readouterr()
     assert "on the bound of the search" in shown.out
     assert any(line.startswith("warning: setup.") and "evnlos scan" in line for line in shown.err.splitlines())
+
+
+def test_a_cutoff_with_which_most_of_those_tried_agree_is_not_identified(fit) -> None:
+    for agree, words in (((5.0, 320.0), "not identified: 5 to 320 agree"), ((80.0, 160.0), "80 to 160")):
+        one = replace(fit, pixel=replace(fit.pixel, cutoff_range_hz=agree))
+        (row,) = [r for r in rows_of(one, PIXEL, CAMERA) if r.name == "setup.pixel.cutoff_hz"]
+        assert words in row.note

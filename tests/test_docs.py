@@ -100,3 +100,14 @@ def test_the_messages_of_the_questions_are_those_of_the_code() -> None:
     quoted = re.findall(r"^> (.*)$", (DOCS / "faq.md").read_text(), flags=re.MULTILINE)
     assert len(quoted) >= 15
     assert not [line for line in quoted if line not in known]
+
+
+def test_files_that_pages_name_exist() -> None:
+    there = {
+        str(path.relative_to(ROOT))
+        for part in ("src", "tests", "benchmarks", "examples", "tools")
+        for path in (ROOT / part).rglob("*.py")
+    }
+    for page in PAGES:
+        for name in re.findall(r"`([\w/]+\.py)`", page.read_text()):
+            assert any(path == name or path.endswith(f"/{name}") for path in there), f"{page.name}: {name}"

@@ -35,6 +35,8 @@ _UNTOLD = "not told by unknown targets: arbitrary"
 _ANOTHER_WALL = "the wall may be of another kind: measure its transport (evnlos scan), or try"
 _TRY = {"known": "another --preset or start", "unknown": "known targets or another start"}
 
+_TOLD_RATIO = 8.0  # of the highest cutoff that agrees to the lowest: more is no answer
+
 
 @dataclass(frozen=True)
 class Row:
@@ -111,7 +113,8 @@ def _pixel_rows(fit: SetupFit, start: Any) -> list[Row]:
     ]
     if fit.pixel.cutoff_range_hz is not None:
         low, high = fit.pixel.cutoff_range_hz
-        tried = f"of those tried: {low:g} to {high:g}"
+        told = high / low < _TOLD_RATIO
+        tried = f"of those tried: {low:g} to {high:g}" if told else f"not identified: {low:g} to {high:g} agree"
         cutoff = getattr(pixel, "cutoff_hz", 0.0)
         rows.append(Row("setup.pixel.cutoff_hz", start.cutoff_hz, cutoff, None, "Hz", tried))
     if hasattr(pixel, "refractory_s"):
