@@ -31,9 +31,8 @@ import numpy as np
 import torch
 
 from evnlos.data import STANDARD_MODALITIES, Sampling
-from evnlos.live.chunk import EventSource
 from evnlos.live.engine import Engine
-from evnlos.live.packet import USUAL_EVENTS, Packet, pack
+from evnlos.live.packet import USUAL_EVENTS, EventSource, Packet, pack
 from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import Replay, TimedFrame
 from evnlos.live.udp import UdpSource

@@ -27,10 +27,10 @@ import numpy as np
 from evnlos.cameras import EventPixel
 from evnlos.data import SensorSize, Simulation, simulate, simulate_object
 from evnlos.data.simulations import default, paper
+from evnlos.machine import one_thread
 from evnlos.plot.figures import new_figure
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import PaperSetup
-from evnlos.threads import one_thread
 from machine import machine
 
 OBJECTS, NODES = 1_000_000, 100

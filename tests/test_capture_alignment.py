@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from evnlos.data import read_capture
 from evnlos.data.cleaning import correct_frames, crop_events, find_hot_pixels, keep_supported, without_pixels
 from evnlos.data.clocks import find_offset
-from evnlos.data.registration import find_dots, homography_from_points, registration_error, warp_frames
+from evnlos.data.frames import find_dots, homography_from_points, registration_error, warp_frames
 from evnlos.errors import DataError
 from evnlos.types import Events
 

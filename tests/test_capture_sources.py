@@ -12,7 +12,7 @@ from PIL import Image
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
 from evnlos.cli import main
 from evnlos.data import check_picture, read_shard
-from evnlos.data.registration import homography_from_points
+from evnlos.data.frames import homography_from_points
 from evnlos.events import write_aedat4, write_celex_frames, write_events
 from evnlos.types import Events
 from ros_files import IMAGE, PACKET, Cdr, Recording, Ros1, event_array, image, write_bag, write_mcap

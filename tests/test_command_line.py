@@ -15,8 +15,8 @@ import evnlos
 from evnlos import Events, doctor, write_events
 from evnlos.cli import VERBS, main
 from evnlos.cli.about import script
+from evnlos.cli.main import command_of
 from evnlos.cli.parsing import say
-from evnlos.cli.verbs import command_of
 
 SOURCE = Path(evnlos.__file__).parent
 PAGE = (SOURCE.parent.parent / "docs" / "command_line.md").read_text()

@@ -22,10 +22,9 @@ from evnlos.models import (
     published_setup,
     save_weights,
 )
-from evnlos.models.confidence import COVERAGE, on_canvas
+from evnlos.models.confidence import COVERAGE, fit_confidence, on_canvas
 from evnlos.report import reconstruct_capture
 from evnlos.setups import RadiometricSetup
-from evnlos.training.validation import fit_confidence
 from evnlos.types import Plane
 
 CANVAS = Plane(48, 96, 0.0025)

@@ -11,12 +11,12 @@ from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation
 from evnlos.errors import DataError
-from evnlos.experiment.generalization import evaluation_sets, generalization
+from evnlos.experiment.presets import evaluation_sets, generalization
 from evnlos.models import UNetConfig, Weights, save_weights
+from evnlos.models.confidence import fit_confidence
 from evnlos.scene import DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.training.validation import fit_confidence
 
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
 SETUP = Simulation(
@@ -59,7 +59,7 @@ def test_a_network_is_scored_set_by_set(tiny_dataset, tmp_path, capsys, monkeypa
         return {"icon": icons, "dim": replace(icons, setup=dim)}
 
     # By name: the package's attribute `generalization` is the function, not the module.
-    monkeypatch.setattr(sys.modules["evnlos.experiment.generalization"], "evaluation_sets", two)
+    monkeypatch.setattr(sys.modules["evnlos.experiment.presets"], "evaluation_sets", two)
     command = ["experiment", "carry-over", "--weights", str(tmp_path / "w.safetensors"), "--rig", "lab"]
     command += ["--out", str(tmp_path), "--workers", "1"]
     with monkeypatch.context() as little:

@@ -25,7 +25,7 @@ from evnlos.scene import (
     read_sd19,
     render_glyph,
 )
-from evnlos.scene.glyphs import character_name
+from evnlos.scene.fonts import character_name
 
 
 def ink_box(mask):

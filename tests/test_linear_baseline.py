@@ -6,7 +6,7 @@ import torch
 
 from evnlos.errors import DataError
 from evnlos.models import fit_linear
-from evnlos.models.linear import _LAMBDAS, _left_out
+from evnlos.models.reconstructor import _LAMBDAS, _left_out
 
 
 def world(noise: float, objects: int = 30, positions: int = 10, seed: int = 0):

@@ -25,11 +25,10 @@ from evnlos.data import STANDARD_MODALITIES, Sampling, capture_samples, read_cap
 from evnlos.errors import ConfigError, DataError, EventFileError
 from evnlos.events import read_events, time_surface, write_events
 from evnlos.live import display as record
-from evnlos.live.chunk import Chunk, ChunkQueue
 from evnlos.live.display import Page
 from evnlos.live.engine import AreaReduction, Engine, Picture, RunningSurface, Timing
 from evnlos.live.growing_file import GrowingFile, open_tail
-from evnlos.live.packet import Packet, PacketError, pack, unpack, unpack_all
+from evnlos.live.packet import Chunk, ChunkQueue, Packet, PacketError, pack, unpack, unpack_all
 from evnlos.live.run import RateOptions, Run, RunStatistics, latency_table
 from evnlos.live.sources import Replay, SourceOptions, TimedFrame, capture_replay, open_live
 from evnlos.live.udp import UdpSender, UdpSource, send_timed

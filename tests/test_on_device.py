@@ -12,11 +12,10 @@ from evnlos.cameras.on_device import capture_tensors, record_tensors
 from evnlos.cameras.pixels.torch_noise import electrons
 from evnlos.cameras.random_numbers import fill_electrons
 from evnlos.data import Sampling, SensorSize, Simulation, live_dataset
-from evnlos.data.live import bytes_of_a_wall, simulate_objects_on
+from evnlos.data.live import bytes_of_a_wall, simulate_objects_on, time_surface_tensors
 from evnlos.data.simulate import simulate_object
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
-from evnlos.events.surface_tensors import time_surface_tensors
 from evnlos.optics import SlidingWall, View
 from evnlos.optics.wall import slide
 from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion

@@ -31,7 +31,7 @@ from evnlos.calibration import (
 )
 from evnlos.cameras import BrownianPixel, EventPixel, PixelSettings, load_pixel, simulate_events
 from evnlos.cli import main
-from evnlos.cli.verbs import command_of
+from evnlos.cli.main import command_of
 from evnlos.config import load_yaml, save_yaml
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events

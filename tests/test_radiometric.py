@@ -20,9 +20,9 @@ from evnlos.optics import (
     lamp_radiance,
     light_transport_matrix,
 )
-from evnlos.optics.occluder import visibility
 from evnlos.optics.radiometric import pair_throughput, quadrature_points
 from evnlos.optics.reflection import conductor_fresnel
+from evnlos.optics.view import visibility
 from evnlos.setups import RadiometricSetup, setup_preset
 from evnlos.types import Plane
 

@@ -16,8 +16,7 @@ from evnlos.analysis.confidence import ConfidenceCheck
 from evnlos.analysis.identify import identify
 from evnlos.analysis.linearized import AnalysisSettings
 from evnlos.analysis.scores import score
-from evnlos.cli.main import main
-from evnlos.cli.verbs import command_of
+from evnlos.cli.main import command_of, main
 from evnlos.config import save_yaml
 from evnlos.data import Sampling, Simulation
 from evnlos.data.sampling import Samples

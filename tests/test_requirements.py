@@ -11,7 +11,7 @@ import pytest
 
 import evnlos
 from evnlos.cli import VERBS, main
-from evnlos.cli.verbs import command_of, summary_of
+from evnlos.cli.main import command_of, summary_of
 from evnlos.doctor import REQUIRED, faults
 
 ROOT = Path(evnlos.__file__).parent.parent.parent

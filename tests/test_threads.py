@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_info
 
 from evnlos.data.pool import run_in_order, run_tasks
 from evnlos.errors import ConfigError
-from evnlos.threads import cores, undisturbed
+from evnlos.machine import cores, undisturbed
 
 
 @pytest.mark.parametrize(("chosen", "expected"), [(None, "PASSIVE"), ("active", "active")])

@@ -14,7 +14,7 @@ from evnlos.models import ResidualUNet, UNetConfig, load_weights, save_weights
 from evnlos.models.sequence import SequenceConfig
 from evnlos.training import LOSSES, Training, check_run, learning_rate_at, normalized_bce_mse_ssim, paper_loss
 from evnlos.training.source import half_mirrored, with_mirrored
-from evnlos.training.validation import validate
+from evnlos.training.train import validate
 
 SMALL = UNetConfig(width=8, depth=2, shuffle=1, rank=0)
 QUICK = Training(

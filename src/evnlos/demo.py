@@ -15,7 +15,7 @@ import numpy as np
 from evnlos.calibration import CALIBRATION_VALUES_FILE, Calibration
 from evnlos.config import write_atomically
 from evnlos.data import STANDARD_MODALITIES
-from evnlos.data.capture import character_of
+from evnlos.data.capture_info import character_of
 from evnlos.data.lab import Lab, lab_of, render_captures
 from evnlos.data.sampling import Sampling
 from evnlos.data.simulations import default

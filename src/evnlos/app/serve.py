@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from evnlos.errors import ConfigError, MissingDependencyError
-from evnlos.hosts import is_local, listening_address, names_this_machine
+from evnlos.machine import is_local, listening_address, names_this_machine
 
 # The browser itself refuses what would leave this server.
 _POLICY = (

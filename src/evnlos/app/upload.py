@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from evnlos.app.controls import POSITIONS, Recorded
 from evnlos.data import read_capture
-from evnlos.data.capture_info import read_capture_info
-from evnlos.data.frame_sources import inside
+from evnlos.data.capture_info import inside, read_capture_info
 from evnlos.errors import DataError
 from evnlos.events.recording import Recording
 from evnlos.scene import LineMotion, Target

@@ -1,5 +1,6 @@
 """Names of `evnlos.calibration`; `__init__.py` reads this list."""
 
+from .captures import Calibration as Calibration
 from .captures import CaptureSet as CaptureSet
 from .captures import read_capture_set as read_capture_set
 from .event_fit import PixelFit as PixelFit
@@ -34,7 +35,6 @@ from .pixel_light import waveform as waveform
 from .pixel_report import KnownLightFit as KnownLightFit
 from .pixel_report import fit_known_light as fit_known_light
 from .pixel_statistics import simulated_events as simulated_events
-from .settings import Calibration as Calibration
 from .summary import CALIBRATION_VALUES_FILE as CALIBRATION_VALUES_FILE
 from .summary import calibration_values as calibration_values
 from .summary import residual_table as residual_table

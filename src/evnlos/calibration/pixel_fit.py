@@ -27,15 +27,18 @@ from numpy.typing import NDArray
 
 from evnlos.calibration.event_models import Free
 from evnlos.calibration.pixel_light import LitRecording, part_of
-from evnlos.calibration.pixel_posterior import NEAR, Surface, clipped, updated
 from evnlos.calibration.pixel_statistics import (
+    NEAR,
     Array,
     Binning,
     Scale,
+    Surface,
     binning_of,
+    clipped,
     scale_of,
     simulated_events,
     statistics_of,
+    updated,
 )
 from evnlos.cameras import BrownianPixel, CircuitPixel, EventPixel, PixelSettings
 from evnlos.errors import ConfigError, DataError
@@ -64,10 +67,7 @@ _THRESHOLDS = (
 _NOISE = Free("shot_noise_rate_hz", 1e-3, 100.0, 0.1)
 _LEAK = Free("leak_rate_hz", 1e-3, 20.0, 0.1)
 CANDIDATES: dict[str, tuple[PixelSettings, tuple[Free, ...]]] = {
-    "continuous": (
-        EventPixel(),
-        (*_THRESHOLDS, Free("cutoff_hz", 1.0, 5000.0, 0.1), _LEAK, _NOISE),
-    ),
+    "continuous": (EventPixel(), (*_THRESHOLDS, Free("cutoff_hz", 1.0, 5000.0, 0.1), _LEAK, _NOISE)),
     "continuous, true logarithm": (
         EventPixel(logarithm="true", dark_dn=1.0, cutoff_floor_dn=1.0),
         (*_THRESHOLDS, Free("cutoff_hz", 1.0, 5000.0, 0.1), _LEAK, _NOISE, Free("dark_dn", 0.02, 60.0, 0.2)),

@@ -24,7 +24,7 @@ from evnlos.calibration.pixel_checks import (
     refractory_of,
     tick_of,
 )
-from evnlos.calibration.pixel_files import Manifest, doubts_of, read_lit_events
+from evnlos.calibration.pixel_files import Manifest, PixelMaps, doubts_of, maps_of, read_lit_events
 from evnlos.calibration.pixel_fit import (
     CandidateFit,
     Estimate,
@@ -34,7 +34,6 @@ from evnlos.calibration.pixel_fit import (
     shortened,
 )
 from evnlos.calibration.pixel_light import LitEvents, LitRecording, choose_panel, lit_recording
-from evnlos.calibration.pixel_maps import PixelMaps, maps_of
 from evnlos.cameras import PixelSettings, ReadoutPixel
 from evnlos.config import save_yaml, to_dict
 from evnlos.errors import DataError

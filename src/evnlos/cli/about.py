@@ -54,7 +54,7 @@ class CompletionCommand:
 
 def script(shell: Shell) -> str:
     """Return the completion script of all commands for a shell."""
-    from evnlos.cli.verbs import VERBS, command_of
+    from evnlos.cli.main import VERBS, command_of
 
     commands = {verb: command_of(verb) for verb in VERBS}
     printed = io.StringIO()

@@ -156,7 +156,7 @@ class InvertCommand:
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, setup: Path) -> None:
-        from evnlos.cli.invert_captures import SequenceOptions, invert_captures, print_sequence
+        from evnlos.cli.invert_captures import SequenceOptions, invert_captures
         from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
@@ -195,10 +195,11 @@ class InvertCommand:
         found["picture"] = str(draw_inversion(self.out, [(name, image[None]) for name, image in best.items()]))
         arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
         _save_arrays(self.out, arrays)
-        print_sequence(found, self.json)
+        table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{found['seconds']} s"
+        print(json.dumps(found) if self.json else table)
 
     def _estimate(self, setup: Path, evidence: Literal["frames", "events", "both"]) -> None:
-        from evnlos.cli.invert_sequences import estimate_captures, sequence_doubts, sequence_text
+        from evnlos.cli.invert_captures import estimate_captures, sequence_doubts, sequence_text
         from evnlos.plot.results import draw_inversion
 
         if self.positions or self.track or self.solver != "all":
@@ -250,3 +251,17 @@ def _weight(text: str) -> tuple[float | None, Literal["cv", "gcv", "discrepancy"
         return float(text), "cv"
     except ValueError:
         raise ConfigError(f"--regularization is {text!r}; give cv, gcv, discrepancy or a number") from None
+
+
+def sequence_table(rows: list[dict[str, Any]]) -> str:
+    """Return mean PSNR by number of positions and solver, over captures and subsets, as lines for people."""
+    solvers = list(dict.fromkeys(row["solver"] for row in rows))
+    lines = ["positions " + "".join(f"{s:>12}" for s in solvers)]
+    for count in dict.fromkeys(row["positions"] for row in rows):
+        values = []
+        for solver in solvers:
+            known = [r["psnr_db"] for r in rows if (r["positions"], r["solver"]) == (count, solver)]
+            db = [v for v in known if v is not None]
+            values.append(f"{np.mean(db):9.2f} dB" if db else f"{'-':>12}")
+        lines.append(f"{count:9d} " + "".join(values))
+    return "\n".join(lines)

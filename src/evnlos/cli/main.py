@@ -1,27 +1,67 @@
-"""From the words of a command line to a command that runs; bad input is one line and exit code 2."""
+"""The verbs, and from the words of a command line to a command that runs; bad input is a line and exit code 2.
+
+- `evnlos doctor`: is the installation whole?
+"""
 
 from __future__ import annotations
 
+import ast
 import difflib
+import importlib
+import json
 import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import MISSING, fields, is_dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
+from importlib.resources import files
 from types import FrameType
 from typing import Any, NoReturn, TextIO, cast
 
 from evnlos.cli.parsing import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen, parse, todays_words
-from evnlos.cli.verbs import VERBS, command_of, summary_of
-from evnlos.doctor import fault_behind
+from evnlos.doctor import examine, fault_behind
 from evnlos.errors import ConfigError, EvnlosError, printable
+from evnlos.machine import sleep_while_waiting
 from evnlos.migrate import __version__
 from evnlos.registry import Kinded, kind_of
-from evnlos.threads import sleep_while_waiting
 
 # Nothing that may be missing is imported before a command is: help, version and doctor work in any case.
+
+
+VERBS: dict[str, str] = {
+    "demo": "experiment.DemoCommand",
+    "simulate": "datasets.SimulateCommand",
+    "capture": "datasets.CaptureCommand",
+    "import": "datasets.ImportCommand",
+    "verify": "datasets.VerifyCommand",
+    "lab": "datasets.LabCommand",
+    "calibrate": "calibration.CalibrateCommand",
+    "scan": "calibration.ScanCommand",
+    "pixel": "calibration.PixelCommand",
+    "train": "learning.TrainCommand",
+    "finetune": "learning.FinetuneCommand",
+    "weights": "learning.WeightsCommand",
+    "evaluate": "learning.EvaluateCommand",
+    "experiment": "experiment.ExperimentCommand",
+    "identify": "results.IdentifyCommand",
+    "reconstruct": "results.ReconstructCommand",
+    "live": "experiment.LiveCommand",
+    "invert": "invert.InvertCommand",
+    "track": "results.TrackCommand",
+    "report": "results.ReportCommand",
+    "events": "events.EventsCommand",
+    "info": "recordings.InfoCommand",
+    "convert": "recordings.ConvertCommand",
+    "preview": "recordings.PreviewCommand",
+    "app": "experiment.AppCommand",
+    "cite": "about.CiteCommand",
+    "doctor": "main.DoctorCommand",
+    "completion": "about.CompletionCommand",
+}
+"""The command of each verb, as module in `evnlos.cli` and class. A class whose settings have presets names them
+in `PRESETS`; one whose settings have a setup says in `with_setup` where it goes."""
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -129,6 +169,22 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
             signal.signal(number, how)
 
 
+def command_of(verb: str) -> type[Any]:
+    """Return the command of a verb."""
+    module, _, name = VERBS[verb].partition(".")
+    return getattr(importlib.import_module(f"evnlos.cli.{module}"), name)
+
+
+def summary_of(verb: str) -> str:
+    """Return the first line of a command's description, without importing what the command needs."""
+    module, _, name = VERBS[verb].partition(".")
+    source = (files("evnlos.cli") / f"{module}.py").read_text(encoding="utf-8")
+    command = next(
+        node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == name
+    )
+    return (ast.get_docstring(command) or "").partition("\n")[0]
+
+
 def _unknown(verb: str) -> str:
     near = difflib.get_close_matches(verb.lower()[:40], VERBS, n=1)
     cure = f"did you mean {near[0]!r}?" if near else f"give one of {', '.join(VERBS)}"
@@ -212,3 +268,23 @@ def _overview() -> str:
     lines.append("")
     lines.append(f"with every command: {FLAG} {{{','.join(LEVELS)}}}, or the variable {VARIABLE}; --version")
     return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class DoctorCommand:
+    """Check the installation (torch, numba, HDF5, fonts, disk, optional parts), with a cure for each fault."""
+
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Print each part; exit code 1 where a needed one is broken."""
+        parts = examine()
+        if self.json:
+            print(json.dumps({"parts": [asdict(part) for part in parts]}))
+        else:
+            for part in parts:
+                mark = "  ok     " if part.there else "! BROKEN " if part.needed else "- without"
+                print(f"{mark} {part.name}: {part.found}" + (f"; {part.cure}" if part.cure else ""))
+        if any(part.needed and not part.there for part in parts):
+            raise SystemExit(1)

@@ -2,11 +2,11 @@
 
 from .capture import Capture as Capture
 from .capture import capture_samples as capture_samples
-from .capture import character_of as character_of
 from .capture import import_captures as import_captures
 from .capture import read_capture as read_capture
 from .capture_check import check_picture as check_picture
 from .capture_info import CaptureInfo as CaptureInfo
+from .capture_info import character_of as character_of
 from .cleaning import PATTERN_FILE as PATTERN_FILE
 from .cleaning import FixedPattern as FixedPattern
 from .cleaning import load_pattern as load_pattern

@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.config import config_hash, to_dict
-from evnlos.data.capture_info import CaptureInfo, RegistrationInfo, TargetInfo, read_capture_info
+from evnlos.data.capture_info import (
+    CaptureInfo,
+    RegistrationInfo,
+    TargetInfo,
+    character_of,
+    digest_of,
+    inside,
+    read_capture_info,
+)
 from evnlos.data.cleaning import (
     FixedPattern,
     check_rectangle,
@@ -25,8 +33,15 @@ from evnlos.data.cleaning import (
     without_pixels,
 )
 from evnlos.data.clocks import find_offset
-from evnlos.data.frame_sources import FrameSeries, inside, read_frame_series, read_image
-from evnlos.data.registration import find_dots, homography_from_points, registration_error, warp_frames
+from evnlos.data.frames import (
+    FrameSeries,
+    find_dots,
+    homography_from_points,
+    read_frame_series,
+    read_image,
+    registration_error,
+    warp_frames,
+)
 from evnlos.data.sampling import Samples, Sampling, make_samples
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, printable
@@ -345,7 +360,7 @@ def import_captures(
         if not path.is_file() and not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
     topics: dict[str, Any] = {"events_topic": events_topic, "frames_topic": frames_topic}
-    described = {name: _digest(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
+    described = {name: digest_of(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
     config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
@@ -363,25 +378,6 @@ def import_captures(
             write_shard(dataset.shard(name), samples, attributes)
             progress(Step(what, done, total, "captures", name))
     return dataset
-
-
-def _digest(info: CaptureInfo) -> str:
-    """Return the hash of a description; settings of files with several streams count where they are made."""
-    values = to_dict(info)
-    for key in ("events_topic", "frames_topic"):
-        if values[key] is None:
-            del values[key]
-    return config_hash(values)
-
-
-def character_of(name: str) -> str:
-    """Return what an object shows, from its name: the part behind the last underscore.
-
-    Example:
-        >>> character_of("near_R"), character_of("writer03_A")
-        ('R', 'A')
-    """
-    return name.rsplit("_", 1)[-1]
 
 
 def _split(names: list[str], test: list[str], validation: list[str]) -> dict[str, list[str]]:

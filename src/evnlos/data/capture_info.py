@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from evnlos.config import from_dict, read_yaml
+from evnlos.config import config_hash, from_dict, read_yaml, to_dict
 from evnlos.errors import ConfigError, DataError
 from evnlos.events.recording import Recording
 from evnlos.files import write_atomically
@@ -288,3 +288,45 @@ def begin_capture(folder: str | Path, width: int, height: int, name: str = "my c
     text = _TEMPLATE.format(name=name.replace("\n", " ").replace(":", " "), width=width, height=height)
     write_atomically(path, text.encode())
     return path
+
+
+def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
+    """Return the path of a file or folder of the capture; a name never leads out of its folder.
+
+    Args:
+        folder: The capture's or scan's folder.
+        name: Path of the file below it.
+        by: File of that folder that names it, for the message.
+
+    Raises:
+        DataError: It is no name, lies outside the folder, or does not exist.
+    """
+    try:
+        path = (folder / name).resolve()
+        there = path.exists()
+    except (OSError, ValueError) as error:
+        raise DataError(f"{folder}: {name[:80]!r} is no name of a file ({error})") from None
+    if not path.is_relative_to(folder.resolve()):
+        raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
+    if not there:
+        raise DataError(f"{path} does not exist; {folder / by} names it, or leaves its name to the default")
+    return path
+
+
+def character_of(name: str) -> str:
+    """Return what an object shows, from its name: the part behind the last underscore.
+
+    Example:
+        >>> character_of("near_R"), character_of("writer03_A")
+        ('R', 'A')
+    """
+    return name.rsplit("_", 1)[-1]
+
+
+def digest_of(info: CaptureInfo) -> str:
+    """Return the hash of a description; settings of files with several streams count where they are made."""
+    values = to_dict(info)
+    for key in ("events_topic", "frames_topic"):
+        if values[key] is None:
+            del values[key]
+    return config_hash(values)

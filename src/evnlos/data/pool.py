@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from threadpoolctl import ThreadpoolController
 
 from evnlos.errors import ConfigError, EvnlosError, MissingDependencyError
-from evnlos.threads import children_undisturbed, cores, one_thread
+from evnlos.machine import children_undisturbed, cores, one_thread
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

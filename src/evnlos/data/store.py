@@ -21,8 +21,8 @@ from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, rea
 from evnlos.data.sampling import Samples, Sampling
 from evnlos.errors import DataError
 from evnlos.files import directory_lock, is_empty, write_atomically
+from evnlos.machine import undisturbed
 from evnlos.migrate import __version__
-from evnlos.threads import undisturbed
 from evnlos.types import Events
 from evnlos.untrusted import open_hdf5, stored
 

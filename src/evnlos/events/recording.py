@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
 from evnlos.events.files.celex import CelexOptions
-from evnlos.events.files.columns import OnError, ReadReport, in_order, trusted_events
-from evnlos.events.files.read import open_source
+from evnlos.events.files.columns import OnError, ReadReport, trusted_events
+from evnlos.events.files.read import in_order, open_source
 from evnlos.events.grids import keep_known_polarity
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS

@@ -6,11 +6,9 @@ from .conditions import base_simulation as base_simulation
 from .conditions import conditions as conditions
 from .conditions import conditions_table as conditions_table
 from .conditions import sweep_parameters as sweep_parameters
-from .generalization import GeneralizationResult as GeneralizationResult
-from .generalization import generalization as generalization
-from .generalization import generalization_table as generalization_table
-from .generalization import write_generalization as write_generalization
 from .presets import STUDIES as STUDIES
+from .presets import GeneralizationResult as GeneralizationResult
+from .presets import generalization as generalization
 from .presets import on_sequences as on_sequences
 from .run import Simulated as Simulated
 from .run import captures_of as captures_of
@@ -26,5 +24,7 @@ from .table import character_table as character_table
 from .table import checks_table as checks_table
 from .table import difference as difference
 from .table import gain_table as gain_table
+from .table import generalization_table as generalization_table
 from .table import means_of as means_of
 from .table import summary_table as summary_table
+from .table import write_generalization as write_generalization

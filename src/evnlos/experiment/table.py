@@ -6,25 +6,32 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling
-from evnlos.analysis.confidence import FrameOperator, consistent
+from evnlos.analysis.confidence import ConfidenceCheck, FrameOperator, consistent, risk_coverage
 from evnlos.analysis.scores import Interval, paired_difference
+from evnlos.config import to_dict
 from evnlos.data import Dataset, NlosDataset, Sampling, as_modality, character_of, modality_order, read_shard
 from evnlos.errors import DataError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there
+from evnlos.files import write_atomically
 from evnlos.models import fit_linear, load_weights
 from evnlos.progress import Progress
 from evnlos.setups import load_setup
+
+if TYPE_CHECKING:
+    from evnlos.experiment.presets import GeneralizationResult
+
 
 TRUST = 1.0
 """How far the frames may move the pictures of `+ consistency`: the variance that a probability itself has."""
@@ -253,3 +260,39 @@ def _cell(values: list[float] | None, digits: int) -> str:
     if len(values) == 1:
         return f"{values[0]:.{digits}f}"
     return f"{np.mean(values):.{digits}f} +- {np.std(values, ddof=1):.{digits}f}"
+
+
+def write_generalization(found: list[GeneralizationResult], path: Path) -> None:
+    """Write the findings, sequence by sequence, as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps([to_dict(one) for one in found], indent=1).encode())
+
+
+def generalization_table(found: list[GeneralizationResult]) -> str:
+    """Return the findings as a table, and how well the support orders all sequences by their skill."""
+    head = ["set", "sequences", "PSNR, dB", "+ consistency, dB", "average target, dB"]
+    head += ["skill", "support", "agreement", "explained", "measured", "coverage", "width"]
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for one in found:
+        moved = "-" if one.consistent_db is None else f"{one.consistent_db:.2f}"
+        row = [one.name, str(len(one.confidence_checks)), f"{one.psnr_db:.2f}", moved, f"{one.average_db:.2f}"]
+        row += [f"{one.mean(key):.2f}" for key in ("skill", "support", "agreement")]
+        row.append("-" if one.confidence_checks[0].explained is None else f"{one.mean('explained'):.2f}")
+        row += [f"{one.mean(key):.0%}" for key in ("measured", "coverage")]
+        lines.append(f"| {' | '.join(row)} | {one.mean('width'):.2f} |")
+    return "\n".join([*lines, "", _order([sequence for one in found for sequence in one.confidence_checks])])
+
+
+def _order(sequences: list[ConfidenceCheck]) -> str:
+    support, skill = (np.array([getattr(one, key) for one in sequences]) for key in ("support", "skill"))
+    risk = 1 - skill
+    parts = []
+    for order, name in (
+        (support, "by support"),
+        (skill, "by skill itself"),
+        (np.zeros(len(risk)), "as they come"),
+    ):
+        shares, kept = risk_coverage(order, risk)
+        at = [float(kept[np.searchsorted(shares, share)]) for share in (0.25, 0.5, 0.75, 1.0)]
+        parts.append(f"{name} " + " / ".join(f"{1 - value:.2f}" for value in at))
+    return "Mean skill of the best 25 / 50 / 75 / 100 % of all sequences: " + "; ".join(parts) + "."

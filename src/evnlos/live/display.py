@@ -26,8 +26,8 @@ from PIL import Image
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import LOCK, check_folder, directory_lock, is_empty, new_file
-from evnlos.hosts import names_this_machine
 from evnlos.live.engine import Picture
+from evnlos.machine import names_this_machine
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
 
 _GAP_PX = 8

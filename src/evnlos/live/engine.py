@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from evnlos.analysis.model import StreamingReconstructor
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import surface as kernels
-from evnlos.live.chunk import UNKNOWN_US, Chunk, Clock, SystemClock
+from evnlos.live.packet import UNKNOWN_US, Chunk, Clock, SystemClock
 from evnlos.models import Weights
 from evnlos.types import Events
 

@@ -14,14 +14,14 @@ from typing import Protocol
 import numpy as np
 
 from evnlos.errors import EventFileError
-from evnlos.events.files.columns import Columns, allocate, cut, keep_after, keep_in_order
-from evnlos.events.files.csv_rows import FAULTS as CSV_FAULTS
-from evnlos.events.files.csv_rows import Layout, find_layout, parse_rows
+from evnlos.events.files.columns import Columns, allocate, cut
+from evnlos.events.files.csv import FAULTS as CSV_FAULTS
+from evnlos.events.files.csv import Layout, find_layout, parse_rows
 from evnlos.events.files.fixed_words import sniff_dat
 from evnlos.events.files.raw import parse_raw_header, sniff_raw
-from evnlos.events.files.read import open_source
+from evnlos.events.files.read import keep_after, keep_in_order, open_source
 from evnlos.events.files.words import FAULTS, KINDS, STATE_SIZE, WordSource, new_state
-from evnlos.live.chunk import Chunk, Clock, SystemClock
+from evnlos.live.packet import Chunk, Clock, SystemClock
 from evnlos.types import Events
 
 _FOLLOWED = "RAW (EVT2, EVT2.1, EVT3), DAT and CSV can be followed while they grow"

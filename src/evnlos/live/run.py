@@ -15,8 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.live.chunk import ChunkQueue, Clock, EventSource, SystemClock
 from evnlos.live.engine import Engine, Picture
+from evnlos.live.packet import ChunkQueue, Clock, EventSource, SystemClock
 
 _KEPT = 100_000  # pictures whose times are kept: half an hour at 50 a second, 6 MB
 _RECENT = 100

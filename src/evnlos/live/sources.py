@@ -19,8 +19,8 @@ from evnlos.data.cleaning import FixedPattern
 from evnlos.errors import ConfigError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording
-from evnlos.live.chunk import Chunk, Clock, EventSource, SystemClock
 from evnlos.live.growing_file import GrowingFile
+from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
 from evnlos.live.udp import UdpSource
 from evnlos.types import Events
 

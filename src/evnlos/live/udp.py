@@ -13,8 +13,19 @@ import numpy as np
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.events.files.columns import cut, trusted_events
-from evnlos.live.chunk import UNKNOWN_US, Chunk, Clock, SystemClock
-from evnlos.live.packet import USUAL_EVENTS, Batch, Heading, Packet, pack, unpack, unpack_all
+from evnlos.live.packet import (
+    UNKNOWN_US,
+    USUAL_EVENTS,
+    Batch,
+    Chunk,
+    Clock,
+    Heading,
+    Packet,
+    SystemClock,
+    pack,
+    unpack,
+    unpack_all,
+)
 from evnlos.types import Events
 
 _BUFFER_BYTES = 1 << 22  # asked of the system, which may give less

@@ -1,8 +1,13 @@
 """Reconstructors, their closed-form parts, the confidence in their images, and their weights on disk."""
 
 from evnlos.models.confidence import Confidence, ConfidenceReport, halves_of, on_target_plane
-from evnlos.models.linear import LinearEstimate, fit_linear
-from evnlos.models.reconstructor import RECONSTRUCTORS, Reconstructor, ReconstructorSettings
+from evnlos.models.reconstructor import (
+    RECONSTRUCTORS,
+    LinearEstimate,
+    Reconstructor,
+    ReconstructorSettings,
+    fit_linear,
+)
 from evnlos.models.sequence import SequenceConfig, SequenceReconstructor
 from evnlos.models.unet import ResidualUNet, UNetConfig, UNetReconstructor
 from evnlos.models.weights import (

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from evnlos.data import Modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.models.linear import LinearEstimate, fit_linear
+from evnlos.models.reconstructor import LinearEstimate, fit_linear
 
 Scaling = Literal["dataset", "picture"]
 

@@ -9,7 +9,6 @@ from evnlos.optics.angular_spectrum import (
     sampling_limit_m,
 )
 from evnlos.optics.matrix_wall import MatrixWall, coarsest_keyframe_step_m
-from evnlos.optics.occluder import Occluder, lamp_radiance
 from evnlos.optics.operator import LinearTransport, MatrixTransport, Patches, Transport, compose, dense_matrix
 from evnlos.optics.radiometric import LightTransport, light_transport_matrix
 from evnlos.optics.reflection import (
@@ -21,7 +20,7 @@ from evnlos.optics.reflection import (
     tpsf_profile,
     tpsf_truncation,
 )
-from evnlos.optics.view import View, ViewOperator
+from evnlos.optics.view import Occluder, View, ViewOperator, lamp_radiance
 from evnlos.optics.wall import Irradiance, SlidingWall
 
 __all__ = [

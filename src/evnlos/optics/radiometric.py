@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from evnlos.errors import ConfigError
 from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.optics.interpolation import gauss_points, points_for
-from evnlos.optics.occluder import Occluder, check_between, visibility
 from evnlos.optics.operator import LinearTransport, Patches, as_patches
 from evnlos.optics.reflection import GGX, Brdf, Direction, Lambert
-from evnlos.optics.view import View
+from evnlos.optics.view import Occluder, View, check_between, visibility
 from evnlos.types import Plane
 
 Array = NDArray[np.float64]

@@ -2,7 +2,15 @@
 
 from evnlos.scene.databases import Handwritten, list_emnist, list_sd19, read_emnist, read_sd19
 from evnlos.scene.drawings import drawing
-from evnlos.scene.fonts import Font, find_font
+from evnlos.scene.fonts import (
+    DIGITS,
+    UPPER_CASE,
+    Font,
+    character_name,
+    find_font,
+    fit_to_target_plane,
+    render_glyph,
+)
 from evnlos.scene.glyph_sets import (
     DrawingGlyphs,
     EmnistGlyphs,
@@ -14,7 +22,6 @@ from evnlos.scene.glyph_sets import (
     ObjectId,
     TargetPlane,
 )
-from evnlos.scene.glyphs import DIGITS, UPPER_CASE, character_name, fit_to_target_plane, render_glyph
 from evnlos.scene.handwriting import (
     TRAIN_WRITERS,
     Hand,
@@ -25,8 +32,7 @@ from evnlos.scene.handwriting import (
     pen_width,
     redrawn,
 )
-from evnlos.scene.motion import LineMotion, Motion, PathMotion, Pose
-from evnlos.scene.scene import Scene, Target
+from evnlos.scene.moving import LineMotion, Motion, PathMotion, Pose, Scene, Target
 
 __all__ = [
     "DIGITS",

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import DataError
-from evnlos.scene.glyphs import DIGITS, UPPER_CASE
+from evnlos.scene.fonts import DIGITS, UPPER_CASE
 from evnlos.untrusted import open_image
 
 _MAX_SIDE = 1024  # the official images have 128 pixels per side

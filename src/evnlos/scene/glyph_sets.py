@@ -18,17 +18,19 @@ from evnlos.config import BESIDE
 from evnlos.errors import ConfigError
 from evnlos.scene.databases import list_emnist, list_sd19, read_emnist_images, read_sd19_image
 from evnlos.scene.drawings import KINDS, drawing
-from evnlos.scene.fonts import FONT_SUFFIXES, Font, find_font
-from evnlos.scene.glyphs import (
+from evnlos.scene.fonts import (
     DIGITS,
+    FONT_SUFFIXES,
     UPPER_CASE,
+    Font,
     character_name,
     check_size,
+    find_font,
     fit_to_target_plane,
     render_glyph,
 )
 from evnlos.scene.handwriting import Strokes, nist_like, redrawn
-from evnlos.scene.scene import Target
+from evnlos.scene.moving import Target
 from evnlos.untrusted import open_image
 
 ObjectId: TypeAlias = str

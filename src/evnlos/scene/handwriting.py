@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
-from evnlos.scene.fonts import Font, find_font
-from evnlos.scene.glyphs import check_size, render_glyph
+from evnlos.scene.fonts import Font, check_size, find_font, render_glyph
 from evnlos.types import derive_seed
 
 

@@ -24,7 +24,7 @@ from evnlos.optics import (
     light_transport_matrix,
 )
 from evnlos.optics.angular_spectrum import check_lengths
-from evnlos.optics.occluder import check_between, check_sight
+from evnlos.optics.view import check_between, check_sight
 from evnlos.scene import Scene
 from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
 from evnlos.types import Plane

@@ -21,8 +21,8 @@ from torch.utils.data import DataLoader
 
 from evnlos.data import InMemoryDataset, LiveDataset, Modality, NlosDataset
 from evnlos.errors import ConfigError
+from evnlos.machine import cores
 from evnlos.models import Reconstructor
-from evnlos.threads import cores
 from evnlos.types import derive_seed
 
 

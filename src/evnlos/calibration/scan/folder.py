@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.config import load_yaml
-from evnlos.data.frame_sources import inside, read_image
+from evnlos.data.capture_info import inside
+from evnlos.data.frames import read_image
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Plane
 from evnlos.untrusted import open_regular

@@ -39,7 +39,7 @@ from evnlos.cameras.random_numbers import (
     uniform_field,
 )
 from evnlos.errors import ConfigError
-from evnlos.threads import cores
+from evnlos.machine import cores
 
 _T = TypeVar("_T")
 _SHARES = 8

@@ -3,12 +3,10 @@
 from evnlos.events.files.aedat4 import write_aedat4
 from evnlos.events.files.celex import CelexOptions
 from evnlos.events.files.celex_write import write_celex_frames
-from evnlos.events.files.columns import ReadReport
-from evnlos.events.files.frames import Frames, read_frames, read_timed_frames
+from evnlos.events.files.columns import ReadReport, Stream
+from evnlos.events.files.frames_triggers import Frames, Triggers, read_frames, read_timed_frames, read_triggers
 from evnlos.events.files.read import iter_events, read_events, read_events_report
 from evnlos.events.files.registry import FORMATS, EventWriter, write_events
-from evnlos.events.files.streams import Stream
-from evnlos.events.files.triggers import Triggers, read_triggers
 
 __all__ = [
     "FORMATS",

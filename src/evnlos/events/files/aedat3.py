@@ -22,13 +22,14 @@ from evnlos.events.files.columns import (
     ColumnCheck,
     Columns,
     ReadReport,
+    Stream,
     allocate,
+    choose_stream,
     collect,
     cut,
     unreadable,
 )
 from evnlos.events.files.ros_messages import decode_libcaer, grey_of
-from evnlos.events.files.streams import Stream, choose_stream
 from evnlos.untrusted import check_memory, open_regular
 
 SIGNATURE = b"#!AER-DAT3"

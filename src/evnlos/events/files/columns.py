@@ -1,5 +1,6 @@
-"""What every format shares: blocks of event columns, reports of reading, pieces in writing.
+"""What every format shares: streams, blocks of event columns, reports of reading, pieces in writing.
 
+- Files that hold several streams (topics of a ROS bag, cameras of one file): listed, and one chosen by name.
 - What reading an event file found: the strict mode raises at the first fault, salvage keeps a tally.
 - What every writer of event files offers: pieces in, one complete file.
 - Blocks of event columns on their way from a file to `Events`.
@@ -7,7 +8,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import logging
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
@@ -17,9 +19,76 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.errors import EventFileError
-from evnlos.events.files.streams import Stream
 from evnlos.types import Events
 from evnlos.untrusted import memory_left
+
+_LOG = logging.getLogger("evnlos")
+StreamKind = Literal["events", "frames", "other"]
+_MOST_NAMES = 12  # of a message
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One stream of a file.
+
+    Args:
+        name: How the file calls it, such as "/event_camera/events"; what `topic=` takes.
+        kind: "events", "frames", or "other" for what is not read.
+        type: What the file says of it: a message type, a camera, a data set.
+        count: Messages or packets that the file announces for it; None where it does not say.
+    """
+
+    name: str
+    kind: StreamKind
+    type: str
+    count: int | None = None
+
+
+def choose_stream(
+    path: Path, streams: Sequence[Stream], topic: str | None, kind: StreamKind, is_strict: bool
+) -> Stream:
+    """Return the stream to read: the named one, else the only one of its kind.
+
+    Args:
+        path: The file, for messages.
+        streams: All that it holds.
+        topic: Name of the stream; a unique end of it, such as "left/events", will do. None = the only one.
+        kind: What is wanted.
+        is_strict: Whether several without a name are an error; else the first is taken, and a warning logged.
+
+    Raises:
+        EventFileError: No stream of that kind or name, or several and no name.
+    """
+    fitting = [stream for stream in streams if stream.kind == kind]
+    names = ", ".join(stream.name for stream in fitting[:_MOST_NAMES])
+    if not fitting:
+        held = ", ".join(f"{stream.name} ({stream.type})" for stream in streams[:_MOST_NAMES]) or "nothing"
+        raise EventFileError(
+            f"{path}: byte 0: holds no stream of {kind}; it holds {held}; record {kind} as well"
+        )
+    if topic is not None:
+        exact = [stream for stream in fitting if stream.name == topic]
+        ends = exact or [stream for stream in fitting if stream.name.endswith("/" + topic.strip("/"))]
+        if len(ends) != 1:
+            raise EventFileError(
+                f"{path}: byte 0: topic {topic!r} is {len(ends)} streams of {kind}; give one of: {names}"
+            )
+        return ends[0]
+    if len(fitting) > 1:
+        told = f"{path}: byte 0: holds {len(fitting)} streams of {kind}; give topic= (--topic), one of: {names}"
+        if is_strict:
+            raise EventFileError(told)
+        _LOG.warning("%s; took %s", told, fitting[0].name)
+    return fitting[0]
+
+
+def refuse_topic(path: Path, name: str, topic: str | None) -> None:
+    """Raise where a topic is named for a format that holds one stream."""
+    if topic is not None:
+        raise EventFileError(
+            f"{path}: byte 0: {name} holds one stream, topic {topic!r} is none of it; leave topic out"
+        )
+
 
 OnError = Literal["strict", "salvage"]
 
@@ -299,56 +368,3 @@ class ColumnCheck:
             inside = (columns["x"] < report.width) & (columns["y"] < report.height)
             columns = {name: column[inside] for name, column in columns.items()}
         return columns
-
-
-@njit(cache=True)
-def _longest_ascent(t_us):
-    """Return a mask of the longest non-decreasing subsequence (patience sorting, n log n)."""
-    count = len(t_us)
-    tails = np.empty(count, np.int64)  # index of the smallest end of a subsequence of each length
-    before = np.full(count, -1, np.int64)
-    length = 0
-    for index in range(count):
-        low, high = 0, length
-        if length and t_us[tails[length - 1]] <= t_us[index]:
-            low = length
-        else:
-            while low < high:
-                middle = (low + high) // 2
-                if t_us[tails[middle]] <= t_us[index]:
-                    low = middle + 1
-                else:
-                    high = middle
-        before[index] = tails[low - 1] if low else -1
-        tails[low] = index
-        length = max(length, low + 1)
-    kept = np.zeros(count, np.bool_)
-    index = tails[length - 1] if length else -1
-    while index >= 0:
-        kept[index] = True
-        index = before[index]
-    return kept
-
-
-def keep_in_order(columns: Columns) -> Columns:
-    """Return the largest set of events in the order of time, so that one outlier costs one event."""
-    kept = _longest_ascent(columns["t_us"])
-    return {name: column[kept] for name, column in columns.items()}
-
-
-def keep_after(columns: Columns, newest_us: int) -> Columns:
-    """Return the events not earlier than `newest_us`."""
-    if not len(columns["t_us"]) or columns["t_us"][0] >= newest_us:
-        return columns
-    return cut(columns, int(np.searchsorted(columns["t_us"], newest_us)), len(columns["t_us"]))
-
-
-def in_order(blocks: Iterable[Columns], report: ReadReport) -> Iterator[Columns]:
-    """Yield the blocks, in salvage mode without events that are earlier than one before them."""
-    newest = np.iinfo(np.int64).min
-    for block in blocks:
-        if report.faults.get("backwards"):
-            block = keep_after(keep_in_order(block), newest)
-        if len(block["t_us"]):
-            newest = int(block["t_us"][-1])
-            yield block

@@ -1,55 +1,237 @@
-"""The times that the CeleX-V program prints into CSV files: they turn over, and some count ticks.
+"""CSV: rows of numbers under a line of names, and the layouts of other programs, of CeleX-V among them.
 
-- CSV: rows of numbers under a line of names, and the layouts of other programs, of CeleX-V among them.
+- What the columns of a text file of events are: names, comments, and the layouts of other programs.
+- Parsing and printing rows of numbers at memory speed.
+- Reading and writing such files in blocks.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.events.files.celex import CelexOptions, clock_from_name, tick_divisor
+from evnlos.events.files.celex import CelexOptions, UnwrapTimes
 from evnlos.events.files.columns import SALVAGE, ColumnCheck, Columns, FileSink, ReadReport, join, unreadable
-from evnlos.events.files.csv_rows import FAULTS, FIRST_FAULT, MAX_LINE, find_layout, parse_rows, print_rows
 from evnlos.types import Events
 
-_SDK_WRAP_TICKS = 1 << 22  # the camera's program prints times modulo this
+MAX_LINE = 4096
+_ALIASES = {
+    "t": "t_us", "time": "t_us", "timestamp": "t_us", "ts": "t_us", "t_us": "t_us", "time_us": "t_us",
+    "x": "x", "col": "x", "column": "x", "y": "y", "row": "y",
+    "p": "p", "pol": "p", "polarity": "p", "on": "p",
+    "adc": "adc", "intensity": "adc", "polarity_known": "polarity_known", "t_in_pixel": "t_in_pixel",
+}  # fmt: skip
+_CELEX = {
+    3: ("y", "x", "t_us"),
+    4: ("y", "x", "t_in_pixel", "t_us"),
+    5: ("y", "x", "adc", "p", "t_us"),
+}
 
 
-class UnwrapTimes:
-    """Undoes the turns of the times that the CeleX-V program prints, and converts ticks to microseconds."""
+@dataclass(frozen=True)
+class Layout:
+    """What the columns of a file are.
 
-    def __init__(self, path: Path, report: ReadReport, options: CelexOptions) -> None:
-        self._path, self._report, self._ticks = path, report, options.csv_in_ticks
-        self._clock = options.clock_mhz or clock_from_name(path)
-        self._turns, self._last = 0, 0
+    Args:
+        names: Column names, left to right.
+        start: Byte offset of the first row.
+        in_seconds: Whether times have decimals and are seconds.
+        is_celex: Whether the file was exported by the CeleX-V program.
+        size: Sensor size (width, height) that comments state.
+        announced: Number of events that comments state.
+    """
 
-    def _divisor(self) -> int:
-        if self._clock is None:
-            found = "times that turn over or count ticks, and no clock"
-            self._report.fault("header", 0, found, "give celex=CelexOptions(clock_mhz=...)")
-            self._clock = 100
-        return tick_divisor(self._clock)
+    names: tuple[str, ...]
+    start: int
+    in_seconds: bool = False
+    is_celex: bool = False
+    size: tuple[int, int] | None = None
+    announced: int | None = None
 
-    def __call__(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the times of the next rows, int64 [rows], in microseconds that go on ascending."""
-        if not len(times):
-            return times
-        steps = np.diff(times, prepend=self._last)
-        self._last = int(times[-1])
-        shortest = _SDK_WRAP_TICKS if self._ticks else _SDK_WRAP_TICKS * 1024 // 140
-        turned = steps < -shortest // 2  # a smaller step back is a fault, which the check of order reports
-        turns = self._turns + np.cumsum(turned)
-        self._turns = int(turns[-1])
-        if not self._ticks and not self._turns:
-            return times
-        divisor = self._divisor()
-        if self._ticks:
-            return ((times + turns * _SDK_WRAP_TICKS) * 2048 + divisor) // (2 * divisor)
-        return times + (turns * _SDK_WRAP_TICKS * 2048 + divisor) // (2 * divisor)
+
+def _comment(lines: list[bytes]) -> tuple[tuple[int, int] | None, int | None]:
+    """Return sensor size and number of events that comment lines state."""
+    text = b"\n".join(lines).decode("latin-1").lower()
+    pair = re.search(r"geometry\W+(\d{1,5})\s*[x,]\s*(\d{1,5})", text)
+    width, height = re.search(r"width\W+(\d{1,5})", text), re.search(r"height\W+(\d{1,5})", text)
+    size = (int(pair[1]), int(pair[2])) if pair else None
+    if size is None and width and height:
+        size = int(width[1]), int(height[1])
+    count = re.search(r"events=(\d{1,18})", text)
+    return size, int(count[1]) if count else None
+
+
+def _split(line: bytes) -> list[bytes]:
+    return [field for field in re.split(rb"[\s,;]+", line.strip()) if field]
+
+
+def _is_number(field: bytes) -> bool:
+    return re.fullmatch(rb"[+-]?\d{1,18}(\.\d*)?", field) is not None
+
+
+def _is_sign(field: bytes) -> bool:
+    return field in (b"0", b"1", b"-1", b"+1")
+
+
+def find_layout(start: bytes) -> Layout | None:
+    """Return the layout of a text file from its first bytes, None where they are no rows of numbers."""
+    if any(byte < 9 or 13 < byte < 32 or byte > 126 for byte in start[:MAX_LINE]):
+        return None
+    offset, comments, names = 0, [], ()
+    for line in start.splitlines(keepends=True):
+        fields = _split(line)
+        if line[:1] in (b"#", b"%"):
+            comments.append(line)
+        elif fields and not names and not any(map(_is_number, fields)):
+            names = tuple(_ALIASES.get(field.decode("latin-1").lower(), "") for field in fields)
+            if not {"t_us", "x", "y"} <= set(names):
+                return None
+        elif fields:
+            break
+        offset += len(line)
+    else:
+        fields = []
+    size, announced = _comment(comments)
+    if names:
+        in_seconds = bool(fields) and len(fields) == len(names) and b"." in fields[names.index("t_us")]
+        return Layout(names, offset, in_seconds, "t_in_pixel" in names, size, announced)
+    if not fields or not all(map(_is_number, fields)):
+        return None
+    return _headless(start, offset, fields, size, announced)
+
+
+def _headless(
+    start: bytes, offset: int, fields: list[bytes], size: tuple[int, int] | None, announced: int | None
+) -> Layout | None:
+    """Return the layout of rows without names: seconds first, the CeleX-V program's, or x, y, p, t."""
+    rows = [_split(line) for line in start[offset:].splitlines()[:1000]]
+    rows = [row for row in rows if len(row) == len(fields)]
+    if len(fields) == 4 and b"." in fields[0]:
+        return Layout(("t_us", "x", "y", "p"), offset, True, False, size, announced)
+    if len(fields) == 4 and all(_is_sign(row[2]) for row in rows):
+        return Layout(("x", "y", "p", "t_us"), offset, False, False, size, announced)
+    if len(fields) == 4 and all(_is_sign(row[3]) for row in rows):
+        return Layout(("t_us", "x", "y", "p"), offset, False, False, size, announced)
+    if len(fields) in _CELEX:
+        return Layout(_CELEX[len(fields)], offset, False, True, size, announced)
+    return None
+
+
+_NEWLINE, _RETURN, _MINUS, _PLUS, _DOT, _ZERO, _NINE = 10, 13, 45, 43, 46, 48, 57
+_COMMA, _SEMICOLON, _SPACE, _TAB = 44, 59, 32, 9
+FAULTS, FIRST_FAULT, SCALED = range(3)  # slots of the state
+
+
+@njit(cache=True)
+def parse_rows(data, columns, seconds_column, values, starts, state):
+    """Parse whole lines of `columns` numbers each; return rows and bytes used.
+
+    Numbers are whole, except in `seconds_column` (-1: none), where decimals are seconds and become
+    microseconds, rounded. A line that is no such row is counted, the first one's place is kept, and it is left
+    out. `starts` receives the place of each row.
+    """
+    rows, used, at, size = 0, 0, 0, len(data)
+    while at < size:
+        end = at
+        while end < size and data[end] != _NEWLINE:
+            end += 1
+        if end == size:
+            break
+        field, place, good = 0, at, True
+        while good:
+            while place < end and (data[place] == _SPACE or data[place] == _TAB or data[place] == _RETURN):
+                place += 1
+            if place == end:
+                break
+            if field == columns:
+                good = False
+                break
+            negative = data[place] == _MINUS
+            if negative or data[place] == _PLUS:
+                place += 1
+            value, digits = np.int64(0), 0
+            while place < end and _ZERO <= data[place] <= _NINE:
+                value = value * 10 + (data[place] - _ZERO)
+                digits += 1
+                place += 1
+            if digits == 0 or digits > 18:
+                good = False
+                break
+            if field == seconds_column:
+                if digits > 12:
+                    good = False
+                    break
+                value *= 1_000_000
+                if place < end and data[place] == _DOT:
+                    place += 1
+                    unit, up = np.int64(100_000), False
+                    first = True
+                    while place < end and _ZERO <= data[place] <= _NINE:
+                        digit = np.int64(data[place] - _ZERO)
+                        if unit > 0:
+                            value += digit * unit
+                        elif first:
+                            up = digit >= 5
+                            first = False
+                        unit //= 10
+                        place += 1
+                    if up:
+                        value += 1
+            values[rows, field] = -value if negative else value
+            field += 1
+            while place < end and (data[place] == _SPACE or data[place] == _TAB or data[place] == _RETURN):
+                place += 1
+            if place < end and (data[place] == _COMMA or data[place] == _SEMICOLON):
+                place += 1
+            elif place < end and place > at and not (data[place - 1] == _SPACE or data[place - 1] == _TAB):
+                good = False
+        if good and field == columns:
+            starts[rows] = at
+            rows += 1
+        elif not (good and field == 0):  # an empty line is no row and no fault
+            if state[FAULTS] == 0:
+                state[FIRST_FAULT] = at
+            state[FAULTS] += 1
+        at = end + 1
+        used = at
+    return rows, used
+
+
+@njit(cache=True)
+def print_rows(values, data):
+    """Print rows of whole numbers with commas; return the bytes written. 21 bytes per number suffice."""
+    at = 0
+    digits = np.empty(20, np.uint8)
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            value = values[row, column]
+            if value < 0:
+                data[at] = _MINUS
+                at += 1
+            count = 0
+            while True:
+                # The remainder is taken before the sign: -value overflows for the smallest number.
+                quotient = (
+                    value // 10 if value >= 0 else -((-(value + 1)) // 10) - (((-(value + 1)) % 10 + 1) // 10)
+                )
+                digit = value - quotient * 10
+                digits[count] = _ZERO + (digit if digit >= 0 else -digit)
+                count += 1
+                value = quotient
+                if value == 0:
+                    break
+            for index in range(count):
+                data[at] = digits[count - 1 - index]
+                at += 1
+            data[at] = _COMMA if column + 1 < values.shape[1] else _NEWLINE
+            at += 1
+    return at
 
 
 _BLOCK_BYTES = 1 << 20

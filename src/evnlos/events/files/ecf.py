@@ -67,8 +67,7 @@ def _run(data, at, word, low, most):
 @njit(cache=True)
 def _decode_times(data, at, t_us):
     """Decode the times; return the place behind them, or a fault as a negative number."""
-    size, count = len(data), len(t_us)
-    time = np.int64(0)
+    size, count, time = len(data), len(t_us), np.int64(0)
     for place in range(8):
         time |= np.int64(data[at + place]) << (8 * place)
     if time < 0:

@@ -11,7 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.events.files.evt3_clock import NEAR, mend_clock
 from evnlos.events.files.words import (
     BACKWARDS,
     BASE,
@@ -21,6 +20,7 @@ from evnlos.events.files.words import (
     CLOCK_JUMP,
     COLUMN,
     JITTER_US,
+    NEAR,
     NEWEST,
     OUT_OF_RANGE,
     POLARITY,
@@ -29,6 +29,7 @@ from evnlos.events.files.words import (
     TRIGGERS,
     UNDATED,
     UNKNOWN,
+    mend_clock,
     note,
 )
 

@@ -16,9 +16,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.events.files.columns import MOST_DEFLATED, ColumnCheck, Columns, ReadReport, unreadable
+from evnlos.events.files.columns import (
+    MOST_DEFLATED,
+    ColumnCheck,
+    Columns,
+    ReadReport,
+    Stream,
+    choose_stream,
+    refuse_topic,
+    unreadable,
+)
 from evnlos.events.files.ecf import EcfSource, is_prophesee
-from evnlos.events.files.streams import Stream, choose_stream, refuse_topic
 from evnlos.untrusted import ElsewhereError, check_memory, open_hdf5, stored
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.threads import undisturbed
+from evnlos.machine import undisturbed
 from evnlos.types import Events
 
 _CHUNK = 65_536

@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 
 from evnlos.errors import EventFileError
 from evnlos.events.files.celex import CelexOptions
@@ -17,9 +18,7 @@ from evnlos.events.files.columns import (
     allocate,
     check_on_error,
     cut,
-    in_order,
     join,
-    keep_in_order,
     trusted_events,
 )
 from evnlos.events.files.registry import FileSource, find_format
@@ -201,3 +200,56 @@ def _by_time(blocks: Iterable[Columns], size: int) -> Iterator[Columns]:
             held.append(cut(block, start, stop))
     if held:
         yield join(held)
+
+
+@njit(cache=True)
+def _longest_ascent(t_us):
+    """Return a mask of the longest non-decreasing subsequence (patience sorting, n log n)."""
+    count = len(t_us)
+    tails = np.empty(count, np.int64)  # index of the smallest end of a subsequence of each length
+    before = np.full(count, -1, np.int64)
+    length = 0
+    for index in range(count):
+        low, high = 0, length
+        if length and t_us[tails[length - 1]] <= t_us[index]:
+            low = length
+        else:
+            while low < high:
+                middle = (low + high) // 2
+                if t_us[tails[middle]] <= t_us[index]:
+                    low = middle + 1
+                else:
+                    high = middle
+        before[index] = tails[low - 1] if low else -1
+        tails[low] = index
+        length = max(length, low + 1)
+    kept = np.zeros(count, np.bool_)
+    index = tails[length - 1] if length else -1
+    while index >= 0:
+        kept[index] = True
+        index = before[index]
+    return kept
+
+
+def keep_in_order(columns: Columns) -> Columns:
+    """Return the largest set of events in the order of time, so that one outlier costs one event."""
+    kept = _longest_ascent(columns["t_us"])
+    return {name: column[kept] for name, column in columns.items()}
+
+
+def keep_after(columns: Columns, newest_us: int) -> Columns:
+    """Return the events not earlier than `newest_us`."""
+    if not len(columns["t_us"]) or columns["t_us"][0] >= newest_us:
+        return columns
+    return cut(columns, int(np.searchsorted(columns["t_us"], newest_us)), len(columns["t_us"]))
+
+
+def in_order(blocks: Iterable[Columns], report: ReadReport) -> Iterator[Columns]:
+    """Yield the blocks, in salvage mode without events that are earlier than one before them."""
+    newest = np.iinfo(np.int64).min
+    for block in blocks:
+        if report.faults.get("backwards"):
+            block = keep_after(keep_in_order(block), newest)
+        if len(block["t_us"]):
+            newest = int(block["t_us"][-1])
+            yield block

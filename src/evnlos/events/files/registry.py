@@ -24,7 +24,6 @@ from evnlos.events.files import (
     celex,
     celex_write,
     csv,
-    csv_rows,
     fixed_words,
     hdf5,
     hdf5_write,
@@ -36,9 +35,8 @@ from evnlos.events.files import (
     ros_bags,
 )
 from evnlos.events.files.celex import CelexOptions
-from evnlos.events.files.columns import Columns, ReadReport, Sink, unreadable
+from evnlos.events.files.columns import Columns, ReadReport, Sink, refuse_topic, unreadable
 from evnlos.events.files.ros_messages import ZSTD
-from evnlos.events.files.streams import refuse_topic
 from evnlos.files import new_file
 from evnlos.types import Events
 from evnlos.untrusted import no_file, open_regular
@@ -188,7 +186,7 @@ FORMATS = (
     Format(
         "CSV",
         (".csv", ".txt"),
-        lambda start: csv_rows.find_layout(start) is not None,
+        lambda start: csv.find_layout(start) is not None,
         _celex(csv.CsvSource),
         lambda path, first, _: csv.CsvSink(path, first),
     ),

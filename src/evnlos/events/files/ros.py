@@ -21,7 +21,10 @@ from evnlos.events.files.columns import (
     ColumnCheck,
     Columns,
     ReadReport,
+    Stream,
+    StreamKind,
     allocate,
+    choose_stream,
     collect,
     cut,
     unreadable,
@@ -30,7 +33,6 @@ from evnlos.events.files.evt3 import WRAP_US
 from evnlos.events.files.mcap import Message, Topic
 from evnlos.events.files.raw import CODECS
 from evnlos.events.files.ros_messages import ARRAYS, IMAGES, PACKETS, EventArray, Packet, image_of
-from evnlos.events.files.streams import Stream, StreamKind, choose_stream
 from evnlos.events.files.words import FAULTS, STATE_SIZE, TRIGGERS, new_state, report_faults
 from evnlos.untrusted import check_memory
 

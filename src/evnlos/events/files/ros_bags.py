@@ -15,8 +15,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from evnlos.events.files.columns import SALVAGE, ReadReport, unreadable
-from evnlos.events.files.mcap import Message, Topic, topics_of
-from evnlos.events.files.unpacking import MOST_CHUNK_BYTES, unpack
+from evnlos.events.files.mcap import MOST_CHUNK_BYTES, Message, Topic, topics_of, unpack
 from evnlos.untrusted import open_regular
 
 BAG_SIGNATURE = b"#ROSBAG V2.0\n"
