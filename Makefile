@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 CAPTURES ?=
 DEMO ?= demo
 
-.PHONY: demo test thorough check bench dist clean
+.PHONY: demo test thorough check declared bench dist clean
 
 demo: $(READY)
 	$(BIN)/evnlos demo --out $(DEMO) $(if $(strip $(CAPTURES)),--captures $(CAPTURES))
@@ -28,18 +28,14 @@ check: $(READY)
 bench: $(READY)
 	for question in benchmarks/*.py; do $(BIN)/python $$question || exit 1; done
 
-# Two wheels, the package below 10 MB and its pretrained weights, with what is not Python in them.
+# Sdist and wheel of the package, the wheel below 10 MB and without weights, and the wheel of the weights.
 dist: $(READY)
-	rm -rf dist build packages/*/build
-	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist . ./packages/evnlos-weights
-	$(BIN)/python -c "import glob, os, zipfile; names = set(zipfile.ZipFile(glob.glob('dist/evnlos-*.whl')[0]).namelist()); \
-	  lost = [n for n in ('evnlos/py.typed', 'evnlos/__init__.pyi', 'evnlos/live/page.html', 'evnlos/app/page.css', 'evnlos/app/page.js', \
-	  'evnlos/app/opening.js', \
-	  'evnlos/report/style.css', 'evnlos/analysis/classifier.safetensors') if n not in names]; assert not lost, lost; \
-	  size = os.path.getsize(glob.glob('dist/evnlos-*.whl')[0]); assert size < 10e6, f'the wheel has {size / 1e6:.1f} MB'; \
-	  names = set(zipfile.ZipFile(glob.glob('dist/evnlos_weights-*.whl')[0]).namelist()); \
-	  lost = [n for n in ('SHA256SUMS', 'near-frame.safetensors', 'near.yaml') if f'evnlos_weights/{n}' not in names]; assert not lost, lost"
-	ls -l dist
+	$(BIN)/python tools/distributions.py --out dist
+
+# The wheel where nothing but its declared dependencies is: no extra, nothing of development.
+declared: $(READY)
+	$(BIN)/python tools/distributions.py --core --out build/declared/dist --environment build/declared/venv
+	build/declared/venv/bin/python -I tests/declared.py
 
 clean:
 	rm -rf $(DEMO) build dist packages/*/build src/*.egg-info packages/*/src/*.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from evnlos.training.validation import fit_confidence
+from evnlos.models.confidence import fit_confidence
 from torch import Tensor, nn
 
 from evnlos.data import NlosDataset, open_dataset

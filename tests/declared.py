@@ -1,9 +1,9 @@
-"""Use the package where nothing but its declared dependencies is installed: rooms, README, a command of each verb.
+"""Use the package with nothing but its declared dependencies: rooms, README, a command of each verb.
 
     make declared     # makes that environment (tools/distributions.py) and runs this in it
 
-Each command is a small, whole job and has to end well. Where a job needs an extra, it has to end with exit code 2
-and one line that names the extra. Exit code 1 where anything else happened.
+Each command is a small, whole job and has to end well. Where a job needs an extra, it has to end with exit code
+2 and one line that names the extra. Exit code 1 where anything else happened.
 """
 
 from __future__ import annotations
@@ -50,13 +50,12 @@ report tuned --data made --split validation --out page
 cite tuned
 capture init begun
 capture check captures/lab_icon_000
-import captures/lab_icon_000 captures/lab_icon_001 --out recorded --test icon_001 {{sampling}}
+import captures/lab_icon_000 captures/lab_icon_001 --out recorded --test lab_icon_001 {{sampling}}
 reconstruct captures/lab_icon_000 --weights fused --out pictures
-live captures/lab_icon_000 --weights fused --headless --out watched --rate 8
-track captures/lab_icon_000 --setup small.yaml --json
-invert captures/lab_icon_000 --setup small.yaml --solver tikhonov --columns 24 --cells 8 --positions 8 --out solved.png
+live captures/lab_icon_000 --weights fused --headless --out watched --speed 8
+track captures/lab_icon_000 --json
+invert captures/lab_icon_000 --setup small.yaml --solver tikhonov --columns 24 --cells 8 --out solved.png
 invert photograph.npz --out photograph.png
-identify small.yaml
 scan plan scan
 events video --fps 100 --out events.h5
 pixel fit events.h5 --light unknown --out fitted
@@ -65,6 +64,7 @@ convert events.h5 events.raw
 convert events.h5 events.npz
 convert events.h5 events.csv
 convert events.h5 events.mcap
+convert events.h5 events.aedat4
 info events.mcap
 preview events.h5 --out events.gif
 """
@@ -72,16 +72,16 @@ preview events.h5 --out events.gif
 
 LACKING = {
     "app": "app",
-    "convert events.h5 events.aedat4": "aedat",
+    "info events.aedat4": "aedat",
+    "identify small.yaml": "fonts",
     "events film.mp4 --out film.h5": "video",
     "lab --glyphs.family Kalam --out lab": "fonts",
-    "simulate --setup.kind paper --out letters": "fonts",
-    "simulate --config small.yaml --scheduler tcp://127.0.0.1:9 --out far": "cluster",
+    "simulate --config small.yaml --engine dask --out far": "cluster",
 }
 """The extra that a job needs."""
 
 
-class Failed(Exception):
+class JobError(Exception):
     """A job ended otherwise than it should."""
 
 
@@ -101,14 +101,14 @@ def run(words: list[str]) -> tuple[int, str, str]:
 def job(line: str) -> None:
     code, out, errors = run(line.split())
     if code:
-        raise Failed(f"exit code {code}: {(errors or out)[-600:].strip()}")
+        raise JobError(f"exit code {code}: {(errors or out)[-600:].strip()}")
 
 
 def lacks(line: str, extra: str) -> None:
     code, _, errors = run(line.split())
     said = [one for one in errors.splitlines() if one.startswith("evnlos")]
     if code != 2 or len(said) != 1 or f"evnlos[{extra}]" not in said[0]:
-        raise Failed(f"exit code {code}, and not a line that names evnlos[{extra}]: {errors[-600:].strip()}")
+        raise JobError(f"exit code {code}, and not a line that names evnlos[{extra}]: {errors[-600:].strip()}")
 
 
 def installed() -> None:
@@ -117,15 +117,15 @@ def installed() -> None:
 
     site = sysconfig.get_path("purelib")
     if not Path(evnlos.__file__).is_relative_to(site):
-        raise Failed(f"evnlos is {evnlos.__file__}, not the wheel in {site}")
+        raise JobError(f"evnlos is {evnlos.__file__}, not the wheel in {site}")
     if there := [name for name in MODULES if importlib.util.find_spec(name)]:
-        raise Failed(f"{', '.join(there)}: more than what the package declares")
+        raise JobError(f"{', '.join(there)}: more than what the package declares")
     program = Path(sysconfig.get_path("scripts")) / "evnlos"
     said = subprocess.run([program, "doctor"], capture_output=True, text=True)
     lost = [name for name in PROJECT["optional-dependencies"] if name not in ("all", "dev", "fonts")
             and f"evnlos[{name}]" not in said.stdout]  # fmt: skip
     if said.returncode or lost:
-        raise Failed(f"doctor says {said.stdout}{said.stderr}; not a word of {lost}")
+        raise JobError(f"doctor says {said.stdout}{said.stderr}; not a word of {lost}")
 
 
 def rooms() -> None:
@@ -160,13 +160,13 @@ def readme() -> None:
                 exec(code, names)
         except MissingDependencyError as error:
             if not re.search(r"evnlos\[\w+\]", str(error)):
-                raise Failed(f"names no extra: {error}") from None
+                raise JobError(f"names no extra: {error}") from None
             continue
         if out.getvalue() != printed:
-            raise Failed(f"prints {out.getvalue()!r}, not {printed!r}")
+            raise JobError(f"prints {out.getvalue()!r}, not {printed!r}")
         whole += 1
     if not whole:
-        raise Failed("no example runs without an extra")
+        raise JobError("no example runs without an extra")
 
 
 def material() -> None:
@@ -174,7 +174,6 @@ def material() -> None:
     import numpy as np
     from PIL import Image
 
-    from evnlos.data import Sampling
     from evnlos.data.lab import Lab, render_captures
     from evnlos.scene import DrawingGlyphs
     from evnlos.setups import load_setup
@@ -187,31 +186,31 @@ def material() -> None:
     bars = 120 + 100 * np.sign(np.sin(np.arange(32) / 3))
     for k in range(20):
         Image.fromarray(np.tile(np.roll(bars, k), (24, 1)).astype(np.uint8)).save(f"video/{k:02}.png")
+    wall = {"wall": np.linspace(0, 1, 256).reshape(16, 16), "distance_m": np.array(0.4)}
+    wall |= {"wall_x_m": np.linspace(0.1, 0.4, 16), "wall_z_m": np.linspace(0.4, 0, 16)}
+    wall |= {"cell_x_m": np.linspace(0.4, 0.1, 6), "cell_z_m": np.linspace(0.35, 0.05, 5)}
+    np.savez("photograph.npz", cell_size_m=np.array([0.054, 0.066]), **wall)
     Path("film.mp4").write_bytes(b"\0\0\0\x18ftypisom" + bytes(400))
-    assert Sampling
-
-
-def verbs() -> list[str]:
-    from evnlos.cli import VERBS
-
-    return list(VERBS)
 
 
 def main() -> int:
-    os.environ.pop("EVNLOS_WEIGHTS", None)
+    from evnlos.cli import VERBS
+
+    for name in ("EVNLOS_WEIGHTS", "PYTHONPATH"):
+        os.environ.pop(name, None)
     begun, faults = time.perf_counter(), 0
     steps = [(one.__doc__, one, ()) for one in (installed, rooms, readme, material)]
     sampling = "--sampling.height 32 --sampling.width 48 --sampling.pitch-m 0.005 --sampling.scored-rows 24"
     steps += [(f"evnlos {line}", job, (line,)) for line in JOBS.format(sampling=sampling).strip().splitlines()]
     steps += [(f"evnlos {line}: [{extra}]", lacks, (line, extra)) for line, extra in LACKING.items()]
-    steps += [(f"evnlos {verb} --help", job, (f"{verb} --help",)) for verb in verbs()]
+    steps += [(f"evnlos {verb} --help", job, (f"{verb} --help",)) for verb in VERBS]
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for name, step, arguments in steps:
             start = time.perf_counter()
             try:
                 step(*arguments)
                 fault = ""
-            except Failed as error:
+            except JobError as error:
                 fault = str(error)
             except Exception:
                 fault = traceback.format_exc()

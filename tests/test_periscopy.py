@@ -1,11 +1,13 @@
 """The real photograph, and photographs of our own, from file to picture."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 import torch
 
+from evnlos.cli import main
 from evnlos.cli.invert import InvertCommand, correlation, to_text
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import prepare_inversion, read_photograph
@@ -39,6 +41,15 @@ def made(tmp_path_factory):
     data["wall"] = clean + smooth + 0.002 * clean.max() * rng.standard_normal(clean.shape)
     np.savez(path, **data, truth=truth)
     return path
+
+
+def test_without_matplotlib_what_was_found_is_kept(made, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    main(["invert", str(made), "--solver", "tikhonov", "--out", str(tmp_path / "p.png"), "--json"])
+    said = capsys.readouterr()
+    assert json.loads(said.out)["picture"] is None
+    assert "evnlos[plot]" in said.err
+    assert np.load(tmp_path / "p.npz")["tikhonov"].shape == (1, 10, 12)
 
 
 def test_own_photograph_needs_its_occluder(made):

@@ -20,7 +20,7 @@ from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
 from evnlos.cli.console import Flat, Folders, Presets
-from evnlos.cli.parsing import say
+from evnlos.cli.parsing import drawn, say
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
 from evnlos.progress import ProgressBars
@@ -80,7 +80,6 @@ class CalibrateCommand:
             write_setup,
         )
         from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
-        from evnlos.errors import MissingDependencyError
         from evnlos.plot.results import draw_calibration
 
         check_out(self.out, self.force)
@@ -92,10 +91,7 @@ class CalibrateCommand:
         else:
             print(f"fitted: {' '.join(fit.fitted)}\nheld out: {' '.join(fit.held_out)}\n")
             print(f"{table(rows)}\n\n{residual_table(fit)}")
-        try:
-            draw_calibration(fit, self.out / "check.png")
-        except MissingDependencyError as error:
-            say(f"note: {error}")
+        drawn(self.out / "check.png", lambda: draw_calibration(fit, self.out / "check.png"))
         for line in warnings_of(fit):
             say(f"warning: {line}")
         path = write_setup(fit, rows, self.out, self.force)
@@ -157,7 +153,6 @@ class ScanCommand:
         import torch
 
         from evnlos.calibration.scan import import_scan
-        from evnlos.errors import MissingDependencyError
         from evnlos.plot.results import draw_scan
         from evnlos.setups.files import write_measurement
         from evnlos.tensor_file import SUFFIX
@@ -166,18 +161,14 @@ class ScanCommand:
         out = self.folder / f"transport{SUFFIX}" if self.out is None else self.out
         result = import_scan(self.folder, self.settings)
         checksum = write_measurement(out, result.measurement)
-        picture: Path | None = out.with_suffix(".png")
-        try:
-            draw_scan(picture, result.measurement, result.raw)  # type: ignore[arg-type]
-        except MissingDependencyError as error:
-            say(f"note: {error}")
-            picture = None
+        shown = out.with_suffix(".png")
+        picture = drawn(shown, lambda: draw_scan(shown, result.measurement, result.raw))
         for warning in result.warnings:
             say(f"warning: {warning}")
         found = figures_of(result) | {
             "transport": str(out),
             "checksum": checksum,
-            "picture": None if picture is None else str(picture),
+            "picture": picture,
         }
         if self.json:
             print(json.dumps(found))
@@ -270,7 +261,6 @@ class PixelCommand:
             values_of_fit,
             write_known_light_fit,
         )
-        from evnlos.errors import MissingDependencyError
         from evnlos.plot.results import draw_pixel_fit
 
         if (self.out / PIXEL_FILE).exists() and not self.force:
@@ -280,10 +270,7 @@ class PixelCommand:
             fit = fit_known_light(manifest, self.settings, progress)
         written = write_known_light_fit(fit, self.out)
         if fit.predicted is not None:
-            try:
-                draw_pixel_fit(fit, self.out / PIXEL_FIGURE)
-            except MissingDependencyError as error:
-                say(f"note: {error}")
+            drawn(self.out / PIXEL_FIGURE, lambda: draw_pixel_fit(fit, self.out / PIXEL_FIGURE))
         for line in fit.warnings:
             say(f"warning: {line}")
         if self.json:

@@ -18,10 +18,10 @@ import tyro
 
 from evnlos.app.serve import Server, serve
 from evnlos.cli.console import Flat
-from evnlos.cli.parsing import say
+from evnlos.cli.parsing import drawn, say
 from evnlos.data import STANDARD_MODALITIES
 from evnlos.demo import Demo, run_demo
-from evnlos.errors import ConfigError, MissingDependencyError
+from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import SourceOptions, open_live
@@ -211,10 +211,8 @@ class ExperimentCommand:
         text = generalization_table(found) + "\n"
         write_atomically(self.out / f"{name}.md", text.encode())
         print(text)
-        try:
-            draw_confidence({one.name: one.confidence_checks for one in found}, self.out / f"{name}.png")
-        except MissingDependencyError as error:
-            say(f"no {name}.png: {error}")
+        shown, checks = self.out / f"{name}.png", {one.name: one.confidence_checks for one in found}
+        drawn(shown, lambda: draw_confidence(checks, shown))
 
     def _mismatch(self) -> None:
         from evnlos.demo import Demo, mismatch_table, run_mismatch

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import tyro
 
-from evnlos.cli.parsing import say
+from evnlos.cli.parsing import drawn, say
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 
@@ -121,7 +121,7 @@ class InvertCommand:
             (name + (f", r = {row['r']:.3f}" if "r" in row else ""), solved[name].image)
             for name, row in found["solutions"].items()
         ]
-        found["picture"] = str(draw_inversion(self.out, panels))
+        found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         arrays: dict[str, Any] = {name.replace(" ", "_"): s.image.numpy() for name, s in solved.items()}
         _save_arrays(self.out, arrays)
         found["seconds"] = round(time.perf_counter() - clock, 1)
@@ -149,7 +149,7 @@ class InvertCommand:
             for name, images in pictures.items()
             for file, image in zip(self.files, images, strict=True)
         ]
-        found["picture"] = str(draw_inversion(self.out, panels))
+        found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         arrays: dict[str, Any] = {name: images.numpy() for name, images in pictures.items()}
         _save_arrays(self.out, arrays)
         found["file"] = " ".join(found["files"])
@@ -192,7 +192,8 @@ class InvertCommand:
         found, pictures = invert_captures(self.files, options)
         most = max(row["positions"] for row in found["rows"])
         best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
-        found["picture"] = str(draw_inversion(self.out, [(name, image[None]) for name, image in best.items()]))
+        panels = [(name, image[None]) for name, image in best.items()]
+        found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
         _save_arrays(self.out, arrays)
         table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{found['seconds']} s"
@@ -209,9 +210,8 @@ class InvertCommand:
         found, pictures = estimate_captures(self.files, setup, evidence, self.pattern)
         for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
-        found["picture"] = str(
-            draw_inversion(self.out, [(name, image[None]) for name, image in pictures.items()])
-        )
+        panels = [(name, image[None]) for name, image in pictures.items()]
+        found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         arrays: dict[str, Any] = {name.replace(" ", "_"): image.numpy() for name, image in pictures.items()}
         _save_arrays(self.out, arrays)
         print(json.dumps(found) if self.json else sequence_text(found))
@@ -240,7 +240,7 @@ def to_text(found: dict[str, Any]) -> str:
     for name, row in found["solutions"].items():
         r = f"{row['r']:8.3f}" if "r" in row else f"{'-':>8}"
         lines.append(f"{name:18}{row['regularization']:10.2e}{row['misfit']:10.5f}{row['iterations']:12d}{r}")
-    lines.append(f"{found['picture']}; {found['seconds']} s")
+    lines.append("; ".join([*([found["picture"]] if found["picture"] else []), f"{found['seconds']} s"]))
     return "\n".join(lines)
 
 

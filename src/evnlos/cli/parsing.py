@@ -12,10 +12,11 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, TextIO
 
-from evnlos.errors import ConfigError, printable
+from evnlos.errors import ConfigError, MissingDependencyError, printable
 
 LEVELS = ("debug", "info", "warning", "error")
 """What is said, most first: where an error came from; notes; only warnings; only errors."""
@@ -57,6 +58,15 @@ class PlainOutput:
 def say(text: str) -> None:
     """Print a note on stderr, so that stdout stays for results; "warning: ..." is shown longer than others."""
     LOG.log(logging.WARNING if text.startswith("warning") else logging.INFO, text)
+
+
+def drawn(path: Path, draw: Callable[[], object]) -> str | None:
+    """Draw the picture of a result, and return its path; None and a note where matplotlib is not installed."""
+    try:
+        return str(draw() or path)
+    except MissingDependencyError as error:
+        say(f"note: no {path.name}: {error}")
+        return None
 
 
 def listen(arguments: list[str]) -> list[str]:

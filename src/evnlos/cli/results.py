@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +20,7 @@ import tyro
 from evnlos.analysis.bounds import SequenceAnalysisSettings
 from evnlos.analysis.linearized import AnalysisSettings
 from evnlos.cli.console import Flat, Folders, result
-from evnlos.cli.parsing import say
+from evnlos.cli.parsing import drawn, say
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.tracking import Tracking
@@ -135,7 +136,7 @@ class TrackCommand:
         truth = true_path(capture, track.time_s) if track.unit == "m" else None
         found = track_values(capture, track, truth)
         found["warnings"] = track_warnings(capture, setup, track)
-        found["picture"] = str(draw_track(track, self.out, truth, capture.name))
+        found["picture"] = drawn(self.out, lambda: draw_track(track, self.out, truth, capture.name))
         text = json.dumps({**found, "track": track.summary()})
         write_atomically(self.out.with_suffix(".json"), text.encode())
         print(json.dumps(found) if self.json else to_text(found))
@@ -219,7 +220,7 @@ def to_text(found: dict[str, Any]) -> str:
             f"error       {scale * found['position_error']:8.3f} {unit} rms about an offset of "
             f"({x:.2f}, {y:.2f}) {unit}; speed {found['speed_error_percent']:.2f} % rms"
         )
-    return "\n".join([*lines, found["picture"]])
+    return "\n".join([*lines, *([found["picture"]] if found["picture"] else [])])
 
 
 @dataclass(frozen=True)
@@ -275,9 +276,11 @@ class IdentifyCommand:
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
             for one in found:
-                draw_identification(one, self.out / f"identify_{one.name}.png")
+                path = self.out / f"identify_{one.name}.png"
+                drawn(path, partial(draw_identification, one, path))
             if len(found) > 1:
-                draw_setups(found, self.out / "identify_setups.png")
+                path = self.out / "identify_setups.png"
+                drawn(path, partial(draw_setups, found, path))
             curves = json.dumps([summary(one, True) for one in found], indent=1)
             write_atomically(self.out / "identify.json", curves.encode())
         if self.json:
@@ -292,7 +295,7 @@ class IdentifyCommand:
         for limit in limits.values():
             print(f"\n{limit.table()}")
         if self.out is not None:
-            print(f"{self.out}: figures and identify.json")
+            print(f"{self.out}: identify.json and what could be drawn")
 
 
 @dataclass(frozen=True)
