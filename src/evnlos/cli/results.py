@@ -295,7 +295,7 @@ class IdentifyCommand:
         for limit in limits.values():
             print(f"\n{limit.table()}")
         if self.out is not None:
-            print(f"{self.out}: identify.json and what could be drawn")
+            print(f"{self.out}: identify.json, and what could be drawn")
 
 
 @dataclass(frozen=True)
