@@ -28,12 +28,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from evnlos.models.confidence import fit_confidence
 from torch import Tensor, nn
 
 from evnlos.data import NlosDataset, open_dataset
 from evnlos.models import Confidence, Weights, halves_of, load_weights, on_target_plane
-from evnlos.models.confidence import COVERAGE
+from evnlos.models.confidence import COVERAGE, fit_confidence
 
 _GAUSSIAN = 1.645  # standard deviations that hold nine tenths
 _FLOOR = 0.003  # of the variance of an unsure pixel, as data consistency has it
