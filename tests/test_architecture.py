@@ -116,10 +116,13 @@ def test_import_costs_little_beside_torch() -> None:
         "from evnlos import *\n"
         "c = time.process_time()\nprint(json.dumps([(c - b) / (b - a), sorted(sys.modules)]))"
     )
-    runs = [json.loads(subprocess.check_output([sys.executable, "-c", code])) for _ in range(5)]
-    # numba looks for scipy by itself and takes it where it is installed.
-    assert not {name.split(".")[0] for name in runs[0][1]} & (FORBIDDEN - {"scipy"})
-    assert min(share for share, _ in runs) < 0.6
+    shares = []
+    while not shares or (min(shares) >= 0.6 and len(shares) < 10):  # another program's work only adds
+        share, loaded = json.loads(subprocess.check_output([sys.executable, "-c", code]))
+        shares.append(share)
+        # numba looks for scipy by itself and takes it where it is installed.
+        assert not {name.split(".")[0] for name in loaded} & (FORBIDDEN - {"scipy"})
+    assert min(shares) < 0.6, shares
 
 
 def test_rooms_are_names_of_the_package() -> None:
