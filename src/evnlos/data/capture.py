@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from evnlos.config import config_hash, to_dict
 from evnlos.data.capture_info import (
     CaptureInfo,
-    RegistrationInfo,
     TargetInfo,
     character_of,
     digest_of,
@@ -29,23 +28,16 @@ from evnlos.data.cleaning import (
     correct_frames,
     crop_events,
     find_hot_pixels,
+    frame_homography,
     keep_supported,
     without_pixels,
 )
 from evnlos.data.clocks import find_offset
-from evnlos.data.frames import (
-    FrameSeries,
-    find_dots,
-    homography_from_points,
-    read_frame_series,
-    read_image,
-    registration_error,
-    warp_frames,
-)
-from evnlos.data.sampling import Samples, Sampling, make_samples
+from evnlos.data.frames import FrameSeries, read_frame_series, read_image, warp_frames
+from evnlos.data.sampling import Samples, Sampling, make_samples, time_steps
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, printable
-from evnlos.events import CelexOptions, event_histogram, keep_known_polarity, read_events, read_triggers
+from evnlos.events import CelexOptions, keep_known_polarity, read_events, read_triggers
 from evnlos.progress import Progress, Step, silent
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.types import Events
@@ -75,6 +67,11 @@ class Capture:
     frame_times_us: NDArray[np.int64]
     target: Target | None
     notes: tuple[str, ...] = field(default=())
+
+    @property
+    def has_frames(self) -> bool:
+        """Whether a frame camera was there; else the frames are black and only mark the time steps."""
+        return self.info.frames is not None
 
     @property
     def peak(self) -> int:
@@ -117,6 +114,7 @@ def read_capture(
     *,
     events_topic: str | None = None,
     frames_topic: str | None = None,
+    needs_frames: bool = True,
 ) -> Capture:
     """Read a capture folder (`capture.yaml`, event file, frames, mask), or one file of events and frames.
 
@@ -127,9 +125,11 @@ def read_capture(
         most_frame_bytes: Memory that its frames may take, bytes; None = a quarter of what is free, up to 2 GiB.
         events_topic: Stream of the events, of a file that holds several.
         frames_topic: Stream of its frames.
+        needs_frames: Whether a capture of an event camera alone is refused; else black frames mark its steps.
 
     Raises:
-        DataError: A file is missing, a frame has another size than the camera, or clock or pixels do not fit.
+        DataError: A file is missing, a frame has another size than the camera, clock or pixels do not fit, or
+            there are no frames where they are needed.
         ConfigError: `capture.yaml` has an unknown key or a wrong type.
         EventFileError: The event file is damaged.
         MissingDependencyError: A file needs an optional package.
@@ -139,14 +139,17 @@ def read_capture(
         raise DataError(f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)")
     info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic)
     name, folder = _name_of(folder), folder.parent if folder.is_file() else folder
-    series = read_frame_series(folder, info, most_frame_bytes)
-    notes = [f"{len(series.images)} frames from {series.what}"]
+    is_alone = info.frames is None and not needs_frames
+    series = None if is_alone else read_frame_series(folder, info, most_frame_bytes)
     events, told = _read_events(folder, info)
-    notes += told
-    frames, told = _prepare_frames(folder, info, series)
-    notes += told
-    times_us, told = _place_in_time(folder, info, events, frames, series.times_us)
-    notes += told
+    if series is None:
+        frames, times_us = time_steps(folder, info, events)
+        notes = [f"no frames: {len(frames)} time steps", *told]
+    else:
+        notes = [f"{len(series.images)} frames from {series.what}", *told]
+        frames, told = _prepare_frames(folder, info, series)
+        times_us, in_time = _place_in_time(folder, info, events, frames, series.times_us)
+        notes += told + in_time
     roi = info.roi
     if roi is not None:
         check_rectangle(events.shape, roi.x, roi.y, roi.width, roi.height)
@@ -157,7 +160,13 @@ def read_capture(
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
     target = _read_target(folder, info.target)
     return Capture(
-        name, info, events, np.ascontiguousarray(frames), times_us, target, tuple(map(printable, notes))
+        name,
+        info,
+        events,
+        frames if is_alone else np.ascontiguousarray(frames),
+        times_us,
+        target,
+        tuple(map(printable, notes)),
     )
 
 
@@ -213,7 +222,7 @@ def _prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tup
         changed = None if changed is None else changed[:, ::-1, ::-1]
         notes.append("frames turned by 180 degrees")
     if info.registration is not None:
-        matrix, how = _homography(folder, info.registration, info)
+        matrix, how = frame_homography(folder, info.registration, info)
         shape = (info.camera.height, info.camera.width)
         check_memory(
             16 * len(frames) * shape[0] * shape[1], f"{folder}: registering its frames", "leave frames out"
@@ -225,29 +234,6 @@ def _prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tup
     if changed is None:
         return frames, notes
     return np.round(changed * 65_535).astype(np.uint16), notes
-
-
-def _homography(folder: Path, info: RegistrationInfo, capture: CaptureInfo) -> tuple[NDArray[np.float64], str]:
-    """Return the matrix from frame to event pixels, and how it was found."""
-    if info.homography is not None:
-        return np.array(info.homography), "the homography stated"
-    if info.points is not None:
-        pairs = np.array(info.points, float).reshape(-1, 4)
-        frame, event, how = pairs[:, :2], pairs[:, 2:], f"{len(pairs)} points"
-    else:
-        dots = info.dots
-        assert dots is not None
-        picture = read_image(inside(folder, dots.frame))
-        if capture.frames_turned:
-            picture = picture[::-1, ::-1]
-        seen = read_events(
-            inside(folder, dots.events), width=capture.camera.width, height=capture.camera.height
-        )
-        frame = find_dots(picture, dots.rows, dots.columns)
-        event = find_dots(event_histogram(seen)[0].sum(axis=0), dots.rows, dots.columns)
-        how = f"{dots.rows} x {dots.columns} dots"
-    matrix = homography_from_points(frame, event)
-    return matrix, f"{how} (rms error {registration_error(matrix, frame, event):.2f} pixels)"
 
 
 def _place_in_time(
@@ -308,7 +294,9 @@ def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern 
             f"{capture.name} has {len(capture.frames)} frame(s); a sample needs two, with events between"
         )
     frames, peak = capture.frames[1:], float(capture.peak)
-    if pattern is not None:
+    if not capture.has_frames:
+        frames = frames[:, :1, :1]
+    elif pattern is not None:
         frames, peak = pattern.correct(frames, peak), 1.0
     known = {"motion": capture.motion, "target": capture.target}
     return make_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
@@ -360,16 +348,17 @@ def import_captures(
         if not path.is_file() and not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
     topics: dict[str, Any] = {"events_topic": events_topic, "frames_topic": frames_topic}
+    how: dict[str, Any] = topics | {"needs_frames": False}
     described = {name: digest_of(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
     config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
-    captures: dict[str, Capture] = {_name_of(first): read_capture(first, **topics)}
+    captures: dict[str, Capture] = {_name_of(first): read_capture(first, **how)}
     with claim_dataset(dataset):
         what, total, missing = f"import {dataset.folder.name}", len(paths), dataset.missing()
         progress(Step(what, total - len(missing), total, "captures"))
         for done, name in enumerate(missing, start=total - len(missing) + 1):
-            capture = captures.pop(name, None) or read_capture(paths[name], **topics)
+            capture = captures.pop(name, None) or read_capture(paths[name], **how)
             if look is not None:
                 look(capture)
             samples = capture_samples(capture, sampling, pattern)

@@ -54,6 +54,10 @@ def check_capture(capture: Capture) -> list[Finding]:
     Args:
         capture: A capture that could be read.
     """
+    if not capture.has_frames:
+        cure = "a network of events needs none; for calibration and fusion record a frame camera beside it"
+        alone = Finding("frames", "doubtful", "none: an event camera alone", cure)
+        return [alone, *_events(capture), *_flicker(capture)]
     return [
         *_light(capture),
         *_movement(capture),
@@ -189,13 +193,7 @@ def _flicker(capture: Capture) -> Iterator[Finding]:
         yield Finding("flicker", "doubtful", f"{len(t_s)} events are too few to tell", "record longer")
         return
     counts, _ = np.histogram(t_s, bins, (0.0, bins * _FLICKER_BIN_S))
-    power = np.abs(np.fft.rfft(counts - counts.mean())) ** 2
-    frequency = np.fft.rfftfreq(bins, _FLICKER_BIN_S)
-    around = np.median(power[(frequency > 80) & (frequency < 140)])
-    found = {}
-    for low, high in _FLICKER_HZ:
-        line = power[(frequency >= low) & (frequency <= high)].max(initial=0.0)
-        found[round((low + high) / 2)] = float(line / max(around, 1e-12))
+    found = flicker_lines(counts)
     worst = max(found, key=lambda hertz: found[hertz])
     # The power of noise is exponential: a line 30 times its median has a chance of 1e-9 a bin.
     yield _finding(
@@ -205,6 +203,22 @@ def _flicker(capture: Capture) -> Iterator[Finding]:
         f"the rate's line at {worst} Hz is {found[worst]:.0f} times its surroundings (30 is safe)",
         "light with direct current, or with daylight; mains lamps flicker",
     )
+
+
+def flicker_lines(counts: NDArray) -> dict[int, float]:
+    """Return how strong the lines at 100 and 120 Hz are, times their surroundings; 30 is no noise.
+
+    Args:
+        counts: Events in each millisecond, at least 500.
+    """
+    power = np.abs(np.fft.rfft(counts - counts.mean())) ** 2
+    frequency = np.fft.rfftfreq(len(counts), _FLICKER_BIN_S)
+    around = np.median(power[(frequency > 80) & (frequency < 140)])
+    found = {}
+    for low, high in _FLICKER_HZ:
+        line = power[(frequency >= low) & (frequency <= high)].max(initial=0.0)
+        found[round((low + high) / 2)] = float(line / max(around, 1e-12))
+    return found
 
 
 def _clock(capture: Capture) -> Iterator[Finding]:
@@ -286,7 +300,7 @@ def check_picture(capture: Capture) -> Image.Image:
     """
     times = capture.frame_times_us
     rates, centres_s = _event_rate(capture.events, times)
-    changes = _frame_changes(capture.frames, capture.peak)
+    changes = _frame_changes(capture.frames if capture.has_frames else capture.frames[:, :8, :8], capture.peak)
     edges = np.searchsorted(capture.events.t_us, times, side="right")
     chosen = int(np.argmax(np.diff(edges))) + 1 if len(times) > 1 else 0
     start, stop = (int(edges[chosen - 1]), int(edges[chosen])) if chosen else (0, len(capture.events))

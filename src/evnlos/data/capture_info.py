@@ -147,6 +147,36 @@ class FilterInfo:
 
 
 @dataclass(frozen=True)
+class RecordingInfo:
+    """How `evnlos capture record` made the recording; what the driver does not say is left out."""
+
+    source: str
+    """Camera or stream that was recorded."""
+    begun: str
+    """Start by the computer's clock, UTC, ISO 8601."""
+    seconds: float
+    """Length of the recording by the computer's clock, seconds."""
+    events: int
+    """Events."""
+    frames: int
+    """Frames."""
+    clock: str
+    """Clock of the event times."""
+    ended_by: str | None = None
+    """What ended it early."""
+    serial: str | None = None
+    """Serial number of the camera."""
+    biases: dict[str, int] | None = None
+    """Bias settings of the camera, by the driver's names and in its units."""
+    temperature_c: tuple[float, float] | None = None
+    """Temperature of the sensor or its board at the beginning and at the end, degrees Celsius."""
+    light: tuple[float, float] | None = None
+    """What the sensor's light meter read at the beginning and at the end, without a unit."""
+    faults: dict[str, int] = field(default_factory=dict)
+    """What the source lost or left out, by name."""
+
+
+@dataclass(frozen=True)
 class CaptureInfo:
     """What `capture.yaml` holds."""
 
@@ -154,9 +184,10 @@ class CaptureInfo:
     """The camera."""
     events: str = "events.raw"
     """The event file, as the camera wrote it."""
-    frames: str = "frames.csv"
+    frames: str | None = "frames.csv"
     """Frames: a table t_us,file; a video; a folder of pictures; an AEDAT file or ROS bag, also the same file as
-    `events`; a CeleX-V recording of mode F."""
+    `events`; a CeleX-V recording of mode F; null for an event camera alone, whose time steps are then at
+    `camera.frame_rate_hz` (30 Hz by default)."""
     events_topic: str | None = None
     """Stream of the event file, where it holds several (topics of a ROS bag); `evnlos info` lists them."""
     frames_topic: str | None = None
@@ -181,6 +212,8 @@ class CaptureInfo:
     """Events to leave out."""
     setup: dict[str, Any] = field(default_factory=dict)
     """Notes about the setup: distance_m, wall, ambient."""
+    recording: RecordingInfo | None = None
+    """How it was recorded, where `evnlos capture record` did."""
 
     @property
     def target_size_m(self) -> float:
@@ -326,7 +359,7 @@ def character_of(name: str) -> str:
 def digest_of(info: CaptureInfo) -> str:
     """Return the hash of a description; settings of files with several streams count where they are made."""
     values = to_dict(info)
-    for key in ("events_topic", "frames_topic"):
+    for key in ("events_topic", "frames_topic", "recording"):
         if values[key] is None:
             del values[key]
     return config_hash(values)

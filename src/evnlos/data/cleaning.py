@@ -1,6 +1,7 @@
 """What a camera adds to what it saw, taken away: dark signal and uneven response, hot pixels, lonely events.
 
 - A camera's fixed pattern, known pixel by pixel: what it does to every frame can be taken away.
+- Where the pixels of the frame camera lie on those of the event camera.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ import torch
 from numba import njit
 from numpy.typing import NDArray
 
+from evnlos.data.capture_info import CaptureInfo, RegistrationInfo, inside
+from evnlos.data.frames import find_dots, homography_from_points, read_image, registration_error
 from evnlos.errors import DataError
+from evnlos.events import event_histogram, read_events
 from evnlos.files import write_atomically
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
 from evnlos.types import Events
@@ -97,7 +101,12 @@ def find_hot_pixels(events: Events, factor: float = 10.0, floor: int = 20) -> ND
     counts = np.bincount(
         events.y.astype(np.int64) * events.width + events.x, minlength=events.width * events.height
     )
-    return _hot(counts.reshape(events.shape), float(factor), floor)
+    return hot_by_counts(counts.reshape(events.shape), factor, floor)
+
+
+def hot_by_counts(counts: NDArray[np.int64], factor: float = 10.0, floor: int = 20) -> NDArray[np.bool_]:
+    """Return which pixels sent far more events than those around them, of their counts [H, W]."""
+    return _hot(counts, float(factor), floor)
 
 
 def without_pixels(events: Events, pixels: NDArray[np.bool_]) -> Events:
@@ -275,3 +284,28 @@ def pattern_of(setup: str | Path | None, pattern: str | Path | None = None) -> F
 
 PATTERN_FILE = "pattern.safetensors"
 """Name of the file in a setup's folder."""
+
+
+def frame_homography(
+    folder: Path, info: RegistrationInfo, capture: CaptureInfo
+) -> tuple[NDArray[np.float64], str]:
+    """Return the matrix from frame to event pixels, float64 [3, 3], and how it was found."""
+    if info.homography is not None:
+        return np.array(info.homography), "the homography stated"
+    if info.points is not None:
+        pairs = np.array(info.points, float).reshape(-1, 4)
+        frame, event, how = pairs[:, :2], pairs[:, 2:], f"{len(pairs)} points"
+    else:
+        dots = info.dots
+        assert dots is not None
+        picture = read_image(inside(folder, dots.frame))
+        if capture.frames_turned:
+            picture = picture[::-1, ::-1]
+        seen = read_events(
+            inside(folder, dots.events), width=capture.camera.width, height=capture.camera.height
+        )
+        frame = find_dots(picture, dots.rows, dots.columns)
+        event = find_dots(event_histogram(seen)[0].sum(axis=0), dots.rows, dots.columns)
+        how = f"{dots.rows} x {dots.columns} dots"
+    matrix = homography_from_points(frame, event)
+    return matrix, f"{how} (rms error {registration_error(matrix, frame, event):.2f} pixels)"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.config import check_made
+from evnlos.data.capture_info import CaptureInfo
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
 from evnlos.scene import Motion, Target
@@ -153,3 +155,25 @@ def area_weights(inside: int, outside: int) -> NDArray[np.float32]:
     low = np.maximum(np.arange(outside)[:, None] * cell, np.arange(inside))
     high = np.minimum(np.arange(1, outside + 1)[:, None] * cell, np.arange(1, inside + 1))
     return (np.maximum(high - low, 0.0) / cell).astype(np.float32)
+
+
+_STEPS_HZ, _MOST_STEPS = 30.0, 1_000_000
+
+
+def time_steps(folder: Path, info: CaptureInfo, events: Events) -> tuple[NDArray, NDArray[np.int64]]:
+    """Return black frames, which take no memory, and their times, over the time of the events.
+
+    Args:
+        folder: The capture's folder, for messages.
+        info: Its description; `camera.frame_rate_hz` is the rate of the time steps, 30 Hz by default.
+        events: Its events, at least one.
+
+    Raises:
+        DataError: There would be more than a million time steps.
+    """
+    first, last = int(events.t_us[0]), int(events.t_us[-1])
+    step_us = 1e6 / (info.camera.frame_rate_hz or _STEPS_HZ)
+    if (last - first) / step_us > _MOST_STEPS:
+        raise DataError(f"{folder}: events over {(last - first) / 1e6:.0f} s; cut them, or lower frame_rate_hz")
+    times_us = first + np.round(np.arange(int((last - first) / step_us) + 1) * step_us).astype(np.int64)
+    return np.broadcast_to(np.uint8(0), (len(times_us), *events.shape)), times_us
