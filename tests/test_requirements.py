@@ -51,6 +51,7 @@ def test_what_the_package_imports_is_declared() -> None:
         "distributed",
         "lz4",
         "zstandard",
+        "neuromorphic_drivers",
     }
     of_required = {"llvmlite": "numba", "pydantic_core": "pydantic"}  # they bring them
     undeclared = {}

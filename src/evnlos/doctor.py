@@ -115,6 +115,7 @@ class Part:
 
 _EXTRAS = {
     "aedat": ("aedat", "reads AEDAT4 recordings"),
+    "neuromorphic_drivers": ("camera", "reads event cameras on a cable"),
     "zstandard": ("ros", "reads packed ROS recordings"),
     "av": ("video", "reads and writes videos"),
     "matplotlib": ("plot", "draws figures"),

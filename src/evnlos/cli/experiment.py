@@ -257,10 +257,12 @@ class AppCommand:
 
 @dataclass(frozen=True)
 class LiveCommand:
-    """Reconstruct while events come in: a replay, a file that grows, or UDP packets."""
+    """Reconstruct while events come in: a replay, a file that grows, a camera, or a stream."""
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """Capture folder or event file (replayed), event file with --follow, or udp://127.0.0.1:7000."""
+    """Capture folder or event file (replayed); event file with --follow; a camera (evk4, evk3-hd, davis346,
+    dvxplorer, centuryarks-vga or triton; NAME:SERIAL where several are connected); - for EVT2 or EVT3 words on
+    standard input; udp://127.0.0.1:7000, aestream://127.0.0.1:3333, dv://127.0.0.1:7777."""
     weights: Path | None = None
     """Weights file, run's folder, or name of published weights, of single positions; of the modality event
     where SOURCE has no frames. None takes published ones: near-frame for a capture, else near-event."""

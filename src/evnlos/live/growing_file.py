@@ -19,14 +19,23 @@ from evnlos.events.files.csv import FAULTS as CSV_FAULTS
 from evnlos.events.files.csv import Layout, find_layout, parse_rows
 from evnlos.events.files.fixed_words import sniff_dat
 from evnlos.events.files.raw import parse_raw_header, sniff_raw
-from evnlos.events.files.read import keep_after, keep_in_order, open_source
-from evnlos.events.files.words import FAULTS, KINDS, STATE_SIZE, WordSource, new_state
+from evnlos.events.files.read import keep_in_order, open_source
+from evnlos.events.files.words import (
+    FAULTS,
+    KINDS,
+    OUT_OF_RANGE,
+    STATE_SIZE,
+    UNDATED,
+    WordCodec,
+    WordSource,
+    new_state,
+)
 from evnlos.live.packet import Chunk, Clock, SystemClock
 from evnlos.types import Events
 
 _FOLLOWED = "RAW (EVT2, EVT2.1, EVT3), DAT and CSV can be followed while they grow"
-_START_BYTES = 65_536
-_UNPRINTABLE = re.compile(rb"[^\t-\r -~]")
+START_BYTES = 65_536
+UNPRINTABLE = re.compile(rb"[^\t-\r -~]")
 
 
 class Tail(Protocol):
@@ -40,8 +49,39 @@ class Tail(Protocol):
         ...
 
 
-class OrderedTail:
-    """Events of a growing file, checked: inside the sensor, in the order of time.
+class OrderedEvents:
+    """What of a stream's events is sound: inside the sensor, in the order of time.
+
+    Args:
+        width: Sensor width, pixels.
+        height: Sensor height, pixels.
+
+    Attributes:
+        faults: Events that were left out.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width, self.height, self.faults = width, height, 0
+        self._newest = np.iinfo(np.int64).min
+
+    def sound(self, columns: Columns) -> Events:
+        """Return the next events of the stream that are sound."""
+        inside = (columns["x"] < self.width) & (columns["y"] < self.height)
+        if not inside.all():
+            self.faults += int((~inside).sum())
+            columns = {name: column[inside] for name, column in columns.items()}
+        t_us = columns["t_us"]
+        if len(t_us) and (int(t_us[0]) < self._newest or (t_us[1:] < t_us[:-1]).any()):
+            on_time = t_us >= self._newest
+            columns = keep_in_order({name: column[on_time] for name, column in columns.items()})
+            self.faults += len(t_us) - len(columns["t_us"])
+        if len(columns["t_us"]):
+            self._newest = int(columns["t_us"][-1])
+        return Events(**columns, width=self.width, height=self.height)
+
+
+class OrderedTail(OrderedEvents):
+    """Events of a growing file, checked.
 
     Args:
         tail: The decoder.
@@ -53,46 +93,55 @@ class OrderedTail:
     """
 
     def __init__(self, tail: Tail, width: int, height: int) -> None:
-        self.start, self.width, self.height = tail.start, width, height
-        self.faults = 0
-        self._tail = tail
-        self._newest = np.iinfo(np.int64).min
+        super().__init__(width, height)
+        self.start, self._tail = tail.start, tail
 
     def feed(self, data: bytes) -> Events:
         """Return the events that further bytes complete."""
         columns, faults = self._tail.feed(data)
         self.faults += faults
-        inside = (columns["x"] < self.width) & (columns["y"] < self.height)
-        if not inside.all():
-            self.faults += int((~inside).sum())
-            columns = {name: column[inside] for name, column in columns.items()}
-        t_us = columns["t_us"]
-        if len(t_us) and (int(t_us[0]) < self._newest or (t_us[1:] < t_us[:-1]).any()):
-            columns = keep_after(keep_in_order(columns), self._newest)
-            self.faults += len(t_us) - len(columns["t_us"])
-        if len(columns["t_us"]):
-            self._newest = int(columns["t_us"][-1])
-        return Events(**columns, width=self.width, height=self.height)
+        return self.sound(columns)
 
 
-class _WordTail:
-    def __init__(self, source: WordSource) -> None:
-        self.start, self._source = source.start, source
+class WordTail:
+    """Words of one format, decoded as they come.
+
+    Args:
+        codec: How words become events.
+        size: Sensor width and height, pixels.
+        t0_us: Time of the clock's zero, microseconds.
+        start: Byte of the file with which they begin.
+
+    Attributes:
+        grave: Faults of the last bytes that neither a stream entered in the middle nor a wrong size explains.
+    """
+
+    def __init__(self, codec: WordCodec, size: tuple[int, int], t0_us: int = 0, start: int = 0) -> None:
+        self.start, self._codec, self._size, self._t0_us = start, codec, size, t0_us
         self._state, self._rest = new_state(), b""
+        self.grave = 0
+
+    @property
+    def unused(self) -> int:
+        """Bytes of a word that is not complete."""
+        return len(self._rest)
 
     def feed(self, data: bytes) -> tuple[Columns, int]:
-        codec, report = self._source.codec, self._source.report
+        """Return the events that further bytes complete, and how many faults were met."""
+        codec = self._codec
         data = self._rest + data
         whole = len(data) // codec.dtype.itemsize * codec.dtype.itemsize
         # Arrays that may be written, as when a whole file is read: others would compile the decoder once more.
         words, self._rest = np.frombuffer(bytearray(data[:whole]), codec.dtype), data[whole:]
         out = allocate(codec.bound(words))
         places = out["t_us"], out["x"], out["y"], out["p"]
-        count = int(codec.decode(words, self._state, *places, report.width, report.height))
-        faults = int(self._state[FAULTS : FAULTS + 2 * len(KINDS) : 2].sum())
+        count = int(codec.decode(words, self._state, *places, *self._size))
+        noted = self._state[FAULTS : FAULTS + 2 * len(KINDS) : 2]
+        faults = int(noted.sum())
+        self.grave = faults - int(noted[UNDATED] + noted[OUT_OF_RANGE])
         self._state[FAULTS:STATE_SIZE] = 0
         columns = cut(out, 0, count)
-        columns["t_us"] = columns["t_us"] + self._source.t0_us
+        columns["t_us"] = columns["t_us"] + self._t0_us
         return columns, faults
 
 
@@ -135,22 +184,23 @@ def open_tail(path: Path, width: int | None = None, height: int | None = None) -
     if not path.is_file():
         return None
     with path.open("rb") as file:
-        start = file.read(_START_BYTES)
-    if not start or _is_cut_header(start):
+        start = file.read(START_BYTES)
+    if not start or is_cut_header(start):
         return None
     named = sniff_raw(start) is not None or sniff_dat(start)
     layout = None if named else find_layout(start[: start.rfind(b"\n") + 1])
     if layout is not None:
         return _csv_tail(path, layout, width, height)
-    if not named and not _UNPRINTABLE.search(start):
+    if not named and not UNPRINTABLE.search(start):
         return None  # text without a row
     source, report = open_source(path, "salvage", width, height)
     if not isinstance(source, WordSource):
         raise EventFileError(f"{path} is {report.format}; {_FOLLOWED}: leave out --follow to replay it")
-    return OrderedTail(_WordTail(source), report.width, report.height)
+    size = report.width, report.height
+    return OrderedTail(WordTail(source.codec, size, source.t0_us, source.start), *size)
 
 
-def _is_cut_header(start: bytes) -> bool:
+def is_cut_header(start: bytes) -> bool:
     """Return whether a file begins with a header of which more may come."""
     if not start.startswith(b"%"):
         return False
@@ -169,7 +219,7 @@ def _csv_tail(path: Path, layout: Layout, width: int | None, height: int | None)
 
 
 _POLL_S = 0.002
-_BLOCK_BYTES = 1 << 16
+BLOCK_BYTES = 1 << 16
 
 
 class GrowingFile:
@@ -219,7 +269,7 @@ class GrowingFile:
         with self.path.open("rb", buffering=0) as file:
             file.seek(place)
             while not stop():
-                data = file.read(_BLOCK_BYTES)
+                data = file.read(BLOCK_BYTES)
                 now = self._clock.now()
                 if not data:
                     if self.path.stat().st_size < place:

@@ -79,6 +79,7 @@ class Chunk:
         last_s: Instant at which its last event came, seconds.
         frame: What the frame camera saw at `until_us`, float32 [H, W], 0..1; None where it took no frame.
         restart: Whether a new stream begins: what came before, and its clock, is forgotten.
+        frame_us: When the frame was taken, microseconds; None = at `until_us`. A camera sends it later.
     """
 
     events: Events
@@ -87,6 +88,7 @@ class Chunk:
     last_s: float
     frame: NDArray[np.float32] | None = None
     restart: bool = False
+    frame_us: int | None = None
 
 
 class EventSource(Protocol):
@@ -160,8 +162,9 @@ class ChunkQueue:
         if following.restart:
             return
         if oldest.restart or (oldest.frame is not None and following.frame is None):
-            frame = oldest.frame if following.frame is None else following.frame
-            self._held[0] = replace(following, frame=frame, restart=oldest.restart)
+            kept = following if following.frame is not None else oldest
+            when = kept.until_us if kept.frame_us is None else kept.frame_us
+            self._held[0] = replace(following, frame=kept.frame, frame_us=when, restart=oldest.restart)
 
     def take(self, timeout_s: float) -> list[Chunk]:
         """Return all chunks held, in their order; none where nothing came in time or the queue was closed.

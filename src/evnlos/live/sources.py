@@ -1,4 +1,4 @@
-"""Sources of a live run: recordings replayed, growing files, packets.
+"""Sources of a live run: recordings replayed, growing files, standard input, packets.
 
 - A recording as if it happened now: its events and frames come when they are due.
 - From the words of a command line to a source: a capture, a recording, a file that grows, or a port.
@@ -19,9 +19,11 @@ from evnlos.data.cleaning import FixedPattern
 from evnlos.errors import ConfigError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording
+from evnlos.live.device import DeviceSource, NeuromorphicDriver, device_of
 from evnlos.live.growing_file import GrowingFile
 from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
-from evnlos.live.udp import UdpSource
+from evnlos.live.streams import DvSource, WordInput
+from evnlos.live.udp import AestreamSource, UdpSource
 from evnlos.types import Events
 
 _NAP_S = 0.05  # longest sleep before `stop` is asked again
@@ -154,9 +156,6 @@ def _plain(events: Events) -> dict[str, NDArray]:
     return {"t_us": events.t_us, "x": events.x, "y": events.y, "p": events.p}
 
 
-_SCHEME = "udp://"
-
-
 @dataclass(frozen=True)
 class SourceOptions:
     """How a source is opened."""
@@ -166,10 +165,12 @@ class SourceOptions:
     speed: float = 1.0
     """Speed of a replay: 1 = as it happened, 10 = ten times faster."""
     idle: float = 10.0
-    """End when a growing file or, after the first packet, UDP brought nothing for so many seconds; 0 = wait for
-    ever."""
+    """End when a growing file or, after the first packet, a network brought nothing for so many seconds, or a
+    camera that went away does not come back; 0 = wait for ever."""
+    format: str | None = None
+    """Words on standard input without a RAW header: evt2, evt21 or evt3, with --width and --height."""
     width: int | None = None
-    """Sensor width, pixels, where a file does not say; give both or neither."""
+    """Sensor width, pixels, where a file or stream does not say; give both or neither."""
     height: int | None = None
     """Sensor height, pixels."""
 
@@ -191,7 +192,8 @@ def open_live(
     """Return a source of events by its name.
 
     Args:
-        source: `udp://HOST:PORT`, the folder of a capture, or an event file.
+        source: A camera (`evk4`, `davis346:SERIAL`), `udp://HOST:PORT`, `aestream://HOST:PORT` or
+            `dv://HOST:PORT`, `-` for words on standard input, the folder of a capture, or an event file.
         how: Whether a file grows, how fast a replay goes, when to give up.
         pattern: Fixed pattern of the frame camera, to be taken from a capture's frames.
 
@@ -200,8 +202,20 @@ def open_live(
         EventFileError: There is no such event file, or it is damaged.
         ConfigError: The address can't be listened at, or an option does not fit.
     """
-    if source.startswith(_SCHEME):
+    if source == "-":
+        return WordInput(format=how.format, width=how.width, height=how.height)
+    if how.format is not None:
+        raise ConfigError(f"--format is for words on standard input; {source} says its own, or give -")
+    scheme = source.partition("://")[0] if "://" in source else ""
+    if scheme == "udp":
         return UdpSource(*_address(source), idle_s=how.idle_s)
+    if scheme == "aestream":
+        return AestreamSource(*_address(source), how.width, how.height, idle_s=how.idle_s)
+    if scheme == "dv":
+        return DvSource(*_address(source), idle_s=how.idle_s)
+    device = device_of(source)
+    if device is not None:
+        return DeviceSource(lambda: NeuromorphicDriver(*device), source, idle_s=how.idle_s)
     path = Path(source)
     if path.is_dir():
         if how.follow:
@@ -227,12 +241,15 @@ def capture_replay(
     Raises:
         DataError: The capture is damaged.
     """
-    capture = read_capture(folder)
-    if pattern is not None:
+    capture = read_capture(folder, needs_frames=False)
+    if not capture.has_frames:
+        images = []
+    elif pattern is not None:
         images = pattern.correct(capture.frames, capture.peak)
     else:
         images = capture.frames / np.float32(capture.peak)
-    frames = [TimedFrame(int(t), image) for t, image in zip(capture.frame_times_us, images, strict=True)]
+    times = capture.frame_times_us[: len(images)]
+    frames = [TimedFrame(int(t), image) for t, image in zip(times, images, strict=True)]
     return Replay([capture.events], frames, speed=speed, clock=clock, name=str(folder))
 
 
@@ -244,5 +261,6 @@ def _address(source: str) -> tuple[str, int]:
     except ValueError:
         host, port, stray = "", None, source
     if port is None or stray:
-        raise ConfigError(f"{source} is no address; give one such as udp://127.0.0.1:7000")
+        scheme = source.partition("://")[0]
+        raise ConfigError(f"{source} is no address; give one such as {scheme}://127.0.0.1:7000")
     return host, port

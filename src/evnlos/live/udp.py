@@ -1,4 +1,8 @@
-"""Events that arrive as UDP packets, and a sender for cameras' programs and for tests."""
+"""Events that arrive as UDP packets, ours or AEStream's, and a sender for cameras' programs and for tests.
+
+A packet of AEStream is words of 32 bits, little endian: row in bits 0-14, polarity in bit 15, column in bits
+16-30; where bit 31 is clear the next word is the time, microseconds.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.events.files.columns import cut, trusted_events
+from evnlos.events.files.columns import Columns, cut, trusted_events
+from evnlos.live.growing_file import OrderedTail
 from evnlos.live.packet import (
     UNKNOWN_US,
     USUAL_EVENTS,
@@ -40,6 +45,57 @@ _AGREEING = (
 _FAULTS = ("malformed packets", "lost packets", "late packets", "streams taken up anew")
 
 
+class Listener:
+    """A port at which datagrams arrive.
+
+    Args:
+        scheme: Kind of the address, for messages.
+        host: Address to listen at; 127.0.0.1 takes packets of this machine only.
+        port: Port; 0 takes a free one.
+        clock: The clock that arrivals are told by.
+
+    Attributes:
+        port: The port that is listened at.
+        name: Its address.
+
+    Raises:
+        ConfigError: The address can't be listened at.
+    """
+
+    def __init__(self, scheme: str, host: str, port: int, clock: Clock) -> None:
+        self._socket, self._clock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), clock
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+            self._socket.bind((host, port))
+        except (OSError, OverflowError) as error:
+            self._socket.close()
+            raise ConfigError(
+                f"{scheme}://{host}:{port} can't be listened at ({error}); give a free port of this machine"
+            ) from None
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+        self.name = f"{scheme}://{host}:{self.port}"
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.close()
+
+    def receive(self) -> tuple[list[bytes], float]:
+        """Return the packets that lie ready, after a short wait for the first one, and when that one came."""
+        if not select.select([self._socket], [], [], _NAP_S)[0]:
+            return [], 0.0
+        first_s, found = self._clock.now(), []
+        self._clock.sleep(_GATHER_S)
+        while len(found) < _BATCH:
+            try:
+                found.append(self._socket.recv(65_536))
+            except BlockingIOError:
+                break
+            except OSError:  # a sender's closed port, as some systems report it
+                continue
+        return found, first_s
+
+
 class UdpSource:
     """A source that listens for packets (`evnlos.live.packet`).
 
@@ -63,20 +119,11 @@ class UdpSource:
     def __init__(
         self, host: str = "127.0.0.1", port: int = 0, *, idle_s: float | None = None, clock: Clock | None = None
     ) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-            self._socket.bind((host, port))
-        except (OSError, OverflowError) as error:
-            self._socket.close()
-            raise ConfigError(
-                f"udp://{host}:{port} can't be listened at ({error}); give a free port of this machine"
-            ) from None
-        self._socket.setblocking(False)
-        unpack(pack(Packet(0, Events.empty(1, 1))))  # compiles the decoder before the first packet comes
-        self.port: int = self._socket.getsockname()[1]
-        self.name, self.has_frames, self.waits = f"udp://{host}:{self.port}", False, False
         self._clock, self._idle_s = clock or SystemClock(), idle_s
+        self._listener = Listener("udp", host, port, self._clock)
+        unpack(pack(Packet(0, Events.empty(1, 1))))  # compiles the decoder before the first packet comes
+        self.port = self._listener.port
+        self.name, self.has_frames, self.waits = self._listener.name, False, False
         self._faults: Counter[str] = Counter()
         self._stream: _Stream | None = None
         self._other: _Stream | None = None  # what packets that were left out agree on
@@ -87,7 +134,7 @@ class UdpSource:
 
     def close(self) -> None:
         """Stop listening."""
-        self._socket.close()
+        self._listener.close()
 
     def chunks(self, stop: Callable[[], bool]) -> Iterator[Chunk]:
         """Yield what arrived since the chunk before, until a packet says that it is the last one."""
@@ -95,7 +142,7 @@ class UdpSource:
         ended = False
         try:
             while not (stop() or ended):
-                datagrams, first_s = self._receive()
+                datagrams, first_s = self._listener.receive()
                 last_s = self._clock.now()
                 if not datagrams:
                     if self._idle_s is not None and heard_s is not None and last_s - heard_s > self._idle_s:
@@ -111,21 +158,6 @@ class UdpSource:
                     ended = ended or any(heading.is_last for heading in batch.headings[first:last])
         finally:
             self.close()
-
-    def _receive(self) -> tuple[list[bytes], float]:
-        """Return the packets that lie ready, after a short wait for the first one, and when that one came."""
-        if not select.select([self._socket], [], [], _NAP_S)[0]:
-            return [], 0.0
-        first_s, found = self._clock.now(), []
-        self._clock.sleep(_GATHER_S)
-        while len(found) < _BATCH:
-            try:
-                found.append(self._socket.recv(65_536))
-            except BlockingIOError:
-                break
-            except OSError:  # a sender's closed port, as some systems report it
-                continue
-        return found, first_s
 
     def _runs(self, batch: Batch) -> Iterator[tuple[int, int, bool]]:
         """Yield (first, last + 1) of packets that follow each other in a stream, and whether they begin it."""
@@ -197,6 +229,92 @@ def _chunk(batch: Batch, first: int, last: int, begins: bool, first_s: float, la
     events = batch.events(first, last)
     until = int(events.t_us[-1]) if len(events) else UNKNOWN_US
     return Chunk(events, until, first_s, last_s, restart=begins)
+
+
+class _AestreamTail:
+    start = 0
+
+    def __init__(self) -> None:
+        self.arrived_us = 0
+        self._newest: int | None = None
+
+    def feed(self, data: bytes) -> tuple[Columns, int]:
+        words = np.frombuffer(data[: len(data) // 4 * 4], "<u4").astype(np.int64)
+        is_timed = bool(len(words)) and not words[0] >> 31
+        at = words[: len(words) // 2 * 2 : 2] if is_timed else words
+        good = (at >> 31 == 0) if is_timed else (at >> 31 == 1)
+        faults = int((~good).sum()) + (4 * (len(at) << is_timed) != len(data))
+        if is_timed:
+            newest = int(words[1]) if self._newest is None else self._newest
+            t_us = newest + (words[1 : 2 * len(at) : 2] - newest + _LATE) % _TURN - _LATE
+        else:
+            t_us = np.full(len(at), self.arrived_us)
+        at, t_us = at[good], t_us[good]
+        if len(at):
+            self._newest = max(int(t_us.max()), int(t_us[0]) if self._newest is None else self._newest)
+        x, y = ((at >> bit & 0x7FFF).astype(np.uint16) for bit in (16, 0))
+        return {"t_us": t_us, "x": x, "y": y, "p": (at >> 15 & 1).astype(bool)}, faults
+
+
+class AestreamSource:
+    """A source that listens for packets of AEStream; which of them were lost can't be known.
+
+    Args:
+        host: Address to listen at; 127.0.0.1 takes packets of this machine only.
+        port: Port; 0 takes a free one.
+        width: Sensor width, pixels: the packets do not say it.
+        height: Sensor height, pixels.
+        idle_s: End after so many seconds without a packet, counted from the first one; None = never.
+
+    Raises:
+        ConfigError: The address can't be listened at, or the sensor size is missing.
+    """
+
+    def __init__(
+        self, host: str, port: int, width: int | None, height: int | None, *, idle_s: float | None = None
+    ) -> None:
+        if width is None or height is None:
+            raise ConfigError("packets of AEStream say no sensor size; give --width and --height")
+        self._clock, self._idle_s, self._size = SystemClock(), idle_s, (width, height)
+        self._listener = Listener("aestream", host, port, self._clock)
+        self.port, self.name = self._listener.port, self._listener.name
+        self.has_frames, self.waits = False, False
+        self._faults: Counter[str] = Counter()
+
+    def faults(self) -> dict[str, int]:
+        """Return how many events were damaged or came late, and how often a stream began anew."""
+        return {name: self._faults[name] for name in ("damaged or late events", "streams taken up anew")}
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._listener.close()
+
+    def chunks(self, stop: Callable[[], bool]) -> Iterator[Chunk]:
+        """Yield what arrived since the chunk before."""
+        begun_s, heard_s, useless, begins = self._clock.now(), None, 0, False
+        tail = OrderedTail(words := _AestreamTail(), *self._size)
+        try:
+            while not stop():
+                datagrams, first_s = self._listener.receive()
+                last_s = self._clock.now()
+                heard_s = last_s if datagrams else heard_s
+                if self._idle_s is not None and heard_s is not None and last_s - heard_s > self._idle_s:
+                    return
+                words.arrived_us = round((last_s - begun_s) * 1e6)
+                for data in datagrams:
+                    before = tail.faults
+                    events = tail.feed(data)
+                    self._faults["damaged or late events"] += tail.faults - before
+                    useless = 0 if len(events) else useless + 1
+                    if len(events):
+                        yield Chunk(events, int(events.t_us[-1]), first_s, last_s, restart=begins)
+                        begins = False
+                    elif useless == _AGREEING:
+                        useless, begins = 0, True
+                        tail = OrderedTail(words := _AestreamTail(), *self._size)
+                        self._faults["streams taken up anew"] += 1
+        finally:
+            self.close()
 
 
 class UdpSender:

@@ -10,6 +10,7 @@ in the comments count from the start of the packet's size.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from contextlib import closing
@@ -86,18 +87,80 @@ def check_packets(path: Path, report: ReadReport) -> None:
             at += 8 + length
 
 
+def _field(table: bytes, number: int, root: int = 0) -> int:
+    """Return where a field of a flat buffer's table begins, 0 where it is absent.
+
+    Raises:
+        struct.error: The buffer is damaged.
+    """
+    start = root + struct.unpack_from("<I", table, root)[0]
+    vtable = start - struct.unpack_from("<i", table, start)[0]
+    if vtable < 0:
+        raise struct.error("a table before its buffer")
+    if struct.unpack_from("<H", table, vtable)[0] < 6 + 2 * number:
+        return 0
+    field = struct.unpack_from("<H", table, vtable + 4 + 2 * number)[0]
+    return start + field if field else 0
+
+
 def _data_table_position(header: bytes) -> int | None:
     """Return the second field of the header's flat buffer, None where it is absent or -1."""
     try:
-        root = struct.unpack_from("<I", header, 0)[0]
-        vtable = root - struct.unpack_from("<i", header, root)[0]
-        if vtable < 0 or struct.unpack_from("<H", header, vtable)[0] < 8:
-            return None
-        field = struct.unpack_from("<H", header, vtable + 6)[0]
-        position = struct.unpack_from("<q", header, root + field)[0] if field else -1
+        field = _field(header, 1)
+        position = struct.unpack_from("<q", header, field)[0] if field else -1
     except struct.error:
         return 2**63 - 1  # outside every file: the caller reports it
     return None if position < 0 else position
+
+
+COMPRESSIONS = ("none", "lz4", "lz4", "zstd", "zstd")
+"""How packets are packed, by the number in the header."""
+
+
+def stream_header(header: bytes) -> tuple[str, int, int, int]:
+    """Return compression, number, width and height of the event stream of a header (without its size).
+
+    Raises:
+        ValueError: It is damaged, or describes no event stream.
+    """
+    try:
+        packed = _field(header, 0)
+        method = struct.unpack_from("<i", header, packed)[0] if packed else 0
+        text = _field(header, 2)
+        text += struct.unpack_from("<I", header, text)[0]
+        length = struct.unpack_from("<I", header, text)[0]
+    except struct.error:
+        raise ValueError("a header that is damaged") from None
+    description = header[text + 4 : text + 4 + length].decode("latin-1")
+    if not 0 <= method < len(COMPRESSIONS):
+        raise ValueError(f"packets packed by method {method}, none, LZ4 and Zstandard are read")
+    nodes = re.split(r'<node name="(\d{1,9})"', description)
+    for number, node in zip(nodes[1::2], nodes[2::2], strict=True):
+        sides = [re.search(rf'"size{axis}"[^>]*>(\d{{1,5}})<', node) for axis in "XY"]
+        if ">EVTS<" in node and sides[0] and sides[1]:
+            return COMPRESSIONS[method], int(number), int(sides[0][1]), int(sides[1][1])
+    raise ValueError("a stream without events of a stated sensor size")
+
+
+def packet_columns(packet: bytes | memoryview) -> Columns:
+    """Return the events of an unpacked packet, as they stand in it.
+
+    Raises:
+        ValueError: It is damaged.
+    """
+    data = bytes(packet)
+    try:
+        vector = _field(data, 0, 4)
+        if vector:
+            vector += struct.unpack_from("<I", data, vector)[0]
+            count = struct.unpack_from("<I", data, vector)[0]
+        else:
+            vector, count = len(data) - 4, 0
+        rows = np.frombuffer(data, _EVENT, count, vector + 4)
+    except (struct.error, ValueError):
+        raise ValueError("a packet that is damaged") from None
+    sides = {name: rows[name].astype(np.uint16) for name in ("x", "y")}  # -1 becomes a pixel outside
+    return {"t_us": rows["t"].astype(np.int64), **sides, "p": rows["on"].astype(bool)}
 
 
 class Aedat4Source:

@@ -23,18 +23,19 @@ MOST_CHUNK_BYTES = 1 << 27
 """Size of a chunk, packed or not, at most; recorders write about a megabyte."""
 
 
-def unpack(method: str, data: bytes | memoryview, size: int) -> bytes | memoryview:
+def unpack(method: str, data: bytes | memoryview, size: int | None) -> bytes | memoryview:
     """Return the unpacked bytes of a chunk.
 
     Args:
         method: "" or "none" (as they are), "bz2", "lz4" (frames) or "zstd".
         data: The packed bytes.
-        size: How many bytes they are unpacked, as the file says.
+        size: How many bytes they are unpacked, as the file says; None where it does not.
 
     Raises:
         ValueError: Another method, damage, another size than stated, or a chunk that is too large.
         MissingDependencyError: lz4 or zstd without its package.
     """
+    is_stated, size = size is not None, MOST_CHUNK_BYTES if size is None else size
     if size > MOST_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size} bytes, at most {MOST_CHUNK_BYTES} are read")
     if method in ("", "none"):
@@ -47,7 +48,7 @@ def unpack(method: str, data: bytes | memoryview, size: int) -> bytes | memoryvi
         unpacked = _zstd(data, size)
     else:
         raise ValueError(f"a chunk packed by {method[:20]!r}; none, bz2, lz4 and zstd are read")
-    if len(unpacked) != size:
+    if len(unpacked) != size if is_stated else len(unpacked) > size:
         raise ValueError(f"a chunk of {len(unpacked)} bytes or more where {size} are announced")
     return unpacked
 

@@ -232,8 +232,10 @@ class RawSource(WordSource):
         name = next(name for name in names if name in CODECS)
         report.format = name
         raw_geometry(header, report, width, height, _MAX_SIDE)
-        self.is_swapped = name == "EVT21" and _is_swapped(path, header)
-        codec = _SWAPPED_EVT21 if self.is_swapped else CODECS[name]
+        with path.open("rb") as file:
+            file.seek(header.size)
+            codec = raw_codec(name, header, file.read(_LOOK_BYTES))
+        self.is_swapped = codec is _SWAPPED_EVT21
         super().__init__(path, codec, header.size, report, header.integer("t0", report) or 0)
         self._announced = _announced_events(header, report)
         self._decoded = 0
@@ -252,16 +254,25 @@ class RawSource(WordSource):
             self.report.fault(kind, size, found, f"copy the file again or {SALVAGE}")
 
 
-def _is_swapped(path: Path, header: RawHeader) -> bool:
-    """Return whether the halves of EVT2.1 words are exchanged: as the header says, else as they look."""
+_LOOK_BYTES = 8 * 4096
+
+
+def raw_codec(name: str, header: RawHeader, data: bytes) -> WordCodec:
+    """Return how words are decoded; halves of EVT2.1 words are exchanged as the header says or as they look.
+
+    Args:
+        name: "EVT2", "EVT21" or "EVT3".
+        header: The header before the words.
+        data: The first of the words, 32 KiB suffice.
+    """
     found = header.find("format")
     stated = re.search(r"endianness=(\w+)", found[0]) if found else None
     if stated:
-        return stated[1] == "legacy"
-    with path.open("rb") as file:
-        file.seek(header.size)
-        start = file.read(8 * 4096)
-    return evt2.looks_swapped(np.frombuffer(start[: len(start) // 8 * 8], "<i8"))
+        is_swapped = stated[1] == "legacy"
+    else:
+        data = data[: len(data) // 8 * 8]
+        is_swapped = name == "EVT21" and evt2.looks_swapped(np.frombuffer(data, "<i8"))
+    return _SWAPPED_EVT21 if is_swapped and name == "EVT21" else CODECS[name]
 
 
 def _announced_events(header: RawHeader, report: ReadReport) -> int | None:
