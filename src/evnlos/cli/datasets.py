@@ -176,33 +176,50 @@ _MARKS = {"good": "  good   ", "doubtful": "? look   ", "bad": "! BAD    "}
 
 @dataclass(frozen=True)
 class CaptureCommand:
-    """Begin a capture folder with a commented capture.yaml (init), or say what a recording is worth (check)."""
+    """Begin a capture folder (init), record one from a camera or stream (record), or tell its worth (check)."""
 
-    action: Annotated[Literal["init", "check"], tyro.conf.Positional]
-    """init writes capture.yaml; check reads the recording and tells what is wrong and how to mend it."""
+    action: Annotated[Literal["init", "record", "check"], tyro.conf.Positional]
+    """init writes a commented capture.yaml; record writes a whole capture; check reads one and tells what is
+    wrong and how to mend it."""
     folder: Annotated[Path, tyro.conf.Positional]
     """The folder of the capture."""
-    width: int = 1280
-    """init: columns of the event camera's sensor, pixels."""
-    height: int = 800
-    """init: rows of the event camera's sensor, pixels; the defaults are those of the CeleX-V."""
+    source: str | None = None
+    """record: what `evnlos live` takes: a camera such as evk4 or davis346, - for words on standard input,
+    udp://, aestream://, dv://."""
+    seconds: float | None = None
+    """record: length, seconds; by default until the source ends, or Ctrl-C."""
+    idle: float = 10.0
+    """record: end when the source brought nothing, or a camera stayed away, for so many seconds; 0 = never."""
+    format: str | None = None
+    """record: words on standard input without a RAW header: evt2, evt21 or evt3, with --width and --height."""
+    width: int | None = None
+    """Columns of the event camera's sensor, pixels; record: where the source does not say; init: 1280."""
+    height: int | None = None
+    """Rows of the event camera's sensor, pixels; init: 800, as the CeleX-V."""
     camera: str = "CeleX-V"
     """init: maker and model."""
     json: bool = False
-    """check: print one JSON object."""
+    """record, check: print one JSON object."""
 
     def run(self) -> None:
-        """Write the file, or print the findings; exit code 1 where one of them is bad."""
+        """Write the file, record, or print the findings; exit code 1 where one of them is bad."""
         if self.action == "init":
             from evnlos.data.capture_info import begin_capture
 
-            path = begin_capture(self.folder, self.width, self.height, self.camera)
+            width, height = (
+                1280 if self.width is None else self.width,
+                800 if self.height is None else self.height,
+            )
+            path = begin_capture(self.folder, width, height, self.camera)
             print(f"{path}: edit it, put the recordings beside it, then: evnlos capture check {self.folder}")
+            return
+        if self.action == "record":
+            self._record()
             return
         from evnlos.data import read_capture
         from evnlos.data.capture_check import check_capture
 
-        capture = read_capture(self.folder)
+        capture = read_capture(self.folder, needs_frames=False)
         found = check_capture(capture)
         if self.json:
             print(json.dumps({"capture": capture.name, "findings": [asdict(one) for one in found]}))
@@ -212,6 +229,36 @@ class CaptureCommand:
                 print(f"{_MARKS[one.level]}{one.what}: {one.found}" + (f"; {one.cure}" if one.cure else ""))
         if any(one.level == "bad" for one in found):
             raise SystemExit(1)
+
+    def _record(self) -> None:
+        from evnlos.files import check_folder
+        from evnlos.live.record import record_capture
+        from evnlos.live.sources import SourceOptions, open_live
+
+        if self.source is None:
+            raise ConfigError("record needs --source: a camera such as evk4, -, udp://HOST:PORT; see --help")
+        check_folder(self.folder)
+        how = SourceOptions(idle=self.idle, format=self.format, width=self.width, height=self.height)
+        source = open_live(self.source, how)
+        is_shown = sys.stderr.isatty()
+
+        def tell(line: str) -> None:
+            print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True) if is_shown else say(line)
+
+        say(f"{source.name} is recorded; Ctrl-C ends")
+        try:
+            every_s = 0.5 if is_shown else 5.0
+            done = record_capture(self.folder, source, seconds=self.seconds, tell=tell, tell_every_s=every_s)
+        finally:
+            source.close()
+            if is_shown:
+                print(file=sys.stderr)
+        if done.ended_by:
+            say(f"warning: it ended early: {done.ended_by}")
+        lost = "".join(f", {count:,} {name}" for name, count in done.faults.items())
+        text = f"{self.folder}: {done.events:,} events and {done.frames:,} frames in {done.seconds:.1f} s{lost}"
+        about = asdict(done) | {"folder": str(self.folder)}
+        result(self.json, about, f"{text}; next: evnlos capture check {self.folder}")
 
 
 @dataclass(frozen=True)

@@ -1,3 +1,5 @@
 """Streaming reconstruction: events arrive, pictures leave, and every picture knows how long it took."""
 
-__all__: list[str] = []
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
