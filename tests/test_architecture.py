@@ -92,6 +92,7 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",
     "cameras/pixels/readout.py",
+    "lab/light_path.py",
     "optics/facets.py",
     "optics/radiometric.py",
 }

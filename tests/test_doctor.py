@@ -6,8 +6,8 @@ import re
 import pytest
 
 from evnlos import doctor
-from evnlos.cite import ENTRIES, entries_for
 from evnlos.cli import main
+from evnlos.cli.about import ENTRIES, entries_for
 from evnlos.config import save_yaml
 from evnlos.data import Simulation
 from evnlos.errors import DataError

@@ -576,7 +576,7 @@ def test_memory_that_is_not_enough_is_one_line(monkeypatch, capsys) -> None:
     def too_much(_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("evnlos.cite.entries_for", too_much)
+    monkeypatch.setattr("evnlos.cli.about.entries_for", too_much)
     fails(["cite"], capsys, "the memory that this process may use is not enough")
 
 

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from evnlos.app.serve import Server, serve
-from evnlos.cli.console import Flat
-from evnlos.cli.parsing import drawn, say
+from evnlos.cli.parsing import Flat, drawn, say
 from evnlos.data import STANDARD_MODALITIES
 from evnlos.demo import Demo, run_demo
 from evnlos.errors import ConfigError

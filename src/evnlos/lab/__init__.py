@@ -1,7 +1,6 @@
 """A second renderer, for captures that the simulator's own models of a setup do not describe."""
 
-from evnlos.lab.light_path import Optics, Rays, cast, fill_throughput, texture
-from evnlos.lab.reflection import Lobe, Reflection
+from evnlos.lab.light_path import Lobe, Optics, Rays, Reflection, cast, fill_throughput, texture
 from evnlos.lab.room import Mount, RenderedWall, Torch, brightness, covered_plane
 
 __all__ = [
