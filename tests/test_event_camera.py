@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from numba.core.dispatcher import Dispatcher
+from numba.types import unliteral
 
 from evnlos import EventCamera, EventPixel, EvnlosError, simulate_events
 from evnlos.cameras import BrownianPixel, CircuitPixel, V2ePixel
@@ -221,10 +222,14 @@ def test_bad_settings(settings: dict) -> None:
     ],
 )
 def test_no_loop_is_compiled_a_second_time_for_a_counter_that_begins_at_zero(name, pixel) -> None:
-    """Numba compiles what a loop calls twice where a literal is passed first: half of a first call's time."""
+    """Numba compiles what a loop calls twice where a literal is passed first: half of a first call's time.
+
+    What a cache on the disk holds is not compiled, so this sees least where all is there already.
+    """
     frames = np.random.default_rng(0).uniform(20, 200, (6, 5, 7)).astype(np.float32)
     simulate_events(frames, 0.01 * np.arange(6), pixel)
     module = importlib.import_module(f"evnlos.cameras.pixels.{name}")
     compiled = {key: one.signatures for key, one in vars(module).items() if isinstance(one, Dispatcher)}
     assert any(compiled.values())
-    assert [key for key, found in compiled.items() if "Literal" in str(found)] == []
+    plain = {key: [tuple(map(unliteral, types)) for types in found] for key, found in compiled.items()}
+    assert [key for key, found in plain.items() if len(set(found)) < len(found)] == []

@@ -2,14 +2,22 @@
 
 - Unpacking a stranger's zip: nothing leaves its folder, nothing is a link, and no stated size is believed.
 - A visitor's file: an event recording, or a capture folder as a zip, checked and read into one sequence.
+- The same in a process of its own, so that a bad file takes neither the page's time nor its memory.
+
+Run as a program: path, folder to unpack in, largest size in bytes, limit of memory in bytes, limit of processor
+time in seconds. Writes one line of JSON, "error" or what the sequence is, then the bytes of the arrays named
+there.
 """
 
 from __future__ import annotations
 
+import json
 import stat
+import sys
 import tempfile
 import zipfile
 import zlib
+from dataclasses import asdict
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -19,11 +27,11 @@ from numpy.typing import NDArray
 from evnlos.app.controls import POSITIONS, Recorded
 from evnlos.data import read_capture
 from evnlos.data.capture_info import inside, read_capture_info
-from evnlos.errors import DataError
+from evnlos.errors import DataError, EvnlosError
 from evnlos.events.recording import Recording
 from evnlos.scene import LineMotion, Target
 from evnlos.types import Events
-from evnlos.untrusted import Child
+from evnlos.untrusted import Child, limit_this_process
 
 MOST_FILES = 5000
 """Files and folders of a zip, at most."""
@@ -140,7 +148,6 @@ _MOST_PIXELS = 2_100_000  # of a sensor whose pixels all get maps
 _MOST_MAP_BYTES = 1 << 30  # of all maps of a sequence
 _MOST_FRAME_BYTES = 1 << 28  # of the frames of a capture
 _ZIP = b"PK\x03\x04"
-_PROGRAM = Path(__file__).with_name("_upload_child.py")
 _CHILD_BYTES = 3 << 30
 _CHILD_S = 60  # and a second more for every megabyte
 
@@ -160,7 +167,7 @@ def read_upload_apart(path: str | Path, scratch: str | Path, limit_bytes: int) -
     seconds = _CHILD_S + path.stat().st_size // 1_000_000
     with tempfile.TemporaryDirectory(prefix="unpacked-", dir=scratch) as folder:
         words = [str(path.absolute()), folder, str(limit_bytes), str(_CHILD_BYTES), str(seconds)]
-        with Child(_PROGRAM, words, seconds) as child:
+        with Child(Path(__file__), words, seconds) as child:
             return _taken(child)
 
 
@@ -293,3 +300,44 @@ def _read_capture(folder: Path) -> Recorded:
 def _own(frames: NDArray) -> NDArray:
     """Return frames that no longer lean on a file."""
     return np.array(frames)
+
+
+def _tell(path: str, folder: str, limit_bytes: int, memory_bytes: int, seconds: int) -> None:
+    """Write what is in an uploaded file to the standard output: the program of the other process."""
+    limit_this_process(memory_bytes, seconds)
+    try:
+        recorded = read_upload(path, folder, limit_bytes)
+    except (EvnlosError, OSError, MemoryError) as error:
+        said = str(error) or f"{Path(path).name} needs too much memory"
+        sys.stdout.buffer.write(json.dumps({"error": said}).encode() + b"\n")
+        return
+    arrays = _arrays(recorded)
+    motion, target = recorded.motion, recorded.target
+    about = {
+        "name": recorded.name,
+        "width": recorded.events.width,
+        "height": recorded.events.height,
+        "peak": int(recorded.peak),
+        "motion": asdict(motion) if isinstance(motion, LineMotion) else None,
+        "target": None if target is None else {"name": target.name, "size_m": target.size_m},
+        "distance_m": recorded.distance_m,
+        "notes": recorded.notes,
+        "arrays": [(name, one.dtype.str, one.shape) for name, one in arrays.items()],
+    }
+    sys.stdout.buffer.write(json.dumps(about).encode() + b"\n")
+    for one in arrays.values():
+        sys.stdout.buffer.write(one.data)
+
+
+def _arrays(recorded: Recorded) -> dict[str, NDArray]:
+    found: dict[str, NDArray] = {f"events.{name}": one for name, one in recorded.events.columns().items()}
+    found["edges_us"] = recorded.edges_us
+    if recorded.frames is not None:
+        found["frames"] = recorded.frames
+    if recorded.target is not None:
+        found["mask"] = recorded.target.mask
+    return {name: np.ascontiguousarray(one) for name, one in found.items()}
+
+
+if __name__ == "__main__":
+    _tell(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), int(sys.argv[5]))

@@ -19,7 +19,8 @@ from evnlos.calibration.pixel_fit import PixelFitSettings
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import Flat, Folders, Presets, drawn, say
+from evnlos.cli.console import Flat, Folders, Presets
+from evnlos.cli.parsing import drawn, say
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
 from evnlos.progress import ProgressBars

@@ -21,7 +21,8 @@ import tyro
 from tqdm import tqdm
 
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import Flat, Folders, Presets, result, say
+from evnlos.cli.console import Flat, Folders, Presets, result
+from evnlos.cli.parsing import say
 from evnlos.data import (
     Capture,
     Sampling,

@@ -9,6 +9,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from evnlos.app.serve import Server, serve
-from evnlos.cli.parsing import Flat, drawn, say
+from evnlos.cli.console import Flat
+from evnlos.cli.parsing import drawn, say
 from evnlos.data import STANDARD_MODALITIES
 from evnlos.demo import Demo, run_demo
 from evnlos.errors import ConfigError
@@ -252,6 +255,10 @@ class AppCommand:
     def run(self) -> None:
         """Run the page until it is interrupted."""
         serve(self.server, self.weights, lambda address: print(f"{address}  (Ctrl+C stops it)", flush=True))
+        # A visitor's picture may be in the making still, in compiled code on a thread of its own, which the
+        # interpreter would tear apart at its end; nothing of it is wanted any more.
+        sys.stdout.flush()
+        os._exit(0)
 
 
 @dataclass(frozen=True)

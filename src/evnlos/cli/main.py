@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
 from importlib.resources import files
 from types import FrameType
@@ -85,7 +85,8 @@ def main(argv: list[str] | None = None) -> None:
         with _terminable(wishes):
             if verb not in VERBS:
                 raise ConfigError(_unknown(verb))
-            command = _command(verb, rest)
+            with _ended_at_once(verb) if argv is None else nullcontext():
+                command = _command(verb, rest)
             LOG.debug("%s", command)
             with redirect_stdout(cast(TextIO, PlainOutput(sys.stdout))):
                 command.run()
@@ -119,9 +120,39 @@ def main(argv: list[str] | None = None) -> None:
 def _end(verb: str, number: int) -> NoReturn:
     """End as a signal wished, with one line and the exit code that shells give such an end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # once is enough
-    how = "terminated" if number == signal.SIGTERM else "interrupted"
-    print(f"evnlos {verb}: {how}; run the same command again to go on", file=sys.stderr)
+    print(_farewell(verb, number), file=sys.stderr)
     sys.exit(128 + number)
+
+
+def _farewell(verb: str, number: int) -> str:
+    how = "terminated" if number == signal.SIGTERM else "interrupted"
+    return f"evnlos {verb}: {how}; run the same command again to go on"
+
+
+@contextmanager
+def _ended_at_once(verb: str) -> Iterator[None]:
+    """End the process at Ctrl-C and SIGTERM without unwinding, while a command is imported and parsed.
+
+    Nothing is begun then. An exception would pass through the start of libraries in C++, some of which end the
+    process with a core dump where Python code that they call raises.
+    """
+
+    def end(number: int, _: FrameType | None) -> None:
+        os.write(2, f"{_farewell(verb, number)}\n".encode())
+        os._exit(128 + number)
+
+    before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    if threading.current_thread() is not threading.main_thread() or None in before.values():
+        yield
+        return
+    handlers = {one: how for one, how in before.items() if how is not signal.SIG_IGN}
+    for one in handlers:
+        signal.signal(one, end)
+    try:
+        yield
+    finally:
+        for one, how in handlers.items():
+            signal.signal(one, how)
 
 
 class _Terminated(KeyboardInterrupt):

@@ -1,7 +1,6 @@
 """From the words of a command line to its command, and notes on stderr.
 
 - Notes on stderr: how much a command says beside its result (`--log-level`, EVNLOS_LOG).
-- What the commands share: flat settings, folders, results as JSON.
 - From the words after a verb to its command; what does not fit is one line, not the parser's box.
 """
 
@@ -9,16 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, TextIO, TypeVar
-
-import tyro
+from typing import Any, TextIO
 
 from evnlos.errors import ConfigError, MissingDependencyError, printable
 
@@ -27,20 +23,6 @@ LEVELS = ("debug", "info", "warning", "error")
 FLAG, VARIABLE = "--log-level", "EVNLOS_LOG"
 LOG = logging.getLogger("evnlos")
 """The logger of the package; its modules log to it and its children."""
-
-
-T = TypeVar("T")
-Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
-"""One or more folders, given without a flag."""
-Flat = Annotated[T, tyro.conf.arg(name="")]
-"""Settings whose flags carry no prefix."""
-Presets = Mapping[str, Callable[[], T]]
-"""Settings by the name that `--preset` gives."""
-
-
-def result(as_json: bool, values: Mapping[str, Any], text: str) -> None:
-    """Print a command's result on stdout: its values as one JSON object, or a line for people."""
-    print(json.dumps(values, default=str) if as_json else text)
 
 
 class _Stderr(logging.Handler):

@@ -17,7 +17,8 @@ from typing import Annotated, Any
 import tyro
 from tqdm import tqdm
 
-from evnlos.cli.parsing import Flat, result, say
+from evnlos.cli.console import Flat, result
+from evnlos.cli.parsing import say
 from evnlos.errors import ConfigError, DataError, printable
 from evnlos.events import CelexOptions, EventWriter, ReadReport
 from evnlos.events.files.columns import OnError
