@@ -148,6 +148,7 @@ _MOST_PIXELS = 2_100_000  # of a sensor whose pixels all get maps
 _MOST_MAP_BYTES = 1 << 30  # of all maps of a sequence
 _MOST_FRAME_BYTES = 1 << 28  # of the frames of a capture
 _ZIP = b"PK\x03\x04"
+_PROGRAM = Path(__file__)
 _CHILD_BYTES = 3 << 30
 _CHILD_S = 60  # and a second more for every megabyte
 
@@ -167,7 +168,7 @@ def read_upload_apart(path: str | Path, scratch: str | Path, limit_bytes: int) -
     seconds = _CHILD_S + path.stat().st_size // 1_000_000
     with tempfile.TemporaryDirectory(prefix="unpacked-", dir=scratch) as folder:
         words = [str(path.absolute()), folder, str(limit_bytes), str(_CHILD_BYTES), str(seconds)]
-        with Child(Path(__file__), words, seconds) as child:
+        with Child(_PROGRAM, words, seconds) as child:
             return _taken(child)
 
 
