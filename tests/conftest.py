@@ -9,6 +9,7 @@ from pathlib import Path
 # before the first import of torch and numba.
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import hypothesis
 import pytest
 import tyro  # noqa: F401  Its import reads all builtins, and stumbles over what a doctest leaves as `_`.
 
@@ -53,6 +54,13 @@ THOROUGH = (
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Take `--thorough`."""
     parser.addoption("--thorough", action="store_true", help="run also what takes long and seldom breaks")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Draw the same examples in each run of the tests, and others in each thorough one."""
+    hypothesis.settings.register_profile("the same", derandomize=True)
+    if not config.getoption("--thorough"):
+        hypothesis.settings.load_profile("the same")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

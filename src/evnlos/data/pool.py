@@ -18,6 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -114,17 +115,27 @@ def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], work
             ) from None
 
 
+class _Worker(SpawnProcess):
+    """A process that does not hear Ctrl-C, from its first instant on."""
+
+    def start(self) -> None:
+        resource_tracker.ensure_running()  # it unblocks the signal when it starts
+        with children_undisturbed():
+            super().start()
+
+
+class _Workers(SpawnContext):
+    Process = _Worker
+
+
 @contextmanager
 def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
     """Give a pool whose processes end with the block, at once where it is left early, and with this process.
 
     They don't hear Ctrl-C, which a terminal sends to all: this process ends them, also those that still start.
     """
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin)
+    pool = ProcessPoolExecutor(count, _Workers(), _begin)
     try:
-        resource_tracker.ensure_running()  # it unblocks the signal when it starts
-        with children_undisturbed():
-            pool.submit(int)  # the first task starts all processes, and inherit what is blocked
         yield pool
         pool.shutdown()
     except BaseException:
