@@ -41,7 +41,6 @@ LEAVES = {
     "config",
     "files",
     "metrics",
-    "progress",
     "tensor_file",
     "untrusted",
 }

@@ -12,7 +12,7 @@ from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.data import simulate
 from evnlos.data.pool import run_on_dask
-from evnlos.progress import Step
+from evnlos.machine import Step
 
 distributed = pytest.importorskip("distributed", reason='needs the extra "cluster"')
 pytestmark = pytest.mark.filterwarnings("ignore")

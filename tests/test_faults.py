@@ -23,7 +23,7 @@ from evnlos.data import SensorSize, Simulation, simulate, simulate_object
 from evnlos.data.simulate import drawn_for
 from evnlos.data.simulations import estimate, find_faults
 from evnlos.files import directory_lock, is_empty
-from evnlos.progress import Step
+from evnlos.machine import Step
 from evnlos.setups import RadiometricSetup
 from watching import Watch, alive, stopped
 

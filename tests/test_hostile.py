@@ -32,8 +32,8 @@ from evnlos.data.simulations import find_faults
 from evnlos.errors import ConfigError, printable
 from evnlos.events.recording import Recording, _Counts
 from evnlos.inverse.inversion import read_photograph
+from evnlos.machine import ProgressBars, Step
 from evnlos.models import UNetConfig
-from evnlos.progress import ProgressBars, Step
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 

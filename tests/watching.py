@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from evnlos.progress import Step
+from evnlos.machine import Step
 
 
 class StoppedError(Exception):

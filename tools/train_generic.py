@@ -19,8 +19,8 @@ import numpy as np
 from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation, simulate
 from evnlos.demo import SEQUENCE_NETWORK
+from evnlos.machine import ProgressBars
 from evnlos.models import layers_of, load_weights, save_weights, with_rank
-from evnlos.progress import ProgressBars
 from evnlos.scene import DIGITS, UPPER_CASE, HandwritingGlyphs, LineMotion, Strokes
 from evnlos.setups import RadiometricSetup
 from evnlos.training import Training, train

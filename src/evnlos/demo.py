@@ -21,8 +21,8 @@ from evnlos.data.sampling import Sampling
 from evnlos.data.simulations import default
 from evnlos.errors import CalibrationError, ConfigError
 from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
+from evnlos.machine import Progress, ProgressBars, silent
 from evnlos.models import GENERIC, SequenceConfig, UNetConfig, layers_of, published
-from evnlos.progress import Progress, ProgressBars, silent
 from evnlos.report import collect_results, to_text, write_report
 from evnlos.scene import FontGlyphs
 from evnlos.setups import ROOMS, named_setup

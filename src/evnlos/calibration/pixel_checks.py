@@ -19,7 +19,7 @@ from evnlos.calibration.event_statistics import by_pixel, count_map, intervals
 from evnlos.calibration.pixel_fit import CandidateFit, Estimate, Panels, PixelFitSettings
 from evnlos.calibration.pixel_light import KnownLight, LitRecording, waveform
 from evnlos.calibration.pixel_statistics import Array, simulated_events
-from evnlos.progress import Progress, Step, silent
+from evnlos.machine import Progress, Step, silent
 from evnlos.types import Events, derive_seed
 
 _DRAWS = 12  # posterior draws whose simulations stand for a model

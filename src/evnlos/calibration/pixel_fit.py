@@ -42,7 +42,7 @@ from evnlos.calibration.pixel_statistics import (
 )
 from evnlos.cameras import BrownianPixel, CircuitPixel, EventPixel, PixelSettings
 from evnlos.errors import ConfigError, DataError
-from evnlos.progress import Progress, Step, silent
+from evnlos.machine import Progress, Step, silent
 from evnlos.types import derive_seed
 
 MISMATCH = "mismatch"

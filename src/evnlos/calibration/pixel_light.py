@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from evnlos.calibration.event_statistics import Recording
 from evnlos.cameras.event_model import require
-from evnlos.data.cleaning import find_hot_pixels
 from evnlos.errors import ConfigError, DataError
+from evnlos.events import find_hot_pixels
 from evnlos.types import Events
 
 LightKind = Literal["unknown", "static", "sine", "square", "edge", "frames"]

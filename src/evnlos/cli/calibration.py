@@ -23,7 +23,7 @@ from evnlos.cli.console import Flat, Folders, Presets
 from evnlos.cli.parsing import drawn, say
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
-from evnlos.progress import ProgressBars
+from evnlos.machine import ProgressBars
 from evnlos.setups import load_setup
 
 if TYPE_CHECKING:

@@ -39,7 +39,7 @@ from evnlos.data.simulations import PRESETS, estimate, find_faults, repair
 from evnlos.data.store import PAGE
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
-from evnlos.progress import ProgressBars
+from evnlos.machine import ProgressBars
 from evnlos.setups import load_setup
 from evnlos.setups.base import is_camera
 from evnlos.setups.load import is_name

@@ -1,4 +1,8 @@
-"""`evnlos events`: a video in, the events of an event camera that watches it out."""
+"""Commands that make events: `events` from a video, `clean` from a recording.
+
+- `evnlos events`: a video in, the events of an event camera that watches it out.
+- `evnlos clean`: a recording in, the same without what the scene did not cause out.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from numpy.typing import NDArray
@@ -16,11 +20,22 @@ from evnlos.cameras.event_model import Phase, PixelSettings
 from evnlos.cameras.pixel import EventPixel, Logarithm, Mode
 from evnlos.cameras.sensors import load_pixel
 from evnlos.cameras.video import Tone, Video, check_video, open_video, video_events
+from evnlos.cli.console import Flat, result
 from evnlos.cli.parsing import say
-from evnlos.cli.recordings import amount, look_of, refuse_existing, write_preview
+from evnlos.cli.recordings import (
+    EventFile,
+    ReadOptions,
+    SelectionOptions,
+    amount,
+    counted,
+    look_of,
+    refuse_existing,
+    write_preview,
+)
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
-from evnlos.events import EventWriter
+from evnlos.events import Cleaner, CleanOptions, EventWriter
+from evnlos.events.files.columns import OnError
 from evnlos.events.recording import CropOptions, Recording
 from evnlos.types import Events
 
@@ -197,3 +212,69 @@ def _text(found: dict[str, Any]) -> str:
         f"  pixel {found['pixel_name']}, mode {found['mode']}, seed {found['seed']}; "
         f"to look at it: evnlos preview {found['out']}"
     )
+
+
+@dataclass(frozen=True)
+class CleanCommand:
+    """Leave out of a recording what the scene did not cause: hot pixels, lamp flicker, background activity.
+
+    The file is read twice, block by block: to find what is wrong with it, and to write the events that stay.
+    """
+
+    file: EventFile
+    """Event file of any format that is read; it may be larger than memory."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """The file to write; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv."""
+    hot_factor: float | Literal["none"] = 10.0
+    """Pixels with more than that many times the events of the median pixel around them go; none keeps all."""
+    flicker: float | Literal["auto", "none"] = "auto"
+    """Frequency of flickering light, hertz, whose events go: twice that of the mains; auto finds it between 90
+    and 132 Hz and takes nothing away where there is none."""
+    background_ms: float | Literal["auto", "none"] = "none"
+    """Events to which none of the 8 pixels around sent one that near in time go, milliseconds; auto: so near that
+    noise as dense as the median pixel's events stays by chance in 1 of 10."""
+    format: str | None = None
+    """Format to write where the ending does not say, e.g. EVT2 for .raw."""
+    on_error: OnError = "strict"
+    """strict: damage ends it, and nothing is written; salvage: damage is left out and told."""
+    reading: Flat[ReadOptions] = field(default_factory=ReadOptions)
+    taking: Flat[SelectionOptions] = field(default_factory=SelectionOptions)
+    force: bool = False
+    """Replace the file where it exists."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Look and clean, with a progress bar over the events of each."""
+        refuse_existing(self.out, self.force)
+        if self.out.exists() and self.file.exists() and self.out.samefile(self.file):
+            raise ConfigError(f"{self.out} is the file that is read; give another name")
+        cleaner = Cleaner(
+            CleanOptions(
+                None if self.hot_factor == "none" else self.hot_factor,
+                None if self.flicker == "none" else self.flicker,
+                _microseconds(self.background_ms),
+            )
+        )
+        recording, cut = self.reading.open(self.file, self.on_error), self.taking.cut()
+        with EventWriter(self.out, format=self.format) as writer:
+            cleaner.look(counted(recording.pieces(cut), f"look at {self.file.name}"))
+            total = recording.report.events
+            for piece in cleaner.clean(counted(recording.pieces(cut), self.out.name, total)):
+                writer.write(piece)
+            if not writer.events:
+                writer.write(recording.blank(cut))
+        if not recording.report.clean:
+            say(f"note: {recording.report}")
+        found, size = cleaner.report, self.out.stat().st_size
+        about = {"out": str(self.out), "bytes": size, **asdict(found)}
+        text = f"{self.out}: {found.kept:,} of {found.events:,} events, {amount(size, 'B')}; left out: {found}"
+        result(self.json, about, text)
+
+
+def _microseconds(window_ms: float | Literal["auto", "none"]) -> int | Literal["auto"] | None:
+    if isinstance(window_ms, str):
+        return "auto" if window_ms == "auto" else None
+    if not 1e-3 <= window_ms <= 1e6:
+        raise ConfigError(f"--background-ms is {window_ms:g}; give 0.001 ms to 1000 s")
+    return round(1e3 * window_ms)

@@ -27,7 +27,7 @@ from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import SourceOptions, open_live
-from evnlos.progress import ProgressBars
+from evnlos.machine import ProgressBars
 
 if TYPE_CHECKING:
     from evnlos.experiment import Arm, Study

@@ -24,9 +24,9 @@ from evnlos.config import load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
 from evnlos.data.live import Place
 from evnlos.errors import ConfigError, DataError, printable
+from evnlos.machine import ProgressBars
 from evnlos.models import GENERIC, Weights, describe_network, load_weights, published, save_weights, with_rank
 from evnlos.models.confidence import COVERAGE
-from evnlos.progress import ProgressBars
 from evnlos.training import (
     Training,
     alternatives,

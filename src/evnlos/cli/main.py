@@ -54,6 +54,7 @@ VERBS: dict[str, str] = {
     "events": "events.EventsCommand",
     "info": "recordings.InfoCommand",
     "convert": "recordings.ConvertCommand",
+    "clean": "events.CleanCommand",
     "preview": "recordings.PreviewCommand",
     "app": "experiment.AppCommand",
     "cite": "about.CiteCommand",

@@ -16,29 +16,29 @@ from numpy.typing import NDArray
 from evnlos.config import config_hash, to_dict
 from evnlos.data.capture_info import (
     CaptureInfo,
+    FilterInfo,
     TargetInfo,
     character_of,
     digest_of,
     inside,
     read_capture_info,
 )
-from evnlos.data.cleaning import (
-    FixedPattern,
-    check_rectangle,
-    correct_frames,
-    crop_events,
-    find_hot_pixels,
-    frame_homography,
-    keep_supported,
-    without_pixels,
-)
+from evnlos.data.cleaning import FixedPattern, correct_frames, frame_homography
 from evnlos.data.clocks import find_offset
 from evnlos.data.frames import FrameSeries, read_frame_series, read_image, warp_frames
 from evnlos.data.sampling import Samples, Sampling, make_samples, time_steps
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, printable
-from evnlos.events import CelexOptions, keep_known_polarity, read_events, read_triggers
-from evnlos.progress import Progress, Step, silent
+from evnlos.events import (
+    CelexOptions,
+    CleanOptions,
+    clean_events,
+    crop_events,
+    keep_known_polarity,
+    read_events,
+    read_triggers,
+)
+from evnlos.machine import Progress, Step, silent
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.types import Events
 from evnlos.untrusted import check_memory
@@ -152,7 +152,6 @@ def read_capture(
         notes += told + in_time
     roi = info.roi
     if roi is not None:
-        check_rectangle(events.shape, roi.x, roi.y, roi.width, roi.height)
         events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
         frames = frames[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width]
         notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
@@ -190,16 +189,11 @@ def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
         events = keep_known_polarity(events)
         notes.append(f"{count - len(events):,} events without polarity left out")
     filters = info.filters
-    if filters.hot_pixel_factor is not None:
-        hot, count = find_hot_pixels(events, filters.hot_pixel_factor), len(events)
-        events = without_pixels(events, hot)
-        notes.append(f"{int(hot.sum())} hot pixels with {count - len(events):,} events left out")
-    if filters.background_us is not None:
-        count = len(events)
-        events = keep_supported(events, filters.background_us)
-        notes.append(
-            f"{count - len(events):,} events without a neighbour in {filters.background_us} us left out"
+    if filters != FilterInfo():
+        events, found = clean_events(
+            events, CleanOptions(filters.hot_pixel_factor, filters.flicker_hz, filters.background_us)
         )
+        notes.append(f"left out: {found}")
     if not len(events):
         raise DataError(f"{path}: no event is left; check the filters in capture.yaml")
     return events, notes

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.data.capture import Capture
-from evnlos.data.cleaning import find_hot_pixels
 from evnlos.data.clocks import LEAST_AGREEMENT, find_lag
 from evnlos.data.sampling import reduce_by_area
-from evnlos.events import event_histogram
+from evnlos.events import event_histogram, find_hot_pixels
+from evnlos.events.cleaning import find_flicker
 from evnlos.events.grids import OFF_RGB, ON_RGB
 from evnlos.types import Events
 
@@ -25,10 +25,7 @@ Level = Literal["good", "doubtful", "bad"]
 
 _DARK_DN, _BORDER = 3, 0.08
 _BLOCK = 6  # pixels: single ones tell nothing of the light
-_FLICKER_HZ = ((99.0, 101.0), (119.0, 121.0))  # twice the mains' frequency
-_FLICKER_BIN_S = 0.001
 _FEWEST_EVENTS = 2_000
-_FEWEST_S = 0.5  # a shorter recording tells no line in its spectrum
 
 
 @dataclass(frozen=True)
@@ -186,39 +183,21 @@ def _events(capture: Capture) -> Iterator[Finding]:
 
 
 def _flicker(capture: Capture) -> Iterator[Finding]:
-    """Look for a line at twice the mains' frequency in the rate of events."""
-    t_s = (capture.events.t_us - capture.events.t_us[0]) * 1e-6
-    bins = int(t_s[-1] / _FLICKER_BIN_S)
-    if len(t_s) < _FEWEST_EVENTS or bins * _FLICKER_BIN_S < _FEWEST_S:
-        yield Finding("flicker", "doubtful", f"{len(t_s)} events are too few to tell", "record longer")
+    """Look for a line near twice the mains' frequency in the rate of events."""
+    line = find_flicker(capture.events) if len(capture.events) >= _FEWEST_EVENTS else None
+    if line is None:
+        text = f"{len(capture.events)} events are too few or too short to tell"
+        yield Finding("flicker", "doubtful", text, "record longer")
         return
-    counts, _ = np.histogram(t_s, bins, (0.0, bins * _FLICKER_BIN_S))
-    found = flicker_lines(counts)
-    worst = max(found, key=lambda hertz: found[hertz])
-    # The power of noise is exponential: a line 30 times its median has a chance of 1e-9 a bin.
     yield _finding(
         "flicker",
-        found[worst] < 30,
-        found[worst] < 300,
-        f"the rate's line at {worst} Hz is {found[worst]:.0f} times its surroundings (30 is safe)",
-        "light with direct current, or with daylight; mains lamps flicker",
+        not line.is_there,
+        line.strength < 300,
+        f"the rate's line at {line.frequency_hz:.1f} Hz is {line.strength:.0f} times its surroundings "
+        "(30 is safe)",
+        "light with direct current or daylight: mains lamps flicker; filters: {flicker_hz: "
+        f"{line.frequency_hz:.2f}}} in capture.yaml takes their events away",
     )
-
-
-def flicker_lines(counts: NDArray) -> dict[int, float]:
-    """Return how strong the lines at 100 and 120 Hz are, times their surroundings; 30 is no noise.
-
-    Args:
-        counts: Events in each millisecond, at least 500.
-    """
-    power = np.abs(np.fft.rfft(counts - counts.mean())) ** 2
-    frequency = np.fft.rfftfreq(len(counts), _FLICKER_BIN_S)
-    around = np.median(power[(frequency > 80) & (frequency < 140)])
-    found = {}
-    for low, high in _FLICKER_HZ:
-        line = power[(frequency >= low) & (frequency <= high)].max(initial=0.0)
-        found[round((low + high) / 2)] = float(line / max(around, 1e-12))
-    return found
 
 
 def _clock(capture: Capture) -> Iterator[Finding]:

@@ -142,8 +142,10 @@ class FilterInfo:
 
     hot_pixel_factor: float | None = None
     """A pixel with that many times the median of its surroundings is hot, e.g. 10; none = keep all."""
+    flicker_hz: float | None = None
+    """Frequency of flickering light, hertz: twice that of the mains; none = keep its events."""
     background_us: int | None = None
-    """Events without one of their 8 neighbours in that time before are noise, microseconds; none = keep all."""
+    """Events that none of their 8 neighbours is so near in time are noise, microseconds; none = keep all."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a camera adds to what it saw, taken away: dark signal and uneven response, hot pixels, lonely events.
+"""What a frame camera adds to what it saw, taken away: dark signal and uneven response.
 
 - A camera's fixed pattern, known pixel by pixel: what it does to every frame can be taken away.
 - Where the pixels of the frame camera lie on those of the event camera.
@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.data.capture_info import CaptureInfo, RegistrationInfo, inside
@@ -21,7 +20,6 @@ from evnlos.errors import DataError
 from evnlos.events import event_histogram, read_events
 from evnlos.files import write_atomically
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
-from evnlos.types import Events
 
 
 def correct_frames(
@@ -56,133 +54,6 @@ def correct_frames(
         # A dead pixel would become infinite; below a tenth of the mean response nothing can be said.
         out *= np.where(response > 0.1 * mean, mean / np.maximum(response, 0.1 * mean), 0.0)
     return np.clip(out / max(peak - float(ground.mean()), 1.0), 0.0, 1.0)
-
-
-@njit(cache=True)
-def _hot(counts, factor, floor):
-    height, width = counts.shape
-    hot = np.zeros((height, width), np.bool_)
-    around = np.empty(24, np.int64)
-    for row in range(height):
-        for column in range(width):
-            if counts[row, column] <= floor:
-                continue
-            size = 0
-            for v in range(max(0, row - 2), min(height, row + 3)):
-                for u in range(max(0, column - 2), min(width, column + 3)):
-                    if v != row or u != column:
-                        place = size  # sorted as they come
-                        while place > 0 and around[place - 1] > counts[v, u]:
-                            around[place] = around[place - 1]
-                            place -= 1
-                        around[place] = counts[v, u]
-                        size += 1
-            middle = (around[(size - 1) // 2] + around[size // 2]) / 2 if size else 0.0
-            hot[row, column] = counts[row, column] > factor * max(middle, 1.0)
-    return hot
-
-
-def find_hot_pixels(events: Events, factor: float = 10.0, floor: int = 20) -> NDArray[np.bool_]:
-    """Return which pixels send far more events than those around them.
-
-    Args:
-        events: The stream.
-        factor: Times the median of the 24 pixels around (at least 1 event) above which a pixel is hot; above 1.
-        floor: Events up to which a pixel is never hot.
-
-    Returns:
-        bool [H, W].
-
-    Raises:
-        DataError: A factor of 1 or less, or a negative floor.
-    """
-    if not factor > 1 or floor < 0:
-        raise DataError(f"factor {factor} and floor {floor}; give a factor above 1 and a floor of 0 or more")
-    counts = np.bincount(
-        events.y.astype(np.int64) * events.width + events.x, minlength=events.width * events.height
-    )
-    return hot_by_counts(counts.reshape(events.shape), factor, floor)
-
-
-def hot_by_counts(counts: NDArray[np.int64], factor: float = 10.0, floor: int = 20) -> NDArray[np.bool_]:
-    """Return which pixels sent far more events than those around them, of their counts [H, W]."""
-    return _hot(counts, float(factor), floor)
-
-
-def without_pixels(events: Events, pixels: NDArray[np.bool_]) -> Events:
-    """Return the events of the pixels that are not marked; `pixels` is bool [H, W]."""
-    return events[~pixels[events.y, events.x]]
-
-
-@njit(cache=True)
-def _supported(t_us, x, y, height, width, window, never):
-    latest = np.full((height + 2, width + 2), never, np.int64)  # a margin in place of a look at the border
-    kept = np.zeros(len(t_us), np.bool_)
-    for index in range(len(t_us)):
-        row, column, time = np.int64(y[index]) + 1, np.int64(x[index]) + 1, t_us[index]
-        newest = never
-        for v in range(row - 1, row + 2):
-            for u in range(column - 1, column + 2):
-                if v != row or u != column:
-                    newest = max(newest, latest[v, u])
-        kept[index] = newest != never and time - newest <= window
-        latest[row, column] = time
-    return kept
-
-
-def keep_supported(events: Events, window_us: int) -> Events:
-    """Return the events that one of the eight pixels around supports: it had an event at most `window_us`
-    earlier.
-
-    Noise comes alone, edges do not (Delbruck, "Frame-free dynamic digital vision", 2008). The first event of
-    every edge goes too.
-
-    Args:
-        events: The stream; it is not changed.
-        window_us: Longest time to the supporting event, microseconds, at least 1.
-
-    Raises:
-        DataError: A window below 1.
-
-    Example:
-        >>> events = Events([1, 5, 6], [0, 1, 9], [0, 0, 0], [1, 1, 1], width=10, height=1)
-        >>> keep_supported(events, 4).x.tolist()
-        [1]
-    """
-    if window_us < 1:
-        raise DataError(f"window_us is {window_us}; give at least 1 us")
-    never = np.iinfo(np.int64).min
-    kept = _supported(events.t_us, events.x, events.y, events.height, events.width, int(window_us), never)
-    return events[kept]
-
-
-def crop_events(events: Events, left: int, top: int, width: int, height: int) -> Events:
-    """Return the events inside a rectangle, with coordinates from its corner.
-
-    Args:
-        events: The stream; it is not changed.
-        left: First column, pixels.
-        top: First row, pixels.
-        width: Columns, pixels.
-        height: Rows, pixels.
-
-    Raises:
-        DataError: The rectangle leaves the sensor.
-    """
-    check_rectangle(events.shape, left, top, width, height)
-    column, row = events.x.astype(np.int64) - left, events.y.astype(np.int64) - top
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    kept = events[inside]
-    columns: dict[str, NDArray] = kept.columns() | {"x": column[inside], "y": row[inside]}
-    return Events(width=width, height=height, **columns)
-
-
-def check_rectangle(shape: tuple[int, int], left: int, top: int, width: int, height: int) -> None:
-    """Raise `DataError` unless the rectangle lies on a sensor of `shape` (rows, columns)."""
-    if left < 0 or top < 0 or width < 1 or height < 1 or left + width > shape[1] or top + height > shape[0]:
-        raise DataError(
-            f"the region {width} x {height} at ({left}, {top}) leaves the sensor of {shape[1]} x {shape[0]}"
-        )
 
 
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less

@@ -21,7 +21,7 @@ from evnlos.data.pool import Engine, processes, run_tasks
 from evnlos.data.sampling import Samples, Sampling, edges_from, make_samples
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import ConfigError
-from evnlos.progress import Progress, Step, silent
+from evnlos.machine import Progress, Step, silent
 from evnlos.scene import Glyphs, HandwritingGlyphs, LineMotion, Scene, character_name
 from evnlos.setups import PaperSetup, SensorSize, Setup
 from evnlos.setups.base import CAMERA_FIELDS, LIGHT_FIELDS, is_camera

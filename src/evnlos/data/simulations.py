@@ -21,7 +21,7 @@ from evnlos.data.sampling import Sampling
 from evnlos.data.simulate import Simulation, needs_a_matrix, simulate, simulate_object
 from evnlos.data.store import PAGE, Dataset, claim_dataset, is_page_changed, read_shard, write_shard
 from evnlos.errors import ConfigError, DataError
-from evnlos.progress import Progress, Step, silent
+from evnlos.machine import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs, LineMotion
 from evnlos.setups.load import as_in_the_paper, page_setup, rough_paper
 

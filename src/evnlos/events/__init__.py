@@ -1,6 +1,17 @@
 """Event streams: files and representations."""
 
 from evnlos.events.batch import event_batch, events_from_tensors, events_to_tensors
+from evnlos.events.cleaning import (
+    Cleaner,
+    CleanOptions,
+    CleanReport,
+    clean_events,
+    crop_events,
+    find_hot_pixels,
+    keep_known_polarity,
+    keep_supported,
+    remove_flicker,
+)
 from evnlos.events.files import (
     CelexOptions,
     EventWriter,
@@ -18,7 +29,7 @@ from evnlos.events.files import (
     write_celex_frames,
     write_events,
 )
-from evnlos.events.grids import edges_from_count, edges_from_rate, keep_known_polarity, suggest_tau_us
+from evnlos.events.grids import edges_from_count, edges_from_rate, suggest_tau_us
 from evnlos.events.surface import normalise_surface, time_surface
 from evnlos.events.volume import (
     event_frame,
@@ -30,11 +41,16 @@ from evnlos.events.volume import (
 
 __all__ = [
     "CelexOptions",
+    "CleanOptions",
+    "CleanReport",
+    "Cleaner",
     "EventWriter",
     "Frames",
     "ReadReport",
     "Stream",
     "Triggers",
+    "clean_events",
+    "crop_events",
     "edges_from_count",
     "edges_from_rate",
     "event_batch",
@@ -42,15 +58,18 @@ __all__ = [
     "event_histogram",
     "events_from_tensors",
     "events_to_tensors",
+    "find_hot_pixels",
     "intensity_map",
     "iter_events",
     "keep_known_polarity",
+    "keep_supported",
     "normalise_surface",
     "read_events",
     "read_events_report",
     "read_frames",
     "read_timed_frames",
     "read_triggers",
+    "remove_flicker",
     "suggest_tau_us",
     "threshold_ordinal_surface",
     "time_surface",

@@ -1,7 +1,6 @@
-"""Time grids, polarity and colours: what every representation of events is made on.
+"""Time grids and colours: what every representation of events is made on.
 
 - Edges of the time grids that a representation is made on: grid g holds edges[g] < t_us <= edges[g + 1].
-- Events whose camera gave no polarity.
 
 The two colours of events, for every picture and page of the project.
 
@@ -101,29 +100,6 @@ def suggest_tau_us(stroke_width_m: float, speed_m_s: float) -> float:
     if not (stroke_width_m > 0 and speed_m_s > 0):
         raise DataError(f"stroke {stroke_width_m} m at {speed_m_s} m/s; both must be positive")
     return stroke_width_m / speed_m_s * 1e6
-
-
-def keep_known_polarity(events: Events) -> Events:
-    """Return the events whose polarity is known.
-
-    A CeleX-V sends intensities: a pixel's polarity is the sign of the change since its last event, so it is
-    unknown for a pixel's first event and where nothing changed. Off-pixel recordings have no polarity at all.
-
-    Args:
-        events: The stream; it is not changed, and returned as it is without the column `polarity_known`.
-
-    Returns:
-        The events with a polarity, without the column `polarity_known`; `adc` stays.
-
-    Example:
-        >>> events = Events([1, 2], [0, 0], [0, 0], [False, True], 1, 1, polarity_known=[False, True])
-        >>> keep_known_polarity(events)
-        Events(1 events, 1 x 1, 2..2 us, 100 % ON)
-    """
-    if events.polarity_known is None:
-        return events
-    known = events[events.polarity_known]
-    return Events(known.t_us, known.x, known.y, known.p, known.width, known.height, adc=known.adc)
 
 
 ON_RGB = (226, 120, 0)

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from os import PathLike
 from pathlib import Path
 
@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
+from evnlos.events.cleaning import check_box, crop_events, keep_known_polarity
 from evnlos.events.files.celex import CelexOptions
 from evnlos.events.files.columns import OnError, ReadReport, trusted_events
 from evnlos.events.files.read import in_order, open_source
-from evnlos.events.grids import keep_known_polarity
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
@@ -136,13 +136,14 @@ class Recording:
             self.report.events += len(events)
             if first is None:
                 first = int(events.t_us[0])
-                _check_box(cut.box, events.shape)  # some formats state the sensor size with their first events
+                if cut.box is not None:  # some formats state the sensor size with their first events
+                    check_box(events.shape, *astuple(cut.box))
             over = cut.stop_s is not None and int(events.t_us[-1]) >= first + cut.stop_s * 1e6
             events = _stretch(events, first, cut)
             if cut.known_polarity:
                 events = keep_known_polarity(events)
             if cut.box is not None:
-                events = _crop(events, cut.box)
+                events = crop_events(events, *astuple(cut.box))
             if len(events):
                 yield events
             if over:
@@ -164,24 +165,6 @@ def _stretch(events: Events, first_us: int, cut: CropOptions) -> Events:
     if cut.stop_s is not None and np.isfinite(cut.stop_s):
         stop = int(np.searchsorted(events.t_us, first_us + int(np.ceil(cut.stop_s * 1e6))))
     return events[start:stop]
-
-
-def _crop(events: Events, box: Box) -> Events:
-    # Coordinates are unsigned: left of the corner they wrap around to more than the box is wide.
-    x, y = events.x - np.uint16(box.x), events.y - np.uint16(box.y)
-    inside = (x < box.width) & (y < box.height)
-    columns = {**events.columns(), "x": x, "y": y}
-    return trusted_events({name: column[inside] for name, column in columns.items()}, box.width, box.height)
-
-
-def _check_box(box: Box | None, shape: tuple[int, int]) -> None:
-    if box is None:
-        return
-    if box.x + box.width > shape[1] or box.y + box.height > shape[0]:
-        given = f"{box.x} {box.y} {box.width} {box.height}"
-        raise ConfigError(
-            f"the box {given} (X Y WIDTH HEIGHT) leaves the sensor of {shape[1]} x {shape[0]} pixels"
-        )
 
 
 WINDOW_US = 10_000

@@ -16,9 +16,9 @@ from evnlos.data import STANDARD_MODALITIES, Simulation, as_modality, simulate_o
 from evnlos.data.pool import processes, run_in_order
 from evnlos.data.simulate import check_sequences, object_bytes
 from evnlos.files import write_atomically
+from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
 from evnlos.models import fit_linear
-from evnlos.progress import Progress, Step, silent
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
 from evnlos.setups.load import FAR_M

@@ -27,10 +27,10 @@ from evnlos.data.pool import processes
 from evnlos.errors import ConfigError, DataError
 from evnlos.experiment.study import Arm, Study
 from evnlos.experiment.table import TRUST
+from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
 from evnlos.models import SequenceConfig, UNetConfig, Weights, load_weights
 from evnlos.models.confidence import on_canvas
-from evnlos.progress import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, DrawingGlyphs, HandwritingGlyphs
 from evnlos.scene.drawings import KINDS
 from evnlos.setups import calibrated_file

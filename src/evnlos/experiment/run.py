@@ -25,8 +25,8 @@ from evnlos.data.simulations import default, paper
 from evnlos.errors import CalibrationError, DataError, MissingDependencyError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there, slug
 from evnlos.experiment.table import score_arm
+from evnlos.machine import Progress, Step, silent
 from evnlos.models import layers_of, load_weights
-from evnlos.progress import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
 from evnlos.setups import SensorSize, calibrated_file
 from evnlos.training import Training, choose_and_finetune, train

@@ -18,8 +18,8 @@ from evnlos.config import to_dict
 from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
+from evnlos.machine import Progress, Step
 from evnlos.migrate import migrate
-from evnlos.progress import Progress, Step
 from evnlos.training import Training
 
 Source = Literal["calibrated", "uncalibrated", "none"]

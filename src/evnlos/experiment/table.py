@@ -25,8 +25,8 @@ from evnlos.data import Dataset, NlosDataset, Sampling, as_modality, character_o
 from evnlos.errors import DataError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there
 from evnlos.files import write_atomically
+from evnlos.machine import Progress
 from evnlos.models import fit_linear, load_weights
-from evnlos.progress import Progress
 from evnlos.setups import load_setup
 
 if TYPE_CHECKING:

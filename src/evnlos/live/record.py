@@ -19,18 +19,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from evnlos.config import save_yaml, to_dict
-from evnlos.data.capture_check import flicker_lines
 from evnlos.data.capture_info import RecordingInfo
-from evnlos.data.cleaning import hot_by_counts
 from evnlos.errors import ConfigError, DataError, EvnlosError
 from evnlos.events import EventWriter
+from evnlos.events.cleaning import flicker_line, hot_by_counts
 from evnlos.files import new_folder
 from evnlos.live.device import DeviceSource
 from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
 from evnlos.types import Events
 
 _KEPT_MS = 4096  # of the rate: enough for a line at 100 Hz
-_FLICKER = 30.0  # times its surroundings: no noise
 _FEWEST_EVENTS = 2000  # in _KEPT_MS, to tell of flicker
 _HOT_S = 5.0  # between two looks at the pixels
 _NAP_S = 0.1
@@ -47,7 +45,7 @@ class RecordingCheck:
 
     def __init__(self, most_rate_hz: float | None = None) -> None:
         self._most_rate_hz, self._lock = most_rate_hz, threading.Lock()
-        self._per_ms = np.zeros(_KEPT_MS, np.int64)
+        self._per_ms = np.zeros((2, _KEPT_MS), np.int64)  # OFF and ON
         self._first_ms: int | None = None
         self._newest_ms = 0
         self._counts: NDArray[np.int64] | None = None  # [H, W]
@@ -73,11 +71,11 @@ class RecordingCheck:
                 self._first_ms = self._newest_ms = int(in_ms[0])
             new = int(in_ms[-1])
             gone = np.arange(self._newest_ms + 1, min(new, self._newest_ms + _KEPT_MS) + 1)
-            self._per_ms[gone % _KEPT_MS] = 0
+            self._per_ms[:, gone % _KEPT_MS] = 0
             if new > self._newest_ms + _KEPT_MS:
                 self._per_ms[:] = 0
-            kept = in_ms[in_ms > new - _KEPT_MS]
-            np.add.at(self._per_ms, kept % _KEPT_MS, 1)
+            kept = in_ms > new - _KEPT_MS
+            np.add.at(self._per_ms, (events.p[kept].astype(int), in_ms[kept] % _KEPT_MS), 1)
             self._newest_ms = new
 
     def values(self, now_s: float) -> dict[str, Any]:
@@ -94,9 +92,9 @@ class RecordingCheck:
         with self._lock:
             events, on, counts, light = self.events, self.on, self._counts, self._light
             order = np.arange(self._newest_ms + 1 - _KEPT_MS, self._newest_ms + 1) % _KEPT_MS
-            per_ms = self._per_ms[order]
+            per_ms = self._per_ms[:, order]
             if self._first_ms is not None:
-                per_ms = per_ms[-min(self._newest_ms - self._first_ms + 1, _KEPT_MS) :]
+                per_ms = per_ms[:, -min(self._newest_ms - self._first_ms + 1, _KEPT_MS) :]
             if counts is not None and now_s - self._hot_at_s >= _HOT_S:
                 counts = counts.copy()
             else:
@@ -105,11 +103,10 @@ class RecordingCheck:
             hot = hot_by_counts(counts)
             self._hot = int(hot.sum()), float(counts[hot].sum() / max(events, 1))
             self._hot_at_s = now_s
-        recent, flicker, readout = per_ms[-1000:], None, None
-        if per_ms.sum() >= _FEWEST_EVENTS and len(per_ms) >= 1000:
-            lines = flicker_lines(per_ms)
-            worst = max(lines, key=lambda hertz: lines[hertz])
-            flicker = worst if lines[worst] >= _FLICKER else None
+        recent, flicker, readout = per_ms.sum(axis=0)[-1000:], None, None
+        if per_ms.sum() >= _FEWEST_EVENTS and per_ms.shape[1] >= 1000:
+            line = flicker_line(per_ms[1] - per_ms[0])
+            flicker = round(line.frequency_hz, 1) if line.is_there else None
         if self._most_rate_hz is not None:
             readout = float((recent > self._most_rate_hz / 2000).mean())
         return {

@@ -17,9 +17,9 @@ from evnlos.config import save_yaml, to_dict, write_atomically
 from evnlos.data import Dataset, NlosDataset
 from evnlos.errors import ConfigError
 from evnlos.files import directory_lock
+from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
 from evnlos.models import Reconstructor, Weights, load_weights, save_weights
-from evnlos.progress import Progress, Step, silent
 from evnlos.training.settings import Training
 from evnlos.training.train import TrainingResult, about_run, check_run, train
 from evnlos.types import derive_seed

@@ -18,7 +18,7 @@ from evnlos.calibration.scan.folder import SCAN_FILE, Pattern, Patterns, ScanFra
 from evnlos.config import save_yaml
 from evnlos.errors import ConfigError
 from evnlos.files import new_folder
-from evnlos.progress import Progress, Step, silent
+from evnlos.machine import Progress, Step, silent
 from evnlos.types import Plane
 
 
