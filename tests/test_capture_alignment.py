@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evnlos.data import read_capture
-from evnlos.data.cleaning import correct_frames, crop_events, find_hot_pixels, keep_supported, without_pixels
+from evnlos.data.cleaning import correct_frames
 from evnlos.data.clocks import find_offset
 from evnlos.data.frames import find_dots, homography_from_points, registration_error, warp_frames
 from evnlos.errors import DataError
@@ -201,61 +201,3 @@ def test_dark_frame_and_flat_field_undo_what_the_camera_did():
         correct_frames(frames, peak, dark, np.ones((3, 3)))
     with pytest.raises(DataError, match="flat field"):
         correct_frames(frames, peak, dark, dark)
-
-
-def scattered(seed: int, count: int = 400, width: int = 12, height: int = 9) -> Events:
-    draw = np.random.default_rng(seed)
-    return Events(
-        np.sort(draw.integers(0, 2_000, count)), draw.integers(0, width, count),
-        draw.integers(0, height, count), draw.integers(0, 2, count), width, height,
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("window", [1, 20, 300])
-def test_the_background_filter_equals_the_slow_one(window):
-    events = scattered(window)
-    kept = []
-    for i in range(len(events)):
-        x, y = int(events.x[i]), int(events.y[i])
-        near = [
-            int(events.t_us[j])
-            for j in range(i)
-            if 0 < max(abs(int(events.x[j]) - x), abs(int(events.y[j]) - y)) <= 1
-        ]
-        kept.append(bool(near) and int(events.t_us[i]) - max(near) <= window)
-    before = events.x.copy()
-    assert keep_supported(events, window) == events[np.array(kept)]
-    np.testing.assert_array_equal(events.x, before)
-
-
-def test_hot_pixels_equal_the_slow_ones_and_go():
-    events = scattered(1)
-    hot_at = Events(np.arange(500) * 4, np.full(500, 3), np.full(500, 2), np.zeros(500, bool), 12, 9)
-    order = np.argsort(np.concatenate([events.t_us, hot_at.t_us]), kind="stable")
-    mixed = Events(
-        *(np.concatenate([events.columns()[n], hot_at.columns()[n]])[order] for n in ("t_us", "x", "y", "p")),
-        12,
-        9,
-    )
-    found = find_hot_pixels(mixed, 10)
-    counts = np.zeros((9, 12), int)
-    np.add.at(counts, (mixed.y, mixed.x), 1)
-    for row in range(9):
-        for column in range(12):
-            block = counts[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3].ravel().tolist()
-            block.remove(counts[row, column])
-            expected = counts[row, column] > 20 and counts[row, column] > 10 * max(np.median(block), 1)
-            assert found[row, column] == expected
-    assert found.sum() == 1 and found[2, 3]
-    assert len(without_pixels(mixed, found)) == len(mixed) - counts[2, 3]
-
-
-def test_cropping_moves_the_corner_to_zero():
-    events = scattered(4)
-    part = crop_events(events, 2, 3, 5, 4)
-    inside = (events.x >= 2) & (events.x < 7) & (events.y >= 3) & (events.y < 7)
-    np.testing.assert_array_equal(part.t_us, events.t_us[inside])
-    np.testing.assert_array_equal(part.x, events.x[inside] - 2)
-    assert part.shape == (4, 5)
-    with pytest.raises(DataError, match="leaves the sensor"):
-        crop_events(events, 8, 0, 5, 4)

@@ -94,7 +94,7 @@ def test_lamps_on_mains_are_found_and_sunlight_is_not(capture, hertz) -> None:
         found = {one.what: one for one in check_capture(replace(capture, events=events))}
         assert found["flicker"].level == level
         if depth:
-            assert f"{hertz} Hz" in found["flicker"].found and "direct current" in found["flicker"].cure
+            assert f"{hertz}.0 Hz" in found["flicker"].found and "direct current" in found["flicker"].cure
 
 
 def test_clocks_that_do_not_meet_are_named(capture) -> None:

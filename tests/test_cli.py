@@ -75,6 +75,7 @@ WITHOUT_OUT = (
     "verify",
     "info",
     "convert",
+    "clean",
     "capture",
     "app",
     "cite",

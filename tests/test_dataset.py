@@ -1,6 +1,5 @@
 """Samples on disk: area averaging, shards, simulation for any number of workers, resume, splits."""
 
-import os
 import pickle
 import signal
 import subprocess
@@ -38,7 +37,7 @@ from evnlos.errors import ConfigError, DataError, EvnlosError
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup
 from evnlos.training.source import DiskSource, ProcessGroup
-from watching import Watch, stopped
+from watching import Watch, always_die, die_once, stopped
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -299,24 +298,10 @@ def test_a_network_is_given_levels_as_they_were_measured() -> None:
     np.testing.assert_allclose(seen[:, 1:], surface, atol=1e-6)
 
 
-def _die_once(task: tuple[Path, int]) -> int:
-    flag, number = task
-    if number == 2 and not flag.exists():
-        flag.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
-def _always_die(number: int) -> int:
-    if number == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
 def test_the_pool_survives_the_death_of_a_worker(tmp_path) -> None:
-    assert sorted(run_tasks(_die_once, [(tmp_path / "died", i) for i in range(6)], 2)) == list(range(6))
+    assert sorted(run_tasks(die_once, [(tmp_path / "died", i) for i in range(6)], 2)) == list(range(6))
     with pytest.raises(EvnlosError, match="died 3 times"):
-        list(run_tasks(_always_die, range(4), 2))
+        list(run_tasks(always_die, range(4), 2))
 
 
 def test_no_dataset_and_overlapping_splits(tmp_path) -> None:

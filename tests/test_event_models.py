@@ -31,18 +31,15 @@ BROWNIAN = BrownianPixel(
 CONTINUOUS_PIXEL = EventPixel(0.18, 0.24, 0.02, 80.0, 0.05, 0.5, 0.0)
 
 
-@pytest.fixture(scope="module")
-def chosen() -> dict:
-    found = {}
-    for name, pixel in (("brownian", BROWNIAN), ("continuous", CONTINUOUS_PIXEL)):
-        fit, held = [recording(pixel, k) for k in (0, 1)], [recording(pixel, k) for k in (2, 3)]
-        first = fit_pixel(fit, EventPixel())
-        found[name] = first, choose_pixel(first, fit, held), held
-    return found
+def chosen(pixel):
+    """Return the usual model's fit, what is chosen, and the recordings that the fit has not seen."""
+    fit, held = [recording(pixel, k) for k in (0, 1)], [recording(pixel, k) for k in (2, 3)]
+    first = fit_pixel(fit, EventPixel())
+    return first, choose_pixel(first, fit, held), held
 
 
-def test_a_sensor_of_another_law_is_told_and_its_numbers_come_back(chosen) -> None:
-    first, found, held = chosen["brownian"]
+def test_a_sensor_of_another_law_is_told_and_its_numbers_come_back() -> None:
+    first, found, held = chosen(BROWNIAN)
     assert isinstance(found.pixel, BrownianPixel) and found.cutoff_range_hz is None
     assert found.pixel.threshold_on == pytest.approx(0.15, rel=0.2)
     assert found.pixel.threshold_off == pytest.approx(0.22, rel=0.2)
@@ -52,8 +49,8 @@ def test_a_sensor_of_another_law_is_told_and_its_numbers_come_back(chosen) -> No
     assert set(found.compared) == {CONTINUOUS, "continuous, true logarithm", "brownian"}
 
 
-def test_a_sensor_of_the_usual_law_keeps_it(chosen) -> None:
-    first, found, _ = chosen["continuous"]
+def test_a_sensor_of_the_usual_law_keeps_it() -> None:
+    first, found, _ = chosen(CONTINUOUS_PIXEL)
     assert replace(found, compared={}) == first
 
 

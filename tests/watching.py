@@ -1,5 +1,7 @@
-"""Watching verbs and commands: a `progress` that keeps every step and may stop, and processes that live on."""
+"""Watching verbs and commands: a `progress` that keeps every step and may stop, processes that live and die."""
 
+import os
+import signal
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -47,3 +49,19 @@ def alive(group: int) -> list[int]:
         if int(their_group) == group and state != "Z":
             found.append(int(path.parent.name))
     return found
+
+
+def die_once(task: tuple[Path, int]) -> int:
+    """Kill the worker that has task 2 first."""
+    flag, number = task
+    if number == 2 and not flag.exists():
+        flag.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def always_die(number: int) -> int:
+    """Kill each worker that has task 1."""
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number

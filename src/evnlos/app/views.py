@@ -25,7 +25,7 @@ from evnlos.app.solving import Reconstruction
 from evnlos.cameras import EventPixel
 from evnlos.data import Sampling, Simulation
 from evnlos.events import time_surface
-from evnlos.events.grids import WORDS
+from evnlos.events.volume import WORDS
 from evnlos.plot.event_views import (
     CloudSize,
     cloud_pictures,

@@ -231,8 +231,11 @@ class CleanCommand:
     """Frequency of flickering light, hertz, whose events go: twice that of the mains; auto finds it between 90
     and 132 Hz and takes nothing away where there is none."""
     background_ms: float | Literal["auto", "none"] = "none"
-    """Events to which none of the 8 pixels around sent one that near in time go, milliseconds; auto: so near that
-    noise as dense as the median pixel's events stays by chance in 1 of 10."""
+    """Events go to which too few of the 4 pixels beside sent one of that polarity that near in time,
+    milliseconds; auto: so near that of noise as dense as the median pixel's events 1 of 10 stays by chance."""
+    background_sides: int = 2
+    """How many of the 4 pixels beside must have sent one, 1 to 4; 3 where the light has no edges, 1 for single
+    lines of pixels."""
     format: str | None = None
     """Format to write where the ending does not say, e.g. EVT2 for .raw."""
     on_error: OnError = "strict"
@@ -254,6 +257,7 @@ class CleanCommand:
                 None if self.hot_factor == "none" else self.hot_factor,
                 None if self.flicker == "none" else self.flicker,
                 _microseconds(self.background_ms),
+                self.background_sides,
             )
         )
         recording, cut = self.reading.open(self.file, self.on_error), self.taking.cut()

@@ -18,7 +18,7 @@ from evnlos.data.clocks import LEAST_AGREEMENT, find_lag
 from evnlos.data.sampling import reduce_by_area
 from evnlos.events import event_histogram, find_hot_pixels
 from evnlos.events.cleaning import find_flicker
-from evnlos.events.grids import OFF_RGB, ON_RGB
+from evnlos.events.volume import OFF_RGB, ON_RGB
 from evnlos.types import Events
 
 Level = Literal["good", "doubtful", "bad"]
@@ -192,9 +192,9 @@ def _flicker(capture: Capture) -> Iterator[Finding]:
     yield _finding(
         "flicker",
         not line.is_there,
-        line.strength < 300,
+        line.strength < 10 * line.limit,
         f"the rate's line at {line.frequency_hz:.1f} Hz is {line.strength:.0f} times its surroundings "
-        "(30 is safe)",
+        f"({line.limit:.0f} is safe)",
         "light with direct current or daylight: mains lamps flicker; filters: {flicker_hz: "
         f"{line.frequency_hz:.2f}}} in capture.yaml takes their events away",
     )

@@ -145,7 +145,8 @@ class FilterInfo:
     flicker_hz: float | None = None
     """Frequency of flickering light, hertz: twice that of the mains; none = keep its events."""
     background_us: int | None = None
-    """Events that none of their 8 neighbours is so near in time are noise, microseconds; none = keep all."""
+    """Events to which fewer than 2 of the 4 pixels beside sent one of that polarity so near in time are noise,
+    microseconds; none = keep all."""
 
 
 @dataclass(frozen=True)

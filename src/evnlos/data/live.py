@@ -35,8 +35,8 @@ from evnlos.data.simulate import (
 )
 from evnlos.data.store import Dataset
 from evnlos.errors import ConfigError
-from evnlos.events.grids import as_edges
 from evnlos.events.surface import Mode, check_surface
+from evnlos.events.volume import as_edges
 from evnlos.machine import cores
 from evnlos.optics import Irradiance
 from evnlos.scene import Scene

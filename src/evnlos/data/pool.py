@@ -205,6 +205,7 @@ def _drain(
 
 
 _RETRIES = 3
+_PATIENCE_S = 20.0  # for a scheduler that does not answer
 
 
 def run_on_dask(
@@ -247,7 +248,7 @@ def run_on_dask(
                 dashboard_address="",
                 silence_logs=50,
             )
-        client = Client(cluster or scheduler, timeout=20)
+        client = Client(cluster or scheduler, timeout=_PATIENCE_S)
     except (OSError, TimeoutError, ValueError) as error:
         raise EvnlosError(
             f"the Dask scheduler {scheduler} does not answer ({' '.join(str(error).split())[:120]}); "

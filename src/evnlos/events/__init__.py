@@ -1,17 +1,7 @@
 """Event streams: files and representations."""
 
 from evnlos.events.batch import event_batch, events_from_tensors, events_to_tensors
-from evnlos.events.cleaning import (
-    Cleaner,
-    CleanOptions,
-    CleanReport,
-    clean_events,
-    crop_events,
-    find_hot_pixels,
-    keep_known_polarity,
-    keep_supported,
-    remove_flicker,
-)
+from evnlos.events.cleaning import Cleaner, CleanOptions, CleanReport, clean_events
 from evnlos.events.files import (
     CelexOptions,
     EventWriter,
@@ -29,12 +19,21 @@ from evnlos.events.files import (
     write_celex_frames,
     write_events,
 )
-from evnlos.events.grids import edges_from_count, edges_from_rate, suggest_tau_us
+from evnlos.events.filters import (
+    crop_events,
+    find_hot_pixels,
+    keep_known_polarity,
+    keep_supported,
+    remove_flicker,
+)
 from evnlos.events.surface import normalise_surface, time_surface
 from evnlos.events.volume import (
+    edges_from_count,
+    edges_from_rate,
     event_frame,
     event_histogram,
     intensity_map,
+    suggest_tau_us,
     threshold_ordinal_surface,
     voxel_grid,
 )

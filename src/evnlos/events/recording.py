@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
-from evnlos.events.cleaning import check_box, crop_events, keep_known_polarity
 from evnlos.events.files.celex import CelexOptions
 from evnlos.events.files.columns import OnError, ReadReport, trusted_events
 from evnlos.events.files.read import in_order, open_source
+from evnlos.events.filters import check_box, crop_events, keep_known_polarity
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 

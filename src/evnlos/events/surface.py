@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import DataError
-from evnlos.events.grids import as_edges
+from evnlos.events.volume import as_edges
 from evnlos.types import Events
 
 SUM, LAST, MAX = 0, 1, 2

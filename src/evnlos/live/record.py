@@ -22,7 +22,8 @@ from evnlos.config import save_yaml, to_dict
 from evnlos.data.capture_info import RecordingInfo
 from evnlos.errors import ConfigError, DataError, EvnlosError
 from evnlos.events import EventWriter
-from evnlos.events.cleaning import flicker_line, hot_by_counts
+from evnlos.events.cleaning import flicker_line
+from evnlos.events.filters import hot_by_counts
 from evnlos.files import new_folder
 from evnlos.live.device import DeviceSource
 from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
@@ -105,7 +106,7 @@ class RecordingCheck:
             self._hot_at_s = now_s
         recent, flicker, readout = per_ms.sum(axis=0)[-1000:], None, None
         if per_ms.sum() >= _FEWEST_EVENTS and per_ms.shape[1] >= 1000:
-            line = flicker_line(per_ms[1] - per_ms[0])
+            line = flicker_line(per_ms[:, None])
             flicker = round(line.frequency_hz, 1) if line.is_there else None
         if self._most_rate_hz is not None:
             readout = float((recent > self._most_rate_hz / 2000).mean())
@@ -138,7 +139,7 @@ def check_line(
         parts.append(f"{'' if is_fair else '! '}ON {100 * found['on_fraction']:.0f} %")
     if found["readout"] is not None:
         parts.append(f"{'' if found['readout'] < 0.01 else '! '}readout busy {100 * found['readout']:.0f} %")
-    parts.append("no flicker" if found["flicker_hz"] is None else f"! flicker at {found['flicker_hz']} Hz")
+    parts.append("no flicker" if found["flicker_hz"] is None else f"! flicker at {found['flicker_hz']:.4g} Hz")
     is_calm = found["hot_fraction"] < 0.02
     parts.append(
         f"{'' if is_calm else '! '}{found['hot_pixels']} hot pixels ({100 * found['hot_fraction']:.1f} %)"

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from evnlos.errors import DataError
 from evnlos.events import event_histogram
-from evnlos.events.grids import OFF_RGB, ON_RGB
+from evnlos.events.volume import OFF_RGB, ON_RGB
 from evnlos.types import Events
 
 _FAINTEST = 0.35  # how strongly a single event is drawn where many are usual

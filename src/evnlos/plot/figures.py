@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.errors import DataError, MissingDependencyError
-from evnlos.events.grids import OFF_HEX, ON_HEX
+from evnlos.events.volume import OFF_HEX, ON_HEX
 from evnlos.files import write_atomically
 from evnlos.plot.event_views import signed_pictures, time_slices
 from evnlos.types import Events

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.events.grids import OFF_RGB, ON_RGB
 from evnlos.events.recording import Summary
+from evnlos.events.volume import OFF_RGB, ON_RGB
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 

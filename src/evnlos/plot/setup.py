@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.events.grids import OFF_HEX, ON_HEX
+from evnlos.events.volume import OFF_HEX, ON_HEX
 from evnlos.optics import DiffuseReflection, tpsf_kernel, tpsf_profile
 from evnlos.plot.figures import new_figure, save_figure
 from evnlos.scene import FontGlyphs

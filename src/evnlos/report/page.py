@@ -14,7 +14,7 @@ import numpy as np
 from evnlos.analysis import CHECKS
 from evnlos.analysis.identify import Identification
 from evnlos.data import Dataset, character_of, read_shard
-from evnlos.events.grids import WORDS
+from evnlos.events.volume import WORDS
 from evnlos.files import write_atomically
 from evnlos.migrate import __version__
 from evnlos.report.pictures import curves_svg, data_uri, grey, png, polarity, stretched

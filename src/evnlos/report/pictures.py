@@ -24,7 +24,7 @@ from evnlos.analysis import load_model, score
 from evnlos.analysis.confidence import confidence_values
 from evnlos.analysis.model import setup_for_track
 from evnlos.data import FixedPattern, read_capture
-from evnlos.events.grids import OFF_RGB, ON_RGB
+from evnlos.events.volume import OFF_RGB, ON_RGB
 from evnlos.files import check_folder, new_folder, write_atomically
 from evnlos.models import published_for
 from evnlos.setups import Setup

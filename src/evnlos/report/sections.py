@@ -17,7 +17,7 @@ from evnlos.analysis import BASELINES
 from evnlos.analysis.identify import Identification
 from evnlos.analysis.scores import Interval, paired_difference
 from evnlos.data import Dataset, character_of, modality_order, read_shard
-from evnlos.events.grids import WORDS
+from evnlos.events.volume import WORDS
 from evnlos.plot.setup import PARTITION, setup_drawing
 from evnlos.report.pictures import animation, curves_svg, data_uri, grey, png, polarity, stretched, strip
 from evnlos.report.tables import METHODS, RunResult, baselines_of, label
