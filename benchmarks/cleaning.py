@@ -32,7 +32,7 @@ from evnlos.types import Events  # noqa: E402
 from machine import machine  # noqa: E402
 
 WIDTH, HEIGHT, SECONDS = 240, 180, 4.0
-WINDOWS_MS = np.geomspace(0.25, 512, 23)
+WINDOWS_MS = np.geomspace(0.25, 512, 16)
 Kept = NDArray[np.bool_]
 Filter = Callable[[Events], Kept]
 
@@ -84,14 +84,13 @@ def hot_pixels(count: int = 40, seed: int = 3) -> Events:
 
 
 def flicker(contrast: float, hertz: float = 100.3) -> Events:
-    """Uneven wall whose lamps ripple, by pixels with mismatch and jitter."""
+    """An uneven patch of 40 x 30 pixels whose lamps ripple, seen by pixels with mismatch and jitter."""
     times = np.arange(0, SECONDS, 1 / (24 * hertz))
-    x = np.mgrid[:HEIGHT, :WIDTH][1]
-    pixel = EventPixel(0.1, 0.12, 0.02, 300, 0, 0, jitter_s=1e-4)
-    level, parts = (60 + 60 * x / WIDTH)[None], []
+    level = np.broadcast_to(np.linspace(60, 120, 40), (30, 40))
     light = level * (1 + contrast * np.sin(2 * np.pi * hertz * times))[:, None, None]
-    parts.append(simulate_events(light.astype(np.float32), times, pixel, seed=4))
-    return parts[0]
+    pixel = EventPixel(0.1, 0.12, 0.02, 300, 0, 0, jitter_s=1e-4)
+    events = simulate_events(light.astype(np.float32), times, pixel, seed=4)
+    return Events(events.t_us, events.x + np.uint16(100), events.y + np.uint16(75), events.p, WIDTH, HEIGHT)
 
 
 def labelled(scene: Events, noise: Events) -> tuple[Events, Kept]:

@@ -61,6 +61,7 @@ events video --fps 100 --out events.h5
 pixel fit events.h5 --light unknown --out fitted
 info events.h5
 convert events.h5 events.raw
+clean events.h5 clean.raw --background-ms auto
 convert events.h5 events.npz
 convert events.h5 events.csv
 convert events.h5 events.mcap

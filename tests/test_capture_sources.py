@@ -282,7 +282,7 @@ def test_points_region_and_filters(tmp_path):
     text = "; ".join(recording.notes)
     for said in (
         "1 hot pixels",
-        "without a neighbour in 100000 us",
+        "without support within 100 ms",
         "4 points (rms error 0.00",
         "region 40 x 30",
     ):
