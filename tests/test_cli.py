@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from evnlos import open_dataset
 from evnlos.cli import VERBS, main
 from evnlos.config import save_yaml
-from evnlos.data import Sampling
-from evnlos.models import Weights, published_for, save_weights
+from evnlos.data import Samples, Sampling
+from evnlos.models import ConfidenceReport, Weights, published_for, save_weights
 from evnlos.models.sequence import SequenceConfig
+from evnlos.report import result_sheet
 
 NETWORK = ["--network.width", "8", "--network.depth", "2"]
 
@@ -248,11 +250,27 @@ def test_one_picture_of_a_whole_recording_is_shown_once(tiny_captures, tmp_path,
     save_weights(tmp_path / "w.safetensors", Weights(network))
     call("reconstruct", tiny_captures[0], "--weights", tmp_path / "w.safetensors", "--out", tmp_path / "r")
     assert "all positions show one picture" in capsys.readouterr().out
-    with (
-        Image.open(tmp_path / "r" / "picture.png") as once,
-        Image.open(tmp_path / "r" / "position_00.png") as one,
-    ):
-        assert once.size == (2 * one.width, 2 * one.height)
+    told = json.loads((tmp_path / "r" / "summary.json").read_text())
+    assert told["one_picture"] and any("one picture" in line for line in told["in_words"])
+    assert "confidence" in told or told["no_confidence"] in told["in_words"]
+    with Image.open(tmp_path / "r" / "result.png") as sheet:
+        assert sheet.width > 900 and sheet.height > 400
+        dark = np.asarray(sheet.convert("L")) < 60
+        assert dark[:40].any() and dark[-40:].any()  # a title, and what it means
+
+
+def test_the_result_is_drawn_with_and_without_what_may_be_unknown() -> None:
+    sampling = Sampling(height=24, width=36, scored_rows=18)
+    draw = np.random.default_rng(1)
+    maps = draw.random((3, 24, 36), np.float32)
+    path = np.stack([np.linspace(-0.08, 0.08, 3), np.zeros(3)], axis=1)
+    samples = Samples(maps, draw.random((3, 2, 24, 36), np.float32), maps, np.arange(3.0), path, np.full(3, 9))
+    interval = ConfidenceReport(0.9, 0.1, torch.zeros(3, 24, 36), torch.ones(3, 24, 36))
+    whole = result_sheet("all", maps, samples, sampling, interval, ["a line"])
+    bare = replace(samples, truth=None, position_m=None)
+    short = result_sheet("less", maps, bare, sampling, None, ["a line", "one that is " + "very " * 60 + "long"])
+    assert whole.dtype == np.uint8 and whole.shape[1:] == short.shape[1:] and whole.shape[0] > short.shape[0]
+    assert (whole == (11, 95, 165)).all(axis=-1).any() and not (short == (11, 95, 165)).all(axis=-1).any()
 
 
 def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, tmp_path, capsys) -> None:

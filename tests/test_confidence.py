@@ -301,7 +301,7 @@ def test_reconstruct_and_evaluate_say_what_the_pictures_are_worth(
     assert shown.shape == (8, 32, 48) and (low <= shown).all() and (shown <= high).all()
     assert found["moved_by_the_setup"] == (0.75 < found["light"] < 1.33)
     assert (out / "unsure.png").is_file()
-    assert not found["one_picture"] and not (out / "picture.png").exists()
+    assert not found["one_picture"] and (out / "result.png").exists()
 
 
 def test_keeping_the_most_supported_first() -> None:

@@ -77,31 +77,11 @@ class ReconstructCommand:
             print(json.dumps(found | {"out": str(self.out)}))
             return
         print(f"{self.out}: {found['positions']} positions of {found['capture']} by {found['weights']}")
-        if found["one_picture"]:
-            how = "found" if self.track else "stated"
-            print(
-                "all positions show one picture, made from the whole recording and drawn where the motion was "
-                f"{how}; picture.png shows it once"
-            )
-        if not found.get("moved_by_the_setup", True):
-            print(
-                f"the light is {found['light']:.2f} x that of the setup: its gain is not this capture's, the "
-                "pictures stay as the network draws them; calibrate at this exposure, on known targets"
-            )
-        print(_said(found["confidence"]) if "confidence" in found else found["no_confidence"])
+        print(f"{self.out / 'result.png'} shows them once, with what was seen and what to believe")
+        for line in found["in_words"]:
+            print(line)
         if "scores" in found:
             print("  ".join(f"{name} {value}" for name, value in found["scores"].items() if value is not None))
-
-
-def _said(confidence: dict[str, Any]) -> str:
-    """Return the confidence in the pictures, in one line."""
-    words = [confidence["verdict"]]
-    if "explained" not in confidence:
-        words.append("not checked against the frames: give the calibrated --setup")
-    elif confidence["measured"]:
-        share = 100 * confidence["explained"]
-        words.append(f"of what the average object leaves unexplained in the frames they explain {share:.0f} %")
-    return "; ".join(words)
 
 
 @dataclass(frozen=True)

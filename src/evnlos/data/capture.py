@@ -31,8 +31,6 @@ from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, printable
 from evnlos.events import (
     CelexOptions,
-    CleanOptions,
-    clean_events,
     crop_events,
     keep_known_polarity,
     read_events,
@@ -190,6 +188,8 @@ def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
         notes.append(f"{count - len(events):,} events without polarity left out")
     filters = info.filters
     if filters != FilterInfo():
+        from evnlos.events import CleanOptions, clean_events
+
         events, found = clean_events(
             events, CleanOptions(filters.hot_pixel_factor, filters.flicker_hz, filters.background_us)
         )

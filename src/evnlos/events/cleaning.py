@@ -66,7 +66,7 @@ def flicker_line(counts: NDArray) -> FlickerLine:
     length = min(length, _SEGMENT_MS)
     starts = range(0, counts.shape[-1] - length + 1, length)
     powers = sum(_powers(counts[..., start : start + length]) for start in starts)
-    return _line(np.asarray(powers), len(starts), counts.any(axis=-1))
+    return _line(np.asarray(powers), len(starts), np.asarray(counts.any(axis=-1)))
 
 
 def _powers(counts: NDArray) -> NDArray[np.float64]:

@@ -124,7 +124,7 @@ class ConfidenceReport:
                 "object "
                 f"share up to {100 * self.threshold:.0f} %"
             )
-        return f"the measurement supports {100 * self.support:.0f} % of the picture"
+        return f"the measurement supports {100 * self.support:.0f} % of what tells this object from others"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Results for people: one HTML page with its numbers as CSV, and reconstructions as pictures."""
 
 from evnlos.report.page import write_report
-from evnlos.report.pictures import reconstruct_capture
+from evnlos.report.pictures import reconstruct_capture, result_sheet
 from evnlos.report.tables import RunResult, collect_results, refuse_seen, seen_in_training, to_csv, to_text
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "collect_results",
     "reconstruct_capture",
     "refuse_seen",
+    "result_sheet",
     "seen_in_training",
     "to_csv",
     "to_text",

@@ -10,7 +10,9 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,15 +20,16 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.analysis import load_model, score
 from evnlos.analysis.confidence import confidence_values
 from evnlos.analysis.model import setup_for_track
 from evnlos.data import FixedPattern, read_capture
-from evnlos.events.volume import OFF_RGB, ON_RGB
+from evnlos.data.sampling import Samples, Sampling
+from evnlos.events.volume import OFF_RGB, ON_RGB, WORDS
 from evnlos.files import check_folder, new_folder, write_atomically
-from evnlos.models import published_for
+from evnlos.models import ConfidenceReport, published_for
 from evnlos.setups import Setup
 
 _COLOURS = ("#0b5fa5", "#b23a12", "#2f7d32", "#7a3fa0", "#8a6d00", "#00788a", "#a02c5d", "#5b6470", "#3d4fc4")
@@ -186,8 +189,9 @@ def reconstruct_capture(
     surface, reconstruction and, where known, truth, side by side) and `reconstruction.npy` (float32
     [N, H, W], 0..1). Where the weights hold a confidence and the motion is known, also
     `interval.npy` (the ends of each pixel's interval, float32 [2, N, H, W]) and `unsure.png`, a strip of the
-    intervals' lengths (black is sure, white is anything). Of a network that sees whole sequences, whose picture
-    is one, `picture.png` shows it once, large, with the ends of its interval beside it where there are any.
+    intervals' lengths (black is sure, white is anything). `result.png` is one labelled picture of it all (wall,
+    events, reconstruction, interval, truth where known, path, and what it means in words), `summary.json` what
+    this returns.
 
     Args:
         capture: A capture folder; its target may be unknown.
@@ -234,10 +238,6 @@ def reconstruct_capture(
         for k, picture in enumerate(pictures):
             save_png(draft / f"position_{k:02d}.png", picture, zoom)
         save_png(draft / "strip.png", strip(pictures), 2)
-        if is_one:
-            middle = len(pictures) // 2
-            ends = [] if confidence is None else [confidence.low[middle], confidence.high[middle]]
-            save_png(draft / "picture.png", strip([pictures[middle], *map(grey, ends)]), 2 * zoom)
         shown = []
         for k, picture in enumerate(pictures):
             row = [stretched(samples.frame[k]), polarity(samples.surface[k]), picture]
@@ -264,12 +264,133 @@ def reconstruct_capture(
             found["confidence"] = confidence_values(confidence)
         else:
             found["no_confidence"] = made.no_confidence
-    if track:
-        found["warnings"] = made.warnings
-    if samples.truth is not None:
-        truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
-        found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
+        if track:
+            found["warnings"] = made.warnings
+        if samples.truth is not None:
+            truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
+            found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
+        found["in_words"] = _in_words(found, track)
+        title = f"{recording.name}, reconstructed by {found['weights']}"
+        sheet = result_sheet(title, images.numpy(), samples, sampling, confidence, found["in_words"])
+        save_png(draft / "result.png", sheet)
+        write_atomically(draft / "summary.json", (json.dumps(found, indent=2) + "\n").encode())
     return found
+
+
+def _in_words(found: dict[str, Any], tracked: bool) -> list[str]:
+    """Return in sentences what the pictures of `reconstruct_capture` are and what of them to believe."""
+    lines = []
+    if found["one_picture"]:
+        lines.append(
+            f"all positions show one picture, made from the whole recording and drawn where the motion was "
+            f"{'found' if tracked else 'stated'}"
+        )
+    if not found.get("moved_by_the_setup", True):
+        lines.append(
+            f"the light is {found['light']:.2f} x that of the setup: its gain is not this capture's, the "
+            "pictures stay as the network draws them; calibrate at this exposure, on known targets"
+        )
+    confidence = found.get("confidence")
+    if confidence is None:
+        return [*lines, found["no_confidence"]]
+    words = confidence["verdict"]
+    if "explained" not in confidence:
+        words += "; not checked against the frames: give the calibrated --setup"
+    elif confidence["measured"]:
+        share = 100 * confidence["explained"]
+        words += f"; of what the average object leaves unexplained in the frames they explain {share:.0f} %"
+    return [*lines, words]
+
+
+_PANEL, _MARGIN, _TEXT_PX, _LINE_PX = 300, 16, 14, 19  # pixels
+_INK, _FAINT, _PAPER, _PATH = (20, 24, 28), (120, 126, 132), (255, 255, 255), (11, 95, 165)
+_BAR_M = 0.02
+
+
+def result_sheet(
+    title: str,
+    images: NDArray[np.float32],
+    samples: Samples,
+    sampling: Sampling,
+    confidence: ConfidenceReport | None,
+    lines: Sequence[str],
+) -> NDArray[np.uint8]:
+    """Return one labelled picture of a reconstruction, at the position in the middle of the sequence.
+
+    Args:
+        title: First line.
+        images: Reconstructions, float32 [N, H, W], 0..1.
+        samples: What was seen at the positions, and the truth and the path where they are known.
+        sampling: Size and pitch of the maps.
+        confidence: Ends of each pixel's interval; None where they can't be told.
+        lines: What it means, in sentences.
+
+    Returns:
+        RGB, uint8 [H', W', 3].
+    """
+    k = len(images) // 2
+    panels: list[tuple[str, NDArray[np.uint8]]] = [
+        (f"wall, position {k + 1} of {len(images)} (contrast stretched)", stretched(samples.frame[k])),
+        (f"its events ({WORDS})", polarity(samples.surface[k])),
+        ("reconstruction", grey(images[k])),
+    ]
+    if confidence is not None:
+        ends = ("lower", confidence.low[k]), ("upper", confidence.high[k])
+        panels += [(f"90 % interval: {name} end", grey(end)) for name, end in ends]
+    if samples.truth is not None:
+        panels.append(("truth", grey(samples.truth[k])))
+    height, width, columns = round(_PANEL * sampling.height / sampling.width), _PANEL, 3
+    rows = -(-(len(panels) + 1) // columns)
+    wide = _MARGIN + columns * (width + _MARGIN)
+    wrapped = [part for line in lines for part in textwrap.wrap(f"{line[:1].upper()}{line[1:]}.", wide // 7)]
+    row_height = height + _LINE_PX + _MARGIN
+    top = _MARGIN + _LINE_PX + 8
+    sheet = Image.new("RGB", (wide, top + rows * row_height + _LINE_PX * len(wrapped) + _MARGIN), _PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(_TEXT_PX)
+    draw.text((_MARGIN, _MARGIN), title, _INK, font)
+    for i in range(len(panels) + 1):
+        left, above = _MARGIN + i % columns * (width + _MARGIN), top + i // columns * row_height
+        box = (left, above + _LINE_PX, left + width - 1, above + _LINE_PX + height - 1)
+        if i == len(panels):
+            _draw_path(draw, font, box, samples.position_m)
+            continue
+        name, picture = panels[i]
+        draw.text((left, above), name, _INK, font)
+        image = Image.fromarray(np.ascontiguousarray(picture)).convert("RGB")
+        sheet.paste(image.resize((width, height), Image.Resampling.NEAREST), box[:2])
+        if i >= 2:  # on the target's plane
+            start, stop = box[2] - 10 - round(_BAR_M / sampling.pitch_m * width / sampling.width), box[2] - 10
+            draw.rectangle((start, box[3] - 12, stop, box[3] - 9), _PAPER, _INK)
+            text = f"{1e2 * _BAR_M:g} cm"
+            draw.text((start, box[3] - 30), text, _PAPER, font, stroke_width=1, stroke_fill=_INK)
+    for i, line in enumerate(wrapped):
+        draw.text((_MARGIN, top + rows * row_height + i * _LINE_PX), line, _INK, font)
+    return np.asarray(sheet)
+
+
+def _draw_path(
+    draw: ImageDraw.ImageDraw,
+    font: ImageFont.ImageFont | ImageFont.FreeTypeFont,
+    box: tuple[int, int, int, int],
+    position_m: NDArray[np.float64] | None,
+) -> None:
+    """Draw the path of the target's centre over its plane, y upwards, from a ring to a dot."""
+    left, above, right, below = box
+    if position_m is None:
+        draw.text((left, above - _LINE_PX), "path: unknown", _FAINT, font)
+        return
+    ends = " to ".join(f"({100 * x:.1f}, {100 * y:.1f})" for x, y in (position_m[0], position_m[-1]))
+    draw.text((left, above - _LINE_PX), f"path: {ends} cm", _INK, font)
+    draw.rectangle(box, None, _FAINT)
+    middle = (position_m.min(axis=0) + position_m.max(axis=0)) / 2
+    extent = max(float(np.ptp(position_m, axis=0).max()), 1e-6)
+    scale = 0.7 * min(right - left, below - above) / extent
+    across = (left + right) / 2 + scale * (position_m[:, 0] - middle[0])
+    down = (above + below) / 2 - scale * (position_m[:, 1] - middle[1])
+    points = list(zip(across.tolist(), down.tolist(), strict=True))
+    draw.line(points, _PATH, 2)
+    for (x, y), fill in ((points[0], _PAPER), (points[-1], _PATH)):
+        draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill, _PATH, 2)
 
 
 def _npy(array: np.ndarray) -> bytes:
