@@ -240,11 +240,11 @@ class Cleaner:
         options: What is left out.
 
     Example:
-        >>> events = Events([1, 5, 6], [0, 1, 9], [0, 0, 0], [1, 1, 1], width=10, height=1)
+        >>> events = Events([1, 5, 6, 7], [0, 1, 2, 9], [0] * 4, [1] * 4, width=10, height=1)
         >>> cleaner = Cleaner(CleanOptions(background_us=4))
         >>> cleaner.look([events])
         >>> [piece.x.tolist() for piece in cleaner.clean([events])], cleaner.report.background_events
-        ([[0, 1]], 1)
+        ([[1]], 3)
     """
 
     def __init__(self, options: CleanOptions | None = None) -> None:
