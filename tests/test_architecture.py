@@ -91,7 +91,9 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",
     "cameras/pixels/readout.py",
+    "inverse/corner.py",
     "lab/light_path.py",
+    "optics/corner.py",
     "optics/facets.py",
     "optics/radiometric.py",
 }

@@ -18,7 +18,7 @@ from evnlos.events import (
     write_aedat4,
     write_events,
 )
-from evnlos.events.files import hdf5_write
+from evnlos.events.files import container_write
 from evnlos.events.files import registry as write
 from evnlos.types import Events
 
@@ -85,7 +85,7 @@ def test_clock_turns_between_and_inside_pieces(file, tmp_path, monkeypatch):
 
 def test_long_recordings_widen_the_times_of_hdf5(tmp_path, monkeypatch):
     monkeypatch.setattr(write, "_PIECE", 5_000)
-    monkeypatch.setattr(hdf5_write, "_CHUNK", 4_096)  # several chunks are copied
+    monkeypatch.setattr(container_write, "_CHUNK", 4_096)  # several chunks are copied
     events = sample("e.h5", 40_000, 2**34)
     write_events(tmp_path / "e.h5", pieces_of(events, 5_000))
     assert read_events(tmp_path / "e.h5") == events

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from event_pixel_reference import reference_exact
 from evnlos.cameras import EventPixel, EventStream, simulate_events
-from evnlos.cameras.event_order import sort_times
 from evnlos.cameras.pixels.continuous_math import (
     LOG_LINEAR,
     LONGEST_TAU,
@@ -21,6 +20,7 @@ from evnlos.cameras.pixels.continuous_math import (
     response,
 )
 from evnlos.cameras.random_numbers import cos_turns, fast_exp, fast_log
+from evnlos.cameras.streams import sort_times
 
 QUIET = {"threshold_sigma": 0.0, "leak_rate_hz": 0.0, "shot_noise_rate_hz": 0.0}
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera, V2ePixel, simulate_batch
-from evnlos.cameras.event_order import EventTensors
 from evnlos.cameras.on_device import capture_tensors, record_tensors
 from evnlos.cameras.pixels.torch_noise import electrons
 from evnlos.cameras.random_numbers import fill_electrons
+from evnlos.cameras.streams import EventTensors
 from evnlos.data import Sampling, SensorSize, Simulation, live_dataset
 from evnlos.data.live import bytes_of_a_wall, simulate_objects_on, time_surface_tensors
 from evnlos.data.simulate import simulate_object

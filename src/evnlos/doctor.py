@@ -173,10 +173,10 @@ def _numba() -> Part:
     """Compile a small kernel and see that the folder where numba keeps those of the package can be written."""
     import numba
 
-    from evnlos.cameras import event_order as _order
+    from evnlos.cameras import streams
 
     compiled = numba.njit(lambda x: x + 1)(1) == 2
-    cache = Path(next(kernel.stats.cache_path for kernel in vars(_order).values() if hasattr(kernel, "stats")))
+    cache = Path(next(kernel.stats.cache_path for kernel in vars(streams).values() if hasattr(kernel, "stats")))
     cache.mkdir(parents=True, exist_ok=True)
     writable = _can_write(cache)
     cure = (

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from evnlos.cameras import EVENT_MODELS, CrossingLaw, PixelSettings
-from evnlos.cameras.light import WHITE_DN
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.data import Sampling
 from evnlos.errors import ConfigError
 from evnlos.inverse import (

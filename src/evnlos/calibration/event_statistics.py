@@ -16,7 +16,7 @@ from evnlos.calibration.captures import CaptureSet
 from evnlos.calibration.frame_model import local_square
 from evnlos.calibration.transport_fit import Residual
 from evnlos.cameras import PixelSettings, simulate_events
-from evnlos.cameras.light import WHITE_DN
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.data.sampling import Sampling, make_samples, reduce_by_area
 from evnlos.errors import DataError
 from evnlos.setups import Setup

@@ -21,8 +21,8 @@ from evnlos.calibration.pixel_light import KnownLight, LitEvents, LitRecording, 
 from evnlos.calibration.pixel_statistics import Array
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.event_model import require
-from evnlos.cameras.light import WHITE_DN
 from evnlos.cameras.pixels.arrays import pixel_thresholds
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.cameras.video import open_video
 from evnlos.config import load_yaml
 from evnlos.data.capture import read_capture

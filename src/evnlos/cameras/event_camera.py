@@ -13,10 +13,10 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.cameras.event_model import PixelSettings
-from evnlos.cameras.light import WHITE_DN, ImageStrips, StripLight
 from evnlos.cameras.pixel import EventPixel, Mode, in_mode
 from evnlos.cameras.pixels.continuous_math import log_light
 from evnlos.cameras.simulation import EventStream
+from evnlos.cameras.streams import WHITE_DN, ImageStrips, StripLight
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events
 

@@ -22,8 +22,7 @@ from evnlos.errors import ConfigError
 from evnlos.registry import Kinded, Registry
 
 if TYPE_CHECKING:
-    from evnlos.cameras.event_order import Columns, EventTensors
-    from evnlos.cameras.light import Light
+    from evnlos.cameras.streams import Columns, EventTensors, Light
 
 Phase = Literal["random", "rest"]
 """State of the pixels before the first frame: anywhere between two events, or as if one had just been sent."""

@@ -17,14 +17,13 @@ from torch import Tensor
 
 from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.event_model import PixelSettings
-from evnlos.cameras.event_order import EventTensors
 from evnlos.cameras.frame_camera import FrameCamera, check_extremes
-from evnlos.cameras.light import check_threshold_maps, check_times
 from evnlos.cameras.pixel import EventPixel, V2ePixel, in_mode
 from evnlos.cameras.pixels.torch_light import Clips, WallLight, check_range
 from evnlos.cameras.pixels.torch_noise import electrons
 from evnlos.cameras.pixels.torch_v2e import Pixels, default_tile
 from evnlos.cameras.random_numbers import check_seed
+from evnlos.cameras.streams import EventTensors, check_threshold_maps, check_times
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events, derive_seed
 

@@ -23,8 +23,8 @@ from evnlos.cameras.event_model import (
 from evnlos.errors import ConfigError
 
 if TYPE_CHECKING:
-    from evnlos.cameras.event_order import EventTensors
     from evnlos.cameras.pixels.continuous_math import Curve
+    from evnlos.cameras.streams import EventTensors
 
 MAX_JITTER = 9
 """Standard deviations that the normal random numbers can reach."""

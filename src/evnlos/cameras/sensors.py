@@ -33,12 +33,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.cameras.event_model import PixelSettings, require
-from evnlos.cameras.light import check_light, check_times
 from evnlos.cameras.pixel import EventPixel, continuous
 from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.readout import ReadoutPixel
 from evnlos.cameras.random_numbers import check_seed
 from evnlos.cameras.simulation import simulate_events
+from evnlos.cameras.streams import check_light, check_times
 from evnlos.config import load_yaml
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events

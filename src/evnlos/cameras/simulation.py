@@ -15,10 +15,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.cameras.event_model import PixelSettings
-from evnlos.cameras.event_order import Columns, join, sort_times
-from evnlos.cameras.light import Frames, Light, check_light, check_times
 from evnlos.cameras.pixel import EventPixel, Mode, V2ePixel, in_mode
 from evnlos.cameras.random_numbers import check_seed
+from evnlos.cameras.streams import Columns, Frames, Light, check_light, check_times, join, sort_times
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events
 

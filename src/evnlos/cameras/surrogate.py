@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE, MIN_THRESHOLD
-from evnlos.cameras.light import check_times
+from evnlos.cameras.streams import check_times
 from evnlos.errors import ConfigError, DataError
 
 Parameter = float | Tensor

@@ -1,4 +1,9 @@
-"""A video as light: files, animations, folders of pictures and arrays, frame by frame, and its events."""
+"""A video as light, frame by frame, from files, animations, folders and arrays; its events; its making.
+
+- A video on disk as light, frame by frame; a part of its pictures where only that is looked at.
+- The events that an event camera would send of it, in memory that does not grow with its length.
+- The video that a frame camera would make of light that is simulated.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,7 @@ import glob
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import get_args
@@ -15,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.event_model import PixelSettings
+from evnlos.cameras.frame_camera import FrameCamera
 from evnlos.cameras.pixel import EventPixel, Mode
 from evnlos.cameras.simulation import EventStream
 from evnlos.cameras.video_files import (
@@ -25,6 +32,7 @@ from evnlos.cameras.video_files import (
     PictureSource,
     PicturesSource,
     Tone,
+    from_light,
     to_light,
 )
 from evnlos.errors import ConfigError, DataError
@@ -52,6 +60,7 @@ class Video:
         slow_motion: How many times slower than life the video plays.
         tone: Tone curve that is undone.
         white: Value of white in the file.
+        box: Part of the frame that is read (left, top, right, bottom), pixels; None = all of it.
     """
 
     path: Path
@@ -63,6 +72,20 @@ class Video:
     tone: Tone
     white: float
     source: PictureSource = field(repr=False)
+    box: tuple[int, int, int, int] | None = None
+
+    def part(self, box: tuple[int, int, int, int]) -> Video:
+        """Return the same video of which only a part (left, top, right, bottom) of each frame becomes light.
+
+        Raises:
+            ConfigError: The part is empty or not within the frame, or the video is read at another size.
+        """
+        left, top, right, bottom = box
+        if (self.width, self.height) != self.source.size:
+            raise ConfigError("a part is taken of a video at its own size; leave out the scale")
+        if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
+            raise ConfigError(f"the part {box} is not within a frame of {self.width} x {self.height} pixels")
+        return replace(self, width=right - left, height=bottom - top, box=box)
 
     def __iter__(self) -> Iterator[tuple[float, NDArray[np.float32]]]:
         first = before = -math.inf
@@ -78,6 +101,9 @@ class Video:
                 found = f"frame {number} is at {time_s:.6f} s, the one before it at {before:.6f} s"
                 raise DataError(f"{self.path}: {found}; give fps (--fps) in place of the file's times")
             before = time_s
+            if self.box is not None:
+                left, top, right, bottom = self.box
+                picture = picture[top:bottom, left:right]
             light = to_light(picture, self.tone, self.white)
             if picture.dtype.kind == "f" and not np.isfinite(light).all():
                 raise DataError(f"{self.path}: frame {number} holds NaN or infinity; leave it out or mend it")
@@ -176,6 +202,33 @@ def video_events(
         raise DataError(f"a video of {count} frame; events need at least two")
     assert held is not None
     yield held
+
+
+def film(
+    wall: Irradiance, camera: FrameCamera, times_s: Sequence[float], tone: Tone = "srgb", seed: int = 0
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield the frames of an ordinary video of a wall or a floor, uint8 [H, W], one at a time.
+
+    The camera's digital numbers are light; a video's are codes of a tone curve, rounded to 8 bits. Give a
+    camera of 12 bits with a curve: its rounding is then finer than that of the codes, as in cameras that are
+    bought.
+
+    Args:
+        wall: The light, 1.0 = white.
+        camera: Exposure, noise and rounding of the sensor.
+        times_s: Middles of the exposures, seconds.
+        tone: Curve of the codes; "as-is" = none.
+        seed: Seed of the noise.
+
+    Raises:
+        DataError: The light is NaN or negative.
+    """
+    span = camera.white - camera.black_level
+    for number, time_s in enumerate(times_s):
+        instants, weights = camera.instants(float(time_s))
+        light = np.tensordot(weights, wall.irradiance(instants).double().numpy(), 1)
+        counts = camera.expose(light[None], seed, number)[0].astype(np.float64)
+        yield from_light(255 * np.clip((counts - camera.black_level) / span, 0, 1), tone)
 
 
 def check_video(video: Video, pixel: PixelSettings) -> None:

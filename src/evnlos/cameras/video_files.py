@@ -2,12 +2,14 @@
 
 - Numbers of a picture as light: the tone curve undone, colours weighed.
 - The four kinds of moving pictures that are read: containers, animations, single pictures, arrays.
+- Light as numbers of a picture, and frames as a video file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -15,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from evnlos.errors import DataError, MissingDependencyError
+from evnlos.errors import ConfigError, DataError, MissingDependencyError
+from evnlos.files import new_file, new_folder
 from evnlos.untrusted import MOST_IMAGE_PIXELS, NUMPY_ERRORS, open_container, open_image, open_regular
 
 Picture = NDArray
@@ -66,6 +69,82 @@ def _decoded(codes: NDArray, tone: Tone) -> NDArray:
     return np.where(
         codes <= low, codes / slope, (np.maximum(codes, low) + offset) ** power / (1 + offset) ** power
     )
+
+
+def from_light(light: NDArray, tone: Tone) -> NDArray[np.uint8]:
+    """Return light in DN, 255 = white, as codes of a tone curve: the inverse of `to_light` up to rounding.
+
+    Args:
+        light: Any shape; what is outside 0..255 is clipped.
+        tone: The curve.
+
+    Example:
+        >>> from_light(np.array([0.0, 128.2, 300.0]), "srgb")
+        array([  0, 188, 255], dtype=uint8)
+    """
+    v = np.clip(light / 255.0, 0, 1)
+    if tone == "srgb":
+        v = np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055)
+    elif tone == "rec709":
+        v = np.where(v <= 0.018, 4.5 * v, 1.099 * v**0.45 - 0.099)
+    return np.rint(255 * v).astype(np.uint8)
+
+
+def write_video(
+    path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, quality: int | None = None
+) -> None:
+    """Write frames as a video, one at a time: a file of FFmpeg's (.mp4, .mkv), a .gif, or a folder of PNG.
+
+    Args:
+        path: The file, or the folder to make.
+        frames: Grey, uint8 [H, W], all of one size.
+        fps: Frames per second; a folder does not keep it, and a GIF keeps whole hundredths of a second.
+        quality: H.264's CRF, 1 (best) to 51, as cameras and phones compress; None = without loss.
+
+    Raises:
+        ConfigError: Another ending, or a quality out of its range.
+        DataError: No frames.
+        MissingDependencyError: A file of FFmpeg's without PyAV.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".mp4", ".mkv", ".gif", ""):
+        raise ConfigError(f"{path}: videos are written as .mp4, .mkv, .gif or a folder of PNG; end its name so")
+    if quality is not None and (not 1 <= quality <= 51 or suffix not in (".mp4", ".mkv")):
+        raise ConfigError(f"the quality is {quality}; give 1 to 51 for .mp4 or .mkv, none for other videos")
+    shots = iter(frames)
+    first = next(shots, None)
+    if first is None:
+        raise DataError(f"{path}: no frames to write; give at least one")
+    if suffix == "":
+        with new_folder(path) as folder:
+            for number, frame in enumerate(_again(first, shots)):
+                Image.fromarray(frame).save(folder / f"{number:06d}.png")
+        return
+    with new_file(path) as draft:
+        if suffix == ".gif":
+            rest = (Image.fromarray(frame) for frame in shots)
+            with draft.open("wb") as file:
+                shown = max(10 * round(100 / fps), 20)
+                Image.fromarray(first).save(
+                    file, "GIF", save_all=True, append_images=rest, duration=shown, loop=0
+                )
+            return
+        av = _pyav()
+        with av.open(str(draft), "w", format="mp4" if suffix == ".mp4" else "matroska") as container:
+            codec = "libx264rgb" if quality is None else "libx264"
+            stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(10_000))
+            stream.height, stream.width = first.shape
+            stream.pix_fmt = "rgb24" if quality is None else "yuv420p"
+            stream.options = {"qp": "0", "preset": "fast"} if quality is None else {"crf": str(quality)}
+            for frame in _again(first, shots):
+                colours = np.repeat(frame[:, :, None], 3, axis=2)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(colours, format="rgb24")))
+            container.mux(stream.encode())
+
+
+def _again(first: NDArray, rest: Iterator[NDArray]) -> Iterator[NDArray]:
+    yield first
+    yield from rest
 
 
 class PictureSource(Protocol):

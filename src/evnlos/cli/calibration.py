@@ -19,8 +19,8 @@ from evnlos.calibration.pixel_fit import PixelFitSettings
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
-from evnlos.cli.console import Flat, Folders, Presets
 from evnlos.cli.parsing import drawn, say
+from evnlos.cli.recordings import Flat, Folders, Presets
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
 from evnlos.machine import ProgressBars

@@ -21,8 +21,8 @@ import tyro
 from tqdm import tqdm
 
 from evnlos.cameras import load_pixel
-from evnlos.cli.console import Flat, Folders, Presets, result
 from evnlos.cli.parsing import say
+from evnlos.cli.recordings import Flat, Folders, Presets, result
 from evnlos.data import (
     Capture,
     Sampling,

@@ -20,16 +20,17 @@ from evnlos.cameras.event_model import Phase, PixelSettings
 from evnlos.cameras.pixel import EventPixel, Logarithm, Mode
 from evnlos.cameras.sensors import load_pixel
 from evnlos.cameras.video import Tone, Video, check_video, open_video, video_events
-from evnlos.cli.console import Flat, result
 from evnlos.cli.parsing import say
 from evnlos.cli.recordings import (
     EventFile,
+    Flat,
     ReadOptions,
     SelectionOptions,
     amount,
     counted,
     look_of,
     refuse_existing,
+    result,
     write_preview,
 )
 from evnlos.config import to_dict

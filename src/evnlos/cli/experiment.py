@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from evnlos.app.serve import Server, serve
-from evnlos.cli.console import Flat
 from evnlos.cli.parsing import drawn, say
+from evnlos.cli.recordings import Flat
 from evnlos.data import STANDARD_MODALITIES
 from evnlos.demo import Demo, run_demo
 from evnlos.errors import ConfigError

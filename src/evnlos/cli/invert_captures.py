@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from evnlos.analysis.bounds import canvas_decibel
 from evnlos.calibration.scan.importer import fill_bad
-from evnlos.cameras.light import WHITE_DN
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.cli.parsing import say
 from evnlos.data import Capture, load_pattern, pattern_of, read_capture
 from evnlos.data.frames import read_image

@@ -18,8 +18,8 @@ import torch
 import tyro
 
 from evnlos.analysis import BASELINES, CHECKS
-from evnlos.cli.console import Flat, Presets, result
 from evnlos.cli.parsing import say
+from evnlos.cli.recordings import Flat, Presets, result
 from evnlos.config import load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
 from evnlos.data.live import Place

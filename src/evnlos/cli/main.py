@@ -50,6 +50,7 @@ VERBS: dict[str, str] = {
     "live": "experiment.LiveCommand",
     "invert": "invert.InvertCommand",
     "track": "results.TrackCommand",
+    "corner": "corner.CornerCommand",
     "report": "results.ReportCommand",
     "events": "events.EventsCommand",
     "info": "recordings.InfoCommand",

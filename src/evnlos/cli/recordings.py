@@ -1,5 +1,6 @@
-"""Commands on event files: `convert`, `info`, `preview`, and what all that read such files share.
+"""Commands on event files: `convert`, `info`, `preview`, and what commands share.
 
+- What all commands share: flat settings, presets, results as JSON.
 - What the commands on event files share: how a file is read, what is taken of it, numbers in words.
 - `evnlos convert`: an event file in, an event file of another format out.
 - `evnlos info`: what an event file holds, and what is wrong with it.
@@ -9,15 +10,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from tqdm import tqdm
 
-from evnlos.cli.console import Flat, result
 from evnlos.cli.parsing import say
 from evnlos.errors import ConfigError, DataError, printable
 from evnlos.events import CelexOptions, EventWriter, ReadReport
@@ -26,8 +26,20 @@ from evnlos.events.recording import WINDOW_US, Box, CropOptions, Recording, Summ
 from evnlos.plot.preview import Background, PreviewOptions, Style, preview_pictures
 from evnlos.types import Events
 
+T = TypeVar("T")
+Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
+"""One or more folders, given without a flag."""
+Flat = Annotated[T, tyro.conf.arg(name="")]
+"""Settings whose flags carry no prefix."""
+Presets = Mapping[str, Callable[[], T]]
+"""Settings by the name that `--preset` gives."""
 EventFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
 """An event file, given without a flag."""
+
+
+def result(as_json: bool, values: Mapping[str, Any], text: str) -> None:
+    """Print a command's result on stdout: its values as one JSON object, or a line for people."""
+    print(json.dumps(values, default=str) if as_json else text)
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ import tyro
 
 from evnlos.analysis.bounds import SequenceAnalysisSettings
 from evnlos.analysis.linearized import AnalysisSettings
-from evnlos.cli.console import Flat, Folders, result
 from evnlos.cli.parsing import drawn, say
+from evnlos.cli.recordings import Flat, Folders, result
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.tracking import Tracking

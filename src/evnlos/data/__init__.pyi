@@ -7,11 +7,6 @@ from .capture import read_capture as read_capture
 from .capture_check import check_picture as check_picture
 from .capture_info import CaptureInfo as CaptureInfo
 from .capture_info import character_of as character_of
-from .cleaning import PATTERN_FILE as PATTERN_FILE
-from .cleaning import FixedPattern as FixedPattern
-from .cleaning import load_pattern as load_pattern
-from .cleaning import pattern_of as pattern_of
-from .cleaning import save_pattern as save_pattern
 from .live import LiveDataset as LiveDataset
 from .live import live_dataset as live_dataset
 from .loader import MODALITIES as MODALITIES
@@ -22,10 +17,15 @@ from .loader import Modality as Modality
 from .loader import NlosDataset as NlosDataset
 from .loader import as_modality as as_modality
 from .loader import modality_order as modality_order
+from .sampling import PATTERN_FILE as PATTERN_FILE
+from .sampling import FixedPattern as FixedPattern
 from .sampling import Samples as Samples
 from .sampling import Sampling as Sampling
+from .sampling import load_pattern as load_pattern
 from .sampling import make_samples as make_samples
+from .sampling import pattern_of as pattern_of
 from .sampling import reduce_by_area as reduce_by_area
+from .sampling import save_pattern as save_pattern
 from .simulate import SensorSize as SensorSize
 from .simulate import Simulation as Simulation
 from .simulate import simulate as simulate

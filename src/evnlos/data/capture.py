@@ -23,10 +23,17 @@ from evnlos.data.capture_info import (
     inside,
     read_capture_info,
 )
-from evnlos.data.cleaning import FixedPattern, correct_frames, frame_homography
 from evnlos.data.clocks import find_offset
 from evnlos.data.frames import FrameSeries, read_frame_series, read_image, warp_frames
-from evnlos.data.sampling import Samples, Sampling, make_samples, time_steps
+from evnlos.data.sampling import (
+    FixedPattern,
+    Samples,
+    Sampling,
+    correct_frames,
+    frame_homography,
+    make_samples,
+    time_steps,
+)
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, printable
 from evnlos.events import (

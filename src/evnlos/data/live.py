@@ -18,8 +18,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from evnlos.cameras.event_order import EventTensors
 from evnlos.cameras.on_device import capture_tensors
+from evnlos.cameras.streams import EventTensors
 from evnlos.config import config_hash, to_dict
 from evnlos.data.loader import Modality, as_modality
 from evnlos.data.pool import processes, run_in_order

@@ -1,5 +1,12 @@
 """Names of `evnlos.inverse`; `__init__.py` reads this list."""
 
+from .corner import CornerPicture as CornerPicture
+from .corner import FloorSector as FloorSector
+from .corner import Penumbra as Penumbra
+from .corner import Prior as Prior
+from .corner import estimate_corner as estimate_corner
+from .corner import noise_of as noise_of
+from .corner import read_penumbra as read_penumbra
 from .event_likelihood import LikelihoodSettings as LikelihoodSettings
 from .event_likelihood import SequenceEstimate as SequenceEstimate
 from .event_likelihood import estimate_sequence as estimate_sequence

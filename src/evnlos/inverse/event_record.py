@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.cameras import CrossingLaw
-from evnlos.cameras.light import WHITE_DN
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.inverse.sequence_light import Array, SequenceLight, group_blocks
 from evnlos.types import Events
 

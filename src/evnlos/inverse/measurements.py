@@ -16,8 +16,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from evnlos.cameras.pixel import EventPixel
-from evnlos.data.cleaning import FixedPattern
-from evnlos.data.sampling import reduce_by_area
+from evnlos.data.sampling import FixedPattern, reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import event_histogram
 from evnlos.inverse.operators import LinearOperator

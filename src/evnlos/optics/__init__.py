@@ -8,6 +8,17 @@ from evnlos.optics.angular_spectrum import (
     rayleigh_sommerfeld_sum,
     sampling_limit_m,
 )
+from evnlos.optics.corner import (
+    ONE_WALKER,
+    TWO_WALKERS,
+    CornerFloor,
+    CornerScene,
+    EdgeOperator,
+    Walker,
+    edge_irradiance,
+    floor_bearing,
+    strip_response,
+)
 from evnlos.optics.matrix_wall import MatrixWall, coarsest_keyframe_step_m
 from evnlos.optics.operator import LinearTransport, MatrixTransport, Patches, Transport, compose, dense_matrix
 from evnlos.optics.radiometric import LightTransport, light_transport_matrix
@@ -25,9 +36,14 @@ from evnlos.optics.wall import Irradiance, SlidingWall
 
 __all__ = [
     "GGX",
+    "ONE_WALKER",
+    "TWO_WALKERS",
     "Brdf",
+    "CornerFloor",
+    "CornerScene",
     "Diffraction",
     "DiffuseReflection",
+    "EdgeOperator",
     "Irradiance",
     "Lambert",
     "LightTransport",
@@ -40,16 +56,20 @@ __all__ = [
     "Transport",
     "View",
     "ViewOperator",
+    "Walker",
     "angular_spectrum",
     "blur_radius_px",
     "coarsest_keyframe_step_m",
     "compose",
     "dense_matrix",
+    "edge_irradiance",
+    "floor_bearing",
     "fresnel_number",
     "lamp_radiance",
     "light_transport_matrix",
     "rayleigh_sommerfeld_sum",
     "sampling_limit_m",
+    "strip_response",
     "tpsf_kernel",
     "tpsf_profile",
     "tpsf_truncation",

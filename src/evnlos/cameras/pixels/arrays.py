@@ -19,8 +19,6 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.cameras.event_model import MIN_THRESHOLD, EventModel
-from evnlos.cameras.event_order import Columns, expand, joined, sort_events, sort_times
-from evnlos.cameras.light import Light, check_threshold_maps
 from evnlos.cameras.pixel import EventPixel, V2ePixel
 from evnlos.cameras.pixels import continuous, v2e
 from evnlos.cameras.pixels.continuous import DIM_MAX
@@ -38,6 +36,7 @@ from evnlos.cameras.random_numbers import (
     normal_field,
     uniform_field,
 )
+from evnlos.cameras.streams import Columns, Light, check_threshold_maps, expand, joined, sort_events, sort_times
 from evnlos.errors import ConfigError
 from evnlos.machine import cores
 

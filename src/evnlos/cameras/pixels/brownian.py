@@ -37,8 +37,6 @@ from evnlos.cameras.event_model import (
     check_phase,
     require,
 )
-from evnlos.cameras.event_order import Columns, grown, joined, sort_times
-from evnlos.cameras.light import Light
 from evnlos.cameras.pixels.arrays import check_tiling, map_shares, pixel_thresholds
 from evnlos.cameras.random_numbers import (
     STREAM_BARRIER,
@@ -51,6 +49,7 @@ from evnlos.cameras.random_numbers import (
     random_normals,
     random_uniform,
 )
+from evnlos.cameras.streams import Columns, Light, grown, joined, sort_times
 from evnlos.errors import ConfigError
 
 _SAFE = 8.0

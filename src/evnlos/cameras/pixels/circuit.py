@@ -40,8 +40,6 @@ from evnlos.cameras.event_model import (
     check_phase,
     require,
 )
-from evnlos.cameras.event_order import Columns, grown, joined, sort_times
-from evnlos.cameras.light import Light
 from evnlos.cameras.pixels.arrays import check_tiling, map_shares, pixel_thresholds
 from evnlos.cameras.random_numbers import (
     STREAM_CIRCUIT,
@@ -52,6 +50,7 @@ from evnlos.cameras.random_numbers import (
     random_normals,
     uniform_field,
 )
+from evnlos.cameras.streams import Columns, Light, grown, joined, sort_times
 
 LEVEL = 0.02
 """Distance of two currents of the table, e-fold."""

@@ -15,7 +15,6 @@ import math
 import numpy as np
 from numba import njit
 
-from evnlos.cameras.event_order import grown
 from evnlos.cameras.pixels.continuous_math import (
     KNEE,
     LINEAR,
@@ -47,6 +46,7 @@ from evnlos.cameras.random_numbers import (
     random_normal,
     random_uniform,
 )
+from evnlos.cameras.streams import grown
 
 DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
 """The factor 1 - 0.75 (I + 20) / 275 of the shot noise at black, its largest value."""

@@ -31,8 +31,6 @@ from evnlos.cameras.event_model import (
     check_pattern_seed,
     require,
 )
-from evnlos.cameras.event_order import Columns, sort_times
-from evnlos.cameras.light import Light
 from evnlos.cameras.pixel import MAX_JITTER, EventPixel
 from evnlos.cameras.random_numbers import (
     STREAM_DEAD,
@@ -46,6 +44,7 @@ from evnlos.cameras.random_numbers import (
     random_uniform,
     uniform_field,
 )
+from evnlos.cameras.streams import Columns, Light, sort_times
 from evnlos.errors import ConfigError
 
 _WINDOW_US = 1000

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE
-from evnlos.cameras.light import WHITE_DN
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.errors import DataError
 
 _AHEAD = 32  # instants rendered at a time, at least

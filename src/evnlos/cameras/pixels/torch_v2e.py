@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.cameras.event_model import MIN_THRESHOLD
-from evnlos.cameras.event_order import EventTensors
 from evnlos.cameras.pixel import V2ePixel
 from evnlos.cameras.pixels.arrays import instants_within, pattern_key
 from evnlos.cameras.pixels.torch_light import Blocks, Filter, lin_log
 from evnlos.cameras.pixels.torch_noise import Leak, ShotNoise, fill
 from evnlos.cameras.random_numbers import BLOCK, STREAM_THRESHOLD_OFF, STREAM_THRESHOLD_ON
+from evnlos.cameras.streams import EventTensors
 
 
 class Sent(NamedTuple):

@@ -1,0 +1,374 @@
+"""People behind a corner: how many, and their bearings over time, with a stated rate of false alarms.
+
+A person is a strip behind the edge: on the floor a ramp over the bearing, and then a plateau
+(`strip_response`). At each step the data say how much likelier such a strip is at each bearing than none, its
+brightness integrated out under a normal prior of mean a and standard deviation a / 2:
+
+    ln L(phi) = ((K + 4 / a)^2 / (J + 4 / a^2) - 4 - ln(1 + J a^2 / 4)) / 2,
+
+with K the strip's matched filter of the data and J its information, the variance of K. A hidden Markov model
+joins the steps: absent, or at a bearing that wanders as people walk. Its evidence over that of an empty scene
+is the score of a track. Whether a score means anybody is decided by the same search on noise alone, as often as
+the rate of false alarms asks; then the track is taken off and the next one looked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from evnlos.config import check_made
+from evnlos.errors import ConfigError
+from evnlos.inverse import Penumbra, noise_of
+from evnlos.optics import strip_response
+from evnlos.types import derive_seed
+
+Array = NDArray[np.float64]
+_COARSE_DEG, _FINE_DEG = 2.0, 0.25
+_WIDTHS_DEG = (4.0, 12.0)
+_STRENGTHS = (1.0, 4.0, 16.0, -1.0, -4.0, -16.0)  # a over the noise of one step, at the best bearing
+_SPREAD = 0.5  # of a person's brightness from step to step, over its mean
+_LEAST_SHARE = 0.1  # of the first track's brightness: below it, what a strip does not explain looks like one
+_ENTER_S, _STAY_S = 20.0, 20.0  # mean times until somebody comes, and goes
+_NORMAL_90 = 1.645
+
+
+@dataclass(frozen=True)
+class BearingTracking:
+    """How people are searched for."""
+
+    most: int = 3
+    """Largest number of tracks."""
+    false_alarms: float = 0.01
+    """Probability that a video without a mover shows a track, 0.005 to 0.2."""
+    turn_deg_s: float = 15.0
+    """Standard deviation of a bearing's speed, degrees per second."""
+    seed: int = 0
+    """Seed of the noise on which the false alarms are counted."""
+
+    def __post_init__(self) -> None:
+        check_made(self)
+        if not 1 <= self.most <= 10:
+            raise ConfigError(f"most is {self.most}; give 1 to 10 tracks")
+        if not 0.005 <= self.false_alarms <= 0.2:
+            raise ConfigError(f"false_alarms is {self.false_alarms}; give 0.005 to 0.2")
+        if not 0.5 <= self.turn_deg_s <= 200:
+            raise ConfigError(f"turn_deg_s is {self.turn_deg_s}; give 0.5 to 200 degrees per second")
+
+
+@dataclass(frozen=True, eq=False)
+class BearingTrack:
+    """One person behind the corner.
+
+    Args:
+        bearing_deg: Mean bearing, [T], degrees from the wall's continuation; NaN where likelier absent.
+        deviation_deg: Its standard deviation, [T], degrees.
+        presence: Probability of being there, [T].
+        brightness: Change of the floor's light beyond the person, [T], relative.
+        width_deg: Width of the strip that fits best, degrees.
+        score: Natural logarithm of the evidence over that of nobody.
+        threshold: Largest score of noise alone at the rate of false alarms.
+        step_sigma: Brightness over its noise in a single step, median while present.
+    """
+
+    bearing_deg: Array
+    deviation_deg: Array
+    presence: Array
+    brightness: Array
+    width_deg: float
+    score: float
+    threshold: float
+    step_sigma: float
+
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """Steps in which somebody is rather there than not, [T]."""
+        return self.presence > 0.5
+
+    @property
+    def typical(self) -> float:
+        """Median size of the brightness while present; 0 where never."""
+        return float(np.median(np.abs(self.brightness[self.there]))) if self.there.any() else 0.0
+
+    def summary(self) -> dict[str, Any]:
+        """Return the track as plain values."""
+        return {
+            "bearing_deg": [None if math.isnan(v) else round(v, 3) for v in self.bearing_deg.tolist()],
+            "deviation_deg": [None if math.isnan(v) else round(v, 3) for v in self.deviation_deg.tolist()],
+            "presence": self.presence.round(4).tolist(),
+            "brightness": self.brightness.round(8).tolist(),
+            "width_deg": self.width_deg,
+            "score": round(self.score, 2),
+            "threshold": round(self.threshold, 2),
+            "step_sigma": round(self.step_sigma, 2),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class BearingTracks:
+    """Who was found behind a corner.
+
+    Args:
+        times_s: Middles of the steps, [T], seconds.
+        tracks: The tracks, the most certain one first.
+        false_alarms: Rate at which noise alone shows a track in a video like this.
+        next_score: Score of the strongest candidate that was turned down, over its threshold.
+        limit: Change of the floor's light by a walker that would have been found in nine of ten such videos,
+            relative; NaN where it was not asked for.
+    """
+
+    times_s: Array
+    tracks: tuple[BearingTrack, ...]
+    false_alarms: float
+    next_score: float
+    limit: float = math.nan
+
+
+@njit(cache=True)
+def _forward(likelihood: Array, move: Array, enter: float, leave: float, kept: Array) -> float:
+    """Return the log evidence of the hidden Markov model over that of nobody.
+
+    Args:
+        likelihood: Log likelihood over that of nobody, [T, N].
+        move: Probability of a move by -W..W cells in a step, [2 W + 1].
+        enter: Probability that somebody comes in a step.
+        leave: Probability of going in a step.
+        kept: Probabilities given the data so far, [T, N + 1], nobody last; overwritten unless empty.
+    """
+    count, cells = likelihood.shape
+    reach = len(move) // 2
+    absent, there, moved = 1.0, np.zeros(cells), np.empty(cells)
+    total = 0.0
+    for t in range(count):
+        highest, stayed, before = 0.0, 0.0, 0.0
+        for j in range(cells):
+            value = 0.0
+            for k in range(max(0, j - reach), min(cells, j + reach + 1)):
+                value += move[j - k + reach] * there[k]
+            moved[j] = value * (1.0 - leave)
+            stayed += moved[j]
+            before += there[j]
+            highest = max(highest, likelihood[t, j])
+        new = absent * enter / cells
+        absent = (absent * (1.0 - enter) + before - stayed) * math.exp(-highest)
+        scale = absent
+        for j in range(cells):
+            there[j] = (moved[j] + new) * math.exp(likelihood[t, j] - highest)
+            scale += there[j]
+        absent /= scale
+        for j in range(cells):
+            there[j] /= scale
+        if kept.size:
+            kept[t, :cells] = there
+            kept[t, cells] = absent
+        total += math.log(scale) + highest
+    return total
+
+
+@njit(cache=True)
+def _backward(likelihood: Array, move: Array, enter: float, leave: float, kept: Array) -> None:
+    """Turn probabilities given the data so far into those given all data, [T, N + 1], in place."""
+    count, cells = likelihood.shape
+    reach = len(move) // 2
+    later, weighed = np.ones(cells), np.empty(cells)
+    nobody_later = 1.0
+    for t in range(count - 2, -1, -1):
+        highest, sum_new = 0.0, 0.0
+        for j in range(cells):
+            highest = max(highest, likelihood[t + 1, j])
+        for j in range(cells):
+            weighed[j] = later[j] * math.exp(likelihood[t + 1, j] - highest)
+            sum_new += weighed[j]
+        off = nobody_later * math.exp(-highest)
+        nobody = (1.0 - enter) * off + enter / cells * sum_new
+        norm = nobody * kept[t, cells]
+        for k in range(cells):
+            value, inside = 0.0, 0.0
+            for j in range(max(0, k - reach), min(cells, k + reach + 1)):
+                value += move[j - k + reach] * weighed[j]
+                inside += move[j - k + reach]
+            later[k] = (1.0 - leave) * value + (1.0 - (1.0 - leave) * inside) * off
+            norm += later[k] * kept[t, k]
+        for k in range(cells):
+            later[k] /= norm
+            kept[t, k] *= later[k]
+        nobody_later = nobody / norm
+        kept[t, cells] *= nobody_later
+
+
+class _Search:
+    """The hidden Markov model on a grid of bearings, for data of unit noise."""
+
+    def __init__(
+        self, penumbra: Penumbra, settings: BearingTracking, cell_deg: float, widths: Sequence[float]
+    ) -> None:
+        edges = penumbra.edges_deg
+        self.whitener, _ = penumbra.whitened()
+        cells = max(8, round((edges[-1] - edges[0]) / cell_deg))
+        self.grid = np.linspace(edges[0], edges[-1], cells + 1)
+        step = penumbra.step_s
+        spread = max(settings.turn_deg_s * step / (self.grid[1] - self.grid[0]), 0.5)
+        reach = max(1, math.ceil(4 * spread))
+        move = np.exp(-0.5 * (np.arange(-reach, reach + 1) / spread) ** 2)
+        self.move = move / move.sum()
+        self.enter, self.leave = min(0.5, step / _ENTER_S), min(0.5, step / _STAY_S)
+        self.lost = penumbra.lost
+        self.widths = tuple(widths)
+        self.filters = [
+            self.whitener @ strip_response(edges, self.grid, w).T for w in self.widths
+        ]  # [B - 2, N]
+        self.information = [(f * f).sum(axis=0) for f in self.filters]
+
+    def likelihood(self, match: Array, width: int, strength: float) -> Array:
+        """Return the log likelihood over that of nobody, [T, N], of the matched filters of a width, [T, N]."""
+        information = self.information[width]
+        usual = strength / math.sqrt(information.max())  # a
+        pull = (_SPREAD * usual) ** -2
+        found = 0.5 * (
+            (match + usual * pull) ** 2 / (information + pull) - usual**2 * pull - np.log1p(information / pull)
+        )
+        found[self.lost] = 0.0
+        return found
+
+    def best(self, data: Array, strengths: Sequence[float] = _STRENGTHS) -> tuple[float, int, float]:
+        """Return the largest score, and the width and the strength that have it."""
+        none = np.empty((0, 0))
+        found = []
+        for w, filters in enumerate(self.filters):
+            match = data @ filters
+            for s in strengths:
+                likelihood = self.likelihood(match, w, s)
+                found.append((_forward(likelihood, self.move, self.enter, self.leave, none), w, s))
+        return max(found)
+
+    def marginals(self, data: Array, width: int, strength: float) -> Array:
+        """Return the probability of each bearing and, last, of nobody, [T, N + 1]."""
+        likelihood = self.likelihood(data @ self.filters[width], width, strength)
+        kept = np.empty((len(data), len(self.grid) + 1))
+        _forward(likelihood, self.move, self.enter, self.leave, kept)
+        _backward(likelihood, self.move, self.enter, self.leave, kept)
+        return kept
+
+
+def _noise(search: _Search, draw: np.random.Generator) -> Array:
+    data = draw.standard_normal((len(search.lost), len(search.whitener)))
+    data[search.lost] = 0.0
+    return data - data[~search.lost].mean(axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A track with what it adds to the floor, [T, B]."""
+
+    track: BearingTrack
+    floor: Array
+
+
+def track_bearings(penumbra: Penumbra, settings: BearingTracking | None = None) -> BearingTracks:
+    """Return who moves behind the corner: as many tracks as stand above the search's own false alarms.
+
+    Args:
+        penumbra: The floor's relative change.
+        settings: How people are searched for.
+    """
+    settings = settings or BearingTracking()
+    draw = np.random.default_rng(derive_seed(settings.seed, "false alarms"))
+    coarse = _Search(penumbra, settings, _COARSE_DEG, _WIDTHS_DEG)
+    draws = math.ceil(1 / settings.false_alarms) - 1
+    threshold = max(max(coarse.best(_noise(coarse, draw))[0] for _ in range(draws)), 0.0)
+    fits: list[_Fit] = []
+    rest, noise = penumbra, penumbra
+    while True:
+        search = _Search(noise, settings, _COARSE_DEG, _WIDTHS_DEG)
+        score, _, strength = search.best(rest.whitened()[1])
+        if score <= threshold or len(fits) == settings.most:
+            break
+        fits.append(_fit(rest, settings, strength, (score, threshold)))
+        for _ in range(3 if len(fits) > 1 else 2):
+            for k, one in enumerate(fits):
+                alone = _without(
+                    noise, penumbra, [other.floor for other in fits if other is not one], one.floor
+                )
+                fits[k] = _fit(alone, settings, strength, (one.track.score, threshold))
+        if fits[-1].track.typical <= _LEAST_SHARE * fits[0].track.typical:
+            fits.pop()  # no more than what a strip does not explain of the first
+            break
+        rest = _without(penumbra, penumbra, [one.floor for one in fits], None)
+        variance, _ = noise_of(rest.change, penumbra.variance / penumbra.noise_factor)
+        noise = replace(penumbra, variance=variance)
+        rest = replace(rest, variance=variance)
+    limit = _limit(coarse, threshold, draw) if not fits else math.nan
+    tracks = tuple(one.track for one in fits)
+    return BearingTracks(penumbra.times_s, tracks, settings.false_alarms, score - threshold, limit)
+
+
+def _without(noise: Penumbra, penumbra: Penumbra, others: Sequence[Array], own: Array | None) -> Penumbra:
+    """Return the change without other tracks, the steady part anew; `own` is what the track itself adds."""
+    change = penumbra.change - sum(others, np.zeros_like(penumbra.change))
+    change = change - np.nanmean(change if own is None else change - own, axis=0)
+    return replace(penumbra, change=change, variance=noise.variance)
+
+
+def _fit(penumbra: Penumbra, settings: BearingTracking, strength: float, scores: tuple[float, float]) -> _Fit:
+    """Return the track of the strip that explains most."""
+    whitener, data = penumbra.whitened()
+    coarse = _Search(penumbra, settings, _COARSE_DEG, (2.0, 4.0, 6.0, 9.0, 13.0, 20.0))
+    _, which, strength = coarse.best(data, (strength / 2, strength, 2 * strength, 4 * strength))
+    width = coarse.widths[which]
+    fine = _Search(penumbra, settings, _FINE_DEG, (width,))
+    probability = fine.marginals(data, 0, strength)
+    presence = 1 - probability[:, -1]
+    there = probability[:, :-1] / np.maximum(presence, 1e-12)[:, None]
+    bearing = there @ fine.grid
+    spread = np.maximum((there * (fine.grid - bearing[:, None]) ** 2).sum(axis=1), 0) + _FINE_DEG**2 / 12
+    ramp = strip_response(penumbra.edges_deg, bearing, width)  # [T, B]
+    filters = ramp @ whitener.T
+    information = (filters * filters).sum(axis=1)
+    mean = strength / math.sqrt(fine.information[0].max())
+    pull = (_SPREAD * mean) ** -2
+    brightness = ((filters * data).sum(axis=1) + mean * pull) / (information + pull) * presence
+    on = (presence > 0.5) & ~penumbra.lost
+    misfit = 1.0
+    if on.any():
+        left = data[on] - brightness[on, None] * filters[on]
+        misfit = max(1.0, float((left * left).mean()))
+    usual = np.abs(brightness) * np.sqrt(information)
+    shown = presence > 0.5
+    track = BearingTrack(
+        np.where(shown, bearing, np.nan),
+        np.where(shown, np.sqrt(misfit * spread), np.nan),
+        presence,
+        brightness,
+        width,
+        *scores,
+        float(np.median(usual[on])) if on.any() else 0.0,
+    )
+    return _Fit(track, brightness[:, None] * ramp)
+
+
+def _limit(search: _Search, threshold: float, draw: np.random.Generator) -> float:
+    """Return the brightness of a walker across the sector that nine of ten videos would show."""
+    steps = len(search.lost)
+    across = np.linspace(0.15, 0.85, steps) * (len(search.grid) - 1)
+    walk = search.filters[0].T[np.rint(across).astype(int)].copy()
+    walk[search.lost] = 0.0
+    walk -= walk[~search.lost].mean(axis=0)
+    noise = [_noise(search, draw) for _ in range(10)]
+    low, high = 0.05 / math.sqrt(search.information[0].max()), 50 / math.sqrt(search.information[0].max())
+    while high / low > 1.15:
+        middle = math.sqrt(low * high)
+        seen = sum(search.best(one + middle * walk)[0] > threshold for one in noise)
+        low, high = (low, middle) if seen >= 9 else (middle, high)
+    return math.sqrt(low * high)
+
+
+def interval_90(track: BearingTrack) -> tuple[Array, Array]:
+    """Return the ends of each step's 90 % interval of a bearing, [T] each, degrees."""
+    half = _NORMAL_90 * track.deviation_deg
+    return track.bearing_deg - half, track.bearing_deg + half
