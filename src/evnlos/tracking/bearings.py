@@ -36,6 +36,8 @@ _STRENGTHS = (1.0, 4.0, 16.0, -1.0, -4.0, -16.0)  # a over the noise of one step
 _SPREAD = 0.5  # of a person's brightness from step to step, over its mean
 _LEAST_SHARE = 0.1  # of the first track's brightness: below it, what a strip does not explain looks like one
 _ENTER_S, _STAY_S = 20.0, 20.0  # mean times until somebody comes, and goes
+_SHAPE = 0.04  # of a strip's width: how far off its middle what a plain strip leaves out may put a bearing
+_LEAST = 1e-200  # probability of nobody, which a bright person's likelihood would round to 0
 _NORMAL_90 = 1.645
 
 
@@ -68,7 +70,8 @@ class BearingTrack:
 
     Args:
         bearing_deg: Mean bearing, [T], degrees from the wall's continuation; NaN where likelier absent.
-        deviation_deg: Its standard deviation, [T], degrees.
+        deviation_deg: Its standard deviation, [T], degrees: noise, widened by what the strip does not explain, and
+            a twenty-fifth of the strip's width for its shape.
         presence: Probability of being there, [T].
         brightness: Change of the floor's light beyond the person, [T], relative.
         width_deg: Width of the strip that fits best, degrees.
@@ -161,7 +164,7 @@ def _forward(likelihood: Array, move: Array, enter: float, leave: float, kept: A
         for j in range(cells):
             there[j] = (moved[j] + new) * math.exp(likelihood[t, j] - highest)
             scale += there[j]
-        absent /= scale
+        absent = max(absent / scale, _LEAST)
         for j in range(cells):
             there[j] /= scale
         if kept.size:
@@ -342,7 +345,7 @@ def _fit(penumbra: Penumbra, settings: BearingTracking, strength: float, scores:
     shown = presence > 0.5
     track = BearingTrack(
         np.where(shown, bearing, np.nan),
-        np.where(shown, np.sqrt(misfit * spread), np.nan),
+        np.where(shown, np.sqrt(misfit * spread + (_SHAPE * width) ** 2), np.nan),
         presence,
         brightness,
         width,
