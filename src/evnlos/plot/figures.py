@@ -349,8 +349,6 @@ def draw_corner(
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    from evnlos.tracking import interval_90
-
     figure = new_figure((11.0, 6.4))
     left, right = figure.subfigures(1, 2, width_ratios=(1, 2.15))
     above, below = left.subplots(2, 1, height_ratios=(1, 0.8))
@@ -382,7 +380,7 @@ def draw_corner(
             label = "truth" if k == 0 else None
             axes[1].plot(picture.times_s, row, ":", color="#2b7bba", lw=1.8, label=label, zorder=4)
     for k, track in enumerate(found.tracks):
-        colour, (low, high) = _TRACKS[k % len(_TRACKS)], interval_90(track)
+        colour, (low, high) = _TRACKS[k % len(_TRACKS)], track.interval_90
         axes[1].fill_between(picture.times_s, low, high, color=colour, alpha=0.4, lw=0)
         style = ("-", "--", "-.")[k % 3]
         axes[1].plot(picture.times_s, track.bearing_deg, style, color=colour, lw=1.4, label=f"person {k + 1}")

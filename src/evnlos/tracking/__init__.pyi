@@ -3,7 +3,6 @@
 from .bearings import BearingTrack as BearingTrack
 from .bearings import BearingTracking as BearingTracking
 from .bearings import BearingTracks as BearingTracks
-from .bearings import interval_90 as interval_90
 from .bearings import track_bearings as track_bearings
 from .follow import Tracking as Tracking
 from .follow import static_light as static_light

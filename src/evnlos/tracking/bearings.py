@@ -35,9 +35,14 @@ _WIDTHS_DEG = (4.0, 12.0)
 _STRENGTHS = (1.0, 4.0, 16.0, -1.0, -4.0, -16.0)  # a over the noise of one step, at the best bearing
 _SPREAD = 0.5  # of a person's brightness from step to step, over its mean
 _LEAST_SHARE = 0.1  # of the first track's brightness: below it, what a strip does not explain looks like one
+_VARIANTS = ((0.0, 0.5), (0.0, 2.0), (-2.0, 1.0), (2.0, 1.0))  # shift in degrees, factor of the width
 _ENTER_S, _STAY_S = 20.0, 20.0  # mean times until somebody comes, and goes
+_CLEAREST = 25.0  # brightness over the noise in a step: a strip describes nobody better than to 4 %
 _SHAPE = 0.04  # of a strip's width: how far off its middle what a plain strip leaves out may put a bearing
-_LEAST = 1e-200  # probability of nobody, which a bright person's likelihood would round to 0
+_STEPS = ("bearing_deg", "deviation_deg", "presence", "brightness")
+_TOTALS = ("width_deg", "score", "threshold", "step_sigma")
+_LEAST = 1e-100  # probability of nobody, which a bright person's likelihood would round to 0
+_MOST = 200.0  # log likelihood that one step may add, for the same reason
 _NORMAL_90 = 1.645
 
 
@@ -56,12 +61,9 @@ class BearingTracking:
 
     def __post_init__(self) -> None:
         check_made(self)
-        if not 1 <= self.most <= 10:
-            raise ConfigError(f"most is {self.most}; give 1 to 10 tracks")
-        if not 0.005 <= self.false_alarms <= 0.2:
-            raise ConfigError(f"false_alarms is {self.false_alarms}; give 0.005 to 0.2")
-        if not 0.5 <= self.turn_deg_s <= 200:
-            raise ConfigError(f"turn_deg_s is {self.turn_deg_s}; give 0.5 to 200 degrees per second")
+        for name, low, high in (("most", 1, 10), ("false_alarms", 0.005, 0.2), ("turn_deg_s", 0.5, 200.0)):
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(f"{name} is {getattr(self, name)}; give {low:g} to {high:g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +72,8 @@ class BearingTrack:
 
     Args:
         bearing_deg: Mean bearing, [T], degrees from the wall's continuation; NaN where likelier absent.
-        deviation_deg: Its standard deviation, [T], degrees: noise, widened by what the strip does not explain, and
-            a twenty-fifth of the strip's width for its shape.
+        deviation_deg: Its standard deviation, [T], degrees: noise, widened by what the strip does not explain,
+            and a twenty-fifth of the strip's width for its shape.
         presence: Probability of being there, [T].
         brightness: Change of the floor's light beyond the person, [T], relative.
         width_deg: Width of the strip that fits best, degrees.
@@ -91,7 +93,7 @@ class BearingTrack:
 
     @property
     def there(self) -> NDArray[np.bool_]:
-        """Steps in which somebody is rather there than not, [T]."""
+        """Steps in which presence is likelier than absence, [T]."""
         return self.presence > 0.5
 
     @property
@@ -99,18 +101,17 @@ class BearingTrack:
         """Median size of the brightness while present; 0 where never."""
         return float(np.median(np.abs(self.brightness[self.there]))) if self.there.any() else 0.0
 
+    @property
+    def interval_90(self) -> tuple[Array, Array]:
+        """Ends of the 90 % interval of each bearing, [T] each, degrees."""
+        half = _NORMAL_90 * self.deviation_deg
+        return self.bearing_deg - half, self.bearing_deg + half
+
     def summary(self) -> dict[str, Any]:
-        """Return the track as plain values."""
-        return {
-            "bearing_deg": [None if math.isnan(v) else round(v, 3) for v in self.bearing_deg.tolist()],
-            "deviation_deg": [None if math.isnan(v) else round(v, 3) for v in self.deviation_deg.tolist()],
-            "presence": self.presence.round(4).tolist(),
-            "brightness": self.brightness.round(8).tolist(),
-            "width_deg": self.width_deg,
-            "score": round(self.score, 2),
-            "threshold": round(self.threshold, 2),
-            "step_sigma": round(self.step_sigma, 2),
-        }
+        """Return the track as plain values; None while absent."""
+        steps = {name: getattr(self, name).tolist() for name in _STEPS}
+        rows = {name: [None if math.isnan(v) else round(v, 8) for v in row] for name, row in steps.items()}
+        return rows | {name: round(getattr(self, name), 3) for name in _TOTALS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,8 +229,11 @@ class _Search:
         ]  # [B - 2, N]
         self.information = [(f * f).sum(axis=0) for f in self.filters]
 
-    def likelihood(self, match: Array, width: int, strength: float) -> Array:
-        """Return the log likelihood over that of nobody, [T, N], of the matched filters of a width, [T, N]."""
+    def likelihood(self, match: Array, width: int, strength: float) -> tuple[Array, float]:
+        """Return the log likelihood over that of nobody, [T, N], of the matched filters of a width, [T, N].
+
+        No step exceeds what the recursions can hold; what was taken off is returned, its sum over the steps.
+        """
         information = self.information[width]
         usual = strength / math.sqrt(information.max())  # a
         pull = (_SPREAD * usual) ** -2
@@ -237,7 +241,9 @@ class _Search:
             (match + usual * pull) ** 2 / (information + pull) - usual**2 * pull - np.log1p(information / pull)
         )
         found[self.lost] = 0.0
-        return found
+        highest = np.maximum(found.max(axis=1, keepdims=True), 0.0)
+        excess = np.maximum(highest - _MOST, 0.0)
+        return np.maximum(found, highest - _MOST) - excess, float(excess.sum())
 
     def best(self, data: Array, strengths: Sequence[float] = _STRENGTHS) -> tuple[float, int, float]:
         """Return the largest score, and the width and the strength that have it."""
@@ -246,13 +252,14 @@ class _Search:
         for w, filters in enumerate(self.filters):
             match = data @ filters
             for s in strengths:
-                likelihood = self.likelihood(match, w, s)
-                found.append((_forward(likelihood, self.move, self.enter, self.leave, none), w, s))
+                likelihood, excess = self.likelihood(match, w, s)
+                score = _forward(likelihood, self.move, self.enter, self.leave, none)
+                found.append((score + excess, w, s))
         return max(found)
 
     def marginals(self, data: Array, width: int, strength: float) -> Array:
         """Return the probability of each bearing and, last, of nobody, [T, N + 1]."""
-        likelihood = self.likelihood(data @ self.filters[width], width, strength)
+        likelihood, _ = self.likelihood(data @ self.filters[width], width, strength)
         kept = np.empty((len(data), len(self.grid) + 1))
         _forward(likelihood, self.move, self.enter, self.leave, kept)
         _backward(likelihood, self.move, self.enter, self.leave, kept)
@@ -267,10 +274,11 @@ def _noise(search: _Search, draw: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A track with what it adds to the floor, [T, B]."""
+    """A track with what it adds to the floor, [T, B], as a plain strip and with what else looks like it."""
 
     track: BearingTrack
     floor: Array
+    around: Array
 
 
 def track_bearings(penumbra: Penumbra, settings: BearingTracking | None = None) -> BearingTracks:
@@ -286,29 +294,44 @@ def track_bearings(penumbra: Penumbra, settings: BearingTracking | None = None) 
     draws = math.ceil(1 / settings.false_alarms) - 1
     threshold = max(max(coarse.best(_noise(coarse, draw))[0] for _ in range(draws)), 0.0)
     fits: list[_Fit] = []
-    rest, noise = penumbra, penumbra
+    rest, noise, inflation = penumbra, penumbra, 1.0
     while True:
         search = _Search(noise, settings, _COARSE_DEG, _WIDTHS_DEG)
         score, _, strength = search.best(rest.whitened()[1])
         if score <= threshold or len(fits) == settings.most:
             break
         fits.append(_fit(rest, settings, strength, (score, threshold)))
+        if len(fits) == 1 and (ratio := fits[0].track.step_sigma / _CLEAREST) > 1:
+            inflation = ratio**2
+            noise = replace(noise, variance=inflation * noise.variance)
         for _ in range(3 if len(fits) > 1 else 2):
             for k, one in enumerate(fits):
                 alone = _without(
                     noise, penumbra, [other.floor for other in fits if other is not one], one.floor
                 )
                 fits[k] = _fit(alone, settings, strength, (one.track.score, threshold))
-        if fits[-1].track.typical <= _LEAST_SHARE * fits[0].track.typical:
-            fits.pop()  # no more than what a strip does not explain of the first
+        new = fits[-1].track
+        if new.typical <= _LEAST_SHARE * fits[0].track.typical or any(
+            _same(new, one.track) for one in fits[:-1]
+        ):
+            fits.pop()  # no more than what a strip does not explain of another one
             break
-        rest = _without(penumbra, penumbra, [one.floor for one in fits], None)
+        rest = _without(penumbra, penumbra, [one.around for one in fits], None)
         variance, _ = noise_of(rest.change, penumbra.variance / penumbra.noise_factor)
-        noise = replace(penumbra, variance=variance)
-        rest = replace(rest, variance=variance)
+        noise = replace(penumbra, variance=inflation * variance)
+        rest = replace(rest, variance=noise.variance)
     limit = _limit(coarse, threshold, draw) if not fits else math.nan
     tracks = tuple(one.track for one in fits)
     return BearingTracks(penumbra.times_s, tracks, settings.false_alarms, score - threshold, limit)
+
+
+def _same(one: BearingTrack, other: BearingTrack) -> bool:
+    """Return whether two tracks run beside each other, nearer than their strips are wide."""
+    both = one.there & other.there
+    if both.sum() < 0.5 * one.there.sum():
+        return False
+    apart = np.median(np.abs(one.bearing_deg - other.bearing_deg)[both])
+    return bool(apart < 0.5 * (one.width_deg + other.width_deg))
 
 
 def _without(noise: Penumbra, penumbra: Penumbra, others: Sequence[Array], own: Array | None) -> Penumbra:
@@ -352,7 +375,25 @@ def _fit(penumbra: Penumbra, settings: BearingTracking, strength: float, scores:
         *scores,
         float(np.median(usual[on])) if on.any() else 0.0,
     )
-    return _Fit(track, brightness[:, None] * ramp)
+    return _Fit(track, brightness[:, None] * ramp, _around(penumbra, track, bearing, ramp))
+
+
+def _around(penumbra: Penumbra, track: BearingTrack, bearing: Array, ramp: Array) -> Array:
+    """Return all of the change, [T, B], that looks like a track: strips nearby, a plateau that slopes.
+
+    Light that falls off over the floor and a person who is no plain strip are nobody else.
+    """
+    edges, width = penumbra.edges_deg, track.width_deg
+    whitener, data = penumbra.whitened()
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    beyond = np.clip(middle - bearing[:, None], 0, None) / float(np.ptp(edges))
+    shapes = [strip_response(edges, bearing + shift, factor * width) for shift, factor in _VARIANTS]
+    basis = np.stack([ramp, *(shape - ramp for shape in shapes), beyond, beyond**2], axis=2)  # [T, B, K]
+    seen = np.einsum("cb,tbk->tck", whitener, basis)
+    gram = np.einsum("tck,tcl->tkl", seen, seen)
+    gram += 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(basis.shape[2])
+    weight = np.linalg.solve(gram, np.einsum("tck,tc->tk", seen, data)[..., None])
+    return np.where(track.there[:, None], (basis @ weight)[..., 0], 0.0)
 
 
 def _limit(search: _Search, threshold: float, draw: np.random.Generator) -> float:
@@ -369,9 +410,3 @@ def _limit(search: _Search, threshold: float, draw: np.random.Generator) -> floa
         seen = sum(search.best(one + middle * walk)[0] > threshold for one in noise)
         low, high = (low, middle) if seen >= 9 else (middle, high)
     return math.sqrt(low * high)
-
-
-def interval_90(track: BearingTrack) -> tuple[Array, Array]:
-    """Return the ends of each step's 90 % interval of a bearing, [T] each, degrees."""
-    half = _NORMAL_90 * track.deviation_deg
-    return track.bearing_deg - half, track.bearing_deg + half
