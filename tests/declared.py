@@ -68,6 +68,8 @@ convert events.h5 events.mcap
 convert events.h5 events.aedat4
 info events.mcap
 preview events.h5 --out events.gif
+corner door.gif --simulate --scene.size 128 96 --scene.fps 10 --scene.seconds 8 --scene.contrast 0.05
+corner door.gif --edge 44.3 44.9 --wall 12.9 86 --end 75.1 21.3
 """
 """A line a job, in the order in which they need each other."""
 

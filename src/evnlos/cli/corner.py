@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +19,7 @@ from evnlos.cli.recordings import Flat, refuse_existing, result
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.inverse import CornerPicture, FloorSector, Penumbra
-from evnlos.tracking import BearingTracking, BearingTracks
+from evnlos.tracking import UNSURE_NOISE, BearingTracking, BearingTracks
 
 _DISTURBED, _SHAKE_PX, _NOISE, _GAIN = 0.02, 0.3, 3.0, 0.01  # beyond these a warning is due
 
@@ -145,7 +145,7 @@ class CornerCommand:
         steps = f"{len(penumbra.times_s)} steps of {penumbra.step_s:.3g} s"
         say(f"note: {penumbra.frames} frames read; people are searched for in {steps}")
         tracks = track_bearings(penumbra, self.tracking)
-        picture = estimate_corner(penumbra)
+        picture = estimate_corner(replace(penumbra, variance=tracks.variance))
         words = in_words(tracks, picture, penumbra, sector)
         errors: list[dict[str, float]] = []
         found = _values(self, penumbra, picture, tracks) | {"in_words": words}
@@ -153,7 +153,7 @@ class CornerCommand:
         if truth is not None:
             true = np.array([np.interp(penumbra.times_s, truth[0], row) for row in truth[1]])
             errors = found["errors_deg"] = _errors(tracks, true)
-        found["warnings"] = warnings_of(penumbra, sector)
+        found["warnings"] = warnings_of(penumbra, tracks)
         self.out.mkdir(parents=True, exist_ok=True)
         shown = self.out / "result.png"
         found["picture"] = drawn(
@@ -285,12 +285,14 @@ def in_words(
             f"{100 * tracks.limit:.2g} % would have been seen in nine of ten such videos; who stands still is "
             "not seen."
         ]
+    if tracks.noise_factor > UNSURE_NOISE:
+        first = f"Doubtful, as the video's noise is that of compression or unsteady light: {first}"
     if sector.to_ground is None:
         rest.append("Bearings are those of the picture, not of the floor: --floor makes them true.")
     return [first, *rest]
 
 
-def warnings_of(penumbra: Penumbra, sector: FloorSector) -> list[str]:
+def warnings_of(penumbra: Penumbra, tracks: BearingTracks) -> list[str]:
     """Return what may spoil the result, each with its cure."""
     found = []
     if penumbra.disturbed > _DISTURBED:
@@ -303,9 +305,9 @@ def warnings_of(penumbra: Penumbra, sector: FloorSector) -> list[str]:
         found.append(
             f"the picture shakes by {shake:.2f} px rms; it is corrected roughly: put the camera on a tripod"
         )
-    if penumbra.noise_factor > _NOISE:
+    if tracks.noise_factor > _NOISE:
         found.append(
-            f"the noise has {penumbra.noise_factor:.1f} times the variance of independent pixels (compression, "
+            f"the noise has {tracks.noise_factor:.1f} times the variance of independent pixels (compression, "
             "lamps that flicker, shake); record with a higher bit rate"
         )
     if (gain := float(np.nanstd(penumbra.gain))) > _GAIN:
@@ -323,7 +325,8 @@ def _values(
         "step_s": penumbra.step_s,
         "bearings_deg": [float(penumbra.edges_deg[0]), float(penumbra.edges_deg[-1])],
         "floor_level": round(penumbra.level, 4),
-        "noise_factor": round(penumbra.noise_factor, 3),
+        "noise_factor": round(tracks.noise_factor, 3),
+        "doubtful": tracks.noise_factor > UNSURE_NOISE,
         "gain_deviation": float(np.nanstd(penumbra.gain)),
         "disturbed": penumbra.disturbed,
         "prior": picture.prior._asdict(),

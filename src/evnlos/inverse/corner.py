@@ -23,7 +23,6 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -55,7 +54,7 @@ class FloorSector:
             as they are in the picture, which is right at the wall's line alone.
 
     Raises:
-        ConfigError: Points that coincide or lie on one line.
+        ConfigError: Points that coincide or are not finite.
     """
 
     edge: Point
@@ -70,12 +69,6 @@ class FloorSector:
         for name in ("wall", "end"):
             if math.dist(getattr(self, name), self.edge) < 8:
                 raise ConfigError(f"{name} is {getattr(self, name)}, beside the edge; give one 8 px off")
-        turn = float(self._turned(points[2:])[0])
-        if not math.radians(10) < turn < math.radians(179.9):
-            raise ConfigError(
-                f"the sector from the wall to the end is {math.degrees(turn):.3g} degrees wide; give "
-                "an end that makes it 10 to 179 degrees"
-            )
 
     @property
     def reach_px(self) -> float:
@@ -112,13 +105,20 @@ class FloorSector:
             Box; flat indices within the box [P]; bearings [P], degrees.
 
         Raises:
-            ConfigError: The edge lies outside the picture, or too little of the sector inside.
+            ConfigError: The edge lies outside the picture, too little of the sector inside, or it is too narrow
+            or
+                too wide.
         """
         height, width = shape
         if not (0 <= self.edge[0] < width and 0 <= self.edge[1] < height):
             raise ConfigError(
                 f"the edge {self.edge} lies outside the picture of {width} x {height} pixels; give "
                 "the column and the row of its foot"
+            )
+        if not 10 < self.span_deg < 179.9:
+            raise ConfigError(
+                f"the sector from the wall to the end is {self.span_deg:.3g} degrees wide; give an end that "
+                "makes it 10 to 179 degrees"
             )
         (x, y), reach = self.edge, self.reach_px
         left, right = max(0, math.floor(x - reach)), min(width, math.ceil(x + reach) + 1)
@@ -370,10 +370,10 @@ def _reducer(stack: NDArray, slopes: Array, bearing: Array, bin_deg: float, whit
 def noise_of(change: Array, predicted: Array) -> tuple[Array, float]:
     """Return the variance of the noise of each bin, [B], and its factor over the predicted one.
 
-    Between neighbouring bins a hidden scene changes little, between steps of time it moves on evenly: second
-    differences of either are noise, but for few of them; a median leaves these out. The largest variance
-    counts, so that noise which is alike in neighbouring pixels or in successive frames (codecs, lamps) is not
-    missed.
+    Between neighbours of three, a hidden scene changes evenly but for few of them: second differences over the
+    bearing are noise, and a median leaves the few out. They are taken of bins, of sums of 3 and of 10 bins, in
+    steps and in means of 4, 16 and 64 steps; noise of independent pixels gives each the same factor. The
+    largest counts, so that noise with a width or a memory (codecs, lamps) is not missed.
 
     Args:
         change: Relative changes, [T, B]; NaN = lost.
@@ -383,19 +383,20 @@ def noise_of(change: Array, predicted: Array) -> tuple[Array, float]:
     middle = np.arange(y.shape[1]) - (y.shape[1] - 1) / 2
     basis, _ = np.linalg.qr(np.stack([np.ones_like(middle), middle], axis=1) / np.sqrt(predicted)[:, None])
     y = y - (y @ basis) @ basis.T  # the gain, and light that slopes
-    across = y[:, 1:-1] - 0.5 * (y[:, 2:] + y[:, :-2])
-    fine = float(np.median(across**2)) / 1.5 / _NORMAL_MEDIAN
-    slow = [fine]
-    for span in (4, 16):  # averaged over steps: noise with a memory falls less than it should
-        whole = len(across) // span
-        if whole * across.shape[1] >= 200:
-            means = across[: whole * span].reshape(whole, span, -1).mean(axis=1)
-            slow.append(span * float(np.median((means - means.mean(axis=0)) ** 2)) / 1.5 / _NORMAL_MEDIAN)
-    bend = (y[2:] - 2 * y[1:-1] + y[:-2]) / math.sqrt(6)
-    ends = np.linspace(0, y.shape[1], min(9, y.shape[1] // 3 + 1)).astype(int)
-    blocks = np.stack([bend[:, a:b].sum(axis=1) / math.sqrt(b - a) for a, b in pairwise(ends)], axis=1)
-    wide = float(np.median(blocks**2)) / _NORMAL_MEDIAN / (1 - 2 / blocks.shape[1])
-    factor = max(*slow, min(wide, 4 * max(slow)), 1e-12)
+    factors = [1e-12]
+    for cells in (1, 3, 10):
+        count = y.shape[1] // cells
+        if cells > 1 and count < 12:
+            continue
+        blocks = y[:, : count * cells].reshape(len(y), count, cells).sum(axis=2) / math.sqrt(cells)
+        across = blocks[:, 1:-1] - 0.5 * (blocks[:, 2:] + blocks[:, :-2])
+        for span in (1, 4, 16, 64):
+            whole = len(y) // span
+            if whole >= 6 and whole * across.shape[1] >= 150:
+                means = across[: whole * span].reshape(whole, span, -1).mean(axis=1)
+                spread = float(np.median((means - means.mean(axis=0)) ** 2)) * whole / (whole - 1)
+                factors.append(span * spread / 1.5 / _NORMAL_MEDIAN)
+    factor = max(factors)
     return factor * predicted, factor
 
 

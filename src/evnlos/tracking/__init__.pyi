@@ -1,5 +1,6 @@
 """Names of `evnlos.tracking`; `__init__.py` reads this list."""
 
+from .bearings import UNSURE_NOISE as UNSURE_NOISE
 from .bearings import BearingTrack as BearingTrack
 from .bearings import BearingTracking as BearingTracking
 from .bearings import BearingTracks as BearingTracks

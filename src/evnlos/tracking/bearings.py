@@ -30,6 +30,7 @@ from evnlos.optics import strip_response
 from evnlos.types import derive_seed
 
 Array = NDArray[np.float64]
+UNSURE_NOISE = 10.0  # over that of independent pixels: from there on a result is doubtful
 _COARSE_DEG, _FINE_DEG = 2.0, 0.25
 _WIDTHS_DEG = (4.0, 12.0)
 _STRENGTHS = (1.0, 4.0, 16.0, -1.0, -4.0, -16.0)  # a over the noise of one step, at the best bearing
@@ -109,8 +110,8 @@ class BearingTrack:
 
     def summary(self) -> dict[str, Any]:
         """Return the track as plain values; None while absent."""
-        steps = {name: getattr(self, name).tolist() for name in _STEPS}
-        rows = {name: [None if math.isnan(v) else round(v, 8) for v in row] for name, row in steps.items()}
+        steps = ((name, getattr(self, name).tolist()) for name in _STEPS)
+        rows = {name: [None if math.isnan(v) else round(v, 8) for v in row] for name, row in steps}
         return rows | {name: round(getattr(self, name), 3) for name in _TOTALS}
 
 
@@ -123,15 +124,18 @@ class BearingTracks:
         tracks: The tracks, the most certain one first.
         false_alarms: Rate at which noise alone shows a track in a video like this.
         next_score: Score of the strongest candidate that was turned down, over its threshold.
-        limit: Change of the floor's light by a walker that would have been found in nine of ten such videos,
-            relative; NaN where it was not asked for.
+        limit: Brightness of a walker that nine of ten such videos would show, relative; NaN with tracks.
+        variance: Variance of the noise of a bin in one step without the tracks, [B].
+        noise_factor: That over independent pixels'; beyond `UNSURE_NOISE` the rate of false alarms is not kept.
     """
 
     times_s: Array
     tracks: tuple[BearingTrack, ...]
     false_alarms: float
     next_score: float
-    limit: float = math.nan
+    limit: float
+    variance: Array
+    noise_factor: float
 
 
 @njit(cache=True)
@@ -224,9 +228,7 @@ class _Search:
         self.enter, self.leave = min(0.5, step / _ENTER_S), min(0.5, step / _STAY_S)
         self.lost = penumbra.lost
         self.widths = tuple(widths)
-        self.filters = [
-            self.whitener @ strip_response(edges, self.grid, w).T for w in self.widths
-        ]  # [B - 2, N]
+        self.filters = [self.whitener @ strip_response(edges, self.grid, w).T for w in widths]  # [B - 2, N]
         self.information = [(f * f).sum(axis=0) for f in self.filters]
 
     def likelihood(self, match: Array, width: int, strength: float) -> tuple[Array, float]:
@@ -247,8 +249,7 @@ class _Search:
 
     def best(self, data: Array, strengths: Sequence[float] = _STRENGTHS) -> tuple[float, int, float]:
         """Return the largest score, and the width and the strength that have it."""
-        none = np.empty((0, 0))
-        found = []
+        none, found = np.empty((0, 0)), []
         for w, filters in enumerate(self.filters):
             match = data @ filters
             for s in strengths:
@@ -268,7 +269,6 @@ class _Search:
 
 def _noise(search: _Search, draw: np.random.Generator) -> Array:
     data = draw.standard_normal((len(search.lost), len(search.whitener)))
-    data[search.lost] = 0.0
     return data - data[~search.lost].mean(axis=0)
 
 
@@ -291,10 +291,10 @@ def track_bearings(penumbra: Penumbra, settings: BearingTracking | None = None) 
     settings = settings or BearingTracking()
     draw = np.random.default_rng(derive_seed(settings.seed, "false alarms"))
     coarse = _Search(penumbra, settings, _COARSE_DEG, _WIDTHS_DEG)
-    draws = math.ceil(1 / settings.false_alarms) - 1
-    threshold = max(max(coarse.best(_noise(coarse, draw))[0] for _ in range(draws)), 0.0)
+    alone = (coarse.best(_noise(coarse, draw))[0] for _ in range(math.ceil(1 / settings.false_alarms) - 1))
+    threshold = max(0.0, *alone)
     fits: list[_Fit] = []
-    rest, noise, inflation = penumbra, penumbra, 1.0
+    rest, noise, inflation, factor = penumbra, penumbra, 1.0, penumbra.noise_factor
     while True:
         search = _Search(noise, settings, _COARSE_DEG, _WIDTHS_DEG)
         score, _, strength = search.best(rest.whitened()[1])
@@ -305,33 +305,34 @@ def track_bearings(penumbra: Penumbra, settings: BearingTracking | None = None) 
             inflation = ratio**2
             noise = replace(noise, variance=inflation * noise.variance)
         for _ in range(3 if len(fits) > 1 else 2):
-            for k, one in enumerate(fits):
-                alone = _without(
-                    noise, penumbra, [other.floor for other in fits if other is not one], one.floor
-                )
-                fits[k] = _fit(alone, settings, strength, (one.track.score, threshold))
-        new = fits[-1].track
-        if new.typical <= _LEAST_SHARE * fits[0].track.typical or any(
-            _same(new, one.track) for one in fits[:-1]
-        ):
+            _fit_again(fits, noise, penumbra, settings)
+        new, first = fits[-1].track, fits[0].track
+        if new.typical <= _LEAST_SHARE * first.typical or any(_same(new, one.track) for one in fits[:-1]):
             fits.pop()  # no more than what a strip does not explain of another one
             break
         rest = _without(penumbra, penumbra, [one.around for one in fits], None)
-        variance, _ = noise_of(rest.change, penumbra.variance / penumbra.noise_factor)
+        variance, factor = noise_of(rest.change, penumbra.variance / penumbra.noise_factor)
         noise = replace(penumbra, variance=inflation * variance)
         rest = replace(rest, variance=noise.variance)
+    _fit_again(fits, noise, penumbra, settings)  # with the noise that is left
     limit = _limit(coarse, threshold, draw) if not fits else math.nan
-    tracks = tuple(one.track for one in fits)
-    return BearingTracks(penumbra.times_s, tracks, settings.false_alarms, score - threshold, limit)
+    tracks, rate = tuple(one.track for one in fits), settings.false_alarms
+    return BearingTracks(penumbra.times_s, tracks, rate, score - threshold, limit, noise.variance, factor)
+
+
+def _fit_again(fits: list[_Fit], noise: Penumbra, penumbra: Penumbra, settings: BearingTracking) -> None:
+    """Fit each track to what the others leave, in place."""
+    for k, one in enumerate(fits):
+        alone = _without(noise, penumbra, [other.floor for other in fits if other is not one], one.floor)
+        sign = math.copysign(4.0, one.track.brightness.sum())
+        fits[k] = _fit(alone, settings, sign, (one.track.score, one.track.threshold))
 
 
 def _same(one: BearingTrack, other: BearingTrack) -> bool:
     """Return whether two tracks run beside each other, nearer than their strips are wide."""
     both = one.there & other.there
-    if both.sum() < 0.5 * one.there.sum():
-        return False
-    apart = np.median(np.abs(one.bearing_deg - other.bearing_deg)[both])
-    return bool(apart < 0.5 * (one.width_deg + other.width_deg))
+    near = np.abs(one.bearing_deg - other.bearing_deg)[both] < 0.5 * (one.width_deg + other.width_deg)
+    return int(near.sum()) > 0.25 * one.there.sum() and int(near.sum()) > 0.5 * both.sum()
 
 
 def _without(noise: Penumbra, penumbra: Penumbra, others: Sequence[Array], own: Array | None) -> Penumbra:
@@ -345,7 +346,7 @@ def _fit(penumbra: Penumbra, settings: BearingTracking, strength: float, scores:
     """Return the track of the strip that explains most."""
     whitener, data = penumbra.whitened()
     coarse = _Search(penumbra, settings, _COARSE_DEG, (2.0, 4.0, 6.0, 9.0, 13.0, 20.0))
-    _, which, strength = coarse.best(data, (strength / 2, strength, 2 * strength, 4 * strength))
+    _, which, strength = coarse.best(data, [strength * 2.0**k for k in range(-2, 4)])
     width = coarse.widths[which]
     fine = _Search(penumbra, settings, _FINE_DEG, (width,))
     probability = fine.marginals(data, 0, strength)
@@ -360,33 +361,21 @@ def _fit(penumbra: Penumbra, settings: BearingTracking, strength: float, scores:
     pull = (_SPREAD * mean) ** -2
     brightness = ((filters * data).sum(axis=1) + mean * pull) / (information + pull) * presence
     on = (presence > 0.5) & ~penumbra.lost
-    misfit = 1.0
-    if on.any():
-        left = data[on] - brightness[on, None] * filters[on]
-        misfit = max(1.0, float((left * left).mean()))
-    usual = np.abs(brightness) * np.sqrt(information)
+    left = data[on] - brightness[on, None] * filters[on]
+    misfit = max(1.0, float((left * left).mean())) if on.any() else 1.0
     shown = presence > 0.5
-    track = BearingTrack(
-        np.where(shown, bearing, np.nan),
-        np.where(shown, np.sqrt(misfit * spread + (_SHAPE * width) ** 2), np.nan),
-        presence,
-        brightness,
-        width,
-        *scores,
-        float(np.median(usual[on])) if on.any() else 0.0,
-    )
+    spread = np.sqrt(misfit * spread + (_SHAPE * width) ** 2)
+    bearings, deviations = (np.where(shown, v, np.nan) for v in (bearing, spread))
+    sigma = float(np.median(np.abs(brightness[on]) * np.sqrt(information[on]))) if on.any() else 0.0
+    track = BearingTrack(bearings, deviations, presence, brightness, width, *scores, sigma)
     return _Fit(track, brightness[:, None] * ramp, _around(penumbra, track, bearing, ramp))
 
 
 def _around(penumbra: Penumbra, track: BearingTrack, bearing: Array, ramp: Array) -> Array:
-    """Return all of the change, [T, B], that looks like a track: strips nearby, a plateau that slopes.
-
-    Light that falls off over the floor and a person who is no plain strip are nobody else.
-    """
+    """Return all of the change, [T, B], that looks like a track: strips nearby, a plateau that slopes."""
     edges, width = penumbra.edges_deg, track.width_deg
     whitener, data = penumbra.whitened()
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    beyond = np.clip(middle - bearing[:, None], 0, None) / float(np.ptp(edges))
+    beyond = np.clip(0.5 * (edges[1:] + edges[:-1]) - bearing[:, None], 0, None) / float(np.ptp(edges))
     shapes = [strip_response(edges, bearing + shift, factor * width) for shift, factor in _VARIANTS]
     basis = np.stack([ramp, *(shape - ramp for shape in shapes), beyond, beyond**2], axis=2)  # [T, B, K]
     seen = np.einsum("cb,tbk->tck", whitener, basis)
@@ -401,8 +390,7 @@ def _limit(search: _Search, threshold: float, draw: np.random.Generator) -> floa
     steps = len(search.lost)
     across = np.linspace(0.15, 0.85, steps) * (len(search.grid) - 1)
     walk = search.filters[0].T[np.rint(across).astype(int)].copy()
-    walk[search.lost] = 0.0
-    walk -= walk[~search.lost].mean(axis=0)
+    walk -= walk[~search.lost].mean(axis=0)  # lost steps count nothing
     noise = [_noise(search, draw) for _ in range(10)]
     low, high = 0.05 / math.sqrt(search.information[0].max()), 50 / math.sqrt(search.information[0].max())
     while high / low > 1.15:
