@@ -16,7 +16,6 @@ from evnlos.config import from_dict, load_yaml, read_yaml, save_yaml, to_dict
 from evnlos.data import MODALITIES, ChannelGroup, Modality, Sampling, as_modality, read_capture
 from evnlos.errors import ConfigError, DataError
 from evnlos.experiment import read_records
-from evnlos.migrate import migrate
 from evnlos.models import (
     RECONSTRUCTORS,
     Reconstructor,
@@ -28,6 +27,7 @@ from evnlos.models import (
     published,
     save_weights,
 )
+from evnlos.registry import migrate
 from evnlos.report import collect_results, write_report
 from evnlos.training import Training
 

@@ -9,8 +9,7 @@ import pytest
 from evnlos import registry as rooms
 from evnlos.config import from_dict, to_dict
 from evnlos.errors import ConfigError
-from evnlos.migrate import migrate
-from evnlos.registry import Kinded, Registry
+from evnlos.registry import Kinded, Registry, migrate
 
 
 class Shape(Kinded):

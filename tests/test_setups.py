@@ -16,8 +16,8 @@ from evnlos.config import from_dict, load_yaml, save_yaml, to_dict
 from evnlos.data import Simulation, simulate_object
 from evnlos.data.lab import Lab, lab_of
 from evnlos.errors import ConfigError, DataError
-from evnlos.migrate import migrate
 from evnlos.optics.facets import SlopeTable
+from evnlos.registry import migrate
 from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion, Pose, Scene, Target
 from evnlos.setups import (
     FittedSetup,

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 try:
     import lazy_loader
 except ModuleNotFoundError:  # without it, help, version and doctor work, and the doctor names it
-    from evnlos.migrate import __version__ as __version__
+    from evnlos.registry import __version__ as __version__
 else:
     __getattr__, __dir__, _NAMES = lazy_loader.attach_stub(__name__, __file__)
     # A star brings names, not rooms.

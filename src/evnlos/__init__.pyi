@@ -36,9 +36,9 @@ from .events import voxel_grid as voxel_grid
 from .events import write_events as write_events
 from .metrics import psnr as psnr
 from .metrics import ssim as ssim
-from .migrate import __version__ as __version__
 from .optics import angular_spectrum as angular_spectrum
 from .optics import tpsf_kernel as tpsf_kernel
+from .registry import __version__ as __version__
 from .scene import Scene as Scene
 from .scene import Target as Target
 from .setups import Setup as Setup

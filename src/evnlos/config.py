@@ -17,8 +17,7 @@ import yaml
 
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
-from evnlos.migrate import migrate
-from evnlos.registry import NESTED, Kinded
+from evnlos.registry import NESTED, Kinded, migrate
 from evnlos.untrusted import open_regular
 
 T = TypeVar("T")
@@ -79,7 +78,7 @@ def from_dict(
 
     Args:
         cls: A (nested) frozen dataclass.
-        values: Keys are field names, today's or those of older versions (`evnlos.migrate`); fields that are
+        values: Keys are field names, today's or those of older versions (`evnlos.registry`); fields that are
             left out keep their defaults.
         source: What to call the values in an error, e.g. the file they came from.
         folder: Where names of files (fields marked `BESIDE`) are looked up; None leaves them as they are.

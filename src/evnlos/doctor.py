@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evnlos.errors import EvnlosError
-from evnlos.migrate import __version__
+from evnlos.registry import __version__
 
 REQUIRED = {
     "numpy": "numpy>=1.26",

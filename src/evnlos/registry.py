@@ -1,15 +1,19 @@
-"""Registries of kinds: what ships with the package, what a program registers, what installed packages bring.
+"""Names in settings files: the kinds that there are, and what older versions of this package called things.
 
 A thing that a researcher swaps (a setup, an event model, a reconstructor) is described by a settings dataclass
 with a field `kind`. The settings of one family share a base class derived from `Kinded`; a field of that type
-takes the settings of any kind, from Python, YAML and the command line alike.
+takes the settings of any kind, from Python, YAML and the command line alike. A registry holds what ships with
+the package, what a program registers, and what installed packages bring.
+
+`from_dict` calls `migrate` for everything that it builds, so a YAML file of an older version loads like one of
+today. Add a function to `_STEPS` for each change of a name or of a meaning; it sees the plain mapping.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
-from importlib.metadata import entry_points
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from typing import Any, ClassVar, Generic, TypeVar
 
 from evnlos.errors import ConfigError
@@ -154,3 +158,209 @@ class Kinded:
                 raise PydanticCustomError(NESTED, "{text}", {**inner, "text": first["msg"]}) from None
 
         return core_schema.no_info_plain_validator_function(validated)
+
+
+try:
+    __version__ = version("evnlos")
+except PackageNotFoundError:  # a source tree that was never installed
+    __version__ = "0+unknown"
+
+
+Step = Callable[[dict[str, Any]], dict[str, Any]]
+
+
+def migrate(name: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of a file of any version in the names and with the meaning of this one.
+
+    Args:
+        name: What the values describe: the name of the settings class, e.g. "Simulation".
+        values: Nested mappings as they stand in the file; not changed. Those of today come back as they are.
+
+    Example:
+        >>> migrate("Simulation", {"pixel": {"leak_rate_hz": 0.0}})["setup"]
+        {'pixel': {'kind': 'continuous', 'initial_phase': 'rest', 'leak_rate_hz': 0.0}}
+    """
+    for step in _STEPS.get(name, ()):
+        values = step(values)
+    return values
+
+
+def todays_weights(name: str) -> str:
+    """Return the name of published weights of any version as it is today; other names come back as they are.
+
+    Example:
+        >>> todays_weights("near-frame-pass")
+        'near-frame-sequence'
+    """
+    return f"{name.removesuffix('-pass')}-sequence" if name.endswith("-pass") else name
+
+
+def _pixel_has_a_kind(values: dict[str, Any]) -> dict[str, Any]:
+    """Name the one event model that settings without `kind` meant."""
+    pixel = values.get("pixel")
+    if not isinstance(pixel, dict) or "kind" in pixel:
+        return values
+    return {**values, "pixel": {"kind": "continuous", **_initial_phase(pixel)}}
+
+
+def _initial_phase(pixel: dict[str, Any]) -> dict[str, Any]:
+    """State the first state of the pixels, which once followed from the leak: at rest without any."""
+    leaks = pixel.get("leak_rate_hz", 1.0) != 0
+    return {"initial_phase": "random" if leaks else "rest", **pixel}
+
+
+def _training(values: dict[str, Any]) -> dict[str, Any]:
+    """Before, `joint` chose the network and `paradigm` what it sees."""
+    values = _renamed(values, paradigm="modality", views="sequence_augmentations")
+    network = values.get("network")
+    if isinstance(network, dict):
+        network = values["network"] = _network(network)
+    if "joint" in values:
+        kind = "sequence" if values.pop("joint") else "unet"
+        values["network"] = {"kind": kind, **(network if isinstance(network, dict) else {})}
+    if values.get("loss") == "balanced":
+        values["loss"] = "normalized_bce_mse_ssim"
+    if "restandardise" in values:
+        values["keep_normalization"] = not values.pop("restandardise")
+    return values
+
+
+def _weights(values: dict[str, Any]) -> dict[str, Any]:
+    """What a weights file says of itself; up to format 3 `joint` stood beside the network's settings."""
+    if values.get("format") != "evnlos-weights-3":
+        return values
+    values = _renamed(values, paradigm="modality")
+    kind, network = "sequence" if values.pop("joint", False) else "unet", values.get("network")
+    if isinstance(network, dict):
+        values["network"] = {"kind": kind, **network}
+    if isinstance(values.get("history"), list):
+        values["history"] = [_run(one) if isinstance(one, dict) else one for one in values["history"]]
+    return values | {"format": "evnlos-weights-4"}
+
+
+def _run(values: dict[str, Any]) -> dict[str, Any]:
+    """What the folder of a run, or the history of its weights, says of one training."""
+    settings = values.get("settings")
+    return {**values, "settings": migrate("Training", settings)} if isinstance(settings, dict) else values
+
+
+def _renamed(values: dict[str, Any], **names: str) -> dict[str, Any]:
+    """Return a copy with keys of before in today's names, in their places; names of today win."""
+    return {
+        names.get(key, key): value
+        for key, value in values.items()
+        if key not in names or names[key] not in values
+    }
+
+
+def _record(values: dict[str, Any]) -> dict[str, Any]:
+    """The record of an experiment."""
+    values = _renamed(values, paradigm="modality", rig="setup")
+    arm = str(values.get("arm", ""))
+    words = {" joint": " sequence", "balanced loss": "normalized loss", " shots": " captures"}
+    for before, now in words.items():
+        arm = arm.replace(before, now)
+    return values | {"arm": arm} if "arm" in values else values
+
+
+def _capture(values: dict[str, Any]) -> dict[str, Any]:
+    """The `capture.yaml` of a recording."""
+    return _renamed(values, rig="setup")
+
+
+def _target(values: dict[str, Any]) -> dict[str, Any]:
+    """The target of a `capture.yaml`."""
+    return _renamed(values, plate_m="size_m")
+
+
+def _paper_setup(values: dict[str, Any]) -> dict[str, Any]:
+    """The setup of the paper's equations."""
+    return _renamed(values, **_PAPER)
+
+
+def _network(values: dict[str, Any]) -> dict[str, Any]:
+    """A network behind a linear embedding."""
+    return _renamed(values, strengths="ridge_multipliers")
+
+
+def _glyphs(values: dict[str, Any]) -> dict[str, Any]:
+    """Hidden characters of any kind."""
+    return _renamed(values, plate="target_plane")
+
+
+def _several_setups(values: dict[str, Any]) -> dict[str, Any]:
+    """Name the number of walls that a simulation draws."""
+    return _renamed(values, rigs="setups")
+
+
+_CAMERAS = ("sensor", "frame_camera", "pixel", "time_step_s")
+_LAB_CAMERAS = {
+    "frame_camera": {"exposure_s": 0.016, "full_well_e": 9000.0, "read_noise_e": 12.0},
+    "pixel": {
+        "kind": "continuous",
+        "initial_phase": "random",
+        "threshold_on": 0.21,
+        "threshold_off": 0.24,
+        "threshold_sigma": 0.04,
+        "cutoff_hz": 40.0,
+        "leak_rate_hz": 0.05,
+        "shot_noise_rate_hz": 0.08,
+        "refractory_s": 0.0005,
+    },
+}
+"""Cameras of the laboratory, which its files need not have stated."""
+_LAB_WALL = {"kind": "radiometric", "gain": 0.7, "ambient": 0.06, "ambient_gradient": [0.3, -0.2]}
+
+
+def _one_setup(values: dict[str, Any]) -> dict[str, Any]:
+    """Gather `transport` and the cameras in `setup`, and rename the ranges over them."""
+    there = [key for key in ("transport", *_CAMERAS) if key in values]
+    found = {key: value for key, value in values.items() if key not in there}
+    if there:
+        setup = dict(values.get("setup") or values.get("transport") or {})
+        setup |= {key: values[key] for key in _CAMERAS if key in values}
+        found["setup"] = setup
+    for ranges in ("vary", "spread"):
+        if isinstance(found.get(ranges), dict):
+            found[ranges] = {_path_in_setup(str(path)): ends for path, ends in found[ranges].items()}
+    return found
+
+
+def _path_in_setup(path: str) -> str:
+    path = path.replace("glyphs.plate.", "glyphs.target_plane.")
+    section, _, rest = path.partition(".")
+    if section == "transport":
+        return f"setup.{_PAPER.get(rest, rest)}"
+    if section == "setup":
+        return f"setup.{_PAPER.get(rest, rest)}"
+    return f"setup.{path}" if section in _CAMERAS else path
+
+
+def _lab_setup(values: dict[str, Any]) -> dict[str, Any]:
+    """Write out the laboratory's own wall and cameras in a file that left some of them out."""
+    if isinstance(values.get("setup"), dict):
+        values = {**values, "setup": {"kind": "radiometric", **_LAB_CAMERAS, **values["setup"]}}
+        return _one_setup(_pixel_has_a_kind(values))
+    if not {"transport", *_CAMERAS} & values.keys():
+        return _one_setup(values)
+    wall = values.get("transport", _LAB_WALL)
+    if isinstance(wall, dict):
+        wall = {"kind": "radiometric", **wall}  # the one kind that a laboratory had
+    return _one_setup(_pixel_has_a_kind({**_LAB_CAMERAS, **values, "transport": wall}))
+
+
+_PAPER = {"wave_pitch_m": "field_step_m", "taper": "window", "rho_max": "kernel_radius"}
+_GLYPHS = ("DrawingGlyphs", "EmnistGlyphs", "FontGlyphs", "HandwritingGlyphs", "NistGlyphs")
+_STEPS: dict[str, tuple[Step, ...]] = {
+    "Simulation": (_pixel_has_a_kind, _one_setup, _several_setups),
+    "Lab": (_lab_setup,),
+    "Training": (_training,),
+    "weights": (_weights,),
+    "run": (_run,),
+    "Record": (_record,),
+    "CaptureInfo": (_capture,),
+    "TargetInfo": (_target,),
+    "PaperSetup": (_paper_setup,),
+    **dict.fromkeys(_GLYPHS, (_glyphs,)),
+    **dict.fromkeys(("UNetConfig", "SequenceConfig"), (_network,)),
+}

@@ -39,7 +39,7 @@ from evnlos.config import save_yaml, to_dict
 from evnlos.errors import DataError
 from evnlos.files import write_atomically
 from evnlos.machine import Progress, Step, silent
-from evnlos.migrate import __version__
+from evnlos.registry import __version__
 
 PIXEL_FILE, PIXEL_VALUES_FILE, PIXEL_FIGURE, PIXEL_MAPS_FILE = (
     "pixel.yaml",

@@ -20,7 +20,7 @@ from evnlos.data.sampling import PATTERN_FILE, save_pattern
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
-from evnlos.migrate import __version__
+from evnlos.registry import __version__
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import CALIBRATED_FILE, FittedSetup
 

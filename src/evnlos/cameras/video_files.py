@@ -71,6 +71,19 @@ def _decoded(codes: NDArray, tone: Tone) -> NDArray:
     )
 
 
+def coded(values: NDArray, tone: Tone) -> NDArray[np.float64]:
+    """Return light in fractions of white as codes of a tone curve in fractions of white: of `to_light` the inverse.
+
+    Example:
+        >>> (255 * coded(np.array([0.0, 0.5, 1.0]), "srgb")).round(1)
+        array([  0. , 187.5, 255. ])
+    """
+    v = np.clip(np.asarray(values, np.float64), 0.0, 1.0)
+    if tone == "srgb":
+        return np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055)
+    return np.where(v <= 0.018, 4.5 * v, 1.099 * v**0.45 - 0.099) if tone == "rec709" else v
+
+
 def from_light(light: NDArray, tone: Tone) -> NDArray[np.uint8]:
     """Return light in DN, 255 = white, as codes of a tone curve: the inverse of `to_light` up to rounding.
 
@@ -82,16 +95,15 @@ def from_light(light: NDArray, tone: Tone) -> NDArray[np.uint8]:
         >>> from_light(np.array([0.0, 128.2, 300.0]), "srgb")
         array([  0, 188, 255], dtype=uint8)
     """
-    v = np.clip(light / 255.0, 0, 1)
-    if tone == "srgb":
-        v = np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055)
-    elif tone == "rec709":
-        v = np.where(v <= 0.018, 4.5 * v, 1.099 * v**0.45 - 0.099)
-    return np.rint(255 * v).astype(np.uint8)
+    return np.rint(255 * coded(light / 255.0, tone)).astype(np.uint8)
 
 
 def write_video(
-    path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, quality: int | None = None
+    path: Path,
+    frames: Iterable[NDArray[np.uint8]],
+    fps: float,
+    quality: int | None = None,
+    effort: Literal["ultrafast", "fast", "medium"] = "medium",
 ) -> None:
     """Write frames as a video, one at a time: a file of FFmpeg's (.mp4, .mkv), a .gif, or a folder of PNG.
 
@@ -99,7 +111,9 @@ def write_video(
         path: The file, or the folder to make.
         frames: Grey, uint8 [H, W], all of one size.
         fps: Frames per second; a folder does not keep it, and a GIF keeps whole hundredths of a second.
-        quality: H.264's CRF, 1 (best) to 51, as cameras and phones compress; None = without loss.
+        quality: H.264's CRF, 1 (best) to 51, as cameras and phones compress; None = without loss. With it an
+            odd last row or column is left out.
+        effort: How long the encoder looks for a smaller file where there is loss.
 
     Raises:
         ConfigError: Another ending, or a quality out of its range.
@@ -133,12 +147,18 @@ def write_video(
         with av.open(str(draft), "w", format="mp4" if suffix == ".mp4" else "matroska") as container:
             codec = "libx264rgb" if quality is None else "libx264"
             stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(10_000))
-            stream.height, stream.width = first.shape
+            even = 1 if quality is None else 2  # colours at half the resolution
+            height, width = (side - side % even for side in first.shape)
+            stream.height, stream.width = height, width
             stream.pix_fmt = "rgb24" if quality is None else "yuv420p"
-            stream.options = {"qp": "0", "preset": "fast"} if quality is None else {"crf": str(quality)}
+            stream.options = {"qp": "0", "preset": "fast"} if quality is None else {"crf": str(quality), "preset": effort}
             for frame in _again(first, shots):
-                colours = np.repeat(frame[:, :, None], 3, axis=2)
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(colours, format="rgb24")))
+                frame = np.ascontiguousarray(frame[:height, :width])
+                if quality is None:
+                    picture = av.VideoFrame.from_ndarray(np.repeat(frame[:, :, None], 3, axis=2), format="rgb24")
+                else:
+                    picture = av.VideoFrame.from_ndarray(frame, format="gray")
+                container.mux(stream.encode(picture))
             container.mux(stream.encode())
 
 

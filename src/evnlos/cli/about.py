@@ -17,7 +17,7 @@ import tyro
 
 from evnlos.config import read_yaml
 from evnlos.errors import DataError
-from evnlos.migrate import __version__, migrate
+from evnlos.registry import __version__, migrate
 
 ENTRIES = {
     "evnlos": f"""@software{{evnlos,

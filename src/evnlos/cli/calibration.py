@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -16,6 +17,7 @@ import tyro
 
 from evnlos.calibration.captures import PRESETS, Calibration
 from evnlos.calibration.pixel_fit import PixelFitSettings
+from evnlos.calibration.scan.film import FilmReading
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
@@ -23,10 +25,12 @@ from evnlos.cli.parsing import drawn, say
 from evnlos.cli.recordings import Flat, Folders, Presets
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
+from evnlos.lab import Phone
 from evnlos.machine import ProgressBars
 from evnlos.setups import load_setup
 
 if TYPE_CHECKING:
+    from evnlos.calibration.scan.film import FilmResult
     from evnlos.calibration.scan.importer import ScanResult
 
 
@@ -105,25 +109,35 @@ class CalibrateCommand:
 
 @dataclass(frozen=True)
 class ScanCommand:
-    """Measure a setup's own light transport with a display or a moving LED: plan a scan, import its frames."""
+    """Measure a setup's own light transport with a display or an LED: plan a scan, import what was seen."""
 
-    action: Annotated[Literal["plan", "import"], tyro.conf.Positional]
-    """plan writes scan.yaml, the table of pictures and what to show; import makes a transport of them."""
+    action: Annotated[Literal["plan", "import", "rehearse"], tyro.conf.Positional]
+    """plan writes scan.yaml, the table of pictures and what to show; import makes a transport of them, or of a
+    film; rehearse films a planned show with a pretended phone: FOLDER/film.mp4."""
     folder: Annotated[Path, tyro.conf.Positional]
     """The folder of the scan."""
     out: Path | None = None
     """import: the transport, a .safetensors file; by default transport.safetensors in the folder. A check
     picture goes to the same name with .png."""
+    film: Path | None = None
+    """import: a video of the wall while the show of `plan --show page` or `video` ran; characters that it moved
+    become captures, FOLDER/captures/*, with simulated events beside the filmed frames."""
+    setup: str = "main-near"
+    """rehearse: the wall, a linear setup: a name, a settings file, or a measured one."""
     json: bool = False
     """Print one JSON object."""
     plan: Flat[ScanPlan] = field(default_factory=ScanPlan)
     """plan: what to scan, and with what."""
     settings: Flat[ScanImport] = field(default_factory=ScanImport)
     """import: how the pictures become a matrix."""
+    reading: Flat[FilmReading] = field(default_factory=FilmReading)
+    """import --film: how the video becomes pictures."""
+    phone: Phone = field(default_factory=Phone)
+    """rehearse: the phone, with a phone's faults."""
 
     def run(self) -> None:
-        """Write the plan, or import the scan."""
-        self._plan() if self.action == "plan" else self._import()
+        """Write the plan, import the scan, or rehearse the show."""
+        {"plan": self._plan, "import": self._import, "rehearse": self._rehearse}[self.action]()
 
     def _plan(self) -> None:
         from evnlos.calibration.scan import write_plan
@@ -147,20 +161,52 @@ class ScanCommand:
         )
         for note in found.notes:
             say(f"note: {note}")
-        print(f"record the pictures as frames.csv names them, then: evnlos scan import {self.folder}")
+        if self.plan.show == "pictures":
+            print(f"record the pictures as frames.csv names them, then: evnlos scan import {self.folder}")
+            return
+        length, name = self.plan.as_show().duration_s, "html" if self.plan.show == "page" else "mp4"
+        print(f"show {self.folder / 'show'}.{name} on the whole display and film the wall: {length:.0f} s")
+        print(f"then: evnlos scan import {self.folder} --film VIDEO")
+
+    def _rehearse(self) -> None:
+        from evnlos.calibration.scan import rehearse_film
+        from evnlos.cli.invert_captures import linear_setup
+
+        with ProgressBars(quiet=self.json) as progress:
+            path = rehearse_film(self.folder, linear_setup(self.setup), self.phone, progress=progress)
+        print(json.dumps({"film": str(path)}) if self.json else f"{path}: simulated, no phone saw this")
+        if not self.json:
+            print(f"then: evnlos scan import {self.folder} --film {path}")
+
+    def _filmed(self) -> FilmResult | None:
+        """Make the scan's pictures of the film, and return what was found in it."""
+        from evnlos.calibration.scan import import_film
+
+        if self.film is None:
+            return None
+        height, width = self.settings.height, self.settings.width
+        shape = None if height is None or width is None else (height, width)
+        with ProgressBars(quiet=self.json) as progress:
+            found = import_film(self.folder, self.film, self.reading, shape, progress)
+        for warning in found.warnings:
+            say(f"warning: {warning}")
+        return found
 
     def _import(self) -> None:
         import torch
 
-        from evnlos.calibration.scan import import_scan
+        from evnlos.calibration.scan import add_events, import_scan
         from evnlos.plot.results import draw_scan
         from evnlos.setups.files import write_measurement
         from evnlos.tensor_file import SUFFIX
 
         torch.set_num_threads(1)
         out = self.folder / f"transport{SUFFIX}" if self.out is None else self.out
+        film = self._filmed()
         result = import_scan(self.folder, self.settings)
         checksum = write_measurement(out, result.measurement)
+        for capture in () if film is None else film.captures:
+            add_events(self.folder, capture, out)
         shown = out.with_suffix(".png")
         picture = drawn(shown, lambda: draw_scan(shown, result.measurement, result.raw))
         for warning in result.warnings:
@@ -170,11 +216,37 @@ class ScanCommand:
             "checksum": checksum,
             "picture": picture,
         }
+        if film is not None:
+            found["film"] = asdict(film) | {"captures": [str(capture) for capture in film.captures]}
         if self.json:
             print(json.dumps(found))
             return
+        if film is not None:
+            print("\n".join(film_lines(film)))
         print("\n".join(to_lines(result)))
         print(f"setup: {{kind: measured, file: {out}, checksum: {checksum}}}")
+        if film is not None and film.captures:
+            print(f"characters: evnlos invert {self.folder / 'captures'}/* --setup {out}")
+
+
+def film_lines(film: FilmResult) -> list[str]:
+    """Return what was found in a film as lines for people."""
+    clock, (g, a) = film.clock, film.tone
+    lines = [
+        f"the show begins {clock.start_s:.3f} s into the film, clocks differ by {1e6 * (clock.rate - 1):+.0f} "
+        f"millionths; flashes agree to {clock.agreement:.3f}"
+    ]
+    if math.isfinite(film.misfit[1]):
+        how = "as stated" if film.tone == (1.0, 0.0) else f"light^{g:.2f} exp({a:.2f} (light - 1)) on top"
+        lines.append(
+            f"tone curve {how}: the light of halves differs from that of the whole by "
+            f"{100 * film.misfit[1]:.1f} % (before: {100 * film.misfit[0]:.1f} %)"
+        )
+    lines.append(
+        f"exposure changed by {100 * film.gain_rms:.1f} %, the phone moved by {film.shift_px:.2f} pixels (root "
+        f"mean square), {'taken out' if film.corrected else 'left as it is'}"
+    )
+    return lines
 
 
 def figures_of(result: ScanResult) -> dict[str, Any]:

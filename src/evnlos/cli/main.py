@@ -24,8 +24,7 @@ from evnlos.cli.parsing import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen,
 from evnlos.doctor import examine, fault_behind
 from evnlos.errors import ConfigError, EvnlosError, printable
 from evnlos.machine import sleep_while_waiting
-from evnlos.migrate import __version__
-from evnlos.registry import Kinded, kind_of
+from evnlos.registry import Kinded, __version__, kind_of
 
 # Nothing that may be missing is imported before a command is: help, version and doctor work in any case.
 

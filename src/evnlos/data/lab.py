@@ -22,7 +22,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.files import new_folder
 from evnlos.machine import Progress, Step, silent
-from evnlos.migrate import __version__
+from evnlos.registry import __version__
 from evnlos.scene import FontGlyphs, Glyphs, LineMotion, Scene
 from evnlos.setups import RadiometricSetup, Setup, named_setup, setup_preset
 from evnlos.setups.load import is_name

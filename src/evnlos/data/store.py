@@ -22,7 +22,7 @@ from evnlos.data.sampling import Samples, Sampling
 from evnlos.errors import DataError
 from evnlos.files import directory_lock, is_empty, write_atomically
 from evnlos.machine import undisturbed
-from evnlos.migrate import __version__
+from evnlos.registry import __version__
 from evnlos.types import Events
 from evnlos.untrusted import open_hdf5, stored
 

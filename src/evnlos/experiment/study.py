@@ -19,7 +19,7 @@ from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.machine import Progress, Step
-from evnlos.migrate import migrate
+from evnlos.registry import migrate
 from evnlos.training import Training
 
 Source = Literal["calibrated", "uncalibrated", "none"]

@@ -1,12 +1,14 @@
 """A second renderer, for captures that the simulator's own models of a setup do not describe."""
 
 from evnlos.lab.light_path import Lobe, Optics, Rays, Reflection, cast, fill_throughput, texture
-from evnlos.lab.room import Mount, RenderedWall, Torch, brightness, covered_plane
+from evnlos.lab.room import FilmedLight, Mount, Phone, RenderedWall, Torch, brightness, covered_plane
 
 __all__ = [
+    "FilmedLight",
     "Lobe",
     "Mount",
     "Optics",
+    "Phone",
     "Rays",
     "Reflection",
     "RenderedWall",

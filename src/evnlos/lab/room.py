@@ -1,18 +1,27 @@
-"""What stands in the room of a rendered setup, and the light on its wall in continuous time."""
+"""What stands in the room of a rendered setup, the light on its wall in continuous time, and a phone.
+
+- What carries and lights the target, and the wall's image while it moves.
+- A phone that films a wall: row after row, in eight bits, with tone curve, automatic exposure and shake.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol, get_args
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from evnlos.cameras.video_files import Tone, coded
+from evnlos.config import check_made
 from evnlos.errors import ConfigError
 from evnlos.lab.light_path import Rays
 from evnlos.scene import Scene
-from evnlos.types import Plane
+from evnlos.types import Plane, derive_seed
 
 Array = NDArray[np.float64]
 
@@ -215,3 +224,147 @@ def _box(plane: Plane, left: float, right: float, top: float, bottom: float) -> 
     across = np.clip(np.minimum(plane.x_m + half, right) - np.maximum(plane.x_m - half, left), 0, None)
     down = np.clip(np.minimum(plane.y_m + half, bottom) - np.maximum(plane.y_m - half, top), 0, None)
     return (down[:, None] * across / plane.pitch_m**2).astype(np.float32)
+
+
+_BANDS = 8  # parts of a frame whose rows are taken as exposed at once
+_MOMENTS = 4  # of an exposure
+_WAVES = 6  # sinusoids of a hand's shake
+_SHAKE_HZ = (0.05, 0.6)
+_METERED = 0.5  # mean code, of white, to which an automatic exposure drives
+
+
+class FilmedLight(Protocol):
+    """Light on the phone's sensor, as a function of time."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the image, pixels."""
+        ...
+
+    def at(self, t_s: float) -> NDArray[np.float32]:
+        """Return the light at an instant, white levels at the locked exposure, float32 [H, W]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Phone:
+    """A phone's video camera: a linear sensor read row by row, then what a phone makes of it.
+
+    Row y of H of frame n is exposed around t = n / frame_rate_hz + (y / H - 1/2) readout_s. The light, times
+    the gain of the automatic exposure, makes a Poisson number of electrons and read noise; tone curve and
+    contrast make codes v of it, v + contrast v (1 - v) (2 v - 1), rounded to eight bits.
+
+    Args:
+        frame_rate_hz: Frames a second.
+        exposure_s: Exposure of a row, seconds.
+        readout_s: Time from the first row to the last, seconds.
+        full_well_e: Electrons at white.
+        read_noise_e: Standard deviation of the read noise, electrons.
+        tone: Curve of the codes: "srgb", "rec709", or "as-is" for a linear video.
+        contrast: How much steeper the codes are in the middle than at black and white, 0 to below 1.
+        auto_exposure: Share of a change of the mean light that the exposure takes back, 0 (locked) to 1.
+        auto_exposure_s: Time constant of that, seconds.
+        shake_px: Root mean square of a hand's movement, pixels of the film, along each axis.
+        clock_ppm: By how much the phone's clock runs faster than the display's, millionths.
+
+    Raises:
+        ConfigError: A value outside its range.
+    """
+
+    frame_rate_hz: float = 30.0
+    """Frames a second."""
+    exposure_s: float = 1 / 60
+    """Exposure of a row, seconds."""
+    readout_s: float = 0.02
+    """Time from the first row to the last, seconds (rolling shutter)."""
+    full_well_e: float = 6_000.0
+    """Electrons at white."""
+    read_noise_e: float = 4.0
+    """Standard deviation of the read noise, electrons."""
+    tone: Tone = "srgb"
+    """Tone curve of the codes."""
+    contrast: float = 0.0
+    """How much steeper codes are in the middle than at black and white, 0 to below 1."""
+    auto_exposure: float = 0.0
+    """Share of a change of the mean light that the exposure takes back; 0 = locked."""
+    auto_exposure_s: float = 0.6
+    """Time constant of the automatic exposure, seconds."""
+    shake_px: float = 0.0
+    """Root mean square of a hand's movement, pixels of the film; 0 = on a tripod."""
+    clock_ppm: float = 20.0
+    """By how much the phone's clock runs faster than the display's, millionths."""
+
+    def __post_init__(self) -> None:
+        limits = {
+            "frame_rate_hz": (1.0, 1000.0),
+            "exposure_s": (1e-5, 1.0),
+            "readout_s": (0.0, 1.0),
+            "full_well_e": (1.0, 1e7),
+            "read_noise_e": (0.0, 1e4),
+            "contrast": (0.0, 0.9),
+            "auto_exposure": (0.0, 1.0),
+            "auto_exposure_s": (0.01, 100.0),
+            "shake_px": (0.0, 100.0),
+            "clock_ppm": (-1e4, 1e4),
+        }
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(f"Phone.{name} is {getattr(self, name)}; give {low:g} to {high:g}")
+        if self.tone not in get_args(Tone):
+            raise ConfigError(f"Phone.tone is {self.tone!r}; give one of {', '.join(get_args(Tone))}")
+        check_made(self)
+
+    def codes(self, light: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the codes of light, both in fractions of white, not yet rounded.
+
+        Example:
+            >>> (255 * Phone().codes(np.array([0.0, 0.5, 1.0]))).round(1)
+            array([  0. , 187.5, 255. ])
+        """
+        codes = coded(light, self.tone)
+        return codes + self.contrast * codes * (1 - codes) * (2 * codes - 1)
+
+    def film(self, light: FilmedLight, duration_s: float, seed: int = 0) -> Iterator[NDArray[np.uint8]]:
+        """Yield the frames of a film, uint8 [H, W], frame n at n / frame_rate_hz on the phone's clock.
+
+        Args:
+            light: What the sensor sees, on the display's clock, which starts as the phone's does.
+            duration_s: Length on the phone's clock, seconds.
+            seed: Seed of noise and shake.
+        """
+        from scipy.ndimage import shift  # loads slowly
+
+        height, _ = light.shape
+        draw = np.random.default_rng(derive_seed(seed, "phone"))
+        edges = np.linspace(0, height, min(_BANDS, height) + 1).round().astype(int)
+        offsets = ((np.arange(_MOMENTS) + 0.5) / _MOMENTS - 0.5) * self.exposure_s
+        waves = _Hand(draw, self.shake_px)
+        gain = 1.0
+        for number in range(round(duration_s * self.frame_rate_hz)):
+            clock_s = number / self.frame_rate_hz
+            image = np.empty(light.shape)
+            for first, last in pairwise(edges):
+                row_s = ((first + last) / 2 / height - 0.5) * self.readout_s
+                instants = (clock_s + row_s + offsets) / (1 + 1e-6 * self.clock_ppm)
+                image[first:last] = np.mean([light.at(float(t))[first:last] for t in instants], axis=0)
+            if self.shake_px > 0:
+                image = shift(image, waves(clock_s), order=3, mode="nearest").clip(min=0)
+            electrons = draw.poisson(gain * image * self.full_well_e).astype(np.float64)
+            electrons += self.read_noise_e * draw.standard_normal(image.shape)
+            codes = self.codes(electrons / self.full_well_e)
+            yield np.rint(255 * codes).astype(np.uint8)
+            if self.auto_exposure > 0:
+                wanted = (_METERED**2.2 / max(float(image.mean()), 1e-6)) ** self.auto_exposure
+                gain += (wanted - gain) * -math.expm1(-1 / self.frame_rate_hz / self.auto_exposure_s)
+
+
+class _Hand:
+    """Slow movement (down, right), pixels: sinusoids of random phases."""
+
+    def __init__(self, draw: np.random.Generator, rms_px: float) -> None:
+        self._hz = draw.uniform(*_SHAKE_HZ, size=(2, _WAVES))
+        self._phase = draw.uniform(0, 2 * math.pi, size=(2, _WAVES))
+        self._amplitude = rms_px * math.sqrt(2 / _WAVES)
+
+    def __call__(self, t_s: float) -> NDArray[np.float64]:
+        return self._amplitude * np.sin(2 * math.pi * self._hz * t_s + self._phase).sum(axis=1)

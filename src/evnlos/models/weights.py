@@ -23,9 +23,9 @@ from evnlos.config import from_dict, to_dict
 from evnlos.data import MODALITIES, STANDARD_MODALITIES, Modality, Sampling
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
-from evnlos.migrate import migrate, todays_weights
 from evnlos.models.confidence import Confidence
 from evnlos.models.reconstructor import Reconstructor, ReconstructorSettings
+from evnlos.registry import migrate, todays_weights
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
 
 VARIABLE = "EVNLOS_WEIGHTS"

@@ -16,7 +16,7 @@ from evnlos.analysis.identify import Identification
 from evnlos.data import Dataset, character_of, read_shard
 from evnlos.events.volume import WORDS
 from evnlos.files import write_atomically
-from evnlos.migrate import __version__
+from evnlos.registry import __version__
 from evnlos.report.pictures import curves_svg, data_uri, grey, png, polarity, stretched
 from evnlos.report.provenance import provenance_section
 from evnlos.report.sections import (

@@ -18,7 +18,7 @@ import torch
 import yaml
 
 from evnlos.data import Dataset, Sampling
-from evnlos.migrate import __version__
+from evnlos.registry import __version__
 from evnlos.report.tables import RunResult
 from evnlos.setups import NamedSetup
 

@@ -18,8 +18,8 @@ import numpy as np
 from evnlos.analysis import BASELINES, Evaluation, Scores, available_lpips, evaluate
 from evnlos.data import Dataset, character_of, modality_order, open_dataset
 from evnlos.errors import DataError
-from evnlos.migrate import todays_weights
 from evnlos.models import load_weights, published
+from evnlos.registry import todays_weights
 
 METHODS = ("simulation only", "E2E", "EPNP")
 

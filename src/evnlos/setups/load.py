@@ -18,7 +18,7 @@ from evnlos.cameras import BrownianPixel, EventPixel, FrameCamera
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError
 from evnlos.lab import Lobe, Mount, Reflection, Torch
-from evnlos.migrate import migrate
+from evnlos.registry import migrate
 from evnlos.setups.base import CAMERA_FIELDS, SensorSize, Setup
 from evnlos.setups.measured import MeasuredSetup
 from evnlos.setups.paper import PaperSetup

@@ -21,9 +21,9 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.files import directory_lock, is_empty, write_atomically
 from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
-from evnlos.migrate import __version__, migrate
 from evnlos.models import Confidence, Reconstructor, Weights, load_weights, save_weights
 from evnlos.models.confidence import FEWEST, fit_confidence
+from evnlos.registry import __version__, migrate
 from evnlos.training.settings import (
     LOSSES,
     Training,

@@ -206,6 +206,41 @@ class ScanFrame:
     file: str
 
 
+def measured_cells(info: ScanInfo) -> NDArray[np.int64]:
+    """Return the number of each measured cell, row by row: all, or the points."""
+    if info.pattern == "points":
+        return np.array([row * info.plane.width + column for row, column in info.cells])
+    return np.arange(info.plane.height * info.plane.width)
+
+
+def lit_cells(info: ScanInfo, pattern: int) -> NDArray[np.bool_]:
+    """Return which cells a pattern lights, [h, w]."""
+    lit = np.zeros(info.plane.height * info.plane.width, np.bool_)
+    lit[measured_cells(info)] = Patterns(info.pattern, info.patterns.cells).row(pattern)
+    return lit.reshape(info.plane.shape)
+
+
+def cell_edges(plane: Plane, display: tuple[int, int], display_pitch: float) -> tuple[NDArray, NDArray]:
+    """Return the first display row of each row of cells and one more, and so the columns; middle on middle."""
+    size = plane.pitch_m / display_pitch  # display pixels per cell, not whole in general
+    edges = [np.round((np.arange(n + 1) - n / 2) * size).astype(int) for n in plane.shape]
+    return edges[0] + display[1] // 2, edges[1] + display[0] // 2
+
+
+def displayed(
+    cells: NDArray, plane: Plane, display: tuple[int, int], display_pitch: float
+) -> NDArray[np.uint8]:
+    """Return the picture of a display [rows, columns] that shows cells [h, w], of brightness 0 to 1."""
+    width, height = display
+    y, x = cell_edges(plane, display, display_pitch)
+    shown = np.repeat(np.repeat(cells, np.diff(y), axis=0), np.diff(x), axis=1)
+    top, left = max(int(y[0]), 0), max(int(x[0]), 0)
+    cut = shown[: height - top, : width - left]
+    picture = np.zeros((height, width), np.uint8)
+    picture[top : top + cut.shape[0], left : left + cut.shape[1]] = np.round(255.0 * cut).astype(np.uint8)
+    return picture
+
+
 def read_scan_info(folder: str | Path) -> ScanInfo:
     """Read the `scan.yaml` of a folder.
 

@@ -20,10 +20,10 @@ from evnlos.calibration.scan.folder import (
     ScanFrame,
     ScanInfo,
     is_main,
+    lit_cells,
     read_scan_frames,
     read_scan_info,
 )
-from evnlos.calibration.scan.plan import lit_cells
 from evnlos.cameras import FrameCamera
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError

@@ -7,19 +7,33 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from evnlos.calibration.scan.folder import SCAN_FILE, Pattern, Patterns, ScanFrame, ScanInfo, write_scan_frames
+from evnlos.calibration.scan.folder import (
+    SCAN_FILE,
+    Pattern,
+    Patterns,
+    ScanFrame,
+    ScanInfo,
+    displayed,
+    lit_cells,
+    measured_cells,
+    write_scan_frames,
+)
+from evnlos.calibration.scan.show import SHOW_FILE, Show, ShowInfo, show_page, show_pictures
+from evnlos.cameras.video_files import write_video
 from evnlos.config import save_yaml
 from evnlos.errors import ConfigError
 from evnlos.files import new_folder
 from evnlos.machine import Progress, Step, silent
-from evnlos.types import Plane
+from evnlos.types import Plane, derive_seed
 
 
 @dataclass(frozen=True)
@@ -43,11 +57,8 @@ class ScanCamera:
         if self.lobe_m is not None and not self.lobe_m > 0:
             raise ConfigError(f"lobe_m is {self.lobe_m}; give a positive number of metres")
         if not self.full_well_e > 0 or not self.read_noise_e >= 0:
-            raise ConfigError(
-                f"full_well_e is {self.full_well_e}, read_noise_e {self.read_noise_e}; give a positive number "
-                "of "
-                "electrons, and 0 or more"
-            )
+            given = f"full_well_e is {self.full_well_e}, read_noise_e {self.read_noise_e}"
+            raise ConfigError(f"{given}; give a positive number of electrons, and 0 or more")
         if not 8 <= self.bit_depth <= 16:
             raise ConfigError(f"bit_depth is {self.bit_depth}; give 8 to 16 bits")
 
@@ -154,6 +165,7 @@ def _noise(patterns: Patterns, light: float, camera: ScanCamera, repeats: int, d
 
 _CHECKS = 4
 _MOST_DISPLAY = 16_384
+_SHOWN_HZ = 20.0  # of a show as a video
 
 
 @dataclass(frozen=True)
@@ -185,6 +197,17 @@ class ScanPlan:
     dark_every: int | None = None
     """A dark frame before every so many pictures, and one at the end of each repeat; none = 64 for hadamard, 4
     else: all cells of a raster share the error of the dark frame, and it adds up where many of them shine."""
+    show: Literal["pictures", "page", "video"] = "pictures"
+    """pictures: one file a pattern, for a camera that takes pictures. page or video: the whole scan as one show
+    on the display, to be filmed (`import --film`)."""
+    hold_s: float = 0.5
+    """page, video: how long a pattern stands, seconds."""
+    targets: str = ""
+    """page, video: characters that move over the plane after the scan, e.g. RK."""
+    target_m: float = 0.06
+    """page, video: side of such a character's square, metres."""
+    speed_m_s: float = 0.02
+    """page, video: its speed, metres per second."""
     camera: ScanCamera = field(default_factory=ScanCamera)
     """Light and noise, for the estimate."""
 
@@ -211,6 +234,14 @@ class ScanPlan:
                     "or more"
                 )
         self.info()  # refuses what a scan.yaml could not hold
+        if self.show != "pictures":
+            if self.display is None:
+                raise ConfigError(f"show is {self.show}, and no display is stated; give --display WIDTH HEIGHT")
+            _ = self.as_show()
+        elif self.targets:
+            raise ConfigError(
+                f"targets is {self.targets!r}; characters move in a show: give --show page or video"
+            )
 
     @property
     def cells(self) -> Plane:
@@ -229,11 +260,15 @@ class ScanPlan:
         count, found = self.info().patterns.count, []
         every = self.dark_every or (64 if self.pattern == "hadamard" else 4)
         for repeat in range(self.repeats):
-            for k in range(count):
-                if k % every == 0:
+            # A film's exposure and place drift: in another order each time, what drifts is told from patterns.
+            mixed = np.random.default_rng(derive_seed(repeat, "order")).permutation(count).tolist()
+            for number, k in enumerate(range(count) if self.show == "pictures" else mixed):
+                if number % every == 0:
                     found.append((None, repeat, self.exposure_s))
                 found.append((k, repeat, self.exposure_s))
             found.append((None, repeat, self.exposure_s))
+        if self.show != "pictures":  # a phone keeps its exposure, and the show has its own check
+            return [ScanFrame(p, r, e, f"frames/{number:05d}.png") for number, (p, r, e) in enumerate(found)]
         # Half of the exposure tells whether the camera is linear; cells near the middle are bright.
         half = self.exposure_s / 2
         middle = self.cells.height // 2 * self.cells.width + self.cells.width // 2
@@ -241,10 +276,25 @@ class ScanPlan:
         found += [(None, 0, half), *((k, 0, half) for k in checks)]
         return [ScanFrame(p, r, e, f"frames/{number:05d}.png") for number, (p, r, e) in enumerate(found)]
 
+    def as_show(self) -> Show:
+        """Return the scan as what a display shows."""
+        times = ShowInfo(
+            self.hold_s,
+            targets=self.targets,
+            target_m=self.target_m,
+            speed_m_s=self.speed_m_s,
+            display=self.display,
+            display_pitch=self.display_pitch,
+        )
+        return Show(self.info(), tuple(self.scan_frames()), times)
+
     def estimate(self) -> ScanEstimate:
         """Return time and noise of the scan."""
         scan_frames = self.scan_frames()
-        darks = sum(scan_frame.pattern is None for scan_frame in scan_frames) - 1
+        darks = sum(scan_frame.pattern is None for scan_frame in scan_frames) - (self.show == "pictures")
+        seconds = self.exposure_s + self.overhead_s
+        if self.show != "pictures":
+            seconds = self.as_show().duration_s / len(scan_frames)
         return estimate_scan(
             self.info().patterns,
             self.camera,
@@ -252,7 +302,7 @@ class ScanPlan:
             self.repeats,
             len(scan_frames),
             darks,
-            self.exposure_s + self.overhead_s,
+            seconds,
         )
 
 
@@ -273,7 +323,9 @@ def spread_points(plane: Plane, count: int) -> tuple[tuple[int, int], ...]:
 
 
 def write_plan(plan: ScanPlan, folder: str | Path, progress: Progress = silent) -> list[Path]:
-    """Write a scan's folder and return its files: scan.yaml, frames.csv, and places.csv or patterns/*.png.
+    """Write a scan's folder and return its files: scan.yaml, frames.csv, and what to show.
+
+    That is places.csv for a lamp, patterns/*.png for a display, or show.yaml with show.html or show.mp4.
 
     The folder gets its name when the last is written.
 
@@ -288,7 +340,8 @@ def write_plan(plan: ScanPlan, folder: str | Path, progress: Progress = silent) 
     folder = Path(folder)
     info, scan_frames = plan.info(), plan.scan_frames()
     shows_places = plan.display is None and plan.pattern != "hadamard"
-    total, written = 3 if shows_places else info.patterns.count + 2, list[Path]()
+    one_file = shows_places or plan.show != "pictures"
+    total, written = 3 + (plan.show != "pictures") if one_file else info.patterns.count + 2, list[Path]()
 
     def wrote(path: Path) -> None:
         written.append(path)
@@ -299,50 +352,44 @@ def write_plan(plan: ScanPlan, folder: str | Path, progress: Progress = silent) 
         (draft / "frames").mkdir()
         write_scan_frames(draft / info.frames, scan_frames)
         wrote(folder / info.frames)
-        if shows_places:
+        if plan.show != "pictures":
+            show = plan.as_show()
+            save_yaml(show.show, draft / SHOW_FILE)
+            wrote(folder / SHOW_FILE)
+            if plan.show == "page":
+                (draft / "show.html").write_text(show_page(show), encoding="utf-8")
+                wrote(folder / "show.html")
+            else:
+                _write_show(draft / "show.mp4", show, progress)
+                wrote(folder / "show.mp4")
+        elif shows_places:
             _write_places(draft / "places.csv", info.plane, measured_cells(info))
             wrote(folder / "places.csv")
         else:
             (draft / "patterns").mkdir()
-            _save(draft / "patterns" / "dark.png", plan, np.zeros(info.plane.shape, np.bool_))
-            for k in range(info.patterns.count):
-                name = f"patterns/{k:05d}.png"
-                _save(draft / name, plan, lit_cells(info, k))
-                wrote(folder / name)
+            for k in (None, *range(info.patterns.count)):
+                name = "patterns/dark.png" if k is None else f"patterns/{k:05d}.png"
+                lit = np.zeros(info.plane.shape, np.bool_) if k is None else lit_cells(info, k)
+                if plan.display is not None:  # otherwise one pixel per cell
+                    lit = displayed(lit, info.plane, plan.display, plan.display_pitch) > 0
+                Image.fromarray(lit.astype(np.uint8) * 255).convert("1").save(draft / name)
+                if k is not None:
+                    wrote(folder / name)
         save_yaml(info, draft / SCAN_FILE)
         wrote(folder / SCAN_FILE)
     return written
 
 
-def measured_cells(info: ScanInfo) -> NDArray[np.int64]:
-    """Return the number of each measured cell, row by row: all, or the points."""
-    if info.pattern == "points":
-        return np.array([row * info.plane.width + column for row, column in info.cells])
-    return np.arange(info.plane.height * info.plane.width)
+def _write_show(path: Path, show: Show, progress: Progress) -> None:
+    total = math.ceil(show.duration_s * _SHOWN_HZ)
 
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        for number, picture in enumerate(show_pictures(show, _SHOWN_HZ)):
+            if number % 20 == 0:
+                progress(Step("draw show", number, total, "frames"))
+            yield picture
 
-def lit_cells(info: ScanInfo, pattern: int) -> NDArray[np.bool_]:
-    """Return which cells a pattern lights, [h, w]."""
-    lit = np.zeros(info.plane.height * info.plane.width, np.bool_)
-    lit[measured_cells(info)] = Patterns(info.pattern, info.patterns.cells).row(pattern)
-    return lit.reshape(info.plane.shape)
-
-
-def _save(path: Path, plan: ScanPlan, lit: NDArray[np.bool_]) -> None:
-    """Write a picture for the display, cells in its middle, or one pixel per cell."""
-    if plan.display is None:
-        Image.fromarray(lit.astype(np.uint8) * 255).convert("1").save(path)
-        return
-    width, height = plan.display
-    size = plan.pitch / plan.display_pitch  # display pixels per cell, not whole in general
-    edges = [np.round((np.arange(n + 1) - n / 2) * size).astype(int) for n in lit.shape]
-    y, x = edges[0] + height // 2, edges[1] + width // 2
-    picture = np.zeros((height, width), np.uint8)
-    shown = np.repeat(np.repeat(lit, np.diff(y), axis=0), np.diff(x), axis=1)
-    top, left = max(int(y[0]), 0), max(int(x[0]), 0)
-    part = shown[: height - top, : width - left]
-    picture[top : top + part.shape[0], left : left + part.shape[1]] = part * np.uint8(255)
-    Image.fromarray(picture).convert("1").save(path)
+    write_video(path, pictures(), _SHOWN_HZ, 12, "ultrafast")
 
 
 def _write_places(path: Path, plane: Plane, cells: NDArray[np.int64]) -> None:
