@@ -1,12 +1,13 @@
 """Frames and events that are simulated on a device and stay there.
 
 - Frames that are simulated on a device and stay there.
-- Checks and division of a batch of clips for the torch path.
+- Light of clips and walls, block by block; checks and division of a batch of clips.
 - Events that are simulated on a device and stay there.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -19,16 +20,78 @@ from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.event_model import PixelSettings
 from evnlos.cameras.frame_camera import FrameCamera, check_extremes
 from evnlos.cameras.pixel import EventPixel, V2ePixel, in_mode
-from evnlos.cameras.pixels.torch_light import Clips, WallLight, check_range
 from evnlos.cameras.pixels.torch_noise import electrons
 from evnlos.cameras.pixels.torch_v2e import Pixels, default_tile
 from evnlos.cameras.random_numbers import check_seed
-from evnlos.cameras.streams import EventTensors, check_threshold_maps, check_times
+from evnlos.cameras.streams import WHITE_DN, EventTensors, check_threshold_maps, check_times
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events, derive_seed
 
 Pattern = tuple[Tensor, Tensor]
 _TOGETHER_PX = 1 << 22  # pixels of frames that are made in one operation
+_AHEAD = 32  # instants rendered at a time, at least
+_AHEAD_PX = 1 << 22  # pixels of a wall's instants, about
+
+
+class Clips:
+    """Light that is there as a whole.
+
+    Args:
+        frames: Light in DN [clips, T, H, W], checked.
+    """
+
+    def __init__(self, frames: Tensor) -> None:
+        clips, steps, height, width = frames.shape
+        self.shape, self.dtype, self.device = (clips, steps, height, width), frames.dtype, frames.device
+        self._flat = frames.flatten(2)
+
+    def block(self, first: int, last: int) -> Tensor:
+        """Return the light at the instants first..last - 1, [clips, last - first, pixels]."""
+        return self._flat[:, first:last]
+
+
+class WallLight:
+    """Light that walls render when pixels ask for it, and forget: clips of any length in little memory.
+
+    Args:
+        walls: One wall a clip, of one size, on one device.
+        times_s: Instants, float64 [T], seconds.
+
+    Raises:
+        DataError: A wall returned NaN, infinity or negative light; also by `block`.
+    """
+
+    dtype = torch.float32
+
+    def __init__(self, walls: Sequence[Irradiance], times_s: NDArray[np.float64]) -> None:
+        height, width = walls[0].shape
+        self._walls, self._times_s = walls, times_s
+        self.shape: tuple[int, int, int, int] = (len(walls), len(times_s), height, width)
+        self._ahead = max(_AHEAD, _AHEAD_PX // (height * width))  # whatever the number of walls
+        self._first, self._held = 0, self._rendered(0, 1)
+        self.device = self._held.device
+
+    def block(self, first: int, last: int) -> Tensor:
+        """Return the light at the instants first..last - 1, [clips, last - first, pixels]."""
+        if not self._first <= first <= last <= self._first + self._held.shape[1]:
+            self._first, self._held = first, self._rendered(first, max(last, first + self._ahead))
+        return self._held[:, first - self._first : last - self._first]
+
+    def _rendered(self, first: int, last: int) -> Tensor:
+        times_s = self._times_s[first:last]
+        light = torch.stack([wall.irradiance(times_s).to(torch.float32) for wall in self._walls])
+        light = light.flatten(2).mul_(WHITE_DN)
+        check_range(light, "the wall's light")
+        return light
+
+
+def check_range(light: Tensor, name: str) -> None:
+    """Refuse light in DN that is not finite, or below 0."""
+    lowest, highest = torch.stack(light.aminmax()).tolist()
+    if not (math.isfinite(lowest) and math.isfinite(highest)):
+        raise DataError(f"{name} holds NaN or infinity; light must be finite, 255 = white")
+    if lowest < 0:
+        raise DataError(f"{name} holds {lowest:g}; light cannot be negative, black is 0")
 
 
 def capture_tensors(camera: FrameCamera, wall: Irradiance, times_s: ArrayLike, seed: int = 0) -> Tensor:

@@ -72,7 +72,7 @@ def _decoded(codes: NDArray, tone: Tone) -> NDArray:
 
 
 def coded(values: NDArray, tone: Tone) -> NDArray[np.float64]:
-    """Return light in fractions of white as codes of a tone curve in fractions of white: of `to_light` the inverse.
+    """Return light as codes of a tone curve, both in fractions of white: the inverse of `to_light`.
 
     Example:
         >>> (255 * coded(np.array([0.0, 0.5, 1.0]), "srgb")).round(1)
@@ -151,11 +151,15 @@ def write_video(
             height, width = (side - side % even for side in first.shape)
             stream.height, stream.width = height, width
             stream.pix_fmt = "rgb24" if quality is None else "yuv420p"
-            stream.options = {"qp": "0", "preset": "fast"} if quality is None else {"crf": str(quality), "preset": effort}
+            stream.options = (
+                {"qp": "0", "preset": "fast"} if quality is None else {"crf": str(quality), "preset": effort}
+            )
             for frame in _again(first, shots):
                 frame = np.ascontiguousarray(frame[:height, :width])
                 if quality is None:
-                    picture = av.VideoFrame.from_ndarray(np.repeat(frame[:, :, None], 3, axis=2), format="rgb24")
+                    picture = av.VideoFrame.from_ndarray(
+                        np.repeat(frame[:, :, None], 3, axis=2), format="rgb24"
+                    )
                 else:
                     picture = av.VideoFrame.from_ndarray(frame, format="gray")
                 container.mux(stream.encode(picture))

@@ -7,6 +7,7 @@ complete one another tell the tone curve, and what the patterns say twice tells 
 from __future__ import annotations
 
 import math
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -37,14 +38,16 @@ _GUARD = 0.2  # of a pattern's time, left out at both ends: the display, a rolli
 _AGREES = 0.8
 _MOST_RATE = 0.005
 _FINE_S = 0.001
-_PASSES = 6
+_PASSES = 3
 _MODES = 24
-_GAIN_PRIOR, _SHIFT_PRIOR = 0.2, 2.0
+_GAIN_PRIOR, _SHIFT_PRIOR = 0.1, 2.0
 _STEADY_GAIN, _STEADY_PX = 0.003, 0.03  # root mean squares below which nothing is corrected
 _MOST_PX = 0.05  # of the width: beyond that the camera was moved
-_LOCKED = 0.01
-_LONGER = 180.0
-_SMOOTH_S, _SMOOTH_GAIN_S = 0.1, 0.3
+_LOCKED = 0.02
+_LONGER, _USUAL_HZ = 180.0, 30.0
+_MEAN = 1e-4
+_ALIKE = 10.0  # neighbouring pixels of a film err alike
+_CALM_S, _JITTER = 0.6, 1e-3  # seconds over which exposure and place stay alike; share that does not
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,8 @@ class Film:
     def mean(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Return the mean light of some frames [H, W], white levels, and where one of them saturates."""
         some = self.frames[chosen]
-        return some.mean(axis=0, dtype=np.float64).astype(np.float32) / _CODED, (some > _CODED).any(axis=0)
+        light = some.mean(axis=0, dtype=np.float64).astype(np.float32) / _CODED
+        return light, some.max(axis=0) > _CODED
 
 
 def read_film(
@@ -155,7 +159,8 @@ def read_film(
             f"{shape[0]} x {shape[1]} pixels are requested, the film has {video.height} x {video.width}"
         )
     times, brightness = [], []
-    progress(Step("read film", 0, video.frames, "frames"))
+    total = video.frames or round(longest_s * _USUAL_HZ)
+    progress(Step("read film", 0, total, "frames"))
     for time_s, light in video:
         if time_s > longest_s:
             raise DataError(
@@ -170,9 +175,9 @@ def read_film(
         times.append(time_s)
         brightness.append(float(level.mean()))
         if len(times) % 30 == 0:
-            progress(Step("read film", len(times), video.frames, "frames"))
+            progress(Step("read film", min(len(times), total), total, "frames"))
     store.flush()
-    progress(Step("read film", len(times), len(times), "frames"))
+    progress(Step("read film", total, total, "frames"))
     if len(times) < 2:
         raise DataError(f"{video.path} has {len(times)} frames; film the whole show")
     frames = np.memmap(store, np.uint16, "r", shape=(len(times), *shape))
@@ -298,41 +303,41 @@ class Steadiness:
 def find_steadiness(pictures: NDArray[np.float32], design: NDArray[np.float64], spacing_s: float) -> Steadiness:
     """Find exposure and movement of each picture of a scan from what the patterns say twice.
 
-    Without them picture k is (D + M p_k), D the dark, M the light of the cells, p_k the pattern, so that K
-    pictures lie in the space of the n + 1 columns of the design. Each is regressed on its own prediction and
-    the prediction's slopes, F_k = (1 + g) P_k + u dP_k/dy + v dP_k/dx; since a prediction is made with the
-    picture itself (leverage h_k), the step is 1 / (1 - h_k) as large; a few rounds settle it.
+    Without them picture k is P_k = D + M p_k, D the dark, M the light of the cells, p_k the pattern, so that K
+    pictures lie in the span of the n + 1 columns of the design. With them, to first order, F_k = P_k + B_k t_k,
+    B_k the picture and its slopes, t_k = (gain, down, right). With Q the projection off the design's span,
+    Q F = Q (B t) holds whatever D and M are (variable projection, Golub and Pereyra 1973): least squares for
+    all t at once, their prior a smooth Gaussian process. A few rounds settle it.
 
     Args:
         pictures: Light, float32 [K, H, W].
         design: Which cells each lights, and a column of ones for the dark, float64 [K, n + 1].
-        spacing_s: Time from one picture to the next, seconds; exposures are smooth over
-            0.3 s, movement over 0.1 s.
+        spacing_s: Time from one picture to the next, seconds.
     """
-    from scipy.ndimage import gaussian_filter1d
-
     count = len(pictures)
-    back = np.linalg.pinv(design)
-    leverage = np.minimum((design * back.T).sum(axis=1), 0.9)
+    off = np.eye(count) - design @ np.linalg.pinv(design)  # Q
+    apart_s = spacing_s * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    calm = np.linalg.inv(np.exp(-0.5 * (apart_s / _CALM_S) ** 2) + _JITTER * np.eye(count))
+    deviations = np.array([_GAIN_PRIOR, _SHIFT_PRIOR, _SHIFT_PRIOR])
+    prior = np.kron(np.diag(1 / deviations**2), calm)
+    prior += np.kron(np.eye(3), np.full((count, count), 1 / (count * _MEAN) ** 2))  # no data tell the means
     gain, moved = np.ones(count), np.zeros((count, 2))
     inside = (slice(None), slice(2, -2), slice(2, -2))
     for _ in range(_PASSES):
-        straight = _steadied(pictures, gain, moved)
-        flat = straight.reshape(count, -1)
-        predicted = (design @ (back @ flat)).reshape(pictures.shape)
-        slopes = np.gradient(predicted, axis=(1, 2))
-        columns = [part[inside].reshape(count, -1) for part in (predicted, *slopes)]
-        rest = (straight - predicted)[inside].reshape(count, -1)
-        noise = float(np.mean(rest**2))
-        for k in range(count):
-            basis = np.stack([column[k] for column in columns])  # [3, pixels]
-            prior = noise / np.array([_GAIN_PRIOR, _SHIFT_PRIOR, _SHIFT_PRIOR]) ** 2
-            step = np.linalg.solve(basis @ basis.T + np.diag(prior + 1e-12), basis @ rest[k])
-            step /= 1 - leverage[k]
-            gain[k] *= 1 + np.clip(step[0], -0.3, 0.3)
-            moved[k] -= np.clip(step[1:], -1.0, 1.0)
-        gain = gaussian_filter1d(gain / gain.mean(), _SMOOTH_GAIN_S / spacing_s, mode="nearest")
-        moved = gaussian_filter1d(moved - moved.mean(axis=0), _SMOOTH_S / spacing_s, axis=0, mode="nearest")
+        straight = _steadied(pictures, gain, moved).astype(np.float64)
+        rest = (off @ straight.reshape(count, -1)).reshape(pictures.shape)
+        predicted = straight - rest
+        parts = (predicted, *np.gradient(predicted, axis=(1, 2)))
+        basis = np.concatenate([part[inside].reshape(count, -1) for part in parts])  # [3 K, pixels]
+        left = rest[inside].reshape(count, -1)
+        noise = _ALIKE * float((left**2).sum()) / (left.shape[1] * max(np.trace(off), 1.0))
+        normal = (basis @ basis.T) * np.tile(off, (3, 3)) / noise + prior
+        right = (basis * np.tile(left, (3, 1))).sum(axis=1) / noise
+        right -= prior @ np.concatenate([gain - 1, -moved[:, 0], -moved[:, 1]])
+        step = np.linalg.solve(normal, right).reshape(3, count)
+        gain *= 1 + np.clip(step[0], -0.3, 0.3)
+        moved -= np.clip(step[1:].T, -1.0, 1.0)
+        gain, moved = gain / gain.mean(), moved - moved.mean(axis=0)
     return Steadiness(gain, moved)
 
 
@@ -347,9 +352,9 @@ def _undone(picture: NDArray[np.float32], gain: float, moved: NDArray) -> NDArra
     """Return a picture [H, W] divided by a gain and moved back by (down, right) pixels."""
     from scipy.ndimage import shift
 
-    if np.abs(moved).max() > 1e-3:
-        picture = shift(picture, -moved, order=3, mode="nearest")
-    return (picture / np.float32(gain)).astype(np.float32)
+    still = np.abs(moved).max() < 1e-3
+    back = picture if still else shift(picture, -moved, order=3, mode="nearest")
+    return (np.asarray(back) / gain).astype(np.float32)
 
 
 def import_film(
@@ -389,7 +394,7 @@ def import_film(
         count = len(show.scan_frames)
         design = np.stack([np.r_[show.cells(part).ravel(), 1.0] for part in stood])
         checks = pictures[count:]
-        again = [float((checks[k] - checks[0]).sum()) for k in (1, 8)]
+        again = [float((checks[k] + checks[k + 1] - 2 * checks[dark]).sum()) for k, dark in ((1, 0), (8, 10))]
         locked = abs(again[1] / max(again[0], 1e-9) - 1) < _LOCKED
         curve, misfit = (1.0, 0.0), (math.nan, math.nan)
         if reading.fit_tone and locked:
@@ -496,6 +501,8 @@ def _write_capture(
     scene = show.scene(part.number)
     out = folder / "captures" / scene.target.name
     out.parent.mkdir(exist_ok=True)
+    if (out / "capture.yaml").is_file():  # of this film, or of one before it
+        shutil.rmtree(out)
     count = max(2, math.floor((part.stop_s - part.start_s) * reading.capture_hz))
     edges = part.start_s + np.arange(count + 1) / reading.capture_hz
     rows = ["t_us,file"]

@@ -267,13 +267,12 @@ class ScanPlan:
                     found.append((None, repeat, self.exposure_s))
                 found.append((k, repeat, self.exposure_s))
             found.append((None, repeat, self.exposure_s))
-        if self.show != "pictures":  # a phone keeps its exposure, and the show has its own check
-            return [ScanFrame(p, r, e, f"frames/{number:05d}.png") for number, (p, r, e) in enumerate(found)]
         # Half of the exposure tells whether the camera is linear; cells near the middle are bright.
         half = self.exposure_s / 2
         middle = self.cells.height // 2 * self.cells.width + self.cells.width // 2
         checks = [0] if self.pattern == "points" else sorted({max(0, middle - k) for k in range(_CHECKS)})
-        found += [(None, 0, half), *((k, 0, half) for k in checks)]
+        if self.show == "pictures":  # a phone keeps its exposure, and the show has a check of its own
+            found += [(None, 0, half), *((k, 0, half) for k in checks)]
         return [ScanFrame(p, r, e, f"frames/{number:05d}.png") for number, (p, r, e) in enumerate(found)]
 
     def as_show(self) -> Show:

@@ -11,6 +11,7 @@ import base64
 import io
 import json
 import math
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -159,18 +160,12 @@ class Show:
         """What the pictures for the tone curve light, [h, w] each: see `CHECKS`."""
         height, width = self.info.plane.shape
         draw = np.random.default_rng(derive_seed(0, "checks"))
-        half = np.broadcast_to(np.arange(width) < width / 2, (height, width))
-        mixed, few = (draw.permutation(height * width).reshape(height, width) for _ in range(2))
-        lit = {
-            "none": np.zeros((height, width), np.bool_),
-            "all": np.ones((height, width), np.bool_),
-            "left": half,
-            "right": ~half,
-            "half": mixed < height * width // 2,
-            "rest": mixed >= height * width // 2,
-            "quarter": few < height * width // 4,
-            "three": few >= height * width // 4,
-        }
+        cells = height * width
+        left = np.broadcast_to(np.arange(width) < width / 2, (height, width))
+        mixed, few = (draw.permutation(cells).reshape(height, width) for _ in range(2))
+        lit = {"none": mixed < 0, "all": mixed >= 0, "left": left, "right": ~left}
+        lit |= {"half": mixed < cells // 2, "rest": mixed >= cells // 2}
+        lit |= {"quarter": few < cells // 4, "three": few >= cells // 4}
         return tuple(lit[name] for name in CHECKS)
 
     @property
@@ -193,8 +188,7 @@ class Show:
 
     def part_at(self, t_s: float) -> Part:
         """Return the stretch at an instant, seconds from the show's begin; the nearest one outside it."""
-        index = int(np.searchsorted(self._starts, t_s, "right")) - 1
-        return self.parts[min(max(index, 0), len(self.parts) - 1)]
+        return self.parts[max(bisect_right(self.parts, t_s, key=lambda part: part.start_s) - 1, 0)]
 
     def cells(self, part: Part, t_s: float = 0.0) -> NDArray[np.float32]:
         """Return the brightness of the cells in a stretch, float32 [h, w]; at an instant for a target."""
@@ -209,10 +203,6 @@ class Show:
         if pattern is not None:
             return lit_cells(self.info, pattern).astype(np.float32)
         return np.full(plane.shape, CODE[part.number] if part.kind == "code" else 0, np.float32)
-
-    @cached_property
-    def _starts(self) -> NDArray[np.float64]:
-        return np.array([part.start_s for part in self.parts])
 
 
 CHECKS = ("none", "left", "right", "half", "rest", "quarter", "three", "all", "left", "right", "none")
@@ -230,9 +220,8 @@ def read_show(folder: str | Path) -> Show:
     """
     folder = Path(folder)
     if not (folder / SHOW_FILE).is_file():
-        raise ConfigError(
-            f"{folder} holds no {SHOW_FILE}, so a film of it tells no time; plan it with --show page or video"
-        )
+        cure = "plan it with --show page or video"
+        raise ConfigError(f"{folder} holds no {SHOW_FILE}, so a film of it tells no time; {cure}")
     info = read_scan_info(folder)
     return Show(info, tuple(read_scan_frames(folder, info)), load_yaml(ShowInfo, folder / SHOW_FILE))
 
@@ -264,10 +253,7 @@ def show_pictures(show: Show, fps: float) -> Iterator[NDArray[np.uint8]]:
 
 
 def show_page(show: Show) -> str:
-    """Return the show as a page that needs nothing but itself: black until a click, then the whole screen.
-
-    Cells are drawn in the display's own pixels; a display of another size than the plan's is said on the page.
-    """
+    """Return the show as a page that needs nothing but itself; cells are drawn in the display's own pixels."""
     assert show.show.display is not None  # refused before
     plane = show.info.plane
     y, x = cell_edges(plane, show.show.display, show.show.display_pitch)
@@ -277,19 +263,19 @@ def show_page(show: Show) -> str:
         if part.kind == "target":
             way = targets[part.number].motion.position_m(np.array([0.0, part.stop_s - part.start_s]))
             ends = (way - np.asarray(plane.center_m)) / show.show.display_pitch
-            parts.append([part.start_s, -1 - part.number, *ends.ravel().round(3).tolist()])
+            parts.append([round(part.start_s, 4), -1 - part.number, *ends.ravel().round(3).tolist()])
             continue
         bits = np.packbits(show.cells(part).ravel() > 0).tobytes()
         if bits not in known:
             known[bits] = len(pictures)
             pictures.append(base64.b64encode(bits).decode())
-        parts.append([part.start_s, known[bits]])
+        parts.append([round(part.start_s, 4), known[bits]])
     data = {
         "display": show.show.display,
         "rows": y.tolist(),
         "columns": x.tolist(),
         "pictures": pictures,
-        "parts": [[round(float(value), 4) for value in part] for part in parts],
+        "parts": parts,
         "duration_s": show.duration_s,
         "side": show.show.target_m / show.show.display_pitch,
         "bar_px": 0.1 / show.show.display_pitch,
@@ -312,8 +298,7 @@ def _as_url(image: Image.Image) -> str:
 
 _STATES = 32  # images that are kept
 _FINER = 4
-BEGIN_S = 1.5
-"""When a rehearsed show begins, seconds after the film."""
+BEGIN_S = 1.5  # a rehearsed show begins this long after the film
 _KEY_S = 0.1  # between the instants at which a moving character's light is computed
 
 
@@ -323,7 +308,7 @@ class FilmedShow:
     Args:
         show: The show.
         matrix: White levels for each cell of a plane at full brightness, float32 [H W, cells].
-        plane: Those cells, as fine as the characters shall be drawn; they cover the scan's plane.
+        plane: Those cells, each a whole fraction of one of the scan's, which they cover.
         ambient: Light that is always there, white levels, float32 [H, W].
     """
 
@@ -353,18 +338,17 @@ class FilmedShow:
         if name not in self._known:
             if len(self._known) >= _STATES:
                 self._known.pop(next(iter(self._known)))
-            cells = self._cells(part, part.start_s + key * _KEY_S)
-            self._known[name] = (self._matrix @ cells.ravel()).reshape(self.shape) + self._ambient
+            if part.kind == "target":
+                scene = self._show.scene(part.number)
+                cells = scene.target.rasterise(self._plane, scene.motion.position_m(key * _KEY_S))
+            else:
+                coarse = self._show.cells(part)
+                cells = np.kron(
+                    coarse, np.ones([n // k for n, k in zip(self._plane.shape, coarse.shape, strict=True)])
+                )
+            image = (self._matrix @ cells.astype(np.float32).ravel()).reshape(self.shape)
+            self._known[name] = image + self._ambient
         return self._known[name]
-
-    def _cells(self, part: Part, show_s: float) -> NDArray[np.float32]:
-        if part.kind == "target":
-            scene = self._show.scene(part.number)
-            place = scene.motion.position_m(show_s - part.start_s)
-            return scene.target.rasterise(self._plane, place).astype(np.float32)
-        coarse = self._show.cells(part)
-        factors = [fine // have for fine, have in zip(self._plane.shape, coarse.shape, strict=True)]
-        return np.repeat(np.repeat(coarse, factors[0], axis=0), factors[1], axis=1)
 
 
 def rehearse_film(
@@ -380,8 +364,7 @@ def rehearse_film(
 ) -> Path:
     """Film the show of a planned scan with a known setup, as a phone would, and return the film: film.mp4.
 
-    Characters are drawn with four times as many cells a side as the scan has. The room's own light is uneven,
-    with a bright spot, so that it moves where the phone does.
+    Characters are drawn with four times as many cells a side as the scan has; the room's own light is uneven.
 
     Args:
         folder: A folder that `write_plan` wrote, with a show.
@@ -392,9 +375,6 @@ def rehearse_film(
         ambient: Light that is always there, white levels.
         seed: Seed of noise and shake.
         progress: Called as the work goes on.
-
-    Raises:
-        ConfigError: The folder holds no show, or the setup is not linear.
     """
     folder, phone = Path(folder), phone or Phone()
     show = read_show(folder)
@@ -406,7 +386,7 @@ def rehearse_film(
     spot = np.exp(-((x + 0.5) ** 2 + (y[:, None] + 0.4) ** 2) / 0.02)
     room = (ambient * (1 + 0.2 * x + 0.1 * y[:, None] + 0.8 * spot)).astype(np.float32)
     light = FilmedShow(show, matrix, fine, room)
-    length = show.duration_s + BEGIN_S + 1.5
+    length = show.duration_s + 2 * BEGIN_S
     total = round(length * phone.frame_rate_hz)
 
     def frames() -> Iterator[NDArray[np.uint8]]:
