@@ -328,7 +328,7 @@ def find_steadiness(pictures: NDArray[np.float32], design: NDArray[np.float64], 
         rest = (off @ straight.reshape(count, -1)).reshape(pictures.shape)
         predicted = straight - rest
         parts = (predicted, *np.gradient(predicted, axis=(1, 2)))
-        basis = np.concatenate([part[inside].reshape(count, -1) for part in parts])  # [3 K, pixels]
+        basis = np.concatenate([np.asarray(one)[inside].reshape(count, -1) for one in parts])  # [3 K, pixels]
         left = rest[inside].reshape(count, -1)
         noise = _ALIKE * float((left**2).sum()) / (left.shape[1] * max(np.trace(off), 1.0))
         normal = (basis @ basis.T) * np.tile(off, (3, 3)) / noise + prior

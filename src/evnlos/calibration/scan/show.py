@@ -297,7 +297,7 @@ def _as_url(image: Image.Image) -> str:
 
 
 _STATES = 32  # images that are kept
-_FINER = 4
+_FINER = 3
 BEGIN_S = 1.5  # a rehearsed show begins this long after the film
 _KEY_S = 0.1  # between the instants at which a moving character's light is computed
 
@@ -355,7 +355,7 @@ def rehearse_film(
     folder: str | Path,
     setup: Setup,
     phone: Phone | None = None,
-    shape: tuple[int, int] = (180, 320),
+    shape: tuple[int, int] = (144, 256),
     *,
     level: float = 0.5,
     ambient: float = 0.04,
@@ -364,7 +364,7 @@ def rehearse_film(
 ) -> Path:
     """Film the show of a planned scan with a known setup, as a phone would, and return the film: film.mp4.
 
-    Characters are drawn with four times as many cells a side as the scan has; the room's own light is uneven.
+    Characters are drawn with three times as many cells a side as the scan has; the room's own light is uneven.
 
     Args:
         folder: A folder that `write_plan` wrote, with a show.
@@ -376,8 +376,8 @@ def rehearse_film(
         seed: Seed of noise and shake.
         progress: Called as the work goes on.
     """
-    folder, phone = Path(folder), phone or Phone()
-    show = read_show(folder)
+    progress(Step("light path", 0, 1, "matrices"))
+    folder, phone, show = Path(folder), phone or Phone(), read_show(folder)
     cells = show.info.plane
     fine = Plane(cells.height * _FINER, cells.width * _FINER, cells.pitch_m / _FINER, cells.center_m)
     matrix = setup.resized(shape).operator(fine, shape, torch.float32).dense(torch.float32).numpy()
