@@ -57,6 +57,7 @@ track captures/lab_icon_000 --json
 invert captures/lab_icon_000 --setup small.yaml --solver tikhonov --columns 24 --cells 8 --out solved.png
 invert photograph.npz --out photograph.png
 scan plan scan
+scan plan tray --display 1920 1080 --pattern hadamard --show page
 events video --fps 100 --out events.h5
 pixel fit events.h5 --light unknown --out fitted
 info events.h5
