@@ -38,7 +38,8 @@ _GUARD = 0.2  # of a pattern's time, left out at both ends: the display, a rolli
 _AGREES = 0.8
 _MOST_RATE = 0.005
 _FINE_S = 0.001
-_PASSES = 3
+_PASSES = 10
+_FINE_ENOUGH = 80  # columns from which gain and movement are found
 _MODES = 24
 _GAIN_PRIOR, _SHIFT_PRIOR = 0.1, 2.0
 _STEADY_GAIN, _STEADY_PX = 0.003, 0.03  # root mean squares below which nothing is corrected
@@ -300,30 +301,40 @@ class Steadiness:
         return float(np.sqrt(((self.shift_px - self.shift_px.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
-def find_steadiness(pictures: NDArray[np.float32], design: NDArray[np.float64], spacing_s: float) -> Steadiness:
+def find_steadiness(
+    pictures: NDArray[np.float32],
+    design: NDArray[np.float64],
+    spacing_s: float,
+    progress: Progress = silent,
+) -> Steadiness:
     """Find exposure and movement of each picture of a scan from what the patterns say twice.
 
     Without them picture k is P_k = D + M p_k, D the dark, M the light of the cells, p_k the pattern, so that K
     pictures lie in the span of the n + 1 columns of the design. With them, to first order, F_k = P_k + B_k t_k,
     B_k the picture and its slopes, t_k = (gain, down, right). With Q the projection off the design's span,
     Q F = Q (B t) holds whatever D and M are (variable projection, Golub and Pereyra 1973): least squares for
-    all t at once, their prior a smooth Gaussian process. A few rounds settle it.
+    all t at once. Their prior is a smooth Gaussian process of the size that the data have (expectation
+    maximisation), so that what never moved stays where it is.
 
     Args:
         pictures: Light, float32 [K, H, W].
         design: Which cells each lights, and a column of ones for the dark, float64 [K, n + 1].
         spacing_s: Time from one picture to the next, seconds.
+        progress: Called after each round.
     """
     count = len(pictures)
+    coarser = max(1, pictures.shape[2] // _FINE_ENOUGH)
+    small = (pictures.shape[1] // coarser, pictures.shape[2] // coarser)
+    pictures = reduce_by_area(pictures[:, : small[0] * coarser, : small[1] * coarser], small)
     off = np.eye(count) - design @ np.linalg.pinv(design)  # Q
     apart_s = spacing_s * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     calm = np.linalg.inv(np.exp(-0.5 * (apart_s / _CALM_S) ** 2) + _JITTER * np.eye(count))
-    deviations = np.array([_GAIN_PRIOR, _SHIFT_PRIOR, _SHIFT_PRIOR])
-    prior = np.kron(np.diag(1 / deviations**2), calm)
-    prior += np.kron(np.eye(3), np.full((count, count), 1 / (count * _MEAN) ** 2))  # no data tell the means
+    size = np.array([_GAIN_PRIOR, _SHIFT_PRIOR, _SHIFT_PRIOR]) ** 2
+    no_mean = np.kron(np.eye(3), np.full((count, count), 1 / (count * _MEAN) ** 2))  # no data tell the means
     gain, moved = np.ones(count), np.zeros((count, 2))
     inside = (slice(None), slice(2, -2), slice(2, -2))
-    for _ in range(_PASSES):
+    for number in range(_PASSES):
+        progress(Step("steady", number, _PASSES, "rounds"))
         straight = _steadied(pictures, gain, moved).astype(np.float64)
         rest = (off @ straight.reshape(count, -1)).reshape(pictures.shape)
         predicted = straight - rest
@@ -331,14 +342,19 @@ def find_steadiness(pictures: NDArray[np.float32], design: NDArray[np.float64], 
         basis = np.concatenate([np.asarray(one)[inside].reshape(count, -1) for one in parts])  # [3 K, pixels]
         left = rest[inside].reshape(count, -1)
         noise = _ALIKE * float((left**2).sum()) / (left.shape[1] * max(np.trace(off), 1.0))
+        prior = np.kron(np.diag(1 / size), calm) + no_mean
         normal = (basis @ basis.T) * np.tile(off, (3, 3)) / noise + prior
         right = (basis * np.tile(left, (3, 1))).sum(axis=1) / noise
         right -= prior @ np.concatenate([gain - 1, -moved[:, 0], -moved[:, 1]])
-        step = np.linalg.solve(normal, right).reshape(3, count)
+        spread = np.linalg.inv(normal)
+        step = (spread @ right).reshape(3, count)
         gain *= 1 + np.clip(step[0], -0.3, 0.3)
         moved -= np.clip(step[1:].T, -1.0, 1.0)
         gain, moved = gain / gain.mean(), moved - moved.mean(axis=0)
-    return Steadiness(gain, moved)
+        found = np.stack([gain - 1, -moved[:, 0], -moved[:, 1]])
+        sure = [np.sum(calm * spread[k : k + count, k : k + count]) for k in range(0, 3 * count, count)]
+        size = np.maximum((np.einsum("ik,kl,il->i", found, calm, found) + sure) / count, 1e-8)
+    return Steadiness(gain, moved * coarser)
 
 
 def _steadied(
@@ -399,11 +415,11 @@ def import_film(
         curve, misfit = (1.0, 0.0), (math.nan, math.nan)
         if reading.fit_tone and locked:
             if reading.steady:
-                moved = find_steadiness(pictures, design, hold_s).shift_px[count:]
+                moved = find_steadiness(pictures, design, hold_s, progress).shift_px[count:]
                 checks = _steadied(checks, np.ones(len(checks)), moved)
             curve, misfit = fit_tone(list(checks))
         light, design = straightened(pictures[:count], curve), design[:count]
-        found = find_steadiness(light, design, hold_s)
+        found = find_steadiness(light, design, hold_s, progress)
         if found.shift_rms_px > _MOST_PX * shape[1]:
             raise DataError(
                 f"the phone moved by {found.shift_rms_px:.1f} of {shape[1]} pixels, at most "
