@@ -92,7 +92,8 @@ def test_a_character_that_moved_becomes_a_capture(locked: tuple[Path, FilmResult
     assert capture.motion is not None and capture.scene is not None
     assert np.diff(capture.frame_times_us).mean() == pytest.approx(1e5, rel=0.02)
     assert "simulated" in (folder / "captures" / "K" / "capture.yaml").read_text()
-    main(["invert", str(folder / "captures" / "K"), "--setup", told["transport"], "--json"])
+    out = str(folder / "k.png")
+    main(["invert", str(folder / "captures" / "K"), "--setup", told["transport"], "--out", out, "--json"])
     row = json.loads(capsys.readouterr().out)["rows"][0]
     blind = 10.0  # about the mean of all characters
     assert row["psnr_db"] > blind + 2
