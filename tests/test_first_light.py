@@ -21,7 +21,7 @@ from evnlos.calibration.scan import (
     write_plan,
 )
 from evnlos.calibration.scan.film import find_steadiness, fit_tone, straightened
-from evnlos.calibration.scan.show import CHECKS, CODE, Show, read_show
+from evnlos.calibration.scan.show import CHECKS, CODE, read_show
 from evnlos.cameras.video import open_video
 from evnlos.cameras.video_files import write_video
 from evnlos.cli import main
@@ -221,5 +221,5 @@ def test_the_code_looks_like_itself_at_one_place_only() -> None:
     signs = 2 * np.array(CODE) - 1
     round_about = [int(signs @ np.roll(signs, k)) for k in range(len(CODE))]
     assert round_about == [15, *[-1] * 14]
-    show = Show(PLAN.info(), tuple(PLAN.scan_frames()), PLAN.as_show().show)
+    show = PLAN.as_show()
     assert len(CHECKS) == len(show.checks) and lit_cells(PLAN.info(), 0).shape == (3, 6)

@@ -16,16 +16,18 @@ import re
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from evnlos.errors import ConfigError
 
 if TYPE_CHECKING:
     from tqdm import tqdm
+
+T = TypeVar("T")
 
 
 def sleep_while_waiting() -> None:
@@ -106,7 +108,7 @@ class Step:
     Args:
         what: The piece of work, e.g. "train near-frame".
         done: Units that are done, those of an earlier, interrupted run included.
-        total: Units of the whole piece.
+        total: Units of the whole piece; 0 where nobody knows.
         unit: What is counted, e.g. "epochs".
         result: What the last unit brought (an object's name, an epoch's record, a score); None for the first
             step of a piece, which only says where it begins.
@@ -126,6 +128,24 @@ keeps what is finished; run it again to go on."""
 
 def silent(step: Step) -> None:
     """Take a step and do nothing: the `progress` of a verb that nobody watches."""
+
+
+def counted(
+    things: Iterable[T], progress: Progress, what: str, total: int, unit: str = "frames"
+) -> Iterator[T]:
+    """Yield things, and tell after each how many have gone by.
+
+    Args:
+        things: What is counted.
+        progress: Told the steps.
+        what: The piece of work.
+        total: How many there are; 0 where nobody knows.
+        unit: What they are.
+    """
+    progress(Step(what, 0, total, unit))
+    for done, thing in enumerate(things, 1):
+        yield thing
+        progress(Step(what, done, total, unit))
 
 
 class ProgressBars:
@@ -153,7 +173,7 @@ class ProgressBars:
 
             self.close()
             self._what = step.what
-            self._bar = tqdm(total=step.total, initial=step.done, desc=step.what, unit=f" {step.unit}")
+            self._bar = tqdm(total=step.total or None, initial=step.done, desc=step.what, unit=f" {step.unit}")
         self._bar.n = step.done
         if isinstance(step.result, Mapping):
             values = {key: step.result[key] for key in ("loss", "psnr_db") if key in step.result}

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -131,7 +132,7 @@ def write_video(
         raise DataError(f"{path}: no frames to write; give at least one")
     if suffix == "":
         with new_folder(path) as folder:
-            for number, frame in enumerate(_again(first, shots)):
+            for number, frame in enumerate(chain([first], shots)):
                 Image.fromarray(frame).save(folder / f"{number:06d}.png")
         return
     with new_file(path) as draft:
@@ -154,7 +155,7 @@ def write_video(
             stream.options = (
                 {"qp": "0", "preset": "fast"} if quality is None else {"crf": str(quality), "preset": effort}
             )
-            for frame in _again(first, shots):
+            for frame in chain([first], shots):
                 frame = np.ascontiguousarray(frame[:height, :width])
                 if quality is None:
                     picture = av.VideoFrame.from_ndarray(
@@ -164,11 +165,6 @@ def write_video(
                     picture = av.VideoFrame.from_ndarray(frame, format="gray")
                 container.mux(stream.encode(picture))
             container.mux(stream.encode())
-
-
-def _again(first: NDArray, rest: Iterator[NDArray]) -> Iterator[NDArray]:
-    yield first
-    yield from rest
 
 
 class PictureSource(Protocol):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +19,9 @@ from evnlos.cli.recordings import Flat, refuse_existing, result
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.inverse import CornerPicture, FloorSector, Penumbra
+from evnlos.machine import ProgressBars, counted
 from evnlos.tracking import UNSURE_NOISE, BearingTracking, BearingTracks
+from evnlos.untrusted import open_regular
 
 _DISTURBED, _SHAKE_PX, _NOISE, _GAIN = 0.02, 0.3, 3.0, 0.01  # beyond these a warning is due
 
@@ -53,8 +55,6 @@ class FilmOptions:
 
     def write(self, out: Path, tone: Tone, quiet: bool) -> dict[str, Any]:
         """Film the corner; return what `evnlos corner` asks for, and the truth."""
-        from tqdm import tqdm
-
         from evnlos.cameras import FrameCamera
         from evnlos.cameras.video import film
         from evnlos.cameras.video_files import write_video
@@ -70,8 +70,8 @@ class FilmOptions:
         camera = FrameCamera(0.0, self.full_well_e, bit_depth=8 if tone == "as-is" else 12)
         times = np.arange(round(self.seconds * self.fps)) / self.fps
         shots = film(floor, camera, times.tolist(), tone, self.seed)
-        bar = tqdm(shots, total=len(times), desc=out.name, unit=" frames", leave=False, disable=quiet or None)
-        write_video(out, bar, self.fps, self.quality)
+        with ProgressBars(quiet) as progress:
+            write_video(out, counted(shots, progress, f"film {out.name}", len(times)), self.fps, self.quality)
         bearings = [[None if np.isnan(v) else round(v, 3) for v in row] for row in scene.bearings_deg(times)]
         about = {"hidden_from_deg": round(scene.hidden_from_deg(), 2), "contrast": self.contrast}
         return floor.marks() | about | {"times_s": times.round(6).tolist(), "bearings_deg": bearings}
@@ -139,8 +139,10 @@ class CornerCommand:
         sector, video = self._sector(), self._video()
         box, index, bearings = sector.pixels((video.height, video.width))
         truth = None if self.truth is None else _true_bearings(self.truth)
-        with _Watch(video, self.start, self.stop, self.json) as watch:
-            still, frames = watch.opened(box)
+        with ProgressBars(self.json) as progress:
+            frames = self._part(
+                counted(video.part(box), progress, f"read {video.path.name}", video.frames or 0)
+            )
             penumbra = read_penumbra(frames, index, bearings, step_s=self.step, bin_deg=self.bin_deg)
         steps = f"{len(penumbra.times_s)} steps of {penumbra.step_s:.3g} s"
         say(f"note: {penumbra.frames} frames read; people are searched for in {steps}")
@@ -155,9 +157,10 @@ class CornerCommand:
             errors = found["errors_deg"] = _errors(tracks, true)
         found["warnings"] = warnings_of(penumbra, tracks)
         self.out.mkdir(parents=True, exist_ok=True)
+        still = next(light for time_s, light in video if time_s >= self.start)
         shown = self.out / "result.png"
         found["picture"] = drawn(
-            shown, lambda: draw_corner(shown, picture, tracks, still(), sector, words[0], true)
+            shown, lambda: draw_corner(shown, picture, tracks, still, sector, words[0], true)
         )
         write_atomically(self.out / "corner.npz", _arrays(penumbra, picture, tracks))
         write_atomically(self.out / "summary.json", json.dumps(found, indent=1).encode())
@@ -198,6 +201,14 @@ class CornerCommand:
             raise ConfigError(f"--stop is {self.stop:g} s, --start {self.start:g} s; give a later stop")
         return open_video(self.video, fps=self.fps, tone=self.tone)
 
+    def _part(self, frames: Iterable[tuple[float, NDArray]]) -> Iterator[tuple[float, NDArray]]:
+        """Yield the frames between start and stop."""
+        for time_s, light in frames:
+            if self.stop is not None and time_s > self.stop:
+                return
+            if time_s >= self.start:
+                yield time_s, light
+
     def _sector(self) -> FloorSector:
         if self.edge is None or self.wall is None or self.end is None:
             lacks = ", ".join(
@@ -218,38 +229,6 @@ class CornerCommand:
             matrix = homography_from_points(corners, [(0, 0), (across, 0), (across, along), (0, along)])
             ground = tuple(tuple(float(v) for v in row) for row in matrix)
         return FloorSector(self.edge, self.wall, self.end, ground)
-
-
-class _Watch:
-    """Reads a part of a video under a progress bar, and keeps one whole frame to draw on."""
-
-    def __init__(self, video: Video, start: float, stop: float | None, quiet: bool) -> None:
-        from tqdm import tqdm
-
-        self._video, self._start, self._stop = video, start, stop
-        self._bar = tqdm(total=video.frames, desc=video.path.name, unit=" frames", disable=quiet or None)
-
-    def __enter__(self) -> _Watch:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def opened(self, box: tuple[int, int, int, int]) -> tuple[Any, Iterator[tuple[float, NDArray]]]:
-        """Return what returns a whole frame, and the frames of the box between start and stop."""
-
-        def still() -> NDArray:
-            return next(light for time_s, light in self._video if time_s >= self._start)
-
-        def frames() -> Iterator[tuple[float, NDArray]]:
-            for time_s, light in self._video.part(box):
-                self._bar.update()
-                if self._stop is not None and time_s > self._stop:
-                    return
-                if time_s >= self._start:
-                    yield time_s, light
-
-        return still, frames()
 
 
 def in_words(
@@ -365,11 +344,12 @@ def _arrays(penumbra: Penumbra, picture: CornerPicture, tracks: BearingTracks) -
 def _true_bearings(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return times [F] and bearings [walkers, F] of a file that --simulate wrote."""
     try:
-        told = json.loads(path.read_bytes())
+        with open_regular(path) as file:
+            told = json.load(file)
         times = np.array(told["times_s"], np.float64)
         rows = [[np.nan if v is None else float(v) for v in row] for row in told["bearings_deg"]]
         return times, np.array(rows, np.float64).reshape(len(rows), len(times))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(
             f"{path}: no file of true bearings ({error}); give the one that --simulate wrote"
         ) from None

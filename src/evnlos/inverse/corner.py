@@ -20,7 +20,7 @@ independent series, each solved by a Kalman filter and a smoother (Rauch, Tung a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -106,8 +106,7 @@ class FloorSector:
 
         Raises:
             ConfigError: The edge lies outside the picture, too little of the sector inside, or it is too narrow
-            or
-                too wide.
+                or too wide.
         """
         height, width = shape
         if not (0 <= self.edge[0] < width and 0 <= self.edge[1] < height):
@@ -199,7 +198,6 @@ def read_penumbra(
     step_s: float = 0.1,
     bin_deg: float = 1.0,
     white: float = 255.0,
-    watch: Callable[[int], None] = lambda _: None,
 ) -> Penumbra:
     """Return the floor's relative change per bin of bearing, from frames that are read once, one by one.
 
@@ -215,7 +213,6 @@ def read_penumbra(
         step_s: Length of a step of time over which frames are averaged, seconds.
         bin_deg: Width of a bin of bearing, degrees.
         white: Light of a saturated pixel, DN.
-        watch: Called with the number of frames read.
 
     Raises:
         DataError: Too few frames or steps; a floor that is too dark, saturated or covered.
@@ -227,7 +224,6 @@ def read_penumbra(
     for time_s, light in source:
         total = total + light
         held.append((time_s, light.ravel()[index]))
-        watch(len(held))
         if len(held) == most:
             break
     if len(held) < _LEAST_FRAMES:
@@ -249,7 +245,8 @@ def read_penumbra(
     start = held[0][0]
     pace = (held[-1][0] - start) / (len(held) - 1)
     step = max(step_s, pace)
-    for number, (time_s, values) in enumerate(frames_again(), 1):
+    for time_s, values in frames_again():
+        number += 1
         slot = int((time_s - start + 0.5 * pace) / step)
         while len(sums) <= slot:
             times.append(start + (len(sums) + 0.5) * step - 0.5 * pace)
@@ -260,8 +257,6 @@ def read_penumbra(
         if calm:
             sums[slot] += found
             counts[slot] += 1
-        if number > most:
-            watch(number)
     count = np.array(counts)
     if np.count_nonzero(count) < _LEAST_STEPS:
         raise DataError(
@@ -350,14 +345,13 @@ def _reducer(stack: NDArray, slopes: Array, bearing: Array, bin_deg: float, whit
     least = max(1 / 12, 0.2 * float(y.mean()))
     sigma = np.sqrt(np.maximum(offset + slope * mean, least))
     bins = max(16, round((bearing.max() - bearing.min()) / bin_deg))
-    edges = np.linspace(bearing.min(), bearing.max() + 1e-9, bins + 1)
-    number = np.clip(np.searchsorted(edges, bearing, "right") - 1, 0, bins - 1)
-    held_bins = np.bincount(number, minlength=bins)
-    while bins > 16 and held_bins.min() < 20:  # too narrow for the pixels that there are
-        bins = max(16, bins * 3 // 4)
+    while True:
         edges = np.linspace(bearing.min(), bearing.max() + 1e-9, bins + 1)
         number = np.clip(np.searchsorted(edges, bearing, "right") - 1, 0, bins - 1)
         held_bins = np.bincount(number, minlength=bins)
+        if bins == 16 or held_bins.min() >= 20:
+            break
+        bins = max(16, bins * 3 // 4)  # too narrow for the pixels that there are
     if held_bins.min() == 0:
         raise DataError("a bearing of the sector has no usable pixel; give another wall or end, or less light")
     order = np.argsort(number, kind="stable")

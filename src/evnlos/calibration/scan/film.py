@@ -194,7 +194,7 @@ def find_show(film: Film, show: Show) -> Clock:
     Raises:
         DataError: The code is not there, or the film runs at another speed.
     """
-    codes = [[part for part in show.parts if part.kind == "code"][k : k + len(CODE)] for k in (0, len(CODE))]
+    starts_s = [part.start_s for part in show.parts if (part.kind, part.number) == ("code", 0)]
     middle = (film.times_s[1:] + film.times_s[:-1]) / 2
     edges = np.r_[2 * film.times_s[0] - middle[0], middle, 2 * film.times_s[-1] - middle[-1]]
     total = np.r_[0.0, np.cumsum(film.brightness * np.diff(edges))]
@@ -209,7 +209,7 @@ def find_show(film: Film, show: Show) -> Clock:
         size = np.linalg.norm(light, axis=1) * np.linalg.norm(wanted)
         return np.where(size > 1e-9, light @ wanted / np.maximum(size, 1e-9), 0.0)
 
-    apart = codes[1][0].start_s - codes[0][0].start_s
+    apart = starts_s[1] - starts_s[0]
     last = edges[-1] - apart - len(CODE) * show.show.chip_s
     if last <= edges[0]:
         length = f"the film lasts {edges[-1] - edges[0]:.1f} s, the show {show.duration_s:.1f} s"
@@ -236,7 +236,7 @@ def find_show(film: Film, show: Show) -> Clock:
         raise DataError(
             f"the film's clock runs {rate:.4f} times as fast as the show's; state the true frame rate (--fps)"
         )
-    return Clock(found[0][0] - rate * codes[0][0].start_s, rate, worst)
+    return Clock(found[0][0] - rate * starts_s[0], rate, worst)
 
 
 def fit_tone(pictures: list[NDArray[np.float32]]) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -327,6 +327,7 @@ def find_steadiness(
     small = (pictures.shape[1] // coarser, pictures.shape[2] // coarser)
     pictures = reduce_by_area(pictures[:, : small[0] * coarser, : small[1] * coarser], small)
     off = np.eye(count) - design @ np.linalg.pinv(design)  # Q
+    free = max(np.trace(off), 1.0)
     apart_s = spacing_s * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     calm = np.linalg.inv(np.exp(-0.5 * (apart_s / _CALM_S) ** 2) + _JITTER * np.eye(count))
     size = np.array([_GAIN_PRIOR, _SHIFT_PRIOR, _SHIFT_PRIOR]) ** 2
@@ -341,7 +342,7 @@ def find_steadiness(
         parts = (predicted, *np.gradient(predicted, axis=(1, 2)))
         basis = np.concatenate([np.asarray(one)[inside].reshape(count, -1) for one in parts])  # [3 K, pixels]
         left = rest[inside].reshape(count, -1)
-        noise = _ALIKE * float((left**2).sum()) / (left.shape[1] * max(np.trace(off), 1.0))
+        noise = _ALIKE * float((left**2).sum()) / (left.shape[1] * free)
         prior = np.kron(np.diag(1 / size), calm) + no_mean
         normal = (basis @ basis.T) * np.tile(off, (3, 3)) / noise + prior
         right = (basis * np.tile(left, (3, 1))).sum(axis=1) / noise
@@ -411,7 +412,8 @@ def import_film(
         design = np.stack([np.r_[show.cells(part).ravel(), 1.0] for part in stood])
         checks = pictures[count:]
         again = [float((checks[k] + checks[k + 1] - 2 * checks[dark]).sum()) for k, dark in ((1, 0), (8, 10))]
-        locked = abs(again[1] / max(again[0], 1e-9) - 1) < _LOCKED
+        brighter = again[1] / max(again[0], 1e-9) - 1
+        locked = abs(brighter) < _LOCKED
         curve, misfit = (1.0, 0.0), (math.nan, math.nan)
         if reading.fit_tone and locked:
             if reading.steady:
@@ -426,11 +428,12 @@ def import_film(
                 f"{100 * _MOST_PX:g} % may be taken out; put it on something stiff and film again"
             )
         unsteady = found.gain_rms > _STEADY_GAIN or found.shift_rms_px > _STEADY_PX
-        if reading.steady and unsteady:
+        corrected = reading.steady and unsteady
+        if corrected:
             light = _steadied(light, found.gain, found.shift_px)
         for scan_frame, picture, over in zip(show.scan_frames, light, clipped, strict=False):
             _save(folder / scan_frame.file, picture, over)
-        steady = _Reference.of(light, design) if reading.steady and unsteady else None
+        steady = _Reference.of(light, design) if corrected else None
         captures = [
             _write_capture(
                 folder, show, part, film, clock, reading, lambda one: straightened(one, curve), steady
@@ -440,10 +443,9 @@ def import_film(
         ]
     warnings = []
     if not locked:
-        change = 100 * (again[1] / max(again[0], 1e-9) - 1)
         warnings.append(
-            f"after the brightest picture the others are {change:+.0f} % brighter than before: the exposure is "
-            "not locked, so that the tone curve could not be checked; lock it and film again"
+            f"after the brightest picture the others are {100 * brighter:+.0f} % brighter than before: the "
+            "exposure is not locked, so that the tone curve could not be checked; lock it and film again"
         )
     elif reading.fit_tone and misfit[1] > 0.05:
         warnings.append(
@@ -460,7 +462,7 @@ def import_film(
         locked,
         found.gain_rms,
         found.shift_rms_px,
-        bool(reading.steady and unsteady),
+        corrected,
         captures,
         warnings,
     )
@@ -514,7 +516,7 @@ def _write_capture(
     steady: _Reference | None,
 ) -> Path:
     """Write the capture folder of a character that moved, still without events, and return it."""
-    scene = show.scene(part.number)
+    scene = show.scenes[part.number]
     out = folder / "captures" / scene.target.name
     out.parent.mkdir(exist_ok=True)
     if (out / "capture.yaml").is_file():  # of this film, or of one before it
@@ -569,7 +571,7 @@ def add_events(folder: str | Path, capture: Path, transport: str | Path, seed: i
         seed: Seed of mismatch and noise.
     """
     show = read_show(folder)
-    scene = show.scene(show.show.targets.index(capture.name))
+    scene = show.scenes[show.show.targets.index(capture.name)]
     setup = MeasuredSetup(file=str(transport))
     setup = setup.resized(setup.measurement().shape)
     events = setup.event_camera.record(

@@ -132,7 +132,7 @@ class Show:
         moving: list[tuple[Kind, float, int]] = []
         for k in range(len(self.show.targets)):
             moving.append(("rest", _REST_S, 0))
-            moving.append(("target", self.scene(k).duration_s, k))
+            moving.append(("target", self.scenes[k].duration_s, k))
         order: list[tuple[Kind, float, int]] = [
             ("rest", _LEAD_S, 0),
             *code,
@@ -174,13 +174,16 @@ class Show:
         x, y = self.info.plane.center_m
         return LineMotion((x - self._way_m / 2, y), self.show.speed_m_s)
 
-    def scene(self, number: int) -> Scene:
-        """Return a character of the show and its motion."""
-        name = self.show.targets[number]
-        glyphs = FontGlyphs(characters=name)
-        mask = glyphs.target(glyphs.objects()[0]).mask
+    @cached_property
+    def scenes(self) -> tuple[Scene, ...]:
+        """The characters of the show and their motion, one after the other."""
         duration_s = max(self._way_m / self.show.speed_m_s, 0.5)
-        return Scene(Target(name, mask, self.show.target_m), self.motion, duration_s)
+        found = []
+        for name in self.show.targets:
+            glyphs = FontGlyphs(characters=name)
+            target = Target(name, glyphs.target(glyphs.objects()[0]).mask, self.show.target_m)
+            found.append(Scene(target, self.motion, duration_s))
+        return tuple(found)
 
     @property
     def _way_m(self) -> float:
@@ -190,19 +193,14 @@ class Show:
         """Return the stretch at an instant, seconds from the show's begin; the nearest one outside it."""
         return self.parts[max(bisect_right(self.parts, t_s, key=lambda part: part.start_s) - 1, 0)]
 
-    def cells(self, part: Part, t_s: float = 0.0) -> NDArray[np.float32]:
-        """Return the brightness of the cells in a stretch, float32 [h, w]; at an instant for a target."""
-        plane = self.info.plane
-        if part.kind == "target":
-            scene = self.scene(part.number)
-            place = scene.motion.position_m(np.array([t_s - part.start_s]))
-            return scene.target.rasterise(plane, place)[0].astype(np.float32)
+    def cells(self, part: Part) -> NDArray[np.float32]:
+        """Return the brightness of the cells in a stretch without a target, float32 [h, w]."""
         if part.kind == "check":
             return self.checks[part.number].astype(np.float32)
         pattern = self.scan_frames[part.number].pattern if part.kind == "pattern" else None
         if pattern is not None:
             return lit_cells(self.info, pattern).astype(np.float32)
-        return np.full(plane.shape, CODE[part.number] if part.kind == "code" else 0, np.float32)
+        return np.full(self.info.plane.shape, CODE[part.number] if part.kind == "code" else 0, np.float32)
 
 
 CHECKS = ("none", "left", "right", "half", "rest", "quarter", "three", "all", "left", "right", "none")
@@ -232,7 +230,7 @@ def shown_picture(show: Show, part: Part, t_s: float) -> NDArray[np.uint8]:
     assert display is not None  # refused before
     if part.kind != "target":
         return displayed(show.cells(part), show.info.plane, display, pitch)
-    scene, side = show.scene(part.number), max(1, round(show.show.target_m / pitch))
+    scene, side = show.scenes[part.number], max(1, round(show.show.target_m / pitch))
     x, y = scene.motion.position_m(t_s - part.start_s) - np.asarray(show.info.plane.center_m)
     canvas = Image.new("L", display)
     place = (round(x / pitch + (display[0] - side) / 2), round(y / pitch + (display[1] - side) / 2))
@@ -257,11 +255,10 @@ def show_page(show: Show) -> str:
     assert show.show.display is not None  # refused before
     plane = show.info.plane
     y, x = cell_edges(plane, show.show.display, show.show.display_pitch)
-    targets = [show.scene(k) for k in range(len(show.show.targets))]
     pictures, parts, known = [], [], dict[bytes, int]()
     for part in show.parts:
         if part.kind == "target":
-            way = targets[part.number].motion.position_m(np.array([0.0, part.stop_s - part.start_s]))
+            way = show.scenes[part.number].motion.position_m(np.array([0.0, part.stop_s - part.start_s]))
             ends = (way - np.asarray(plane.center_m)) / show.show.display_pitch
             parts.append([round(part.start_s, 4), -1 - part.number, *ends.ravel().round(3).tolist()])
             continue
@@ -279,7 +276,7 @@ def show_page(show: Show) -> str:
         "duration_s": show.duration_s,
         "side": show.show.target_m / show.show.display_pitch,
         "bar_px": 0.1 / show.show.display_pitch,
-        "targets": [_as_url(_target_picture(scene.target)) for scene in targets],
+        "targets": [_as_url(_target_picture(scene.target)) for scene in show.scenes],
     }
     page = (Path(__file__).parent / "show.html").read_text(encoding="utf-8")
     return page.replace('"{show}"', json.dumps(data))
@@ -314,7 +311,7 @@ class FilmedShow:
 
     def __init__(self, show: Show, matrix: NDArray, plane: Plane, ambient: NDArray) -> None:
         self._show, self._matrix, self._plane, self._ambient = show, matrix, plane, ambient
-        self._known: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self._known: dict[tuple[Part, int], NDArray[np.float32]] = {}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -334,18 +331,16 @@ class FilmedShow:
         return mixed.astype(np.float32)
 
     def _light(self, part: Part, key: int) -> NDArray[np.float32]:
-        name = (self._show.parts.index(part), key)
+        name = (part, key)
         if name not in self._known:
             if len(self._known) >= _STATES:
                 self._known.pop(next(iter(self._known)))
             if part.kind == "target":
-                scene = self._show.scene(part.number)
+                scene = self._show.scenes[part.number]
                 cells = scene.target.rasterise(self._plane, scene.motion.position_m(key * _KEY_S))
             else:
-                coarse = self._show.cells(part)
-                cells = np.kron(
-                    coarse, np.ones([n // k for n, k in zip(self._plane.shape, coarse.shape, strict=True)])
-                )
+                finer = self._plane.height // self._show.info.plane.height
+                cells = np.kron(self._show.cells(part), np.ones((finer, finer)))
             image = (self._matrix @ cells.astype(np.float32).ravel()).reshape(self.shape)
             self._known[name] = image + self._ambient
         return self._known[name]

@@ -1,6 +1,6 @@
-"""Draw the parts of two rigs, to scale: the paper's, and the one of a monitor, a phone and a baking tray.
+"""Draw the parts of two setups, to scale: the paper's, and the one of a monitor, a phone and a baking tray.
 
-python tools/draw_rigs.py        # docs/figures/rig_paper.svg, docs/figures/rig_first_light.svg
+python tools/draw_setups.py        # docs/figures/setup_paper.svg, docs/figures/setup_first_light.svg
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ ROOM = "style='background:#fff;color:#222' "
 def main() -> None:
     """Write both drawings."""
     setup = setup_preset("main-near")
-    rigs = {
+    drawings = {
         "paper": (setup_drawing(setup, 0.16, 0.08), {"cameras, ": "event and frame camera, "}),
         "first_light": (
             setup_drawing(setup, 0.0, 0.16),
@@ -27,12 +27,13 @@ def main() -> None:
             },
         ),
     }
-    for name, (drawing, words) in rigs.items():
+    for name, (drawing, words) in drawings.items():
         assert drawing is not None
         svg = drawing.svg.replace("<svg ", f"<svg {ROOM}", 1)
         for before, after in words.items():
+            assert before in svg, f"the drawing no longer says {before!r}"
             svg = svg.replace(before, after)
-        (FIGURES / f"rig_{name}.svg").write_text(svg + "\n", encoding="utf-8")
+        (FIGURES / f"setup_{name}.svg").write_text(svg + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
