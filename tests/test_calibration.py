@@ -338,6 +338,20 @@ def test_standard_error_is_that_of_linear_theory() -> None:
     assert math.isinf(blind.error[1]) and math.isfinite(blind.error[0])
 
 
+def test_no_step_of_the_search_is_longer_than_it_may_be() -> None:
+    tried = []
+
+    def residual(p):
+        tried.append(p.copy())
+        return torch.tensor([p[0] - 5.0, 3.0 * p[1] + 4.0], dtype=torch.float64)
+
+    bounds = [(-9.0, 9.0)] * 2
+    found = levenberg_marquardt(residual, [0.0, 0.0], [1e-3] * 2, bounds, iterations=40, most=[0.5, 1.0])
+    assert found.values == pytest.approx([5.0, -4 / 3], abs=1e-4)
+    steps = np.abs(np.diff(np.array(tried), axis=0))
+    assert (steps <= np.array([0.5, 1.0]) + 2e-3).all() and (steps[:, 0] > 0.49).any()
+
+
 def test_noise_of_a_camera_without_light_on_it() -> None:
     """Photon transfer on frames whose light is known exactly."""
     rng = np.random.default_rng(0)

@@ -304,6 +304,22 @@ def test_the_pool_survives_the_death_of_a_worker(tmp_path) -> None:
         list(run_tasks(always_die, range(4), 2))
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_task_waits_for_those_that_it_needs(tmp_path, workers) -> None:
+    tasks = [(tmp_path / str(number), [tmp_path / str(n) for n in needs]) for number, needs in enumerate(NEEDS)]
+    assert sorted(run_tasks(write_after, tasks, workers, NEEDS)) == [str(n) for n in range(len(NEEDS))]
+
+
+NEEDS = [set(), {0}, set(), {0, 2}, {1, 3}, set()]
+
+
+def write_after(task) -> str:
+    path, needed = task
+    assert all(other.is_file() for other in needed)
+    path.write_text("done")
+    return path.name
+
+
 def test_no_dataset_and_overlapping_splits(tmp_path) -> None:
     with pytest.raises(DataError, match="no dataset"):
         open_dataset(tmp_path)

@@ -119,7 +119,9 @@ def run_demo(settings: Demo) -> Path:
 
     single = [record for record in records if record.arm in [arm.name for arm in study.arms]]
     runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
-    dataset, results = collect_results(runs, out / "recorded" / single[0].settings["captures"])
+    recorded = out / "recorded" / single[0].settings["captures"]
+    with ProgressBars() as progress:
+        dataset, results = collect_results(runs, recorded, workers=settings.workers, progress=progress)
     setup = named_setup(out / "setups" / study.setup) if settings.calibrate else None
     path = write_report(out / "report.html", dataset, results, notes, setup=setup)
     for note in notes:

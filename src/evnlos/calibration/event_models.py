@@ -29,6 +29,7 @@ _FEWEST = 1e-3  # events per pixel per second that count as none
 _BIN_S, _BLOCK_PX = 0.4, 5
 _SHARED = ("threshold_on", "threshold_off", "leak_rate_hz")
 _MARGIN = 0.1
+_FURTHEST = 0.7  # of a step along a logarithm: a factor of two
 _EDGE = 0.02  # of a parameter's range
 
 
@@ -161,8 +162,11 @@ def fit_model(
 
     bounds = [(_encoded(f, f.low), _encoded(f, f.high)) for f in free]
     first = [_encoded(f, min(max(getattr(start, f.name), f.low), f.high)) for f in free]
+    # A bold step may end where a pixel sends a hundred times the events: half a minute that tells nothing.
+    most = [_FURTHEST if f.log else 0.5 * (f.high - f.low) for f in free]
+    steps = [f.step for f in free]
     found = levenberg_marquardt(
-        residual, first, [f.step for f in free], bounds, iterations=iterations, tolerance=5e-3
+        residual, first, steps, bounds, iterations=iterations, tolerance=5e-3, most=most
     )
     pixel = made(found.values)
     scale = [getattr(pixel, f.name) if f.log else 1.0 for f in free]

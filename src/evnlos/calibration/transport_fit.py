@@ -71,6 +71,7 @@ def levenberg_marquardt(
     *,
     iterations: int = 15,
     tolerance: float = 1e-4,
+    most: Sequence[float] | None = None,
 ) -> Minimum:
     """Minimise the sum of squares of `residual`, staying within bounds.
 
@@ -84,6 +85,7 @@ def levenberg_marquardt(
         bounds: Lowest and highest value of each parameter [P].
         iterations: Most steps that are taken.
         tolerance: The search ends when a step lowers the root mean square by less than this fraction.
+        most: How far a step may go along each parameter [P]; a longer one is shortened, in its direction.
 
     Example:
         >>> t = torch.linspace(0, 1, 20, dtype=torch.float64)
@@ -110,6 +112,8 @@ def levenberg_marquardt(
             part = normal[np.ix_(inside, inside)]
             damped = part + damping * np.diag(np.diag(part)) + 1e-30 * np.eye(len(part))
             move[inside] = -np.linalg.lstsq(damped, slope[inside], rcond=None)[0]
+            if most is not None:
+                move /= max(1.0, float(np.abs(move / most).max()))
             trial = np.clip(values + move, low, high)
             after = residual(trial).flatten()
             count += 1

@@ -23,6 +23,7 @@ from evnlos.cli.parsing import drawn, say
 from evnlos.cli.recordings import Flat, Folders, result
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
+from evnlos.machine import ProgressBars
 from evnlos.tracking import Tracking
 
 if TYPE_CHECKING:
@@ -303,7 +304,8 @@ class ReportCommand:
         from evnlos.report.tables import baselines_of
         from evnlos.setups import named_setup
 
-        dataset, results = collect_results(list(self.runs), self.data, self.split)
+        with ProgressBars(quiet=self.json) as progress:
+            dataset, results = collect_results(list(self.runs), self.data, self.split, progress=progress)
         setup = None if self.setup is None else named_setup(self.setup)
         limits = None if setup is None else identify(setup.setup, name=setup.name)
         if setup is None and dataset.origin == "simulation":

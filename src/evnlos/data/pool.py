@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -47,7 +47,10 @@ def processes(workers: int, tasks: int) -> int:
 
 
 def run_tasks(
-    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int
+    function: Callable[[Task], Result],
+    tasks: Iterable[Task],
+    workers: int,
+    after: Sequence[Collection[int]] | None = None,
 ) -> Generator[Result, None, None]:
     """Run `function` on each task and yield the results as they come.
 
@@ -55,6 +58,8 @@ def run_tasks(
         function: A picklable function of one task; it writes its own file and returns its name.
         tasks: The tasks, in the order in which they start.
         workers: Processes; 1 runs everything in this process, 0 means one for each core.
+        after: Of each task, the numbers of those before it in the list that must be done before it starts;
+            None: nothing waits for anything.
 
     Raises:
         ConfigError: A number of workers below 0.
@@ -67,14 +72,15 @@ def run_tasks(
         return
     tries = [0] * len(pending)
     left = set(range(len(pending)))
+    after = after or [()] * len(pending)
     while left:
+        flying: dict[Future, int] = {}
         with _workers(workers) as pool:
             try:
-                yield from _drain(pool, function, pending, left, workers)
+                yield from _drain(pool, function, pending, left, after, flying, workers)
             except BrokenProcessPool:
                 # The pool can't say which task killed the worker: all that were in flight get a try more.
-                first = sorted(left)[: 2 * workers]
-                for i in first:
+                for i in flying.values():
                     tries[i] += 1
                 if max(tries) >= _TRIES:
                     raise EvnlosError(
@@ -184,23 +190,20 @@ def _drain(
     function: Callable[[Task], Result],
     tasks: list[Task],
     left: set[int],
+    after: Sequence[Collection[int]],
+    flying: dict[Future, int],
     workers: int,
 ) -> Iterator[Result]:
     """Keep twice as many tasks in flight as there are workers, so that memory stays bounded."""
-    queue = iter(sorted(left))
-    flying: dict[Future, int] = {}
-    while True:
-        for i in queue:
+    queue = sorted(left)
+    while queue or flying:
+        for i in [i for i in queue if left.isdisjoint(after[i])][: 2 * workers - len(flying)]:
             flying[pool.submit(function, tasks[i])] = i
-            if len(flying) >= 2 * workers:
-                break
-        if not flying:
-            return
+            queue.remove(i)
         done, _ = wait(flying, return_when=FIRST_COMPLETED)
         for future in done:
-            i = flying.pop(future)
             result = future.result()
-            left.discard(i)
+            left.discard(flying.pop(future))
             yield result
 
 

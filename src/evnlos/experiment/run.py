@@ -7,8 +7,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,46 +56,12 @@ class Run:
 
 def train_one(run: Run, progress: Progress = silent) -> None:
     """Train what is not trained yet; `progress` is that of `train`."""
+    if (run.out / "weights.safetensors").is_file():  # its folder's name holds a hash of what decides it
+        return
     if run.choose and run.start is not None:
         choose_and_finetune(run.data, (run.settings,), run.out, run.start, progress=progress)
         return
     train(run.data, run.settings, run.out, run.start, progress)
-
-
-def train_together(runs: list[Run], at_a_time: int, progress: Progress = silent) -> None:
-    """Train several networks at a time.
-
-    A network of this size gains little from a second core, so that as many trainings as there are cores, each
-    with its share of them, take less time than one after the other. On a GPU nothing is done here: there they
-    go one by one.
-
-    Args:
-        runs: The trainings; one that is named twice, or was done before, is done once.
-        at_a_time: Trainings at a time; 0 = one for each core.
-        progress: Called when the work begins and after each training, with its folder's name.
-    """
-    todo = {run.out: run for run in runs if not (run.out / "weights.safetensors").is_file()}
-    if torch.cuda.is_available() or not todo:
-        return
-    progress(Step("train networks", 0, len(todo), "networks"))
-    done = 0
-    # Pre-training and end-to-end training first: fine-tuning begins where they end.
-    for stage in (True, False):
-        some = [run for run in todo.values() if (run.start not in todo) == stage]
-        at_once = max(1, processes(at_a_time, len(some)))
-        tasks = [(run, max(1, torch.get_num_threads() // at_once)) for run in some]
-        with closing(run_tasks(_trained, tasks, at_once)) as finished:
-            for name in finished:
-                done += 1
-                progress(Step("train networks", done, len(todo), "networks", name))
-
-
-def _trained(task: tuple[Run, int]) -> str:
-    """Train one network to the end, with so many threads, and return its folder's name."""
-    run, threads = task
-    torch.set_num_threads(threads)
-    train_one(run)
-    return run.out.name
 
 
 def run_study(study: Study, place: Place, progress: Progress = silent) -> list[Record]:
@@ -125,23 +93,93 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
         except DataError as error:
             raise CalibrationError(str(error)) from None
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))
-    networks, records = [], list[Record]()
+    networks = list[_Network]()
     for arm in study.arms:
         recorded = _import(study, arm, place, progress)
         made = _simulate(study, arm, place, progress)
         for modality in study.modalities:
             plans = [_planned(study, arm, modality, seed, made, recorded, place) for seed in study.seeds]
-            networks.append((arm, recorded, made, modality, plans))
-    if place.trainings != 1:
-        every = [run for *_, plans in networks for runs, _ in plans for run in runs]
-        train_together(every, place.trainings, progress)
-    for arm, recorded, made, modality, plans in networks:
-        for runs, _ in plans:
-            for run in runs:
-                train_one(run, progress)
-        last = [(runs[-1].out, decided) for runs, decided in plans]
-        records += score_arm(study, arm, modality, last, made, recorded, place, progress)
+            networks.append(_Network(study, arm, modality, plans, made, recorded, place))
+    if place.trainings != 1 and not torch.cuda.is_available():  # on a GPU one after the other
+        return _together(networks, place.trainings, progress)
+    records = list[Record]()
+    for network in networks:
+        for run in network.runs:
+            train_one(run, progress)
+        records += network.scored(progress)
     return records
+
+
+@dataclass(frozen=True)
+class _Network:
+    """The networks of an arm, one a seed, that see one modality, and where their records are kept."""
+
+    study: Study
+    arm: Arm
+    modality: str
+    plans: list[tuple[list[Run], dict[str, Any]]]
+    made: Dataset | None
+    recorded: Dataset
+    place: Place
+
+    @property
+    def runs(self) -> list[Run]:
+        """The trainings of all seeds, each after the one that it starts from."""
+        return [run for runs, _ in self.plans for run in runs]
+
+    def scored(self, progress: Progress) -> list[Record]:
+        """Score what was trained, and return the new records."""
+        last = [(runs[-1].out, decided) for runs, decided in self.plans]
+        made, recorded, place = self.made, self.recorded, self.place
+        return score_arm(self.study, self.arm, self.modality, last, made, recorded, place, progress)
+
+
+def _together(networks: list[_Network], at_a_time: int, progress: Progress) -> list[Record]:
+    """Train and score several networks at a time, and return the new records.
+
+    A network of this size gains little from a second core, so that as many trainings as there are cores, each
+    with its share of them, take less time than one after the other. What others wait for comes first.
+    """
+    todo = {run.out: run for network in networks for run in network.runs}
+    todo = {out: run for out, run in todo.items() if not (out / "weights.safetensors").is_file()}
+    awaited = {run.start for run in todo.values()}
+    runs = sorted(todo.values(), key=lambda run: run.out not in awaited)
+    place = {run.out: number for number, run in enumerate(runs)}
+    after = [{place[Path(run.start)]} if run.start and Path(run.start) in place else set() for run in runs]
+    after += [{place[run.out] for run in network.runs if run.out in place} for network in networks]
+    at_once = max(1, processes(at_a_time, len(after)))
+    threads = max(1, torch.get_num_threads() // at_once)
+    tasks = [partial(_trained, run, threads) for run in runs]
+    tasks += [partial(_scored, network, threads) for network in networks]
+    records, done = list[Record](), 0
+    progress(Step("train networks", 0, len(runs), "networks"))
+    with closing(run_tasks(_called, tasks, at_once, after)) as finished:
+        for name, found in finished:
+            if name:
+                done += 1
+                progress(Step("train networks", done, len(runs), "networks", name))
+            for record in found:
+                progress(Step(f"score {record.name}", 1, 1, "networks", record))
+            records += found
+    order = {(n.arm.name, n.modality): number for number, n in enumerate(networks)}
+    return sorted(records, key=lambda r: order.get((r.arm, r.modality), len(order)))
+
+
+def _called(task: Callable[[], tuple[str, list[Record]]]) -> tuple[str, list[Record]]:
+    return task()
+
+
+def _trained(run: Run, threads: int) -> tuple[str, list[Record]]:
+    """Train to the end, with so many threads; return the name of the run's folder, and no record."""
+    torch.set_num_threads(threads)
+    train_one(run)
+    return run.out.name, []
+
+
+def _scored(network: _Network, threads: int) -> tuple[str, list[Record]]:
+    """Score with so many threads; return no name, and the records."""
+    torch.set_num_threads(threads)
+    return "", network.scored(silent)
 
 
 def _draw(fit: SetupFit, path: Path) -> None:

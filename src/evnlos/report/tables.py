@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ import numpy as np
 
 from evnlos.analysis import BASELINES, Evaluation, Scores, available_lpips, evaluate
 from evnlos.data import Dataset, character_of, modality_order, open_dataset
+from evnlos.data.pool import run_tasks
 from evnlos.errors import DataError
+from evnlos.machine import Progress, Step, silent
 from evnlos.models import load_weights, published
 from evnlos.registry import todays_weights
 
@@ -55,9 +58,20 @@ class RunResult:
 
 
 def collect_results(
-    runs: list[str | Path], data: str | Path, split: str = "test"
+    runs: list[str | Path],
+    data: str | Path,
+    split: str = "test",
+    workers: int = 1,
+    progress: Progress = silent,
 ) -> tuple[Dataset, list[RunResult]]:
     """Evaluate runs on one split of a dataset, ordered by method and modality.
+
+    Args:
+        runs: Folders of runs, weights files, or names of published weights.
+        data: The dataset's folder.
+        split: "train", "validation", "test" or "all".
+        workers: Processes, each with a network at a time; 0 = one for each core.
+        progress: Called when the work begins and after each network.
 
     Raises:
         DataError: No run is given, a run has not ended, or a run was trained on objects of the split.
@@ -65,17 +79,28 @@ def collect_results(
     if not runs:
         raise DataError("no runs given; name at least one run's folder")
     dataset = open_dataset(data)
-    results = []
-    for run in map(Path, runs):
-        weights = load_weights(run)
-        name, is_published = named(run)
-        lines = _log_of(run)
-        refuse_seen(weights.history, dataset, split)
-        evaluation = evaluate(weights, dataset, split, available_lpips())
-        kind = (weights.modality.name, weights.network.sees_sequence, method_of(weights.history))
-        results.append(RunResult(name, *kind, evaluation, lines, weights.history, is_published))
-    results.sort(key=lambda r: (METHODS.index(r.method), r.sees_sequence, modality_order(r.modality)))
-    return dataset, results
+    results: dict[int, RunResult] = {}
+    tasks = [(number, Path(run), dataset, split) for number, run in enumerate(runs)]
+    progress(Step("evaluate", 0, len(runs), "networks"))
+    with closing(run_tasks(_evaluated, tasks, workers)) as finished:
+        for number, result in finished:
+            results[number] = result
+            progress(Step("evaluate", len(results), len(runs), "networks", result.name))
+    ordered = [results[number] for number in range(len(runs))]
+    ordered.sort(key=lambda r: (METHODS.index(r.method), r.sees_sequence, modality_order(r.modality)))
+    return dataset, ordered
+
+
+def _evaluated(task: tuple[int, Path, Dataset, str]) -> tuple[int, RunResult]:
+    """Evaluate the run of a number."""
+    number, run, dataset, split = task
+    weights = load_weights(run)
+    name, is_published = named(run)
+    lines = _log_of(run)
+    refuse_seen(weights.history, dataset, split)
+    evaluation = evaluate(weights, dataset, split, available_lpips())
+    kind = (weights.modality.name, weights.network.sees_sequence, method_of(weights.history))
+    return number, RunResult(name, *kind, evaluation, lines, weights.history, is_published)
 
 
 def _log_of(run: Path) -> list[dict[str, Any]]:
