@@ -1,6 +1,7 @@
 """What an import costs: a room brings what it needs and no more, and a start can be interrupted at any time."""
 
 import ast
+import json
 import os
 import signal
 import subprocess
@@ -94,3 +95,75 @@ def test_names_come_when_they_are_asked_for() -> None:
     for wrong in ("nonsense", "_nonsense"):
         with pytest.raises(AttributeError, match=wrong):
             getattr(evnlos, wrong)
+
+
+HELP_OF_ALL = """
+import contextlib, importlib, io, json, sys
+if {libraries}:
+    import h5py, numba, pydantic, safetensors, scipy, torch
+main = importlib.import_module("evnlos.cli.main")
+said = {{}}
+for verb in main.VERBS:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        main.main([verb, "--help"])
+    heavy = [name for name in ("torch", "numba", "scipy", "h5py", "PIL", "pydantic") if name in sys.modules]
+    said[verb] = (out.getvalue(), heavy)
+print(json.dumps(said))
+"""
+
+
+def help_of_all(*, libraries: bool) -> dict[str, tuple[str, list[str]]]:
+    code = HELP_OF_ALL.format(libraries=libraries)
+    out = subprocess.check_output([sys.executable, "-c", code], text=True, env=os.environ | {"COLUMNS": "100"})
+    return json.loads(out)
+
+
+def test_help_needs_no_library_of_the_work_and_says_the_same() -> None:
+    """What it takes is some half a second; what it loads is measured here, since a busy machine is slow."""
+    alone, complete = help_of_all(libraries=False), help_of_all(libraries=True)
+    assert {verb: heavy for verb, (_, heavy) in alone.items() if heavy} == {}
+    for verb, (text, heavy) in complete.items():
+        assert {"torch", "numba"} <= set(heavy)
+        assert text.startswith("usage: evnlos " + verb), verb
+        assert alone[verb][0] == text, verb
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["train", "--epoch-count", "3"], "--epoch-count"),
+        (["simulate", "--preset", "nonsense", "--out", "d"], "nonsense"),
+        (["simulate", "--out"], "--out"),
+        (["train", "--out", "run", "--epochs", "many"], "many"),
+        (["events", "clip.mp4", "--thresholdon", "0.2", "--out", "e.h5"], "--thresholdon"),
+        (["trian"], "did you mean 'train'"),
+    ],
+)
+def test_words_that_do_not_fit_are_refused_before_any_library_is_loaded(words: list[str], says: str) -> None:
+    code = (
+        "import sys\n"
+        "from evnlos.__main__ import main\n"
+        f"sys.argv = ['evnlos', *{words!r}]\n"
+        "try:\n    main()\n"
+        "except SystemExit as end:\n    print(end.code, *sorted(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    exit_code, *modules = done.stdout.split()
+    assert exit_code == "2"
+    assert done.stderr.count("\n") == 1 and says in done.stderr and "Traceback" not in done.stderr
+    assert not {"torch", "numba", "scipy", "h5py", "PIL", "pydantic"} & set(modules)
+
+
+def test_what_was_described_without_libraries_runs_with_them() -> None:
+    code = (
+        "import sys\n"
+        "from evnlos.__main__ import main\n"
+        "sys.argv = ['evnlos', 'simulate', '--setup', 'main-near', '--out', 'nowhere', '--dry-run']\n"
+        "main()\n"
+        "import torch, evnlos, evnlos.setups\n"
+        "assert torch.ones(2).sum() == 2 and evnlos.setups is sys.modules['evnlos.setups']\n"
+        "assert evnlos.cameras.EventPixel is sys.modules['evnlos.cameras.pixel'].EventPixel\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

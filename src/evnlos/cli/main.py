@@ -10,6 +10,7 @@ import difflib
 import importlib
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -20,7 +21,19 @@ from importlib.resources import files
 from types import FrameType
 from typing import Any, NoReturn, TextIO, cast
 
-from evnlos.cli.parsing import FLAG, LEVELS, LOG, VARIABLE, PlainOutput, listen, parse, todays_words
+from evnlos.cli.parsing import (
+    FLAG,
+    LEVELS,
+    LOG,
+    VARIABLE,
+    WORK_LIBRARIES,
+    PlainOutput,
+    UnfitWordsError,
+    listen,
+    parse,
+    todays_words,
+    without_work_libraries,
+)
 from evnlos.doctor import examine, fault_behind
 from evnlos.errors import ConfigError, EvnlosError, printable
 from evnlos.machine import sleep_while_waiting
@@ -87,6 +100,7 @@ def main(argv: list[str] | None = None) -> None:
             if verb not in VERBS:
                 raise ConfigError(_unknown(verb))
             with _ended_at_once(verb) if argv is None else nullcontext():
+                _answer_at_once(verb, rest)
                 command = _command(verb, rest)
             LOG.debug("%s", command)
             with redirect_stdout(cast(TextIO, PlainOutput(sys.stdout))):
@@ -223,6 +237,35 @@ def _unknown(verb: str) -> str:
     return f"unknown command {printable(verb[:80])!r}; {cure}"
 
 
+def _answer_at_once(verb: str, rest: list[str]) -> None:
+    """Print help, or refuse words that do not fit, before the libraries of the work are imported.
+
+    Where the words fit, or where only those libraries can tell, nothing happens: a setup, a file of settings or
+    a kind that another package brings decides which flags there are.
+
+    Raises:
+        UnfitWordsError: A word does not fit.
+        SystemExit: Help was asked for, and printed.
+    """
+    if verb == "doctor" or set(WORK_LIBRARIES) & set(sys.modules):
+        return
+    refusal = None
+    try:
+        with without_work_libraries():
+            command = command_of(verb)
+            if not (hasattr(command, "PRESETS") and any(_DECIDES.match(word) for word in rest)):
+                parse(command, rest, verb, _defaults(command, rest))
+    except UnfitWordsError as error:
+        refusal = error
+    except Exception:  # a library was needed after all
+        LOG.debug("%s is not described without its libraries", verb, exc_info=True)
+    if refusal is not None:
+        raise refusal
+
+
+_DECIDES = re.compile(r"--(config|setup|pixel|[\w.-]+\.kind)(=|$)")  # what decides which flags there are
+
+
 def _command(verb: str, rest: list[str]) -> Any:
     """Return the command that the words ask for."""
     command = command_of(verb)
@@ -242,7 +285,7 @@ def _defaults(command: type[Any], rest: list[str]) -> Any:
 
     preset, config = _flag(rest, "--preset"), _flag(rest, "--config")
     if preset is not None and preset not in presets:
-        raise ConfigError(f"--preset is {preset!r}; give one of {', '.join(presets)}")
+        raise UnfitWordsError(f"--preset is {preset!r}; give one of {', '.join(presets)}")
     settings = presets[preset or "default"]()
     if config is not None:
         settings = load_yaml(type(settings), config)

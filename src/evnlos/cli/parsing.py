@@ -2,11 +2,15 @@
 
 - Notes on stderr: how much a command says beside its result (`--log-level`, EVNLOS_LOG).
 - From the words after a verb to its command; what does not fit is one line, not the parser's box.
+- The description of a command without the libraries that its work needs, so that help comes at once.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
+import importlib.abc
+import importlib.machinery
 import io
 import logging
 import os
@@ -23,6 +27,10 @@ LEVELS = ("debug", "info", "warning", "error")
 FLAG, VARIABLE = "--log-level", "EVNLOS_LOG"
 LOG = logging.getLogger("evnlos")
 """The logger of the package; its modules log to it and its children."""
+
+
+class UnfitWordsError(ConfigError):
+    """A word of a command line is none that the command takes, or one that it needs is missing."""
 
 
 class _Stderr(logging.Handler):
@@ -186,7 +194,7 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
     except SystemExit as end:
         if not end.code:
             raise
-        raise ConfigError(f"{in_one_line(said.getvalue())}; see evnlos {verb} --help") from None
+        raise UnfitWordsError(f"{in_one_line(said.getvalue())}; see evnlos {verb} --help") from None
     except (ArithmeticError, MemoryError, ValueError) as error:  # of a setting that only fits together
         raise ConfigError(f"the settings do not fit together ({error}); see evnlos {verb} --help") from None
     from evnlos.config import check_numbers  # needs packages that may be missing
@@ -230,3 +238,99 @@ def in_one_line(box: str) -> str:
             sections[-1].append(line.strip())
     kept = [part for part in sections if part and not part[0].startswith(("For full", "Argument helptext"))]
     return "; ".join(f"{part[0]} {', '.join(part[1:])}".strip() for part in kept).rstrip(".")
+
+
+WORK_LIBRARIES = (
+    "torch",
+    "numba",
+    "llvmlite",
+    "scipy",
+    "h5py",
+    "PIL",
+    "safetensors",
+    "pydantic",
+    "threadpoolctl",
+)
+"""What takes most of a start, or brings that along, and describes no flag."""
+
+
+class _StandIn:
+    """What a name of a library that is not imported stands for, as far as a module's top level uses it.
+
+    It decorates without effect, is a base class of nothing, and stands in annotations.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __repr__(self) -> str:
+        return self._name
+
+    def __getattr__(self, name: str) -> _StandIn:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _StandIn(f"{self._name}.{name}")
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        if len(arguments) == 1 and not named and callable(arguments[0]):
+            return arguments[0]  # what it decorates
+        return _StandIn(f"{self._name}()")
+
+    def __getitem__(self, _: Any) -> _StandIn:
+        return self
+
+    def __or__(self, _: Any) -> Any:
+        return self
+
+    __ror__ = __or__
+
+    def __mro_entries__(self, _: tuple[Any, ...]) -> tuple[type, ...]:
+        return ()
+
+
+class _StandInLibraries(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Import modules of `WORK_LIBRARIES` as modules that hold a `_StandIn` under every name."""
+
+    def find_spec(
+        self, name: str, path: Any = None, target: Any = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """Return a module of nothing for a library that takes long, and leave all others to Python."""
+        if name.partition(".")[0] not in WORK_LIBRARIES:
+            return None
+        return importlib.machinery.ModuleSpec(name, self, is_package=True)
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> Any:
+        """Return the module that Python makes itself."""
+
+    def exec_module(self, module: Any) -> None:
+        """Let the module have every name."""
+        stand_in = _StandIn(module.__name__)
+        module.__getattr__ = stand_in.__getattr__
+
+
+@contextlib.contextmanager
+def without_work_libraries() -> Iterator[None]:
+    """Import modules of this package without `WORK_LIBRARIES`: enough to describe a command, not to run it.
+
+    Afterwards what was imported meanwhile is forgotten, as far as it is of this package or of those libraries.
+    """
+    finder, before, collects = _StandInLibraries(), set(sys.modules), gc.isenabled()
+    kept = {name: dict(vars(module)) for name, module in sys.modules.items() if _is_ours(name)}
+    sys.meta_path.insert(0, finder)
+    gc.disable()  # a tenth of the time, and next to nothing to collect
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+        sys.meta_path.remove(finder)
+        for name in set(sys.modules) - before:
+            if _is_ours(name) or name.partition(".")[0] in WORK_LIBRARIES:
+                del sys.modules[name]
+        for name, names in kept.items():  # a package holds its modules as attributes, too
+            for added in set(vars(sys.modules[name])) - set(names):
+                delattr(sys.modules[name], added)
+
+
+def _is_ours(name: str) -> bool:
+    return name.partition(".")[0] == "evnlos"
