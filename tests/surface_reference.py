@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from evnlos.events import TraceLaw
 from evnlos.types import Events
 
 
@@ -73,4 +74,58 @@ def time_surface_reference(
         if mode == "sae":
             for (sign, row, column), t in latest.items():
                 out[grid, sign, row, column] = np.exp(-(stop - t) / tau_us)
+    return out
+
+
+def event_trace_reference(
+    events: Events, edges_us: NDArray[np.int64], tau_us: float, law: TraceLaw
+) -> NDArray[np.float64]:
+    """Return what `event_trace` returns, from whole covariances: one matrix for all instants of a pixel."""
+    begin = min(int(edges_us[0]), int(events.t_us[0]) - 1) if len(events) else int(edges_us[0])
+    out = np.zeros((len(edges_us) - 1, 2, events.height, events.width))
+    for row in range(events.height):
+        for column in range(events.width):
+            mine = (events.x == column) & (events.y == row)
+            times = np.concatenate([[begin], events.t_us[mine]]).astype(float)
+            aim, error = np.where(events.p[mine], 1.0, -1.0), np.full(len(times) - 1, law.crossing)
+            aim[:1], error[:1] = 0.5 * aim[:1], law.quiet
+            signal = np.full(len(aim), 1 - law.noise)
+
+            def moments(now: NDArray, but: int | None, said: tuple) -> tuple[NDArray, NDArray]:
+                """Return mean and covariance at the events and `now`, without what event `but` says."""
+                times, aim, error, signal = said
+                instants = np.append(times, now)
+                decay = np.exp(-np.abs(instants[:, None] - instants) / tau_us)
+                precision, weighted = np.linalg.inv(law.spread**2 * decay), np.zeros(len(instants))
+                for k in range(len(aim)):
+                    step = np.zeros(len(instants))
+                    step[k], step[k + 1] = -1.0, 1.0
+                    if k != but:
+                        weight = signal[k] / error[k] + ((1 - signal[k]) / law.quiet if k else 0.0)
+                        precision += weight * np.outer(step, step)
+                        weighted += signal[k] / error[k] * aim[k] * step
+                for k, t in enumerate(now, start=len(times)):  # no threshold was met since the last event
+                    step = np.zeros(len(instants))
+                    step[k], step[np.searchsorted(times, t, side="right") - 1] = 1.0, -1.0
+                    precision += np.outer(step, step) / law.quiet
+                covariance = np.linalg.inv(precision)
+                return covariance @ weighted, covariance
+
+            for _ in range(law.sweeps):
+                found = signal.copy()
+                for k in range(len(aim)):
+                    mean, covariance = moments(np.empty(0), k, (times, aim, error, signal))
+                    step = np.zeros(len(times))
+                    step[k], step[k + 1] = -1.0, 1.0
+                    change, variance = step @ mean, step @ covariance @ step
+                    of_signal, of_noise = (
+                        share * np.exp(-((at - change) ** 2) / (2 * (own + variance))) / np.sqrt(own + variance)
+                        for share, at, own in ((1 - law.noise, aim[k], error[k]), (law.noise, 0.0, law.quiet))
+                    )
+                    found[k] = of_signal / (of_signal + of_noise)
+                signal = found
+            for grid, now in enumerate(edges_us[1:]):
+                mean, covariance = moments(np.array([float(now)]), None, (times, aim, error, signal))
+                known = 1 - covariance[-1, -1] / law.spread**2
+                out[grid, :, row, column] = (known + mean[-1]) / 2, (known - mean[-1]) / 2
     return out

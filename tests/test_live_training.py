@@ -131,7 +131,7 @@ def test_nobody_to_train_on_is_refused(few) -> None:
         live_dataset(replace(few, glyphs=replace(few.glyphs, characters="A"), validation=0.9))
 
 
-@pytest.mark.parametrize("surface", ["sae", "context", "hots"])
+@pytest.mark.parametrize("surface", ["sae", "context", "hots", "trace"])
 def test_samples_made_on_a_device_are_those_of_the_same_events(few, surface) -> None:
     """Each stage is that of the CPU."""
     sampling = replace(few.sampling, surface=surface, radius=2)

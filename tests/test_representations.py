@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 
 from evnlos.errors import DataError
 from evnlos.events import (
+    TraceLaw,
     edges_from_count,
     edges_from_rate,
     event_frame,
     event_histogram,
+    event_trace,
     normalise_surface,
     suggest_tau_us,
     threshold_ordinal_surface,
@@ -20,7 +22,7 @@ from evnlos.events import (
     voxel_grid,
 )
 from evnlos.types import Events
-from surface_reference import time_surface_reference
+from surface_reference import event_trace_reference, time_surface_reference
 
 
 def random_events(seed: int, count: int = 300, width: int = 9, height: int = 7, span_us: int = 1000) -> Events:
@@ -147,6 +149,7 @@ def test_nothing_writes_into_the_events():
         column.setflags(write=False)
     for mode in ("sae", "context", "hots"):
         time_surface(events, EDGES, 5.0, mode)
+    event_trace(events, EDGES, 5.0)
     voxel_grid(events, 4)
     event_histogram(events)
     event_frame(events, mode="last")
@@ -240,3 +243,69 @@ def test_grid_makers():
     ):
         with pytest.raises(DataError):
             wrong()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("law", [TraceLaw(), TraceLaw(spread=5.0, crossing=0.01, noise=0.5, sweeps=2)])
+def test_the_trace_is_the_smoother_of_whole_covariances(seed, law):
+    draw = np.random.default_rng(seed)
+    count = 40
+    events = Events(
+        2 * np.sort(draw.choice(1000, count, replace=False)),
+        draw.integers(0, 3, count),
+        draw.integers(0, 2, count),
+        draw.integers(0, 2, count).astype(bool),
+        width=3,
+        height=2,
+    )
+    edges = np.array([101, 351, 361, 901, 2801])  # events lie before the first; after the last, time goes on
+    fast, slow = event_trace(events, edges, 700.0, law), event_trace_reference(events, edges, 700.0, law)
+    assert fast.dtype == np.float32 and fast.shape == (4, 2, 2, 3)
+    np.testing.assert_allclose(fast, slow, atol=3e-7)
+    assert np.abs(slow).max() > 0.5
+
+
+def test_the_trace_follows_a_known_light_and_doubts_noise():
+    """A wave of 6 thresholds, met exactly, and now and then an event of the other polarity that is none."""
+    time_s = np.linspace(0, 8, 80_001)
+    wave = 3.05 * (1 - np.cos(2 * np.pi * time_s / 8))
+    met, rising, reference = [], [], -0.5
+    for k, level in enumerate(wave):
+        if abs(level - reference) >= 1:
+            met.append(round(time_s[k] * 1e6))
+            rising.append(level > reference)
+            reference = level
+    clean = Events(met, len(met) * [0], len(met) * [0], rising, width=1, height=1)
+    edges = np.arange(0, 8_000_001, 200_000)
+    on, off = event_trace(clean, edges, 5e6)[:, :, 0, 0].T
+    truth = np.interp(edges[1:] * 1e-6, time_s, wave)
+    assert np.corrcoef(on - off, truth)[0, 1] > 0.97
+    assert (on + off).min() > 0 and (on + off).max() < 1
+    # an OFF event a millisecond after an ON one moves the estimate by less than half a threshold
+    between = 1
+    t_us = int(clean.t_us[between]) + 1000
+    dirty = Events(
+        np.insert(clean.t_us, between + 1, t_us),
+        np.zeros(len(clean) + 1, int),
+        np.zeros(len(clean) + 1, int),
+        np.insert(clean.p, between + 1, False),
+        width=1,
+        height=1,
+    )
+    moved = event_trace(dirty, edges, 5e6)[:, :, 0, 0].T
+    assert np.abs(np.diff(moved - np.stack([on, off]), axis=0)).max() < 0.5
+
+
+def test_the_trace_of_nothing_and_what_it_refuses():
+    on, off = event_trace(Events.empty(3, 2), [0, 1000], 100.0)[0]
+    np.testing.assert_array_equal(on, off)
+    assert 0 < on.max() < 0.5
+    for wrong in (
+        {"tau_us": 0.0},
+        {"edges_us": [5, 5]},
+        {"law": TraceLaw(noise=1.0)},
+        {"law": TraceLaw(spread=0.0)},
+    ):
+        with pytest.raises(DataError) as raised:
+            event_trace(**({"events": random_events(0), "edges_us": [0, 10], "tau_us": 1.0} | wrong))
+        assert "\n" not in str(raised.value)

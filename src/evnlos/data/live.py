@@ -23,7 +23,7 @@ from evnlos.cameras.streams import EventTensors
 from evnlos.config import config_hash, to_dict
 from evnlos.data.loader import Modality, as_modality
 from evnlos.data.pool import processes, run_in_order
-from evnlos.data.sampling import Samples, area_weights, edges_from
+from evnlos.data.sampling import Samples, area_weights, edges_from, surface_of
 from evnlos.data.simulate import (
     Simulation,
     check_sequences,
@@ -116,9 +116,12 @@ def _samples(
     times_s = scene.position_times_s(config.positions)
     edges_us = edges_from(times_s)
     frames = capture_tensors(drawn.frame_camera, wall, times_s, derive_seed(config.seed, name, "frames"))
-    surface = time_surface_tensors(
-        events, edges_us, sampling.tau_s * 1e6, sampling.surface, radius=sampling.radius
-    )
+    if sampling.surface == "trace":  # two walks through each pixel's events: the CPU's work
+        surface = torch.from_numpy(surface_of(events.to_events(), edges_us, sampling)).to(device)
+    else:
+        surface = time_surface_tensors(
+            events, edges_us, sampling.tau_s * 1e6, sampling.surface, radius=sampling.radius
+        )
     shape = sampling.height, sampling.width
     return DeviceSamples(
         _reduced(frames / drawn.frame_camera.white, shape),

@@ -20,7 +20,7 @@ from evnlos.config import check_made
 from evnlos.data.capture_info import CaptureInfo, RegistrationInfo, inside
 from evnlos.data.frames import find_dots, homography_from_points, read_image, registration_error
 from evnlos.errors import ConfigError, DataError
-from evnlos.events import event_histogram, read_events, time_surface
+from evnlos.events import event_histogram, event_trace, read_events, time_surface
 from evnlos.files import write_atomically
 from evnlos.scene import Motion, Target
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
@@ -199,10 +199,10 @@ class Sampling:
     """Size of a pixel of the truth on the target's plane, metres."""
     scored_rows: int = 48
     """Rows in the middle of the canvas that are scored; the target never leaves them, pixels."""
-    surface: Literal["sae", "context", "hots"] = "sae"
-    """Kind of the time surface."""
+    surface: Literal["sae", "context", "hots", "trace"] = "sae"
+    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones."""
     tau_s: float = 0.2
-    """Time constant of the time surface, seconds."""
+    """Time constant of the time surface, seconds; of `trace`, the time in which the light changes: 1 to 5."""
     radius: int = 3
     """Radius of the neighbourhood of the surfaces `context` and `hots`, pixels."""
 
@@ -235,7 +235,7 @@ class Samples:
 
     Args:
         frame: What the frame camera saw, float32 [N, H, W], 0..1 (1 = the largest digital number).
-        surface: Time surface of the events since the position before, float32 [N, 2, H, W]: ON, OFF.
+        surface: Surface of the events, float32 [N, 2, H, W]: ON, OFF (`surface_of`).
         truth: The target on the canvas, float32 [N, H, W], 0..1; None where the target is unknown.
         time_s: Instant of each position, float64 [N], seconds.
         position_m: Target's centre (x, y), float64 [N, 2], metres; None where the motion is unknown.
@@ -256,6 +256,20 @@ class Samples:
 def edges_from(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the instants between positions, int64 [N + 1], microseconds: 0, then those of the positions."""
     return np.concatenate([[0], np.round(times_s * 1e6)]).astype(np.int64)
+
+
+def surface_of(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) -> NDArray[np.float32]:
+    """Return the surface that the settings name at the end of each grid, float32 [N, 2, H, W]: ON, OFF.
+
+    Args:
+        events: The events of the whole recording.
+        edges_us: N + 1 ascending instants, microseconds.
+        sampling: Kind of the surface and its settings.
+    """
+    tau_us = sampling.tau_s * 1e6
+    if sampling.surface == "trace":
+        return event_trace(events, edges_us, tau_us)
+    return time_surface(events, edges_us, tau_us, mode=sampling.surface, radius=sampling.radius)
 
 
 def make_samples(
@@ -285,9 +299,7 @@ def make_samples(
     if len(edges_us) != len(frames) + 1:
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
     shape = (sampling.height, sampling.width)
-    surface = time_surface(
-        events, edges_us, sampling.tau_s * 1e6, mode=sampling.surface, radius=sampling.radius
-    )  # [N, 2, H, W]
+    surface = surface_of(events, edges_us, sampling)  # [N, 2, H, W]
     time_s = np.asarray(edges_us[1:], dtype=np.float64) * 1e-6
     position = None if motion is None else motion.position_m(time_s)
     truth = None

@@ -1,6 +1,8 @@
 """Names of `evnlos.events`; `__init__.py` reads this list."""
 
+from .batch import TraceLaw as TraceLaw
 from .batch import event_batch as event_batch
+from .batch import event_trace as event_trace
 from .batch import events_from_tensors as events_from_tensors
 from .batch import events_to_tensors as events_to_tensors
 from .cleaning import Cleaner as Cleaner
