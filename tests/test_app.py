@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 import chromium
-from evnlos import Events, machine
+from evnlos import Events, machine, untrusted
 from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, drawn, picked, simulate_sequence
 from evnlos.app.page import Wanted, build_page, simulated
 from evnlos.app.serve import Server, middleware, running
@@ -282,7 +282,7 @@ def test_a_resolver_that_does_not_answer_is_not_waited_for(monkeypatch) -> None:
 
 def test_names_of_this_machine() -> None:
     for name in ("127.0.0.1:7860", "localhost", "LOCALHOST:1", "[::1]:7860", "127.8.9.1"):
-        assert machine.names_this_machine(name)
+        assert untrusted.names_this_machine(name)
     for name in (
         "evil.example",
         "127.0.0.1.evil.example",
@@ -291,8 +291,8 @@ def test_names_of_this_machine() -> None:
         "::1",
         "a@localhost",
     ):
-        assert not machine.names_this_machine(name)
-    assert machine.names_this_machine("Lab:7860", own="lab") and not machine.names_this_machine("lab:7860")
+        assert not untrusted.names_this_machine(name)
+    assert untrusted.names_this_machine("Lab:7860", own="lab") and not untrusted.names_this_machine("lab:7860")
 
 
 @pytest.mark.parametrize(("own", "codes"), [("127.0.0.1", [200, 403]), (None, [200, 200])])

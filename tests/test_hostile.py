@@ -3,7 +3,6 @@
 import json
 import os
 import random
-import re
 import resource
 import shutil
 import struct
@@ -32,7 +31,6 @@ from evnlos.data.simulations import find_faults
 from evnlos.errors import ConfigError, printable
 from evnlos.events.recording import Recording, _Counts
 from evnlos.inverse.inversion import read_photograph
-from evnlos.machine import ProgressBars, Step
 from evnlos.models import UNetConfig
 from evnlos.types import Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS
@@ -562,14 +560,6 @@ def test_a_kind_in_a_file_brings_no_program(path: str, tmp_path, monkeypatch) ->
             load_yaml(Simulation, tmp_path / "s.yaml")
         assert "\n" not in str(caught.value)
     assert "trap" not in sys.modules
-
-
-def test_the_bar_tells_the_time_that_is_left(capsys) -> None:
-    with ProgressBars() as progress:
-        progress(Step("simulate", 0, 4, "objects"))
-        time.sleep(0.02)
-        progress(Step("simulate", 1, 4, "objects"))
-    assert re.search(r"1/4 \[\d\d:\d\d<\d\d:\d\d", capsys.readouterr().err)
 
 
 def test_memory_that_is_not_enough_is_one_line(monkeypatch, capsys) -> None:

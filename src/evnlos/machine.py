@@ -1,25 +1,25 @@
-"""What a process may use of its machine, how far its work is, and by which names others reach it.
+"""What a process may use of its machine, how far its work is, and where others reach it.
 
 - How many threads there are, and how they wait for each other.
 - Ctrl-C and the wish to end, held back while something runs that must not break off in its middle.
 - How far a piece of work is: one small protocol for all that takes long, and progress bars that speak it.
-- Names of this machine: which requests come from its own browsers, and which addresses can be listened on.
+- Which addresses of this machine can be listened on.
 """
 
 from __future__ import annotations
 
 import errno
-import ipaddress
+import json
 import os
 import queue
-import re
 import signal
 import socket
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from evnlos.errors import ConfigError
@@ -112,6 +112,8 @@ class Step:
         unit: What is counted, e.g. "epochs".
         result: What the last unit brought (an object's name, an epoch's record, a score); None for the first
             step of a piece, which only says where it begins.
+        within: What is at work now, where a unit takes long: a text, or a function that looks it up and
+            returns, before the text, how many units the unfinished ones amount to.
     """
 
     what: str
@@ -119,6 +121,7 @@ class Step:
     total: int
     unit: str = "steps"
     result: Any = None
+    within: str | Callable[[], tuple[float, str]] = ""
 
 
 Progress: TypeAlias = Callable[[Step], None]
@@ -148,8 +151,20 @@ def counted(
         progress(Step(what, done, total, unit))
 
 
+PROGRESS = "EVNLOS_PROGRESS"
+"""Environment variable: how progress is shown, one of `SHOWN`."""
+SHOWN = ("auto", "bar", "lines", "json", "none")
+"""auto: bar on a terminal, else lines; lines and json: a line every `LINE_S` seconds; none: nothing."""
+LINE_S = 5.0
+"""Seconds between two lines of progress; what takes less says nothing."""
+_BEAT_S = 0.5
+
+
 class ProgressBars:
-    """A bar on stderr for each piece of work, one after the other; use it as a context manager.
+    """Shows on stderr how far each piece of work is, one after the other; use it as a context manager.
+
+    What is shown moves by itself: time passes, and what is at work within a unit is looked up. On a terminal
+    it is a bar, elsewhere a line now and then, after `--json` a line of JSON.
 
     Args:
         quiet: Show nothing.
@@ -160,74 +175,181 @@ class ProgressBars:
     """
 
     def __init__(self, quiet: bool = False) -> None:
-        self._quiet, self._what, self._bar = quiet, "", None
-
-    _bar: tqdm | None
+        self._how = "none" if quiet else _progress_shown()
+        self._step: Step | None = None
+        self._began = self._said = self._first = 0.0
+        self._bar: tqdm | None = None
+        self._lock, self._end = threading.RLock(), threading.Event()
+        self._beats: threading.Thread | None = None
 
     def __call__(self, step: Step) -> None:
-        """Move the bar of the step's piece of work; open it where it is a new one."""
-        if self._quiet:
+        """Show a step; a new piece of work begins where its name is another one."""
+        if self._how == "none":
             return
-        if self._bar is None or step.what != self._what:
+        with self._lock:
+            if self._step is None or step.what != self._step.what:
+                self._finish()
+                self._began = self._said = time.monotonic()
+                self._first = step.done
+            self._step = step
+            self._show()
+        if self._beats is None:
+            self._beats = threading.Thread(target=self._beat, name="progress", daemon=True)
+            self._beats.start()
+
+    @contextmanager
+    def stage(self, what: str, within: str, done: int = 0, total: int = 1) -> Iterator[None]:
+        """Show a stage that says nothing itself while it lasts.
+
+        Args:
+            what: The piece of work.
+            within: What this stage of it does.
+            done: Stages before it.
+            total: All stages.
+        """
+        self(Step(what, done, total, "stages", within=within))
+        yield
+        self(Step(what, done + 1, total, "stages"))
+
+    def _beat(self) -> None:
+        while not self._end.wait(_BEAT_S):
+            with self._lock:
+                self._show()
+
+    def _show(self) -> None:
+        step, now = self._step, time.monotonic()
+        if step is None:
+            return
+        if self._how != "bar":
+            if now - self._said >= LINE_S:
+                self._said = now
+                self._say(*self._state(step, now))
+            return
+        if self._bar is None:
             from tqdm import tqdm
 
-            self.close()
-            self._what = step.what
+            # `disable=False` would overrule TQDM_DISABLE; None would leave it out where there is no terminal.
             self._bar = tqdm(total=step.total or None, initial=step.done, desc=step.what, unit=f" {step.unit}")
-        self._bar.n = step.done
-        if isinstance(step.result, Mapping):
-            values = {key: step.result[key] for key in ("loss", "psnr_db") if key in step.result}
-            self._bar.set_postfix(values, refresh=False)
+        done, text = self._state(step, now)
+        self._bar.n = round(done, 2) if done != step.done else step.done
+        values = step.result if isinstance(step.result, Mapping) else {}
+        scores = [f"{key}={values[key]}" for key in ("loss", "psnr_db") if key in values]
+        self._bar.set_postfix_str(", ".join([*scores, *([text] if text else [])]), refresh=False)
         self._bar.refresh()
 
-    def close(self) -> None:
-        """Leave the last bar as it stands."""
+    def _state(self, step: Step, now: float) -> tuple[float, str]:
+        """Return how many units are done, unfinished ones by their part, and what is at work."""
+        part, text = (0.0, step.within) if isinstance(step.within, str) else step.within()
+        compiling = _compiling_since()
+        if compiling is not None and now - compiling > 1:
+            text = f"{text}; " * bool(text) + "compiling, once per installation"
+        return min(step.done + part, step.total) if step.total else step.done, text
+
+    def _say(self, done: float, text: str) -> None:
+        assert self._step is not None
+        step, passed = self._step, self._said - self._began
+        speed = (done - self._first) / passed
+        left = (step.total - done) / speed if speed > 0 and step.total else None
+        if self._how == "json":
+            said = {"what": step.what, "done": step.done, "total": step.total, "unit": step.unit}
+            said |= {"within": text, "elapsed_s": round(passed, 1)}
+            line = json.dumps({"progress": said | {"left_s": None if left is None else round(left, 1)}})
+        else:
+            of = f" of {step.total}" if step.total else ""
+            rest = "" if left is None else f", about {_duration(left)} left"
+            work = f" ({text})" if text else ""
+            line = f"{step.what}: {step.done}{of} {step.unit}{work}, {_duration(passed)}{rest}"
+        print(line, file=sys.stderr, flush=True)
+
+    def _finish(self) -> None:
+        """Leave the last bar as it stands; a piece that said something says how it ended."""
         if self._bar is not None:
+            self._bar.set_postfix_str("", refresh=True)
             self._bar.close()
             self._bar = None
+        elif self._step is not None and self._said > self._began:
+            self._said = time.monotonic()
+            self._say(self._step.done, "")
+
+    def close(self) -> None:
+        """Show how the last piece ended, and nothing further."""
+        self._end.set()
+        with self._lock:
+            self._finish()
+            self._step = None
 
     def __enter__(self) -> ProgressBars:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
-_PATIENCE_S = 2.0  # for the name of a machine; a resolver that nobody answers takes half a minute to say so
-_HEADER = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:\[\]@/]+)(?::\d+)?")
+_chosen: str | None = None
 
 
-def is_local(host: str) -> bool:
-    """Return whether a host is this machine itself, which nobody else can reach.
-
-    Example:
-        >>> is_local("127.0.0.1"), is_local("[::1]"), is_local("localhost"), is_local("0.0.0.0")
-        (True, True, True, False)
-    """
-    try:
-        return host.lower() == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
-
-
-def names_this_machine(header: str, own: str = "127.0.0.1") -> bool:
-    """Return whether a request's Host header names this machine.
-
-    A page from elsewhere may have made its own name lead here; its requests carry that name. The port says
-    nothing more, and another one is what a forwarded port has.
+def show_progress(how: str | None) -> None:
+    """Choose how this process shows progress from now on.
 
     Args:
-        header: The header, with or without a port.
-        own: Further name that the server listens under.
+        how: One of `SHOWN`; None leaves it to EVNLOS_PROGRESS.
+    """
+    global _chosen
+    _chosen = how
+
+
+def _progress_shown() -> str:
+    """Return how progress is shown in this process: bar, lines, json or none."""
+    how = _chosen or os.environ.get(PROGRESS) or "auto"
+    if how not in SHOWN:
+        raise ConfigError(f"{PROGRESS} is {how!r}; give one of {', '.join(SHOWN)}")
+    if os.environ.get("TQDM_DISABLE", "") not in ("", "0") and how in ("auto", "bar", "lines"):
+        return "none"
+    if how != "auto":
+        return how
+    return "bar" if hasattr(sys.stderr, "isatty") and sys.stderr.isatty() else "lines"
+
+
+def _duration(seconds: float) -> str:
+    """Return a time as people say it.
 
     Example:
-        >>> names_this_machine("localhost:8765"), names_this_machine("evil.example:8765")
-        (True, False)
+        >>> _duration(8.4), _duration(95), _duration(7300)
+        ('8 s', '1 min 35 s', '2 h 1 min')
     """
-    found = _HEADER.fullmatch(header)
-    return found is not None and (is_local(found[1]) or found[1].lower() == own.lower())
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+_compilations = list[float]()
+"""When each compilation that is going on began; empty where none is."""
+_is_listening = False
+
+
+def _compiling_since() -> float | None:
+    """Return since when numba compiles; None where it does not. The first call only begins to look."""
+    global _is_listening
+    if not _is_listening and hasattr(sys.modules.get("numba"), "njit"):
+        from numba.core import event
+
+        class Compilations(event.Listener):
+            def on_start(self, event: Any) -> None:
+                _compilations.append(time.monotonic())
+
+            def on_end(self, event: Any) -> None:
+                if _compilations:
+                    _compilations.pop()
+
+        event.register("numba:compile", Compilations())
+        _is_listening = True
+    return next(iter(_compilations), None)
+
+
+_PATIENCE_S = 2.0  # for the name of a machine; a resolver that nobody answers takes half a minute to say so
 
 
 def listening_address(host: str, port: int) -> str:

@@ -1,14 +1,17 @@
 """Opening files that may be a stranger's: plain files only, by lists of formats, and nothing beside the file.
 
 A picture named `.png` may be a program for Ghostscript, a video a playlist of films elsewhere, a column of an
-HDF5 file the bytes of another file, and a name in a folder a pipe that never ends: all are opened here.
+HDF5 file the bytes of another file, and a name in a folder a pipe that never ends: all are opened here. So are
+requests told apart that a page from elsewhere sends to a server of this machine.
 """
 
 from __future__ import annotations
 
 import errno
+import ipaddress
 import json
 import os
+import re
 import stat
 import struct
 import subprocess
@@ -358,3 +361,37 @@ def _end_with_input() -> None:
     while os.read(0, 1 << 10):
         pass
     os._exit(1)
+
+
+_HEADER = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:\[\]@/]+)(?::\d+)?")
+
+
+def is_local(host: str) -> bool:
+    """Return whether a host is this machine itself, which nobody else can reach.
+
+    Example:
+        >>> is_local("127.0.0.1"), is_local("[::1]"), is_local("localhost"), is_local("0.0.0.0")
+        (True, True, True, False)
+    """
+    try:
+        return host.lower() == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def names_this_machine(header: str, own: str = "127.0.0.1") -> bool:
+    """Return whether a request's Host header names this machine.
+
+    A page from elsewhere may have made its own name lead here; its requests carry that name. The port says
+    nothing more, and another one is what a forwarded port has.
+
+    Args:
+        header: The header, with or without a port.
+        own: Further name that the server listens under.
+
+    Example:
+        >>> names_this_machine("localhost:8765"), names_this_machine("evil.example:8765")
+        (True, False)
+    """
+    found = _HEADER.fullmatch(header)
+    return found is not None and (is_local(found[1]) or found[1].lower() == own.lower())

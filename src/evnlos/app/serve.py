@@ -20,7 +20,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from evnlos.errors import ConfigError, MissingDependencyError
-from evnlos.machine import is_local, listening_address, names_this_machine
+from evnlos.machine import listening_address
+from evnlos.untrusted import is_local, names_this_machine
 
 # The browser itself refuses what would leave this server.
 _POLICY = (

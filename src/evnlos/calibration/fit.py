@@ -26,6 +26,7 @@ from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
 from evnlos.data.simulate import Simulation
 from evnlos.errors import DataError
+from evnlos.machine import Progress, Step, silent
 from evnlos.scene import HandwritingGlyphs, LineMotion, Strokes, pen_width
 from evnlos.setups import RadiometricSetup, SensorSize, Setup
 
@@ -120,7 +121,9 @@ class SetupFit:
         return tuple(found)
 
 
-def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None) -> SetupFit:
+def fit_setup(
+    folders: Iterable[str | Path], settings: Calibration | None = None, progress: Progress = silent
+) -> SetupFit:
     """Fit the simulator to captures of a setup whose targets are known, or, with `targets="unknown"`, are not.
 
     Where they are not, everything behind the optics (noise, event pixel) is fitted with the targets that are
@@ -129,6 +132,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
     Args:
         folders: Capture folders of one setup and one camera.
         settings: What to hold out, what to fit and where to start; None is a wall of rough metal.
+        progress: Called at the begin of each stage.
 
     Returns:
         The calibrated simulation, its parameters' errors, and the residuals before and after on the captures
@@ -139,6 +143,13 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
             not follow the targets.
     """
     settings = Calibration() if settings is None else settings
+    stages = ("read the captures", "fit the wall", "fit the noise of the frames", "fit the event pixel")
+    stages = stages[: 4 if settings.events else 3]
+
+    def begin(stage: int) -> None:
+        progress(Step("calibrate", stage, len(stages), "stages", within=stages[stage]))
+
+    begin(0)
     fit, held = read_capture_set(
         folders,
         exclude=settings.exclude,
@@ -149,6 +160,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
     )
     start, fixed = _at_known_distance(settings, fit)
     residuals: dict[str, Residual] = {}
+    begin(1)
     if isinstance(start, RadiometricSetup) and _is_any(settings, fit):
         optics = fit_wall(fit, held, start, fit_distance=settings.fit_distance).optics
     elif settings.targets == "known":
@@ -157,6 +169,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
         found = fit_blind(fit, held, start, fixed=fixed)
         optics, fit, held = found.optics, found.fitted, found.held_out
         residuals["every other frame held out"] = found.check
+    begin(2)
     models = {"fit": FrameModel(fit, fit.shape), "held out": FrameModel(held, held.shape)}
     predicted = {name: model.predict(optics.setup) for name, model in models.items()}
     noise = fit_frame_noise(fit, predicted["fit"].numpy(), settings.start.frame_camera)
@@ -178,6 +191,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
     pixel: PixelFit | None = None
     surfaces: Surfaces = {}
     if settings.events:
+        begin(3)
         recordings = read_recordings(fit, optics.setup, settings.event_captures)
         there = read_recordings(held, optics.setup, settings.event_captures)
         pixel = fit_pixel(recordings, continuous(start_pixel), seed=settings.seed)
@@ -188,6 +202,7 @@ def fit_setup(folders: Iterable[str | Path], settings: Calibration | None = None
                 capture_set, found, start_pixel, pixel.pixel, simulation.sampling, settings.seed
             )
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
+    progress(Step("calibrate", len(stages), len(stages), "stages"))
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
     strokes, known = Strokes().pen, dict[str, NDArray[np.float32]]()
     if settings.targets == "known":

@@ -22,7 +22,7 @@ from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
 from evnlos.cli.parsing import drawn, say
-from evnlos.cli.recordings import Flat, Folders, Presets
+from evnlos.cli.recordings import Flat, Folders, Presets, check_writable
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
 from evnlos.lab import Phone
@@ -86,8 +86,10 @@ class CalibrateCommand:
         from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
         from evnlos.plot.results import draw_calibration
 
+        check_writable(self.out)
         check_out(self.out, self.force)
-        fit = fit_setup(self.captures, self.settings)
+        with ProgressBars() as progress:
+            fit = fit_setup(self.captures, self.settings, progress)
         rows = rows_of(fit, self.settings.start.pixel, self.settings.start.frame_camera)
         self.out.mkdir(parents=True, exist_ok=True)
         if self.json:
@@ -143,7 +145,7 @@ class ScanCommand:
         from evnlos.calibration.scan import write_plan
 
         info, found = self.plan.info(), self.plan.estimate()
-        with ProgressBars(quiet=self.json) as progress:
+        with ProgressBars() as progress:
             files = len(write_plan(self.plan, self.folder, progress))
         if self.json:
             print(json.dumps({"folder": str(self.folder), "files": files, **asdict(found)}))
@@ -172,7 +174,7 @@ class ScanCommand:
         from evnlos.calibration.scan import rehearse_film
         from evnlos.cli.invert_captures import linear_setup
 
-        with ProgressBars(quiet=self.json) as progress:
+        with ProgressBars() as progress:
             path = rehearse_film(self.folder, linear_setup(self.setup), self.phone, progress=progress)
         print(json.dumps({"film": str(path)}) if self.json else f"{path}: simulated, no phone saw this")
         if not self.json:
@@ -186,7 +188,7 @@ class ScanCommand:
             return None
         height, width = self.settings.height, self.settings.width
         shape = None if height is None or width is None else (height, width)
-        with ProgressBars(quiet=self.json) as progress:
+        with ProgressBars() as progress:
             found = import_film(self.folder, self.film, self.reading, shape, progress)
         for warning in found.warnings:
             say(f"warning: {warning}")

@@ -139,7 +139,7 @@ class CornerCommand:
         sector, video = self._sector(), self._video()
         box, index, bearings = sector.pixels((video.height, video.width))
         truth = None if self.truth is None else _true_bearings(self.truth)
-        with ProgressBars(self.json) as progress:
+        with ProgressBars() as progress:
             frames = self._part(
                 counted(video.part(box), progress, f"read {video.path.name}", video.frames or 0)
             )

@@ -310,7 +310,7 @@ class ImportCommand:
 
     def _look(self, capture: Capture) -> None:
         """Tell what was done to a capture, and draw it."""
-        tqdm.write(f"{capture.name}: {'; '.join(capture.notes)}", file=sys.stderr)
+        tqdm.write(f"{capture.name}: {'; '.join(capture.notes)}", file=sys.stderr)  # above the bar
         if self.check_pictures:
             folder = self.out / "checks"
             folder.mkdir(exist_ok=True)

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from evnlos.cameras.event_model import Phase, PixelSettings
 from evnlos.cameras.pixel import EventPixel, Logarithm, Mode
@@ -38,6 +37,8 @@ from evnlos.errors import ConfigError
 from evnlos.events import Cleaner, CleanOptions, EventWriter
 from evnlos.events.files.columns import OnError
 from evnlos.events.recording import CropOptions, Recording
+from evnlos.machine import ProgressBars
+from evnlos.machine import counted as frames_counted
 from evnlos.types import Events
 
 
@@ -171,9 +172,10 @@ class _Clock:
     frames, last_s = 0, 0.0
 
     def watched(self, video: Video, name: str) -> Iterator[tuple[float, NDArray]]:
-        for time_s, light in tqdm(video, total=video.frames, desc=name, unit=" frames", leave=False):
-            self.frames, self.last_s = self.frames + 1, time_s
-            yield time_s, light
+        with ProgressBars() as progress:
+            for time_s, light in frames_counted(video, progress, name, video.frames or 0):
+                self.frames, self.last_s = self.frames + 1, time_s
+                yield time_s, light
 
 
 def _found(

@@ -25,6 +25,8 @@ from evnlos.cli.parsing import (
     FLAG,
     LEVELS,
     LOG,
+    PROGRESS_FLAG,
+    QUIET_FLAG,
     VARIABLE,
     WORK_LIBRARIES,
     PlainOutput,
@@ -36,7 +38,7 @@ from evnlos.cli.parsing import (
 )
 from evnlos.doctor import examine, fault_behind
 from evnlos.errors import ConfigError, EvnlosError, printable
-from evnlos.machine import sleep_while_waiting
+from evnlos.machine import PROGRESS, SHOWN, sleep_while_waiting
 from evnlos.registry import Kinded, __version__, kind_of
 
 # Nothing that may be missing is imported before a command is: help, version and doctor work in any case.
@@ -342,6 +344,9 @@ def _overview() -> str:
     lines += [f"  {verb:<12} {summary_of(verb)}" for verb in VERBS]
     lines.append("")
     lines.append(f"with every command: {FLAG} {{{','.join(LEVELS)}}}, or the variable {VARIABLE}; --version")
+    lines.append(
+        f"                    {PROGRESS_FLAG} {{{','.join(SHOWN)}}}, or the variable {PROGRESS}; {QUIET_FLAG}"
+    )
     return "\n".join(lines)
 
 

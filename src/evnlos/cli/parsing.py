@@ -21,10 +21,13 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from evnlos.errors import ConfigError, MissingDependencyError, printable
+from evnlos.machine import PROGRESS, SHOWN, show_progress
 
 LEVELS = ("debug", "info", "warning", "error")
 """What is said, most first: where an error came from; notes; only warnings; only errors."""
 FLAG, VARIABLE = "--log-level", "EVNLOS_LOG"
+PROGRESS_FLAG, QUIET_FLAG = "--progress", "--quiet"
+"""How progress is shown, with every command; quiet: neither progress nor notes."""
 LOG = logging.getLogger("evnlos")
 """The logger of the package; its modules log to it and its children."""
 
@@ -78,19 +81,20 @@ def drawn(path: Path, draw: Callable[[], object]) -> str | None:
 
 
 def listen(arguments: list[str]) -> list[str]:
-    """Set the level that the arguments, else EVNLOS_LOG, ask for; return the arguments without the flag.
+    """Set what the arguments, else the environment, say of notes and progress; return the other arguments.
 
     Args:
-        arguments: Words of the command line; the flag may stand anywhere before a bare `--`.
+        arguments: Words of the command line; these flags may stand anywhere before a bare `--`.
 
     Raises:
-        ConfigError: The level is none of `LEVELS`.
+        ConfigError: The level is none of `LEVELS`, or the progress none of `evnlos.machine.SHOWN`.
 
     Example:
         >>> listen(["info", "--log-level", "warning", "events.raw"])
         ['info', 'events.raw']
     """
     rest, level, source = [], os.environ.get(VARIABLE) or "info", VARIABLE
+    shown = None
     words = iter(arguments)
     for word in words:
         if word == "--":
@@ -98,8 +102,17 @@ def listen(arguments: list[str]) -> list[str]:
         elif word == FLAG or word.startswith(f"{FLAG}="):
             level = word.partition("=")[2] if "=" in word else next(words, "")
             source = FLAG
+        elif word == PROGRESS_FLAG or word.startswith(f"{PROGRESS_FLAG}="):
+            shown = word.partition("=")[2] if "=" in word else next(words, "")
+        elif word == QUIET_FLAG:
+            level, source, shown = "warning", FLAG, "none"
         else:
             rest.append(word)
+    if shown is None and "--json" in rest and not os.environ.get(PROGRESS):
+        shown = "json"
+    if shown is not None and shown not in SHOWN:
+        raise ConfigError(f"{PROGRESS_FLAG} is {shown!r}; give one of {', '.join(SHOWN)}")
+    show_progress(shown)
     if level.lower() not in LEVELS:
         raise ConfigError(f"{source} is {level!r}; give one of {', '.join(LEVELS)}")
     for handler in [one for one in LOG.handlers if isinstance(one, _Stderr)]:

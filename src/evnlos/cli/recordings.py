@@ -10,19 +10,20 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
-from tqdm import tqdm
 
 from evnlos.cli.parsing import say
 from evnlos.errors import ConfigError, DataError, printable
 from evnlos.events import CelexOptions, EventWriter, ReadReport
 from evnlos.events.files.columns import OnError
 from evnlos.events.recording import WINDOW_US, Box, CropOptions, Recording, Summary, summarise
+from evnlos.machine import ProgressBars, Step
 from evnlos.plot.preview import Background, PreviewOptions, Style, preview_pictures
 from evnlos.types import Events
 
@@ -83,13 +84,38 @@ def refuse_existing(path: Path, force: bool) -> None:
         raise ConfigError(f"{path} exists; give another name, or --force to replace it")
 
 
+def check_writable(path: Path) -> None:
+    """Raise where a result could not be written, before it is worked for; nothing is made or changed.
+
+    Args:
+        path: File or folder that the command will write, or will make along with the folders above it.
+
+    Raises:
+        ConfigError: It, or the nearest folder above it that exists, cannot be written.
+    """
+    place = path.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if place != path.absolute() and not place.is_dir():
+        raise ConfigError(f"{path} cannot be made: {place} is a file; give another --out")
+    if not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)) or _is_read_only(place):
+        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another --out")
+
+
+def _is_read_only(place: Path) -> bool:
+    """Return whether a file system takes no file, which an administrator's rights hide."""
+    return hasattr(os, "statvfs") and bool(os.statvfs(place).f_flag & os.ST_RDONLY)
+
+
 def counted(pieces: Iterable[Events], name: str, total: int | None = None) -> Iterator[Events]:
-    """Yield the pieces under a progress bar that counts their events and is gone when they are through."""
-    bar = tqdm(desc=name, total=total, unit=" events", unit_scale=True, delay=0.5, leave=False)
-    with bar:
+    """Yield the pieces, and show how many events have gone by."""
+    done = 0
+    with ProgressBars() as progress:
+        progress(Step(name, 0, total or 0, "events"))
         for piece in pieces:
             yield piece
-            bar.update(len(piece))
+            done += len(piece)
+            progress(Step(name, done, total or 0, "events"))
 
 
 def amount(value: float, unit: str) -> str:

@@ -20,7 +20,7 @@ import tyro
 from evnlos.analysis.bounds import SequenceAnalysisSettings
 from evnlos.analysis.linearized import AnalysisSettings
 from evnlos.cli.parsing import drawn, say
-from evnlos.cli.recordings import Flat, Folders, result
+from evnlos.cli.recordings import Flat, Folders, check_writable, result
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
@@ -66,12 +66,15 @@ class ReconstructCommand:
         from evnlos.report import reconstruct_capture
         from evnlos.setups import calibrated_folder, load_setup
 
+        check_writable(self.out)
         folder = calibrated_folder(self.setup) if self.setup else None
         pattern = pattern_of(folder, self.pattern)
         setup = load_setup(folder) if folder else None
-        found = reconstruct_capture(
-            self.capture, self.weights, self.out, pattern=pattern, setup=setup, track=self.track
-        )
+        stages = "follow the target, reconstruct" if self.track else "reconstruct, compare with the wall"
+        with ProgressBars() as progress, progress.stage(f"reconstruct {self.capture.name}", stages):
+            found = reconstruct_capture(
+                self.capture, self.weights, self.out, pattern=pattern, setup=setup, track=self.track
+            )
         for warning in found.get("warnings", []):
             say(f"warning: {warning}")
         if self.json:
@@ -110,10 +113,15 @@ class TrackCommand:
         from evnlos.plot.results import draw_track
         from evnlos.tracking import track_capture, track_warnings
 
-        capture = read_capture(self.capture)
-        setup = None if self.setup is None else linear_setup(self.setup)
-        pattern = pattern_of(self.setup, self.pattern)
-        track = track_capture(capture, setup, self.settings, pattern)
+        check_writable(self.out)
+        with ProgressBars() as progress:
+            with progress.stage("track", "read the capture", 0, 3):
+                capture = read_capture(self.capture)
+            with progress.stage("track", "render the light of the setup", 1, 3):
+                setup = None if self.setup is None else linear_setup(self.setup)
+                pattern = pattern_of(self.setup, self.pattern)
+            with progress.stage("track", "follow the target", 2, 3):
+                track = track_capture(capture, setup, self.settings, pattern)
         truth = true_path(capture, track.time_s) if track.unit == "m" else None
         found = track_values(capture, track, truth)
         found["warnings"] = track_warnings(capture, setup, track)
@@ -229,8 +237,6 @@ class IdentifyCommand:
 
     def run(self) -> None:
         """Identify and print."""
-        from tqdm import tqdm
-
         from evnlos.analysis.bounds import sequence_bounds
         from evnlos.analysis.identify import identify, setup_table
         from evnlos.plot.results import draw_identification, draw_setups
@@ -241,14 +247,18 @@ class IdentifyCommand:
             raise ConfigError(
                 f"no setup given; give a settings file, --all, or names: {', '.join(setup_names())}"
             )
+        if self.out is not None:
+            check_writable(self.out)
         setups = [named_setup(name) for name in names]
-        # `disable=False` would overrule TQDM_DISABLE.
-        shown = setups if len(setups) == 1 else tqdm(setups, desc="identify", unit=" setups")
-        found = [identify(one.setup, self.settings, one.name, self.seed) for one in shown]
-        limits = {
-            one.name: sequence_bounds(one.setup, self.sequence, one.name, self.seed)
-            for one in (setups if self.bounds else [])
-        }
+        found, limits, stages = [], {}, len(setups) * (1 + self.bounds)
+        with ProgressBars() as progress:
+            for one in setups:
+                with progress.stage("identify", f"{one.name}: modes above the noise", len(found), stages):
+                    found.append(identify(one.setup, self.settings, one.name, self.seed))
+            for one in setups if self.bounds else ():
+                done = len(found) + len(limits)
+                with progress.stage("identify", f"{one.name}: moving targets", done, stages):
+                    limits[one.name] = sequence_bounds(one.setup, self.sequence, one.name, self.seed)
 
         def summary(one: Identification, arrays: bool) -> dict[str, Any]:
             known = {"bounds": limits[one.name].summary()} if one.name in limits else {}
@@ -304,13 +314,16 @@ class ReportCommand:
         from evnlos.report.tables import baselines_of
         from evnlos.setups import named_setup
 
-        with ProgressBars(quiet=self.json) as progress:
+        check_writable(self.out)
+        with ProgressBars() as progress:
             dataset, results = collect_results(list(self.runs), self.data, self.split, progress=progress)
-        setup = None if self.setup is None else named_setup(self.setup)
-        limits = None if setup is None else identify(setup.setup, name=setup.name)
-        if setup is None and dataset.origin == "simulation":
-            setup = named_setup(self.data / "dataset.yaml")
-        path = write_report(self.out, dataset, results, [], self.split, setup, limits)
+            with progress.stage("report", "what the setup can show", 0, 2):
+                setup = None if self.setup is None else named_setup(self.setup)
+                limits = None if setup is None else identify(setup.setup, name=setup.name)
+                if setup is None and dataset.origin == "simulation":
+                    setup = named_setup(self.data / "dataset.yaml")
+            with progress.stage("report", "pictures, films and page", 1, 2):
+                path = write_report(self.out, dataset, results, [], self.split, setup, limits)
         about: dict[str, Any] = {"report": str(path), "csv": str(path.with_suffix(".csv"))}
         about["runs"] = {r.name: r.evaluation.scores.mean() for r in results}
         about["baselines"] = {name: scores.mean() for name, scores in baselines_of(results).items()}

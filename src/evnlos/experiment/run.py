@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -87,7 +87,7 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
         settings = replace(study.calibration, exclude=(*study.calibration.exclude, *study.test))
         progress(Step(f"calibrate {study.setup}", 0, 1, "setups"))
         try:
-            fit = fit_setup(place.captures, settings)
+            fit = fit_setup(place.captures, settings, progress)
             write_setup(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), setup)
             _draw(fit, setup / "check.png")
         except DataError as error:
@@ -152,17 +152,30 @@ def _together(networks: list[_Network], at_a_time: int, progress: Progress) -> l
     tasks = [partial(_trained, run, threads) for run in runs]
     tasks += [partial(_scored, network, threads) for network in networks]
     records, done = list[Record](), 0
-    progress(Step("train networks", 0, len(runs), "networks"))
+    within = partial(_epochs_at_work, runs)
+    progress(Step("train networks", 0, len(runs), "networks", within=within))
     with closing(run_tasks(_called, tasks, at_once, after)) as finished:
         for name, found in finished:
             if name:
                 done += 1
-                progress(Step("train networks", done, len(runs), "networks", name))
+                progress(Step("train networks", done, len(runs), "networks", name, within))
             for record in found:
                 progress(Step(f"score {record.name}", 1, 1, "networks", record))
             records += found
     order = {(n.arm.name, n.modality): number for number, n in enumerate(networks)}
     return sorted(records, key=lambda r: order.get((r.arm, r.modality), len(order)))
+
+
+def _epochs_at_work(runs: Sequence[Run]) -> tuple[float, str]:
+    """Return how many networks the unfinished trainings amount to, and their epochs in words."""
+    part, words = 0.0, list[str]()
+    for run in runs:
+        if run.out.is_dir() and not (run.out / "weights.safetensors").is_file():
+            log = run.out / "metrics.jsonl"
+            epochs = log.read_text().count("\n") if log.is_file() else 0
+            part += epochs / run.settings.epochs
+            words.append(f"{run.out.name} epoch {min(epochs + 1, run.settings.epochs)}/{run.settings.epochs}")
+    return part, ", ".join(words)
 
 
 def _called(task: Callable[[], tuple[str, list[Record]]]) -> tuple[str, list[Record]]:

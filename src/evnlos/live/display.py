@@ -27,8 +27,8 @@ from PIL import Image
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import LOCK, check_folder, directory_lock, is_empty, new_file
 from evnlos.live.engine import Picture
-from evnlos.machine import names_this_machine
 from evnlos.report.pictures import data_uri, grey, png, polarity, stretched
+from evnlos.untrusted import names_this_machine
 
 _GAP_PX = 8
 

@@ -1,0 +1,161 @@
+"""How far a piece of work is: bars, lines and JSON that move while nothing is told, and time that is left."""
+
+import json
+import re
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from evnlos.cli import main
+from evnlos.errors import ConfigError
+from evnlos.machine import ProgressBars, Step, show_progress
+
+
+@pytest.fixture(autouse=True)
+def shown(monkeypatch):
+    """Lines every 50 ms instead of every five seconds; what a test chooses ends with it."""
+    monkeypatch.setattr("evnlos.machine.LINE_S", 0.05)
+    monkeypatch.setattr("evnlos.machine._BEAT_S", 0.01)
+    monkeypatch.delenv("TQDM_DISABLE", raising=False)
+    yield
+    show_progress(None)
+
+
+def work(how: str | None, within="", total: int = 4) -> None:
+    """Do a piece of work whose second unit lasts long."""
+    show_progress(how)
+    with ProgressBars() as progress:
+        progress(Step("simulate", 0, total, "objects"))
+        time.sleep(0.02)
+        progress(Step("simulate", 1, total, "objects", within=within))
+        time.sleep(0.4)
+
+
+def test_the_bar_tells_the_time_that_is_left(capsys) -> None:
+    work("bar")
+    assert re.search(r"1/4 \[\d\d:\d\d<\d\d:\d\d", capsys.readouterr().err)
+
+
+def test_where_there_is_no_terminal_lines_come_while_nothing_is_told(capsys) -> None:
+    work(None, "writer03_R")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) >= 4
+    assert not [line for line in lines if "\r" in line]
+    pattern = r"simulate: 1 of 4 objects \(writer03_R\), \d+ s, about \d+ s left"
+    assert [line for line in lines if re.fullmatch(pattern, line)]
+
+
+def test_short_work_says_nothing_without_a_terminal(capsys, monkeypatch) -> None:
+    monkeypatch.setattr("evnlos.machine.LINE_S", 5.0)
+    work(None)
+    assert capsys.readouterr().err == ""
+
+
+def test_lines_of_json_hold_numbers_for_a_program(capsys) -> None:
+    work("json", lambda: (0.5, "half of it"))
+    found = [json.loads(line)["progress"] for line in capsys.readouterr().err.splitlines()]
+    told = [one for one in found if one["within"] == "half of it"]
+    assert told and {(one["what"], one["done"], one["total"], one["unit"]) for one in told} == {
+        ("simulate", 1, 4, "objects")
+    }
+    for one in told:  # one and a half of four units are done
+        assert one["left_s"] == pytest.approx(one["elapsed_s"] * 2.5 / 1.5, abs=0.2)
+
+
+@pytest.mark.parametrize(("how", "variable"), [("none", ""), (None, "1"), ("lines", "1")])
+def test_quiet_and_tqdm_disable_show_nothing(how, variable, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("TQDM_DISABLE", variable)
+    work(how)
+    assert capsys.readouterr().err == ""
+
+
+def test_work_that_nobody_knows_the_length_of(capsys) -> None:
+    work("lines", total=0)
+    assert re.search(r"simulate: 1 objects, \d+ s$", capsys.readouterr().err, re.MULTILINE)
+
+
+def test_a_stage_that_says_nothing_itself_moves(capsys) -> None:
+    show_progress("lines")
+    with ProgressBars() as progress, progress.stage("track", "follow the target", 2, 3):
+        time.sleep(0.3)
+    assert "track: 2 of 3 stages (follow the target), 0 s" in capsys.readouterr().err
+
+
+def test_compiling_is_told_apart_from_standing_still(capsys, monkeypatch) -> None:
+    from numba import njit
+
+    @njit
+    def kernel(x: float) -> float:
+        return x + 1
+
+    seen = list[float | None]()
+    show_progress("lines")
+    with ProgressBars() as progress:
+        progress(Step("events", 0, 2, "frames"))
+        time.sleep(0.1)  # the first look begins to listen
+        from numba.core import event
+
+        class Look(event.Listener):
+            def on_start(self, event) -> None:
+                from evnlos.machine import _compiling_since
+
+                seen.append(_compiling_since())
+
+            def on_end(self, event) -> None: ...
+
+        with event.install_listener("numba:compile", Look()):
+            kernel(1.0)
+            kernel(2.0)
+        monkeypatch.setattr("evnlos.machine._compilations", [time.monotonic() - 3])
+        time.sleep(0.2)
+    assert len(seen) == 1 and seen[0] is not None
+    assert "events: 0 of 2 frames (compiling, once per installation)" in capsys.readouterr().err
+
+
+def test_the_flags_stand_anywhere(tmp_path, capsys, monkeypatch) -> None:
+    shown = list[str]()
+    monkeypatch.setattr("evnlos.machine.ProgressBars._show", lambda self: shown.append(self._how))
+    video = tmp_path / "v.npy"
+    np.save(video, np.full((3, 4, 6), 100, np.uint8))
+    for words, how in ((["--progress", "lines"], "lines"), (["--progress=json"], "json"), (["--json"], "json")):
+        main(["events", str(video), "--fps", "10", "--out", str(tmp_path / f"{words[0]}{how}.npz"), *words])
+        assert shown and set(shown) == {how}
+        shown.clear()
+    main(["events", str(video), "--fps", "10", "--out", str(tmp_path / "q.npz"), "--quiet"])
+    assert not shown
+    with pytest.raises(SystemExit):
+        main(["--progress", "loud", "doctor"])
+    assert "give one of auto, bar, lines, json, none" in capsys.readouterr().err
+
+
+def test_a_variable_that_is_none_of_them_is_refused(monkeypatch) -> None:
+    monkeypatch.setenv("EVNLOS_PROGRESS", "loud")
+    with pytest.raises(ConfigError, match="EVNLOS_PROGRESS is 'loud'"):
+        ProgressBars()
+
+
+def test_networks_at_work_are_told_with_their_epochs(tmp_path) -> None:
+    from evnlos.experiment.run import Run, _epochs_at_work
+    from evnlos.training import Training
+
+    runs = [Run(None, Training(epochs=4), tmp_path / name, None) for name in ("done", "half", "new", "later")]
+    for name, epochs in (("done", 4), ("half", 2), ("new", 0)):
+        (tmp_path / name).mkdir()
+        if epochs:
+            (tmp_path / name / "metrics.jsonl").write_text('{"epoch": 1}\n' * epochs)
+    (tmp_path / "done" / "weights.safetensors").touch()
+    part, text = _epochs_at_work(runs)
+    assert part == 0.5
+    assert text == "half epoch 3/4, new epoch 1/4"
+
+
+def test_a_result_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys) -> None:
+    (tmp_path / "file").touch()
+    for words in (["track", "no"], ["reconstruct", "no"], ["identify", "main-near"], ["calibrate", "no"]):
+        began = time.monotonic()
+        with pytest.raises(SystemExit):
+            main([*words, "--out", str(tmp_path / "file" / "below")])
+        assert "is a file; give another --out" in capsys.readouterr().err
+        assert time.monotonic() - began < 5, sys.argv
