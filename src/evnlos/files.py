@@ -1,7 +1,11 @@
-"""Files and folders that are whole or not there, and one run at a time in a folder, whatever dies."""
+"""Files and folders that are whole or not there, and one run at a time in a folder, whatever dies.
+
+- Files from an address of the network or from a folder, each checked against the SHA-256 that a list states.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import secrets
@@ -11,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
+from typing import IO
 
 from evnlos.errors import DataError
 
@@ -290,3 +295,110 @@ def _is_alive(process: int) -> bool:
     except (PermissionError, OverflowError):  # another user's, or no number of a process of ours
         pass
     return True
+
+
+ADDRESSES: tuple[str, ...] = ()
+"""Where published captures, weights and examples lie, the first that answers counts; none is public yet."""
+ADDRESS_VARIABLE = "EVNLOS_DATA"  # addresses that come before those, separated by spaces; also folders
+LIST = "SHA256SUMS"
+"""File of a published folder that names its files: a SHA-256 and a path below the folder a line."""
+_MOST_LIST_BYTES, _ANSWER_S = 1 << 20, 20.0
+_LINE = re.compile(r"([0-9a-f]{64})  (\S[^\\\0\r\n]*)", re.A)
+
+
+def data_addresses() -> list[str]:
+    """Return where published files are looked for, first those of `EVNLOS_DATA`."""
+    return [*os.environ.get(ADDRESS_VARIABLE, "").split(), *ADDRESSES]
+
+
+def published_list(address: str, kind: str) -> dict[str, str]:
+    """Return the files that an address offers, path below the folder -> SHA-256; downloads the list alone.
+
+    Args:
+        address: A URL (https://, http://) or a folder, with a folder for each kind below it.
+        kind: "captures", "weights" or "examples".
+
+    Raises:
+        OSError: It can't be reached.
+        DataError: The list is none, or names a file outside its folder.
+    """
+    with _opened(address, f"{kind}/{LIST}") as file:
+        text = file.read(_MOST_LIST_BYTES + 1)
+    lines = text.decode("utf-8", "replace").splitlines()
+    found = {match[2]: match[1] for match in map(_LINE.fullmatch, lines) if match}
+    if not found or len(found) != len(lines) or len(text) > _MOST_LIST_BYTES:
+        raise DataError(f"{address}: {kind}/{LIST} is no list of files; give an address of published files")
+    for name in found:
+        if ":" in name or not {"", ".", ".."}.isdisjoint(name.split("/")):
+            raise DataError(f"{address}: {kind}/{LIST} names {name[:80]!r}, outside its folder; don't use it")
+    return dict(sorted(found.items()))
+
+
+def fetch_file(address: str, kind: str, name: str, digest: str, out: Path, most_bytes: int) -> int:
+    """Get one published file, and return its size in bytes; it is there as it was published, or not at all.
+
+    Args:
+        address: As for `published_list`.
+        kind: Folder of the address.
+        name: Path of the file below it, and below `out`.
+        digest: SHA-256 that it must have.
+        out: Folder for the files.
+        most_bytes: A larger file is refused.
+
+    Raises:
+        OSError: The address can't be reached, or the file not be written.
+        DataError: The file is another one, or too large.
+    """
+    size, found = 0, hashlib.sha256()
+    (out / name).parent.mkdir(parents=True, exist_ok=True)
+    with (
+        _opened(address, f"{kind}/{name}") as source,
+        new_file(out / name) as draft,
+        draft.open("wb") as target,
+    ):
+        while block := source.read(1 << 20):
+            size += len(block)
+            if size > most_bytes:
+                raise DataError(f"{name} is larger than {most_bytes / 1e9:g} GB; allow more with --most-gb")
+            found.update(block)
+            target.write(block)
+        if found.hexdigest() != digest:
+            raise DataError(
+                f"{address}: {kind}/{name} is not the listed file (SHA-256 {found.hexdigest()[:12]}..., not "
+                f"{digest[:12]}...); it was damaged or replaced: try again, or another address"
+            )
+    return size
+
+
+def has_digest(path: Path, digest: str) -> bool:
+    """Return whether a file is there and has a SHA-256."""
+    return path.is_file() and _digest(path) == digest
+
+
+def write_list(folder: Path) -> Path:
+    """Write the list of a folder that is to be published, and return its path."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != LIST)
+    lines = [f"{_digest(path)}  {path.relative_to(folder).as_posix()}\n" for path in paths]
+    write_atomically(folder / LIST, "".join(lines).encode())
+    return folder / LIST
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _opened(address: str, name: str) -> IO[bytes]:
+    """Open a file below an address; nothing but http, https and plain folders is followed."""
+    if "://" not in address:
+        return (Path(address) / name).open("rb")
+    if not address.lower().startswith(("http://", "https://")):
+        raise DataError(f"{address} is no address of published files; give https://, http:// or a folder")
+    from http.client import HTTPException
+    from urllib.parse import quote
+    from urllib.request import urlopen
+
+    try:
+        return urlopen(f"{address.rstrip('/')}/{quote(name)}", timeout=_ANSWER_S)
+    except (HTTPException, ValueError) as error:
+        raise DataError(f"{address} is no address ({error}); give https://HOST/PATH or a folder") from None

@@ -1,7 +1,8 @@
-"""`evnlos cite` and `evnlos completion`: what to quote, and what to type.
+"""`evnlos cite`, `evnlos completion` and `evnlos fetch`: what to quote, what to type, what others published.
 
 - `evnlos cite`: BibTeX for exactly what a simulation, a dataset or a run uses.
 - `evnlos completion`: a script that completes commands and flags.
+- `evnlos fetch`: captures, weights and examples from an address or a folder, each file checked.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from evnlos.config import read_yaml
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError, EvnlosError, printable
 from evnlos.registry import __version__, migrate
 
 ENTRIES = {
@@ -210,3 +211,95 @@ def script(shell: Shell) -> str:
         )
     # Where nothing of ours fits, bash offers files.
     return printed.getvalue().replace("complete -F ", "complete -o default -F ")
+
+
+@dataclass(frozen=True)
+class FetchCommand:
+    """Get published captures, weights or examples: each file is checked against its listed SHA-256."""
+
+    kind: Annotated[Literal["captures", "weights", "examples"], tyro.conf.Positional]
+    """What to get."""
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Files or folders of the list, e.g. near_R; by default all."""
+    out: Path | None = None
+    """Folder for the files; by default the kind's name, in this folder. Files that are there already stay."""
+    address: tuple[str, ...] = ()
+    """Addresses (https://, http://) or folders, the first that answers counts; by default those of the variable
+    EVNLOS_DATA."""
+    list: bool = False
+    """Print what there is; get nothing."""
+    force: bool = False
+    """Replace files that differ from the published ones."""
+    most_gb: float = 2.0
+    """Refuse a file that is larger, gigabytes."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def run(self) -> None:
+        """Get the files, and print how many."""
+        from evnlos.files import fetch_file, has_digest
+        from evnlos.machine import ProgressBars, Step
+
+        address, listed = self._reached()
+        wanted = {
+            name: digest
+            for name, digest in listed.items()
+            if not self.names or any(f"{name}/".startswith(f"{one.rstrip('/')}/") for one in self.names)
+        }
+        for one in self.names:
+            if not any(f"{name}/".startswith(f"{one.rstrip('/')}/") for name in wanted):
+                tops = sorted({name.partition("/")[0] for name in listed})
+                raise ConfigError(f"{address} has no {one[:80]!r}; give some of {', '.join(tops)[:300]}")
+        out = self.out or Path(self.kind)
+        if self.list:
+            there = {name: has_digest(out / name, digest) for name, digest in wanted.items()}
+            lines = [f"{'there' if there[name] else '-':<6}{printable(name)}" for name in wanted]
+            print(json.dumps({"address": address, "files": there}) if self.json else "\n".join(lines))
+            return
+        missing = {name: digest for name, digest in wanted.items() if not has_digest(out / name, digest)}
+        if (other := next((name for name in missing if (out / name).exists()), None)) and not self.force:
+            raise DataError(f"{out / other} is there and is not the published file; --force replaces it")
+        size = 0
+        with ProgressBars() as progress:
+            for done, (name, digest) in enumerate(missing.items()):
+                progress(Step(f"fetch {self.kind}", done, len(missing), "files", within=name))
+                try:
+                    size += fetch_file(address, self.kind, name, digest, out, int(self.most_gb * 1e9))
+                except OSError as error:
+                    raise DataError(
+                        f"{address}: {name} can't be had ({error}); run the command again"
+                    ) from None
+            progress(Step(f"fetch {self.kind}", len(missing), len(missing), "files"))
+        about = {
+            "out": str(out),
+            "address": address,
+            "files": len(wanted),
+            "fetched": len(missing),
+            "bytes": size,
+        }
+        words = (
+            f"{out}: {len(wanted)} files as published, {len(missing)} of them fetched now ({size / 1e6:.1f} MB)"
+        )
+        if self.kind == "weights":
+            words += f"; EVNLOS_WEIGHTS={out} lets the commands find them"
+        print(json.dumps(about) if self.json else words)
+
+    def _reached(self) -> tuple[str, dict[str, str]]:
+        """Return the first address that answers, and its list."""
+        from evnlos.files import ADDRESS_VARIABLE, data_addresses, published_list
+
+        addresses, failed = self.address or data_addresses(), []
+        if not addresses:
+            raise ConfigError(
+                f"no address of published {self.kind} is known; give --address, or set {ADDRESS_VARIABLE} to a "
+                "URL or a folder"
+            )
+        for address in addresses:
+            try:
+                return address, published_list(address, self.kind)
+            except (OSError, EvnlosError) as error:
+                failed.append(f"{address}: {error}")
+        raise DataError(
+            f"no published {self.kind} can be reached ({'; '.join(failed)[:400]}); look at the network, or "
+            "give --address with another URL or a folder"
+        )

@@ -72,6 +72,7 @@ VERBS: dict[str, str] = {
     "clean": "events.CleanCommand",
     "preview": "recordings.PreviewCommand",
     "app": "experiment.AppCommand",
+    "fetch": "about.FetchCommand",
     "cite": "about.CiteCommand",
     "doctor": "main.DoctorCommand",
     "completion": "about.CompletionCommand",
