@@ -37,7 +37,7 @@ from evnlos.live import (
     check_line,
     record_capture,
 )
-from evnlos.live.packet import Chunk
+from evnlos.live.packet import Chunk, SystemClock
 from evnlos.live.sources import SourceOptions, open_live
 from evnlos.types import Events
 
@@ -274,6 +274,44 @@ def test_the_stream_of_dv_is_its_events(method: int, start: int, tmp_path: Path)
     source = DvSource("127.0.0.1", served([header[start:], other, *bodies]), idle_s=5)
     assert joined([part.events for part in taken(source)]) == events
     assert not any(source.faults().values())
+
+
+def test_time_that_the_events_take_here_is_no_silence_of_dv(tmp_path: Path) -> None:
+    """All packets lie in the socket while the first is looked at for longer than --idle."""
+
+    class Slow(SystemClock):
+        ahead_s = 0.0
+
+        def now(self) -> float:
+            return super().now() + self.ahead_s
+
+    events, clock = stream(80_000, 9), Slow()
+    source = DvSource("127.0.0.1", served(dv_stream(events, tmp_path)), idle_s=5, clock=clock)
+    found = []
+    for chunk in source.chunks(lambda: False):
+        found.append(chunk.events)
+        clock.ahead_s += 60
+    assert len(found) > 3 and joined(found) == events
+
+
+def test_a_server_of_dv_that_falls_silent_in_a_packet_is_counted(tmp_path: Path) -> None:
+    header, first, *_ = dv_stream(stream(20_000, 9), tmp_path)
+    held = threading.Event()
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        connection, _ = server.accept()
+        with connection, server:
+            connection.sendall(header + first + first[:100])
+            held.wait(30)
+
+    threading.Thread(target=serve, daemon=True).start()
+    source = DvSource("127.0.0.1", server.getsockname()[1], idle_s=0.2)
+    try:
+        assert len(joined([part.events for part in taken(source)])) == 1 << 14
+    finally:
+        held.set()
+    assert source.faults()["bytes left out"] == 92
 
 
 def test_damage_in_the_stream_of_dv_is_counted_or_one_line(tmp_path: Path) -> None:

@@ -122,6 +122,20 @@ def test_one_file_of_events_and_frames_is_imported_by_one_command(name, tmp_path
     main(["import", str(path), "--out", str(tmp_path / "d"), "--no-check-pictures"])  # nothing is left to do
 
 
+def test_convert_tells_what_the_new_file_does_not_hold(tmp_path, capsys):
+    davis_bag(tmp_path / "a.bag")
+    main(["convert", str(tmp_path / "a.bag"), str(tmp_path / "a.h5")])
+    told = capsys.readouterr().err
+    assert "a.h5 holds events alone, not the frames (/davis/image_raw of" in told and "trigger" not in told
+    main(["clean", str(tmp_path / "a.bag"), str(tmp_path / "b.h5")])
+    assert "b.h5 holds events alone" in capsys.readouterr().err
+
+
+def test_a_file_that_is_not_there_is_told_so(tmp_path):
+    with pytest.raises(EvnlosError, match=r"none\.bag: no such file; check the path"):
+        import_captures([tmp_path / "none.bag"], tmp_path / "out")
+
+
 def test_topics_of_a_capture_are_chosen(tmp_path):
     folder = folder_of(tmp_path, events="a.bag", frames="a.bag", events_topic="/davis/events")
     davis_bag(folder / "a.bag")

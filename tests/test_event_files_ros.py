@@ -130,7 +130,7 @@ def test_several_cameras_are_chosen_by_name(container, caplog):
     with pytest.raises(EventFileError, match=r"topic=.*/left/events, /right/events"):
         read_events(path)
     assert read_events(path, topic="/right/events") == right and read_events(path, topic="left/events") == left
-    with pytest.raises(EventFileError, match="'/up' is 0 streams"):
+    with pytest.raises(EventFileError, match="no stream of events is '/up'; give one of: /left/events"):
         read_events(path, topic="/up")
     with caplog.at_level(logging.WARNING, "evnlos"):
         assert read_events_report(path)[0] == left
@@ -199,6 +199,54 @@ def test_a_cut_file_keeps_its_good_part(container):
 
 
 # ---------------------------------------------------------------- messages
+
+
+@pytest.mark.parametrize("method", ["", "lz4", "zstd"])
+def test_salvage_of_a_damaged_mcap_chunk_invents_no_events(method, tmp_path):
+    """A wrong byte of a packed chunk spreads over what comes out; the chunk goes, the others stay."""
+    if method:
+        pytest.importorskip({"lz4": "lz4", "zstd": "zstandard"}[method])
+    events = stream(4_000)
+    path = write_mcap(tmp_path / "a.mcap", recording(events, per_packet=100), compression=method, per_chunk=10)
+    data, draw = path.read_bytes(), np.random.default_rng(5)
+    true = {row.tobytes() for row in np.stack([events.t_us, events.x, events.y, events.p], 1)}
+    kept = []
+    for _ in range(60):
+        out = bytearray(data)
+        out[int(draw.integers(len(data) // 4, len(data) // 2))] ^= 1 << int(draw.integers(0, 8))
+        path.write_bytes(out)
+        try:
+            found, report = read_events_report(path)
+        except EventFileError:
+            continue
+        rows = np.stack([found.t_us, found.x, found.y, found.p], 1)
+        false = sum(row.tobytes() not in true for row in rows)
+        assert false <= (0 if method else 100)  # of a plain chunk the damaged packet alone
+        assert report.clean or len(found) < 4_000 or not method
+        kept.append(len(found))
+    assert len(kept) > 40 and 2_000 <= min(kept) < 4_000
+
+
+def test_what_hides_all_topics_is_told_in_strict_mode(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, 10_000).astype(np.uint8).tobytes()
+    path = tmp_path / "a"
+    for start, place in ((b"#ROSBAG V2.0\n", 13), (b"\x89MCAP0\r\n", 8)):
+        path.write_bytes(start + noise)
+        with pytest.raises(EventFileError, match=f"byte {place}: a record"):
+            read_events(path)
+        with pytest.raises(EventFileError, match="nothing in it can be read; copy it again"):
+            read_events_report(path)
+
+
+def test_faults_of_a_db3_name_the_message(tmp_path):
+    path = write_db3(tmp_path / "a.db3", recording(stream()))
+    with sqlite3.connect(path) as base:
+        base.execute("UPDATE messages SET data = x'0001000000' WHERE id = 3")
+    base.close()
+    with pytest.raises(EventFileError, match=r"a\.db3: message 3: "):
+        read_events(path)
+    found, report = read_events_report(path)
+    assert len(found) == 30 and "message 3: " in report.first["left_over"]
 
 
 @pytest.mark.parametrize("frame_id", ["", "a", "ab", "abc", "abcd"])

@@ -12,13 +12,14 @@ from evnlos.events import (
     EventWriter,
     iter_events,
     read_events,
+    read_events_report,
     read_frames,
     read_timed_frames,
     read_triggers,
     write_aedat4,
     write_events,
 )
-from evnlos.events.files import container_write
+from evnlos.events.files import aedat4, container_write
 from evnlos.events.files import registry as write
 from evnlos.types import Events
 
@@ -226,6 +227,38 @@ def test_aedat4_with_frames_and_events(tmp_path):
     for wrong in (frames[:4], frames.astype(float), frames[0]):
         with pytest.raises(DataError):
             write_aedat4(tmp_path / "wrong.aedat4", events, wrong, times)
+
+
+def test_cameras_of_an_aedat4_are_listed_and_chosen(tmp_path):
+    """Two cameras in one file: neither is taken in silence, and each is had by its name."""
+    pytest.importorskip("aedat")
+    left, right = sample("e.aedat4", 500), sample("e.aedat4", 700)
+    node = (
+        '<node name="{0}" path="/outInfo/{0}/"><attr key="originalOutputName" type="string">{1}</attr>'
+        '<attr key="typeIdentifier" type="string">{2}</attr><node name="info" path="/outInfo/{0}/info/">'
+        '<attr key="sizeX" type="int">{3}</attr><attr key="sizeY" type="int">{4}</attr></node></node>'
+    )
+    size = left.width, left.height
+    streams = ((0, "left", "EVTS"), (1, "right", "EVTS"), (2, "imu", "IMUS"), (3, "frames", "FRME"))
+    nodes = "".join(node.format(*one, *size) for one in streams)
+    text = f'<dv version="2.0"><node name="outInfo" path="/outInfo/">{nodes}</node></dv>'
+    data = aedat4.SIGNATURE + aedat4._header(text.encode())
+    for number, events in ((0, left), (1, right)):
+        packet = aedat4._event_packet(events)
+        data += struct.pack("<ii", number, len(packet)) + packet
+    picture = aedat4._frame_packet(np.full((4, 6), 7, np.uint8), 5)
+    path = tmp_path / "two.aedat4"
+    path.write_bytes(data + struct.pack("<ii", 3, len(picture)) + picture)
+    with pytest.raises(EventFileError, match=r"2 streams of events; give topic=.*: 0/left, 1/right"):
+        read_events(path)
+    assert read_events(path, topic="left") == left and read_events(path, topic="1/right") == right
+    _, report = read_events_report(path, topic="right")
+    assert [(one.name, one.kind) for one in report.streams] == [
+        ("0/left", "events"), ("1/right", "events"), ("2/imu", "other"), ("3/frames", "frames"),
+    ]  # fmt: skip
+    assert read_timed_frames(path).images.tolist() == np.full((1, 4, 6), 7).tolist()
+    with pytest.raises(EventFileError, match="no stream of events is 'imu'"):
+        read_events(path, topic="imu")
 
 
 def test_an_independent_reader_agrees_on_aedat4(tmp_path):

@@ -30,6 +30,7 @@ from evnlos.cli.recordings import (
     look_of,
     refuse_existing,
     result,
+    say_of,
     write_preview,
 )
 from evnlos.config import to_dict
@@ -271,8 +272,7 @@ class CleanCommand:
                 writer.write(piece)
             if not writer.events:
                 writer.write(recording.blank(cut))
-        if not recording.report.clean:
-            say(f"note: {recording.report}")
+        say_of(recording.report, self.out)
         found, size = cleaner.report, self.out.stat().st_size
         about = {"out": str(self.out), "bytes": size, **asdict(found)}
         text = f"{self.out}: {found.kept:,} of {found.events:,} events, {amount(size, 'B')}; left out: {found}"

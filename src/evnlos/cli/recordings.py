@@ -118,6 +118,20 @@ def counted(pieces: Iterable[Events], name: str, total: int | None = None) -> It
             progress(Step(name, done, total or 0, "events"))
 
 
+def say_of(report: ReadReport, out: Path) -> None:
+    """Tell what was wrong with a file, and what of it the new file does not hold: edges and frames."""
+    if not report.clean:
+        say(f"note: {report}")
+    frames = [stream.name for stream in report.streams if stream.kind == "frames"]
+    if report.triggers:
+        edges = f"{report.triggers:,} trigger edges of {report.path} (read_triggers reads them)"
+        say(f"note: {out} holds events alone, not the {edges}")
+    if frames or report.frames:
+        held = ", ".join(frames) if frames else f"{report.frames:,} pictures"
+        which = f"{held} of {report.path}; evnlos import takes both"
+        say(f"note: {out} holds events alone, not the frames ({which})")
+
+
 def amount(value: float, unit: str) -> str:
     """Return a number with a prefix: 12.3 kev/s.
 
@@ -167,8 +181,7 @@ class ConvertCommand:
             if not writer.events:
                 writer.write(recording.blank(cut))
         report = recording.report
-        if not report.clean:
-            say(f"note: {report}")
+        say_of(report, self.out)
         if report.geometry_from in ("assumed", "events"):
             say(f"note: the sensor size {report.width} x {report.height} is a guess; give --width and --height")
         size = self.out.stat().st_size
@@ -240,6 +253,7 @@ def describe(size: int, report: ReadReport, summary: Summary) -> dict[str, Any]:
         "silences_over_10ms": summary.silences,
         "columns": list(summary.columns),
         "triggers": report.triggers,
+        "frames": report.frames,
         "skipped": report.skipped,
         "memory_bytes": summary.memory_bytes,
         "faults": dict(report.faults),
@@ -257,6 +271,8 @@ def to_text(name: str, found: dict[str, Any]) -> str:
         rows += _event_rows(found)
     if found["triggers"]:
         rows.append(("triggers", f"{found['triggers']:,} edges"))
+    if found["frames"]:
+        rows.append(("frames", f"{found['frames']:,} pictures"))
     if found["skipped"]:
         rows.append(("skipped", f"{found['skipped']:,} events before the first row or time: no fault"))
     rows.append(("memory", f"{amount(found['memory_bytes'], 'B')} as arrays"))

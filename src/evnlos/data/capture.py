@@ -46,7 +46,7 @@ from evnlos.events import (
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.types import Events
-from evnlos.untrusted import check_memory
+from evnlos.untrusted import check_memory, no_file
 
 _MOST_US = 2**62  # of a time stamp: differences of two fit into 64 bits
 
@@ -346,6 +346,8 @@ def import_captures(
     split = _split(list(paths), list(test), list(validation))
     # Read every description first: a wrong folder is an error before anything is written.
     for path in paths.values():
+        if not path.exists():
+            raise DataError(no_file(path))
         if not path.is_file() and not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
     topics: dict[str, Any] = {"events_topic": events_topic, "frames_topic": frames_topic}

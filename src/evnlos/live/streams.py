@@ -15,9 +15,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from evnlos.errors import ConfigError, EventFileError
-from evnlos.events.files.aedat4 import SIGNATURE, packet_columns, stream_header
-from evnlos.events.files.columns import ReadReport
+from evnlos.events.files.aedat4 import EVENT, SIGNATURE, described, field_of
+from evnlos.events.files.columns import Columns, ReadReport
 from evnlos.events.files.mcap import MOST_CHUNK_BYTES, unpack
 from evnlos.events.files.raw import parse_raw_header, raw_codec, raw_format_names, raw_geometry
 from evnlos.events.files.words import WordCodec
@@ -223,6 +225,40 @@ def _begins_header(start: bytes) -> bool | None:
     return True if newline else None if len(start) < _LINE_BYTES else False
 
 
+def _stream_header(header: bytes) -> tuple[str, int, int, int]:
+    """Return compression, number, width and height of the first event stream of a header (without its size).
+
+    Raises:
+        ValueError: It is damaged, or describes no event stream.
+    """
+    method, streams = described(header)
+    for stream in streams:
+        if stream.identifier == "EVTS" and stream.width and stream.height:
+            return method, stream.number, stream.width, stream.height
+    raise ValueError("a stream without events of a stated sensor size")
+
+
+def _packet_columns(packet: bytes | memoryview) -> Columns:
+    """Return the events of an unpacked packet, as they stand in it.
+
+    Raises:
+        ValueError: It is damaged.
+    """
+    data = bytes(packet)
+    try:
+        vector = field_of(data, 0, 4)
+        if vector:
+            vector += struct.unpack_from("<I", data, vector)[0]
+            count = struct.unpack_from("<I", data, vector)[0]
+        else:
+            vector, count = len(data) - 4, 0
+        rows = np.frombuffer(data, EVENT, count, vector + 4)
+    except (struct.error, ValueError):
+        raise ValueError("a packet that is damaged") from None
+    sides = {name: rows[name].astype(np.uint16) for name in ("x", "y")}  # -1 becomes a pixel outside
+    return {"t_us": rows["t"].astype(np.int64), **sides, "p": rows["on"].astype(bool)}
+
+
 class DvSource:
     """A source that connects to a server of dv-processing and takes its event stream, packed or not.
 
@@ -280,7 +316,7 @@ class DvSource:
                     continue
                 now = self._clock.now()
                 try:
-                    columns = packet_columns(unpack(method, body, None if method != "none" else length))
+                    columns = _packet_columns(unpack(method, body, None if method != "none" else length))
                 except ValueError:
                     self._faults["damaged packets"] += 1
                     continue
@@ -301,7 +337,7 @@ class DvSource:
         if header is None:
             return None
         try:
-            method, stream, width, height = stream_header(header)
+            method, stream, width, height = _stream_header(header)
         except ValueError as error:
             raise EventFileError(f"{self.name} sends {error}; stream events by dv's NetworkWriter") from None
         report = ReadReport(Path(self.name))
@@ -316,10 +352,14 @@ class DvSource:
                 f"{self.name} sends a packet of {count} bytes, at most {MOST_CHUNK_BYTES} are read"
             )
         while len(self._held) < count:
-            now = self._clock.now()
-            if stop() or (self._idle_s and self._heard_s is not None and now - self._heard_s > self._idle_s):
+            if stop():
                 return None
+            # What waits in the socket is taken first: the time that its events take here is no silence.
             if not select.select([self._socket], [], [], _NAP_S)[0]:
+                silence_s = 0.0 if self._heard_s is None else self._clock.now() - self._heard_s
+                if self._idle_s and silence_s > self._idle_s:
+                    self._faults["bytes left out"] += len(self._held)
+                    return None
                 continue
             try:
                 more = self._socket.recv(BLOCK_BYTES)
@@ -328,7 +368,7 @@ class DvSource:
             if not more:
                 self._faults["bytes left out"] += len(self._held)
                 return None
-            self._heard_s = now
+            self._heard_s = self._clock.now()
             self._held += more
         taken = bytes(self._held[:count])
         del self._held[:count]

@@ -1,7 +1,8 @@
 """Decodes an AEDAT4 file in a process of its own: on damage the package may abort, hang or ask for all memory.
 
-Run as a program: path, limit of memory in bytes, limit of processor time in seconds, "events" or "frame".
-Writes one line of JSON (width and height of the first stream of that kind, or null), then for every packet of
+Run as a program: path, limit of memory in bytes, limit of processor time in seconds, "events" or "frame",
+and the number of a stream where it is not the first of that kind.
+Writes one line of JSON (width and height of the stream, or null), then for every packet of
 events a 64-bit count and the columns t, x, y, on, for every frame its time, height, width and channels (64 bits
 each) and its pixels; -1 ends a complete file.
 """
@@ -13,13 +14,14 @@ import sys
 from evnlos.untrusted import limit_this_process
 
 
-def main(path: str, memory_bytes: int, seconds: int, kind: str) -> None:
-    """Write the first stream of a kind in `path` to the standard output."""
+def main(path: str, memory_bytes: int, seconds: int, kind: str, chosen: int | None = None) -> None:
+    """Write one stream of a kind in `path` to the standard output."""
     limit_this_process(memory_bytes, seconds)
     import aedat
 
     decoder = aedat.Decoder(path)
     streams = [(number, stream) for number, stream in decoder.id_to_stream().items() if stream["type"] == kind]
+    streams = [one for one in streams if chosen in (None, one[0])]
     out = sys.stdout.buffer
     if not streams:
         out.write(b"null\n")
@@ -47,4 +49,4 @@ def main(path: str, memory_bytes: int, seconds: int, kind: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4], *map(int, sys.argv[5:6]))

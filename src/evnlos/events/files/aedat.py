@@ -95,6 +95,7 @@ def set_size(report: ReadReport, chip: str, width: int | None, height: int | Non
 
 
 CLOCK, BASE, STARTED = range(3)  # slots of the state
+_SIGNAL_MASK, _SIGNAL = np.uint32(1 << 31 | 3 << 10), np.uint32(1 << 31 | 1 << 10)
 
 
 @njit(cache=True)
@@ -147,7 +148,7 @@ class Aedat2Source:
             raise unreadable(path, 0, "an AEDAT file whose first line is damaged", "#!AER-DAT2.0 belongs there")
         chip = next((line.partition("AEChip:")[2].strip() for line in lines if "AEChip:" in line), "")
         set_size(report, chip, width, height)
-        self._is_davis = "dvs128" not in chip.lower()
+        self._is_davis, self._signals = "dvs128" not in chip.lower(), 0
         if not self._is_davis:
             _LOG.warning(
                 "%s: a DVS128; a polarity bit of 0 counts as ON, as in jAER (iniVation's page says 1)", path
@@ -170,11 +171,15 @@ class Aedat2Source:
 
     def _decoded(self) -> Iterator[tuple[int, Columns, NDArray[np.int64], NDArray[np.int64]]]:
         """Yield (byte, events, number of the pair of each, times of external inputs) of each block."""
+        self._signals = 0
         state = np.zeros(3, np.int64)
         for at, pairs in self.pairs():
             out, many = allocate(len(pairs) // 2), len(pairs) // 2
             places, edges = np.empty(many, np.int64), np.empty(many, np.int64)
             columns = out["t_us"], out["x"], out["y"], out["p"]
+            if self._is_davis:  # bit 31 and 1 in bits 10 and 11: a pixel's signal; each picture has one of each
+                self._signals += int(np.count_nonzero(pairs[::2] & _SIGNAL_MASK == _SIGNAL))
+                self.report.frames = self._signals // (self.report.width * self.report.height)
             count, inputs = _decode(pairs, state, self._is_davis, *columns, places, edges)
             yield at, cut(out, 0, count), places[:count], edges[:inputs]
 

@@ -122,7 +122,10 @@ class Aedat3Source:
     def blocks(self) -> Iterator[Columns]:
         """Yield the valid events packet by packet."""
         check = ColumnCheck(self.report)
-        for packet in self._packets((_POLARITY, _SPECIAL)):
+        for packet in self._packets((_POLARITY, _SPECIAL, _FRAME)):
+            if packet.kind == _FRAME:
+                self.report.frames += packet.events
+                continue
             if packet.kind == _SPECIAL:
                 self.report.triggers += len(self._inputs(packet)[0])
                 continue

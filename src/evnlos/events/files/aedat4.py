@@ -1,8 +1,7 @@
 """AEDAT4, the format of iniVation's cameras, read and written.
 
-- AEDAT4, the format of iniVation's cameras, read through the optional package `aedat`.
-
-Writing AEDAT4: an XML description, then packets of events or frames as flat buffers, not compressed.
+- Reading goes through the optional package `aedat`.
+- Writing: an XML description, then packets of events or frames as flat buffers, not compressed.
 
 Flat buffers are laid out by hand: each packet is one table whose places are known beforehand. Numbers of bytes
 in the comments count from the start of the packet's size.
@@ -16,12 +15,23 @@ from collections.abc import Iterator
 from contextlib import closing
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import DataError, EventFileError, MissingDependencyError
-from evnlos.events.files.columns import ColumnCheck, Columns, FileSink, ReadReport, join, unreadable
+from evnlos.events.files.columns import (
+    ColumnCheck,
+    Columns,
+    FileSink,
+    ReadReport,
+    Stream,
+    StreamKind,
+    choose_stream,
+    join,
+    unreadable,
+)
 from evnlos.events.files.ros_messages import grey_of
 from evnlos.files import new_file
 from evnlos.types import Events
@@ -46,11 +56,14 @@ def _require_package() -> None:
 class _Decoder(Child):
     """The package at work in a process of its own, whose memory and time grow with the file only."""
 
-    def __init__(self, path: Path, kind: str) -> None:
+    def __init__(self, path: Path, kind: str, number: int | None) -> None:
         self._path = path
         size = path.stat().st_size
         limits = [str(_CHILD_BYTES + _MAX_RATIO * size), str(30 + size // 500_000)]
-        super().__init__(Path(__file__).with_name("_aedat4_child.py"), [str(path.absolute()), *limits, kind])
+        super().__init__(
+            Path(__file__).with_name("_aedat4_child.py"),
+            [str(path.absolute()), *limits, kind, *([] if number is None else [str(number)])],
+        )
 
     def stream_size(self) -> tuple[int, int] | None:
         """Return width and height of the stream, None where there is none; the first thing to take."""
@@ -87,7 +100,7 @@ def check_packets(path: Path, report: ReadReport) -> None:
             at += 8 + length
 
 
-def _field(table: bytes, number: int, root: int = 0) -> int:
+def field_of(table: bytes, number: int, root: int = 0) -> int:
     """Return where a field of a flat buffer's table begins, 0 where it is absent.
 
     Raises:
@@ -106,7 +119,7 @@ def _field(table: bytes, number: int, root: int = 0) -> int:
 def _data_table_position(header: bytes) -> int | None:
     """Return the second field of the header's flat buffer, None where it is absent or -1."""
     try:
-        field = _field(header, 1)
+        field = field_of(header, 1)
         position = struct.unpack_from("<q", header, field)[0] if field else -1
     except struct.error:
         return 2**63 - 1  # outside every file: the caller reports it
@@ -117,16 +130,27 @@ COMPRESSIONS = ("none", "lz4", "lz4", "zstd", "zstd")
 """How packets are packed, by the number in the header."""
 
 
-def stream_header(header: bytes) -> tuple[str, int, int, int]:
-    """Return compression, number, width and height of the event stream of a header (without its size).
+class Described(NamedTuple):
+    """A stream as the header describes it: kind ("EVTS"), name, camera, sensor size or zeros."""
+
+    number: int
+    identifier: str
+    output: str
+    source: str
+    width: int
+    height: int
+
+
+def described(header: bytes) -> tuple[str, list[Described]]:
+    """Return how packets are packed and the streams that a header (without its size) describes.
 
     Raises:
-        ValueError: It is damaged, or describes no event stream.
+        ValueError: It is damaged.
     """
     try:
-        packed = _field(header, 0)
+        packed = field_of(header, 0)
         method = struct.unpack_from("<i", header, packed)[0] if packed else 0
-        text = _field(header, 2)
+        text = field_of(header, 2)
         text += struct.unpack_from("<I", header, text)[0]
         length = struct.unpack_from("<I", header, text)[0]
     except struct.error:
@@ -135,42 +159,61 @@ def stream_header(header: bytes) -> tuple[str, int, int, int]:
     if not 0 <= method < len(COMPRESSIONS):
         raise ValueError(f"packets packed by method {method}, none, LZ4 and Zstandard are read")
     nodes = re.split(r'<node name="(\d{1,9})"', description)
+    found = []
     for number, node in zip(nodes[1::2], nodes[2::2], strict=True):
-        sides = [re.search(rf'"size{axis}"[^>]*>(\d{{1,5}})<', node) for axis in "XY"]
-        if ">EVTS<" in node and sides[0] and sides[1]:
-            return COMPRESSIONS[method], int(number), int(sides[0][1]), int(sides[1][1])
-    raise ValueError("a stream without events of a stated sensor size")
+        texts = [_attribute(node, key) for key in ("typeIdentifier", "originalOutputName", "source")]
+        sides = [_attribute(node, key) for key in ("sizeX", "sizeY")]
+        width, height = (int(side) if side.isdecimal() and len(side) < 6 else 0 for side in sides)
+        found.append(Described(int(number), *texts, width, height))
+    return COMPRESSIONS[method], found
 
 
-def packet_columns(packet: bytes | memoryview) -> Columns:
-    """Return the events of an unpacked packet, as they stand in it.
+def _attribute(node: str, key: str) -> str:
+    """Return the text of an attribute of a node's XML, "" where it has none."""
+    match = re.search(rf'"{key}"[^>]*>([^<]{{0,200}})<', node)
+    return match[1].strip() if match else ""
+
+
+_KINDS: dict[str, StreamKind] = {"EVTS": "events", "FRME": "frames"}
+
+
+def _choose(path: Path, report: ReadReport, topic: str | None, kind: StreamKind) -> int | None:
+    """List the streams of a file and return the number of the one to read.
+
+    None is the first of its kind: the header says of no stream what it holds.
 
     Raises:
-        ValueError: It is damaged.
+        EventFileError: No stream of that kind or name, or several and no name.
     """
-    data = bytes(packet)
-    try:
-        vector = _field(data, 0, 4)
-        if vector:
-            vector += struct.unpack_from("<I", data, vector)[0]
-            count = struct.unpack_from("<I", data, vector)[0]
-        else:
-            vector, count = len(data) - 4, 0
-        rows = np.frombuffer(data, _EVENT, count, vector + 4)
-    except (struct.error, ValueError):
-        raise ValueError("a packet that is damaged") from None
-    sides = {name: rows[name].astype(np.uint16) for name in ("x", "y")}  # -1 becomes a pixel outside
-    return {"t_us": rows["t"].astype(np.int64), **sides, "p": rows["on"].astype(bool)}
+    with path.open("rb") as file:
+        file.seek(len(SIGNATURE))
+        try:
+            streams = described(file.read(struct.unpack("<I", file.read(4))[0]))[1]
+        except (ValueError, struct.error):
+            streams = []  # the package judges it
+    streams = [stream for stream in streams if stream.identifier]
+    numbers = {f"{stream.number}/{stream.output}".rstrip("/"): stream.number for stream in streams}
+    report.streams = tuple(
+        Stream(name, _KINDS.get(stream.identifier, "other"), f"{stream.identifier} {stream.source}".strip())
+        for name, stream in zip(numbers, streams, strict=False)
+    )
+    if not any(stream.kind == kind for stream in report.streams) and topic is None:
+        return None
+    report.topic = choose_stream(path, report.streams, topic, kind, report.strict).name
+    return numbers[report.topic]
 
 
 class Aedat4Source:
-    """The first event stream of an AEDAT4 file."""
+    """One event stream of an AEDAT4 file."""
 
-    def __init__(self, path: Path, report: ReadReport, width: int | None, height: int | None) -> None:
+    def __init__(
+        self, path: Path, report: ReadReport, width: int | None, height: int | None, topic: str | None = None
+    ) -> None:
         self.path, self.report = path, report
         report.format = "AEDAT4"
         _require_package()
         check_packets(path, report)
+        self._number = _choose(path, report, topic, "events")
         if width is not None:
             report.set_geometry(width, height, "caller")
 
@@ -184,7 +227,7 @@ class Aedat4Source:
     def blocks(self) -> Iterator[Columns]:
         """Yield the columns packet by packet."""
         check = ColumnCheck(self.report)
-        with _Decoder(self.path, "events") as decoder:
+        with _Decoder(self.path, "events", self._number) as decoder:
             self._read_size(decoder)
             while True:
                 count = struct.unpack("<q", decoder.take(8))[0]
@@ -192,13 +235,9 @@ class Aedat4Source:
                     return
                 data = decoder.take(13 * count)
                 times = np.frombuffer(data, "<i8", count)
-                x, y = (
-                    np.frombuffer(data, "<u2", count, 8 * count),
-                    np.frombuffer(data, "<u2", count, 10 * count),
-                )
-                yield check(
-                    {"t_us": times, "x": x, "y": y, "p": np.frombuffer(data, np.bool_, count, 12 * count)}
-                )
+                x, y = (np.frombuffer(data, "<u2", count, place * count) for place in (8, 10))
+                p = np.frombuffer(data, np.bool_, count, 12 * count)
+                yield check({"t_us": times, "x": x, "y": y, "p": p})
 
     def read(self) -> Columns:
         """Return all events of the stream."""
@@ -208,7 +247,7 @@ class Aedat4Source:
 def read_aedat4_frames(
     path: Path, report: ReadReport, topic: str | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Return the pictures of the first frame stream as grey [T, H, W], and their times [T], microseconds.
+    """Return the pictures of a frame stream as grey [T, H, W], and their times [T], microseconds.
 
     Raises:
         EventFileError: The file is damaged, has no frames, or frames of several sizes.
@@ -216,9 +255,10 @@ def read_aedat4_frames(
     """
     _require_package()
     check_packets(path, ReadReport(path))
+    number = _choose(path, report, topic, "frames")
     frames: list[NDArray[np.uint8]] = []
     times: list[int] = []
-    with _Decoder(path, "frame") as decoder:
+    with _Decoder(path, "frame", number) as decoder:
         if decoder.stream_size() is None:
             raise unreadable(path, 0, "an AEDAT4 file without frames", "record frames as well")
         while True:
@@ -239,10 +279,9 @@ def read_aedat4_frames(
     return np.stack(frames), np.array(times, np.int64)
 
 
-_SIGNATURE = b"#!AER-DAT4.0\r\n"
 _MAX_SIDE = 1 << 15
 _PACKET = 1 << 14  # events
-_EVENT = np.dtype(
+EVENT = np.dtype(
     {
         "names": ["t", "x", "y", "on"],
         "formats": ["<i8", "<i2", "<i2", "?"],
@@ -280,7 +319,7 @@ def _header(description: bytes) -> bytes:
 
 def _event_packet(events: Events) -> bytes:
     """Return the table EventPacket: a vector of structures of 16 bytes."""
-    rows = np.zeros(len(events), _EVENT)
+    rows = np.zeros(len(events), EVENT)
     rows["t"], rows["x"], rows["y"], rows["on"] = events.t_us, events.x, events.y, events.p
     vtable = struct.pack("<3H", 6, 8, 4)  # at 12
     table = struct.pack("<iI", 20 - 12, 4)  # at 20
@@ -309,7 +348,7 @@ class Aedat4Sink(FileSink):
                 "write .h5 or .npz"
             )
         super().__init__(path)
-        self.file.write(_SIGNATURE + _header(_description(first.width, first.height, has_frames)))
+        self.file.write(SIGNATURE + _header(_description(first.width, first.height, has_frames)))
 
     def _packet(self, stream: int, content: bytes) -> None:
         self.file.write(struct.pack("<ii", stream, len(content)) + content)

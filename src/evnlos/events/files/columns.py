@@ -62,17 +62,21 @@ def choose_stream(
     fitting = [stream for stream in streams if stream.kind == kind]
     names = ", ".join(stream.name for stream in fitting[:_MOST_NAMES])
     if not fitting:
-        held = ", ".join(f"{stream.name} ({stream.type})" for stream in streams[:_MOST_NAMES]) or "nothing"
-        raise EventFileError(
-            f"{path}: byte 0: holds no stream of {kind}; it holds {held}; record {kind} as well"
+        held = ", ".join(f"{stream.name} ({stream.type})" for stream in streams[:_MOST_NAMES])
+        found = (
+            f"it holds {held}; record {kind} as well" if held else "nothing in it can be read; copy it again"
         )
+        raise EventFileError(f"{path}: byte 0: holds no stream of {kind}; {found}")
     if topic is not None:
         exact = [stream for stream in fitting if stream.name == topic]
         ends = exact or [stream for stream in fitting if stream.name.endswith("/" + topic.strip("/"))]
         if len(ends) != 1:
-            raise EventFileError(
-                f"{path}: byte 0: topic {topic!r} is {len(ends)} streams of {kind}; give one of: {names}"
+            found = (
+                f"{len(ends)} streams of {kind} end in {topic!r}"
+                if ends
+                else f"no stream of {kind} is {topic!r}"
             )
+            raise EventFileError(f"{path}: byte 0: {found}; give one of: {names}")
         return ends[0]
     if len(fitting) > 1:
         told = f"{path}: byte 0: holds {len(fitting)} streams of {kind}; give topic= (--topic), one of: {names}"
@@ -122,6 +126,7 @@ class ReadReport:
             "assumed" (the format's usual sensor).
         events: Events returned.
         triggers: External trigger edges seen.
+        frames: Pictures seen among the events of AEDAT 2.0 and 3.1; other formats list them in `streams`.
         skipped: Events before the first row or time of a recording that starts in the middle; no fault.
         faults: How many faults of each kind: "truncated", "left_over", "out_of_range", "backwards",
             "undated", "unknown", "header", "checksum", "count", "clock" (a jump that bit errors of the camera's
@@ -131,6 +136,7 @@ class ReadReport:
         truncated: Whether the file ends before it should.
         streams: All streams, of a file that can hold several.
         topic: Name of the stream that is read, of such a file.
+        place: What faults are counted in: "byte" of the file, or "message" where bytes have no place (SQLite).
     """
 
     path: Path
@@ -141,6 +147,7 @@ class ReadReport:
     geometry_from: str = ""
     events: int = 0
     triggers: int = 0
+    frames: int = 0
     skipped: int = 0
     faults: dict[str, int] = field(default_factory=dict)
     first: dict[str, str] = field(default_factory=dict)
@@ -148,6 +155,7 @@ class ReadReport:
     truncated: bool = False
     streams: tuple[Stream, ...] = ()
     topic: str = ""
+    place: str = "byte"
 
     def set_geometry(self, width: object, height: object, source: str, offset: int = 0) -> None:
         """Take over a sensor size and where it comes from.
@@ -172,8 +180,8 @@ class ReadReport:
     def fault(
         self, kind: str, offset: int, found: str, cure: str, *, count: int = 1, lost_bytes: int = 0
     ) -> None:
-        """Note a fault at byte `offset`; in strict mode raise it as one line."""
-        line = f"{self.path}: byte {offset}: {found}; {cure}"
+        """Note a fault at byte (`place`) `offset`; in strict mode raise it as one line."""
+        line = f"{self.path}: {self.place} {offset}: {found}; {cure}"
         if self.strict:
             raise EventFileError(line)
         self.faults[kind] = self.faults.get(kind, 0) + count

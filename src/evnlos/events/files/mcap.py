@@ -122,7 +122,10 @@ def topics_of(connections: dict[int, Topic], counts: dict[int, int]) -> list[Top
 
 
 class Message(NamedTuple):
-    """A message: its topic, byte of the file where it (or its chunk) stands, its time of receipt, its bytes."""
+    """A message: its topic, where it (or its chunk) stands in the file, its time of receipt, its bytes.
+
+    The place is a byte; of a `.db3` it is the number of the message.
+    """
 
     topic: Topic
     offset: int
@@ -279,8 +282,11 @@ class McapFile:
         size, crc, method = walk.number(8), walk.number(4), walk.text()
         unpacked = memoryview(unpack(method, walk.take(walk.number(8)), size))
         if crc and zlib.crc32(unpacked) != crc:
-            # In salvage mode its messages are read as far as they can be: one wrong byte costs one of them.
             self.report.fault("checksum", at, "a chunk whose checksum is wrong", _SALVAGE)
+            # Salvage: one wrong byte of a plain chunk costs one message. Unpacking spreads it over all of them,
+            # and what comes out may look like messages.
+            if method:
+                raise ValueError(f"a chunk packed by {method} that unpacks to other bytes than were packed")
         return unpacked
 
     def _check_end(self, file: BinaryIO, at: int) -> None:

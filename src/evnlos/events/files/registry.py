@@ -152,9 +152,10 @@ FORMATS = (
         "AEDAT4",
         (".aedat4",),
         lambda start: start.startswith(aedat4.SIGNATURE),
-        _plain(aedat4.Aedat4Source),
+        _of_streams(aedat4.Aedat4Source),
         lambda path, first, _: aedat4.Aedat4Sink(path, first),
         aedat4.read_aedat4_frames,
+        has_streams=True,
     ),
     Format(
         "AEDAT2",

@@ -86,6 +86,9 @@ class RosSource:
         self.path, self.report, self._container = path, report, container
         report.format = container.name
         report.streams = streams_of(container.topics())
+        if not report.streams:
+            for _ in container.messages(frozenset()):  # in strict mode the damage that hid them is the error
+                pass
         chosen = choose_stream(path, report.streams, topic, "events", report.strict)
         report.topic = chosen.name
         self._is_packet = chosen.type in PACKETS
@@ -103,7 +106,9 @@ class RosSource:
             parsed = self._parsed(message)
             if parsed is not None:
                 return self.report.set_geometry(parsed.width, parsed.height, "header", message.offset)
-        raise unreadable(self.path, 0, f"topic {self.report.topic} holds no whole message", "record it again")
+        raise unreadable(
+            self.path, 0, f"topic {self.report.topic} holds no whole message", "copy the file again"
+        )
 
     def _parsed(self, message: Message) -> Packet | EventArray | None:
         try:

@@ -221,6 +221,7 @@ class Db3File:
 
     def messages(self, names: frozenset[str]) -> Iterator[Message]:
         """Yield the messages of the named topics in the order of their receipt."""
+        self.report.place = "byte"
         if Path(f"{self.path}-wal").exists() and Path(f"{self.path}-wal").stat().st_size:
             found = f"messages may still stand in {self.path.name}-wal beside it, which is not read"
             cure = f"close the recorder, or open and close the bag with ros2 bag info, or {SALVAGE}"
@@ -230,12 +231,14 @@ class Db3File:
         with closing(base):
             with self._errors():
                 wanted = {number: topic for number, topic in self._topics(base).items() if topic.name in names}
-            for row in self._rows(base, wanted):
+            rows = self._rows(base, wanted)
+            self.report.place = "message"  # SQLite does not say where in the file its bytes stand
+            for row in rows:
                 found = self._row(base, row)
                 if found is None or found[0] not in wanted:
-                    self.report.fault("left_over", 0, f"message {row} holds no bytes of a message", _SALVAGE)
+                    self.report.fault("left_over", row, "it holds no bytes of a message", _SALVAGE)
                 else:
-                    yield Message(wanted[found[0]], 0, found[1], found[2])
+                    yield Message(wanted[found[0]], row, found[1], found[2])
 
     def _row(self, base: sqlite3.Connection, row: int) -> tuple[int, int, bytes] | None:
         """Return topic, time of receipt and bytes of a message; None where it is damaged."""
