@@ -85,9 +85,7 @@ def check_packets(path: Path, report: ReadReport) -> None:
         length = struct.unpack("<I", prefix)[0] if len(prefix) == 4 else 0
         if length < 16 or start + 4 + length > size:
             raise unreadable(path, start, f"a header of {length} bytes in a file of {size}", _CURE)
-        end = _data_table_position(file.read(length))
-        if end is None:
-            end = size
+        end = _data_table_position(file.read(length), size)
         at = start + 4 + length
         if not at <= end <= size:
             raise unreadable(path, start, f"a data table at byte {end} of {size}", _CURE)
@@ -116,14 +114,14 @@ def field_of(table: bytes, number: int, root: int = 0) -> int:
     return start + field if field else 0
 
 
-def _data_table_position(header: bytes) -> int | None:
-    """Return the second field of the header's flat buffer, None where it is absent or -1."""
+def _data_table_position(header: bytes, size: int) -> int:
+    """Return the second field of the header's flat buffer, the file's size where it is absent or -1."""
     try:
         field = field_of(header, 1)
         position = struct.unpack_from("<q", header, field)[0] if field else -1
     except struct.error:
         return 2**63 - 1  # outside every file: the caller reports it
-    return None if position < 0 else position
+    return size if position < 0 else position
 
 
 COMPRESSIONS = ("none", "lz4", "lz4", "zstd", "zstd")
@@ -161,11 +159,13 @@ def described(header: bytes) -> tuple[str, list[Described]]:
     nodes = re.split(r'<node name="(\d{1,9})"', description)
     found = []
     for number, node in zip(nodes[1::2], nodes[2::2], strict=True):
-        texts = [_attribute(node, key) for key in ("typeIdentifier", "originalOutputName", "source")]
-        sides = [_attribute(node, key) for key in ("sizeX", "sizeY")]
+        kind, output, source, *sides = (_attribute(node, key) for key in _ATTRIBUTES)
         width, height = (int(side) if side.isdecimal() and len(side) < 6 else 0 for side in sides)
-        found.append(Described(int(number), *texts, width, height))
+        found.append(Described(int(number), kind, output, source, width, height))
     return COMPRESSIONS[method], found
+
+
+_ATTRIBUTES = "typeIdentifier", "originalOutputName", "source", "sizeX", "sizeY"
 
 
 def _attribute(node: str, key: str) -> str:
