@@ -126,7 +126,10 @@ def test_convert_tells_what_the_new_file_does_not_hold(tmp_path, capsys):
     davis_bag(tmp_path / "a.bag")
     main(["convert", str(tmp_path / "a.bag"), str(tmp_path / "a.h5")])
     told = capsys.readouterr().err
-    assert "a.h5 holds events alone, not the frames (/davis/image_raw of" in told and "trigger" not in told
+    assert (
+        "a.h5 holds events alone, not the frames (/davis/image_raw; evnlos import" in told
+        and "trigger" not in told
+    )
     main(["clean", str(tmp_path / "a.bag"), str(tmp_path / "b.h5")])
     assert "b.h5 holds events alone" in capsys.readouterr().err
 

@@ -119,17 +119,11 @@ def counted(pieces: Iterable[Events], name: str, total: int | None = None) -> It
 
 
 def say_of(report: ReadReport, out: Path) -> None:
-    """Tell what was wrong with a file, and what of it the new file does not hold: edges and frames."""
+    """Tell what was wrong with a file, and what of it the new file does not hold."""
     if not report.clean:
         say(f"note: {report}")
-    frames = [stream.name for stream in report.streams if stream.kind == "frames"]
-    if report.triggers:
-        edges = f"{report.triggers:,} trigger edges of {report.path} (read_triggers reads them)"
-        say(f"note: {out} holds events alone, not the {edges}")
-    if frames or report.frames:
-        held = ", ".join(frames) if frames else f"{report.frames:,} pictures"
-        which = f"{held} of {report.path}; evnlos import takes both"
-        say(f"note: {out} holds events alone, not the frames ({which})")
+    if report.beside:
+        say(f"note: {out} holds events alone, not the {' nor the '.join(report.beside)} of {report.path}")
 
 
 def amount(value: float, unit: str) -> str:
@@ -293,12 +287,8 @@ def _stream_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     for stream in found["streams"]:
         count = "" if stream["count"] is None else f", {stream['count']:,} messages"
         mark = ", read here" if stream["name"] == found["topic"] else ""
-        rows.append(
-            (
-                "streams" if not rows else "",
-                f"{stream['name']}: {stream['kind']} ({stream['type']}{count}){mark}",
-            )
-        )
+        text = f"{stream['name']}: {stream['kind']} ({stream['type']}{count}){mark}"
+        rows.append(("" if rows else "streams", text))
     return rows
 
 

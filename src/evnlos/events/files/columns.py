@@ -177,6 +177,16 @@ class ReadReport:
         """Whether no fault was found."""
         return not self.faults
 
+    @property
+    def beside(self) -> list[str]:
+        """What the file holds beside the events that were read: trigger edges, frames."""
+        frames = [stream.name for stream in self.streams if stream.kind == "frames"]
+        found = [f"{self.triggers:,} trigger edges (read_triggers)"] if self.triggers else []
+        if frames or self.frames:
+            held = ", ".join(frames[:_MOST_NAMES]) if frames else f"{self.frames:,} pictures"
+            found.append(f"frames ({held}; evnlos import takes both)")
+        return found
+
     def fault(
         self, kind: str, offset: int, found: str, cure: str, *, count: int = 1, lost_bytes: int = 0
     ) -> None:
