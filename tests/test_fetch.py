@@ -107,7 +107,7 @@ def test_where_nothing_is_reachable_one_line_says_so(here, capsys, monkeypatch) 
 
 def test_what_was_replaced_is_refused(server, folder, here, capsys) -> None:
     (folder / "captures" / "near_G" / "capture.yaml").write_text("name: other\n")
-    assert "as listed" in fails(["captures", "--address", server], capsys)
+    assert "is not the listed file" in fails(["captures", "--address", server], capsys)
     assert [p for p in (here / "captures").rglob("*") if p.is_file()] == []
 
 

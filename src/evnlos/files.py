@@ -306,11 +306,6 @@ _MOST_LIST_BYTES, _ANSWER_S = 1 << 20, 20.0
 _LINE = re.compile(r"([0-9a-f]{64})  (\S[^\\\0\r\n]*)", re.A)
 
 
-def data_addresses() -> list[str]:
-    """Return where published files are looked for, first those of `EVNLOS_DATA`."""
-    return [*os.environ.get(ADDRESS_VARIABLE, "").split(), *ADDRESSES]
-
-
 def published_list(address: str, kind: str) -> dict[str, str]:
     """Return the files that an address offers, path below the folder -> SHA-256; downloads the list alone.
 

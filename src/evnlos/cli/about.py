@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -286,9 +287,10 @@ class FetchCommand:
 
     def _reached(self) -> tuple[str, dict[str, str]]:
         """Return the first address that answers, and its list."""
-        from evnlos.files import ADDRESS_VARIABLE, data_addresses, published_list
+        from evnlos.files import ADDRESS_VARIABLE, ADDRESSES, published_list
 
-        addresses, failed = self.address or data_addresses(), []
+        own = os.environ.get(ADDRESS_VARIABLE, "").split()
+        addresses, failed = self.address or (*own, *ADDRESSES), []
         if not addresses:
             raise ConfigError(
                 f"no address of published {self.kind} is known; give --address, or set {ADDRESS_VARIABLE} to a "
