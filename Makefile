@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 CAPTURES ?=
 DEMO ?= demo
 
-.PHONY: demo test thorough check declared bench dist clean
+.PHONY: demo test thorough check site declared bench dist clean
 
 demo: $(READY)
 	$(BIN)/evnlos demo --out $(DEMO) $(if $(strip $(CAPTURES)),--captures $(CAPTURES))
@@ -24,6 +24,10 @@ check: $(READY)
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/python -m pytest -q tests/test_architecture.py
+
+# The documentation as a site in build/site; a warning or a dead link is an error.
+site: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 bench: $(READY)
 	for question in benchmarks/*.py; do $(BIN)/python $$question || exit 1; done
@@ -46,5 +50,5 @@ $(READY): pyproject.toml packages/evnlos-weights/pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0+cpu" \
 	  || $(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[all,dev]" -e packages/evnlos-weights
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[all,dev,docs]" -e packages/evnlos-weights
 	touch $@

@@ -126,7 +126,7 @@ def installed() -> None:
         raise JobError(f"{', '.join(there)}: more than what the package declares")
     program = Path(sysconfig.get_path("scripts")) / "evnlos"
     said = subprocess.run([program, "doctor"], capture_output=True, text=True)
-    lost = [name for name in PROJECT["optional-dependencies"] if name not in ("all", "dev", "fonts")
+    lost = [name for name in PROJECT["optional-dependencies"] if name not in ("all", "dev", "docs", "fonts")
             and f"evnlos[{name}]" not in said.stdout]  # fmt: skip
     if said.returncode or lost:
         raise JobError(f"doctor says {said.stdout}{said.stderr}; not a word of {lost}")

@@ -27,7 +27,7 @@ CORE = {
     "threadpoolctl",
     "yaml",
 }
-CORE |= {"scipy"}  # numba looks for it by itself and takes it where it is installed
+CORE |= {"scipy", "colorama"}  # numba looks for them by itself and takes them where they are installed
 STAGES = [
     "scene",
     "optics",

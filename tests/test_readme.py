@@ -31,13 +31,31 @@ def test_python_snippets_print_what_they_say() -> None:
 
 
 def test_yaml_snippets_load() -> None:
-    settings, capture = (yaml.safe_load(code) for kind, code in BLOCKS if kind == "yaml")
+    capture, settings = (yaml.safe_load(code) for kind, code in BLOCKS if kind == "yaml")
     assert from_dict(Simulation, settings).pixel.refractory_s == 0.001
     assert from_dict(CaptureInfo, capture).target.name == "R"
 
 
 def test_every_command_is_listed() -> None:
-    assert set(re.findall(r"`evnlos (\w+)", TEXT)) == set(VERBS)
+    page = (ROOT / "docs" / "command_line.md").read_text()
+    table = page[page.index("| command |") : page.index("## What goes where")]
+    assert set(re.findall(r"`evnlos (\w+)", table)) == set(VERBS)
+
+
+def test_the_readme_is_three_screens_with_three_doors() -> None:
+    assert len(TEXT.splitlines()) <= 140
+    assert "| I want events | I have a wall | I want to learn |" in TEXT
+    assert "docs/figures/setup_paper.svg" in TEXT
+
+
+def test_the_way_from_pip_to_a_picture_is_short() -> None:
+    """Three commands to events, five to a reconstructed picture, and neither make nor a compiler."""
+    text = TEXT[TEXT.index("## Install") : TEXT.index("## What it measures")]
+    events, picture, *_ = re.findall(r"(?:^    .*\n)+", text, flags=re.MULTILINE)
+    for commands, most in ((events, 3), (picture, 5)):
+        lines = commands.strip().splitlines()
+        assert len(lines) <= most and lines[0].strip().startswith("pip install") and "make" not in commands
+    assert "evnlos invert" in picture and "evnlos events" in events
 
 
 @pytest.mark.parametrize(

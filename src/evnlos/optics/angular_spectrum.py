@@ -31,7 +31,7 @@ def angular_spectrum(
 ) -> torch.Tensor:
     """Propagate a monochromatic field from its plane to a parallel one.
 
-    E(x, y) = F^-1[ F[U](fx, fy) exp(j 2 pi z (sqrt(1/l^2 - f^2) - 1/l)) ], the Rayleigh-Sommerfeld solution
+    E(x, y) = F^-1{ F{U}(fx, fy) exp(j 2 pi z (sqrt(1/l^2 - f^2) - 1/l)) }, the Rayleigh-Sommerfeld solution
     without its carrier exp(j k z), which is a constant phase and would cost float32 all of its digits. The
     transfer function is limited to the band that its sampling can represent (Matsushima and Shimobaba, Opt.
     Express 17, 19662, 2009), made once in float64 and cached.

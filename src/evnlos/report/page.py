@@ -41,7 +41,7 @@ from evnlos.report.tables import (
 )
 from evnlos.setups import NamedSetup
 
-_WORDS = {
+GLOSSARY = {
     "epnp": (
         "EPNP",
         "the paper's training: first on simulation, then fine-tuned on a few real captures. Short for "
@@ -107,8 +107,8 @@ class Glossary:
             key: Which word; one that is not explained stays as it is.
             words: How it is written here; None: as in the glossary.
         """
-        shown = html.escape(words or _WORDS.get(key, (key, ""))[0])
-        if key in self._linked or key not in _WORDS:
+        shown = html.escape(words or GLOSSARY.get(key, (key, ""))[0])
+        if key in self._linked or key not in GLOSSARY:
             return shown
         self._linked.add(key)
         return f"<a href='#word-{key}'>{shown}</a>"
@@ -124,7 +124,7 @@ class Glossary:
         other = [key for key in _METRIC_KEYS if key not in metrics]
         rows = "".join(
             f"<dt id='word-{key}'>{html.escape(word)}</dt><dd>{html.escape(said)}</dd>"
-            for key, (word, said) in _WORDS.items()
+            for key, (word, said) in GLOSSARY.items()
             if key not in other
         )
         return f"<h2>Words</h2><dl>{rows}</dl>"
