@@ -1,7 +1,9 @@
 """The protocol for the lab: a folder that explains itself, and faults that are named with their cure."""
 
+import contextlib
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from evnlos.cli import main
 from evnlos.data import read_capture
 from evnlos.data.capture_check import check_capture
-from evnlos.data.capture_info import begin_capture, read_capture_info
+from evnlos.data.capture_info import CAMERAS, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize
@@ -136,6 +138,45 @@ def test_a_new_folder_explains_itself_and_is_read_back(tmp_path, capsys) -> None
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="is a file"):
         begin_capture(tmp_path / "file", 640, 480)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_a_folder_for_a_camera_by_its_name(name, tmp_path) -> None:
+    main(["capture", "init", str(tmp_path / "a"), "--camera", name.upper()])
+    info = read_capture_info(tmp_path / "a")
+    said, width, height, events, frames = CAMERAS[name]
+    camera = info.camera
+    assert (camera.name, camera.width, camera.height) == (said, width, height)
+    assert (info.events, info.frames) == (events, frames)
+
+
+def test_a_camera_that_is_not_known_needs_its_size(tmp_path, capsys) -> None:
+    for words, says in (
+        ([], "no --camera; give one of davis346"),
+        (["--camera", "davis34"], "did you mean davis346?"),
+        (["--camera", "other", "--width", "64"], "--width and --height"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["capture", "init", str(tmp_path / "a"), *words])
+        assert says in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
+
+
+def test_many_captures_are_a_table(tiny_captures, tmp_path, capsys) -> None:
+    folders = [str(one) for one in tiny_captures[:2]]
+    with pytest.raises(SystemExit) as stop:
+        main(["capture", "check", *folders, str(tmp_path)])
+    said = capsys.readouterr()
+    assert stop.value.code == 2 and "1 of 3 captures can't be read" in said.err
+    for folder in [*folders, str(tmp_path)]:
+        assert [line for line in said.out.splitlines() if line.startswith(folder + " ")]
+    assert "of 3 captures are good in all" in said.out and "can't be read" in said.out
+    with contextlib.suppress(SystemExit):
+        main(["capture", "check", *folders, "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert [one["capture"] for one in found] == [Path(one).name for one in folders]
+    single = {one["what"]: one["level"] for one in found[0]["findings"]}
+    assert single == levels(read_capture(folders[0]))
 
 
 def test_the_command_prints_and_its_exit_code_tells(tiny_captures, tmp_path, capsys) -> None:

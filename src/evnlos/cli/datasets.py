@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import difflib
 import io
 import json
 import sys
@@ -37,9 +38,9 @@ from evnlos.data.lab import Lab, lab_of, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
 from evnlos.data.simulations import PRESETS, estimate, find_faults, repair
 from evnlos.data.store import PAGE
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError, DataError, EvnlosError
 from evnlos.files import write_atomically
-from evnlos.machine import ProgressBars
+from evnlos.machine import ProgressBars, counted
 from evnlos.setups import load_setup
 from evnlos.setups.base import is_camera
 from evnlos.setups.load import is_name
@@ -171,9 +172,6 @@ class LabCommand:
         print(f"{self.out}: {len(rendered)} captures; settings and the drawn sensor in {self.out / 'lab.yaml'}")
 
 
-_MARKS = {"good": "  good   ", "doubtful": "? look   ", "bad": "! BAD    "}
-
-
 @dataclass(frozen=True)
 class CaptureCommand:
     """Begin a capture folder (init), record one from a camera or stream (record), or tell its worth (check)."""
@@ -181,8 +179,8 @@ class CaptureCommand:
     action: Annotated[Literal["init", "record", "check"], tyro.conf.Positional]
     """init writes a commented capture.yaml; record writes a whole capture; check reads one and tells what is
     wrong and how to mend it."""
-    folder: Annotated[Path, tyro.conf.Positional]
-    """The folder of the capture."""
+    folders: Folders
+    """The folder of the capture; check: or of several."""
     source: str | None = None
     """record: what `evnlos live` takes: a camera such as evk4 or davis346, - for words on standard input,
     udp://, aestream://, dv://."""
@@ -193,41 +191,74 @@ class CaptureCommand:
     format: str | None = None
     """record: words on standard input without a RAW header: evt2, evt21 or evt3, with --width and --height."""
     width: int | None = None
-    """Columns of the event camera's sensor, pixels; record: where the source does not say; init: 1280."""
+    """Columns of the event camera's sensor, pixels; record: where the source does not say; init: by default the
+    camera's."""
     height: int | None = None
-    """Rows of the event camera's sensor, pixels; init: 800, as the CeleX-V."""
-    camera: str = "CeleX-V"
-    """init: maker and model."""
+    """Rows of the event camera's sensor, pixels."""
+    camera: str | None = None
+    """init: davis346, davis240, dvxplorer, dvs128, evk4, evk3-hd, gen3-vga, centuryarks-vga, triton or celex-v;
+    or, with --width and --height, maker and model of another."""
     json: bool = False
     """record, check: print one JSON object."""
 
     def run(self) -> None:
         """Write the file, record, or print the findings; exit code 1 where one of them is bad."""
-        if self.action == "init":
-            from evnlos.data.capture_info import begin_capture
+        if not self.folders or (self.action != "check" and len(self.folders) > 1):
+            raise ConfigError(f"{len(self.folders)} folders; {self.action} takes one, check one or more")
+        {"init": self._init, "record": self._record, "check": self._check}[self.action]()
 
-            width, height = (
-                1280 if self.width is None else self.width,
-                800 if self.height is None else self.height,
-            )
-            path = begin_capture(self.folder, width, height, self.camera)
-            print(f"{path}: edit it, put the recordings beside it, then: evnlos capture check {self.folder}")
-            return
-        if self.action == "record":
-            self._record()
-            return
+    def _init(self) -> None:
+        from evnlos.data.capture_info import CAMERAS, begin_capture
+
+        known, own_size = CAMERAS.get((self.camera or "").lower()), self.width and self.height
+        if known is None and not own_size:
+            near = difflib.get_close_matches((self.camera or "").lower(), CAMERAS, n=1)
+            cure = f"did you mean {near[0]}?" if near else f"give one of {', '.join(CAMERAS)}"
+            camera = "no --camera" if self.camera is None else f"--camera {self.camera!r} is not known"
+            raise ConfigError(f"{camera}; {cure}, or --width and --height of its sensor")
+        name, columns, rows, events, frames = known or (
+            self.camera or "my camera",
+            0,
+            0,
+            "events.raw",
+            "frames",
+        )
+        folder = self.folders[0]
+        path = begin_capture(folder, self.width or columns, self.height or rows, name, events, frames)
+        print(f"{path}: edit it, put the recordings beside it, then: evnlos capture check {folder}")
+
+    def _check(self) -> None:
+        """Tell of each capture in full, or of several in a table with what is not good below it."""
         from evnlos.data import read_capture
-        from evnlos.data.capture_check import check_capture
+        from evnlos.data.capture_check import Finding, check_capture, finding_line, findings_table
 
-        capture = read_capture(self.folder, needs_frames=False)
-        found = check_capture(capture)
+        found, failed = dict[str, list[Finding]](), dict[str, str]()
+        with ProgressBars() as progress:
+            for folder in counted(self.folders, progress, "check", len(self.folders), "captures"):
+                try:
+                    capture = read_capture(folder, needs_frames=False)
+                    found[str(folder)] = check_capture(capture)
+                except EvnlosError as error:
+                    if len(self.folders) == 1:
+                        raise
+                    failed[str(folder)] = str(error)
+                    continue
+                if len(self.folders) == 1 and not self.json:
+                    print("\n".join(capture.notes))
         if self.json:
-            print(json.dumps({"capture": capture.name, "findings": [asdict(one) for one in found]}))
+            page = [
+                {"capture": Path(name).name, "findings": [asdict(one) for one in all_]}
+                for name, all_ in found.items()
+            ]
+            page += [{"capture": Path(name).name, "error": text} for name, text in failed.items()]
+            print(json.dumps(page[0] if len(self.folders) == 1 else page))
+        elif len(self.folders) == 1:
+            print("\n".join(map(finding_line, *found.values())))
         else:
-            print("\n".join(capture.notes))
-            for one in found:
-                print(f"{_MARKS[one.level]}{one.what}: {one.found}" + (f"; {one.cure}" if one.cure else ""))
-        if any(one.level == "bad" for one in found):
+            print(findings_table(found, failed))
+        if failed:
+            raise DataError(f"{len(failed)} of {len(self.folders)} captures can't be read")
+        if any(one.level == "bad" for all_ in found.values() for one in all_):
             raise SystemExit(1)
 
     def _record(self) -> None:
@@ -237,7 +268,8 @@ class CaptureCommand:
 
         if self.source is None:
             raise ConfigError("record needs --source: a camera such as evk4, -, udp://HOST:PORT; see --help")
-        check_folder(self.folder)
+        folder = self.folders[0]
+        check_folder(folder)
         how = SourceOptions(idle=self.idle, format=self.format, width=self.width, height=self.height)
         source = open_live(self.source, how)
         is_shown = sys.stderr.isatty()
@@ -248,7 +280,7 @@ class CaptureCommand:
         say(f"{source.name} is recorded; Ctrl-C ends")
         try:
             every_s = 0.5 if is_shown else 5.0
-            done = record_capture(self.folder, source, seconds=self.seconds, tell=tell, tell_every_s=every_s)
+            done = record_capture(folder, source, seconds=self.seconds, tell=tell, tell_every_s=every_s)
         finally:
             source.close()
             if is_shown:
@@ -256,9 +288,9 @@ class CaptureCommand:
         if done.ended_by:
             say(f"warning: it ended early: {done.ended_by}")
         lost = "".join(f", {count:,} {name}" for name, count in done.faults.items())
-        text = f"{self.folder}: {done.events:,} events and {done.frames:,} frames in {done.seconds:.1f} s{lost}"
-        about = asdict(done) | {"folder": str(self.folder)}
-        result(self.json, about, f"{text}; next: evnlos capture check {self.folder}")
+        text = f"{folder}: {done.events:,} events and {done.frames:,} frames in {done.seconds:.1f} s{lost}"
+        about = asdict(done) | {"folder": str(folder)}
+        result(self.json, about, f"{text}; next: evnlos capture check {folder}")
 
 
 @dataclass(frozen=True)

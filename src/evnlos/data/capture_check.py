@@ -65,6 +65,35 @@ def check_capture(capture: Capture) -> list[Finding]:
     ]
 
 
+_MARKS = {"good": "  good   ", "doubtful": "? look   ", "bad": "! BAD    "}
+
+
+def finding_line(one: Finding) -> str:
+    """Return a finding as a line for people, with its cure where there is one."""
+    return f"{_MARKS[one.level]}{one.what}: {one.found}" + (f"; {one.cure}" if one.cure else "")
+
+
+def findings_table(found: dict[str, list[Finding]], failed: dict[str, str]) -> str:
+    """Return a row for each capture and a column for each look (. good, ? look, ! bad), and below what to mend.
+
+    Args:
+        found: Findings by capture.
+        failed: What is wrong with captures that can't be read.
+    """
+    looks = list(dict.fromkeys(one.what for several in found.values() for one in several))
+    width = max(map(len, [*found, *failed]))
+    lines = [f"{'':<{width}}  {k:>2} {look}" for k, look in enumerate(looks, 1)]
+    lines.append(f"{'':<{width}}  " + " ".join(f"{k:>2}" for k in range(1, len(looks) + 1)))
+    marks, wrong = {"good": " .", "doubtful": " ?", "bad": " !"}, list[str]()
+    for name, several in found.items():
+        by_look = {one.what: marks[one.level] for one in several}
+        lines.append(f"{name:<{width}}  " + " ".join(by_look.get(look, "  ") for look in looks))
+        wrong += [f"{name}: {finding_line(one).strip()}" for one in several if one.level != "good"]
+    lines += [f"{name:<{width}}  can't be read: {text}" for name, text in failed.items()]
+    good = sum(all(one.level == "good" for one in several) for several in found.values())
+    return "\n".join([*lines, "", *wrong, f"{good} of {len(found) + len(failed)} captures are good in all"])
+
+
 def _finding(what: str, good: bool, bearable: bool, found: str, cure: str) -> Finding:
     """Return a finding with its level; the cure stands only where something is to do."""
     if good:

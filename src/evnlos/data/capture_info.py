@@ -273,8 +273,9 @@ camera:
   # exposure_s: 0.01         # of a frame; the calibration blurs by it
   # clock_mhz: 100           # CeleX-V only, where the file's name does not say it
 
-events: events.raw           # as the camera wrote it; the format is found from its content
-frames: frames               # a folder of pictures, a video, a table t_us,file, an AEDAT file or a ROS bag
+events: {events}           # as the camera wrote it; the format is found from its content
+frames: {frames}               # a folder of pictures, a video, a table t_us,file, an AEDAT file or a ROS bag;
+                             # null for an event camera alone
 # frames_turned: true        # pictures that the CeleX-V program exported are turned by 180 degrees
 
 # Clocks. Leave out where both files share one; otherwise one of:
@@ -300,7 +301,29 @@ frames: frames               # a folder of pictures, a video, a table t_us,file,
 """
 
 
-def begin_capture(folder: str | Path, width: int, height: int, name: str = "my camera") -> Path:
+CAMERAS = {
+    "davis346": ("iniVation DAVIS346", 346, 260, "events.aedat4", "events.aedat4"),
+    "davis240": ("iniVation DAVIS240", 240, 180, "events.aedat", "frames"),
+    "dvxplorer": ("iniVation DVXplorer", 640, 480, "events.aedat4", "frames"),
+    "dvs128": ("iniVation DVS128", 128, 128, "events.aedat", "frames"),
+    "evk4": ("Prophesee EVK4 (IMX636)", 1280, 720, "events.raw", "frames"),
+    "evk3-hd": ("Prophesee EVK3 HD (IMX636)", 1280, 720, "events.raw", "frames"),
+    "gen3-vga": ("Prophesee Gen3 VGA", 640, 480, "events.raw", "frames"),
+    "centuryarks-vga": ("CenturyArks SilkyEvCam VGA", 640, 480, "events.raw", "frames"),
+    "triton": ("Lucid Triton2 EVS (IMX636)", 1280, 720, "events.raw", "frames"),
+    "celex-v": ("CelePixel CeleX-V", 1280, 800, "events.bin", "frames"),
+}
+"""Cameras by name: maker and model, columns and rows of the sensor, the usual names of events and frames."""
+
+
+def begin_capture(
+    folder: str | Path,
+    width: int,
+    height: int,
+    name: str = "my camera",
+    events: str = "events.raw",
+    frames: str = "frames",
+) -> Path:
     """Write a commented `capture.yaml` into a new or empty folder and return its path.
 
     Args:
@@ -308,6 +331,8 @@ def begin_capture(folder: str | Path, width: int, height: int, name: str = "my c
         width: Columns of the event camera's sensor, pixels.
         height: Rows, pixels.
         name: Maker and model.
+        events: File of the events.
+        frames: File or folder of the frames.
 
     Raises:
         DataError: The folder has a capture.yaml already, or is a file; or the size is none.
@@ -321,7 +346,8 @@ def begin_capture(folder: str | Path, width: int, height: int, name: str = "my c
     if width < 1 or height < 1:
         raise DataError(f"the sensor is {width} x {height} pixels; give its width and height")
     folder.mkdir(parents=True, exist_ok=True)
-    text = _TEMPLATE.format(name=name.replace("\n", " ").replace(":", " "), width=width, height=height)
+    name = name.replace("\n", " ").replace(":", " ")
+    text = _TEMPLATE.format(name=name, width=width, height=height, events=events, frames=frames)
     write_atomically(path, text.encode())
     return path
 
