@@ -148,20 +148,18 @@ class ExactArray(EventModel):
         self.pixel, self.seed = pixel, np.uint64(seed)
         self._tile_px, self._threads = check_tiling(tile_px, threads)
         count = shape[0] * shape[1]
-        self._on, self._off = pixel_thresholds(pixel, shape, seed, thresholds)
-        self._leak = np.zeros(count)
+        on, off = pixel_thresholds(pixel, shape, seed, thresholds)
+        leak = np.zeros(count)
         if pixel.leak_rate_hz > 0:
             factor = 10.0 ** (0.1 * normal_field(pattern_key(pixel, seed), STREAM_LEAK_RATE, count))
-            self._leak = pixel.leak_rate_hz * factor * self._on
+            leak = pixel.leak_rate_hz * factor * on
         half = 0.5 * pixel.shot_noise_rate_hz
-        self._rate_on, self._rate_off = (
-            half * pixel.threshold_on / self._on,
-            half * pixel.threshold_off / self._off,
-        )
-        self._rate_hot = np.zeros(count)
+        rate_hot = np.zeros(count)
         if pixel.hot_pixel_fraction > 0:
             hot = uniform_field(pattern_key(pixel, seed), STREAM_HOT, count) < pixel.hot_pixel_fraction
-            self._rate_hot[hot] = pixel.hot_pixel_rate_hz
+            rate_hot[hot] = pixel.hot_pixel_rate_hz
+        rates = half * pixel.threshold_on / on, half * pixel.threshold_off / off, rate_hot
+        self._pixels = continuous.Pixels(on, off, leak, *rates)
         self._curve = pixel.curve()
         white = 255.0 + pixel.cutoff_floor_dn
         self._rate = 2.0 * math.pi * pixel.cutoff_hz / white / self._curve.stretch
@@ -171,20 +169,25 @@ class ExactArray(EventModel):
     def start(self, frame: NDArray, time_s: float) -> None:
         """Let all pixels have settled to the first light, DN [N], with references in their first phase."""
         count = len(frame)
-        self._light = self._curve.scale * frame.astype(np.float64) + self._curve.offset
-        self._filtered = np.empty(count)
-        log_row(self._light, self._filtered)
-        self._base = self._filtered.copy()
+        light = self._curve.scale * frame.astype(np.float64) + self._curve.offset
+        filtered = np.empty(count)
+        log_row(light, filtered)
+        base = filtered.copy()
         if self.pixel.initial_phase == "random":
             # each pixel has been leaking since its last event, at a time of its own
-            self._base -= self._on * uniform_field(self.seed, STREAM_LEAK_PHASE, count)
-        self._time, self._window = time_s, (time_s, math.inf)
-        rate = (self._rate_on + self._rate_off) * DIM_MAX + self._rate_hot
-        self._candidate = np.zeros(0)
+            base -= self._pixels.on * uniform_field(self.seed, STREAM_LEAK_PHASE, count)
+        rate = (self._pixels.rate_on + self._pixels.rate_off) * DIM_MAX + self._pixels.rate_hot
+        candidate = np.zeros(0)
         if rate.any():
             gap = exponential_field(self.seed, STREAM_SHOT_GAP, count)
-            self._candidate = time_s + np.divide(gap, rate, out=np.full(count, np.inf), where=rate > 0)
-        self._drawn = np.zeros(count, np.uint32)
+            candidate = time_s + np.divide(gap, rate, out=np.full(count, np.inf), where=rate > 0)
+        drawn = np.zeros(count, np.uint32)
+        self._state = continuous.State(light, filtered, base, self._last_event, candidate, drawn, self._sent)
+        pixel = self.pixel
+        self._law = continuous.Law(
+            self._rate, self._curve, pixel.refractory_s, pixel.jitter_s, (time_s, math.inf), self.seed
+        )
+        self._time = time_s
 
     def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
         """Take the next light at `times_s` [T] and return the events in order."""
@@ -193,13 +196,10 @@ class ExactArray(EventModel):
         def work(first: int, last: int) -> Columns:
             frames, origin = light.pixels(first, last)
             return continuous.run_tiles(
-                frames, origin, times, first, last, self._tile_px, self._light, self._filtered, self._base,
-                self._last_event, self._candidate, self._drawn, self._sent, self._on, self._off, self._leak,
-                self._rate_on, self._rate_off, self._rate_hot, self._rate, self._curve, self.pixel.refractory_s,
-                self.pixel.jitter_s, self._window, self.seed,
-            )  # fmt: skip
+                frames, origin, times, first, last, self._tile_px, self._state, self._pixels, self._law
+            )
 
-        tiles = list(map_shares(work, len(self._light), self._tile_px, self._threads, light.most_px))
+        tiles = list(map_shares(work, len(self._state.base), self._tile_px, self._threads, light.most_px))
         self._time = float(times_s[-1])
         return sort_times(*joined(tiles))
 
@@ -224,17 +224,18 @@ class V2eArray(EventModel):
         count = shape[0] * shape[1]
         on, off = pixel_thresholds(pixel, shape, seed, thresholds)
         # v2e keeps drawn thresholds in single precision and equal ones as a double
-        self._step_on, self._step_off = on.astype(np.float32), off.astype(np.float32)
+        step_on, step_off = on.astype(np.float32), off.astype(np.float32)
         if thresholds is not None or pixel.threshold_sigma > 0:
-            on, off = self._step_on.astype(np.float64), self._step_off.astype(np.float64)
+            on, off = step_on.astype(np.float64), step_off.astype(np.float64)
         self._state_type = np.float64 if pixel.cutoff_hz > 0 else np.float32
-        self._on, self._off = on.astype(self._state_type), off.astype(self._state_type)
-        self._ratio_on, self._ratio_off = pixel.threshold_on / on, pixel.threshold_off / off
-        self._most = float((self._ratio_on + self._ratio_off).max())
-        self._leak = np.zeros(0, np.float32)
+        leak = np.zeros(0, np.float32)
         if pixel.leak_rate_hz > 0:
             factor = 10.0 ** (0.1 * normal_field(pattern_key(pixel, seed), STREAM_LEAK_RATE, count))
-            self._leak = (factor * on).astype(np.float32)
+            leak = (factor * on).astype(np.float32)
+        ratio_on, ratio_off = pixel.threshold_on / on, pixel.threshold_off / off
+        self._most = float((ratio_on + ratio_off).max())
+        own_on, own_off = on.astype(self._state_type), off.astype(self._state_type)
+        self._pixels = v2e.Pixels(own_on, own_off, step_on, step_off, leak, ratio_on, ratio_off)
         self._hazard = np.zeros(0)
         if pixel.shot_noise_rate_hz > 0:
             self._hazard = exponential_field(self.seed, STREAM_SHOT_GAP, count)
@@ -247,7 +248,8 @@ class V2eArray(EventModel):
         """Set all pixels to rest at the first frame, [N] DN."""
         logs = np.empty(len(frame), np.float32)
         v2e.log_row(frame, logs)
-        self._lp, self._base = logs.astype(self._state_type), logs.astype(self._state_type)
+        low_pass, base = logs.astype(self._state_type), logs.astype(self._state_type)
+        self._state = v2e.State(low_pass, base, self._hazard, self._drawn)
         self._time = time_s
 
     def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
@@ -258,7 +260,7 @@ class V2eArray(EventModel):
         return tuple(np.concatenate(column) for column in zip(*blocks, strict=True))  # type: ignore[return-value]
 
     def _advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
-        pixel, steps, count = self.pixel, len(times_s), len(self._lp)
+        pixel, steps, count = self.pixel, len(times_s), len(self._state.base)
         starts = np.concatenate([[self._time], times_s[:-1]])
         delta = times_s - starts
         if pixel.cutoff_hz > 0:
@@ -271,17 +273,15 @@ class V2eArray(EventModel):
         chance[:, 0] = 0.5 * pixel.shot_noise_rate_hz * delta
         chance[:, 1] = np.minimum(chance[:, 0] * self._most * _DIM_MAX, 1.0 - 1e-9)
         hazard_sum = np.cumsum(np.concatenate([[self._hazard_sum], -np.log1p(-chance[:, 1])]))
-        defer = pixel.refractory_s > 0
+        leaked = pixel.leak_rate_hz * delta
+        law = v2e.Law(table, jitter_table(), self.seed, pixel.refractory_s > 0)
 
         def work(first: int, last: int) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
             peak = np.zeros(steps, np.int32)
             frames, origin = light.pixels(first, last)
             records = v2e.run_tiles(
-                frames, origin, first, last, self._tile_px, self._lp, self._base, self._on, self._off,
-                self._step_on, self._step_off,
-                self._leak, self._hazard, self._drawn, table, rate, pixel.leak_rate_hz * delta,
-                hazard_sum[1:], chance, self._ratio_on, self._ratio_off, jitter_table(), self.seed, self._steps,
-                defer, peak,
+                frames, origin, first, last, self._tile_px, self._steps, self._state, self._pixels,
+                v2e.Steps(rate, leaked, hazard_sum[1:], chance, peak), law,
             )  # fmt: skip
             return (*records, peak)
 
@@ -292,7 +292,7 @@ class V2eArray(EventModel):
         self._hazard_sum = float(hazard_sum[-1])
         stamps = np.rint(np.concatenate(sub_times).astype(np.float64) * 1e6).astype(np.int64)
         stamps = np.maximum.accumulate(stamps)
-        if defer:
+        if law.defer:
             return self._settle(tiles, sub_times[0], float(delta[0]), stamps)
         first_bucket = np.concatenate([[0], np.cumsum([len(times) for times in sub_times])])
         total = sum(int(np.abs(tile[2]).sum()) + int(np.count_nonzero(tile[3])) for tile in tiles)
@@ -309,11 +309,8 @@ class V2eArray(EventModel):
         """Send the events of one step through the refractory period."""
         active = self.pixel.refractory_s > delta / len(sub_times)
         period = np.float32(self.pixel.refractory_s if active else 0.0)
-        step, place, crossings, shot = (np.concatenate([tile[n] for tile in tiles]) for n in range(4))
-        bucket, where, on = v2e.settle(
-            step, place, crossings, shot, sub_times, period, self._last_event, self._base,
-            self._step_on, self._step_off,
-        )  # fmt: skip
+        record = tuple(np.concatenate([tile[n] for tile in tiles]) for n in range(4))
+        bucket, where, on = v2e.settle(record, sub_times, period, self._last_event, self._state, self._pixels)
         return sort_events(bucket, where, on, stamps)
 
 

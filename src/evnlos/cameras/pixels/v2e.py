@@ -6,8 +6,11 @@ only pixels that crossed a threshold are visited one by one. Nothing depends on 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from evnlos.cameras.pixels.continuous_math import log_light
 from evnlos.cameras.random_numbers import (
@@ -18,6 +21,46 @@ from evnlos.cameras.random_numbers import (
     random_exponential,
     random_uniform,
 )
+
+
+class State(NamedTuple):
+    """What changes: one value per pixel, [N]; single precision without a filter, double with one."""
+
+    low_pass: NDArray  # y, log units
+    base: NDArray  # b, log units: what the next event is counted from
+    hazard: NDArray[np.float64]  # H at which the next candidate of shot noise is due; empty without shot noise
+    drawn: NDArray[np.uint32]  # candidates so far
+
+
+class Pixels(NamedTuple):
+    """What stays: one value per pixel, [N]."""
+
+    on: NDArray  # theta_on, log units
+    off: NDArray  # theta_off, log units
+    step_on: NDArray[np.float32]  # theta_on as v2e adds it to b
+    step_off: NDArray[np.float32]
+    leak: NDArray[np.float32]  # theta_on times a factor of the pixel, log units; empty without leak
+    ratio_on: NDArray[np.float64]  # nominal threshold / theta_on
+    ratio_off: NDArray[np.float64]
+
+
+class Steps(NamedTuple):
+    """One value per step of the block, [T]."""
+
+    rate: NDArray[np.float64]  # 2 pi f_c d: filter's speed times the step's length; 0 = no filter
+    leaked: NDArray[np.float64]  # r d, leak events per step
+    hazard_sum: NDArray[np.float64]  # H at the end of the step
+    chance: NDArray[np.float64]  # [T, 2]: nominal chance of one polarity, and of a candidate
+    peak: NDArray[np.int32]  # takes the largest number of crossings of a pixel
+
+
+class Law(NamedTuple):
+    """What holds for the whole recording."""
+
+    table: NDArray[np.float32]  # logarithms of 8-bit light [256]; empty for other light
+    jitter: NDArray[np.float32]  # factors of the leak, of which each step and block takes a run
+    seed: np.uint64
+    defer: bool  # b stays where it is at a crossing: the caller decides which events pass
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -113,16 +156,14 @@ def _grown(column):
 
 
 @njit(cache=True, error_model="numpy")
-def _run_tile(
-    out, count, frames, origin, first, last, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
-    rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
-    defer, peak,
-):  # fmt: skip
+def _run_tile(out, count, frames, origin, first, last, first_step, state, pixels, time, law):
     """Run the pixels first..last - 1 through all steps of a block; see `run_tiles`."""
+    hazard, drawn, step_on, step_off = state.hazard, state.drawn, pixels.step_on, pixels.step_off
+    rate, hazard_sum, chance, table, seed = time.rate, time.hazard_sum, time.chance, law.table, law.seed
     size = last - first
     steps = len(rate)
-    my_lp, my_base = lp[first:last], base[first:last]
-    my_on, my_off, my_leak = on[first:last], off[first:last], leak[first:last]
+    my_lp, my_base = state.low_pass[first:last], state.base[first:last]
+    my_on, my_off, my_leak = pixels.on[first:last], pixels.off[first:last], pixels.leak[first:last]
     words = (size + 7) // 8
     flag_words = np.zeros(words, np.uint64)
     flags = flag_words.view(np.uint8)
@@ -140,8 +181,8 @@ def _run_tile(
     filtered = rate[0] > 0.0
     for k in range(steps):
         row = frames[k, first - origin : last - origin]
-        if leak_scale[k] > 0.0:
-            _leak(my_base, my_leak, np.float32(leak_scale[k]), jitter, seed, first, first_step + k)
+        if time.leaked[k] > 0.0:
+            _leak(my_base, my_leak, np.float32(time.leaked[k]), law.jitter, seed, first, first_step + k)
         if len(table) > 0:
             _look_up(row, table, logs)
         else:
@@ -168,19 +209,19 @@ def _run_tile(
                     change = my_lp[i] - my_base[i]
                     if change > 0:
                         crossings = floor_divide(change, my_on[i])
-                        if not defer:
+                        if not law.defer:
                             my_base[i] += np.float32(crossings) * step_on[pixel]
                     else:
                         crossings = -floor_divide(-change, my_off[i])
-                        if not defer:
+                        if not law.defer:
                             my_base[i] -= np.float32(-crossings) * step_off[pixel]
-                    peak[k] = max(peak[k], abs(crossings))
+                    time.peak[k] = max(time.peak[k], abs(crossings))
                 shot = 0
                 if flags[i] & 2:
                     dim = 1.0 - 0.75 * brightness(np.float64(row[i]))
                     shot = shot_choice(
-                        seed, pixel, drawn[pixel], chance[k, 0] * dim * ratio_on[pixel],
-                        chance[k, 0] * dim * ratio_off[pixel], chance[k, 1],
+                        seed, pixel, drawn[pixel], chance[k, 0] * dim * pixels.ratio_on[pixel],
+                        chance[k, 0] * dim * pixels.ratio_off[pixel], chance[k, 1],
                     )  # fmt: skip
                     drawn[pixel] += 1
                     hazard[pixel] = hazard_sum[k] + random_exponential(
@@ -207,39 +248,44 @@ def _run_tile(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def run_tiles(
-    frames, origin, first, last, tile_px, lp, base, on, off, step_on, step_off, leak, hazard, drawn, table,
-    rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter, seed, first_step,
-    defer, peak,
-):  # fmt: skip
+def run_tiles(frames, origin, first, last, tile_px, first_step, state, pixels, time, law):
     """Run the pixels first..last - 1 through all steps of a block, tile by tile, and return what they sent.
 
-    `frames` [T, M] light in DN of the pixels origin..origin + M - 1; `lp`, `base`, thresholds, `leak`,
-    `hazard`, `drawn` [N] state and constants of the pixels; `table` [256] logarithms of 8-bit light, empty for
-    other light; `rate`, `leak_scale`, `hazard_sum`, `chance` [T].
-    Returns four columns: step, pixel, signed number of threshold crossings, sign of a shot-noise event. `peak`
-    [T] takes the largest number of crossings of a pixel in each step. With `defer` the reference stays where
-    it is when a threshold is crossed: the caller decides which events pass.
+    In each step of length d, with I the light in DN and L = log I (linear below 20 DN):
+
+        y <- (1 - w) y + w L,  w = min((I + 20) / 275 * 2 pi f_c d, 1)
+        b <- b - r d leak * jitter
+        n = floor((y - b) / theta_on) ON events, or floor((b - y) / theta_off) OFF events;  b <- b +- n theta
+        a candidate of shot noise is due when the sum H of -log(1 - chance) reaches its hazard; as event: b <- y
+
+    frames      light, DN [T, M], of the pixels origin..origin + M - 1
+    tile_px     pixels that are run together, a multiple of `BLOCK`
+    first_step  number of the block's first step since the start
+    state       `State`, changed;  pixels  `Pixels`;  time  `Steps`, its peak changed;  law  `Law`
+    Returns four columns: step, pixel, signed number of threshold crossings, sign of a shot-noise event.
     """
     out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024, np.int8)
     count = np.int64(0)
     for start in range(first, last, tile_px):
         out, count = _run_tile(
-            out, count, frames, origin, start, min(start + tile_px, last), lp, base, on, off, step_on, step_off,
-            leak, hazard, drawn, table, rate, leak_scale, hazard_sum, chance, ratio_on, ratio_off, jitter,
-            seed, first_step, defer, peak,
-        )  # fmt: skip
+            out, count, frames, origin, start, min(start + tile_px, last), first_step, state, pixels, time, law
+        )
     return out[0][:count], out[1][:count], out[2][:count], out[3][:count]
 
 
 @njit(cache=True, error_model="numpy")
-def settle(step, pixel, crossings, shot, sub_times, period, last_event, base, step_on, step_off):
-    """Let the events of one step sequence the refractory period; return (sub-time index, pixel, polarity)
-    columns.
+def settle(record, sub_times, period, last_event, state, pixels):
+    """Let the events of one step that keep the refractory period pass: those with t - last > period.
 
-    `sub_times` [M] float32 seconds; `last_event` [N] float32 seconds and `base` are updated. Dropped events
-    leave the reference alone: they are deferred. The period is `period` seconds, 0 = let everything pass.
+    record      columns of `run_tiles`: step, pixel, signed crossings, sign of a shot-noise event
+    sub_times   times of a pixel's first, second, ... event, float32 seconds [M]
+    period      refractory period, seconds; 0 = all pass
+    last_event  time of each pixel's last event, float32 seconds [N], changed
+    state       `State`: only events that pass move b, others are deferred;  pixels  `Pixels`
+    Returns three columns: index into `sub_times`, pixel, polarity.
     """
+    step, pixel, crossings, shot = record
+    base, step_on, step_off = state.base, pixels.step_on, pixels.step_off
     total = 0
     for i in range(len(step)):
         total += abs(crossings[i]) + 1
