@@ -1,8 +1,8 @@
 """Opening files that may be a stranger's: plain files only, by lists of formats, and nothing beside the file.
 
 A picture named `.png` may be a program for Ghostscript, a video a playlist of films elsewhere, a column of an
-HDF5 file the bytes of another file, and a name in a folder a pipe that never ends: all are opened here. So are
-requests told apart that a page from elsewhere sends to a server of this machine.
+HDF5 file the bytes of another file, and a name in a folder a pipe that never ends: all are opened here.
+Requests that a page from elsewhere sends to a server of this machine are refused here.
 """
 
 from __future__ import annotations

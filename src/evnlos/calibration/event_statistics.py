@@ -267,7 +267,7 @@ def _maps(events: Sequence[Events], edges: list[NDArray[np.int64]], sampling: Sa
 
 
 def _block_counts(events: Events, edges_us: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Return the mean events a pixel in blocks of the sensor between two instants, float32 [N, 2, h, w]."""
+    """Return the mean events per pixel in blocks of the sensor between two instants, float32 [N, 2, h, w]."""
     bins = len(edges_us) - 1
     when = np.searchsorted(edges_us, events.t_us, side="left") - 1
     inside = (when >= 0) & (when < bins)

@@ -309,7 +309,7 @@ def lines_of_fit(fit: KnownLightFit) -> list[str]:
                 if one.behind == 0
                 else f"{one.behind:.1f} +- {one.error:.1f} nats ({one.bits_per_event:.3g} bits per event)"
             )
-            near = "; not told apart" if 0 < one.behind < 2 * one.error else ""
+            near = "; not distinguished" if 0 < one.behind < 2 * one.error else ""
             lines.append(f"  {one.name:<28} {told}{near}")
     if fit.predicted is not None:
         checks = fit.predicted.checks

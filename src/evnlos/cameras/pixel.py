@@ -76,7 +76,7 @@ class EventPixel(_ContrastPixel):
         threshold_sigma: Standard deviation of both thresholds over the pixels, log units; 0 = none.
         cutoff_hz: Corner frequency of the low-pass filter at white (255 DN), hertz; 0 = no filter. At black
             it is 20/275 of this.
-        leak_rate_hz: Rate of the ON events that the leaking reference makes, events per second a pixel.
+        leak_rate_hz: Rate of the ON events that the leaking reference makes, events per second per pixel.
         shot_noise_rate_hz: Rate of noise events, ON and OFF together, of a pixel in the dark limit, hertz.
         refractory_s: Time after an event in which a pixel cannot send another one, seconds.
         hot_pixel_fraction: Fraction of pixels that fire without cause, 0 to 1 (`mode="exact"` only).

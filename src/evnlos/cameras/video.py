@@ -56,7 +56,7 @@ class Video:
         width: Width of a frame, pixels.
         height: Height of a frame, pixels.
         frames: Number of frames, None where the file does not say.
-        fps: Frames a second in place of the times in the file; None = the file's own, whatever their spacing.
+        fps: Frames per second in place of the times in the file; None = the file's own, whatever their spacing.
         slow_motion: How many times slower than life the video plays.
         tone: Tone curve that is undone.
         white: Value of white in the file.
@@ -124,7 +124,7 @@ def open_video(
     Args:
         path: Video file (needs the extra `video`), animated GIF, PNG or WebP, folder, list or glob of pictures,
             NumPy file [T, H, W] or [T, H, W, 3]. Pictures are ordered by the numbers in their names.
-        fps: Frames a second, 0.001 to 1e9; needed for pictures and arrays, else in place of the file's times.
+        fps: Frames per second, 0.001 to 1e9; needed for pictures and arrays, else in place of the file's times.
         slow_motion: How many times slower than life the video plays, 0.001 to 1e9; 8 for 240 Hz shown at 30 Hz.
         tone: "as-is" takes the numbers as light, as v2e does (luma of Rec. 601 for colour); "srgb" and "rec709"
             undo that curve first (luminance of Rec. 709); white stays white.

@@ -115,7 +115,7 @@ class EventsCommand:
     seed: int = 0
     """Seed of mismatch and noise: same seed, same bytes."""
     fps: float | None = None
-    """Frames a second; needed for pictures and arrays, otherwise in place of the times in the file."""
+    """Frames per second; needed for pictures and arrays, otherwise in place of the times in the file."""
     slow_motion: float = 1.0
     """How many times slower than life the video plays, e.g. 8 for 240 Hz shown at 30 Hz."""
     tone: Tone = "as-is"

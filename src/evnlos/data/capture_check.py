@@ -350,7 +350,7 @@ def check_picture(capture: Capture) -> Image.Image:
 
 
 def _event_rate(events: Events, times_us: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-    """Return events a second in equal bins over events and frames, and the bins' middles in seconds."""
+    """Return events per second in equal bins over events and frames, and the bins' middles in seconds."""
     low, high = min(events.t_us[0], times_us[0]), max(events.t_us[-1], times_us[-1]) + 1
     counts, edges = np.histogram(events.t_us, _BINS, (float(low), float(high)))
     return counts / (np.diff(edges) * 1e-6), (edges[1:] + edges[:-1]) / 2e6

@@ -27,7 +27,7 @@ class CameraInfo:
     name: str = "unknown"
     """Maker and model."""
     frame_rate_hz: float | None = None
-    """Frames a second, hertz; the frames' times where they carry none (frame 0 at 0 on the frames' clock)."""
+    """Frames per second, hertz; the frames' times where they carry none (frame 0 at 0 on the frames' clock)."""
     exposure_s: float | None = None
     """Exposure of a frame, seconds."""
     clock_mhz: int | None = None
@@ -96,7 +96,7 @@ class DotsInfo:
     rows: int
     """Rows of dots."""
     columns: int
-    """Dots a row."""
+    """Dots per row."""
     frame: str
     """Picture of the grid by the frame camera, a file in the folder."""
     events: str

@@ -354,7 +354,7 @@ def find_dots(picture: NDArray, rows: int, columns: int) -> NDArray[np.float64]:
     Args:
         picture: [H, W], brighter dots; for a blinking grid the number of events per pixel.
         rows: Rows of dots, at least 2.
-        columns: Dots a row, at least 2.
+        columns: Dots per row, at least 2.
 
     Returns:
         Points (x, y), float64 [rows * columns, 2], pixels.

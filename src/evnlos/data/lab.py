@@ -89,7 +89,7 @@ class Lab:
     duration_s: float = 8.0
     """Length of a sequence, seconds."""
     frame_rate_hz: float = 5.0
-    """Frames a second, hertz; a sequence of 8 s has the 40 positions of the paper."""
+    """Frames per second, hertz; a sequence of 8 s has the 40 positions of the paper."""
     setup: Setup = field(default_factory=lambda: in_the_lab(RadiometricSetup()))
     """Wall, geometry, light and cameras; the frame camera has 8 bits, as captures have, and the event pixel is
     on purpose not that of the training simulator."""

@@ -88,7 +88,7 @@ def page() -> Simulation:
     """Return the simulation that the networks of `evnlos app` learn from: the page's setup, its sliders moved.
 
     Metal from smooth to rough, the distances, lights, noises and thresholds around the page's first setting;
-    beyond, where even the best linear picture shows next to nothing, the networks are not at home.
+    outside that range, where even the best linear image shows next to nothing, the networks are unreliable.
     """
     setup = page_setup()
     well_e, read_e = setup.frame_camera.full_well_e, setup.frame_camera.read_noise_e

@@ -1,7 +1,7 @@
 """Datasets on disk: a folder of shards, each one HDF5 file for one object.
 
 - One HDF5 file per object: written whole or not at all, checksummed, read in one go or by position.
-- A dataset on disk: a folder with `dataset.yaml` and one shard an object; a shard that exists is done.
+- A dataset on disk: a folder with `dataset.yaml` and one shard per object; a shard that exists is done.
 """
 
 from __future__ import annotations

@@ -250,7 +250,7 @@ class _Peak:
 
 
 class _Counts:
-    """Events of each pixel; of a sensor of very many pixels, only of those that sent one."""
+    """Events of each pixel; of a sensor of very many pixels, only of pixels that sent one."""
 
     def __init__(self, pixels: int) -> None:
         self._where = None if pixels <= MOST_SENSOR_PIXELS else np.zeros(0, np.int64)

@@ -30,7 +30,7 @@ EVENT_BYTES = 4
 """Bytes of an event in a plain stream of 32-bit words."""
 
 FRAME_RATE_HZ = 100.0
-"""Frames a second of the paper's frame camera: what its data volume is counted with."""
+"""Frames per second of the paper's frame camera: what its data volume is counted with."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Finding:
         psnr_db: str -> mean PSNR of the linear estimate on the test writer, dB.
         mean_db: PSNR of the mean picture, dB.
         gain_db: PSNR of events minus that of frames: mean, low and high end of the 95 % interval over objects.
-        events_per_pixel: Events a pixel and sequence.
+        events_per_pixel: Events per pixel and sequence.
         event_bytes_s: Data of the events, bytes per second.
         frame_bytes_s: Data of 8-bit frames at `FRAME_RATE_HZ`, bytes per second.
     """

@@ -255,7 +255,7 @@ class Phone:
     contrast make codes v of it, v + contrast v (1 - v) (2 v - 1), rounded to eight bits.
 
     Args:
-        frame_rate_hz: Frames a second.
+        frame_rate_hz: Frames per second.
         exposure_s: Exposure of a row, seconds.
         readout_s: Time from the first row to the last, seconds.
         full_well_e: Electrons at white.
@@ -272,7 +272,7 @@ class Phone:
     """
 
     frame_rate_hz: float = 30.0
-    """Frames a second."""
+    """Frames per second."""
     exposure_s: float = 1 / 60
     """Exposure of a row, seconds."""
     readout_s: float = 0.02

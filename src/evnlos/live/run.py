@@ -195,7 +195,7 @@ class Run:
         """Run until the source ends, time is up, or `stop` or Ctrl-C ends it; return what was done.
 
         Raises:
-            EvnlosError: The source can't go on; the pictures before it were made.
+            EvnlosError: The source can't go on; earlier images were made.
         """
         sinks = list(sinks)
         self._engine.begin()

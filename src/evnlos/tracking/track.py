@@ -242,7 +242,7 @@ class Track:
         event_windows: Number of velocities that came from events.
         distance: Distance from the wall, where it was looked for.
         misfit: With a setup: what it leaves of the frames' changes, over their noise, root mean square. The
-            stated deviations hold it as if it were noise.
+            stated deviations hold it like noise.
     """
 
     time_s: NDArray[np.float64]

@@ -90,7 +90,7 @@ class Training:
     epochs: int = 20
     """Passes over the training samples."""
     batch_size: int = 32
-    """Samples a step."""
+    """Samples per step."""
     learning_rate: float = 2e-3
     """Learning rate of Adam at the start."""
     schedule: Literal["cosine", "constant", "step"] = "cosine"

@@ -138,7 +138,7 @@ class DiskSource:
 
     Args:
         samples: The samples: positions, or sequences.
-        batch_size: Samples a step, of all processes together.
+        batch_size: Samples per step, of all processes together.
         seed: Seed of the order.
         process_group: The processes.
     """
@@ -229,7 +229,7 @@ class SimulatedSource:
     Args:
         dataset: The simulation.
         modality: What the network sees.
-        batch_size: Samples a step, of all processes together.
+        batch_size: Samples per step, of all processes together.
         seed: Seed of the order.
         process_group: The processes.
 

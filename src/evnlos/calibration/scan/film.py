@@ -62,13 +62,13 @@ class FilmReading:
     steady: bool = True
     """Take out changes of the exposure and movement of the phone."""
     fps: float | None = None
-    """Frames a second; none = the film's own times."""
+    """Frames per second; none = the film's own times."""
     capture_hz: float = 10.0
-    """Frames a second of the captures that are made of moving characters, hertz."""
+    """Frames per second of the captures that are made of moving characters, hertz."""
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.capture_hz <= 240:
-            raise ConfigError(f"capture_hz is {self.capture_hz}; give 0.5 to 240 frames a second")
+            raise ConfigError(f"capture_hz is {self.capture_hz}; give 0.5 to 240 frames per second")
 
 
 @dataclass(frozen=True)
@@ -478,7 +478,7 @@ def _pictures(film: Film, clock: Clock, parts: list[Part]) -> tuple[NDArray[np.f
         if not chosen.any():
             raise DataError(
                 f"no frame of the film lies between {first:.2f} and {last:.2f} s, while a pattern stood; "
-                "film with more frames a second, or plan with a longer --hold-s"
+                "film with more frames per second, or plan with a longer --hold-s"
             )
         found.append(film.mean(chosen))
     return np.stack([light for light, _ in found]), np.stack([over for _, over in found])

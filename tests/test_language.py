@@ -1,0 +1,78 @@
+"""Plain English: words and turns that readers had to decode stand in no page, help or message any more."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+UNITS = "(?:second|pixel|position|step|image|picture|object|capture|shot|frame|sample|event|sequence|setup|row)"
+RATES = (
+    r"(?:events?|hertz|metres?|seconds?|s|ms|us|ns|kB|MB|GB|dB|bytes|steps|frames|samples|numbers|dots|shard)"
+)
+BANNED = {
+    "rightly": "correctly",
+    "told apart": "distinguished",
+    r"(?:is|are) asked(?! for| of|\b.{0,3}(?:to|again))": "is required",
+    "not at home": "unreliable",
+    "of those that": "name them",
+    "so it may": "the same happens",
+    "which it never saw": "held out from ...",
+    "what was said here": "delete it; the changelog tells what changed",
+    r"\bit were\b": "it was, or it is",
+    "takes no look": "is skipped",
+    r"nor does the": "say what it does",
+    "the price:": "a limitation:",
+    "whole pass": "whole sequence",
+    "not ours to": "not licensed",
+    "by heart": "memorizes",
+    r"half as \w+ again": "1.5 times",
+    "a second and pixel": "per pixel per second",
+    rf"\b{RATES} an? {UNITS}\b(?! and the)": "per",
+}
+"""What is banned, as a regular expression, and what to write."""
+
+
+def messages() -> list[tuple[str, str]]:
+    """Return every text of the code with its place: messages, help and docstrings."""
+    found = []
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found += [(f"{path.name}:{node.lineno}", node.value)]
+    return found
+
+
+def pages() -> list[tuple[str, str]]:
+    """Return README and pages, paragraph by paragraph, without code."""
+    found = []
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+        found += [(path.name, one) for one in text.split("\n\n")]
+    return found
+
+
+@pytest.mark.parametrize("where", [pages, messages])
+def test_banned_words_stand_nowhere(where) -> None:
+    ban = {re.compile(word, re.IGNORECASE): cure for word, cure in BANNED.items()}
+    wrong = []
+    for place, text in where():
+        flat = " ".join(text.split())
+        for word, cure in ban.items():
+            wrong += [f"{place}: {found[0]!r}; write {cure}" for found in word.finditer(flat)]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_ban_finds_what_it_is_for() -> None:
+    sentences = [
+        "named 81 % rightly",
+        "0.01 events a second",
+        "70 are asked",
+        "it were 0.5 dB ahead",
+        "3 ms a position",
+    ]
+    for sentence in sentences:
+        assert any(re.search(word, sentence, re.IGNORECASE) for word in BANNED), sentence
+    for sentence in ["where nothing else is asked for", "events per second", "a frame a and the next"]:
+        assert not any(re.search(word, sentence, re.IGNORECASE) for word in BANNED), sentence
