@@ -13,10 +13,10 @@ from evnlos.scene.drawings import KINDS, Canvas
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_drawing_is_on_the_target_and_like_no_other(kind: str) -> None:
     pictures = [drawing(kind, number, size_px=64) for number in range(16)]
-    for picture in pictures:
-        assert picture.shape == (64, 64) and picture.min() == 0
-        assert 0.02 < picture.mean() < 0.7  # strokes or surfaces, neither a speck nor a blank sheet
-        border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+    for image in pictures:
+        assert image.shape == (64, 64) and image.min() == 0
+        assert 0.02 < image.mean() < 0.7  # strokes or surfaces, neither a speck nor a blank sheet
+        border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
         assert border.max() == 0  # nothing is cut off
     flat = np.stack(pictures).reshape(16, -1)
     apart = np.square(flat[:, None] - flat).mean(axis=2)[~np.eye(16, dtype=bool)]
@@ -34,16 +34,16 @@ def test_only_grey_drawings_are_grey() -> None:
 def test_a_canvas_draws_to_scale() -> None:
     canvas = Canvas(100, np.random.default_rng(0))
     canvas.box(-0.5, -0.5, 0.5, 0.5)
-    assert canvas.picture().mean() == pytest.approx(0.25, rel=0.02)
+    assert canvas.image().mean() == pytest.approx(0.25, rel=0.02)
     canvas.disc(0, 0, 0.25, level=0)
-    assert canvas.picture().mean() == pytest.approx(0.25 - np.pi / 64, rel=0.03)
+    assert canvas.image().mean() == pytest.approx(0.25 - np.pi / 64, rel=0.03)
     canvas = Canvas(100, np.random.default_rng(0), angle=np.pi / 4, scale=0.5, centre=(0.2, -0.3))
     canvas.box(-0.5, -0.5, 0.5, 0.5)
-    picture = canvas.picture()
-    rows, columns = np.indices(picture.shape)
-    assert picture.mean() == pytest.approx(0.0625, rel=0.05)
-    assert (picture * columns).sum() / picture.sum() == pytest.approx(59.5, abs=0.3)
-    assert (picture * rows).sum() / picture.sum() == pytest.approx(34.5, abs=0.3)
+    image = canvas.image()
+    rows, columns = np.indices(image.shape)
+    assert image.mean() == pytest.approx(0.0625, rel=0.05)
+    assert (image * columns).sum() / image.sum() == pytest.approx(59.5, abs=0.3)
+    assert (image * rows).sum() / image.sum() == pytest.approx(34.5, abs=0.3)
 
 
 def test_drawings_are_simulated_like_characters(tiny) -> None:

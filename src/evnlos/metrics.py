@@ -62,8 +62,8 @@ def ssim(
         DataError: The shapes differ, a value is not finite, or the image is smaller than the window.
 
     Example:
-        >>> picture = torch.linspace(0, 1, 256).reshape(16, 16)
-        >>> round(ssim(picture, picture).item(), 6)
+        >>> image = torch.linspace(0, 1, 256).reshape(16, 16)
+        >>> round(ssim(image, image).item(), 6)
         1.0
     """
     image, truth = checked(image, truth)
@@ -139,8 +139,8 @@ def gmsd(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> torc
         DataError: The shapes differ, a value is not finite, or the image is too small.
 
     Example:
-        >>> picture = torch.linspace(0, 1, 256).reshape(16, 16)
-        >>> gmsd(picture, picture).item()
+        >>> image = torch.linspace(0, 1, 256).reshape(16, 16)
+        >>> gmsd(image, image).item()
         0.0
     """
     image, truth = checked(image, truth)
@@ -162,7 +162,7 @@ def _magnitude(x: torch.Tensor) -> torch.Tensor:
 
 _HAAR_C, _HAAR_ALPHA = 30.0, 4.2
 HAAR_LEAST_SIDE = 16
-"""Smallest side of an image, pixels: three scales of a picture halved once."""
+"""Smallest side of an image, pixels: three scales of an image halved once."""
 
 
 def haarpsi(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> torch.Tensor:
@@ -184,8 +184,8 @@ def haarpsi(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> t
         DataError: The shapes differ, a value is not finite, or the image is too small.
 
     Example:
-        >>> picture = torch.linspace(0, 1, 256).reshape(16, 16)
-        >>> round(haarpsi(picture, picture).item(), 6)
+        >>> image = torch.linspace(0, 1, 256).reshape(16, 16)
+        >>> round(haarpsi(image, image).item(), 6)
         1.0
     """
     image, truth = checked(image, truth)
@@ -243,8 +243,8 @@ def ms_ssim(image: torch.Tensor, truth: torch.Tensor, *, peak: float = 1.0) -> t
         DataError: The shapes differ, a value is not finite, or a side has fewer than 11 pixels.
 
     Example:
-        >>> picture = torch.linspace(0, 1, 1024).reshape(32, 32)
-        >>> round(ms_ssim(picture, picture).item(), 6)
+        >>> image = torch.linspace(0, 1, 1024).reshape(32, 32)
+        >>> round(ms_ssim(image, image).item(), 6)
         1.0
     """
     image, truth = checked(image, truth)

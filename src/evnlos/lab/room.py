@@ -136,11 +136,11 @@ def brightness(scene: Scene, mount: Mount, plane: Plane, times_s: Array) -> NDAr
     if mount.brightness > 0:
         half, outer = scene.target.size_m / 2, scene.target.size_m / 2 + mount.rim_m
         wide, long = mount.stick_m
-        for picture, (x, y) in zip(shown, place, strict=True):
+        for image, (x, y) in zip(shown, place, strict=True):
             rim = _box(plane, x - outer, x + outer, y - outer, y + outer)
             rim -= _box(plane, x - half, x + half, y - half, y + half)
             stick = _box(plane, x - wide / 2, x + wide / 2, y + outer, y + outer + long)
-            picture += np.float32(mount.brightness) * (rim + stick)
+            image += np.float32(mount.brightness) * (rim + stick)
     return shown
 
 

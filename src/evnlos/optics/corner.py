@@ -8,7 +8,7 @@ positive x axis), whatever its distance from the edge:
     E(r, theta) = E_visible(r, theta) + integral from 0 to theta of e(phi; r, theta) dphi.
 
 For a scene that is far compared with r, e depends on phi alone, and the derivative of the light along theta is
-a picture of the hidden side with one dimension (Bouman, Ye, Yedidia, Durand, Wornell, Torralba and Freeman,
+an image of the hidden side with one dimension (Bouman, Ye, Yedidia, Durand, Wornell, Torralba and Freeman,
 "Turning corners into cameras: principles and methods", ICCV 2017).
 
 - The exact irradiance of upright rectangles behind the edge, by Lambert's contour formula.

@@ -130,7 +130,7 @@ def carry_facets(
     index: NDArray[np.int64],
     light: Array,
 ) -> None:
-    """Set what the wall points see of sparse pictures of the target: `fill_facets` times the pictures, [P, N].
+    """Set what the wall points see of sparse images of the target: `fill_facets` times the images, [P, N].
 
     Args:
         out: Light [P, N], overwritten.
@@ -144,7 +144,7 @@ def carry_facets(
         step: See there.
         matte: See there.
         masking: See there.
-        starts: Where each picture's entries begin, and their end [N + 1].
+        starts: Where each image's entries begin, and their end [N + 1].
         index: Cell of each entry.
         light: Brightness of each entry.
     """
@@ -248,7 +248,7 @@ def carry_lobes(
     index: NDArray[np.int64],
     light: Array,
 ) -> None:
-    """Set what GGX walls of several roughnesses make of sparse pictures, and a matte wall last, [P, N, L + 1].
+    """Set what GGX walls of several roughnesses make of sparse images, and a matte wall last, [P, N, L + 1].
 
     Args:
         out: Light, overwritten.

@@ -131,7 +131,7 @@ class MatrixWall:
         if self._along is None:
             return image
         carry, other = self._along
-        assert isinstance(carry.source, Plane)  # a moving picture needs square cells
+        assert isinstance(carry.source, Plane)  # a moving image needs square cells
         for start in range(0, len(positions), _CHUNK):
             drawn = other.rasterise(carry.source, positions[start : start + _CHUNK])
             image[start : start + _CHUNK] = carry(torch.as_tensor(drawn).to(image))

@@ -168,7 +168,7 @@ class SlidingWall:
         ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
 
     Raises:
-        ConfigError: The gain or the ambient light is negative or not finite, or the picture of the target is
+        ConfigError: The gain or the ambient light is negative or not finite, or the image of the target is
             too large.
         DataError: The image does not have the size of the plane, or the ambient array that of the view.
     """
@@ -263,7 +263,7 @@ class SlidingWall:
         size = pixels.amax(dim=0).ceil().long() + MARGIN + 1 - low
         if int(size.max()) > _MAX_CANVAS:
             raise ConfigError(
-                f"the target's picture is {int(size[0])} x {int(size[1])} pixels, above {_MAX_CANVAS}; "
+                f"the target's image is {int(size[0])} x {int(size[1])} pixels, above {_MAX_CANVAS}; "
                 "lower the magnification or the length of the tPSF"
             )
         self._low = (int(low[0]), int(low[1]))

@@ -26,7 +26,7 @@ class Canvas:
     """Shapes drawn one over the other, anti-aliased; each is turned, scaled and moved as the canvas says.
 
     Args:
-        size_px: Side of the picture, pixels.
+        size_px: Side of the image, pixels.
         angle: By how much the shapes are turned, radians.
         scale: By how much they are scaled.
         centre: Where their origin is.
@@ -89,7 +89,7 @@ class Canvas:
         for point in at:
             self.disc(point[0], point[1], width / 2, level=level)
 
-    def picture(self) -> NDArray[np.float32]:
+    def image(self) -> NDArray[np.float32]:
         """Return what was drawn, float32 [size_px, size_px], 0..1."""
         return np.asarray(self._image.reduce(_SUPERSAMPLING), dtype=np.float32) / np.float32(255)
 
@@ -105,7 +105,7 @@ def drawing(kind: str, number: int, seed: int = 0, size_px: int = 256) -> NDArra
             "grey" (any of the first three, its parts of different brightness).
         number: Number of the object, from 0 on.
         seed: Fixes the whole population.
-        size_px: Side of the picture, pixels.
+        size_px: Side of the image, pixels.
 
     Returns:
         float32 [size_px, size_px], 0..1.
@@ -123,7 +123,7 @@ def drawing(kind: str, number: int, seed: int = 0, size_px: int = 256) -> NDArra
         shapes = [*_ICONS, _person, *_VEHICLES] if kind == "grey" else _SHAPES[kind]
         canvas.place(draw.uniform(-0.2, 0.2), draw.uniform(0.75, 0.9), (0, 0))
         shapes[number % len(shapes)](canvas)
-    return canvas.picture()
+    return canvas.image()
 
 
 def _several(canvas: Canvas, number: int) -> None:

@@ -92,7 +92,7 @@ class HandwritingGlyphs:
         characters: Characters that each writer writes.
         strokes: Base faces and pens.
         target_plane: The target plane that carries a character.
-        known: Folder with pictures of known targets of this target's size, NAME.png; "" = none.
+        known: Folder with images of known targets of this target's size, NAME.png; "" = none.
         redrawn: How often each known target is drawn again, as by another hand (see `redrawn`); these objects
             come after those of the writers.
     """
@@ -277,9 +277,9 @@ def _known_targets(folder: str) -> dict[str, NDArray[np.float32]]:
             with open_image(path) as image:
                 found[path.stem] = np.asarray(image.convert("L"), np.float32) / 255
         except OSError as error:
-            raise ConfigError(f"{path}: {error}; give pictures of known targets") from None
+            raise ConfigError(f"{path}: {error}; give images of known targets") from None
     if not found:
-        raise ConfigError(f"{folder} holds no pictures NAME.png of known targets; name the folder that does")
+        raise ConfigError(f"{folder} holds no images NAME.png of known targets; name the folder that does")
     return found
 
 

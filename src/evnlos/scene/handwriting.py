@@ -65,7 +65,7 @@ def pen_width(mask: NDArray[np.float32]) -> float:
         mask: Bright ink on dark ground, [H, W], 0..1.
 
     Raises:
-        DataError: The picture has no ink.
+        DataError: The image has no ink.
     """
     left, top, right, bottom = ink_box(mask)
     return pen_px(mask) / max(right - left, bottom - top)
@@ -212,7 +212,7 @@ def nist_like(
     Args:
         writer: Number of the writer, 0 or more (see `held_out_writers`).
         char: One character, A-Z, a-z or 0-9.
-        seed: Seed of the population; the picture depends on (seed, writer, char) and on nothing else.
+        seed: Seed of the population; the image depends on (seed, writer, char) and on nothing else.
         size_px: Side of the mask, pixels, 8 to 2048.
         fraction: Room for the ink as a part of the target plane's side, above 0 to 1.
         strokes: Base faces and pens of the population of writers.
@@ -259,7 +259,7 @@ def redrawn(drawing: NDArray[np.float32], name: str, number: int, seed: int) -> 
     Args:
         drawing: Bright ink on dark ground, square [S, S], 0..1.
         name: Its name.
-        number: Number of the hand; the picture depends on (seed, name, number) and on the drawing alone.
+        number: Number of the hand; the image depends on (seed, name, number) and on the drawing alone.
         seed: Seed of the population.
 
     Returns:

@@ -278,8 +278,8 @@ class Target:
         """Draw the target on a sampled plane, exactly: each sample is the mean of the mask over its cell.
 
         With O_y [H, S] and O_x [W, S] the fractions of each cell that each mask pixel covers along one axis,
-        the picture is O_y mask O_x^T (computed from running integrals). Light is conserved: where the whole
-        target lies on the plane, picture.sum() pitch^2 = mask.mean() size^2, at any sub-pixel position.
+        the image is O_y mask O_x^T (computed from running integrals). Light is conserved: where the whole
+        target lies on the plane, image.sum() pitch^2 = mask.mean() size^2, at any sub-pixel position.
 
         Args:
             plane: The plane to draw on.
@@ -305,7 +305,7 @@ class Target:
         places = position.reshape(-1, 2)  # [N, 2]
         x_edges = self._edges(plane.x_m, plane.pitch_m, places[:, 0])  # [N, W + 1]
         y_edges = self._edges(plane.y_m, plane.pitch_m, places[:, 1])  # [N, H + 1]
-        picture = np.zeros((len(places), *plane.shape), np.float32)
+        image = np.zeros((len(places), *plane.shape), np.float32)
         side = self.mask.shape[0]
         # Motion along a row is the usual case: places at one height share their vertical resampling.
         heights, group = np.unique(places[:, 1], return_inverse=True)
@@ -315,9 +315,9 @@ class Target:
             y, x = _covered(y_edges[chosen[:1]], side), _covered(x_edges[chosen], side)
             rows = _cell_means(integral, y_edges[chosen[0], y.start : y.stop + 1])  # [h, S]
             columns = _cell_means(_integral(rows.T), x_edges[chosen, x.start : x.stop + 1])  # [n, w, h]
-            picture[chosen, y, x] = columns.transpose(0, 2, 1)
-        np.clip(picture, 0.0, 1.0, out=picture)
-        return picture if position.ndim == 2 else picture[0]
+            image[chosen, y, x] = columns.transpose(0, 2, 1)
+        np.clip(image, 0.0, 1.0, out=image)
+        return image if position.ndim == 2 else image[0]
 
     def _edges(
         self, centre_m: NDArray[np.float64], pitch_m: float, place_m: NDArray[np.float64]
