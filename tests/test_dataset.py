@@ -25,6 +25,7 @@ from evnlos.data import (
     as_modality,
     live_dataset,
     open_dataset,
+    randomized,
     read_shard,
     reduce_by_area,
     simulate,
@@ -360,3 +361,24 @@ def test_optics_are_drawn_for_groups_of_objects_and_light_for_each() -> None:
     assert len({d.setup.roughness for d in own}) == 40
     with pytest.raises(ConfigError, match="setups"):
         Simulation(setups=-1)
+
+
+def test_a_randomized_simulation_draws_sensors_and_walls_from_wide_ranges():
+    narrow = Simulation(
+        setup=RadiometricSetup(distance_m=0.3),
+        vary={"setup.gain": (0.9, 1.1), "setup.pixel.threshold_on": (0.01, 2.0)},
+        setups=2,
+    )
+    wide = randomized(narrow)
+    assert wide.vary["setup.pixel.threshold_on"] == (0.01, 2.0)  # was wider already
+    low, high = wide.vary["setup.gain"]
+    assert low == pytest.approx(0.8 * narrow.setup.gain) and high == 1.1
+    value = narrow.setup.roughness
+    assert wide.vary["setup.roughness"] == pytest.approx((0.8 * value, 1.2 * value))
+    places = [one for one in narrow.setup.parameters() if one.role == "place"]
+    assert places
+    for one in places:
+        assert wide.vary[f"setup.{one.name}"] == pytest.approx((one.value - 0.002, one.value + 0.002))
+    assert wide.setups == 6 and randomized(wide) == wide and narrow.setups == 2
+    drawn = {drawn_for(wide, name).setup.pixel.threshold_off for name in ("a", "b", "c")}
+    assert len(drawn) == 3

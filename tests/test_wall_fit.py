@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evnlos.calibration import Calibration, fit_setup
 from evnlos.calibration.captures import CaptureSet, grouped, wall_data
 from evnlos.calibration.wall_fit import FREEDOMS, WallState, _Unknowns, normal_equations, start_at
 from evnlos.calibration.wall_rest import correction_of, pixel_sensitivity
 from evnlos.calibration.wall_search import fit_wall, travelled
 from evnlos.data.capture import Capture
 from evnlos.data.capture_info import CameraInfo, CaptureInfo, MotionInfo, TargetInfo
-from evnlos.errors import DataError
+from evnlos.errors import ConfigError, DataError
 from evnlos.lab import Lobe, Optics, Reflection, cast, fill_throughput
 from evnlos.optics.facets import Pose, SlopeTable
 from evnlos.scene import FontGlyphs
@@ -26,10 +27,13 @@ KNOWN = RadiometricSetup(distance_m=0.3)
 SHINING = 0.25  # brightness of a bar below the target
 
 
-def operator(bent: float = 0.0) -> np.ndarray:
-    """What pixels see of cells of a wall with two lobes, by code that shares nothing with the fit, [P, C]."""
+def operator(bent: float = 0.0, corner: float = 0.0) -> np.ndarray:
+    """What pixels see of cells of a wall with two lobes, by code that shares nothing with the fit, [P, C].
+
+    `corner` is the share by which the lens moves the corner's ray outwards.
+    """
     optics = Optics(
-        SHAPE, 0.62, math.radians(28), 0.0, 0.0, math.radians(31), (0, 0), 0.0, 0.6, 0.15, (bent, 0.0), 4
+        SHAPE, 0.62, math.radians(28), 0.0, 0.0, math.radians(31), (corner, 0), 0.0, 0.6, 0.15, (bent, 0.0), 4
     )
     rays = cast(optics)
     reflection = Reflection((Lobe("ggx", 0.6, 0.06, 0.06), Lobe("beckmann", 0.4, 0.08, 0.2)), matte=0.02)
@@ -129,6 +133,41 @@ def test_intervals_hold_the_truth(fitted):
             assert abs(getattr(fitted.optics.setup, parameter.name) - truth[parameter.name]) < 3 * error, (
                 parameter.name
             )
+
+
+def test_what_is_measured_holds_and_tells_the_distortion_of_the_lens():
+    # Pose, slopes and distortion make up for each other: only where the camera's place is known is a lens seen.
+    corner = 0.12
+    matrix = operator(corner=corner)
+    fit, held = capture_set_of("ABDEHLOTX", matrix), capture_set_of("KRZ4", matrix, seed=1)
+    measured = {
+        "camera_distance_m": (0.62, 0.003),
+        "camera_angle_deg": (28.0, 0.3),
+        "field_of_view_deg": (31.0, 0.2),
+        "target_offset_m.0": (-0.165, 0.001),
+        "target_offset_m.1": (0.004, 0.001),
+    }
+    found = fit_wall(fit, held, KNOWN, measured=measured, columns=36).optics
+    assert abs(found.setup.camera_distance_m - 0.62) < 0.006
+    assert abs(found.setup.camera_angle_deg - 28.0) < 0.6
+    assert abs(found.setup.target_offset_m[0] + 0.165) < 0.002
+    truth = corner / (1 + (SHAPE[0] / SHAPE[1]) ** 2)  # at the left and right border
+    error = dict(zip([p.name for p in found.parameters], found.error, strict=True))["distortion"]
+    assert 0.3 * truth < found.setup.distortion < truth + error
+
+
+@pytest.mark.parametrize(
+    ("measured", "words"),
+    [
+        ({"camera_distanc_m": (0.6, 0.01)}, "camera_distance_m"),
+        ({"camera_angle_deg": (30.0, 0.0)}, "above 0"),
+        ({"field_of_view_deg": (-3.0, 1.0)}, "above 0"),
+        ({"distance_m": (math.nan, 1.0)}, "nan"),
+    ],
+)
+def test_measurements_that_cannot_be_are_refused(measured, words):
+    with pytest.raises(ConfigError, match=words):
+        fit_setup([], Calibration(measured=measured))
 
 
 def test_mirrored_frames_are_refused(rendered):

@@ -68,6 +68,9 @@ class Demo:
     """Processes that simulate, and networks trained at a time where there is no GPU; 0 = one for each core."""
     force: bool = False
     """Begin although the machine's memory will hardly do."""
+    robust: bool = False
+    """Draw sensors and walls of the simulated objects from wide ranges around the fitted ones: for setups that
+    change, or that the fit does not explain."""
     calibrate: bool = True
     """Fit the simulator to the setup of the captures first; without it, pre-train on the default simulation."""
     seed: int = 0
@@ -208,6 +211,7 @@ def _study(settings: Demo, test: list[str]) -> Study:
         simulation=replace(default(), seed=settings.seed),
         calibration=Calibration(event_captures=2, columns=48, seed=settings.seed),
         setups=2,
+        robust=settings.robust,
         refine=False,
         correct_pattern=settings.calibrate,
     )

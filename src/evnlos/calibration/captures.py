@@ -50,6 +50,9 @@ class Calibration:
     metal by one formula; `auto` is the first where targets are known and five captures or more are fitted."""
     fit_distance: bool = False
     """Fit the distance of target and wall too; else that of the capture's notes is taken as measured."""
+    measured: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """What somebody has measured of the setup, each with its standard deviation, e.g.
+    `camera_distance_m 0.6 0.02 camera_angle_deg 30 1`: priors of the fit of any wall."""
     events: bool = True
     """Fit the event pixel too."""
     columns: int = 64

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,11 +21,12 @@ from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
 from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
+from evnlos.calibration.wall_fit import check_measured
 from evnlos.calibration.wall_search import fit_wall
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
-from evnlos.data.simulate import Simulation
-from evnlos.errors import DataError
+from evnlos.data.simulate import Simulation, ranges_around
+from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import HandwritingGlyphs, LineMotion, Strokes, pen_width
 from evnlos.setups import RadiometricSetup, SensorSize, Setup
@@ -141,8 +142,10 @@ def fit_setup(
     Raises:
         DataError: Too few captures, unknown targets or motions, different setups or cameras, or frames that do
             not follow the targets.
+        ConfigError: Something is measured that the fit has no number for, or that cannot be.
     """
     settings = Calibration() if settings is None else settings
+    check_measured(settings.measured)
     stages = ("read the captures", "fit the wall", "fit the noise of the frames", "fit the event pixel")
     stages = stages[: 4 if settings.events else 3]
 
@@ -160,9 +163,16 @@ def fit_setup(
     )
     start, fixed = _at_known_distance(settings, fit)
     residuals: dict[str, Residual] = {}
+    wall = start if isinstance(start, RadiometricSetup) and _is_any(settings, fit) else None
+    if settings.measured and wall is None:
+        raise ConfigError(
+            f"measured.{next(iter(settings.measured))} is a prior of the fit of any wall, and this one is by a "
+            "formula; leave it out, or give --wall any"
+        )
     begin(1)
-    if isinstance(start, RadiometricSetup) and _is_any(settings, fit):
-        optics = fit_wall(fit, held, start, fit_distance=settings.fit_distance).optics
+    if wall is not None:
+        free, measured = settings.fit_distance, settings.measured
+        optics = fit_wall(fit, held, wall, fit_distance=free, measured=measured).optics
     elif settings.targets == "known":
         optics = fit_transport(fit, start, fixed=fixed, columns=settings.columns)
     else:
@@ -338,13 +348,7 @@ def training_simulation(
         low, high = pens[0] * (1 - _PEN_MARGIN), pens[1] * (1 + _PEN_MARGIN)
         strokes = Strokes("both", (max(0.02, round(low, 3)), min(0.4, round(high, 3))))
         glyphs = replace(glyphs, strokes=strokes)
-    vary = dict(fitted.vary)
-    for path, spread in _SPREAD.items():
-        value: Any = fitted
-        for name in path.split("."):
-            value = getattr(value, name, None)
-        if value is not None:
-            vary[path] = (value * (1 - spread), value * (1 + spread))
+    vary = fitted.vary | ranges_around(fitted, _SPREAD)
     for one in fitted.setup.parameters():
         if one.role == "place":
             vary[f"setup.{one.name}"] = (one.value - _SLACK_M, one.value + _SLACK_M)

@@ -16,6 +16,7 @@ from evnlos.calibration.fit import SetupFit
 from evnlos.calibration.transport_fit import Residual, values_of
 from evnlos.calibration.wall_search import WALL_FILE
 from evnlos.config import save_yaml
+from evnlos.data import randomized
 from evnlos.data.sampling import PATTERN_FILE, save_pattern
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
@@ -163,7 +164,15 @@ def warnings_of(fit: SetupFit) -> list[str]:
         found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")
     if fit.unexplained is not None:
         found.append(f"{_left(fit.unexplained)}; {cure}")
-    return found + _event_warnings(fit)
+    found += _event_warnings(fit)
+    if _fits_nothing(fit):
+        found.append(f"{TRAINING_FILE} draws sensors and walls from wide ranges around this fit")
+    return found
+
+
+def _fits_nothing(fit: SetupFit) -> bool:
+    """Return whether no wall or no event pixel makes what the cameras recorded."""
+    return fit.unexplained is not None or bool(_event_warnings(fit))
 
 
 def _event_warnings(fit: SetupFit) -> list[str]:
@@ -256,8 +265,8 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
     """Write `calibration.json` and, where the fit stands on captures that it has not seen, the setup.
 
     The setup is `setup.yaml` (the simulation that matches it), `training.yaml` (that simulation, varied, to
-    pre-train on), `targets` (the known targets, which it draws again) and `pattern.safetensors` (the frame
-    camera's fixed pattern, for `import --pattern`).
+    pre-train on; `randomized` where no wall or no event pixel fits), `targets` (the known targets, which it
+    draws again) and `pattern.safetensors` (the frame camera's fixed pattern, for `import --pattern`).
 
     Args:
         fit: The calibration.
@@ -291,7 +300,8 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
             f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
         )
     save_pattern(fit.noise.pattern, out / PATTERN_FILE)
-    save_yaml(_with_targets(fit, _with_wall(fit, fit.training, out), out / TARGETS), out / TRAINING_FILE)
+    training = randomized(fit.training) if _fits_nothing(fit) else fit.training
+    save_yaml(_with_targets(fit, _with_wall(fit, training, out), out / TARGETS), out / TRAINING_FILE)
     save_yaml(_with_wall(fit, fit.simulation, out), out / CALIBRATED_FILE)
     return out / CALIBRATED_FILE
 

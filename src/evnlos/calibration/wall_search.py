@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Array, CaptureSet, WallData, wall_data
 from evnlos.calibration.transport_fit import TransportFit
-from evnlos.calibration.wall_fit import FREEDOMS, Freedom, Progress, WallState, refine, start_at, uncertainty
+from evnlos.calibration.wall_fit import (
+    FREEDOMS,
+    Freedom,
+    Progress,
+    WallState,
+    check_measured,
+    refine,
+    start_at,
+    uncertainty,
+)
 from evnlos.calibration.wall_rest import WallRest, rest_of
 from evnlos.errors import ConfigError, DataError
 from evnlos.optics.facets import Pose
@@ -46,6 +55,7 @@ class WallSearch:
 _ANGLES_DEG = (30.0, 15.0, 45.0, 0.0, -30.0)
 _VIEWS = (1.0, 0.67, 1.5)
 _DISTANCES = (1.0, 0.65, 1.5)
+_ROUGH = {f.name: 0.6 * f.spread for f in FREEDOMS}  # a spread below it is a measurement, and is not scanned
 _TRIED = 3  # of the scan's best are refined
 _COARSE = 25  # columns of the working pictures of the scan
 _CELLS_DOWN = 11  # of the target in the scan
@@ -80,9 +90,10 @@ def search_wall(
     frames = sum(len(capture.frames) for capture in capture_set.captures)
     coarse = wall_data(capture_set, _COARSE, wide, every=max(1, frames // _COARSE_FRAMES))
     quick: list[tuple[Progress, Pose]] = []
-    for state in _scanned(coarse, known)[:_TRIED]:
+    first = [freedom for freedom in freedoms if not freedom.fine]
+    for state in _scanned(coarse, known, freedoms)[:_TRIED]:
         prior = replace(known, target_offset_m=state.pose.target_offset_m)
-        quick.append((refine(coarse, state, prior=prior, freedoms=freedoms, iterations=8), prior))
+        quick.append((refine(coarse, state, prior=prior, freedoms=first, iterations=8), prior))
     quick.sort(key=lambda one: one[0].cost())
     best, prior = quick[0]
     fine = wall_data(capture_set, columns, plane, every=max(1, frames // _FINE_FRAMES), checkered=True)
@@ -98,18 +109,28 @@ def search_wall(
     return WallSearch(found.state, tuple(freedoms), np.array(errors), found.left)
 
 
-def _scanned(data: WallData, known: Pose) -> list[WallState]:
-    """Return the walls of GGX lobes at all poses of the scan, the best first."""
+def _scanned(data: WallData, known: Pose, freedoms: Sequence[Freedom]) -> list[WallState]:
+    """Return the walls of GGX lobes at all poses of the scan, the best first.
+
+    What somebody has measured is not scanned: it stays at its value.
+    """
+    measured = {f.name for f in freedoms if f.spread < _ROUGH.get(f.name, 0.0)}
+    angles = (known.camera_angle_deg,) if "camera_angle_deg" in measured else _ANGLES_DEG
+    views = (1.0,) if "field_of_view_deg" in measured else _VIEWS
+    distances = (1.0,) if "camera_distance_m" in measured else _DISTANCES
     turned = replace(data, seen=data.seen[_mirrored(data)])
     tried: list[tuple[float, WallState]] = []
     mirrored = math.inf
-    for angle, view, away in itertools.product(_ANGLES_DEG, _VIEWS, _DISTANCES):
+    for angle, view, away in itertools.product(angles, views, distances):
+        middle = -known.distance_m * math.tan(math.radians(angle))
+        if "target_offset_m.0" in measured:
+            middle = known.target_offset_m[0]
         pose = replace(
             known,
             camera_angle_deg=angle,
             field_of_view_deg=known.field_of_view_deg * view,
             camera_distance_m=known.camera_distance_m * away,
-            target_offset_m=(-known.distance_m * math.tan(math.radians(angle)), known.target_offset_m[1]),
+            target_offset_m=(middle, known.target_offset_m[1]),
         )
         try:
             state, left = start_at(data, pose)
@@ -166,7 +187,13 @@ class WallFit:
 
 
 def fit_wall(
-    fit: CaptureSet, held: CaptureSet, start: RadiometricSetup, *, fit_distance: bool = False, columns: int = 60
+    fit: CaptureSet,
+    held: CaptureSet,
+    start: RadiometricSetup,
+    *,
+    fit_distance: bool = False,
+    measured: Mapping[str, tuple[float, float]] | None = None,
+    columns: int = 60,
 ) -> WallFit:
     """Fit a wall of any kind to captures with known targets.
 
@@ -175,6 +202,7 @@ def fit_wall(
         held: Captures that decide which freedoms stay.
         start: What is known of camera and target; its roughness is the start's.
         fit_distance: Whether the distance of target and wall is hardly known; else to 3 %.
+        measured: Name of a freedom -> its value and standard deviation, as somebody has measured them.
         columns: Columns of the working pictures of the search, pixels.
     """
     known = Pose(
@@ -187,6 +215,7 @@ def fit_wall(
     freedoms = tuple(
         replace(f, spread=_FREE_DISTANCE) if f.name == "distance_m" and fit_distance else f for f in FREEDOMS
     )
+    known, freedoms = with_measured(known, freedoms, measured or {})
     plane = travelled(fit, held, _SEARCH_CELL_M)
     search = search_wall(fit, known, freedoms, plane, columns=columns)
     rest = rest_of(fit, held, search.state, plane)
@@ -203,6 +232,29 @@ def fit_wall(
     every = {p.name: p for p in before.parameters()}
     searched = tuple(every[freedom.name] for freedom in freedoms)
     return WallFit(TransportFit(before, found, searched, search.error), search, rest)
+
+
+def with_measured(
+    known: Pose, freedoms: Sequence[Freedom], measured: Mapping[str, tuple[float, float]]
+) -> tuple[Pose, tuple[Freedom, ...]]:
+    """Return the pose and the freedoms with what somebody has measured as their priors.
+
+    Args:
+        known: What is known of the pose otherwise.
+        freedoms: The numbers that are searched.
+        measured: Name of a freedom -> its value and standard deviation, in its unit.
+
+    Raises:
+        ConfigError: A name is unknown, or a value or deviation cannot be.
+    """
+    check_measured(measured)
+    spreads = {}
+    for freedom in freedoms:
+        if freedom.name in measured:
+            value, error = measured[freedom.name]
+            known = freedom.into(known, value)
+            spreads[freedom.name] = error / value if freedom.log else error
+    return known, tuple(replace(f, spread=spreads.get(f.name, f.spread)) for f in freedoms)
 
 
 def travelled(fit: CaptureSet, held: CaptureSet, cell_m: float) -> Plane:

@@ -32,6 +32,7 @@ from evnlos.data import (
     import_captures,
     load_pattern,
     open_dataset,
+    randomized,
     simulate,
 )
 from evnlos.data.lab import Lab, lab_of, render_captures
@@ -66,6 +67,8 @@ class SimulateCommand:
     pixel: str | None = None
     """The event pixel instead of the setup's: a preset's name, or a YAML file, as `evnlos pixel fit`
     writes it."""
+    robust: bool = False
+    """Draw sensors and walls from wide ranges around those of the settings: for setups that change."""
     workers: int = 0
     """Processes; 0 = one for each core."""
     shard: str = "1/1"
@@ -104,7 +107,7 @@ class SimulateCommand:
 
     def run(self) -> None:
         """Simulate, with a progress bar over the objects."""
-        config = self.settings
+        config = randomized(self.settings) if self.robust else self.settings
         for note in config.glyphs.notes():
             say(note)
         for line in config.setup.warnings():

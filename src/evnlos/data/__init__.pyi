@@ -30,6 +30,7 @@ from .simulate import SensorSize as SensorSize
 from .simulate import Simulation as Simulation
 from .simulate import simulate as simulate
 from .simulate import simulate_object as simulate_object
+from .simulations import randomized as randomized
 from .store import Dataset as Dataset
 from .store import ShardIndex as ShardIndex
 from .store import create_dataset as create_dataset

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -66,6 +67,24 @@ def check_ranges(config: object, ranges: Ranges) -> None:
             raise _unknown(path, first, names)
         for value in (low, high):
             _replaced(getattr(config, first), rest, value, path)
+
+
+def ranges_around(config: object, spreads: Mapping[str, float]) -> Ranges:
+    """Return ranges about the settings' own values; settings that `config` does not have are passed over.
+
+    Args:
+        config: A nested dataclass.
+        spreads: Dotted name of a number -> half-width of its range over its value.
+    """
+    ranges: Ranges = {}
+    for path, spread in spreads.items():
+        value: Any = config
+        for name in path.split("."):
+            value = getattr(value, name, None)
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            ends = sorted((float(value) * (1 - spread), float(value) * (1 + spread)))
+            ranges[path] = (ends[0], ends[1])
+    return ranges
 
 
 def _seed_word(path: str) -> str:

@@ -1,6 +1,7 @@
 """Simulations by name, what they will take, and whether their shards are whole.
 
-- Named simulations: Python functions, so that a preset can say why each of its values is what it is.
+- Named simulations: Python functions, so that a preset can say why each of its values is what it is;
+  and simulations with sensors and walls drawn from wide ranges.
 - What a simulation will take, from one object that is really simulated.
 - Is every shard whole, and the one that its settings say?
 """
@@ -18,7 +19,7 @@ from pathlib import Path
 from evnlos.config import config_hash, from_dict
 from evnlos.data.pool import processes
 from evnlos.data.sampling import Sampling
-from evnlos.data.simulate import Simulation, needs_a_matrix, simulate, simulate_object
+from evnlos.data.simulate import Simulation, needs_a_matrix, ranges_around, simulate, simulate_object
 from evnlos.data.store import PAGE, Dataset, claim_dataset, is_page_changed, read_shard, write_shard
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Progress, Step, silent
@@ -51,6 +52,49 @@ def default() -> Simulation:
             "setup.pixel.shot_noise_rate_hz": (0.0, 1.0),
         },
     )
+
+
+_WIDE = {
+    "setup.roughness": 0.2,
+    "setup.slopes": 0.12,
+    "setup.tpsf_length_m": 0.2,
+    "setup.gain": 0.2,
+    "setup.ambient": 0.3,
+    "setup.companion": 0.5,
+    "setup.frame_camera.full_well_e": 0.3,
+    "setup.frame_camera.read_noise_e": 0.3,
+    "setup.pixel.threshold_on": 0.25,
+    "setup.pixel.threshold_off": 0.25,
+    "setup.pixel.threshold_sigma": 0.5,
+    "setup.pixel.cutoff_hz": 0.5,
+    "setup.pixel.shot_noise_rate_hz": 0.7,
+    "setup.pixel.leak_rate_hz": 0.7,
+    "setup.pixel.leak_rate_per_dn_hz": 0.7,
+    "setup.pixel.photon_noise": 0.5,
+}
+_WIDE_PLACE_M = 0.002
+_WIDE_SETUPS = 6
+
+
+def randomized(simulation: Simulation) -> Simulation:
+    """Return a simulation whose sensors and walls are drawn from wide ranges around those that it has.
+
+    What a network learns from it depends less on how well the setup is known (domain randomization; Tobin et
+    al., IROS 2017): event thresholds within 25 %, noise within 30 to 70 %, slopes of the wall's facets within
+    12 %, light within 20 to 30 %, the place of the travel within 2 mm. A range that is wider already stays.
+
+    Args:
+        simulation: The simulation, as a rule that of a calibrated setup.
+    """
+    ranges = ranges_around(simulation, _WIDE)
+    places = {p.name: p.value for p in simulation.setup.parameters() if p.role == "place"}
+    setup = simulation.setup.with_parameters(places)  # what follows from other numbers is written out
+    ranges |= {f"setup.{name}": (v - _WIDE_PLACE_M, v + _WIDE_PLACE_M) for name, v in places.items()}
+    for path, (low, high) in simulation.vary.items():
+        wide = ranges.get(path, (low, high))
+        ranges[path] = (min(low, wide[0]), max(high, wide[1]))
+    setups = max(simulation.setups, _WIDE_SETUPS) if simulation.setups else simulation.setups
+    return replace(simulation, setup=setup, vary=ranges, setups=setups)
 
 
 def paper() -> Simulation:

@@ -20,7 +20,15 @@ import torch
 from evnlos.analysis import available_lpips, evaluate
 from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
-from evnlos.data import STANDARD_MODALITIES, Dataset, Simulation, import_captures, load_pattern, simulate
+from evnlos.data import (
+    STANDARD_MODALITIES,
+    Dataset,
+    Simulation,
+    import_captures,
+    load_pattern,
+    randomized,
+    simulate,
+)
 from evnlos.data.capture_info import character_of
 from evnlos.data.pool import processes, run_tasks
 from evnlos.data.simulations import default, paper
@@ -227,7 +235,8 @@ def simulation_of(study: Study, arm: Arm, place: Place) -> Simulation:
     glyphs = replace(glyphs, writers=study.writers if arm.writers is None else arm.writers)
     if glyphs.known:
         glyphs = replace(glyphs, redrawn=study.redrawn)
-    return replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
+    config = replace(config, glyphs=glyphs, sampling=arm.sampling, vary=config.vary | arm.vary)
+    return randomized(config) if study.robust else config
 
 
 def _simulate(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset | None:

@@ -99,6 +99,8 @@ class Study:
     """How the setup is calibrated; the test characters are left out of it whatever it says."""
     setups: int | None = None
     """Different walls and cameras in the calibrated simulation; None is as many as the calibration says."""
+    robust: bool = False
+    """Draw sensors and walls of the simulations from wide ranges (`evnlos.data.randomized`)."""
     refine: bool = True
     """Also score pictures after data consistency, where there are a frame and a calibrated setup."""
     correct_pattern: bool = True

@@ -237,7 +237,7 @@ class FittedSetup(Setup):
         return replace(self, strip_m=(width, height))
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the place of camera and target, and the wall's bend."""
+        """Return the place of camera and target, the lens's distortion, and the wall's bend."""
         found = [
             Parameter("camera_distance_m", "m", self.camera_distance_m, 0.05, 20.0, 0.005, log=True),
             Parameter("camera_angle_deg", "deg", self.camera_angle_deg, -75.0, 75.0, 0.2),
@@ -253,6 +253,8 @@ class FittedSetup(Setup):
             found.append(Parameter(f"target_offset_m.{k}", "m", axis, -10.0, 10.0, 5e-4, role="place"))
         for k, bend in enumerate(self.curvature_per_m):
             found.append(Parameter(f"curvature_per_m.{k}", "1/m", bend, -5.0, 5.0, 0.02))
+        found.append(Parameter("distortion", "", self.distortion, -0.3, 0.3, 0.005))
+        found.append(Parameter("travel_slope", "m/m", self.travel_slope, -0.5, 0.5, 0.005))
         return tuple(found)
 
     def warnings(self) -> list[str]:
