@@ -69,8 +69,7 @@ class Demo:
     force: bool = False
     """Begin although the machine's memory will hardly do."""
     robust: bool = False
-    """Draw sensors and walls of the simulated objects from wide ranges around the fitted ones: for setups that
-    change, or that the fit does not explain."""
+    """Draw sensors and walls of the simulated objects from wide ranges around the fitted ones."""
     calibrate: bool = True
     """Fit the simulator to the setup of the captures first; without it, pre-train on the default simulation."""
     seed: int = 0
@@ -95,8 +94,8 @@ def run_demo(settings: Demo) -> Path:
     if not folders:
         lab = Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=settings.seed)
         notes.append(
-            "The captures of this page are not recordings: they were rendered with a wall of rough aluminium, "
-            "cameras and noise that only calibration can tell the simulator. Give --captures for recordings."
+            "The captures of this page are not recordings: they were rendered with a wall of rough aluminium and "
+            "cameras that only calibration can tell the simulator. Give --captures for recordings."
         )
         notes += lab.glyphs.notes()
         with ProgressBars() as progress:

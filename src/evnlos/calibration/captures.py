@@ -51,8 +51,7 @@ class Calibration:
     fit_distance: bool = False
     """Fit the distance of target and wall too; else that of the capture's notes is taken as measured."""
     measured: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """What somebody has measured of the setup, each with its standard deviation, e.g.
-    `camera_distance_m 0.6 0.02 camera_angle_deg 30 1`: priors of the fit of any wall."""
+    """What is measured, with a standard deviation, e.g. `camera_distance_m 0.6 0.02`: priors of wall `any`."""
     events: bool = True
     """Fit the event pixel too."""
     columns: int = 64
@@ -65,10 +64,8 @@ class Calibration:
     """Seed of every draw."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.holdout_share < 1:
-            raise ConfigError(
-                f"Calibration.holdout_share is {self.holdout_share}; give a share between 0 and 1"
-            )
+        if not 0 < (share := self.holdout_share) < 1:
+            raise ConfigError(f"Calibration.holdout_share is {share}; give a share between 0 and 1")
         setup = self.start.setup
         if not setup.parameters():
             raise ConfigError(

@@ -21,8 +21,7 @@ from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
 from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
-from evnlos.calibration.wall_fit import check_measured
-from evnlos.calibration.wall_search import fit_wall
+from evnlos.calibration.wall_search import check_measured, fit_wall
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
 from evnlos.data.simulate import Simulation, ranges_around

@@ -9,9 +9,8 @@ priors.
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -108,28 +107,6 @@ FREEDOMS = (
     Freedom("distortion", "", 0.05, 0.01, fine=True),
     Freedom("travel_slope", "m/m", 0.03, 0.01, fine=True),
 )
-
-
-def check_measured(measured: Mapping[str, tuple[float, float]]) -> None:
-    """Refuse measurements of what is no freedom of a wall's pose, and values that cannot be.
-
-    Args:
-        measured: Name of a freedom -> its value and standard deviation, in its unit.
-
-    Raises:
-        ConfigError: A name is unknown (the nearest is named), or a value or deviation cannot be.
-    """
-    known = {freedom.name: freedom for freedom in FREEDOMS}
-    for name, (value, error) in measured.items():
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1) or list(known)
-            raise ConfigError(f"measured.{name} is unknown; give {' or '.join(near)}")
-        if not (math.isfinite(value) and math.isfinite(error) and error > 0):
-            raise ConfigError(
-                f"measured.{name} is {value} +- {error}; give a value and a standard deviation above 0"
-            )
-        if known[name].log and value <= 0:
-            raise ConfigError(f"measured.{name} is {value} {known[name].unit}; give a value above 0")
 
 
 @dataclass(frozen=True, eq=False)

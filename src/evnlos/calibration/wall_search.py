@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import math
 import tempfile
@@ -22,7 +23,6 @@ from evnlos.calibration.wall_fit import (
     Freedom,
     Progress,
     WallState,
-    check_measured,
     refine,
     start_at,
     uncertainty,
@@ -232,6 +232,28 @@ def fit_wall(
     every = {p.name: p for p in before.parameters()}
     searched = tuple(every[freedom.name] for freedom in freedoms)
     return WallFit(TransportFit(before, found, searched, search.error), search, rest)
+
+
+def check_measured(measured: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse measurements of what is no freedom of a wall's pose, and values that cannot be.
+
+    Args:
+        measured: Name of a freedom -> its value and standard deviation, in its unit.
+
+    Raises:
+        ConfigError: A name is unknown (the nearest is named), or a value or deviation cannot be.
+    """
+    known = {freedom.name: freedom for freedom in FREEDOMS}
+    for name, (value, error) in measured.items():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1) or list(known)
+            raise ConfigError(f"measured.{name} is unknown; give {' or '.join(near)}")
+        if not (math.isfinite(value) and math.isfinite(error) and error > 0):
+            raise ConfigError(
+                f"measured.{name} is {value} +- {error}; give a value and a standard deviation above 0"
+            )
+        if known[name].log and value <= 0:
+            raise ConfigError(f"measured.{name} is {value} {known[name].unit}; give a value above 0")
 
 
 def with_measured(

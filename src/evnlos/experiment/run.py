@@ -20,18 +20,10 @@ import torch
 from evnlos.analysis import available_lpips, evaluate
 from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
-from evnlos.data import (
-    STANDARD_MODALITIES,
-    Dataset,
-    Simulation,
-    import_captures,
-    load_pattern,
-    randomized,
-    simulate,
-)
+from evnlos.data import STANDARD_MODALITIES, Dataset, Simulation, import_captures, load_pattern, simulate
 from evnlos.data.capture_info import character_of
 from evnlos.data.pool import processes, run_tasks
-from evnlos.data.simulations import default, paper
+from evnlos.data.simulations import default, paper, randomized
 from evnlos.errors import CalibrationError, DataError, MissingDependencyError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there, slug
 from evnlos.experiment.table import score_arm
