@@ -77,9 +77,7 @@ class Demo:
 
 
 def run_demo(settings: Demo) -> Path:
-    """Run the main job and return the path of the report.
-
-    Every step is resumable: what is done is not done again.
+    """Run the main job, or what is left of it, and return the path of the report.
 
     Raises:
         ConfigError: One of the captures is none.
