@@ -92,8 +92,8 @@ def run_demo(settings: Demo) -> Path:
     if not folders:
         lab = Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=settings.seed)
         notes.append(
-            "The captures of this page are not recordings: they were rendered with a wall of rough aluminium and "
-            "cameras that only calibration can tell the simulator. Give --captures for recordings."
+            "The captures of this page are not recordings: they were rendered with a wall of rough aluminium, "
+            "cameras and noise that only calibration can tell the simulator. Give --captures for recordings."
         )
         notes += lab.glyphs.notes()
         with ProgressBars() as progress:
