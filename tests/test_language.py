@@ -8,9 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 UNITS = "(?:second|pixel|position|step|image|picture|object|capture|shot|frame|sample|event|sequence|setup|row)"
-RATES = (
-    r"(?:events?|hertz|metres?|seconds?|s|ms|us|ns|kB|MB|GB|dB|bytes|steps|frames|samples|numbers|dots|shard)"
-)
+RATES = "(?:events?|Hz|hertz|metres?|seconds?|s|ms|us|ns|kB|MB|GB|dB|bytes|steps|frames|samples|dots|shard)"
 BANNED = {
     "rightly": "correctly",
     "told apart": "distinguished",

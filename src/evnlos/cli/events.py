@@ -207,7 +207,7 @@ def _found(
 
 def _text(found: dict[str, Any]) -> str:
     ratio = f"{found['on_off_ratio']:.2f}" if found["on_off_ratio"] is not None else "no OFF events"
-    rate = f"{amount(found['rate_hz'], 'ev/s')}, {found['rate_per_pixel_hz']:.3g} Hz a pixel"
+    rate = f"{amount(found['rate_hz'], 'ev/s')}, {found['rate_per_pixel_hz']:.3g} Hz per pixel"
     times = "from --fps" if found["times_from"] == "fps" else "from the file"
     return (
         f"{found['out']}: {found['events']:,} events ({rate}), ON/OFF {ratio}, {amount(found['bytes'], 'B')}\n"
