@@ -102,6 +102,23 @@ def test_nothing_is_biased() -> None:
     assert 0.0 < np.mean([estimated(s).noise_share for s in range(SEQUENCES)]) < 0.1
 
 
+@pytest.mark.parametrize("from_truth", [False, True])
+def test_many_noise_events_are_told_from_signals(from_truth: bool) -> None:
+    """Where three events of ten are noise, an event must not confirm itself by its own say on its threshold."""
+    noisy = replace(PIXEL, shot_noise_rate_hz=0.2)
+    law, settings = noisy.crossing_law(40.0), LikelihoodSettings(least_noise=EXACT)
+    found, reached, away = [], [], []
+    for seed in range(4):
+        start = truth(seed) if from_truth else None
+        one = estimate_sequence(light(), prior(), law, recorded(seed, noisy), settings=settings, start=start)
+        found.append(one)
+        reached.append(error(one, seed))
+        away.append(np.abs(one.image - prior().image(truth(seed))) / one.deviation)
+    assert np.mean([one.noise_share for one in found]) > 0.25
+    assert 10 * np.log10(np.mean(reached) / np.mean([one.expected_error for one in found])) < 0.5
+    assert 0.86 < np.mean(np.array(away) < 1.645) < 0.94
+
+
 def test_it_stays_at_the_truth() -> None:
     """Started there it ends where it ends from the prior's mean, as near to the truth as the bound allows."""
     errors, expected = [], []

@@ -1,21 +1,17 @@
 """One likelihood of a whole sequence: the target from events, from frames, or from both, with its uncertainty.
 
 With z the coefficients of the Gaussian prior and L(i, t; z) the filtered log light of pixel i:
-
-- Between two events of a pixel, L (with the leak's share) moves by D = +theta_on or -theta_off, with the
-  error of a crossing. What a pixel's own thresholds differ from the mean is integrated out in closed form, by
+- Between two events of a pixel, L (with the leak's share) moves by D = +theta_on or -theta_off, with the error
+  of a crossing. What a pixel's own thresholds differ from the mean is integrated out in closed form, by
   polarity.
-- What is observed is a time, so its density is that of the level times |dD/dt|. Without that factor every
-  contrast that is too low looks more likely, the further a threshold may be from its mean.
-- The error of a crossing is not claimed but estimated, from events of one pixel and polarity: with the
-  factor, an error that is too large would make every contrast too high.
-- An event is a signal or noise: that density, or the rate of noise events.
-- A silence bounds L from both sides, at the instants of each gap where L is furthest up and down, by what the
-  crossings leave open of the pixel's own threshold. Where an event ends the gap, its own side is left out:
-  that it was not met before is already in the event's row.
-- The leak is known to a few per cent only and is estimated along; so are both mean thresholds where asked.
-- Frames are linear in z, with the camera's noise, and an unknown offset of each pixel where its pattern is
-  unknown.
+- What is observed is a time: the level's density times |dD/dt|, without which contrasts come out too low.
+- The error of a crossing is estimated, from events of a pixel and polarity; too large, contrasts are too high.
+- An event is a signal or noise: that density, by what the pixel's other events say of its threshold, or the
+  rate of noise events times the probability that the threshold was not met yet.
+- A silence bounds L from both sides, where L is furthest up and down in each gap, by what crossings leave open
+  of the threshold. The side of the event that ends the gap counts as far as that event is noise.
+- The leak is known to a few per cent and is estimated along; so are both mean thresholds where asked.
+- Frames are linear in z, with the camera's noise, and an unknown offset of each pixel of an unknown pattern.
 
 Gauss-Newton on it, the error of a crossing annealed from 0.25; the curvature is the estimate's information.
 """
@@ -157,8 +153,8 @@ def estimate_sequence(
     first = settings.first_noise if start is None else min(settings.first_noise, _NEAR_NOISE)
     trust = np.ones(len(record))
     total, noise = NormalEquations.empty(len(unknown)), first
-    # The last three iterations have the final error.
-    shares = np.minimum(np.arange(settings.iterations) / max(settings.iterations - 3, 1), 1.0)
+    steps = max(settings.iterations - 3, 1)  # the last three have the final error
+    shares = np.minimum(np.arange(settings.iterations) / steps, 1.0)
     for share in shares:
         least = first ** (1 - share) * settings.least_noise**share
         total = NormalEquations.empty(len(unknown))
@@ -326,16 +322,23 @@ class _State:
     def update_trust(self, trust: Array) -> None:
         """Bring the probability of a signal up to date: its density in time against the noise events' rate."""
         measured = np.flatnonzero(self.record.measured)
-        if not len(measured):
-            return
-        offset, variance = (column[self.group[measured]] for column in self.offsets(trust))
-        spread = self.variance[measured] + variance
-        away = self.residual[measured] + offset
+        # by the group's other events: with its own say each would confirm itself
+        of, residual, own = self.group[measured], self.residual[measured], self.variance[measured]
+        weight, mismatch = trust[measured] / own, self.law.threshold_sigma**2
+        known, seen = (
+            np.bincount(of, column, 2 * len(self.light.left))[of] for column in (weight, weight * residual)
+        )
+        variance = mismatch / (1.0 + mismatch * np.maximum(known - weight, 0.0))
+        spread = own + variance
+        away = residual - variance * (seen - weight * residual)
         signal = np.exp(-0.5 * away**2 / spread) / np.sqrt(2 * math.pi * spread)
         signal *= _upward(self.record.sign[measured] * self.rate[measured], self.blur)[0]
         duration = self.light.times_s[-1] - self.light.times_s[0]
         least = _FEWEST_NOISE * len(measured) / (duration * len(self.light.left))
-        trust[measured] = signal / (signal + 0.5 * max(self.law.events_hz, least))
+        # a noise event meets a pixel that has not crossed its threshold yet
+        room = torch.from_numpy(self.record.sign[measured] * away / np.sqrt(spread))
+        noise = 0.5 * max(self.law.events_hz, least) * torch.special.ndtr(room).numpy()
+        trust[measured] = signal / (signal + np.maximum(noise, 1e-300))
 
     def steepness(self, trust: Array) -> Rows:
         """Return the rows of log |dD/dt|, the density of an event in time over that in its level, [N] each."""
@@ -354,11 +357,10 @@ class _State:
         of an observation of y: at m + g / h, with the precision h / (1 - h v).
         """
         record = self.record
-        quiet = np.flatnonzero((record.sign == 0) & (record.origin >= 0))
-        ends = np.zeros(len(record), np.int8)
-        crossed = np.flatnonzero(record.measured)
-        ends[record.origin[crossed]] = record.sign[crossed]
-        free = quiet[ends[record.origin[quiet]] != sign]
+        unmet = np.ones(len(record))  # what ends a gap may be the crossing itself
+        crossed = np.flatnonzero(record.measured & (record.sign == sign))
+        unmet[record.origin[crossed]] = 1.0 - trust[crossed]
+        free = np.flatnonzero((record.origin >= 0) & ((record.sign == 0) | (record.sign == sign)))
         order = free[np.lexsort((-sign * self.change[free], record.origin[free]))]
         at = order[np.diff(record.origin[order], prepend=-1) != 0]
         offset, variance = (column[2 * record.pixel[at] + (sign > 0)] for column in self.offsets(trust))
@@ -368,10 +370,10 @@ class _State:
         scaled = torch.from_numpy(room / width)
         ratio = torch.exp(-0.5 * scaled**2 - torch.special.log_ndtr(scaled)).numpy() / math.sqrt(2 * math.pi)
         bend = np.clip(ratio * (ratio + scaled.numpy()), 0.0, 1.0)
-        near = bend > _ACTIVE
+        near = unmet[record.origin[at]] * bend > _ACTIVE
         at, room, width, variance, ratio, bend = (c[near] for c in (at, room, width, variance, ratio, bend))
         curve = bend / width**2
-        precision = curve / np.maximum(1.0 - curve * variance, 1e-6)
+        precision = unmet[record.origin[at]] * curve / np.maximum(1.0 - curve * variance, 1e-6)
         seen = room + ratio / width / curve  # y as if it were observed
         residual = sign * (theta - seen) - self.change[at]
         return Rows(at, np.full(len(at), sign, np.int8), precision, residual)
