@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from evnlos.cameras.event_model import MIN_THRESHOLD, EventModel
 from evnlos.cameras.pixel import EventPixel, V2ePixel
-from evnlos.cameras.pixels import continuous, v2e
+from evnlos.cameras.pixels import continuous, continuous_math, v2e
 from evnlos.cameras.pixels.continuous import DIM_MAX
 from evnlos.cameras.pixels.continuous_math import log_row
 from evnlos.cameras.random_numbers import (
@@ -159,7 +159,7 @@ class ExactArray(EventModel):
             hot = uniform_field(pattern_key(pixel, seed), STREAM_HOT, count) < pixel.hot_pixel_fraction
             rate_hot[hot] = pixel.hot_pixel_rate_hz
         rates = half * pixel.threshold_on / on, half * pixel.threshold_off / off, rate_hot
-        self._pixels = continuous.Pixels(on, off, leak, *rates)
+        self._pixels = continuous_math.Pixels(on, off, leak, *rates)
         self._curve = pixel.curve()
         white = 255.0 + pixel.cutoff_floor_dn
         self._rate = 2.0 * math.pi * pixel.cutoff_hz / white / self._curve.stretch
@@ -182,9 +182,11 @@ class ExactArray(EventModel):
             gap = exponential_field(self.seed, STREAM_SHOT_GAP, count)
             candidate = time_s + np.divide(gap, rate, out=np.full(count, np.inf), where=rate > 0)
         drawn = np.zeros(count, np.uint32)
-        self._state = continuous.State(light, filtered, base, self._last_event, candidate, drawn, self._sent)
+        self._state = continuous_math.State(
+            light, filtered, base, self._last_event, candidate, drawn, self._sent
+        )
         pixel = self.pixel
-        self._law = continuous.Law(
+        self._law = continuous_math.Law(
             self._rate, self._curve, pixel.refractory_s, pixel.jitter_s, (time_s, math.inf), self.seed
         )
         self._time = time_s

@@ -7,11 +7,9 @@ sent something; only these are solved piece by piece for the instants of their e
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from evnlos.cameras.pixels.continuous_math import (
     KNEE,
@@ -20,7 +18,8 @@ from evnlos.cameras.pixels.continuous_math import (
     LOG_LINEAR,
     LOW_PASS,
     PIECE,
-    Curve,
+    Line,
+    Pixel,
     apply_leak,
     copy_light,
     crossing_time,
@@ -49,60 +48,6 @@ from evnlos.cameras.streams import grown
 
 DIM_MAX = 1.0 - 0.75 * 20.0 / 275.0
 """The factor 1 - 0.75 (I + 20) / 275 of the shot noise at black, its largest value."""
-
-
-class State(NamedTuple):
-    """What changes: one value per pixel, [N]."""
-
-    light: NDArray[np.float64]  # I on the scale of `Curve`
-    filtered: NDArray[np.float64]  # y, log units
-    base: NDArray[np.float64]  # b, log units: what the next event is counted from
-    last_event: NDArray[np.float64]  # seconds; -inf = none yet
-    candidate: NDArray[np.float64]  # next candidate of shot noise, seconds; empty without noise
-    drawn: NDArray[np.uint32]  # candidates so far
-    sent: NDArray[np.uint32]  # events so far
-
-
-class Pixels(NamedTuple):
-    """What stays: one value per pixel, [N]."""
-
-    on: NDArray[np.float64]  # theta_on, log units
-    off: NDArray[np.float64]  # theta_off, log units
-    leak: NDArray[np.float64]  # lambda, log units per second
-    rate_on: NDArray[np.float64]  # shot noise at black, ON, hertz
-    rate_off: NDArray[np.float64]  # shot noise at black, OFF, hertz
-    rate_hot: NDArray[np.float64]  # of a hot pixel, both polarities, hertz
-
-
-class Pixel(NamedTuple):
-    """One pixel's `Pixels`."""
-
-    on: float
-    off: float
-    leak: float
-    rate_on: float
-    rate_off: float
-    rate_hot: float
-
-
-class Law(NamedTuple):
-    """What holds for all pixels."""
-
-    rate: float  # g, speed of the filter per unit of light, hertz; 0 = no filter
-    curve: Curve
-    refractory: float  # seconds
-    jitter: float  # standard deviation of time stamps, seconds
-    window: tuple[float, float]  # in which jittered time stamps stay, seconds
-    seed: np.uint64
-
-
-class Line(NamedTuple):
-    """Light that is linear in time: at a piece's start and end, and its logarithms."""
-
-    light_a: float
-    light_b: float
-    log_a: float
-    log_b: float
 
 
 # What sends events owns no array. Without `_nrt=False` numba would count references to those that it is handed,

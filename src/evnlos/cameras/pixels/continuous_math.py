@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE
 from evnlos.cameras.random_numbers import fast_exp, fast_log
@@ -48,6 +49,60 @@ class Curve(NamedTuple):
     """J per DN at the pixel."""
     dark: float
     """Light in darkness, DN at the pixel."""
+
+
+class State(NamedTuple):
+    """What changes: one value per pixel, [N]."""
+
+    light: NDArray[np.float64]  # I on the scale of `Curve`
+    filtered: NDArray[np.float64]  # y, log units
+    base: NDArray[np.float64]  # b, log units: what the next event is counted from
+    last_event: NDArray[np.float64]  # seconds; -inf = none yet
+    candidate: NDArray[np.float64]  # next candidate of shot noise, seconds; empty without noise
+    drawn: NDArray[np.uint32]  # candidates so far
+    sent: NDArray[np.uint32]  # events so far
+
+
+class Pixels(NamedTuple):
+    """What stays: one value per pixel, [N]."""
+
+    on: NDArray[np.float64]  # theta_on, log units
+    off: NDArray[np.float64]  # theta_off, log units
+    leak: NDArray[np.float64]  # lambda, log units per second
+    rate_on: NDArray[np.float64]  # shot noise at black, ON, hertz
+    rate_off: NDArray[np.float64]  # shot noise at black, OFF, hertz
+    rate_hot: NDArray[np.float64]  # of a hot pixel, both polarities, hertz
+
+
+class Pixel(NamedTuple):
+    """One pixel's `Pixels`."""
+
+    on: float
+    off: float
+    leak: float
+    rate_on: float
+    rate_off: float
+    rate_hot: float
+
+
+class Law(NamedTuple):
+    """What holds for all pixels."""
+
+    rate: float  # g, speed of the filter per unit of light, hertz; 0 = no filter
+    curve: Curve
+    refractory: float  # seconds
+    jitter: float  # standard deviation of time stamps, seconds
+    window: tuple[float, float]  # in which jittered time stamps stay, seconds
+    seed: np.uint64
+
+
+class Line(NamedTuple):
+    """Light that is linear in time: at a piece's start and end, and its logarithms."""
+
+    light_a: float
+    light_b: float
+    log_a: float
+    log_b: float
 
 
 KNEE = KNEE_DN
