@@ -456,8 +456,9 @@ def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targe
         )
 
     assert warnings_of(leaving(0.105, "known")) == []
-    (line,) = warnings_of(leaving(0.13, "known"))
+    line, training = warnings_of(leaving(0.13, "known"))
     assert "13.0 % is left where noise alone leaves 10.0 %" in line and "evnlos scan" in line
+    assert training == "training.yaml draws sensors and walls from wide ranges around this fit"
     assert warnings_of(leaving(0.15, "unknown")) == []  # targets that are only expected leave that much
     wrong = leaving(0.412, "unknown")
     rows = rows_of(wrong, EventPixel(), FrameCamera())
@@ -467,6 +468,9 @@ def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targe
     assert "41.2 %" in json.loads((tmp_path / "refused" / "calibration.json").read_text())["warnings"][0]
     assert write_setup(wrong, rows, tmp_path / "forced", force=True).exists()
     assert write_setup(leaving(0.412, "known"), rows, tmp_path / "known").exists()
+    drawn = load_yaml(Simulation, tmp_path / "known" / "training.yaml").vary["setup.pixel.threshold_on"]
+    narrow = fit.training.vary["setup.pixel.threshold_on"]
+    assert drawn[1] - drawn[0] > 2 * (narrow[1] - narrow[0])  # no wall fits: sensors and walls are randomized
 
 
 def test_the_gain_of_unknown_targets_is_called_arbitrary(fit) -> None:

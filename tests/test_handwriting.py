@@ -201,5 +201,5 @@ def test_redrawn_targets_are_objects_of_the_set(tmp_path) -> None:
     other = tmp_path / "other"
     other.mkdir()
     for folder in (tmp_path / "none", other):
-        with pytest.raises(ConfigError, match="holds no pictures"):
+        with pytest.raises(ConfigError, match="holds no images"):
             HandwritingGlyphs(known=str(folder), redrawn=1).objects()

@@ -203,8 +203,8 @@ def event_trace(
     Example:
         >>> events = Events([500, 900], [0, 0], [0, 0], [True, True], width=2, height=1)
         >>> on, off = event_trace(events, [0, 1000], tau_us=1e4)[0]
-        >>> (on - off).round(2).tolist()
-        [[1.07, 0.0]]
+        >>> [round(float(mean), 2) for mean in (on - off)[0]]
+        [0.43, 0.0]
     """
     edges = as_edges(edges_us)
     law = law or TraceLaw()
