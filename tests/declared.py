@@ -48,7 +48,7 @@ weights run
 evaluate --weights tuned --data made --split validation --json
 report tuned --data made --split validation --out page
 cite tuned
-capture init begun
+capture init begun --camera davis346
 capture check captures/lab_icon_000
 import captures/lab_icon_000 captures/lab_icon_001 --out recorded --test lab_icon_001 {{sampling}}
 reconstruct captures/lab_icon_000 --weights fused --out pictures
