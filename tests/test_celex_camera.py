@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evnlos.cameras import CelexCamera, EventPixel, ReadoutPixel
+from evnlos.cameras import CelexCamera, CelexPixel, EventPixel, ReadoutPixel, simulate_events
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import read_events, read_frames, write_celex_frames, write_events
 
@@ -115,7 +115,44 @@ def test_recordings_go_through_the_cameras_own_files(tmp_path) -> None:
         assert np.array_equal(read_frames(path, bits=bits), frames)
 
 
+def test_the_level_is_that_of_the_low_pass_filter() -> None:
+    """Against steps of 2 us, in light whose bandwidth changes: the frames' own steps are 5 ms."""
+    pixel = replace(PIXEL, cutoff_hz=60.0, cutoff_floor_dn=5.0)
+    times = np.linspace(0.0, 0.1, 21)
+    light = 30.0 + 25.0 * np.sin(2 * np.pi * 8 * times)
+    fine = np.linspace(0.0, 0.1, 50_001)
+    log = np.interp(fine, times, np.log(light + 0.01))  # a line between the frames, as documented
+    speed = 2 * np.pi * 60 * (np.interp(fine, times, light) + 5) / 260 * np.diff(fine, prepend=0)
+    level = log.copy()
+    for k in range(1, len(fine)):
+        level[k] = level[k - 1] + (log[k] - level[k - 1]) * -np.expm1(-speed[k])
+    at = np.array([0.0123, 0.031, 0.0475, 0.1])
+    frames = replace(CLEAN, pixel=pixel, codes_per_efold=1000.0).capture(
+        light[:, None, None], times, at, bits=12
+    )
+    expected = 2048 + 1000 * (np.interp(at, fine, level) - math.log(60))
+    assert np.abs(log - level).max() > 0.1
+    np.testing.assert_allclose(frames.ravel(), expected, atol=6)
+
+
+def test_the_event_model_sends_what_the_software_reports() -> None:
+    """`CelexPixel` streams the events of `record` that have a polarity."""
+    times = np.linspace(0.0, 0.5, 51)
+    light = 60.0 * np.exp(np.sin(12 * times))[:, None, None] * np.ones((1, 6, 5))
+    camera = CelexCamera(PIXEL, codes_per_efold=100.0, noise_codes=8.0)
+    full, polarity = camera.record(light, times, seed=3)
+    told = full[full.polarity_known]
+    events = simulate_events(light, times, CelexPixel(camera), seed=3)
+    assert np.array_equal(events.t_us, told.t_us) and np.array_equal(events.x, told.x)
+    assert np.array_equal(events.p, told.p)
+    assert len(told) < len(full) and 0.02 < (full.p != polarity).mean() < 0.5
+
+
 def test_wrong_cameras_are_refused() -> None:
+    with pytest.raises(ConfigError, match="jitter"):
+        CelexPixel(CelexCamera(ReadoutPixel(PIXEL, jitter_s=1e-4)))
+    with pytest.raises(DataError, match="two"):
+        CLEAN.record(FLAT[:1], [0.0])
     with pytest.raises(ConfigError, match="true"):
         CelexCamera(EventPixel())
     with pytest.raises(ConfigError, match="noise_codes"):

@@ -1,4 +1,4 @@
-"""Which event model a sensor follows: chosen on recordings that the fit has not seen."""
+"""Laws of all event models, and which of them a sensor follows: chosen on recordings that no fit has seen."""
 
 import math
 from dataclasses import replace
@@ -9,10 +9,62 @@ import pytest
 from evnlos.calibration.event_fit import CONTINUOUS, choose_pixel, fit_pixel
 from evnlos.calibration.event_models import figures_of, is_better, misfit
 from evnlos.calibration.event_statistics import Recording, thinned
-from evnlos.cameras import BrownianPixel, EventPixel, simulate_events
+from evnlos.cameras import (
+    EVENT_MODELS,
+    BrownianPixel,
+    EventPixel,
+    EventStream,
+    ReadoutPixel,
+    V2ePixel,
+    simulate_events,
+)
 from evnlos.types import Events
 
 SHAPE = (60, 48)
+
+REGISTERED = sorted(kind for kind in EVENT_MODELS if EVENT_MODELS[kind].__module__.startswith("evnlos."))
+
+
+def events_of(kind, light, times, blocks=(), **options):
+    """Return the events of a model's pixels as they come, of light that comes in blocks."""
+    model = EVENT_MODELS[kind]
+    pixel = model(event_s=2e-6) if model is ReadoutPixel else model()
+    if model is V2ePixel:
+        pixel = replace(pixel, shot_noise_rate_hz=2.0)
+    stream = EventStream(pixel, (light.shape[1], light.shape[2]), **options)
+    for frames, instants in zip(np.split(light, blocks), np.split(times, blocks), strict=True):
+        stream.push(frames, instants)
+    return stream.finish()
+
+
+def columns(events):
+    return np.stack([events.t_us, events.x, events.y, events.p])
+
+
+@pytest.mark.parametrize("kind", REGISTERED)
+def test_events_are_a_function_of_light_and_seed_alone(kind) -> None:
+    """The same for any blocks, tiles and threads; others for another seed; in order, within the recording."""
+    times = np.linspace(0.0, 0.4, 81)
+    phase = np.arange(35).reshape(5, 7) / 35 + 5 * times[:, None, None]
+    light = (60 + 50 * np.sin(2 * np.pi * phase)).astype(np.float32)
+    whole = events_of(kind, light, times, seed=1)
+    assert len(whole) > 300 and 0.2 < whole.p.mean() < 0.8
+    assert whole.t_us.min() >= 0 and whole.t_us.max() <= 400_000 and (np.diff(whole.t_us) >= 0).all()
+    for options in ({"blocks": range(1, 81)}, {"blocks": (30, 31, 70)}, {"tile_px": 6}, {"threads": 2}):
+        np.testing.assert_array_equal(columns(events_of(kind, light, times, seed=1, **options)), columns(whole))
+    other = events_of(kind, light, times, seed=2)
+    assert columns(other).shape != columns(whole).shape or (columns(other) != columns(whole)).any()
+
+
+@pytest.mark.parametrize("kind", REGISTERED)
+def test_thresholds_that_are_given_are_those_of_the_pixels(kind) -> None:
+    """Light that rises by 1.2 log units: four events at 0.27, at most one at 1.5."""
+    times = np.linspace(0.0, 0.5, 101)
+    light = np.repeat(60.0 * np.exp(2.4 * times)[:, None, None], 32, axis=1).repeat(2, axis=2)
+    on = np.broadcast_to([0.27, 1.5], (32, 2))
+    events = events_of(kind, light, times, seed=1, thresholds=(on, np.full((32, 2), 1.5)))
+    assert 3.4 < np.median(np.bincount(events.y[events.x == 0], minlength=32)) < 4.6
+    assert np.bincount(events.y[events.x == 1], minlength=32).max() <= 1
 
 
 def recording(pixel, seed: int) -> Recording:

@@ -128,6 +128,41 @@ def test_every_named_room_shows_its_target_and_survives_a_file(name):
     assert float(light.max()) < 1.0
 
 
+def test_every_wall_and_every_sensor_is_in_some_room():
+    """What real rigs have, one by one, and each event model; two rooms have both outside the simulator's."""
+    rooms = dict(ROOMS)
+    lobes = {name: one.reflection.lobes for name, one in rooms.items()}
+    texture = {name: np.hypot(one.texture_smooth, one.texture_fine) for name, one in rooms.items()}
+    walls = {
+        "two lobes": {name for name in rooms if len(lobes[name]) == 2},
+        "anisotropic": {name for name in rooms if any(one.width_x != one.width_y for one in lobes[name])},
+        "texture of 5 to 10 %": {name for name in rooms if 0.05 <= texture[name] <= 0.1},
+        "curvature of a metre": {name for name, one in rooms.items() if max(map(abs, one.curvature)) >= 0.8},
+        "vignetting": {name for name, one in rooms.items() if one.vignetting},
+        "distortion": {name for name, one in rooms.items() if any(one.distortion)},
+        "defocus": {name for name, one in rooms.items() if one.aperture_m},
+        "mount": {name for name, one in rooms.items() if one.mount.brightness},
+        "ripple": {name for name, one in rooms.items() if one.ripple},
+        "torch": {name for name, one in rooms.items() if one.lamp and one.lamp.body_m and one.lamp.holder_m},
+    }
+    assert [what for what, having in walls.items() if not having] == []
+    kinds = {name: getattr(one.pixel, "kind", "") for name, one in rooms.items()}
+    true_log = {name for name, one in rooms.items() if getattr(one.pixel, "logarithm", "") == "true"}
+    assert true_log and set(kinds.values()) == {"continuous", "v2e", "brownian", "circuit", "readout", "celex"}
+    plain = {name for name in rooms if not any(name in having for having in walls.values())}
+    assert len(set(rooms) - plain - {n for n in rooms if kinds[n] == "continuous"}) >= 2
+
+
+@pytest.mark.parametrize("name", sorted(ROOMS))
+def test_the_sensor_of_every_room_records_its_target(name):
+    setup = load_setup(name)
+    small = dataclasses.replace(setup.resized((10, 16)), cell_m=0.01, key_frame_s=0.5)
+    passing = Scene(scene().target, LineMotion(), 2.0)
+    events = small.event_camera.record(small.observe(passing), 0.0, 2.0, seed=1)
+    assert (events.width, events.height) == (16, 10)
+    assert len(events) > 50 and 0 < events.p.mean() < 1
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

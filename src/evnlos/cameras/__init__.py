@@ -7,13 +7,14 @@ from evnlos.cameras.pixel import EventPixel, V2ePixel
 from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.circuit import CircuitPixel
 from evnlos.cameras.pixels.readout import FlickeringWall, ReadoutPixel
-from evnlos.cameras.sensors import CelexCamera, load_pixel, pixel_preset
+from evnlos.cameras.sensors import CelexCamera, CelexPixel, load_pixel, pixel_preset
 from evnlos.cameras.simulation import EventStream, simulate_batch, simulate_events
 
 __all__ = [
     "EVENT_MODELS",
     "BrownianPixel",
     "CelexCamera",
+    "CelexPixel",
     "CircuitPixel",
     "CrossingLaw",
     "EventCamera",

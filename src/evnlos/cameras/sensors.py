@@ -1,6 +1,4 @@
-"""Sensors that exist: named settings of pixels, and CeleX-V, the paper's camera.
-
-Event pixels of known settings and sensors, with the source of every number that has one.
+"""Sensors that exist: settings of pixels with the source of every number, and CeleX-V, the paper's camera.
 
 A data sheet quotes a contrast c as a fraction of the light. An ON threshold is ln(1 + c). An OFF threshold is
 -ln(1 - c) where c is a fraction of the light before, and ln(1 + c) where it is one of the darker light, as the
@@ -26,19 +24,19 @@ import difflib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_model import PixelSettings, require
+from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, LogCurve, PixelSettings, require
 from evnlos.cameras.pixel import EventPixel, continuous
 from evnlos.cameras.pixels.brownian import BrownianPixel
-from evnlos.cameras.pixels.readout import ReadoutPixel
+from evnlos.cameras.pixels.readout import LogLevel, ReadoutPixel, ValuesArray
 from evnlos.cameras.random_numbers import check_seed
-from evnlos.cameras.simulation import simulate_events
-from evnlos.cameras.streams import check_light, check_times
+from evnlos.cameras.streams import Frames, check_light, check_times
 from evnlos.config import load_yaml
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events
@@ -265,16 +263,16 @@ class CelexCamera:
         """
         light = check_light(frames)
         times = check_times(times_s, len(light))
-        plain = simulate_events(light, times, self.pixel, seed=seed)
+        if len(times) < 2:
+            raise DataError(f"frames has {len(times)} instants; a recording needs at least two")
         height, width = light.shape[1:]
-        place = plain.y.astype(np.int64) * width + plain.x
-        level = _at(self._levels(light, times), times, plain.t_us * 1e-6, place)
-        values = self._values(level, place, (height, width), np.random.default_rng([check_seed(seed), 1]))
-        sign = _signs(values, place, height * width)
-        events = Events(
-            plain.t_us, plain.x, plain.y, sign > 0, width, height, adc=values, polarity_known=sign != 0
-        )
-        return CelexRecording(events, plain.p)
+        rows = np.ascontiguousarray(light).reshape(len(light), height * width)
+        array = self.model(self.pixel.model((height, width), check_seed(seed)), (height, width), seed)
+        array.start(rows[0], float(times[0]))
+        (t_us, place, polarity), values, sign = array.read(Frames(rows[1:]), times[1:])
+        y, x = np.divmod(place, width)
+        events = Events(t_us, x, y, sign > 0, width, height, adc=values, polarity_known=sign != 0)
+        return CelexRecording(events, polarity)
 
     def capture(
         self, frames: ArrayLike, times_s: ArrayLike, instants_s: ArrayLike, bits: int = 8, seed: int = 0
@@ -301,14 +299,18 @@ class CelexCamera:
         instants = np.atleast_1d(np.asarray(instants_s, np.float64))
         if not (instants >= times[0]).all() or not (instants <= times[-1]).all():
             raise DataError(f"instants_s leave the light's {times[0]:g} to {times[-1]:g} s; give times within")
-        levels, shape = self._levels(light, times), light.shape[1:]
+        shape = light.shape[1:]
+        rows = light.reshape(len(light), -1)
         draw = np.random.default_rng([check_seed(seed), 2])
-        place = np.arange(shape[0] * shape[1])
-        values = [
-            self._values(_at(levels, times, np.full(len(place), t), place), place, shape, draw)
-            for t in instants
-        ]
-        whole = np.array(values, np.uint16).reshape(len(instants), *shape)
+        values = np.empty((len(instants), rows.shape[1]), np.uint16)
+        level, pattern = LogLevel(self._photoreceptor, rows[0]), self.pattern((shape[0], shape[1]))
+        steps, next_frame = np.diff(times, prepend=times[0] - 1.0), np.searchsorted(times, instants, "left")
+        for k, row in enumerate(rows):
+            level.step(row, steps[k])
+            for n in np.flatnonzero(next_frame == k):
+                now = level.at(1.0 - (times[k] - instants[n]) / steps[k])
+                values[n] = self._values(now, slice(None), draw.standard_normal(len(row)), pattern)
+        whole = values.reshape(len(instants), *shape)
         return whole if bits == 12 else (whole >> 4).astype(np.uint8)
 
     def pattern(self, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -324,47 +326,75 @@ class CelexCamera:
         offset += self.column_codes * draw.standard_normal((1, shape[1]))
         return gain, offset
 
-    def _levels(self, light: NDArray, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the filtered log light at the frames, [T, H * W]; the log light is a line in between."""
-        pixel = self._photoreceptor
-        seen = pixel.exposure * light.reshape(len(light), -1).astype(np.float64)
-        logs = np.log(seen + pixel.dark_dn)
-        if pixel.cutoff_hz == 0:
-            return logs
-        speed = 2.0 * math.pi * pixel.cutoff_hz / (255.0 + pixel.cutoff_floor_dn)
-        levels = logs.copy()
-        for k in range(1, len(logs)):
-            x = speed * (0.5 * (seen[k] + seen[k - 1]) + pixel.cutoff_floor_dn) * (times[k] - times[k - 1])
-            passed = -np.expm1(-x)
-            change = logs[k] - logs[k - 1]
-            share = np.divide(passed, x, out=np.ones_like(x), where=x > 0)
-            levels[k] = logs[k] - change * share + (levels[k - 1] - logs[k - 1]) * (1.0 - passed)
-        return levels
+    def model(self, array: EventModel, shape: tuple[int, int], seed: int) -> ValuesArray:
+        """Return an array of the camera's event pixels with the software behind it.
+
+        Args:
+            array: The event pixels.
+            shape: Sensor size (height, width), pixels.
+            seed: Seed of the values' noise.
+        """
+        return ValuesArray(array, self._photoreceptor, partial(self._values, pattern=self.pattern(shape)), seed)
 
     def _values(
-        self, level: NDArray, place: NDArray, shape: tuple[int, ...], draw: np.random.Generator
+        self, level: NDArray, place: NDArray | slice, noise: NDArray, pattern: tuple[NDArray, NDArray]
     ) -> NDArray[np.uint16]:
-        """Return the values of pixels `place` [N] at log levels [N]."""
-        gain, offset = (part.ravel()[place] for part in self.pattern((shape[0], shape[1])))
+        """Return the values of pixels `place` at log levels [N], with normal random numbers [N]."""
+        gain, offset = (part.ravel()[place] for part in pattern)
         value = self.mid_code + self.codes_per_efold * gain * (level - math.log(self.mid_dn)) + offset
-        value += self.noise_codes * draw.standard_normal(len(place))
-        return np.clip(np.rint(value), 0, WHITE).astype(np.uint16)
+        return np.clip(np.rint(value + self.noise_codes * noise), 0, WHITE).astype(np.uint16)
 
 
-def _at(levels: NDArray, times: NDArray, instants: NDArray, place: NDArray) -> NDArray[np.float64]:
-    """Return the levels of pixels `place` [N] at `instants` [N], on lines between the frames."""
-    after = np.clip(np.searchsorted(times, instants, "left"), 1, len(times) - 1)
-    share = np.clip((instants - times[after - 1]) / (times[after] - times[after - 1]), 0.0, 1.0)
-    before, behind = levels[after - 1, place], levels[after, place]
-    return before + share * (behind - before)
+@EVENT_MODELS.register
+@dataclass(frozen=True)
+class CelexPixel(PixelSettings):
+    """The event pixels of a `CelexCamera`, with the polarity that its software derives from their values.
 
+    Events whose value is their pixel's last one have no polarity and are left out.
 
-def _signs(values: NDArray[np.uint16], place: NDArray, count: int) -> NDArray[np.int8]:
-    """Return the sign of each value less its pixel's last one, 0 at first, in the order of the events."""
-    order = np.argsort(place, kind="stable")
-    ordered, pixel = values[order].astype(np.int64), place[order]
-    before = np.concatenate([[0], ordered[:-1]])
-    before[np.flatnonzero(np.diff(pixel, prepend=-1))] = 0
-    signs = np.empty(len(values), np.int8)
-    signs[order] = np.sign(ordered - before)
-    return signs
+    Args:
+        camera: The camera; its pixels have no jitter and no ticks.
+
+    Raises:
+        ConfigError: They have.
+
+    Example:
+        >>> CelexPixel().camera.codes_per_efold
+        600.0
+    """
+
+    camera: CelexCamera = field(default_factory=CelexCamera)
+    """The camera whose software gives the events their polarity."""
+    kind: Literal["celex"] = "celex"
+    """The event model."""
+
+    def __post_init__(self) -> None:
+        if self.camera.pixel.disorder_s > 0 or getattr(self.camera.pixel, "tick_s", 0.0) > 0:
+            raise ConfigError("CelexPixel.camera.pixel has jitter or ticks; set jitter_s and tick_s to 0")
+
+    def model(
+        self,
+        shape: tuple[int, int],
+        seed: int = 0,
+        thresholds: object = None,
+        *,
+        tile_px: int | None = None,
+        threads: int | None = None,
+    ) -> EventModel:
+        """Return an array of such pixels; arguments as in `PixelSettings.model`."""
+        array = self.camera.pixel.model(shape, seed, thresholds, tile_px=tile_px, threads=threads)
+        return self.camera.model(array, shape, seed)
+
+    @property
+    def finest_threshold(self) -> float:
+        """That of the camera's pixels, log units."""
+        return self.camera.pixel.finest_threshold
+
+    @property
+    def log_curve(self) -> LogCurve:
+        """That of the camera's pixels."""
+        return self.camera.pixel.log_curve
+
+    def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw | None:
+        """Return that of the camera's pixels; of wrong polarities it knows nothing."""
+        return self.camera.pixel.crossing_law(light_dn)

@@ -24,7 +24,8 @@ from evnlos.data.store import PAGE, Dataset, claim_dataset, is_page_changed, rea
 from evnlos.errors import ConfigError, DataError
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs, LineMotion
-from evnlos.setups.load import as_in_the_paper, page_setup, rough_paper
+from evnlos.setups.load import page_setup
+from evnlos.setups.paper import as_in_the_paper, rough_paper
 
 
 def default() -> Simulation:

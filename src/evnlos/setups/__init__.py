@@ -1,13 +1,11 @@
 """Setups: wall, geometry, ambient light and cameras in one object, from names, files and measurements."""
 
 from evnlos.setups.base import Layout, OperatorNoise, Parameter, SensorSize, Setup, stated_distance_m
+from evnlos.setups.files import CALIBRATED_FILE, calibrated_file, calibrated_folder
 from evnlos.setups.fitted import FittedSetup
 from evnlos.setups.load import (
-    CALIBRATED_FILE,
     ROOMS,
     NamedSetup,
-    calibrated_file,
-    calibrated_folder,
     load_setup,
     named_setup,
     setup_names,

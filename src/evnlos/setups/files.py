@@ -1,4 +1,4 @@
-"""Setups on disk: a measured matrix, and a fitted wall.
+"""Setups on disk: a measured matrix, a fitted wall, and the folder of a calibration.
 
 - A measured light-transport matrix on disk: safetensors with its geometry in the metadata.
 - A fitted wall on disk: its facets' slopes, maps of the image, light that moves along.
@@ -241,3 +241,35 @@ def write_fitted(path: str | Path, wall: FittedWall) -> str:
     """
     arrays = {name: torch.tensor(getattr(wall, name)) for name in _ARRAYS}
     return WALL.write(path, arrays, wall.about)
+
+
+CALIBRATED_FILE = "setup.yaml"
+"""The simulation that `evnlos calibrate` fits, in its folder."""
+OLDER_FILE = "rig.yaml"  # its name in folders of before
+
+
+def calibrated_file(path: Path) -> Path:
+    """Return the settings file of a folder that `calibrate` wrote; any other path stays as it is.
+
+    Example:
+        >>> str(calibrated_file(Path("setup.yaml")))
+        'setup.yaml'
+    """
+    files = (path / name for name in (CALIBRATED_FILE, OLDER_FILE))
+    return next((file for file in files if file.is_file()), path)
+
+
+def calibrated_folder(word: str | Path) -> Path:
+    """Return the folder that `calibrate` wrote, named by itself or by the settings file in it.
+
+    Raises:
+        ConfigError: The word names no such folder.
+    """
+    path = Path(word)
+    folder = path.parent if path.name in (CALIBRATED_FILE, OLDER_FILE) else path
+    if calibrated_file(folder) == folder:
+        raise ConfigError(
+            f"--setup is {word}, which holds no {CALIBRATED_FILE}; give the folder that `calibrate` wrote for "
+            "this very setup (a name such as main-near knows neither its light nor its cameras), or none"
+        )
+    return folder

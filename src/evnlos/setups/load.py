@@ -14,23 +14,40 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from evnlos.cameras import BrownianPixel, EventPixel, FrameCamera
+from evnlos.cameras import (
+    BrownianPixel,
+    CelexCamera,
+    CelexPixel,
+    CircuitPixel,
+    EventPixel,
+    FrameCamera,
+    ReadoutPixel,
+    V2ePixel,
+)
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError
 from evnlos.lab import Lobe, Mount, Reflection, Torch
 from evnlos.registry import migrate
 from evnlos.setups.base import CAMERA_FIELDS, SensorSize, Setup
+from evnlos.setups.files import CALIBRATED_FILE, OLDER_FILE, calibrated_file
 from evnlos.setups.measured import MeasuredSetup
-from evnlos.setups.paper import PaperSetup
+from evnlos.setups.paper import as_in_the_paper, rough_paper
 from evnlos.setups.radiometric import RadiometricSetup
 from evnlos.setups.room import RoomSetup
 from evnlos.tensor_file import SUFFIX
 
+_PLACE = ("distance_m", "camera_distance_m", "camera_angle_deg", "field_of_view_deg")
+_TEXTURE = ("texture_smooth", "texture_fine", "texture_seed")
+
+
+def _set(names: tuple[str, ...], *values: float) -> dict[str, Any]:
+    """Return settings by their names."""
+    return dict(zip(names, values, strict=True))
+
+
 TWO_LOBES = RoomSetup(
     reflection=Reflection((Lobe("ggx", 0.6, 0.05, 0.05), Lobe("ggx", 0.4, 0.07, 0.15)), matte=0.02),
-    texture_smooth=0.045,
-    texture_fine=0.04,
-    texture_seed=11,
+    **_set(_TEXTURE, 0.045, 0.04, 11),
     vignetting=0.15,
     aperture_m=0.012,
     focus_m=0.47,
@@ -41,28 +58,19 @@ TWO_LOBES = RoomSetup(
 
 ONE_SIDED = RoomSetup(
     reflection=Reflection((Lobe("ggx", 1.0, 0.05, 0.05),), matte=0.0),
-    distance_m=0.28,
-    camera_distance_m=0.55,
-    camera_angle_deg=33.0,
-    field_of_view_deg=32.0,
     ambient=0.05,
     ambient_gradient=(0.1, 0.1),
     frame_camera=FrameCamera(0.016, 10_000.0, 12.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=12),
     pixel=EventPixel(0.12, 1.4, 0.007, 40.0, 0.15, 0.02, 2e-3, pattern_seed=12, logarithm="true", dark_dn=1.0),
+    **_set(_PLACE, 0.28, 0.55, 33.0, 32.0),
 )
 """Plain aluminium; a sensor of which about 95 % of the events are ON."""
 
 CURVED = RoomSetup(
     reflection=Reflection((Lobe("ggx", 1.0, 0.06, 0.06),), matte=0.05),
-    texture_smooth=0.05,
-    texture_fine=0.05,
-    texture_seed=13,
+    **_set(_TEXTURE, 0.05, 0.05, 13),
     curvature=(0.9, 0.5),
     vignetting=0.08,
-    distance_m=0.33,
-    camera_distance_m=0.65,
-    camera_angle_deg=26.0,
-    field_of_view_deg=28.0,
     mount=Mount(0.04),
     ripple=0.04,
     ambient=0.08,
@@ -70,24 +78,20 @@ CURVED = RoomSetup(
     pixel=EventPixel(
         0.18, 0.20, 0.01, 70.0, 0.08, 0.1, 5e-4, 3e-4, pattern_seed=13, logarithm="true", dark_dn=0.4
     ),
+    **_set(_PLACE, 0.33, 0.65, 26.0, 28.0),
 )
 """A wall that bulges (radii of 1.1 and 2 m), with 7 % of texture; the mount shines; lamps ripple at 100 Hz."""
 
 BRUSHED = RoomSetup(
     reflection=Reflection((Lobe("ggx", 1.0, 0.035, 0.11, turn_deg=12.0),), matte=0.03),
-    texture_smooth=0.02,
-    texture_fine=0.05,
-    texture_seed=14,
+    **_set(_TEXTURE, 0.02, 0.05, 14),
     grain=8.0,
     distortion=(-0.05, 0.012),
     camera_roll_deg=1.5,
     camera_elevation_deg=4.0,
-    distance_m=0.35,
-    camera_distance_m=0.55,
-    camera_angle_deg=24.0,
-    field_of_view_deg=35.0,
     frame_camera=FrameCamera(0.010, 12_000.0, 12.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=14),
     pixel=EventPixel(0.22, 0.19, 0.01, 120.0, 0.1, 0.1, 5e-4, pattern_seed=14, logarithm="true", dark_dn=0.5),
+    **_set(_PLACE, 0.35, 0.55, 24.0, 35.0),
 )
 """Brushed metal, not along the camera's axes, seen from above by a turned camera whose lens distorts."""
 
@@ -101,33 +105,104 @@ STREAKS = RoomSetup(
         ),
         matte=0.02,
     ),
-    texture_smooth=0.03,
-    texture_fine=0.04,
-    texture_seed=15,
+    **_set(_TEXTURE, 0.03, 0.04, 15),
     vignetting=0.1,
-    distance_m=0.26,
-    camera_distance_m=0.70,
-    camera_angle_deg=38.0,
-    field_of_view_deg=25.0,
     frame_camera=FrameCamera(0.016, 8000.0, 12.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=15),
     pixel=BrownianPixel(0.20, 0.20, 0.01, 8.0, 0.08, 0.002, 0.04, 0.004, pattern_seed=15),
+    **_set(_PLACE, 0.26, 0.70, 38.0, 25.0),
 )
 """A reflection of two crossed streaks, a ring that is off its middle, and a core: no ellipse."""
 
 TORCH = RoomSetup(
     reflection=Reflection((Lobe("beckmann", 0.7, 0.07, 0.07), Lobe("ggx", 0.3, 0.03, 0.03)), matte=0.06),
-    texture_smooth=0.03,
-    texture_fine=0.03,
-    texture_seed=16,
+    **_set(_TEXTURE, 0.03, 0.03, 16),
     vignetting=0.12,
-    distance_m=0.40,
-    camera_angle_deg=22.0,
     mount=Mount(0.03),
     lamp=Torch((0.06, 0.09, 0.22), 0.012, 0.02, holder_m=(0.02, 0.058, 0.27, 0.009), spill=0.04),
     frame_camera=FrameCamera(0.016, 9000.0, 12.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=16),
     pixel=EventPixel(0.20, 0.24, 0.01, 50.0, 0.15, 0.1, 5e-4, pattern_seed=16, logarithm="true", dark_dn=0.5),
+    **_set(_PLACE, 0.40, 0.6, 22.0, 30.0),
 )
 """A satin wall and a target that a torch lights, whose body and holder cast shadows."""
+
+CIRCUIT = RoomSetup(
+    reflection=Reflection((Lobe("ggx", 1.0, 0.05, 0.05),), matte=0.02),
+    frame_camera=FrameCamera(0.020, 6000.0, 14.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=17),
+    pixel=CircuitPixel(0.19, 0.23, 0.012, 1e-15, follower_a=2.5e-12, leak_rate_hz=0.1, pattern_seed=17),
+    **_set(_PLACE, 0.31, 0.58, 28.0, 31.0),
+)
+"""Plain aluminium in dim light; a circuit whose pixels are slow there, and whose noise comes in pairs."""
+
+STEPPED = RoomSetup(
+    reflection=Reflection((Lobe("ggx", 1.0, 0.055, 0.055),), matte=0.02),
+    frame_camera=FrameCamera(0.014, 10_000.0, 10.0, prnu=0.015, dsnu_e=8.0, black_level=4.0, pattern_seed=18),
+    pixel=V2ePixel(0.20, 0.24, 0.03, 40.0, 0.1, 1.0, 5e-4, pattern_seed=18),
+    time_step_s=0.005,
+    **_set(_PLACE, 0.29, 0.62, 32.0, 29.0),
+)
+"""Plain aluminium; v2e's pixel, stepped every 5 ms with the noise of its parameter set for dim scenes."""
+
+SLOW_BUS = RoomSetup(
+    reflection=Reflection((Lobe("ggx", 1.0, 0.045, 0.045),), matte=0.02),
+    frame_camera=FrameCamera(0.016, 9000.0, 12.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=19),
+    pixel=ReadoutPixel(
+        EventPixel(0.15, 0.17, 0.01, 90.0, 0.1, 0.1, 5e-4, pattern_seed=19, logarithm="true", dark_dn=0.5),
+        *("row", 2e-4, 2e-5),
+        tick_s=1e-4,
+        jitter_s=2e-4,
+        hot_pixel_fraction=2e-3,
+        hot_pixel_rate_hz=20.0,
+        dead_pixel_fraction=5e-3,
+        pattern_seed=19,
+    ),
+    **_set(_PLACE, 0.32, 0.60, 31.0, 30.0),
+)
+"""Plain aluminium; a row arbiter near its limit, which delays and loses events; hot and dead pixels."""
+
+CELEX = RoomSetup(
+    reflection=Reflection((Lobe("ggx", 1.0, 0.05, 0.05),), matte=0.02),
+    frame_camera=FrameCamera(0.010, 8000.0, 14.0, prnu=0.02, dsnu_e=15.0, black_level=4.0, pattern_seed=20),
+    pixel=CelexPixel(CelexCamera(codes_per_efold=300.0)),
+)
+"""Plain aluminium; a CeleX-V whose software reads one polarity in fifty wrong from its noisy values."""
+
+WORN = RoomSetup(
+    reflection=Reflection(
+        (Lobe("ggx", 0.6, 0.035, 0.08, turn_deg=-15.0), Lobe("beckmann", 0.4, 0.11, 0.11)), matte=0.04
+    ),
+    **_set(_TEXTURE, 0.05, 0.06, 21),
+    grain=5.0,
+    curvature=(-0.4, 0.8),
+    distortion=(-0.03, 0.008),
+    aperture_m=0.010,
+    focus_m=0.52,
+    vignetting=0.12,
+    frame_camera=FrameCamera(0.020, 7000.0, 14.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=21),
+    pixel=CircuitPixel(0.18, 0.20, 0.012, 2e-15, follower_a=2.5e-12, leak_rate_hz=0.15, pattern_seed=21),
+    **_set(_PLACE, 0.31, 0.62, 27.0, 31.0),
+)
+"""Wall and sensor both: a scratched, bent plate of two lobes, 8 % of texture, a poor lens; a slow circuit."""
+
+WORKSHOP = RoomSetup(
+    reflection=Reflection((Lobe("ggx", 0.7, 0.045, 0.09), Lobe("ggx", 0.3, 0.1, 0.05)), matte=0.05),
+    **_set(_TEXTURE, 0.04, 0.04, 22),
+    curvature=(0.6, -0.3),
+    vignetting=0.1,
+    mount=Mount(0.03),
+    lamp=Torch((0.05, 0.08, 0.21), 0.012, 0.02, holder_m=(0.02, 0.055, 0.26, 0.009), spill=0.04),
+    ripple=0.03,
+    frame_camera=FrameCamera(0.020, 8000.0, 12.0, prnu=0.015, dsnu_e=10.0, black_level=4.0, pattern_seed=22),
+    pixel=ReadoutPixel(
+        BrownianPixel(0.17, 0.2, 0.01, 6.0, 0.1, 0.004, 0.036, 0.004, pattern_seed=22),
+        *("row", 1e-4, 1e-5),
+        jitter_s=2e-4,
+        hot_pixel_fraction=1e-3,
+        hot_pixel_rate_hz=20.0,
+        pattern_seed=22,
+    ),
+    **_set(_PLACE, 0.38, 0.60, 25.0, 29.0),
+)
+"""Wall and sensor both: a torch, a shining mount, rippling lamps, a bent wall; Brownian pixels, a slow bus."""
 
 ROOMS = {
     "two-lobes": TWO_LOBES,
@@ -136,6 +211,12 @@ ROOMS = {
     "brushed": BRUSHED,
     "streaks": STREAKS,
     "torch": TORCH,
+    "circuit": CIRCUIT,
+    "stepped": STEPPED,
+    "slow-bus": SLOW_BUS,
+    "celex": CELEX,
+    "worn": WORN,
+    "workshop": WORKSHOP,
 }
 """Rooms by name; each has light, cameras and a geometry of its own."""
 
@@ -185,24 +266,6 @@ def setup_preset(name: str, distance_m: float | None = None) -> RadiometricSetup
     return replace(_WALLS[wall], distance_m=_DISTANCES[place or "near"] if distance_m is None else distance_m)
 
 
-def rough_paper() -> PaperSetup:
-    """Return the paper's wall around a target 0.3 m and a camera 0.6 m from it: what `default` varies."""
-    return PaperSetup(field_of_view_m=0.585, tpsf_length_m=0.02)
-
-
-def as_in_the_paper() -> PaperSetup:
-    """Return the paper's simulated setup: 0.5 m, 500 nm, 960 x 600 pixels."""
-    return PaperSetup(
-        distance_m=0.5,
-        wavelength_m=500e-9,
-        tpsf_t=2.0,
-        mean_free_path=0.8,
-        kernel_radius=2.0,
-        sensor=SensorSize(600, 960),
-        pixel=EventPixel(0.15, 0.15, 0.03, 15.0, 0.01, 0.0015, 0.0),
-    )
-
-
 def page_setup() -> RadiometricSetup:
     """Return the setup of `evnlos app` as its controls first stand."""
     return RadiometricSetup(cell_m=0.005, ambient=0.05, sensor=SensorSize(30, 48))
@@ -221,9 +284,6 @@ NAMED: dict[str, Callable[[], Setup]] = {
 """Setups by name: walls with -near or -far, rooms, and the setups of the presets of `evnlos simulate`."""
 
 
-CALIBRATED_FILE = "setup.yaml"
-"""The simulation that `evnlos calibrate` fits, in its folder."""
-_OLDER_FILE = "rig.yaml"  # its name in folders of before
 _TOLD_BY_FOLDER = ("setup", "rig", "lab", "dataset")  # files that are distinguished by their folder
 
 
@@ -280,33 +340,6 @@ def is_name(word: str | Path) -> bool:
     return str(word) in NAMED and not Path(word).exists()
 
 
-def calibrated_file(path: Path) -> Path:
-    """Return the settings file of a folder that `calibrate` wrote; any other path stays as it is.
-
-    Example:
-        >>> str(calibrated_file(Path("setup.yaml")))
-        'setup.yaml'
-    """
-    files = (path / name for name in (CALIBRATED_FILE, _OLDER_FILE))
-    return next((file for file in files if file.is_file()), path)
-
-
-def calibrated_folder(word: str | Path) -> Path:
-    """Return the folder that `calibrate` wrote, named by itself or by the settings file in it.
-
-    Raises:
-        ConfigError: The word names no such folder.
-    """
-    path = Path(word)
-    folder = path.parent if path.name in (CALIBRATED_FILE, _OLDER_FILE) else path
-    if calibrated_file(folder) == folder:
-        raise ConfigError(
-            f"--setup is {word}, which holds no {CALIBRATED_FILE}; give the folder that `calibrate` wrote for "
-            "this very setup (a name such as main-near knows neither its light nor its cameras), or none"
-        )
-    return folder
-
-
 def setup_name(word: str | Path) -> str:
     """Return what a page or a table calls the setup of a word: its name, or that of its folder or file."""
     path = calibrated_file(Path(word))
@@ -321,7 +354,7 @@ def setup_word(word: str | Path) -> str:
     if not path.is_file():
         return str(word)
     folder = path.resolve().parent.name
-    if path.name in (CALIBRATED_FILE, _OLDER_FILE):
+    if path.name in (CALIBRATED_FILE, OLDER_FILE):
         return folder
     return f"{folder}/{path.name}" if path.stem in _TOLD_BY_FOLDER else path.name
 

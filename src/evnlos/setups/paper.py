@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 
 import torch
 
+from evnlos.cameras import EventPixel
 from evnlos.errors import ConfigError
 from evnlos.optics import (
     Diffraction,
@@ -24,7 +25,7 @@ from evnlos.optics import (
 )
 from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.scene import Scene
-from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
+from evnlos.setups.base import Layout, Parameter, SensorSize, Setup, stated_distance_m
 from evnlos.types import Plane
 
 _SAMPLES_PER_RHO = 4  # samples of the target to one unit of the tPSF's rho
@@ -248,3 +249,21 @@ class _LinearPart(LinearTransport):
         samples = self._reflection.adjoint(self._view.adjoint(self._gain * image))
         height, width = self.source.shape
         return samples.unflatten(-1, (width, self._fine)).unflatten(-3, (height, self._fine)).sum(dim=(-3, -1))
+
+
+def rough_paper() -> PaperSetup:
+    """Return the paper's wall around a target 0.3 m and a camera 0.6 m from it: what `default` varies."""
+    return PaperSetup(field_of_view_m=0.585, tpsf_length_m=0.02)
+
+
+def as_in_the_paper() -> PaperSetup:
+    """Return the paper's simulated setup: 0.5 m, 500 nm, 960 x 600 pixels."""
+    return PaperSetup(
+        distance_m=0.5,
+        wavelength_m=500e-9,
+        tpsf_t=2.0,
+        mean_free_path=0.8,
+        kernel_radius=2.0,
+        sensor=SensorSize(600, 960),
+        pixel=EventPixel(0.15, 0.15, 0.03, 15.0, 0.01, 0.0015, 0.0),
+    )

@@ -2,7 +2,8 @@
 
 - The kernels of the readout: arbitration, loss, events without cause, jitter.
 
-What stands between pixels and file: defects, an arbiter of finite speed, queues, ticks; rippling lamps.
+What stands between pixels and file: defects, an arbiter of finite speed, queues, ticks, values of events and
+the polarity that a camera's software takes from them; rippling lamps.
 
 Pixels ask for the bus when they meet a threshold. A row arbiter reads all pixels of one row that ask, then goes
 to the next row below that has any; an event arbiter reads one pixel at a time, first come, first served. All
@@ -13,6 +14,7 @@ takes, a grant of n events keeps the bus for s + n e.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
@@ -33,6 +35,7 @@ from evnlos.cameras.event_model import (
 )
 from evnlos.cameras.pixel import MAX_JITTER, EventPixel
 from evnlos.cameras.random_numbers import (
+    STREAM_CELEX,
     STREAM_DEAD,
     STREAM_RATE_CONTROL,
     STREAM_READOUT_CHOICE,
@@ -391,6 +394,105 @@ class ReadoutArray(EventModel):
         self._queue = time[rest], pixel[rest], on[rest]
         chosen = order[:count]
         return granted[:count], pixel[chosen], on[chosen]
+
+
+class LogLevel:
+    """The log light of all pixels behind their low-pass filter, carried from frame to frame.
+
+    Args:
+        pixel: The pixels, with a true logarithm.
+        light: The light that they have settled to, DN [N].
+    """
+
+    def __init__(self, pixel: EventPixel, light: NDArray) -> None:
+        self._pixel, self._seen = pixel, pixel.exposure * light.astype(np.float64)
+        self._speed = 2.0 * math.pi * pixel.cutoff_hz / (255.0 + pixel.cutoff_floor_dn)
+        self._log = self._level = np.log(self._seen + pixel.dark_dn)
+
+    def step(self, light: NDArray, seconds: float) -> None:
+        """Go on to the next light, DN [N]; its logarithm is a line until then, the bandwidth its mean."""
+        seen = self._pixel.exposure * light.astype(np.float64)
+        self._turns = self._speed * (0.5 * (seen + self._seen) + self._pixel.cutoff_floor_dn) * seconds
+        self._start, self._lag, self._seen = self._log, self._level - self._log, seen
+        self._log = np.log(seen + self._pixel.dark_dn)
+        self._level = self.at(1.0)
+
+    def at(
+        self, share: float | NDArray[np.floating], place: NDArray | slice = slice(None)
+    ) -> NDArray[np.floating]:
+        """Return the level of pixels `place` at a share of the last step, 0 to 1."""
+        start, change = self._start[place], self._log[place] - self._start[place]
+        if self._speed == 0:
+            return start + change * share
+        turns = self._turns[place]
+        passed = -np.expm1(-turns * share)
+        behind = np.divide(passed, turns, out=np.broadcast_to(share, turns.shape).copy(), where=turns > 0)
+        return start + change * (share - behind) + self._lag[place] * (1.0 - passed)
+
+
+class ValuesArray(EventModel):
+    """Pixels whose events carry a value, and the software that takes their polarity from it.
+
+    Args:
+        array: The event pixels.
+        pixel: Their logarithm and low-pass filter.
+        values: What the converter makes of levels, pixels and normal random numbers, [N] each.
+        seed: Seed of the values' noise.
+    """
+
+    def __init__(
+        self, array: EventModel, pixel: EventPixel, values: Callable[..., NDArray[np.uint16]], seed: int
+    ) -> None:
+        self._array, self._pixel, self._values, self._seed = array, pixel, values, np.uint64(seed)
+
+    def start(self, frame: NDArray, time_s: float) -> None:
+        """Take the first light, DN [N]; the software's store holds zeros."""
+        self._array.start(frame, time_s)
+        self._level, self._now = LogLevel(self._pixel, frame), time_s
+        self._last, self._drawn = np.zeros(len(frame), np.int64), np.zeros(len(frame), np.uint32)
+
+    def advance(self, light: Light, times_s: NDArray[np.float64]) -> Columns:
+        """Take the next light at `times_s` [T] and return the events whose value has changed, in order."""
+        (time_us, pixel, _), _, sign = self.read(light, times_s)
+        told = sign != 0
+        return time_us[told], pixel[told], sign[told] > 0
+
+    def read(self, light: Light, times_s: NDArray[np.float64]) -> tuple[Columns, NDArray, NDArray]:
+        """Return all events up to the last instant, their values [N] and the signs of their changes [N]."""
+        events = self._array.advance(light, times_s)
+        time_us, place, _ = events
+        values, signs = np.empty(len(time_us), np.uint16), np.empty(len(time_us), np.int8)
+        ends = np.append(np.searchsorted(time_us, 1e6 * times_s[:-1], "right"), len(time_us))
+        for k, (first, last) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
+            rows, _ = light[k : k + 1].pixels(0, len(self._last))
+            before, self._now = self._now, float(times_s[k])
+            self._level.step(rows[0], self._now - before)
+            pixels = place[first:last]
+            share = np.clip((1e-6 * time_us[first:last] - before) / (self._now - before), 0.0, 1.0)
+            noise = _noise(pixels, self._seed, self._drawn)
+            level = self._level.at(share, pixels)
+            values[first:last] = self._values(level, pixels, noise)
+            _compare(values[first:last], pixels, self._last, signs[first:last])
+        return events, values, signs
+
+
+@njit(cache=True)
+def _noise(pixels, seed, drawn):
+    """Return a normal number for each event, the next of its pixel; `drawn` [pixels] counts them."""
+    out = np.empty(len(pixels))
+    for i in range(len(pixels)):
+        out[i] = random_normal(seed, STREAM_CELEX, pixels[i], drawn[pixels[i]])
+        drawn[pixels[i]] += 1
+    return out
+
+
+@njit(cache=True)
+def _compare(values, pixels, last, signs):
+    """Fill the sign of each value less its pixel's last one, which `last` [pixels] keeps."""
+    for i in range(len(values)):
+        change = np.int64(values[i]) - last[pixels[i]]
+        signs[i] = (change > 0) - (change < 0)
+        last[pixels[i]] = values[i]
 
 
 @dataclass(frozen=True)
