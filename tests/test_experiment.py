@@ -98,6 +98,15 @@ def test_a_second_run_does_nothing_again(records, place) -> None:
     assert after == before
 
 
+def test_single_positions_are_scored_averaged_where_asked(records, apart) -> None:
+    study = replace(STUDY, arms=ARMS[:1], seeds=(0,), average=True)
+    (new,) = run_study(study, apart)
+    (single,) = [one for one in records if (one.arm, one.seed) == ("E2E", 0)]
+    assert new.arm == "E2E, averaged" and new.settings["run"] == single.settings["run"]
+    assert new.scores["psnr_db"]["lab_4"] != single.scores["psnr_db"]["lab_4"]
+    assert run_study(study, apart) == []
+
+
 def test_other_networks_under_the_name_of_a_record_are_scored_anew(records, apart) -> None:
     """After a change of the settings the folder still holds the records of before."""
     arm = replace(ARMS[0], finetuning=replace(SMALL, epochs=2))

@@ -210,6 +210,7 @@ def _study(settings: Demo, test: list[str]) -> Study:
         setups=2,
         robust=settings.robust,
         refine=False,
+        average=True,
         correct_pattern=settings.calibrate,
     )
 

@@ -46,10 +46,11 @@ def varied(config: T, ranges: Ranges, seed: int, name: str) -> T:
     Raises:
         ConfigError: A name is unknown (the nearest is named) or is not a number.
     """
-    for path, (low, high) in ranges.items():
-        draw = np.random.default_rng(derive_seed(seed, name, "vary", _seed_word(path))).uniform(low, high)
-        config = _replaced(config, path.split("."), float(draw), path)
-    return config
+    draws = {
+        path: float(np.random.default_rng(derive_seed(seed, name, "vary", _seed_word(path))).uniform(low, high))
+        for path, (low, high) in ranges.items()
+    }
+    return _replaced(config, {tuple(path.split(".")): (value, path) for path, value in draws.items()})
 
 
 def check_ranges(config: object, ranges: Ranges) -> None:
@@ -66,7 +67,7 @@ def check_ranges(config: object, ranges: Ranges) -> None:
         if first not in names:
             raise _unknown(path, first, names)
         for value in (low, high):
-            _replaced(getattr(config, first), rest, value, path)
+            _replaced(getattr(config, first), {tuple(rest): (value, path)})
 
 
 def ranges_around(config: object, spreads: Mapping[str, float]) -> Ranges:
@@ -101,21 +102,35 @@ def _unknown(path: str, key: str, names: list[str]) -> ConfigError:
     return ConfigError(f"vary.{path}: unknown setting {key!r}; {cure}")
 
 
-def _replaced(node: Any, keys: list[str], value: float, path: str) -> Any:
-    if not keys:
+def _replaced(node: Any, values: Mapping[tuple[str, ...], tuple[float, str]]) -> Any:
+    """Return a node with numbers below it replaced; each dataclass on the way is made, and checked, once.
+
+    Args:
+        node: A nested frozen dataclass, a tuple or a number.
+        values: Names from the node down to a number -> (value, dotted name from the top).
+    """
+    if not values:
+        return node
+    if () in values:
+        value, path = values[()]
         if isinstance(node, bool) or not isinstance(node, (int, float)):
             raise ConfigError(f"vary.{path} names {node!r}, which is no number; name a number")
         return value
-    key, rest = keys[0], keys[1:]
-    if isinstance(node, tuple) and key.isdigit() and int(key) < len(node):
-        i = int(key)
-        return (*node[:i], _replaced(node[i], rest, value, path), *node[i + 1 :])
-    if not dataclasses.is_dataclass(node) or isinstance(node, type):
-        raise _unknown(path, key, [])
-    names = [field.name for field in dataclasses.fields(node)]
-    if key not in names:
-        raise _unknown(path, key, names)
-    return dataclasses.replace(node, **{key: _replaced(getattr(node, key), rest, value, path)})
+    below: dict[str, dict[tuple[str, ...], tuple[float, str]]] = {}
+    for (key, *rest), value in values.items():
+        below.setdefault(key, {})[tuple(rest)] = value
+    if isinstance(node, tuple) and all(key.isdigit() and int(key) < len(node) for key in below):
+        return tuple(_replaced(old, below[str(i)]) if str(i) in below else old for i, old in enumerate(node))
+    names = [field.name for field in dataclasses.fields(node)] if _is_settings(node) else []
+    for key, inner in below.items():
+        if key not in names:
+            raise _unknown(next(iter(inner.values()))[1], key, names)
+    changes = {key: _replaced(getattr(node, key), inner) for key, inner in below.items()}
+    return dataclasses.replace(node, **changes)
+
+
+def _is_settings(node: Any) -> bool:
+    return dataclasses.is_dataclass(node) and not isinstance(node, type)
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,9 @@ class Study:
     """Draw sensors and walls of the simulations from wide ranges (`evnlos.data.randomized`)."""
     refine: bool = True
     """Also score pictures after data consistency, where there are a frame and a calibrated setup."""
+    average: bool = False
+    """Also score the images of networks of single positions after they are aligned along the known motion and
+    averaged over the sequence."""
     correct_pattern: bool = True
     """Take the frame camera's fixed pattern, as the calibration found it, from all frames."""
 

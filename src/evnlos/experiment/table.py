@@ -26,7 +26,7 @@ from evnlos.errors import DataError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there
 from evnlos.files import write_atomically
 from evnlos.machine import Progress
-from evnlos.models import fit_linear, load_weights
+from evnlos.models import aligned_mean, fit_linear, load_weights
 from evnlos.setups import load_setup
 
 if TYPE_CHECKING:
@@ -92,8 +92,13 @@ def score_arm(
     for (run, settings), seed in zip(runs, study.seeds, strict=True):
         weights = load_weights(run)
         check_sampling(weights, recorded.sampling)
+        settings = settings | {"run": run.name}
         pictures.append(weights.network.infer(samples.inputs, samples.position_m, samples.names))
-        score_variants(pictures[-1], seed, settings | {"run": run.name}, weights.mean_image)
+        score_variants(pictures[-1], seed, settings, weights.mean_image)
+        averaged = record(f"{arm.name}, averaged", seed, settings)
+        if study.average and not weights.network.sees_sequence and not is_scored(averaged, there):
+            mean = aligned_mean(pictures[-1], samples.position_m, samples.names, recorded.sampling)
+            score(averaged, mean, weights.mean_image)
     if len(runs) > 1:
         together = torch.stack(pictures).mean(dim=0)
         score_variants(together, ENSEMBLE, {"runs": [run.name for run, _ in runs]}, means)

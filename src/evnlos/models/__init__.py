@@ -8,7 +8,7 @@ from evnlos.models.reconstructor import (
     ReconstructorSettings,
     fit_linear,
 )
-from evnlos.models.sequence import SequenceConfig, SequenceReconstructor
+from evnlos.models.sequence import SequenceConfig, SequenceReconstructor, aligned_mean
 from evnlos.models.unet import ResidualUNet, UNetConfig, UNetReconstructor
 from evnlos.models.weights import (
     GENERIC,
@@ -38,6 +38,7 @@ __all__ = [
     "UNetConfig",
     "UNetReconstructor",
     "Weights",
+    "aligned_mean",
     "describe_network",
     "fit_linear",
     "halves_of",

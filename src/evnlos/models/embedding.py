@@ -20,6 +20,7 @@ MOST_SAMPLES = 16_384
 """Samples that the linear embedding is fitted to, at most."""
 
 _SMALLEST = 1e-3
+_AT_ONCE = 256  # samples: what is worked on stays in the cache
 
 
 class InputNormalization(nn.Module):
@@ -46,10 +47,14 @@ class InputNormalization(nn.Module):
         self.register_buffer("size", torch.ones(modality.channels))
 
     def fit(self, inputs: Tensor) -> None:
-        """Take mean and size from the inputs of a dataset, [N, C, H, W]."""
-        mean, size = self._measured(inputs, dims=(0, 1, 2, 3))
-        self.mean.copy_(mean[0, :, 0, 0])
-        self.size.copy_(size[0, :, 0, 0])
+        """Take mean and size from the inputs of a dataset, [N, C, H, W], a part of it at a time."""
+        parts = inputs.split(_AT_ONCE)
+        sums = torch.stack([_sums(part.to(self.mean.device)) for part in parts]).sum(dim=0)  # [2, C], float64
+        mean, square = sums / (len(inputs) * inputs.shape[2] * inputs.shape[3])
+        for group, own in zip(self.modality.groups, self.modality.slices.values(), strict=True):
+            middle = mean[own].mean() if group.centred else mean.new_zeros(())
+            self.mean[own] = middle.float()
+            self.size[own] = (square[own].mean() - middle**2).sqrt().float().clamp_min(_SMALLEST)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [B, C, H, W] to normalized [B, C, H, W]."""
@@ -86,6 +91,12 @@ class InputNormalization(nn.Module):
             return name
         only = f"{modality.groups[0].name}." if len(modality.groups) == 1 else ""
         return f"embedding.groups.{only}{rest}"
+
+
+def _sums(part: Tensor) -> Tensor:
+    """Return the sums of values and of their squares over samples [N, C, H, W] and pixels, float64 [2, C]."""
+    values = part.float().transpose(0, 1).flatten(1)
+    return torch.stack([values.sum(dim=1).double(), values.square().sum(dim=1).double()])
 
 
 class LinearEmbedding(nn.Module):
@@ -282,10 +293,13 @@ def fit_input(
     inputs, truth, names = subset(MOST_SAMPLES)
     device = normalization.mean.device
     if measures:
-        normalization.fit(inputs.float().to(device))
+        normalization.fit(inputs)
     if embeds:
         assert embedding is not None
         if len(np.unique(names)) < 2:  # one object: its time steps stand for objects
             names = np.arange(len(names)).astype(str)
-        seen = torch.cat([normalization(part.float().to(device)).cpu() for part in inputs.split(256)])
+        seen = torch.empty(inputs.shape)
+        for start in range(0, len(inputs), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            seen[part] = normalization(inputs[part].float().to(device)).cpu()
         embedding.fit(seen, truth, names, seed)

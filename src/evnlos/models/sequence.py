@@ -50,6 +50,75 @@ class SequenceConfig(UNetConfig):
         return SequenceReconstructor(as_modality(modality), self, sampling)
 
 
+class TargetGrid:
+    """The square around the target plane's centre, `FINER` than the canvas, and the way there and back.
+
+    Args:
+        sampling: Size of the maps and their pitch on the target's canvas.
+
+    Raises:
+        ConfigError: The pitch is too fine for the square of 10 cm.
+    """
+
+    def __init__(self, sampling: Sampling) -> None:
+        pitch_m = sampling.pitch_m / FINER
+        self.side = max(1, round(PLANE_M / pitch_m / _CELLS)) * _CELLS
+        if self.side > _MOST_PIXELS:
+            raise ConfigError(
+                f"Sampling.pitch_m is {sampling.pitch_m}; a sequence network takes {PLANE_M / 2000:g} m or more"
+            )
+        # On the CPU wherever the layers are: the first arithmetic on the device "meta" imports for seconds.
+        across = (torch.arange(self.side, device="cpu") + 0.5 - self.side / 2) * pitch_m
+        self._place_m = torch.stack(torch.meshgrid(across, across, indexing="xy"), dim=-1)  # [P, P, 2]
+        self._canvas_m = torch.tensor([sampling.width, sampling.height], device="cpu") * sampling.pitch_m
+        self._side_m, self._canvas = self.side * pitch_m, sampling.canvas
+
+    def seen(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Return images [N, S, H, W] as seen from the plane, [N, S, P, P], and where, bool [N, P, P].
+
+        Args:
+            images: Images of the canvas.
+            position_m: The plane's centre on the canvas at each, (x, y) in metres, [N, 2].
+        """
+        place = self._place_m + position_m.float().cpu()[:, None, None]  # [N, P, P, 2]
+        grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
+        inside = (grid.abs() <= 1).all(dim=-1)  # [N, P, P]
+        moved = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
+        return moved * inside[:, None], inside
+
+    def mean(self, images: Tensor, position_m: Tensor) -> Tensor:
+        """Return the plane [P, P] that images [N, H, W] of all positions show: their mean."""
+        light, inside = self.seen(images[:, None].float(), position_m)
+        return light.sum(dim=0)[0] / inside.sum(dim=0).clamp_min(1)
+
+    def on_canvas(self, plane: Tensor, position_m: Tensor) -> Tensor:
+        """Return the target plane [P, P] on the canvas at each position [N, 2], metres: images [N, H, W].
+
+        Each pixel is the mean of `FINER` x `FINER` samples.
+        """
+        canvas = self._canvas
+        fine = Plane(canvas.height * FINER, canvas.width * FINER, canvas.pitch_m / FINER)
+        return F.avg_pool2d(on_canvas(plane, fine, position_m, self._side_m), FINER)
+
+
+def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: Sampling) -> Tensor:
+    """Return images [N, H, W] of which each object's are replaced by their mean along the motion.
+
+    What images of single time steps make of a whole sequence without a network of sequences.
+
+    Args:
+        images: Images of single time steps on the canvas, [N, H, W].
+        position_m: The target's centre at each, (x, y) in metres, [N, 2].
+        names: Object of each, [N].
+        sampling: Size of the maps and their pitch on the target's canvas.
+    """
+    grid, found, places = TargetGrid(sampling), torch.zeros_like(images), torch.from_numpy(position_m)
+    for name in np.unique(names):
+        mine = torch.from_numpy(np.flatnonzero(names == name))
+        found[mine] = grid.on_canvas(grid.mean(images[mine], places[mine]), places[mine])
+    return found
+
+
 class SequenceReconstructor(Reconstructor):
     """All time steps -> the target plane: embed each, look at it from the plane, take the mean, then a U-Net.
 
@@ -73,22 +142,12 @@ class SequenceReconstructor(Reconstructor):
     def __init__(self, modality: Modality, settings: SequenceConfig, sampling: Sampling) -> None:
         super().__init__(modality, settings, sampling)
         self.settings: SequenceConfig = settings
-        fine_m = sampling.pitch_m / FINER
-        side = max(1, round(PLANE_M / fine_m / _CELLS)) * _CELLS
-        if side > _MOST_PIXELS:
-            raise ConfigError(
-                f"Sampling.pitch_m is {sampling.pitch_m}; a sequence network takes {PLANE_M / 2000:g} m or more"
-            )
         size = (sampling.height, sampling.width)
         self.normalization = InputNormalization(modality, settings.scaling)
         self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.ridge_multipliers)
         self.scale = PooledScale(self.embedding.images)
         self.unet = ResidualUNet(self.embedding.images, settings)
-        # On the CPU wherever the layers are: the first arithmetic on the device "meta" imports for seconds.
-        across = (torch.arange(side, device="cpu") + 0.5 - side / 2) * fine_m
-        self._place_m = torch.stack(torch.meshgrid(across, across, indexing="xy"), dim=-1)  # [P, P, 2]
-        self._canvas_m = torch.tensor([size[1], size[0]], device="cpu") * sampling.pitch_m
-        self._side_m = side * fine_m
+        self.grid = TargetGrid(sampling)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map pooled maps [B, S, P, P] to images of the target plane [B, 1, P, P], 0..1."""
@@ -135,7 +194,7 @@ class SequenceReconstructor(Reconstructor):
                     "capture.yaml, or train on single time steps (--network.kind unet)"
                 )
             places = torch.from_numpy(samples.position_m[mine])
-            plane = self.plane_of(samples.truth[torch.from_numpy(mine)], places).half()
+            plane = self.grid.mean(samples.truth[torch.from_numpy(mine)], places).half()
             kept = torch.zeros(augmentations, len(mine))
             for number in range(augmentations):
                 kept[number, _subset(number, len(mine), draw)] = 1
@@ -151,7 +210,7 @@ class SequenceReconstructor(Reconstructor):
     def draw(self, inputs: Tensor, position_m: Tensor, at_m: Tensor) -> Tensor:
         """Return images of one object at positions `at_m`, [M, H, W], from its sequence."""
         plane = self(self.pooled(inputs, position_m)[None])[0, 0]
-        return self.on_canvas(plane, at_m)
+        return self.grid.on_canvas(plane, at_m)
 
     def reduced(self, rank: int) -> Reconstructor:
         """Return a copy whose linear embedding has fewer components, the strongest."""
@@ -188,7 +247,7 @@ class SequenceReconstructor(Reconstructor):
         for start in range(0, len(inputs), 64):
             part = slice(start, start + 64)
             embedded = self.embedding(self.normalization(inputs[part].float()))
-            light, inside = self._from_plane(embedded, position_m[part])
+            light, inside = self.grid.seen(embedded, position_m[part])
             weights = kept[:, part].to(light)
             total = total + torch.tensordot(weights, light, dims=1)
             seen = seen + torch.tensordot(weights, inside.to(light), dims=1)
@@ -197,33 +256,6 @@ class SequenceReconstructor(Reconstructor):
                 "the target plane is off the canvas at every time step; give positions within the travel"
             )
         return total / seen[:, None].clamp_min(1)
-
-    def on_canvas(self, plane: Tensor, position_m: Tensor) -> Tensor:
-        """Return the target plane on the canvas at each position.
-
-        Args:
-            plane: Image of the plane, [P, P].
-            position_m: Its centre, (x, y) in metres, [N, 2].
-
-        Returns:
-            Images [N, H, W]; each pixel is the mean of `FINER` x `FINER` samples.
-        """
-        canvas = self.sampling.canvas
-        fine = Plane(canvas.height * FINER, canvas.width * FINER, canvas.pitch_m / FINER)
-        return F.avg_pool2d(on_canvas(plane, fine, position_m, self._side_m), FINER)
-
-    def plane_of(self, images: Tensor, position_m: Tensor) -> Tensor:
-        """Return the plane [P, P] that images [N, H, W] of all positions show, their mean: what to learn."""
-        light, inside = self._from_plane(images[:, None].float(), position_m)
-        return light.sum(dim=0)[0] / inside.sum(dim=0).clamp_min(1)
-
-    def _from_plane(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Return images [N, S, H, W] as seen from the plane, [N, S, P, P], and where, bool [N, P, P]."""
-        place = self._place_m + position_m.float().cpu()[:, None, None]  # [N, P, P, 2]
-        grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
-        inside = (grid.abs() <= 1).all(dim=-1)  # [N, P, P]
-        moved = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
-        return moved * inside[:, None], inside
 
     @classmethod
     def today(cls, name: str, modality: Modality) -> str:
