@@ -121,16 +121,14 @@ def _replaced(node: Any, values: Mapping[tuple[str, ...], tuple[float, str]]) ->
         below.setdefault(key, {})[tuple(rest)] = value
     if isinstance(node, tuple) and all(key.isdigit() and int(key) < len(node) for key in below):
         return tuple(_replaced(old, below[str(i)]) if str(i) in below else old for i, old in enumerate(node))
-    names = [field.name for field in dataclasses.fields(node)] if _is_settings(node) else []
+    settings: Any = node
+    is_settings = dataclasses.is_dataclass(node) and not isinstance(node, type)
+    names = [field.name for field in dataclasses.fields(settings)] if is_settings else []
     for key, inner in below.items():
         if key not in names:
             raise _unknown(next(iter(inner.values()))[1], key, names)
-    changes = {key: _replaced(getattr(node, key), inner) for key, inner in below.items()}
-    return dataclasses.replace(node, **changes)
-
-
-def _is_settings(node: Any) -> bool:
-    return dataclasses.is_dataclass(node) and not isinstance(node, type)
+    changes = {key: _replaced(getattr(settings, key), inner) for key, inner in below.items()}
+    return dataclasses.replace(settings, **changes)
 
 
 @dataclass(frozen=True)
