@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -219,6 +220,26 @@ def test_events_without_times_have_the_one_of_their_arrival() -> None:
     assert (found.x == events.x).all() and (found.p == events.p).all() and np.ptp(found.t_us) == 0
 
 
+# What AEStream 0.6.4 sent of seven events of ours, in a .dat file: `aestream input file q.dat output udp
+# 127.0.0.1 3399 --include-timestamp true`, and with `false`.
+AESTREAM_TIMED = (
+    "00800000 005ed0b2 df017f02 005ed0b2 00807f02 015ed0b2 df010000 465ed0b2 02800100 475ed0b2 f0004001"
+    "90bdd1b2 04800300 90bdd1b2" + "00000000" * 14
+)
+AESTREAM_UNTIMED = "00800080 df017f82 00807f82 df010080 02800180 f0004081 04800380"
+
+
+def test_packets_that_the_program_of_aestream_sent_are_its_events() -> None:
+    t_us = 3_000_000_000 + np.array([0, 0, 1, 70, 71, 90_000, 90_000])
+    x, y = np.array([[0, 639, 639, 0, 1, 320, 3], [0, 479, 0, 479, 2, 240, 4]], np.uint16)
+    sent = Events(t_us, x, y, np.array([1, 0, 1, 0, 1, 0, 1], bool), 640, 480)
+    for text, has_times in ((AESTREAM_TIMED, True), (AESTREAM_UNTIMED, False)):
+        source = AestreamSource("127.0.0.1", 0, 640, 480, idle_s=0.2)
+        found = joined([part.events for part in packets(source, [bytes.fromhex(text)])])
+        assert not any(source.faults().values())
+        assert found == (sent if has_times else replace(sent, t_us=found.t_us))
+
+
 def test_a_sender_of_aestream_that_begins_anew_is_heard() -> None:
     late, early = stream(300, 6), stream(4_000, 7)
     late = Events(late.t_us + 10**9, late.x, late.y, late.p, 30, 20)
@@ -231,9 +252,9 @@ def test_a_sender_of_aestream_that_begins_anew_is_heard() -> None:
     assert source.faults() == {"damaged or late events": 2000, "streams taken up anew": 1}
 
 
-def served(pieces: list[bytes]) -> int:
+def served(pieces: list[bytes], port: int = 0) -> int:
     """Return the port of a server that sends pieces to the first who connects, and closes."""
-    server = socket.create_server(("127.0.0.1", 0))
+    server = socket.create_server(("127.0.0.1", port))
 
     def serve() -> None:
         connection, _ = server.accept()
@@ -243,6 +264,12 @@ def served(pieces: list[bytes]) -> int:
 
     threading.Thread(target=serve, daemon=True).start()
     return server.getsockname()[1]
+
+
+def free_port() -> int:
+    """Return a port at which nobody answers."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
 
 
 def dv_stream(events: Events, folder: Path, method: int = 0) -> list[bytes]:
@@ -314,6 +341,36 @@ def test_a_server_of_dv_that_falls_silent_in_a_packet_is_counted(tmp_path: Path)
     assert source.faults()["bytes left out"] == 92
 
 
+def test_a_server_of_dv_that_is_not_there_or_says_nothing_is_one_line(tmp_path: Path) -> None:
+    port = free_port()
+    begun_s = time.monotonic()
+    with pytest.raises(ConfigError, match=f"127.0.0.1:{port} did not answer within 3 s"):
+        DvSource("127.0.0.1", port)
+    assert time.monotonic() - begun_s < 10
+    with socket.create_server(("127.0.0.1", 0)) as mute:  # it never accepts, and so never sends
+        source = DvSource("127.0.0.1", mute.getsockname()[1])
+        with pytest.raises(EventFileError, match="sent nothing for 3 s"):
+            taken(source)
+    with pytest.raises(EventFileError, match="closed"):
+        taken(DvSource("127.0.0.1", served([])))
+
+
+def test_a_server_of_dv_that_is_only_starting_is_waited_for(tmp_path: Path) -> None:
+    events = stream(2_000, 9)
+    pieces = dv_stream(events, tmp_path)
+    port, slept = free_port(), list[float]()
+
+    class Late(SystemClock):
+        def sleep(self, seconds: float) -> None:
+            slept.append(seconds)
+            if len(slept) == 3:
+                served(pieces, port)
+            super().sleep(seconds)
+
+    source = DvSource("127.0.0.1", port, clock=Late())
+    assert len(slept) == 3 and joined([part.events for part in taken(source)]) == events
+
+
 def test_damage_in_the_stream_of_dv_is_counted_or_one_line(tmp_path: Path) -> None:
     events = stream(40_000, 9)
     header, first, second, third = dv_stream(events, tmp_path)
@@ -347,7 +404,7 @@ def test_addresses_of_other_programs_are_checked() -> None:
     for source, text in (
         ("aestream://127.0.0.1:0", "--width and --height"),
         ("aestream://127.0.0.1", "aestream://127.0.0.1:7000"),
-        ("dv://127.0.0.1:1", "does not answer"),
+        ("dv://127.0.0.1:1", "did not answer within 3 s"),
         ("dv://127.0.0.1:99999", "dv://127.0.0.1:7000"),
         ("udp://127.0.0.1:0", "--format is for words"),
     ):

@@ -41,6 +41,7 @@ _JUDGED_WORDS = 64  # fewest words by which a stream is judged
 _FORMATS = {"evt2": "EVT2", "evt21": "EVT21", "evt3": "EVT3"}
 _LINE_BYTES = 1024
 _NAP_S = 0.05
+_ANSWER_S = 3.0  # a server of dv is waited for: to answer, then to say what it streams
 _HOW = "pipe a RAW file with its header, or give --format evt3 --width 1280 --height 720 (as the camera has)"
 
 
@@ -265,27 +266,36 @@ class DvSource:
     Args:
         host: Address of the server.
         port: Its port.
-        idle_s: End after so many seconds without a byte, counted from the first one; None = never.
+        idle_s: End after so many seconds without a byte once the header came; None = never.
         clock: The clock that arrivals are told by.
 
     Raises:
-        ConfigError: Nobody answers there.
+        ConfigError: Nobody answers there within 3 s.
     """
 
     def __init__(
         self, host: str, port: int, *, idle_s: float | None = None, clock: Clock | None = None
     ) -> None:
         self.name, self.has_frames, self.waits = f"dv://{host}:{port}", False, False
-        try:
-            self._socket = socket.create_connection((host, port), timeout=5)
-        except (OSError, OverflowError) as error:
-            raise ConfigError(f"{self.name} does not answer ({error}); start the server first") from None
-        self._socket.setblocking(False)
         self._clock, self._idle_s = clock or SystemClock(), idle_s
+        self._socket = self._connected(host, port)
+        self._socket.setblocking(False)
         self._held = bytearray()
-        self._heard_s: float | None = None
+        self._heard_s = 0.0
         self._faults: Counter[str] = Counter()
         self._events: OrderedEvents | None = None
+
+    def _connected(self, host: str, port: int) -> socket.socket:
+        """Return a connection; a server that is only starting is tried again until `_ANSWER_S` are over."""
+        until_s = self._clock.now() + _ANSWER_S
+        while True:
+            try:
+                return socket.create_connection((host, port), timeout=max(until_s - self._clock.now(), 0.1))
+            except (OSError, OverflowError) as error:
+                if not isinstance(error, ConnectionRefusedError) or self._clock.now() > until_s:
+                    found = f"{self.name} did not answer within {_ANSWER_S:g} s ({error})"
+                    raise ConfigError(f"{found}; start the server first, and check host and port") from None
+            self._clock.sleep(0.1)
 
     def faults(self) -> dict[str, int]:
         """Return how many packets and events were damaged, and bytes of a packet that was cut."""
@@ -301,7 +311,8 @@ class DvSource:
         """Yield the events of each packet until the server closes the connection.
 
         Raises:
-            EventFileError: What the server sends is no stream of events, or a packet has an impossible length.
+            EventFileError: What the server sends is no stream of events, nothing comes within 3 s, or a packet
+                has an impossible length.
             MissingDependencyError: The packets are packed and the package that unpacks them is missing.
         """
         try:
@@ -329,13 +340,17 @@ class DvSource:
 
     def _open(self, stop: Callable[[], bool]) -> tuple[str, int] | None:
         """Return how packets are packed and the number of the event stream; None where `stop` came first."""
+        self._heard_s = self._clock.now()
         start = self._take(4, stop)
         if start == SIGNATURE[:4]:  # as files begin; dv-processing leaves it out
             self._take(len(SIGNATURE) - 4, stop)
             start = self._take(4, stop)
         header = None if start is None else self._take(struct.unpack("<I", start)[0], stop)
-        if header is None:
+        if header is None and stop():
             return None
+        if header is None:
+            found = f"{self.name} closed, or sent nothing for {_ANSWER_S:g} s, before it said what it streams"
+            raise EventFileError(f"{found}; give the port of a dv NetworkWriter")
         try:
             method, stream, width, height = _stream_header(header)
         except ValueError as error:
@@ -356,8 +371,8 @@ class DvSource:
                 return None
             # What waits in the socket is taken first: the time that its events take here is no silence.
             if not select.select([self._socket], [], [], _NAP_S)[0]:
-                silence_s = 0.0 if self._heard_s is None else self._clock.now() - self._heard_s
-                if self._idle_s and silence_s > self._idle_s:
+                idle_s = _ANSWER_S if self._events is None else self._idle_s
+                if idle_s and self._clock.now() - self._heard_s > idle_s:
                     self._faults["bytes left out"] += len(self._held)
                     return None
                 continue

@@ -1,7 +1,7 @@
 """Events that arrive as UDP packets, ours or AEStream's, and a sender for cameras' programs and for tests.
 
 A packet of AEStream is words of 32 bits, little endian: row in bits 0-14, polarity in bit 15, column in bits
-16-30; where bit 31 is clear the next word is the time, microseconds.
+16-30; where bit 31 is clear the next word is the time, microseconds. The last packet is filled up, also with zeros.
 """
 
 from __future__ import annotations
@@ -39,9 +39,8 @@ _GATHER_S = 0.001  # packets are gathered so long: a chunk each would cost more 
 _NAP_S = 0.05
 _TURN = 1 << 32
 _LATE = 1 << 31
-_AGREEING = (
-    100  # packets in a row that are left out and follow each other: a fifth of a second of a calm stream
-)
+_PADDING = bytes(8)  # as an event, it would be one at pixel (0, 0) and time 0
+_AGREEING = 100  # packets in a row that are left out and follow each other: 0.2 s of a calm stream
 _FAULTS = ("malformed packets", "lost packets", "late packets", "streams taken up anew")
 
 
@@ -239,6 +238,8 @@ class _AestreamTail:
         self._newest: int | None = None
 
     def feed(self, data: bytes) -> tuple[Columns, int]:
+        if data.endswith(_PADDING):
+            data = data[: (len(data.rstrip(b"\0")) + 7) // 8 * 8]
         words = np.frombuffer(data[: len(data) // 4 * 4], "<u4").astype(np.int64)
         is_timed = bool(len(words)) and not words[0] >> 31
         at = words[: len(words) // 2 * 2 : 2] if is_timed else words

@@ -245,8 +245,11 @@ def read_scan_info(folder: str | Path) -> ScanInfo:
     """Read the `scan.yaml` of a folder.
 
     Raises:
-        ConfigError: It is missing, or has an unknown key, a wrong type or a value out of range.
+        ConfigError: Folder or file is missing, or it has an unknown key, a wrong type or a value out of range.
     """
+    if not Path(folder).is_dir():
+        what = "is not a folder" if Path(folder).exists() else "does not exist"
+        raise ConfigError(f"{folder} {what}; give the folder that `evnlos scan plan` made")
     return load_yaml(ScanInfo, Path(folder) / SCAN_FILE)
 
 

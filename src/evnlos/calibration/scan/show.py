@@ -216,11 +216,10 @@ def read_show(folder: str | Path) -> Show:
     Raises:
         ConfigError: show.yaml is missing, or has an unknown key, a wrong type or a value out of range.
     """
-    folder = Path(folder)
+    folder, info = Path(folder), read_scan_info(folder)
     if not (folder / SHOW_FILE).is_file():
         cure = "plan it with --show page or video"
         raise ConfigError(f"{folder} holds no {SHOW_FILE}, so a film of it tells no time; {cure}")
-    info = read_scan_info(folder)
     return Show(info, tuple(read_scan_frames(folder, info)), load_yaml(ShowInfo, folder / SHOW_FILE))
 
 
