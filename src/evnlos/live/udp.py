@@ -1,7 +1,7 @@
 """Events that arrive as UDP packets, ours or AEStream's, and a sender for cameras' programs and for tests.
 
 A packet of AEStream is words of 32 bits, little endian: row in bits 0-14, polarity in bit 15, column in bits
-16-30; where bit 31 is clear the next word is the time, microseconds. The last packet is filled up, also with zeros.
+16-30; where bit 31 is clear the next word is the time, microseconds. Zeros may fill up the last packet.
 """
 
 from __future__ import annotations
@@ -238,8 +238,7 @@ class _AestreamTail:
         self._newest: int | None = None
 
     def feed(self, data: bytes) -> tuple[Columns, int]:
-        if data.endswith(_PADDING):
-            data = data[: (len(data.rstrip(b"\0")) + 7) // 8 * 8]
+        data = data[: (len(data.rstrip(b"\0")) + 7) // 8 * 8] if data.endswith(_PADDING) else data
         words = np.frombuffer(data[: len(data) // 4 * 4], "<u4").astype(np.int64)
         is_timed = bool(len(words)) and not words[0] >> 31
         at = words[: len(words) // 2 * 2 : 2] if is_timed else words
