@@ -64,7 +64,7 @@ def voltmeter(path: str) -> Callable[[np.ndarray, np.ndarray], int]:
 
     def run(frames: np.ndarray, times: np.ndarray) -> int:
         torch.manual_seed(0)
-        simulator = EventSim(cfg=cfg)
+        simulator = EventSim(cfg=cfg, output_folder="", video_name="")
         found = (
             simulator.generate_events(frame.astype(np.float64), int(t * 1e6))
             for frame, t in zip(frames, times, strict=True)

@@ -207,6 +207,22 @@ def test_interval_covers_as_often_as_it_says() -> None:
     assert found == paired_difference(base + effect, base, objects, draws=1000, seed=199)
 
 
+def test_interval_over_seeds_covers_what_other_seeds_would_give() -> None:
+    """Seeds differ by 0.5, as much as objects do here: an interval of objects alone would cover far less."""
+    draw, covered, plain = np.random.default_rng(1), 0, 0
+    objects = np.arange(30)
+    for seed in range(200):
+        base = draw.normal(18, 2, 30)
+        a = base + 0.5 + draw.normal(0, 1, 30) + draw.normal(0, 0.5, (5, 1))
+        b = base + draw.normal(0, 0.5, (5, 1))
+        found = paired_difference(a, b, objects, draws=500, seed=seed)
+        alone = paired_difference(a.mean(axis=0), b.mean(axis=0), objects, draws=500, seed=seed)
+        covered += found.low <= 0.5 <= found.high
+        plain += alone.low <= 0.5 <= alone.high
+    assert 0.88 <= covered / 200 <= 0.99
+    assert plain / 200 < 0.8
+
+
 def test_interval_draws_objects_not_pictures() -> None:
     objects = np.repeat([0, 1], 50)
     wide = paired_difference(np.repeat([1.0, 3.0], 50), np.zeros(100), objects)

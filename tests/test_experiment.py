@@ -11,7 +11,7 @@ import pytest
 
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.data import FixedPattern, Sampling, SensorSize, Simulation, open_dataset, save_pattern
+from evnlos.data import FixedPattern, Sampling, SensorSize, Simulation, character_of, open_dataset, save_pattern
 from evnlos.data.simulate import split_of
 from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import (
@@ -24,7 +24,9 @@ from evnlos.experiment import (
     character_table,
     checks_table,
     difference,
+    folds_of,
     gain_table,
+    merge_folds,
     on_sequences,
     read_records,
     run_simulated,
@@ -207,6 +209,62 @@ def test_captures_that_no_setup_fits_say_so(tiny_captures, tmp_path) -> None:
     place = Place(tuple(tiny_captures[:1]), tmp_path)
     with pytest.raises(CalibrationError, match="capture"):
         run_study(replace(STUDY, test=()), place)
+
+
+def test_folds_test_every_character_once_and_each_half_is_calibrated_to_the_other() -> None:
+    characters = "ABCDEFGHIJ"
+    folds = folds_of(STUDY, 4, characters)
+    assert sorted(c for fold in folds for c in fold.test) == list(characters)
+    for half in ("lab-a", "lab-b"):
+        own = [fold for fold in folds if fold.setup == half]
+        tested = {c for fold in own for c in fold.test}
+        assert len(own) == 2 and own[0].calibration == own[1].calibration
+        assert tested == set(own[0].calibration.exclude)
+    assert len({fold.name for fold in folds}) == 4
+    for wrong in (1, 3, 12):
+        with pytest.raises(ConfigError, match=f"folds is {wrong}"):
+            folds_of(STUDY, wrong, characters)
+
+
+def test_folds_are_trained_and_scored_apart(apart) -> None:
+    for half in ("lab-a", "lab-b"):
+        shutil.copytree(apart.out / "setups" / "lab", apart.out / "setups" / half)
+    characters = [character_of(folder.name) for folder in apart.captures]
+    study = replace(STUDY, name="few", arms=ARMS[:1], seeds=(0,), refine=False)
+    for fold in folds_of(study, 2, characters):
+        run_study(fold, apart)
+    (merged,) = merge_folds(read_records(apart.out / "records" / "few-folds"), "lab")
+    assert {character_of(name) for name in merged.scores["psnr_db"]} == set(characters)
+    assert len(set(merged.settings["runs"])) == 2
+
+
+def test_records_of_folds_are_one_record_of_all_characters() -> None:
+    def record(setup: str, name: str, psnr: float, seed: int = 0) -> Record:
+        scores = {"psnr_db": {name: psnr}}
+        checks = {"read": float(psnr > 20)}
+        return Record(
+            "s-folds/1-of-2",
+            setup,
+            "EPNP",
+            "frame",
+            seed,
+            "test",
+            scores,
+            {name: [psnr]},
+            {"mean": scores},
+            checks,
+            {},
+        )
+
+    parts = [
+        record("lab-a", "lab_A", 19.0),
+        record("lab-b", "lab_B", 23.0),
+        record("lab-a", "lab_A", 1.0, seed=1),
+    ]
+    (one,) = merge_folds([*parts, record("other-a", "other_A", 5.0)], "lab")
+    assert one.scores == {"psnr_db": {"lab_A": 19.0, "lab_B": 23.0}} == one.baselines["mean"]
+    assert (one.setup, one.study, one.checks) == ("lab", "s-folds", {"read": 0.5})
+    assert one.positions == {"lab_A": [19.0], "lab_B": [23.0]}
 
 
 def test_wrong_plans_are_refused(tmp_path) -> None:

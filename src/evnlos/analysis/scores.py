@@ -112,11 +112,12 @@ class Interval:
 def paired_difference(
     a: ArrayLike, b: ArrayLike, objects: ArrayLike, *, draws: int = 10_000, seed: int = 0
 ) -> Interval:
-    """Return the mean of a - b with a 95 % percentile interval, objects drawn with replacement.
+    """Return the mean of a - b with a 95 % percentile interval, objects and seeds drawn with replacement.
 
     The positions of one object are not independent, so whole objects are drawn, and both methods are always
-    compared on the same pictures. With few objects (4 characters) such an interval is coarse and, as a rule,
-    too narrow; it speaks of other objects like these, not of other setups.
+    compared on the same pictures. Of several seeds each draw takes as many, those of `a` and of `b` apart, so
+    that the interval holds what another training would change. With few objects (4 characters) such an
+    interval is coarse and, as a rule, too narrow; it speaks of other objects like these, not of other setups.
 
     Args:
         a: Scores of one method, [N], or [S, N] for S seeds, which are averaged.
@@ -132,15 +133,20 @@ def paired_difference(
         >>> str(paired_difference([3.0, 4.0, 6.0], [1.0, 2.0, 3.0], ["A", "A", "B"]))
         '+2.33 [+2.00, +3.00]'
     """
-    difference = np.atleast_2d(np.asarray(a, np.float64)).mean(axis=0)
-    difference = difference - np.atleast_2d(np.asarray(b, np.float64)).mean(axis=0)
-    labels = np.asarray(objects)
-    if difference.shape != labels.shape or not len(labels):
-        raise DataError(f"{difference.shape} differences and {labels.shape} objects; give one object a picture")
+    both, labels = [np.atleast_2d(np.asarray(scores, np.float64)) for scores in (a, b)], np.asarray(objects)
+    difference = both[0].mean(axis=0) - (both[1].mean(axis=0) if both[1].size else 0.0)
+    if any(one.shape[1:] != labels.shape for one in both) or not len(labels):
+        shapes = " and ".join(str(one.shape) for one in both)
+        raise DataError(f"scores {shapes} and {labels.shape} objects; give one object a picture")
     _, group = np.unique(labels, return_inverse=True)
-    sums, counts = np.bincount(group, difference), np.bincount(group)
-    chosen = np.random.default_rng(seed).integers(0, len(sums), (draws, len(sums)))
-    means = sums[chosen].sum(axis=1) / counts[chosen].sum(axis=1)
+    counts, draw = np.bincount(group), np.random.default_rng(seed)
+    chosen = draw.integers(0, len(counts), (draws, len(counts)))  # [D, G]
+    drawn = []
+    for one in both:
+        sums = np.stack([np.bincount(group, scores) for scores in one])  # [S, G]
+        weights = draw.multinomial(len(one), np.full(len(one), 1 / len(one)), draws) / len(one)  # [D, S]
+        drawn.append(np.take_along_axis(weights @ sums, chosen, axis=1).sum(axis=1))
+    means = (drawn[0] - drawn[1]) / counts[chosen].sum(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     return Interval(float(difference.mean()), float(low), float(high))
 

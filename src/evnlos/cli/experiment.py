@@ -79,6 +79,10 @@ class ExperimentCommand:
     """Characters that nothing sees before the test."""
     validation: tuple[str, ...] = ()
     """Characters to choose settings on: only these are scored, the test characters are not even read."""
+    folds: int = 0
+    """Deal the characters into so many folds, an even number, and test each fold by networks that learned from
+    the others: every character is tested once, and --test is not used. Two calibrations and pre-trainings serve
+    all folds, each for the half that it has not seen. 0: test --test alone."""
     writers: int | None = None
     """Writers of the simulation, 36 objects each; by default the experiment's own number."""
     pretrain_epochs: int | None = None
@@ -108,17 +112,31 @@ class ExperimentCommand:
         alone.get(self.name, self._on_captures)()
 
     def _on_captures(self) -> None:
-        from evnlos.experiment import Place, captures_of, read_records, run_study
+        from evnlos.data import character_of
+        from evnlos.experiment import Place, captures_of, folds_of, merge_folds, read_records, run_study
+        from evnlos.machine import Step
 
         study = self._study()
         assert self.captures is not None
         folders = tuple(captures_of(self.captures, self.captures_of))
+        place = Place(folders, self.out, self.workers, self.trainings, self.force)
+        name, studies = study.name, [study]
+        if self.folds:
+            if self.validation:
+                raise ConfigError("folds test every character: leave out --validation, or --folds")
+            studies = folds_of(study, self.folds, [character_of(folder.name) for folder in folders])
+            name += "-folds"
         with ProgressBars() as progress:
-            run_study(study, Place(folders, self.out, self.workers, self.trainings, self.force), progress)
-        records = [r for r in read_records(self.out / "records" / study.name) if r.setup == self.captures_of]
-        records = [r for r in records if r.split == study.split]
-        text = _tables(study.name, records, self.metric)
-        write_atomically(self.out / f"{study.name}-{self.captures_of}-{study.split}.md", text.encode())
+            for done, one in enumerate(studies):
+                if self.folds:
+                    progress(Step("folds", done, len(studies), "folds"))
+                run_study(one, place, progress)
+        records = read_records(self.out / "records" / name)
+        if self.folds:
+            records = merge_folds(records, self.captures_of)
+        records = [r for r in records if r.setup == self.captures_of and r.split == study.split]
+        text = _tables(name, records, self.metric)
+        write_atomically(self.out / f"{name}-{self.captures_of}-{study.split}.md", text.encode())
         print(text)
 
     def _study(self) -> Study:

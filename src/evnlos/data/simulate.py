@@ -46,11 +46,11 @@ def varied(config: T, ranges: Ranges, seed: int, name: str) -> T:
     Raises:
         ConfigError: A name is unknown (the nearest is named) or is not a number.
     """
-    draws = {
-        path: float(np.random.default_rng(derive_seed(seed, name, "vary", _seed_word(path))).uniform(low, high))
-        for path, (low, high) in ranges.items()
-    }
-    return _replaced(config, {tuple(path.split(".")): (value, path) for path, value in draws.items()})
+    draws = {}
+    for path, (low, high) in ranges.items():
+        draw = np.random.default_rng(derive_seed(seed, name, "vary", _seed_word(path))).uniform(low, high)
+        draws[tuple(path.split("."))] = (float(draw), path)
+    return _replaced(config, draws) if draws else config
 
 
 def check_ranges(config: object, ranges: Ranges) -> None:
@@ -103,14 +103,7 @@ def _unknown(path: str, key: str, names: list[str]) -> ConfigError:
 
 
 def _replaced(node: Any, values: Mapping[tuple[str, ...], tuple[float, str]]) -> Any:
-    """Return a node with numbers below it replaced; each dataclass on the way is made, and checked, once.
-
-    Args:
-        node: A nested frozen dataclass, a tuple or a number.
-        values: Names from the node down to a number -> (value, dotted name from the top).
-    """
-    if not values:
-        return node
+    """Return a node with numbers below it replaced, by their names: (value, dotted name from the top)."""
     if () in values:
         value, path = values[()]
         if isinstance(node, bool) or not isinstance(node, (int, float)):
@@ -121,14 +114,12 @@ def _replaced(node: Any, values: Mapping[tuple[str, ...], tuple[float, str]]) ->
         below.setdefault(key, {})[tuple(rest)] = value
     if isinstance(node, tuple) and all(key.isdigit() and int(key) < len(node) for key in below):
         return tuple(_replaced(old, below[str(i)]) if str(i) in below else old for i, old in enumerate(node))
-    settings: Any = node
-    is_settings = dataclasses.is_dataclass(node) and not isinstance(node, type)
-    names = [field.name for field in dataclasses.fields(settings)] if is_settings else []
+    names = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
     for key, inner in below.items():
         if key not in names:
             raise _unknown(next(iter(inner.values()))[1], key, names)
-    changes = {key: _replaced(getattr(settings, key), inner) for key, inner in below.items()}
-    return dataclasses.replace(settings, **changes)
+    changes = {key: _replaced(getattr(node, key), inner) for key, inner in below.items()}
+    return dataclasses.replace(node, **changes)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)

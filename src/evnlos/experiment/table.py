@@ -162,7 +162,7 @@ def means_of(records: list[Record], metric: str = "psnr_db") -> dict[tuple[str, 
 
 
 def difference(records: list[Record], arm: str, other: str, modality: str) -> Interval:
-    """Return PSNR of an arm minus that of another, dB, seeds averaged, with an interval over characters.
+    """Return PSNR of an arm minus that of another, dB, with an interval over characters and seeds.
 
     Raises:
         DataError: One of the arms has no record.
@@ -222,7 +222,8 @@ def character_table(records: list[Record], arms: tuple[str, ...], metric: str = 
 
 
 def gain_table(records: list[Record], arm: str = "EPNP", other: str = "E2E") -> str:
-    """Return Markdown: what an arm gains over the strongest of others, dB with a 95 % interval over characters.
+    """Return Markdown: what an arm gains over the strongest of others, dB, with a 95 % interval.
+
 
     Args:
         records: Records of a study.
