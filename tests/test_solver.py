@@ -9,17 +9,14 @@ import torch
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import (
     BackgroundModel,
-    DenoiserTraining,
     Gradient,
     LogChange,
     Problem,
     block_folds,
     log_change,
     operator_norm,
-    plug_and_play,
     tikhonov,
     total_variation,
-    train_denoiser,
 )
 from evnlos.inverse.tikhonov import Spectrum
 from evnlos.optics import LinearTransport, MatrixTransport, dense_matrix
@@ -307,49 +304,6 @@ def test_total_variation_beats_tikhonov_on_a_square():
     assert float((checked.image - truth).norm()) < 0.8 * float((smooth.image - truth).norm())
 
 
-# --- a denoiser as prior --------------------------------------------------------------------------
-
-
-def test_plug_and_play_with_a_quadratic_prox_is_tikhonov():
-    operator, y = random_operator(), noise(2, 8, 9)
-    rho, regularization = 0.7, 0.2
-    found = plug_and_play(
-        operator,
-        y,
-        lambda v: v * rho / (rho + regularization),
-        rho,
-        background_model=BackgroundModel(1),
-        tolerance=1e-10,
-        max_iterations=500,
-    )
-    assert found.converged
-    torch.testing.assert_close(
-        found.image,
-        tikhonov(operator, y, regularization, background_model=BackgroundModel(1)).image,
-        rtol=1e-6,
-        atol=1e-8,
-    )
-
-
-def test_a_trained_denoiser_denoises_repeats_and_serves_as_prior():
-    draw = torch.Generator().manual_seed(1)
-    squares = torch.zeros(64, 12, 12)
-    for square in squares:
-        y, x, size = (
-            int(torch.randint(low, high, (1,), generator=draw)) for low, high in ((1, 5), (1, 5), (3, 7))
-        )
-        square[y : y + size, x : x + size] = 1
-    settings = DenoiserTraining(width=12, layers=4, steps=300)
-    net = train_denoiser(squares, settings, seed=2)
-    same = train_denoiser(squares, settings, seed=2)
-    assert all(torch.equal(a, b) for a, b in zip(net.parameters(), same.parameters(), strict=True))
-    operator, truth, y = blurred_scene()
-    noisy = truth + 0.2 * noise(12, 12)
-    assert (net.at(0.2)(noisy) - truth).norm() < 0.6 * (noisy - truth).norm()
-    found = plug_and_play(operator, y, net.at(0.1), 0.01, max_iterations=60)
-    assert (found.image - truth).norm() < 0.8 * (tikhonov(operator, y).image - truth).norm()
-
-
 # --- the event channel ----------------------------------------------------------------------------
 
 
@@ -400,11 +354,8 @@ def test_log_change_counts_thresholds():
         (ConfigError, "method is", lambda: total_variation(identity(2, 2), noise(2, 2), 1.0, method="x")),
         (ConfigError, "rule is", lambda: total_variation(identity(2, 2), noise(2, 2), rule="gcv")),
         (ConfigError, "positive one", lambda: total_variation(identity(9, 9), noise(9, 9), rule="discrepancy")),
-        (ConfigError, "rho is", lambda: plug_and_play(identity(2, 2), noise(2, 2), lambda v: v, 0.0)),
         (ConfigError, "at rest", lambda: LogChange(identity(2, 2), torch.ones(2, 2), (0, 0))),
         (DataError, "ambient", lambda: LogChange(identity(2, 2), torch.zeros(2, 2))),
-        (ConfigError, "layers", lambda: DenoiserTraining(layers=1)),
-        (DataError, "real", lambda: train_denoiser(torch.zeros(2, 2))),
     ],
 )
 def test_bad_input(error, match, make):

@@ -25,10 +25,6 @@ from .operators import Gradient as Gradient
 from .operators import LinearOperator as LinearOperator
 from .operators import Solution as Solution
 from .operators import operator_norm as operator_norm
-from .plug_and_play import DenoiserTraining as DenoiserTraining
-from .plug_and_play import ResidualDenoiser as ResidualDenoiser
-from .plug_and_play import plug_and_play as plug_and_play
-from .plug_and_play import train_denoiser as train_denoiser
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
 from .problem import block_folds as block_folds
