@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -16,7 +17,6 @@ from evnlos.optics import (
     Diffraction,
     DiffuseReflection,
     Lambert,
-    LightTransport,
     MatrixTransport,
     Occluder,
     Transport,
@@ -34,8 +34,8 @@ _AFFINE = View.affine((9, 13), 110.0, rotation_rad=0.3, shear=0.1, offset_px=(0.
 _OBLIQUE = View.perspective((9, 13), 0.6, math.radians(30), math.radians(20))
 
 
-def _matrix(brdf: Brdf) -> MatrixTransport:
-    return MatrixTransport(light_transport_matrix(_OBLIQUE, _SCENE, 0.3, brdf), _SCENE, _OBLIQUE.shape)
+def _matrix(brdf: Brdf, seen: View | Plane = _OBLIQUE, **options: Any) -> MatrixTransport:
+    return MatrixTransport(light_transport_matrix(seen, _SCENE, 0.3, brdf, **options), _SCENE, seen.shape)
 
 
 def _reflection(source: Plane) -> DiffuseReflection:
@@ -63,11 +63,11 @@ EXAMPLES: dict[str, Callable[[], Transport]] = {
     "matte wall": lambda: _matrix(Lambert()),
     "rough metal": lambda: _matrix(GGX(0.1)),
     "brushed metal": lambda: _matrix(GGX(0.05, 0.2)),
-    "matte wall behind a post": lambda: LightTransport(
-        Plane(5, 8, 0.02), _SCENE, 0.3, Lambert(), occluders=(Occluder.post(0.01, 0.1, 0.02),), block=200
+    "matte wall behind a post": lambda: _matrix(
+        Lambert(), Plane(5, 8, 0.02), occluders=(Occluder.post(0.01, 0.1, 0.02),)
     ),
-    "brushed metal, torch-lit, in blocks": lambda: LightTransport(
-        _OBLIQUE, _SCENE, 0.3, GGX(0.1, 0.3), emission=lamp_radiance(_SCENE, 0.3, (0.1, 0.0, 0.1)), block=500
+    "brushed metal, torch-lit": lambda: _matrix(
+        GGX(0.1, 0.3), emission=lamp_radiance(_SCENE, 0.3, (0.1, 0.0, 0.1))
     ),
     "reflection, then view": lambda: _chain(_reflection, lambda plane: ViewOperator(plane, _AFFINE)),
     "the paper's steps": lambda: _chain(

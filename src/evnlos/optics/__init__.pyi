@@ -4,7 +4,6 @@ from .angular_spectrum import Diffraction as Diffraction
 from .angular_spectrum import angular_spectrum as angular_spectrum
 from .angular_spectrum import blur_radius_px as blur_radius_px
 from .angular_spectrum import fresnel_number as fresnel_number
-from .angular_spectrum import rayleigh_sommerfeld_sum as rayleigh_sommerfeld_sum
 from .angular_spectrum import sampling_limit_m as sampling_limit_m
 from .corner import ONE_WALKER as ONE_WALKER
 from .corner import TWO_WALKERS as TWO_WALKERS
@@ -23,7 +22,6 @@ from .operator import Patches as Patches
 from .operator import Transport as Transport
 from .operator import compose as compose
 from .operator import dense_matrix as dense_matrix
-from .radiometric import LightTransport as LightTransport
 from .radiometric import light_transport_matrix as light_transport_matrix
 from .reflection import GGX as GGX
 from .reflection import Brdf as Brdf

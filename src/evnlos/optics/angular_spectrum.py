@@ -181,45 +181,6 @@ def _filter_in_blocks(field: torch.Tensor, transposed: torch.Tensor) -> torch.Te
     return moved
 
 
-def rayleigh_sommerfeld_sum(
-    field: torch.Tensor, pitch_m: float, wavelength_m: float, distance_m: float, *, carrier: bool = False
-) -> torch.Tensor:
-    """Propagate by the first Rayleigh-Sommerfeld integral, summed directly: the slow reference (paper Eq. 16).
-
-    E(p) = sum over q of U(q) z / (2 pi r^2) (1/r - j k) exp(j k r) dx^2, with r the distance from q to p; the
-    term 1/r, which the paper drops, is kept.
-
-    Args:
-        field: Amplitude, real or complex [H, W].
-        pitch_m: Distance between samples, metres.
-        wavelength_m: Wavelength, metres.
-        distance_m: Distance, metres, above 0.
-        carrier: Whether to keep the factor exp(j k z).
-
-    Returns:
-        Field [H, W], complex128; the cost grows with (H W)^2.
-    """
-    check_lengths(pitch_m=pitch_m, wavelength_m=wavelength_m, distance_m=distance_m)
-    height, width = field.shape
-    k = 2 * math.pi / wavelength_m
-    dy = torch.arange(1 - height, height, dtype=torch.float64, device=field.device) * pitch_m
-    dx = torch.arange(1 - width, width, dtype=torch.float64, device=field.device) * pitch_m
-    lateral = dy[:, None] ** 2 + dx**2
-    r = (lateral + distance_m**2).sqrt()
-    excess = lateral / (r + distance_m)  # r - z without cancellation
-    start = k * distance_m if carrier else 0.0
-    impulse = torch.polar(distance_m / (2 * math.pi * r**2), k * excess + start) * torch.complex(
-        1 / r, -k + 0 * r
-    )
-    source = field.to(torch.complex128)
-    out = torch.zeros_like(source)
-    for i in range(height):
-        for j in range(width):
-            window = impulse[height - 1 - i : 2 * height - 1 - i, width - 1 - j : 2 * width - 1 - j]
-            out += source[i, j] * window
-    return out * pitch_m**2
-
-
 def fresnel_number(half_width_m: float, wavelength_m: float, distance_m: float) -> float:
     """Return the Fresnel number a^2 / (l z): far above 1 diffraction changes only the edges.
 

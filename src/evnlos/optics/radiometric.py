@@ -1,8 +1,4 @@
-"""Light transport by radiometry: the matrix from a luminous plane over a wall to a camera (paper Eq. 2-3).
-
-- The light-transport matrix from a luminous plane over a wall to a camera (paper Eq. 2-3).
-- The radiometric transport without its matrix: blocks of rows are made, used and forgotten.
-"""
+"""Light transport by radiometry: the matrix from a luminous plane over a wall to a camera (paper Eq. 2-3)."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ from numpy.typing import NDArray
 from evnlos.errors import ConfigError
 from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.optics.interpolation import gauss_points, points_for
-from evnlos.optics.operator import LinearTransport, Patches, as_patches
+from evnlos.optics.operator import Patches, as_patches
 from evnlos.optics.reflection import GGX, Brdf, Direction, Lambert
 from evnlos.optics.view import Occluder, View, check_between, visibility
 from evnlos.types import Plane
@@ -209,7 +205,6 @@ def light_transport_matrix(
     emission: torch.Tensor | None = None,
     emission_exponent: tuple[float, float] = (0.0, 0.0),
     points: tuple[int, int] | None = None,
-    rows: slice = slice(None),
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
     compiled: bool | None = None,
@@ -235,7 +230,6 @@ def light_transport_matrix(
         emission_exponent: Extra fall of the emission, cos_x^a cos_y^b of its angles in the two axes; (0, 0) is
             Lambertian, screens have more.
         points: Quadrature points a side of a (pixel, cell); None adapts them to the lobe.
-        rows: The pixels, counted row by row, whose rows of the matrix are made.
         dtype: Floating-point type of the result; what needs no gradient is computed in float64.
         device: Device of the result.
         compiled: Whether to use the compiled loop; None does so on the CPU when no gradient is requested.
@@ -254,7 +248,6 @@ def light_transport_matrix(
     if emission is not None and tuple(emission.shape) != source.shape:
         raise ConfigError(f"emission is {tuple(emission.shape)}; the target plane has {source.shape} cells")
     wall, wall_weight = _wall_points(seen, over_pixel)  # [S, P, 2], [S]
-    wall = wall[:, rows]
     differentiable = any(
         isinstance(value, torch.Tensor) and value.requires_grad
         for value in (distance_m, *offset_m, emission, *vars(brdf).values())
@@ -456,81 +449,3 @@ def _fill(
             np.array([corner for one in occluders for corner in one.vertices_m], np.float64).reshape(-1, 3),
             np.cumsum([len(one.vertices_m) for one in occluders], dtype=np.int64),
         )
-
-
-_BLOCK = 2**22  # entries of the matrix in memory at a time
-
-
-class LightTransport(LinearTransport):
-    """`light_transport_matrix` as an operator in bounded memory, for planes whose matrix would not fit.
-
-    Every application makes the entries anew: use `MatrixTransport` where the matrix fits.
-
-    Args:
-        seen: The camera's view, or wall patches (matte walls only).
-        source: The target's plane or cells.
-        distance_m: Distance from wall to target, metres.
-        brdf: How the wall reflects.
-        offset_m: Where the target plane's origin lies over the wall (x, y), metres.
-        occluders: Opaque polygons between wall and target.
-        emission: Radiance of each cell at brightness 1, [h, w].
-        emission_exponent: Extra fall of the emission with its angle in both axes.
-        block: Entries of the matrix to hold at a time.
-    """
-
-    def __init__(
-        self,
-        seen: View | Plane | Patches,
-        source: Plane | Patches,
-        distance_m: float,
-        brdf: Brdf,
-        *,
-        offset_m: tuple[float, float] = (0.0, 0.0),
-        occluders: Sequence[Occluder] = (),
-        emission: torch.Tensor | None = None,
-        emission_exponent: tuple[float, float] = (0.0, 0.0),
-        block: int = _BLOCK,
-    ) -> None:
-        self.seen = seen
-        self.source = source
-        self.distance_m = distance_m
-        self.brdf = brdf
-        self._options = {
-            "offset_m": offset_m,
-            "occluders": occluders,
-            "emission": emission,
-            "emission_exponent": emission_exponent,
-        }
-        self._rows = max(1, block // (source.height * source.width))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Size (H, W) of the image, or of the plane of wall patches."""
-        return self.seen.shape
-
-    def _blocks(self, like: torch.Tensor) -> Iterator[tuple[slice, torch.Tensor]]:
-        pixels = self.shape[0] * self.shape[1]
-        for start in range(0, pixels, self._rows):
-            rows = slice(start, min(start + self._rows, pixels))
-            block = light_transport_matrix(
-                self.seen,
-                self.source,
-                self.distance_m,
-                self.brdf,
-                rows=rows,
-                dtype=like.dtype,
-                device=like.device,
-                **self._options,
-            )
-            yield rows, block
-
-    def _forward(self, scene: torch.Tensor) -> torch.Tensor:
-        flat = scene.flatten(-2)  # [..., h w]
-        image = torch.cat([flat @ block.mT for _, block in self._blocks(scene)], dim=-1)
-        return image.unflatten(-1, self.shape)
-
-    def _adjoint(self, image: torch.Tensor) -> torch.Tensor:
-        flat = image.flatten(-2)  # [..., H W]
-        scene = sum(flat[..., rows] @ block for rows, block in self._blocks(image))
-        assert isinstance(scene, torch.Tensor)  # a view has at least one pixel
-        return scene.unflatten(-1, self.source.shape)
