@@ -1,6 +1,6 @@
 """Figures; matplotlib is imported when one is drawn.
 
-`figures` draws wall, events, surfaces and reconstructions, and films of them over time; `setup` draws the setup
+`figures` draws films of a sequence and what a corner shows; `setup` draws the setup
 to scale; `preview` and `event_views` show events without matplotlib; `results` belongs to the commands.
 """
 
