@@ -67,6 +67,8 @@ class ExperimentCommand:
     """Which captures: those whose names begin with this and an underscore."""
     setups: tuple[str, ...] = ()
     """For mismatch: rooms of `evnlos lab`, or, with --captures, folders of captures in it; all by default."""
+    robust: bool = False
+    """For mismatch: draw sensors and walls of the simulated objects from wide ranges around the fitted ones."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of initial weights and order of the samples."""
     modalities: tuple[str, ...] = STANDARD_MODALITIES
@@ -237,7 +239,7 @@ class ExperimentCommand:
     def _mismatch(self) -> None:
         from evnlos.demo import Demo, mismatch_table, run_mismatch
 
-        base = Demo(out=self.out, test=self.test, workers=self.workers, force=self.force)
+        base = Demo(out=self.out, test=self.test, workers=self.workers, force=self.force, robust=self.robust)
         base = replace(
             base,
             writers=self.writers or base.writers,

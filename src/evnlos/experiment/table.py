@@ -224,7 +224,6 @@ def character_table(records: list[Record], arms: tuple[str, ...], metric: str = 
 def gain_table(records: list[Record], arm: str = "EPNP", other: str = "E2E") -> str:
     """Return Markdown: what an arm gains over the strongest of others, dB, with a 95 % interval.
 
-
     Args:
         records: Records of a study.
         arm: Name of the arm.
