@@ -181,14 +181,16 @@ _SEQUENCE_FINETUNING = replace(FINETUNING, epochs=8, batch_size=16)
 def sequence(setup: str) -> Study:
     """Return the comparison of E2E and EPNP where all time steps of a sequence are seen together.
 
-    A sequence is one sample: the simulation has four times the writers of the other studies.
+    A sequence is one sample: the simulation has four times the writers of the other studies. The images of an
+    end-to-end network of single positions, aligned and averaged, are the stronger E2E.
     """
     arms = (
+        Arm("E2E, single positions", "none", None, END_TO_END),
         Arm("E2E sequence", "none", None, replace(_SEQUENCE, epochs=60)),
         Arm("simulation only sequence", "calibrated", _SEQUENCE, None),
         Arm("EPNP sequence", "calibrated", _SEQUENCE, _SEQUENCE_FINETUNING),
     )
-    return Study("sequence", setup, arms, writers=44)
+    return Study("sequence", setup, arms, writers=44, average=True)
 
 
 def on_sequences(study: Study) -> Study:
