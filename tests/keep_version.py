@@ -1,19 +1,19 @@
 """Keep small files of this version, which later ones must read: dataset, run, weights, setup, capture.
 
-    python tests/keep_version.py
+    python tests/keep_version.py 0.2.0
 
-writes `tests/upgrade/VERSION`; run it once, before a version is released. `tests/test_upgrade.py`
+writes `tests/upgrade/0.2.0`; run it once, before that version is tagged. `tests/test_upgrade.py`
 reads them all.
 """
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 
-import evnlos
 from evnlos.analysis import evaluate
 from evnlos.config import save_yaml
 from evnlos.data import (
@@ -65,7 +65,9 @@ def answers(folder: Path) -> dict:
 
 
 def main() -> None:
-    folder = UPGRADE / evnlos.__version__
+    if len(sys.argv) != 2 or re.fullmatch(r"\d+\.\d+\.\d+", sys.argv[1]) is None:
+        sys.exit("give the version that comes next, e.g. 0.2.0")
+    folder = UPGRADE / sys.argv[1]
     if folder.exists():
         sys.exit(f"{folder} exists; a version's files never change")
     dataset = simulate(SIMULATION, folder / "dataset", workers=1)

@@ -1,5 +1,6 @@
 """What an older version wrote, this one reads, and it says the same: dataset, run, weights, setup, capture."""
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from evnlos.cli import main
+from evnlos.models import load_weights, published
 from keep_version import UPGRADE, answers
 
 VERSIONS = sorted(path for path in UPGRADE.iterdir() if path.is_dir())
@@ -36,6 +38,19 @@ def test_work_goes_on_with_files_of_a_version(version, tmp_path, capsys) -> None
     main(["finetune", "--weights", run, "--data", str(version / "dataset"), "--out", again, "--epochs", "1"])
     capsys.readouterr()
     main(["weights", again, "--json"])
+    assert json.loads(capsys.readouterr().out)
+
+
+def test_published_weights_of_a_version_reconstruct(version, tmp_path, monkeypatch, capsys) -> None:
+    folder = tmp_path / "published"
+    folder.mkdir()
+    file = shutil.copy(version / "run" / "weights.safetensors", folder / "old-frame.safetensors")
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    (folder / "SHA256SUMS").write_text(f"{digest}  {file.name}\n")
+    monkeypatch.setenv("EVNLOS_WEIGHTS", str(folder))
+    assert published()["old-frame"] == file
+    assert load_weights("old-frame").sampling == load_weights(version / "run").sampling
+    main(["weights", "old-frame", "--json"])
     assert json.loads(capsys.readouterr().out)
 
 

@@ -1,18 +1,27 @@
 """Build what users install, look at what is in it, and make an environment of what the package declares.
 
     python tools/distributions.py --out dist                                # sdist, wheel, wheel of the weights
+    python tools/distributions.py --out dist --release                      # the same, of a commit with a tag
     python tools/distributions.py --out build/declared/dist --core --environment build/declared/venv
 
-The wheel is built from the sdist, so that it shows what the sdist lacks. An environment is a fresh virtual one
-that holds the wheel and what its dependencies name, with what these name in turn; nothing of an extra, nothing
-of development. The packages are those of the Python that runs this, linked file by file: no index is asked.
+The version is that of the git tag. The wheel is built from the sdist, so that it shows what the sdist lacks.
+Sizes, names, metadata and the sums of the weights are checked, and SHA256SUMS is written beside the files. A
+release also needs a clean checkout with a tag, a dated heading in the changelog, the version in CITATION.cff
+and files of that version in tests/upgrade.
+
+An environment is a fresh virtual one that holds the wheel and what its dependencies name, with what these name
+in turn; nothing of an extra, nothing of development. The packages are those of the Python that runs this,
+linked file by file: no index is asked.
 """
 
 from __future__ import annotations
 
 import argparse
+import email
+import hashlib
 import importlib.metadata
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -43,33 +52,81 @@ READER = "analysis/classifier.safetensors"  # reads characters for a score; what
 BUILD = "import sys, setuptools.build_meta as backend; print(getattr(backend, sys.argv[1])(sys.argv[2]))"
 
 
-def built(kind: str, source: Path, out: Path) -> Path:
+def version_of(source: Path) -> str:
+    """Return the version that the git tags of a checkout give, as setuptools-scm does."""
+    call = [
+        sys.executable,
+        "-m",
+        "setuptools_scm",
+        "--root",
+        str(source),
+        "--config",
+        str(source / "pyproject.toml"),
+    ]
+    done = subprocess.run(call, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"{done.stderr}\n{source} has no version; pip install setuptools-scm")
+    return done.stdout.split()[-1]
+
+
+def release_faults(source: Path, version: str) -> list[str]:
+    """Return what keeps a checkout from being released; nothing where all is there."""
+    if re.fullmatch(r"\d+\.\d+\.\d+", version) is None:
+        return [f"{version} is no release; commit all changes and tag the commit, e.g. git tag v0.2.0"]
+    changed = subprocess.run(["git", "status", "--porcelain"], cwd=source, capture_output=True, text=True)
+    heading = re.compile(rf"^## {re.escape(version)}, \d{{4}}-\d\d-\d\d$", re.MULTILINE)
+    stated = re.compile(rf"^version: {re.escape(version)}$", re.MULTILINE)
+    faults = {
+        "the checkout has changes that are not committed": bool(changed.returncode or changed.stdout.strip()),
+        f"CHANGELOG.md has no heading '## {version}, YYYY-MM-DD'": not heading.search(
+            (source / "CHANGELOG.md").read_text(encoding="utf-8")
+        ),
+        f"CITATION.cff does not say 'version: {version}'": not stated.search(
+            (source / "CITATION.cff").read_text(encoding="utf-8")
+        ),
+        f"tests/upgrade/{version} is missing: python tests/keep_version.py {version}": not (
+            source / "tests" / "upgrade" / version / "answers.json"
+        ).exists(),
+    }
+    return [text for text, is_wrong in faults.items() if is_wrong]
+
+
+def built(kind: str, source: Path, out: Path, version: str = "") -> Path:
     """Return the sdist or wheel of a project's folder, made by its own backend without another environment."""
     call = [sys.executable, "-c", BUILD, f"build_{kind}", str(out.resolve())]
-    done = subprocess.run(call, cwd=source, capture_output=True, text=True)
+    known = {"SETUPTOOLS_SCM_PRETEND_VERSION_FOR_EVNLOS": version} if version else {}
+    done = subprocess.run(call, cwd=source, capture_output=True, text=True, env=os.environ | known)
     if done.returncode:
         raise SystemExit(f"{done.stdout}{done.stderr}\n{source} gives no {kind}")
     return out / done.stdout.split()[-1]
 
 
-def build_core(out: Path) -> tuple[Path, Path]:
+def build_core(out: Path, version: str) -> tuple[Path, Path]:
     """Return the sdist, and the wheel that is built from it."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"  # what is built leaves nothing in the checkout
         ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
         shutil.copytree(ROOT / "src", copy / "src", ignore=ignored)
-        for name in ("pyproject.toml", "README.md", "LICENSE"):
+        for name in ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff"):
             shutil.copy2(ROOT / name, copy)
-        sdist = built("sdist", copy, out)
+        sdist = built("sdist", copy, out, version)
         with tarfile.open(sdist) as archive:
             archive.extractall(folder, filter="data")
         return sdist, built("wheel", Path(folder) / sdist.name.removesuffix(".tar.gz"), out)
 
 
-def check_core(sdist: Path, wheel: Path) -> None:
-    """Raise where a file is lost, published weights came along, or the wheel is too large."""
+def check_core(sdist: Path, wheel: Path, version: str) -> None:
+    """Raise where a file is lost, weights came along, the wheel is too large, or metadata is wrong."""
     with tarfile.open(sdist) as archive:
         names = archive.getnames()
+        held = archive.extractfile(f"{sdist.name.removesuffix('.tar.gz')}/PKG-INFO")
+        stated = [email.message_from_bytes(held.read() if held else b"")]
+    with zipfile.ZipFile(wheel) as archive:
+        metadata = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        stated.append(email.message_from_bytes(archive.read(metadata)))
+    for key, wanted in {"Name": "evnlos", "Version": version, "License-Expression": "MIT"}.items():
+        if found := [one[key] for one in stated if one[key] != wanted]:
+            raise SystemExit(f"the metadata says {key}: {found[0]} where {wanted} is right")
     weights = [name for name in names if name.endswith(".safetensors") and not name.endswith(READER)]
     if weights:
         raise SystemExit(f"{sdist.name} holds weights: {', '.join(weights)}")
@@ -85,6 +142,24 @@ def check_names(wheel: Path, wanted: tuple[str, ...]) -> None:
         names = set(archive.namelist())
     if lost := [name for name in wanted if name not in names]:
         raise SystemExit(f"{wheel.name} lacks {', '.join(lost)}")
+
+
+def check_weights(wheel: Path) -> None:
+    """Raise where a wheel of weights lacks files, or a file is not that of the sums in it."""
+    check_names(wheel, IN_WEIGHTS)
+    with zipfile.ZipFile(wheel) as archive:
+        for line in archive.read("evnlos_weights/SHA256SUMS").decode().splitlines():
+            total, name = line.split()
+            if hashlib.sha256(archive.read(f"evnlos_weights/{name}")).hexdigest() != total:
+                raise SystemExit(f"{name} in {wheel.name} is not the file that its SHA256SUMS lists")
+
+
+def write_sums(folder: Path) -> None:
+    """Write SHA256SUMS of the files of a folder, as `sha256sum --check` reads it."""
+    lines = [
+        f"{hashlib.sha256(one.read_bytes()).hexdigest()}  {one.name}\n" for one in sorted(folder.iterdir())
+    ]
+    (folder / "SHA256SUMS").write_text("".join(lines), encoding="utf-8")
 
 
 def closure(requirements: list[str]) -> dict[str, importlib.metadata.Distribution]:
@@ -155,16 +230,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder of what is built, made anew")
     parser.add_argument("--core", action="store_true", help="the package alone, without its weights")
+    parser.add_argument("--release", action="store_true", help="refuse what is no release")
     parser.add_argument("--environment", type=Path, help="folder of the environment, made anew")
     asked = parser.parse_args()
+    version = version_of(ROOT)
+    if asked.release and (faults := release_faults(ROOT, version)):
+        raise SystemExit("no release: " + "; ".join(faults))
     shutil.rmtree(asked.out, ignore_errors=True)
     asked.out.mkdir(parents=True)
-    sdist, wheel = build_core(asked.out)
-    check_core(sdist, wheel)
+    sdist, wheel = build_core(asked.out, version)
+    check_core(sdist, wheel, version)
     if not asked.core:
         with tempfile.TemporaryDirectory() as folder:
             copy = shutil.copytree(WEIGHTS, Path(folder) / "weights")
-            check_names(built("wheel", copy, asked.out), IN_WEIGHTS)
+            check_weights(built("wheel", copy, asked.out))
+    write_sums(asked.out)
     for one in sorted(asked.out.iterdir()):
         print(f"{one}: {one.stat().st_size / 1e6:.2f} MB")
     if asked.environment is not None:
