@@ -12,9 +12,8 @@ import numpy as np
 import torch
 
 from evnlos import EventCamera, EventPixel, FrameCamera, Scene, Target, psnr, time_surface
-from evnlos.data import Sampling
+from evnlos.data import Sampling, object_light
 from evnlos.inverse import SequenceOperator, SequenceProblem
-from evnlos.inverse.measurements import object_light
 from evnlos.inverse.sequence_problem import strip_gram_of
 from evnlos.plot.event_views import signed_pictures, slice_pictures
 from evnlos.plot.figures import Column, film

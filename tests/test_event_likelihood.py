@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,20 +11,28 @@ import torch
 from evnlos.analysis import SequenceAnalysisSettings, event_information
 from evnlos.cameras import EventPixel, FrameCamera, simulate_events
 from evnlos.cli import main
+from evnlos.config import save_yaml, to_dict
+from evnlos.data import NlosDataset, Sampling, Simulation, simulate
+from evnlos.data.sampling import surface_of
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import (
     EventRecord,
+    EventSolver,
     FrameTerm,
     LikelihoodSettings,
     PatternPrior,
     SequenceEstimate,
     SequenceLight,
     estimate_sequence,
+    event_images,
     record_of,
     sequence_light,
 )
+from evnlos.metrics import psnr
+from evnlos.models import SequenceConfig
+from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup, SensorSize
-from evnlos.types import Plane
+from evnlos.types import Events, Plane
 
 COUNT = 24
 PIXEL = EventPixel(0.12, 0.14, 0.02, 60.0, 0.02, 0.05)
@@ -51,11 +60,14 @@ def truth(seed: int) -> np.ndarray:
     return np.random.default_rng([seed, 9]).standard_normal(COUNT)
 
 
-def recorded(seed: int, pixel: EventPixel = PIXEL) -> EventRecord:
+def simulated(seed: int, pixel: EventPixel = PIXEL) -> Events:
     """The events of the project's own continuous pixel, with mismatch, filter, leak and noise events."""
     frames = 255 * np.maximum(light()(truth(seed)), 1e-3).T.reshape(-1, *light().shape)
-    events = simulate_events(frames.astype(np.float32), light().times_s, pixel, seed=seed)
-    return record_of(events, pixel.crossing_law(40.0), (0.0, BENCH.duration_s), 0.4)
+    return simulate_events(frames.astype(np.float32), light().times_s, pixel, seed=seed)
+
+
+def recorded(seed: int, pixel: EventPixel = PIXEL) -> EventRecord:
+    return record_of(simulated(seed, pixel), pixel.crossing_law(40.0), (0.0, BENCH.duration_s), 0.4)
 
 
 def photographed(seed: int, camera: FrameCamera, known: bool) -> FrameTerm:
@@ -207,3 +219,61 @@ def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) 
     with pytest.raises(SystemExit):
         main(["invert", "shot", "--setup", "main-near", "--from", "events", "--positions", "3"])
     assert "--from takes whole sequences" in capsys.readouterr().err
+
+
+NOISY = replace(PIXEL, shot_noise_rate_hz=0.2)
+
+
+@pytest.mark.parametrize("pixel", [PIXEL, NOISY], ids=["few noise events", "many"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_fast_estimate_is_that_of_the_slow_one(pixel: EventPixel, seed: int) -> None:
+    law = pixel.crossing_law(40.0)
+    solver, unknown = EventSolver(light(), law), np.zeros(COUNT + 1)
+    record = recorded(seed, pixel)
+    slow = estimate_sequence(light(), prior(), law, record)
+    shares = np.minimum(np.arange(12) / 9, 1.0)
+    solver.improve(record, unknown, 0.25 ** (1 - shares) * 0.04**shares)
+    fast = solver(simulated(seed, pixel))
+    for z in (unknown[:COUNT], fast.z):  # from all pixels, and from a ninth of them first
+        away = prior().image(z) - slow.image
+        assert np.sqrt((away**2).mean()) < 0.35 * np.sqrt(slow.expected_error)
+    own = np.eye(COUNT)
+    weak, strong = fast.solutions((1.0, 10.0))
+    assert np.allclose(weak, np.linalg.solve(fast.information + own, fast.score))
+    assert np.linalg.norm(strong) < np.linalg.norm(weak)
+    expected = np.trace(np.linalg.inv(fast.information + own)) / np.trace(slow.covariance)
+    assert 0.8 < expected < 1.25
+
+
+def test_the_surface_shows_the_target(tmp_path: Path) -> None:
+    """Through simulation, shards and a network: what is stored is the target, twice, where it was."""
+    glyphs = HandwritingGlyphs(writers=1, characters="EH")
+    setup = replace(SETUP, gain=1.6)
+    config = Simulation(glyphs=glyphs, duration_s=8.0, positions=8, setup=setup, validation=0.0)
+    save_yaml(to_dict(config), tmp_path / "setup.yaml")
+    sampling = Sampling(surface="likelihood", setup=str(tmp_path / "setup.yaml"))
+    dataset = simulate(replace(config, sampling=sampling), tmp_path / "made")
+    samples = NlosDataset(dataset, "train", "event")
+    rows = sampling.scored
+    truth = samples.truth[:, rows].float()
+    for image in samples.inputs[:, :, rows].float().unbind(1):
+        own = psnr(image, truth).mean()
+        assert (
+            own > psnr(truth.flip(0), truth).mean() + 1
+            and own > psnr(torch.zeros_like(truth), truth).mean() + 1
+        )
+    network = SequenceConfig(width=4, depth=1, rank=8).build("event", sampling)
+    assert network.embedding.rank == 0 and network.embedding.images == 2
+    fused = SequenceConfig(width=4, depth=1, rank=8, ridge_multipliers=(0.1, 1.0)).build("fusion", sampling)
+    assert fused.embedding.images == 4 and fused.embedding(torch.rand(1, 3, 64, 96)).shape == (1, 4, 64, 96)
+
+
+def test_the_surface_is_refused_without_setup_or_motion() -> None:
+    events, edges = simulated(0), np.array([0, 4_000_000, 8_000_000])
+    canvas = Sampling().canvas
+    with pytest.raises(ConfigError, match="setup is empty"):
+        event_images(events, edges, BENCH.motion, "", canvas)
+    with pytest.raises(DataError, match="motion is unknown"):
+        event_images(events, edges, None, "near", canvas)
+    with pytest.raises(ConfigError, match="whole recordings"):
+        surface_of(events, edges, Sampling(surface="likelihood", setup="near"))

@@ -17,7 +17,7 @@ from evnlos.config import save_yaml
 from evnlos.data import Simulation
 from evnlos.data.lab import Lab
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.measurements import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_targets
+from evnlos.inverse.problem import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_targets
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup, named_setup, setup_names, setup_preset
 

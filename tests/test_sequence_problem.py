@@ -6,9 +6,8 @@ import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import Gradient, SequenceOperator, SequenceProblem, total_variation
-from evnlos.inverse.measurements import position_subsets
 from evnlos.inverse.operators import normal_matrix
-from evnlos.inverse.sequence_problem import matrix_of, strip_gram_of, strip_of
+from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import RadiometricSetup

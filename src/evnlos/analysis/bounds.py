@@ -33,7 +33,8 @@ from evnlos.inverse import (
     predicted_record,
     sequence_light,
 )
-from evnlos.inverse.measurements import handwritten_targets, position_subsets
+from evnlos.inverse.problem import handwritten_targets
+from evnlos.inverse.sequence_problem import position_subsets
 from evnlos.scene import LineMotion
 from evnlos.setups import Setup
 from evnlos.types import Plane

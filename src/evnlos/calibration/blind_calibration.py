@@ -28,7 +28,7 @@ from evnlos.calibration.transport_fit import (
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import SequenceOperator
-from evnlos.inverse.measurements import handwritten_targets
+from evnlos.inverse.problem import handwritten_targets
 from evnlos.inverse.sequence_problem import strip_gram_of, strip_of
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 from evnlos.analysis.bounds import canvas_decibel
 from evnlos.calibration.scan.importer import fill_bad
-from evnlos.cameras.streams import WHITE_DN
 from evnlos.cli.parsing import say
 from evnlos.data import Capture, load_pattern, pattern_of, read_capture
 from evnlos.data.frames import read_image
-from evnlos.data.sampling import Sampling
+from evnlos.data.sampling import Sampling, object_light
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
     FrameTerm,
@@ -37,9 +36,8 @@ from evnlos.inverse import (
     sequence_light,
 )
 from evnlos.inverse.inversion import Inversion, chosen_degree
-from evnlos.inverse.measurements import object_light, position_subsets
 from evnlos.inverse.operators import Solution
-from evnlos.inverse.sequence_problem import matrix_of, strip_gram_of, strip_of
+from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
 from evnlos.inverse.tikhonov import Rule
 from evnlos.metrics import psnr
 from evnlos.optics import MatrixTransport
@@ -322,10 +320,7 @@ def estimate_captures(
             times = np.asarray(capture.frame_times_us * 1e-6, np.float64)
             frames = FrameTerm(light, values, times, setup.frame_camera, known is not None)
         if evidence != "frames":
-            typical = WHITE_DN * float(
-                light.still.mean() + light.left.mean(axis=0) @ light.right[:, :, 0].mean(axis=0)
-            )
-            law = setup.pixel.crossing_law(typical)
+            law = setup.pixel.crossing_law(light.typical_dn)
             if law is None:
                 raise ConfigError(
                     f"{word}: its event model states no law of its crossings; give one of kind continuous, "

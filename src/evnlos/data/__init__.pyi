@@ -23,6 +23,7 @@ from .sampling import Samples as Samples
 from .sampling import Sampling as Sampling
 from .sampling import load_pattern as load_pattern
 from .sampling import make_samples as make_samples
+from .sampling import object_light as object_light
 from .sampling import pattern_of as pattern_of
 from .sampling import reduce_by_area as reduce_by_area
 from .sampling import save_pattern as save_pattern

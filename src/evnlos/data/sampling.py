@@ -23,6 +23,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.events import event_histogram, event_trace, read_events, time_surface
 from evnlos.files import write_atomically
 from evnlos.scene import Motion, Target
+from evnlos.setups import Setup
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
 from evnlos.types import Events, Plane
 
@@ -199,12 +200,15 @@ class Sampling:
     """Size of a pixel of the truth on the target's plane, metres."""
     scored_rows: int = 48
     """Rows in the middle of the canvas that are scored; the target never leaves them, pixels."""
-    surface: Literal["sae", "context", "hots", "trace"] = "sae"
-    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones."""
+    surface: Literal["sae", "context", "hots", "trace", "likelihood"] = "sae"
+    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones; `likelihood` =
+    the target that the events of the whole sequence make most likely through the light path of `setup`."""
     tau_s: float = 0.2
     """Time constant of the time surface, seconds; of `trace`, the time in which the light changes: 1 to 5."""
     radius: int = 3
     """Radius of the neighbourhood of the surfaces `context` and `hots`, pixels."""
+    setup: str = ""
+    """Setup for the surface `likelihood`: a folder of `evnlos calibrate`, a settings file, or a name."""
 
     def __post_init__(self) -> None:
         for name in ("height", "width", "scored_rows"):
@@ -266,6 +270,10 @@ def surface_of(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) 
         edges_us: N + 1 ascending instants, microseconds.
         sampling: Kind of the surface and its settings.
     """
+    if sampling.surface == "likelihood":
+        raise ConfigError(
+            "the surface 'likelihood' is made of whole recordings; give another --sampling.surface"
+        )
     tau_us = sampling.tau_s * 1e6
     if sampling.surface == "trace":
         return event_trace(events, edges_us, tau_us)
@@ -299,7 +307,12 @@ def make_samples(
     if len(edges_us) != len(frames) + 1:
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
     shape = (sampling.height, sampling.width)
-    surface = surface_of(events, edges_us, sampling)  # [N, 2, H, W]
+    if sampling.surface == "likelihood":
+        from evnlos.inverse.sequence_statistic import event_images  # which compiles
+
+        surface = event_images(events, edges_us, motion, sampling.setup, sampling.canvas)
+    else:
+        surface = reduce_by_area(surface_of(events, edges_us, sampling), shape)  # [N, 2, H, W]
     time_s = np.asarray(edges_us[1:], dtype=np.float64) * 1e-6
     position = None if motion is None else motion.position_m(time_s)
     truth = None
@@ -307,12 +320,36 @@ def make_samples(
         truth = target.rasterise(sampling.canvas, position)
     return Samples(
         frame=reduce_by_area(frames / np.float32(peak), shape),
-        surface=reduce_by_area(surface, shape),
+        surface=surface,
         truth=truth,
         time_s=time_s,
         position_m=position,
         event_count=np.diff(np.searchsorted(events.t_us, edges_us, side="right")).astype(np.int64),
     )
+
+
+def object_light(
+    frames: NDArray,
+    peak: int,
+    setup: Setup,
+    shape: tuple[int, int],
+    pattern: FixedPattern | None = None,
+) -> torch.Tensor:
+    """Return frames less the setup's ambient light, reduced by area averaging.
+
+    Args:
+        frames: Digital numbers [N, H, W].
+        peak: Largest digital number.
+        setup: The setup that says how much ambient light there is.
+        shape: Size (h, w) of the result, pixels.
+        pattern: The camera's fixed pattern, to be taken off first.
+
+    Returns:
+        White levels, float32 [N, h, w]; noise makes some of them negative.
+    """
+    levels = frames / np.float32(peak) if pattern is None else pattern.correct(frames, peak)
+    size = (frames.shape[-2], frames.shape[-1])
+    return torch.from_numpy(reduce_by_area(levels - setup.ambient_light(size).numpy(), shape))
 
 
 def reduce_by_area(images: NDArray, shape: tuple[int, int]) -> NDArray[np.float32]:

@@ -265,6 +265,8 @@ def check_dataset(dataset: Dataset, settings: type[Any] | None = None) -> bool:
         stored = read_yaml(path, LONG_YAML)
         if settings is not None and isinstance(stored.get("config"), dict):
             stored["config"] = to_dict(from_dict(settings, stored["config"], source=str(path)))
+        if isinstance(stored.get("sampling"), dict):
+            stored["sampling"] = to_dict(from_dict(Sampling, stored["sampling"], source=str(path)))
         differing = differing_keys(_comparable(_content(dataset)), _comparable(stored))
         if differing:
             shown = "; ".join(differing[:6]) + (

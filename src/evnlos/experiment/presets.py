@@ -117,6 +117,7 @@ def surface(setup: str) -> Study:
         f"{kind}, radius {r}": Sampling(surface=kind, radius=r) for kind in ("context", "hots") for r in (1, 3)
     }  # type: ignore[arg-type]
     samplings["trace, 2 s"] = Sampling(surface="trace", tau_s=2.0)
+    samplings["likelihood"] = Sampling(surface="likelihood")  # of the calibrated setup
     arms = [
         replace(arm, name=f"{arm.name} {name}", sampling=s)
         for name, s in samplings.items()

@@ -82,7 +82,8 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
     for arm in study.arms:
         _chosen(study, arm, place)
     setup = place.out / "setups" / study.setup
-    needs_setup = study.correct_pattern or any(arm.source == "calibrated" for arm in study.arms)
+    needs_setup = study.correct_pattern or any(arm.needs_setup for arm in study.arms)
+    study = replace(study, arms=tuple(arm.with_light_path(setup) for arm in study.arms))
     if needs_setup and not calibrated_file(setup).is_file():
         settings = replace(study.calibration, exclude=(*study.calibration.exclude, *study.test))
         progress(Step(f"calibrate {study.setup}", 0, 1, "setups"))

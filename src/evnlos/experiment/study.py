@@ -71,6 +71,21 @@ class Arm:
                 f"arm {self.name!r}: captures is {self.captures}; give at least 1, or leave out fine-tuning"
             )
 
+    @property
+    def needs_setup(self) -> bool:
+        """Whether the captures have to be calibrated first."""
+        return self.source == "calibrated" or self.sampling.surface == "likelihood"
+
+    def with_light_path(self, setup: Path) -> Arm:
+        """Return the arm with a setup for the surface `likelihood`, where it is made and names none.
+
+        Args:
+            setup: Folder of the calibrated setup.
+        """
+        if self.sampling.surface != "likelihood" or self.sampling.setup:
+            return self
+        return replace(self, sampling=replace(self.sampling, setup=str(setup)))
+
 
 @dataclass(frozen=True)
 class Study:

@@ -19,11 +19,11 @@ from .inversion import Inversion as Inversion
 from .inversion import Photograph as Photograph
 from .inversion import prepare_inversion as prepare_inversion
 from .inversion import read_photograph as read_photograph
-from .measurements import LogChange as LogChange
-from .measurements import log_change as log_change
 from .operators import Gradient as Gradient
 from .operators import LinearOperator as LinearOperator
+from .operators import LogChange as LogChange
 from .operators import Solution as Solution
+from .operators import log_change as log_change
 from .operators import operator_norm as operator_norm
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
@@ -36,6 +36,9 @@ from .sequence_light import handwritten_prior as handwritten_prior
 from .sequence_light import sequence_light as sequence_light
 from .sequence_problem import SequenceOperator as SequenceOperator
 from .sequence_problem import SequenceProblem as SequenceProblem
+from .sequence_statistic import EventSolver as EventSolver
+from .sequence_statistic import EventStatistic as EventStatistic
+from .sequence_statistic import event_images as event_images
 from .tikhonov import tikhonov as tikhonov
 from .tikhonov import tikhonov_cv_error as tikhonov_cv_error
 from .total_variation import total_variation as total_variation

@@ -332,7 +332,7 @@ class _State:
         spread = own + variance
         away = residual - variance * (seen - weight * residual)
         signal = np.exp(-0.5 * away**2 / spread) / np.sqrt(2 * math.pi * spread)
-        signal *= _upward(self.record.sign[measured] * self.rate[measured], self.blur)[0]
+        signal *= upward(self.record.sign[measured] * self.rate[measured], self.blur)[0]
         duration = self.light.times_s[-1] - self.light.times_s[0]
         least = _FEWEST_NOISE * len(measured) / (duration * len(self.light.left))
         # a noise event meets a pixel that has not crossed its threshold yet
@@ -342,7 +342,7 @@ class _State:
 
     def steepness(self, trust: Array) -> Rows:
         """Return the rows of log |dD/dt|, the density of an event in time over that in its level, [N] each."""
-        _, slope, bend = _upward(self.record.sign * self.rate, self.blur)
+        _, slope, bend = upward(self.record.sign * self.rate, self.blur)
         bend = np.maximum(bend, 1e-12)
         everything = np.arange(len(self.record))
         residual = np.where(self.record.measured, self.record.sign * slope / bend, 0.0)
@@ -379,7 +379,7 @@ class _State:
         return Rows(at, np.full(len(at), sign, np.int8), precision, residual)
 
 
-def _upward(rate: Array, blur: float) -> tuple[Array, Array, Array]:
+def upward(rate: Array, blur: float) -> tuple[Array, Array, Array]:
     """Return E of max(rate + blur n, 0), n normal, and slope and negative curvature of its logarithm.
 
     Args:

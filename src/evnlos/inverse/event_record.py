@@ -105,6 +105,16 @@ class EventRecord:
         origin = np.where(chosen & (self.origin >= 0), index[self.origin], -1)
         return EventRecord(self.pixel[kept], self.t_s[kept], self.sign[kept], origin[kept])
 
+    def of_pixels(self, chosen: NDArray[np.bool_]) -> EventRecord:
+        """Return the record of some pixels alone.
+
+        Args:
+            chosen: Whether the pixel of an instant is one of them, [N].
+        """
+        index = np.cumsum(chosen) - 1
+        origin = np.where(self.origin >= 0, index[self.origin], -1)[chosen]
+        return EventRecord(self.pixel[chosen], self.t_s[chosen], self.sign[chosen], origin)
+
     def change(self, light: SequenceLight, levels: Levels) -> Array:
         """Return by how much the level moved since the origin, the leak's share included, [N]; NaN = none."""
         level = light.at(levels.value, self.pixel, self.t_s)

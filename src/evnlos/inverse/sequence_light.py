@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
 from evnlos.cameras import FrameCamera
+from evnlos.cameras.streams import WHITE_DN
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.measurements import handwritten_targets
+from evnlos.inverse.problem import handwritten_targets
 from evnlos.inverse.sequence_problem import SequenceOperator, strip_of
 from evnlos.optics import MatrixTransport
 from evnlos.setups import Setup
@@ -121,6 +122,11 @@ class SequenceLight:
     def __call__(self, z: Array) -> Array:
         """Return the light of a target with coefficients [k], white levels, [P, T]."""
         return self.left @ (self.right @ np.append(1.0, z)).T + self.still
+
+    @property
+    def typical_dn(self) -> float:
+        """Mean light of the mean target, DN."""
+        return WHITE_DN * float(self.still.mean() + self.left.mean(axis=0) @ self.right[:, :, 0].mean(axis=0))
 
     def place(self, t_s: Array) -> tuple[NDArray[np.int64], Array]:
         """Return of instants [N] the node before, and the share of the way to the next; clipped to the ends."""

@@ -346,3 +346,24 @@ class SequenceProblem:
         values, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(lower, half.mT, upper=False))
         basis = torch.linalg.solve_triangular(lower.mT, vectors, upper=True)
         return values.clamp(min=0), basis
+
+
+def position_subsets(count: int, positions: int, subsets: int) -> list[NDArray[np.int64]]:
+    """Return up to `subsets` different, equally spaced choices of `positions` out of `count`.
+
+    Raises:
+        ConfigError: Fewer than one position, or more than there are.
+
+    Example:
+        >>> [one.tolist() for one in position_subsets(40, 2, 2)]
+        [[5, 25], [15, 35]]
+    """
+    if not 1 <= positions <= count or subsets < 1:
+        raise ConfigError(
+            f"{positions} positions of {count} in {subsets} subsets; give 1 to {count}, and 1 or more"
+        )
+    found: dict[tuple[int, ...], NDArray[np.int64]] = {}
+    for k in range(subsets):
+        chosen = np.floor((np.arange(positions) + (k + 0.5) / subsets) * count / positions).astype(np.int64)
+        found.setdefault(tuple(chosen.tolist()), chosen)
+    return list(found.values())

@@ -190,47 +190,55 @@ class LinearEmbedding(nn.Module):
 
 
 class LinearEmbeddings(nn.Module):
-    """Each group of channels undone by its own ridges: [B, C, H, W] -> [B, G S, H, W], the first group's first.
+    """Each group of channels undone by its own ridges: [B, C, H, W] -> [B, S, H, W], the first group's first.
 
     One regression on all would mix them by their noise in the samples that it was fitted to; apart, the
-    network behind weighs them, image by image and place by place.
+    network behind weighs them, image by image and place by place. A map that shows the target already (the
+    surface `likelihood`) stays as it is.
 
     Args:
         modality: What is seen; each of its G groups has an embedding.
         size: Height and width of the input, pixels.
         rank: Most components of all groups together, at least one for each.
-        ridge_multipliers: As in `LinearEmbedding`, S of them.
+        ridge_multipliers: As in `LinearEmbedding`.
+        solved: Name of a map that shows the target already; groups of it alone are not embedded.
 
     Raises:
         ConfigError: The rank is less than the number of groups.
     """
 
     def __init__(
-        self, modality: Modality, size: tuple[int, int], rank: int, ridge_multipliers: tuple[float, ...]
+        self,
+        modality: Modality,
+        size: tuple[int, int],
+        rank: int,
+        ridge_multipliers: tuple[float, ...],
+        solved: str = "",
     ) -> None:
         super().__init__()
         self.modality = modality
+        embedded = [group for group in modality.groups if group.maps != (solved,)]
+        ranks = dict(zip(modality.layout, modality.ranks(rank), strict=True))
         self.groups = nn.ModuleDict(
             {
-                group.name: LinearEmbedding(group.channels, size, part, ridge_multipliers)
-                for group, part in zip(modality.groups, modality.ranks(rank), strict=True)
+                group.name: LinearEmbedding(group.channels, size, ranks[group.name], ridge_multipliers)
+                for group in embedded
             }
         )
         self.shape = (modality.channels, *size)
+        self.images = modality.channels + sum(
+            part.images - group.channels for group, (_, part) in zip(embedded, self._parts, strict=True)
+        )
 
     @property
     def _parts(self) -> list[tuple[slice, LinearEmbedding]]:
-        return [(own, self.groups[name]) for name, own in self.modality.slices.items()]  # type: ignore[misc]
+        slices = self.modality.slices
+        return [(slices[name], part) for name, part in self.groups.items()]  # type: ignore[misc]
 
     @property
     def rank(self) -> int:
         """Most components of all groups together."""
         return sum(part.rank for _, part in self._parts)
-
-    @property
-    def images(self) -> int:
-        """Images that come out for each input."""
-        return sum(part.images for _, part in self._parts)
 
     def fit(self, seen: Tensor, truth: Tensor, objects: NDArray[np.str_], seed: int) -> None:
         """Fit each group to normalized samples [N, C, H, W]; arguments as in `fit_linear`."""
@@ -246,16 +254,17 @@ class LinearEmbeddings(nn.Module):
         Raises:
             ConfigError: There are not as many, or a group would have none.
         """
-        least = len(self._parts)
-        if not least <= rank <= self.rank:
+        least = len(self.modality.groups)
+        if not self.groups or not least <= rank <= self.rank:
             raise ConfigError(
                 f"the rank is to be {rank}; this embedding has {self.rank}: give {least} to {self.rank}"
             )
-        for (_, part), own in zip(self._parts, self.modality.ranks(rank), strict=True):
-            part.keep(own)
+        ranks = dict(zip(self.modality.layout, self.modality.ranks(rank), strict=True))
+        for name, part in self.groups.items():
+            part.keep(ranks[name])  # type: ignore[operator]
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [B, C, H, W] to images [B, G S, H, W].
+        """Map [B, C, H, W] to images [B, S, H, W].
 
         Raises:
             DataError: The input has another size than this embedding was made for.
@@ -263,7 +272,11 @@ class LinearEmbeddings(nn.Module):
         if tuple(x.shape[1:]) != self.shape:
             wanted = ", ".join(str(side) for side in self.shape)
             raise DataError(f"input is {tuple(x.shape)}; this network's embedding takes [B, {wanted}]")
-        return torch.cat([part(x[:, own]) for own, part in self._parts], dim=1)
+        parts = [
+            self.groups[name](x[:, own]) if name in self.groups else x[:, own].float()
+            for name, own in self.modality.slices.items()
+        ]
+        return torch.cat(parts, dim=1)
 
 
 @torch.inference_mode()

@@ -144,7 +144,8 @@ class SequenceReconstructor(Reconstructor):
         self.settings: SequenceConfig = settings
         size = (sampling.height, sampling.width)
         self.normalization = InputNormalization(modality, settings.scaling)
-        self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.ridge_multipliers)
+        solved = "surface" if sampling.surface == "likelihood" else ""
+        self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.ridge_multipliers, solved)
         self.scale = PooledScale(self.embedding.images)
         self.unet = ResidualUNet(self.embedding.images, settings)
         self.grid = TargetGrid(sampling)
