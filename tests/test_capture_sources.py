@@ -1,6 +1,7 @@
 """Loose recordings as a laboratory produces them become captures: every source of frames, clock and pixels."""
 
 import struct
+import tracemalloc
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,9 +12,9 @@ from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
 from evnlos.cli import main
-from evnlos.data import check_picture, read_shard
+from evnlos.data import Capture, FixedPattern, Sampling, check_picture, read_shard
 from evnlos.data.frames import homography_from_points
-from evnlos.events import write_aedat4, write_celex_frames, write_events
+from evnlos.events import FrameStack, write_aedat4, write_celex_frames, write_events
 from evnlos.types import Events
 from ros_files import IMAGE, PACKET, Cdr, Recording, Ros1, event_array, image, write_bag, write_mcap
 
@@ -120,6 +121,74 @@ def test_one_file_of_events_and_frames_is_imported_by_one_command(name, tmp_path
     samples, _ = read_shard(open_dataset(tmp_path / "d").shard("shot_A"))
     assert samples.frame.shape == (5, 64, 96)
     main(["import", str(path), "--out", str(tmp_path / "d"), "--no-check-pictures"])  # nothing is left to do
+
+
+def long_bag(path: Path, count: int, size=(96, 128)) -> Path:
+    """Write a bag of as many events whatever the number of images, 1 ms apart."""
+    draw = np.random.default_rng(1)
+    t_us = np.sort(draw.integers(0, 40_000, 2_000))
+    events = Events(t_us, draw.integers(0, 128, 2_000), draw.integers(0, 96, 2_000), t_us % 2 == 0, 128, 96)
+    data = event_array(
+        (t_us * 1000).tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist(), (128, 96)
+    )
+    messages: Recording = [("/events", "dvs_msgs/EventArray", 0, data)]
+    for k in range(count):
+        stamp = k * 1_000_000
+        frame = draw.integers(0, 256, size).astype(np.uint8)
+        messages.append(("/image", "sensor_msgs/Image", stamp, image(stamp, frame, make=Ros1)))
+    return write_bag(path, messages)
+
+
+@pytest.fixture
+def little_held(monkeypatch):
+    monkeypatch.setattr("evnlos.data.capture._HELD_BYTES", 1 << 17)
+    monkeypatch.setattr("evnlos.data.sampling._BLOCK_BYTES", 1 << 21)
+    # Columns are begun for as many events as a file has bytes; pages that no event reaches are never used.
+    monkeypatch.setattr("evnlos.events.files.columns.memory_left", lambda: 0)
+
+
+def test_the_memory_of_an_import_does_not_grow_with_the_frames(tmp_path, little_held):
+    import_captures([long_bag(tmp_path / "first.bag", 4)], tmp_path / "d0")  # what is imported once, is
+    peaks = []
+    for count in (60, 600):
+        path = long_bag(tmp_path / f"of{count}.bag", count)
+        tracemalloc.start()
+        import_captures([path], tmp_path / f"d{count}", look=check_picture)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    held = 540 * 96 * 128  # of the frames that are more, as bytes
+    assert peaks[1] - peaks[0] < 0.25 * held
+
+
+def test_an_import_that_reads_frames_twice_makes_the_same_dataset(tmp_path, little_held, monkeypatch):
+    path = long_bag(tmp_path / "shot_A.bag", 150)
+    dark = np.zeros((96, 128), np.float32)
+    how = {"sampling": Sampling(), "pattern": FixedPattern(dark + 1.5, dark + 0.1)}
+    found: list[Capture] = []
+    import_captures([path], tmp_path / "lazy", **how, look=found.append)
+    monkeypatch.undo()
+    import_captures([path], tmp_path / "held", **how, look=found.append)
+    lazy, held = (read_shard(open_dataset(tmp_path / name).shard("shot_A"))[0] for name in ("lazy", "held"))
+    for name in ("frame", "surface", "time_s", "event_count"):
+        np.testing.assert_array_equal(getattr(lazy, name), getattr(held, name))
+    assert isinstance(found[0].frames, FrameStack) and isinstance(found[1].frames, np.ndarray)
+    stack, whole = found[0].frames, found[1].frames
+    np.testing.assert_array_equal(stack, whole)
+    np.testing.assert_array_equal(stack[3:7], whole[3:7])
+    np.testing.assert_array_equal(stack[-1], whole[-1])
+    np.testing.assert_array_equal(stack[[5, 9]], whole[[5, 9]])
+    assert stack.mean() == whole.mean() and len(stack[7:7].shape) == 3 and not list(stack[7:7].blocks())
+
+
+def test_frames_of_a_file_that_changed_meanwhile_are_refused(tmp_path):
+    path = long_bag(tmp_path / "a.bag", 9)
+    stack = read_capture(path, 1 << 14, lazy_frames=True).frames
+    with pytest.raises(EvnlosError, match=r"its frames needs .* GB of memory"):
+        read_capture(path, 1 << 14)
+    for count in (6, 12):
+        long_bag(path, count)
+        with pytest.raises(EvnlosError, match="has changed while it was read"):
+            np.asarray(stack)
 
 
 def test_convert_tells_what_the_new_file_does_not_hold(tmp_path, capsys):

@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +32,15 @@ from evnlos.data.sampling import (
     Sampling,
     correct_frames,
     frame_homography,
-    make_samples,
+    iter_samples,
+    join_samples,
     time_steps,
 )
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, printable
 from evnlos.events import (
     CelexOptions,
+    FrameStack,
     crop_events,
     keep_known_polarity,
     read_events,
@@ -48,6 +51,7 @@ from evnlos.scene import LineMotion, Scene, Target
 from evnlos.types import Events
 from evnlos.untrusted import check_memory, no_file
 
+_HELD_BYTES = 1 << 26  # frames of an import that take more are read as they are asked for
 _MOST_US = 2**62  # of a time stamp: differences of two fit into 64 bits
 
 
@@ -120,6 +124,7 @@ def read_capture(
     events_topic: str | None = None,
     frames_topic: str | None = None,
     needs_frames: bool = True,
+    lazy_frames: bool = False,
 ) -> Capture:
     """Read a capture folder (`capture.yaml`, event file, frames, mask), or one file of events and frames.
 
@@ -131,6 +136,7 @@ def read_capture(
         events_topic: Stream of the events, of a file that holds several.
         frames_topic: Stream of its frames.
         needs_frames: Whether a capture of an event camera alone is refused; else black frames mark its steps.
+        lazy_frames: Whether frames that take more memory are a `FrameStack`, in place of an error.
 
     Raises:
         DataError: A file is missing, a frame has another size than the camera, clock or pixels do not fit, or
@@ -145,7 +151,7 @@ def read_capture(
     info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic)
     name, folder = _name_of(folder), folder.parent if folder.is_file() else folder
     is_alone = info.frames is None and not needs_frames
-    series = None if is_alone else read_frame_series(folder, info, most_frame_bytes)
+    series = None if is_alone else read_frame_series(folder, info, most_frame_bytes, lazy_frames)
     events, told = _read_events(folder, info)
     if series is None:
         frames, times_us = time_steps(folder, info, events)
@@ -158,20 +164,13 @@ def read_capture(
     roi = info.roi
     if roi is not None:
         events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
-        frames = frames[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width]
+        frames = _mapped(frames, lambda one: one[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
         notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
     if not len(events):
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
     target = _read_target(folder, info.target)
-    return Capture(
-        name,
-        info,
-        events,
-        frames if is_alone else np.ascontiguousarray(frames),
-        times_us,
-        target,
-        tuple(map(printable, notes)),
-    )
+    held = cast(Any, frames) if is_alone or isinstance(frames, FrameStack) else np.ascontiguousarray(frames)
+    return Capture(name, info, events, held, times_us, target, tuple(map(printable, notes)))
 
 
 def _name_of(path: Path) -> str:
@@ -206,35 +205,41 @@ def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
     return events, notes
 
 
-def _prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[NDArray, list[str]]:
+def _mapped(frames: Any, work: Callable[[NDArray], NDArray]) -> Any:
+    """Return frames with `work` done on them; on those that are read as they are asked for, block by block."""
+    return frames.mapped(work) if isinstance(frames, FrameStack) else work(frames)
+
+
+def _prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[Any, list[str]]:
     """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
     frames, notes = series.images, []
     size = frames.shape[1:]
     peak = float(np.iinfo(frames.dtype).max)
-    changed = None
-    if info.dark is not None or info.flat is not None:
-        dark, flat = (
-            read_image(inside(folder, name), size) if name else None for name in (info.dark, info.flat)
-        )
-        changed = correct_frames(frames, peak, dark, flat)
+    dark, flat = (read_image(inside(folder, name), size) if name else None for name in (info.dark, info.flat))
+    is_corrected = dark is not None or flat is not None
+    if is_corrected:
         notes.append(f"frames corrected by {' and '.join(name for name in (info.dark, info.flat) if name)}")
     if info.frames_turned:
-        frames = frames[:, ::-1, ::-1]
-        changed = None if changed is None else changed[:, ::-1, ::-1]
         notes.append("frames turned by 180 degrees")
+    matrix, shape = None, (info.camera.height, info.camera.width)
     if info.registration is not None:
         matrix, how = frame_homography(folder, info.registration, info)
-        shape = (info.camera.height, info.camera.width)
-        check_memory(
-            16 * len(frames) * shape[0] * shape[1], f"{folder}: registering its frames", "leave frames out"
-        )
-        changed, covered = warp_frames(frames / np.float32(peak) if changed is None else changed, matrix, shape)
-        notes.append(
-            f"frames registered by {how}; they cover {100 * float(covered.mean()):.0f} % of the events' view"
-        )
-    if changed is None:
-        return frames, notes
-    return np.round(changed * 65_535).astype(np.uint16), notes
+        if not isinstance(frames, FrameStack):
+            needed = 16 * len(frames) * shape[0] * shape[1]
+            check_memory(needed, f"{folder}: registering its frames", "leave frames out")
+        covered = 100 * float(warp_frames(frames[:1], matrix, shape)[1].mean())
+        notes.append(f"frames registered by {how}; they cover {covered:.0f} % of the events' view")
+
+    def prepared(block: NDArray) -> NDArray:
+        changed = correct_frames(block, peak, dark, flat) if is_corrected else None
+        if info.frames_turned:
+            block = block[:, ::-1, ::-1]
+            changed = None if changed is None else changed[:, ::-1, ::-1]
+        if matrix is not None:
+            changed = warp_frames(block / np.float32(peak) if changed is None else changed, matrix, shape)[0]
+        return block if changed is None else np.round(changed * 65_535).astype(np.uint16)
+
+    return _mapped(frames, prepared), notes
 
 
 def _place_in_time(
@@ -290,17 +295,19 @@ def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern 
     Raises:
         DataError: The capture has fewer than two frames.
     """
-    if len(capture.frames) < 2:
-        raise DataError(
-            f"{capture.name} has {len(capture.frames)} frame(s); a sample needs two, with events between"
-        )
+    return join_samples(_samples_of(capture, sampling, pattern))
+
+
+def _samples_of(capture: Capture, sampling: Sampling, pattern: FixedPattern | None) -> Iterator[Samples]:
+    if (count := len(capture.frames)) < 2:
+        raise DataError(f"{capture.name} has {count} frame(s); a sample needs two, with events between")
     frames, peak = capture.frames[1:], float(capture.peak)
     if not capture.has_frames:
         frames = frames[:, :1, :1]
     elif pattern is not None:
-        frames, peak = pattern.correct(frames, peak), 1.0
+        frames, peak = _mapped(frames, partial(pattern.correct, peak=peak)), 1.0
     known = {"motion": capture.motion, "target": capture.target}
-    return make_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
+    yield from iter_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
 
 
 def import_captures(
@@ -329,6 +336,7 @@ def import_captures(
         events_topic: Stream of the events, of files that hold several.
         frames_topic: Stream of their frames.
         look: Called with each capture that was read, before its samples are made: to tell of it, or to draw it.
+            Its frames are a `FrameStack` where they take more than 64 MiB.
         progress: Called when the work begins and as each shard is in place, with the capture's name.
 
     Returns:
@@ -351,23 +359,26 @@ def import_captures(
         if not path.is_file() and not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
     topics: dict[str, Any] = {"events_topic": events_topic, "frames_topic": frames_topic}
-    how: dict[str, Any] = topics | {"needs_frames": False}
+    read = partial(read_capture, most_frame_bytes=_HELD_BYTES, **topics, needs_frames=False, lazy_frames=True)
     described = {name: digest_of(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
     config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
-    captures: dict[str, Capture] = {_name_of(first): read_capture(first, **how)}
+    captures: dict[str, Capture] = {_name_of(first): read(first)}
     with claim_dataset(dataset):
         what, total, missing = f"import {dataset.folder.name}", len(paths), dataset.missing()
         progress(Step(what, total - len(missing), total, "captures"))
         for done, name in enumerate(missing, start=total - len(missing) + 1):
-            capture = captures.pop(name, None) or read_capture(paths[name], **how)
+            capture = captures.pop(name, None) or read(paths[name])
             if look is not None:
                 look(capture)
-            samples = capture_samples(capture, sampling, pattern)
-            camera = capture.info.camera.name
-            attributes = {"object": name, "config_hash": dataset.config_hash, "camera": camera}
-            write_shard(dataset.shard(name), samples, attributes)
+            samples = _samples_of(capture, sampling, pattern)
+            attributes = {
+                "object": name,
+                "config_hash": dataset.config_hash,
+                "camera": capture.info.camera.name,
+            }
+            write_shard(dataset.shard(name), samples, attributes, count=len(capture.frames) - 1)
             progress(Step(what, done, total, "captures", name))
     return dataset
 
@@ -376,9 +387,7 @@ def _split(names: list[str], test: list[str], validation: list[str]) -> dict[str
     split: dict[str, list[str]] = {"train": [], "validation": [], "test": []}
     for wanted in (*test, *validation):
         if not any(wanted in (name, character_of(name)) for name in names):
-            raise DataError(
-                f"no capture is named {wanted} or shows it; held-out names must be among the captures"
-            )
+            raise DataError(f"no capture is named {wanted} or shows it; held-out names must be among them")
     for name in names:
         keys = {name, character_of(name)}
         in_test, in_validation = bool(keys & set(test)), bool(keys & set(validation))

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from evnlos.data.capture import Capture
 from evnlos.data.clocks import LEAST_AGREEMENT, find_lag
 from evnlos.data.sampling import reduce_by_area
-from evnlos.events import event_histogram, find_hot_pixels
+from evnlos.events import event_histogram, find_hot_pixels, frame_blocks
 from evnlos.events.cleaning import find_flicker
 from evnlos.events.volume import OFF_RGB, ON_RGB
 from evnlos.types import Events
@@ -361,7 +361,8 @@ def _frame_changes(frames: NDArray, peak: float) -> NDArray[np.float64]:
 
     Of blocks of 8 x 8 pixels: noise that is independent from pixel to pixel would hide the rest.
     """
-    small = reduce_by_area(frames, (max(1, frames.shape[1] // 8), max(1, frames.shape[2] // 8)))
+    shape = max(1, frames.shape[1] // 8), max(1, frames.shape[2] // 8)
+    small = np.concatenate([reduce_by_area(block, shape) for block in frame_blocks(frames)])
     return np.abs(np.diff(small, axis=0)).mean(axis=(1, 2), dtype=np.float64) / peak
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.errors import DataError
+from evnlos.events import frame_blocks
 from evnlos.types import Events
 
 _DARK = 0.02  # of the peak: added to frames before the logarithm, or black noise would count most
@@ -137,12 +138,12 @@ def _changes(frames: NDArray, grid: tuple[int, int], signed: bool) -> NDArray[np
     block = blocks_of(grid, frames.shape[1:])
     size = np.bincount(block)
     out = np.empty((len(frames) - 1, len(size)))
-    before = np.log(frames[0].astype(np.float64).ravel() / peak + _DARK)
-    for k in range(1, len(frames)):
-        now = np.log(frames[k].astype(np.float64).ravel() / peak + _DARK)
+    levels = (
+        np.log(one.astype(np.float64).ravel() / peak + _DARK) for part in frame_blocks(frames) for one in part
+    )
+    for k, (before, now) in enumerate(itertools.pairwise(levels)):
         change = now - before
-        out[k - 1] = np.bincount(block, change if signed else np.abs(change)) / size
-        before = now
+        out[k] = np.bincount(block, change if signed else np.abs(change)) / size
     return out
 
 

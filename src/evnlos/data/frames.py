@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
@@ -19,7 +20,7 @@ from PIL import Image, UnidentifiedImageError
 from evnlos.cameras.video import open_video
 from evnlos.data.capture_info import CaptureInfo, inside
 from evnlos.errors import DataError
-from evnlos.events import read_timed_frames
+from evnlos.events import FrameReader, FrameStack, gather_frames, iter_frames
 from evnlos.untrusted import check_memory, memory_left, open_image, open_regular
 
 _RECORDINGS = (".aedat4", ".aedat", ".bag", ".db3", ".mcap", ".bin")
@@ -30,12 +31,12 @@ class FrameSeries:
     """Frames in the order of time.
 
     Args:
-        images: uint8 or uint16 [N, H, W], digital numbers.
+        images: uint8 or uint16 [N, H, W], digital numbers, held or read as they are asked for.
         times_us: Times on the frames' own clock, int64 [N], microseconds.
         what: What they were read from, for a message.
     """
 
-    images: NDArray
+    images: NDArray | FrameStack
     times_us: NDArray[np.int64]
     what: str
 
@@ -55,13 +56,17 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
     return array
 
 
-def read_frame_series(folder: Path, info: CaptureInfo, most_bytes: int | None = None) -> FrameSeries:
+def read_frame_series(
+    folder: Path, info: CaptureInfo, most_bytes: int | None = None, is_lazy: bool = False
+) -> FrameSeries:
     """Read the frames that a capture names.
 
     Args:
         folder: The capture's folder.
         info: Its description.
         most_bytes: Memory that they may take, bytes; None = a quarter of what is free, at most 2 GiB.
+        is_lazy: Whether frames of a recording or a video that take more become a `FrameStack`, in place of an
+            error.
 
     Raises:
         DataError: A file is missing or unreadable, the frames take too much memory, or they carry no time and
@@ -78,11 +83,12 @@ def read_frame_series(folder: Path, info: CaptureInfo, most_bytes: int | None = 
     if path.suffix.lower() == ".csv":
         return _from_table(folder, path, size, most)
     if path.suffix.lower() in _RECORDINGS:
-        found = read_timed_frames(path, topic=info.frames_topic)
-        times = found.t_us if found.t_us is not None else _at_rate(path, len(found.images), info)
-        series = FrameSeries(found.images, times, path.name)
+        read = lambda: iter_frames(path, topic=info.frames_topic)  # noqa: E731
     else:
-        series = _from_video(folder, path, info, most)
+        read = _video_frames(folder, path, info, None if is_lazy else most)
+    images, times_us = gather_frames(read, path, most, is_lazy)
+    times = _at_rate(path, len(images), info) if times_us is None else times_us
+    series = FrameSeries(images, times, path.name)
     _check_times(path, series.times_us)
     if size is not None and series.images.shape[1:] != size:
         high, wide = series.images.shape[1:]
@@ -103,24 +109,23 @@ def _at_rate(path: Path, count: int, info: CaptureInfo) -> NDArray[np.int64]:
     return np.round(np.arange(count) * (1e6 / _rate(path, info))).astype(np.int64)
 
 
-def _from_video(folder: Path, path: Path, info: CaptureInfo, most: int) -> FrameSeries:
-    """Read a video, animation, array or folder of pictures as 16 bits."""
+def _video_frames(folder: Path, path: Path, info: CaptureInfo, most: int | None) -> FrameReader:
+    """Return what reads a video, animation, array or folder of pictures as 16 bits."""
     if path.is_dir():
         for one in path.iterdir():
             inside(folder, str(one.relative_to(folder.resolve())), f"{info.frames}")
     timed = path.is_file() and path.suffix.lower() != ".npy"
     video = open_video(path, fps=None if timed else _rate(path, info))
-    _check_size(path, (video.frames or 1) * video.width * video.height * 2, most)
-    times_s, images = [], []
-    for time_s, light in video:
-        _check_size(path, (len(images) + 1) * light.size * 2, most)
-        if not np.isfinite(light).all():
-            raise DataError(f"{path}: frame {len(images)} holds NaN or infinity; give finite values")
-        times_s.append(time_s)
-        images.append(np.clip(np.round(light * (65_535 / 255)), 0, 65_535).astype(np.uint16))
-    if not images:
-        raise DataError(f"{path} holds no frames; give another file")
-    return FrameSeries(np.stack(images), np.round(np.array(times_s) * 1e6).astype(np.int64), path.name)
+    if most is not None:
+        _check_size(path, (video.frames or 1) * video.width * video.height * 2, most)
+
+    def frames() -> Iterator[tuple[int, NDArray]]:
+        for k, (time_s, light) in enumerate(video):
+            if not np.isfinite(light).all():
+                raise DataError(f"{path}: frame {k} holds NaN or infinity; give finite values")
+            yield round(time_s * 1e6), np.clip(np.round(light * (65_535 / 255)), 0, 65_535).astype(np.uint16)
+
+    return frames
 
 
 def _from_table(folder: Path, path: Path, size: tuple[int, int] | None, most: int) -> FrameSeries:

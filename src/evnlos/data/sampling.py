@@ -8,9 +8,11 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,10 +22,17 @@ from evnlos.config import check_made
 from evnlos.data.capture_info import CaptureInfo, RegistrationInfo, inside
 from evnlos.data.frames import find_dots, homography_from_points, read_image, registration_error
 from evnlos.errors import ConfigError, DataError
-from evnlos.events import event_histogram, event_trace, read_events, time_surface
+from evnlos.events import (
+    FrameStack,
+    event_histogram,
+    event_trace,
+    frame_blocks,
+    iter_time_surfaces,
+    read_events,
+    time_surface,
+)
 from evnlos.files import write_atomically
 from evnlos.scene import Motion, Target
-from evnlos.setups import Setup
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
 from evnlos.types import Events, Plane
 
@@ -62,6 +71,7 @@ def correct_frames(
     return np.clip(out / max(peak - float(ground.mean()), 1.0), 0.0, 1.0)
 
 
+_BLOCK_BYTES = 1 << 26  # of frames and surfaces at the sensor's resolution
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less
 
 
@@ -200,15 +210,12 @@ class Sampling:
     """Size of a pixel of the truth on the target's plane, metres."""
     scored_rows: int = 48
     """Rows in the middle of the canvas that are scored; the target never leaves them, pixels."""
-    surface: Literal["sae", "context", "hots", "trace", "likelihood"] = "sae"
-    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones; `likelihood` =
-    the target that the events of the whole sequence make most likely through the light path of `setup`."""
+    surface: Literal["sae", "context", "hots", "trace"] = "sae"
+    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones."""
     tau_s: float = 0.2
     """Time constant of the time surface, seconds; of `trace`, the time in which the light changes: 1 to 5."""
     radius: int = 3
     """Radius of the neighbourhood of the surfaces `context` and `hots`, pixels."""
-    setup: str = ""
-    """Setup for the surface `likelihood`: a folder of `evnlos calibrate`, a settings file, or a name."""
 
     def __post_init__(self) -> None:
         for name in ("height", "width", "scored_rows"):
@@ -270,10 +277,6 @@ def surface_of(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) 
         edges_us: N + 1 ascending instants, microseconds.
         sampling: Kind of the surface and its settings.
     """
-    if sampling.surface == "likelihood":
-        raise ConfigError(
-            "the surface 'likelihood' is made of whole recordings; give another --sampling.surface"
-        )
     tau_us = sampling.tau_s * 1e6
     if sampling.surface == "trace":
         return event_trace(events, edges_us, tau_us)
@@ -304,52 +307,50 @@ def make_samples(
     Raises:
         DataError: The number of frames and of edges disagree.
     """
+    return join_samples(iter_samples(frames, peak, events, edges_us, sampling, motion=motion, target=target))
+
+
+def join_samples(blocks: Iterable[Samples]) -> Samples:
+    """Return blocks of samples, at least one, as one."""
+    parts = list(blocks)
+    columns = {one.name: [getattr(part, one.name) for part in parts] for one in fields(Samples)}
+    joined: Any = {name: None if of[0] is None else np.concatenate(of) for name, of in columns.items()}
+    return Samples(**joined)
+
+
+def iter_samples(
+    frames: NDArray | FrameStack,
+    peak: float,
+    events: Events,
+    edges_us: NDArray[np.int64],
+    sampling: Sampling,
+    *,
+    motion: Motion | None = None,
+    target: Target | None = None,
+) -> Iterator[Samples]:
+    """Yield what `make_samples` returns in blocks, at least one, whose memory does not grow with the positions.
+
+    Of the surface `trace` alone all are held at once.
+    """
     if len(edges_us) != len(frames) + 1:
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
     shape = (sampling.height, sampling.width)
-    if sampling.surface == "likelihood":
-        from evnlos.inverse.sequence_statistic import event_images  # which compiles
-
-        surface = event_images(events, edges_us, motion, sampling.setup, sampling.canvas)
+    steps = max(1, _BLOCK_BYTES // (4 * (2 * events.width * events.height + math.prod(frames.shape[1:]))))
+    tau_us, mode = sampling.tau_s * 1e6, sampling.surface
+    if mode == "trace":
+        surfaces = frame_blocks(event_trace(events, edges_us, tau_us), steps)
     else:
-        surface = reduce_by_area(surface_of(events, edges_us, sampling), shape)  # [N, 2, H, W]
-    time_s = np.asarray(edges_us[1:], dtype=np.float64) * 1e-6
-    position = None if motion is None else motion.position_m(time_s)
-    truth = None
-    if target is not None and position is not None:
-        truth = target.rasterise(sampling.canvas, position)
-    return Samples(
-        frame=reduce_by_area(frames / np.float32(peak), shape),
-        surface=surface,
-        truth=truth,
-        time_s=time_s,
-        position_m=position,
-        event_count=np.diff(np.searchsorted(events.t_us, edges_us, side="right")).astype(np.int64),
-    )
-
-
-def object_light(
-    frames: NDArray,
-    peak: int,
-    setup: Setup,
-    shape: tuple[int, int],
-    pattern: FixedPattern | None = None,
-) -> torch.Tensor:
-    """Return frames less the setup's ambient light, reduced by area averaging.
-
-    Args:
-        frames: Digital numbers [N, H, W].
-        peak: Largest digital number.
-        setup: The setup that says how much ambient light there is.
-        shape: Size (h, w) of the result, pixels.
-        pattern: The camera's fixed pattern, to be taken off first.
-
-    Returns:
-        White levels, float32 [N, h, w]; noise makes some of them negative.
-    """
-    levels = frames / np.float32(peak) if pattern is None else pattern.correct(frames, peak)
-    size = (frames.shape[-2], frames.shape[-1])
-    return torch.from_numpy(reduce_by_area(levels - setup.ambient_light(size).numpy(), shape))
+        surfaces = iter_time_surfaces(events, edges_us, tau_us, mode, radius=sampling.radius, grids=steps)
+    counts = np.diff(np.searchsorted(events.t_us, edges_us, side="right")).astype(np.int64)
+    blocks = frame_blocks(frames, steps) if len(frames) else iter([np.asarray(frames)])
+    for k, (block, surface) in enumerate(zip(blocks, surfaces, strict=True)):
+        part = slice(k * steps, k * steps + len(block))
+        time_s = np.asarray(edges_us[1:][part], dtype=np.float64) * 1e-6
+        position = None if motion is None else motion.position_m(time_s)
+        is_known = target is not None and position is not None
+        truth = target.rasterise(sampling.canvas, position) if is_known else None
+        light, maps = reduce_by_area(block / np.float32(peak), shape), reduce_by_area(surface, shape)
+        yield Samples(light, maps, truth, time_s, position, counts[part])
 
 
 def reduce_by_area(images: NDArray, shape: tuple[int, int]) -> NDArray[np.float32]:

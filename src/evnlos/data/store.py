@@ -6,12 +6,11 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import h5py
 import numpy as np
@@ -20,8 +19,7 @@ from numpy.typing import NDArray
 from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data.sampling import Samples, Sampling
 from evnlos.errors import DataError
-from evnlos.files import directory_lock, is_empty, write_atomically
-from evnlos.machine import undisturbed
+from evnlos.files import directory_lock, is_empty, new_file
 from evnlos.registry import __version__
 from evnlos.types import Events
 from evnlos.untrusted import open_hdf5, stored
@@ -33,50 +31,60 @@ _DEFLATE = 1032  # no compressed byte holds more
 _MOST_BYTES = 4 << 30
 
 
-def write_shard(path: str | Path, samples: Samples, attributes: dict, events: Events | None = None) -> None:
+def write_shard(
+    path: str | Path,
+    samples: Samples | Iterable[Samples],
+    attributes: dict,
+    events: Events | None = None,
+    count: int | None = None,
+) -> None:
     """Write the samples of one object as an HDF5 shard: temporary file, fsync, rename; fletcher32 throughout.
 
     Maps are stored as float16 (11 bits of mantissa; frames have 8 to 12), one chunk a position, so that a
-    loader can fetch a single position. The same samples give the same bytes.
+    loader can fetch a single position. The same samples in the same blocks give the same bytes.
 
     Args:
         path: The shard's final name.
-        samples: What to store.
+        samples: What to store; or its blocks in the order of time, of which one is held at a time.
         attributes: Provenance of the shard: strings, numbers.
         events: The whole recording, stored as `events/{x, y, t, p}` where given.
+        count: How many time steps the blocks have together; needed for blocks alone.
     """
-    buffer = io.BytesIO()
-    with undisturbed(), h5py.File(buffer, "w", libver=("v110", "v110"), track_order=True) as file:
+    if isinstance(samples, Samples):
+        samples, count = (samples,), len(samples)
+    how: dict[str, Any] = {"libver": ("v110", "v110"), "track_order": True}
+    with new_file(path) as temporary, h5py.File(temporary, "w", **how) as file:
         for key, value in attributes.items():
             file.attrs[key] = value
-        for name in _MAPS:
-            maps = getattr(samples, name)
-            if maps is not None:
-                _put(file, name, maps.astype(np.float16), chunks=(1, *maps.shape[1:]))
-        _put(file, "time_s", samples.time_s)
-        if samples.position_m is not None:
-            _put(file, "position_m", samples.position_m)
-        _put(file, "event_count", samples.event_count)
+        at = 0
+        for block in samples:
+            for name in _AXES:
+                values = getattr(block, name)
+                if values is not None:
+                    chunks = (1, *values.shape[1:]) if name in _MAPS else True
+                    _put(file, name, values.astype(np.float16) if name in _MAPS else values, chunks, at, count)
+            at += len(block)
         if events is not None:
             for name, column in (("x", events.x), ("y", events.y), ("t", events.t_us), ("p", events.p)):
-                _put(
-                    file, f"events/{name}", column.astype(np.uint8) if name == "p" else column, chunks=(65_536,)
-                )
+                _put(file, f"events/{name}", column.astype(np.uint8) if name == "p" else column, (65_536,))
             file["events"].attrs["width"], file["events"].attrs["height"] = events.width, events.height
-    write_atomically(path, buffer.getvalue())
 
 
-def _put(file: h5py.File, name: str, values: np.ndarray, chunks: tuple[int, ...] | bool = True) -> None:
+def _put(
+    file: h5py.File, name: str, values: np.ndarray, chunks: Any = True, at: int = 0, count: int | None = None
+) -> None:
+    """Store rows of a dataset from row `at` on, of `count` rows in all."""
+    count = len(values) if count is None else count
     if not values.size:
         file.create_dataset(name, data=values)
         return
-    if isinstance(chunks, tuple):
-        chunks = (min(chunks[0], len(values)), *chunks[1:])
-    dataset = file.create_dataset(
-        name, data=values, chunks=chunks, fletcher32=True, compression="gzip", compression_opts=1
-    )
-    # Else chunks go to the file when the object is collected, and a debugger or a profiler that holds the frame
-    # would change their order, and so the bytes of the file.
+    if name not in file:
+        chunks = (min(chunks[0], count), *chunks[1:]) if isinstance(chunks, tuple) else chunks
+        how = {"fletcher32": True, "compression": "gzip", "compression_opts": 1, "chunks": chunks}
+        file.create_dataset(name, (count, *values.shape[1:]), values.dtype, **how)
+    dataset = cast(h5py.Dataset, file[name])
+    dataset[at : at + len(values)] = values
+    # Else chunks go to the file when the object is collected, in an order that a debugger would change.
     dataset.flush()
 
 

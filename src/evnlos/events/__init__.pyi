@@ -11,11 +11,16 @@ from .cleaning import CleanReport as CleanReport
 from .cleaning import clean_events as clean_events
 from .files import CelexOptions as CelexOptions
 from .files import EventWriter as EventWriter
+from .files import FrameReader as FrameReader
 from .files import Frames as Frames
+from .files import FrameStack as FrameStack
 from .files import ReadReport as ReadReport
 from .files import Stream as Stream
 from .files import Triggers as Triggers
+from .files import frame_blocks as frame_blocks
+from .files import gather_frames as gather_frames
 from .files import iter_events as iter_events
+from .files import iter_frames as iter_frames
 from .files import read_events as read_events
 from .files import read_events_report as read_events_report
 from .files import read_frames as read_frames
@@ -29,6 +34,7 @@ from .filters import find_hot_pixels as find_hot_pixels
 from .filters import keep_known_polarity as keep_known_polarity
 from .filters import keep_supported as keep_supported
 from .filters import remove_flicker as remove_flicker
+from .surface import iter_time_surfaces as iter_time_surfaces
 from .surface import normalise_surface as normalise_surface
 from .surface import time_surface as time_surface
 from .volume import edges_from_count as edges_from_count

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Iterator
+from typing import Any, Literal
 
 import numpy as np
 from numba import njit
@@ -294,6 +295,29 @@ def time_surface(
         >>> time_surface(events, [0, 10], tau_us=5.0).round(3).tolist()
         [[[[0.36800000071525574, 0.0]], [[0.0, 1.0]]]]
     """
+    options: dict[str, Any] = {"radius": radius, "shape": shape, "border": border, "projection": projection}
+    options |= {"include_self": include_self, "carry": carry}
+    return next(iter_time_surfaces(events, edges_us, tau_us, mode, **options))
+
+
+def iter_time_surfaces(
+    events: Events,
+    edges_us: ArrayLike,
+    tau_us: float,
+    mode: Mode = "sae",
+    *,
+    grids: int | None = None,
+    radius: int = 1,
+    shape: Shape = "box",
+    border: Border = "crop",
+    projection: Projection = "sum",
+    include_self: bool = False,
+    carry: bool = True,
+) -> Iterator[NDArray[np.float32]]:
+    """Yield what `time_surface` returns, `grids` at a time (None = all): memory does not grow with them.
+
+    The other arguments, and the errors, are those of `time_surface`.
+    """
     edges = as_edges(edges_us)
     check_surface(tau_us, radius, mode)
     _choice("shape", shape, ("box", "disc"))
@@ -301,19 +325,25 @@ def time_surface(
     _choice("projection", projection, tuple(_PROJECTIONS))
     starts = np.searchsorted(events.t_us, edges, side="right")
     newest, never, origin = _time_map(events, edges, int(radius) if mode == "context" else 0)
-    out = np.zeros((len(edges) - 1, 2, events.height, events.width), np.float32)
-    columns = (events.t_us, events.x, events.y, events.p)
-    if mode == "sae":
-        sae(*columns, edges, starts, float(tau_us), carry, newest, never, origin, out)
-        return out
     spans = _spans(int(radius), shape)
-    chosen = (*columns, edges, starts, float(tau_us), carry, _PROJECTIONS[projection], include_self, spans)
-    if mode == "context":
-        context(*chosen, shape == "box", newest, never, origin, out)
-    else:
-        whole_area = int((2 * spans + 1).sum()) if border == "zero" else 0
-        hots(*chosen, whole_area, newest, never, origin, out)
-    return out
+    whole_area = int((2 * spans + 1).sum()) if border == "zero" else 0
+    step = grids or max(len(edges) - 1, 1)
+    for at in range(0, max(len(edges) - 1, 1), step):
+        some, ends = edges[at : at + step + 1], starts[at : at + step + 1]
+        first = 0 if at == 0 else int(ends[0])  # what came before is in `newest`
+        part = slice(first, int(ends[-1]))
+        columns = events.t_us[part], events.x[part], events.y[part], events.p[part]
+        out = np.zeros((len(some) - 1, 2, events.height, events.width), np.float32)
+        inputs = (*columns, some, ends - first, float(tau_us), carry)
+        if mode == "sae":
+            sae(*inputs, newest, never, origin, out)
+        else:
+            chosen = (*inputs, _PROJECTIONS[projection], include_self, spans)
+            if mode == "context":
+                context(*chosen, shape == "box", newest, never, origin, out)
+            else:
+                hots(*chosen, whole_area, newest, never, origin, out)
+        yield out
 
 
 def normalise_surface(surface: NDArray, how: Literal["signed", "joint"] = "joint") -> NDArray[np.float32]:

@@ -18,7 +18,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.errors import EventFileError
 from evnlos.events.files.columns import (
     SALVAGE,
     ColumnCheck,
@@ -29,7 +28,7 @@ from evnlos.events.files.columns import (
     cut,
     unreadable,
 )
-from evnlos.untrusted import check_memory, open_regular
+from evnlos.untrusted import open_regular
 
 SIGNATURE = b"#!AER-DAT2"
 _BLOCK = 1 << 17  # pairs
@@ -233,29 +232,21 @@ def _sample(pairs, start, state, samples, seen):
     return -1
 
 
-def read_aedat2_frames(path: Path, report: ReadReport, topic: str | None) -> tuple[NDArray, NDArray[np.int64]]:
-    """Return the frames of a DAVIS, uint16 [T, H, W], and their times, microseconds.
+def aedat2_frames(
+    path: Path, report: ReadReport, topic: str | None
+) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+    """Yield the time [us] and the picture, uint16 [H, W], of each complete frame of a DAVIS.
 
     A pixel is its level after reset minus that after the exposure: 10 bits, in the upper ones of 16. A frame's
     time is that of its first sample after the exposure. Frames that are not complete are left out.
-
-    Raises:
-        EventFileError: No frame is complete, or the file is damaged.
     """
     source = Aedat2Source(path, report, None, None)
     state = np.zeros(6, np.int64)
     samples = np.zeros((2, report.height, report.width), np.int32)
     seen = np.zeros(samples.shape, np.bool_)
-    frames: list[NDArray[np.uint16]] = []
-    times: list[int] = []
     for _, pairs in source.pairs():
         at = _sample(pairs, 0, state, samples, seen)
         while at >= 0:
             levels = np.clip(samples[0] - samples[1], 0, (1 << SAMPLE_BITS) - 1)  # [H, W]
-            frames.append((levels << (16 - SAMPLE_BITS)).astype(np.uint16))
-            times.append(int(state[5]))
-            check_memory(4 * len(frames) * frames[0].nbytes, f"{path}: its frames", "cut the recording")
+            yield int(state[5]), (levels << (16 - SAMPLE_BITS)).astype(np.uint16)
             at = _sample(pairs, at, state, samples, seen)
-    if not frames:
-        raise EventFileError(f"{path}: holds no complete frame; record frames as well")
-    return np.stack(frames), np.array(times, np.int64)

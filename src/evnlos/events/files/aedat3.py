@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.errors import EventFileError
 from evnlos.events.files.aedat import read_comments, set_size
 from evnlos.events.files.columns import (
     SALVAGE,
@@ -30,7 +29,7 @@ from evnlos.events.files.columns import (
     unreadable,
 )
 from evnlos.events.files.ros_messages import decode_libcaer, grey_of
-from evnlos.untrusted import check_memory, open_regular
+from evnlos.untrusted import open_regular
 
 SIGNATURE = b"#!AER-DAT3"
 _HEAD = struct.Struct("<hhiiiiii")
@@ -195,22 +194,8 @@ def _frame(data: bytes, turns: int) -> tuple[int, NDArray[np.uint16]] | None:
     return (turns << 31) + (begin + end) // 2, grey_of(pixels)
 
 
-def read_aedat3_frames(path: Path, report: ReadReport, topic: str | None) -> tuple[NDArray, NDArray[np.int64]]:
-    """Return the frames, uint16 [T, H, W], and the middles of their exposures, microseconds.
-
-    Raises:
-        EventFileError: The file holds no frame, or frames of several sizes, or is damaged.
-    """
-    frames: list[NDArray[np.uint16]] = []
-    times: list[int] = []
-    for t_us, frame in Aedat3Source(path, report, None, None, topic, "frames").frames():
-        if frames and frame.shape != frames[0].shape:
-            raise EventFileError(
-                f"{path}: a frame {frame.shape} after {frames[0].shape}; record frames of one size"
-            )
-        frames.append(frame)
-        times.append(t_us)
-        check_memory(4 * len(frames) * frame.nbytes, f"{path}: its frames", "cut the recording")
-    if not frames:
-        raise EventFileError(f"{path}: holds no frame; record frames as well")
-    return np.stack(frames), np.array(times, np.int64)
+def aedat3_frames(
+    path: Path, report: ReadReport, topic: str | None
+) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+    """Yield the middle of the exposure [us] and the picture, uint16 [H, W], of each frame."""
+    return Aedat3Source(path, report, None, None, topic, "frames").frames()

@@ -244,39 +244,23 @@ class Aedat4Source:
         return join(list(self.blocks()))
 
 
-def read_aedat4_frames(
-    path: Path, report: ReadReport, topic: str | None
-) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Return the pictures of a frame stream as grey [T, H, W], and their times [T], microseconds.
+def aedat4_frames(path: Path, report: ReadReport, topic: str | None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield the time [us] and the grey picture [H, W] of each frame of a stream.
 
     Raises:
-        EventFileError: The file is damaged, has no frames, or frames of several sizes.
+        EventFileError: The file is damaged or has no frames.
         MissingDependencyError: The package `aedat` is not installed.
     """
     _require_package()
     check_packets(path, ReadReport(path))
     number = _choose(path, report, topic, "frames")
-    frames: list[NDArray[np.uint8]] = []
-    times: list[int] = []
     with _Decoder(path, "frame", number) as decoder:
         if decoder.stream_size() is None:
             raise unreadable(path, 0, "an AEDAT4 file without frames", "record frames as well")
-        while True:
-            t_us = struct.unpack("<q", decoder.take(8))[0]
-            if t_us == -1:
-                break
+        while (t_us := struct.unpack("<q", decoder.take(8))[0]) != -1:
             height, width, channels = struct.unpack("<3q", decoder.take(24))
             pixels = np.frombuffer(decoder.take(height * width * channels), np.uint8)
-            frames.append(grey_of(pixels.reshape(height, width, channels)))  # [H, W]
-            times.append(t_us)
-            if frames[-1].shape != frames[0].shape:
-                found = (
-                    f"a frame of {width} x {height} pixels after {frames[0].shape[1]} x {frames[0].shape[0]}"
-                )
-                raise unreadable(path, 0, found, "record frames of one size")
-    if not frames:
-        raise unreadable(path, 0, "an AEDAT4 file whose frame stream is empty", "record frames as well")
-    return np.stack(frames), np.array(times, np.int64)
+            yield t_us, grey_of(pixels.reshape(height, width, channels))
 
 
 _MAX_SIDE = 1 << 15

@@ -1,22 +1,22 @@
 """What an event camera's file holds beside, or in place of, events: frames, and external triggers.
 
-- Frames and their times.
+- Frames and their times, one by one or all at once; frames that stay in their file until they are asked for.
 - External triggers: edges that another instrument, such as a frame camera, put into a recording.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.errors import EventFileError
+from evnlos.errors import DataError, EventFileError
 from evnlos.events.files import evt2, evt3
 from evnlos.events.files.celex import CelexOptions, read_celex_frames
 from evnlos.events.files.columns import OnError, ReadReport, check_on_error, unreadable
@@ -24,6 +24,7 @@ from evnlos.events.files.raw import RawSource
 from evnlos.events.files.read import open_source
 from evnlos.events.files.registry import find_format
 from evnlos.events.files.words import mend_clock
+from evnlos.untrusted import check_memory, memory_left
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,167 @@ class Frames:
     t_us: NDArray[np.int64] | None
 
 
+class FrameStack:
+    """Frames [N, H, W] that are read in the order of time, as often as they are asked for, and not held.
+
+    One frame and a slice are read alone, `blocks` goes through all in bounded memory; `numpy.asarray`, and what
+    an array can do besides, reads them all, if memory allows.
+
+    Args:
+        count: How many they are.
+        first: The first of them, [H, W].
+        read: Begins anew and yields them one by one.
+        what: What they are read from, for a message.
+    """
+
+    def __init__(self, count: int, first: NDArray, read: Callable[[], Iterator[NDArray]], what: str) -> None:
+        self.shape, self.dtype, self.ndim = (count, *first.shape), first.dtype, 1 + first.ndim
+        self._first, self._read, self._what = first, read, what
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def blocks(self, size: int = 32) -> Iterator[NDArray]:
+        """Yield the frames, [size, H, W] at a time; the last block may be shorter.
+
+        Raises:
+            DataError: The file has changed since it was counted.
+        """
+        held: list[NDArray] = []
+        left = len(self)
+        for image in self._read():
+            held.append(image)
+            left -= 1
+            if left < 0 or image.shape != self._first.shape:
+                break
+            if len(held) == size or not left:
+                yield np.stack(held)
+                held = []
+        if left:
+            raise DataError(f"{self._what} has changed while it was read; begin again")
+
+    def mapped(self, work: Callable[[NDArray], NDArray]) -> FrameStack:
+        """Return the frames with `work` done on each block [n, H, W]."""
+        images = lambda: (image for block in self.blocks() for image in work(block))  # noqa: E731
+        return FrameStack(len(self), work(self._first[None])[0], images, self._what)
+
+    def _part(self, start: int, stop: int) -> Iterator[NDArray]:
+        if stop <= start:
+            return
+        for k, image in enumerate(image for block in self.blocks(1) for image in block):
+            if k >= start:
+                yield image
+            if k + 1 == stop:
+                return
+
+    def __getitem__(self, key: Any) -> Any:
+        if isinstance(key, slice) and key.step in (None, 1):
+            start, stop, _ = key.indices(len(self))
+            read = lambda: self._part(start, stop)  # noqa: E731
+            return FrameStack(max(stop - start, 0), self._first, read, self._what)
+        if isinstance(key, (int, np.integer)):
+            k = range(len(self))[key]
+            return next(self._part(k, k + 1))
+        return np.asarray(self)[key]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:
+        needed = len(self) * self._first.nbytes
+        check_memory(needed, f"{self._what}: its frames", "look at fewer of them at a time")
+        whole = np.empty(self.shape, self.dtype if dtype is None else dtype)
+        at = 0
+        for block in self.blocks():
+            whole[at : at + len(block)] = block
+            at += len(block)
+        return whole
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(np.asarray(self), name)
+
+
+def frame_blocks(frames: NDArray | FrameStack, size: int = 32) -> Iterator[NDArray]:
+    """Yield frames [N, H, W] in blocks of at most `size`, whether they are held or read."""
+    if isinstance(frames, FrameStack):
+        return frames.blocks(size)
+    return (frames[at : at + size] for at in range(0, len(frames), size))
+
+
+def iter_frames(
+    path: str | PathLike[str],
+    *,
+    bits: int = 8,
+    fpn: NDArray | str | PathLike[str] | None = None,
+    on_error: OnError = "strict",
+    celex: CelexOptions | None = None,
+    topic: str | None = None,
+) -> Iterator[tuple[int | None, NDArray]]:
+    """Yield time (microseconds, None where the file has none) and picture of each frame of a file.
+
+    Memory does not grow with the number of frames, but for CeleX-V. Arguments and errors as of `read_frames`.
+    """
+    path = Path(path)
+    check_on_error(on_error)
+    options = celex or CelexOptions()
+    format = find_format(path, options)
+    report = ReadReport(path, strict=on_error == "strict", format=format.name)
+    format.check_topic(path, topic)
+    if format.name == "CELEX":
+        yield from ((None, image) for image in read_celex_frames(path, bits, fpn, on_error, options))
+        return
+    if format.frames is None:
+        found = f"{format.name}, which holds no frames"
+        cure = "frames are read from CeleX-V .bin of mode F, .aedat4, AEDAT 2.0 and 3.1, and ROS bags"
+        raise unreadable(path, 0, found, cure)
+    first: NDArray | None = None
+    for t_us, image in format.frames(path, report, topic):
+        first = image if first is None else first
+        if image.shape != first.shape or image.dtype != first.dtype:
+            found = f"a frame {image.shape} {image.dtype} after {first.shape} {first.dtype}"
+            raise EventFileError(f"{path}: {found}; record frames of one size")
+        yield t_us, image
+    if first is None:
+        raise EventFileError(f"{path}: holds no whole frame; record frames as well")
+
+
+FrameReader = Callable[[], Iterator[tuple[int | None, NDArray]]]
+"""Begins anew, and yields time (microseconds, or None) and picture of each frame."""
+
+
+def gather_frames(
+    read: FrameReader, path: Path, most: int, is_lazy: bool = False
+) -> tuple[NDArray | FrameStack, NDArray[np.int64] | None]:
+    """Return frames and their times; None where they have none.
+
+    Args:
+        read: Reads them.
+        path: What is read.
+        most: Memory that they may take, bytes.
+        is_lazy: Whether frames that take more are a `FrameStack`, in place of an error.
+
+    Raises:
+        DataError: There is no frame, or they take too much memory.
+    """
+    held, times = list[NDArray](), list[int | None]()
+    first: NDArray | None = None
+    for t_us, image in read():
+        first = image if first is None else first
+        times.append(t_us)
+        needed = len(times) * image.nbytes
+        if needed <= most:
+            held.append(image)
+        elif is_lazy:
+            held.clear()
+        else:
+            cure = "leave frames out, or read them one by one (evnlos.events.iter_frames)"
+            check_memory(needed, f"{path}: its frames", cure, most)
+    if first is None:
+        raise DataError(f"{path} holds no frames; give another file")
+    images = lambda: (image for _, image in read())  # noqa: E731
+    frames = np.stack(held) if held else FrameStack(len(times), first, images, str(path))
+    return frames, None if None in times else np.array(times, np.int64)
+
+
 def read_timed_frames(
     path: str | PathLike[str],
     *,
@@ -50,23 +212,9 @@ def read_timed_frames(
     topic: str | None = None,
 ) -> Frames:
     """Return the frames of a file with their times; arguments as those of `read_frames`."""
-    path = Path(path)
-    check_on_error(on_error)
-    options = celex or CelexOptions()
-    format = find_format(path, options)
-    report = ReadReport(path, strict=on_error == "strict", format=format.name)
-    format.check_topic(path, topic)
-    if format.frames is not None:
-        return Frames(*format.frames(path, report, topic))
-    if format.name != "CELEX":
-        found = f"{format.name}, which holds no frames"
-        raise unreadable(
-            path,
-            0,
-            found,
-            "frames are read from CeleX-V .bin of mode F, .aedat4, AEDAT 2.0 and 3.1, and ROS bags",
-        )
-    return Frames(read_celex_frames(path, bits, fpn, on_error, options), None)
+    how: dict[str, Any] = {"bits": bits, "fpn": fpn, "on_error": on_error, "celex": celex, "topic": topic}
+    images, t_us = gather_frames(lambda: iter_frames(path, **how), Path(path), memory_left() // 4)
+    return Frames(np.asarray(images), t_us)
 
 
 def read_frames(

@@ -66,7 +66,7 @@ class Format:
         open: Opens a file: (path, report, width, height, celex options, topic).
         create: Begins a file: (path, first piece of the events, the name that it will get); None where the
             format is only read.
-        frames: Reads its frames and their times, microseconds: (path, report, topic); None where it has none.
+        frames: Yields time [us] and picture of its frames: (path, report, topic); None where it has none.
         has_streams: Whether a file may hold several streams, of which `topic` names one.
     """
 
@@ -75,7 +75,7 @@ class Format:
     sniff: Callable[[bytes], bool]
     open: Callable[[Path, ReadReport, int | None, int | None, CelexOptions | None, str | None], FileSource]
     create: Callable[[Path, Events, Path], Sink] | None = None
-    frames: Callable[[Path, ReadReport, str | None], tuple[NDArray, NDArray[np.int64]]] | None = None
+    frames: Callable[[Path, ReadReport, str | None], Iterator[tuple[int, NDArray]]] | None = None
     has_streams: bool = False
 
     def check_topic(self, path: Path, topic: str | None) -> None:
@@ -121,7 +121,7 @@ def _ros(
         return ros.RosSource(container(path, report), path, report, width, height, topic)
 
     def frames(path, report, topic):
-        return ros.read_ros_frames(container(path, report), path, report, topic)
+        return ros.ros_frames(container(path, report), path, report, topic)
 
     suffix = f".{name.lower()}"
     return Format(name, (suffix,), lambda start: start.startswith(signature), opened, create, frames, True)
@@ -154,7 +154,7 @@ FORMATS = (
         lambda start: start.startswith(aedat4.SIGNATURE),
         _of_streams(aedat4.Aedat4Source),
         lambda path, first, _: aedat4.Aedat4Sink(path, first),
-        aedat4.read_aedat4_frames,
+        aedat4.aedat4_frames,
         has_streams=True,
     ),
     Format(
@@ -162,14 +162,14 @@ FORMATS = (
         (".aedat",),
         lambda start: start.startswith(aedat.SIGNATURE),
         _plain(aedat.Aedat2Source),
-        frames=aedat.read_aedat2_frames,
+        frames=aedat.aedat2_frames,
     ),
     Format(
         "AEDAT3",
         (".aedat",),
         lambda start: start.startswith(aedat3.SIGNATURE),
         _of_streams(aedat3.Aedat3Source),
-        frames=aedat3.read_aedat3_frames,
+        frames=aedat3.aedat3_frames,
         has_streams=True,
     ),
     _ros("DB3", ros_bags.DB3_SIGNATURE, ros_bags.Db3File),

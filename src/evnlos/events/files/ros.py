@@ -15,7 +15,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.errors import EventFileError
 from evnlos.events.files.columns import (
     SALVAGE,
     ColumnCheck,
@@ -34,7 +33,6 @@ from evnlos.events.files.mcap import Message, Topic
 from evnlos.events.files.raw import CODECS
 from evnlos.events.files.ros_messages import ARRAYS, IMAGES, PACKETS, EventArray, Packet, image_of
 from evnlos.events.files.words import FAULTS, STATE_SIZE, TRIGGERS, new_state, report_faults
-from evnlos.untrusted import check_memory
 
 _LOG = logging.getLogger("evnlos")
 _BLOCK_BYTES = 1 << 18  # its events stay in the cache until they are copied
@@ -266,36 +264,28 @@ class _Words:
             yield cut(out, 0, count)
 
 
-def read_ros_frames(
+def ros_frames(
     container: Container, path: Path, report: ReadReport, topic: str | None
-) -> tuple[NDArray, NDArray[np.int64]]:
-    """Return the images of a topic [T, H, W], uint8 or uint16, and their stamps [T], microseconds.
+) -> Iterator[tuple[int, NDArray]]:
+    """Yield the stamp [us] and the picture, uint8 or uint16 [H, W], of each image of a topic.
 
     Raises:
         EventFileError: The file has no images, or images of several sizes, or is damaged.
     """
     report.streams = streams_of(container.topics())
     report.topic = choose_stream(path, report.streams, topic, "frames", report.strict).name
-    images: list[NDArray] = []
-    times: list[int] = []
+    offset = _sensor_offset(container, path, report)
+    kind = None
     for message in container.messages(frozenset([report.topic])):
         try:
             stamp_ns, image = image_of(message)
-            if images and (image.shape, image.dtype) != (images[0].shape, images[0].dtype):
-                raise ValueError(
-                    f"an image {image.shape} {image.dtype} after {images[0].shape} {images[0].dtype}"
-                )
+            kind = kind or (image.shape, image.dtype)
+            if (image.shape, image.dtype) != kind:
+                raise ValueError(f"an image {image.shape} {image.dtype} after {kind[0]} {kind[1]}")
         except ValueError as error:
             report.fault("left_over", message.offset, str(error), _CURE, lost_bytes=len(message.data))
             continue
-        images.append(image)
-        times.append(stamp_ns // 1000)
-        if len(images) & (len(images) - 1) == 0:
-            what = f"{path}: the images of {report.topic}"
-            check_memory(4 * len(images) * image.nbytes, what, "leave frames out (ros2 bag convert)")
-    if not images:
-        raise EventFileError(f"{path}: topic {report.topic} holds no whole image; record it again")
-    return np.stack(images), np.array(times, np.int64) - _sensor_offset(container, path, report)
+        yield stamp_ns // 1000 - offset, image
 
 
 def _sensor_offset(container: Container, path: Path, report: ReadReport) -> int:

@@ -1,0 +1,181 @@
+"""What a frame camera adds to what it saw, dark signal and uneven response, and how it is taken away.
+
+- A dark frame and a flat field, as a capture's folder holds them.
+- The fixed pattern that a calibration found, its file, and where a setup has it.
+- What is left of frames without the setup's ambient light.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.data.sampling import reduce_by_area
+from evnlos.errors import DataError
+from evnlos.files import write_atomically
+from evnlos.setups import Setup
+from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
+
+
+def correct_frames(
+    frames: NDArray, peak: float, dark: NDArray | None = None, flat: NDArray | None = None
+) -> NDArray[np.float32]:
+    """Return frames without dark signal and uneven response, 0..1.
+
+    (F - D) / (peak - mean D), divided by (flat - D) / mean(flat - D) where a flat field is given; clipped to
+    0..1.
+
+    Args:
+        frames: [N, H, W], digital numbers.
+        peak: Largest digital number.
+        dark: Mean of frames with the lens covered, [H, W], digital numbers.
+        flat: Mean of frames of an evenly lit surface, [H, W], digital numbers.
+
+    Raises:
+        DataError: A picture of another size, or a flat field that is nowhere brighter than the dark frame.
+    """
+    ground = np.zeros(frames.shape[1:], np.float32) if dark is None else np.asarray(dark, np.float32)
+    for name, picture in (("dark", ground), ("flat", flat)):
+        if picture is not None and np.shape(picture) != frames.shape[1:]:
+            raise DataError(f"the {name} frame is {np.shape(picture)}, the frames are {frames.shape[1:]}")
+    out = frames.astype(np.float32) - ground
+    if flat is not None:
+        response = np.asarray(flat, np.float32) - ground
+        mean = float(response.mean())
+        if mean <= 0:
+            raise DataError(
+                f"the flat field is {mean:.1f} brighter than the dark frame; record an evenly lit one"
+            )
+        # A dead pixel would become infinite; below a tenth of the mean response nothing can be said.
+        out *= np.where(response > 0.1 * mean, mean / np.maximum(response, 0.1 * mean), 0.0)
+    return np.clip(out / max(peak - float(ground.mean()), 1.0), 0.0, 1.0)
+
+
+_LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less
+
+
+@dataclass(frozen=True, eq=False)
+class FixedPattern:
+    """What each pixel of a frame camera makes of the light: DN / peak = sensitivity * light + offset.
+
+    Args:
+        sensitivity: Relative sensitivity, about 1, float32 [H, W].
+        offset: Offset, white levels, float32 [H, W].
+    """
+
+    sensitivity: NDArray[np.float32]
+    offset: NDArray[np.float32]
+
+    def correct(self, frames: NDArray, peak: float) -> NDArray[np.float32]:
+        """Return the light that frames [N, H, W] (digital numbers up to `peak`) saw, white levels.
+
+        Noise can make a dark pixel slightly negative; nothing is clipped.
+
+        Raises:
+            DataError: The frames have another size than the pattern.
+        """
+        if frames.shape[1:] != self.offset.shape:
+            height, width = self.offset.shape
+            raise DataError(
+                f"the fixed pattern is of {width} x {height} pixels, the frames have {frames.shape[2]} x "
+                f"{frames.shape[1]}; calibrate the camera that took them"
+            )
+        light = frames.astype(np.float32) / np.float32(peak) - self.offset
+        return (light / np.maximum(self.sensitivity, _LEAST)).astype(np.float32)
+
+    @property
+    def digest(self) -> str:
+        """Hash of the pattern: datasets that were corrected by different patterns are not alike."""
+        return hashlib.sha256(self.sensitivity.tobytes() + self.offset.tobytes()).hexdigest()[:16]
+
+
+def save_pattern(pattern: FixedPattern, path: str | Path) -> None:
+    """Write a fixed pattern as a safetensors file, atomically."""
+    tensors = {"sensitivity": pattern.sensitivity, "offset": pattern.offset}
+    content = {name: torch.tensor(value, dtype=torch.float32) for name, value in tensors.items()}
+    write_atomically(Path(path), sealed_bytes(content, "fixed pattern"))
+
+
+def load_pattern(path: str | Path) -> FixedPattern:
+    """Read a fixed pattern.
+
+    Args:
+        path: The file, or the folder of a calibrated setup that holds it.
+
+    Raises:
+        DataError: There is no such file, it is damaged, or it holds something else.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / PATTERN_FILE
+    if not path.is_file():
+        raise DataError(
+            f"{path} does not exist; `evnlos calibrate` writes the fixed pattern of a setup's camera"
+        )
+    try:
+        _, tensors, _ = read_sealed(path)
+        check_floats(tensors)
+        sensitivity, offset = (tensors[name].float().numpy() for name in ("sensitivity", "offset"))
+    except (OSError, ValueError, LookupError) as error:
+        raise DataError(f"{path} holds no fixed pattern: {' '.join(str(error).split())}") from None
+    if sensitivity.ndim != 2 or sensitivity.shape != offset.shape:
+        raise DataError(
+            f"{path}: sensitivity {sensitivity.shape} and offset {offset.shape} are no pictures of one size"
+        )
+    return FixedPattern(sensitivity, offset)
+
+
+def pattern_of(setup: str | Path | None, pattern: str | Path | None = None) -> FixedPattern | None:
+    """Return the fixed pattern that a setup stands for to every command: the one in its calibrated folder.
+
+    Args:
+        setup: Word of a setup (see `load_setup`): a calibrated folder, a settings file in it, or any other
+            word; None for no setup.
+        pattern: A file or folder with another pattern, which wins.
+
+    Returns:
+        The pattern; None where neither has any.
+
+    Raises:
+        DataError: As of `load_pattern`.
+    """
+    if pattern is not None:
+        return load_pattern(pattern)
+    if setup is None:
+        return None
+    folder = Path(setup) if Path(setup).is_dir() else Path(setup).parent
+    names_folder = folder == Path(setup) or Path(setup).suffix in (".yaml", ".yml")
+    return load_pattern(folder) if names_folder and (folder / PATTERN_FILE).is_file() else None
+
+
+PATTERN_FILE = "pattern.safetensors"
+"""Name of the file in a setup's folder."""
+
+
+def object_light(
+    frames: NDArray,
+    peak: int,
+    setup: Setup,
+    shape: tuple[int, int],
+    pattern: FixedPattern | None = None,
+) -> torch.Tensor:
+    """Return frames less the setup's ambient light, reduced by area averaging.
+
+    Args:
+        frames: Digital numbers [N, H, W].
+        peak: Largest digital number.
+        setup: The setup that says how much ambient light there is.
+        shape: Size (h, w) of the result, pixels.
+        pattern: The camera's fixed pattern, to be taken off first.
+
+    Returns:
+        White levels, float32 [N, h, w]; noise makes some of them negative.
+    """
+    levels = frames / np.float32(peak) if pattern is None else pattern.correct(frames, peak)
+    size = (frames.shape[-2], frames.shape[-1])
+    return torch.from_numpy(reduce_by_area(levels - setup.ambient_light(size).numpy(), shape))
