@@ -407,6 +407,7 @@ def test_addresses_of_other_programs_are_checked() -> None:
         ("dv://127.0.0.1:1", "did not answer within 3 s"),
         ("dv://127.0.0.1:99999", "dv://127.0.0.1:7000"),
         ("udp://127.0.0.1:0", "--format is for words"),
+        ("evk9", "neither a file nor one of the cameras .*evk4"),
     ):
         how = SourceOptions(format="evt3") if source.startswith("udp") else SourceOptions()
         with pytest.raises(ConfigError, match=text):

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data.sampling import Samples, Sampling
 from evnlos.errors import DataError
+from evnlos.events.files.container_write import Storage
 from evnlos.files import directory_lock, is_empty, new_file
+from evnlos.machine import undisturbed
 from evnlos.registry import __version__
 from evnlos.types import Events
 from evnlos.untrusted import open_hdf5, stored
@@ -52,29 +54,42 @@ def write_shard(
     """
     if isinstance(samples, Samples):
         samples, count = (samples,), len(samples)
-    how: dict[str, Any] = {"libver": ("v110", "v110"), "track_order": True}
-    with new_file(path) as temporary, h5py.File(temporary, "w", **how) as file:
-        for key, value in attributes.items():
-            file.attrs[key] = value
-        at = 0
-        for block in samples:
-            for name in _AXES:
-                values = getattr(block, name)
-                if values is not None:
-                    chunks = (1, *values.shape[1:]) if name in _MAPS else True
-                    _put(file, name, values.astype(np.float16) if name in _MAPS else values, chunks, at, count)
-            at += len(block)
-        if events is not None:
-            for name, column in (("x", events.x), ("y", events.y), ("t", events.t_us), ("p", events.p)):
-                _put(file, f"events/{name}", column.astype(np.uint8) if name == "p" else column, (65_536,))
-            file["events"].attrs["width"], file["events"].attrs["height"] = events.width, events.height
+    with new_file(path) as temporary, closing(Storage(temporary)) as storage:
+        with undisturbed():
+            file = h5py.File(storage, "w", libver=("v110", "v110"), track_order=True)
+            file.attrs.update(attributes)
+            if events is not None:
+                file.create_group("events").attrs.update({"width": events.width, "height": events.height})
+        try:
+            for part in _parts(samples, events, count):  # made between the writing, where Ctrl-C is heard
+                with undisturbed():
+                    for row in part:
+                        _put(file, *row)
+                if storage.failure is not None:
+                    break
+        finally:
+            with undisturbed():
+                file.close()
+        if storage.failure is not None:
+            raise storage.failure
 
 
-def _put(
-    file: h5py.File, name: str, values: np.ndarray, chunks: Any = True, at: int = 0, count: int | None = None
-) -> None:
+def _parts(samples: Iterable[Samples], events: Events | None, count: int | None) -> Iterator[list[tuple]]:
+    """Yield what each block adds to the datasets, and the events: the arguments of `_put`."""
+    at = 0
+    for block in samples:
+        found = {name: getattr(block, name) for name in _AXES if getattr(block, name) is not None}
+        maps = {name: found.pop(name).astype(np.float16) for name in _MAPS if name in found}
+        rows = [(name, values, (1, *values.shape[1:]), at, count) for name, values in maps.items()]
+        yield rows + [(name, values, True, at, count) for name, values in found.items()]
+        at += len(block)
+    if events is not None:
+        columns = {"x": events.x, "y": events.y, "t": events.t_us, "p": events.p.astype(np.uint8)}
+        yield [(f"events/{name}", column, (65_536,), 0, len(column)) for name, column in columns.items()]
+
+
+def _put(file: h5py.File, name: str, values: np.ndarray, chunks: Any, at: int, count: int) -> None:
     """Store rows of a dataset from row `at` on, of `count` rows in all."""
-    count = len(values) if count is None else count
     if not values.size:
         file.create_dataset(name, data=values)
         return
@@ -105,30 +120,18 @@ def read_shard(path: str | Path, steps: slice | NDArray[np.int64] | None = None)
         attributes = {key: _plain(value) for key, value in file.attrs.items()}
     frame, surface, time_s, count = (found[name] for name in ("frame", "surface", "time_s", "event_count"))
     if frame is None or surface is None or time_s is None or count is None:
-        raise DataError(
-            f"{path} is not a shard: it lacks a map or its times; delete it and run the command again"
-        )
+        what = "not a shard: it lacks a map or its times"
+        raise DataError(f"{path} is {what}; delete it and run the command again")
     truth, position_m = found["truth"], found["position_m"]
     maps = (len(time_s), *frame.shape[1:])
-    if (
-        frame.shape != maps
-        or surface.shape != (maps[0], 2, *maps[1:])
-        or (truth is not None and truth.shape != maps)
-        or (position_m is not None and position_m.shape != (maps[0], 2))
-        or count.shape != time_s.shape
-    ):
-        raise DataError(
-            f"{path} contradicts itself: its maps are of different numbers or sizes; make the dataset again"
-        )
-    samples = Samples(
-        frame=frame.astype(np.float32),
-        surface=surface.astype(np.float32),
-        truth=None if truth is None else truth.astype(np.float32),
-        time_s=time_s,
-        position_m=position_m,
-        event_count=count,
-    )
-    return samples, attributes
+    is_whole = frame.shape == maps and surface.shape == (maps[0], 2, *maps[1:]) and count.shape == time_s.shape
+    is_whole &= (truth is None or truth.shape == maps) and (position_m is None or len(position_m) == maps[0])
+    if not is_whole or (position_m is not None and position_m.shape[1:] != (2,)):
+        what = "its maps are of different numbers or sizes"
+        raise DataError(f"{path} contradicts itself: {what}; make the dataset again")
+    truth = None if truth is None else truth.astype(np.float32)
+    maps = frame.astype(np.float32), surface.astype(np.float32), truth
+    return Samples(*maps, time_s, position_m, count), attributes
 
 
 class ShardIndex(NamedTuple):
@@ -169,9 +172,8 @@ def _damage(path: str | Path) -> Iterator[None]:
     except FileNotFoundError:
         raise DataError(f"{path} does not exist; run the command that made the dataset again") from None
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
-        raise DataError(
-            f"{path} is damaged ({_one_line(error)}); delete it and run the command again"
-        ) from None
+        found = f"{path} is damaged ({_one_line(error)})"
+        raise DataError(f"{found}; delete it and run the command again") from None
 
 
 def _array(
@@ -277,9 +279,8 @@ def check_dataset(dataset: Dataset, settings: type[Any] | None = None) -> bool:
             stored["sampling"] = to_dict(from_dict(Sampling, stored["sampling"], source=str(path)))
         differing = differing_keys(_comparable(_content(dataset)), _comparable(stored))
         if differing:
-            shown = "; ".join(differing[:6]) + (
-                f"; and {len(differing) - 6} more" if len(differing) > 6 else ""
-            )
+            more = [f"and {len(differing) - 6} more"] if len(differing) > 6 else []
+            shown = "; ".join(differing[:6] + more)
             raise DataError(f"{dataset.folder} holds a dataset of other settings ({shown}); give another --out")
         return True
     if not is_empty(dataset.folder):
@@ -339,15 +340,13 @@ def open_dataset(folder: str | Path) -> Dataset:
     folder = Path(folder)
     path = folder / PAGE
     if not path.is_file():
-        raise DataError(
-            f"{folder} is no dataset: {path.name} is missing; make one with `evnlos simulate` or `import`"
-        )
+        found = f"{folder} is no dataset: {path.name} is missing"
+        raise DataError(f"{found}; make one with `evnlos simulate` or `import`")
     values = read_yaml(path, LONG_YAML)
     unknown = values.keys() - _KEYS
     if unknown:
-        raise DataError(
-            f"{path} holds an unknown entry {min(map(str, unknown))[:40]!r}; make the dataset again"
-        )
+        entry = min(map(str, unknown))[:40]
+        raise DataError(f"{path} holds an unknown entry {entry!r}; make the dataset again")
     try:
         split = {str(key): list(names) for key, names in values["split"].items()}
         sampling = from_dict(Sampling, values["sampling"], source=str(path))

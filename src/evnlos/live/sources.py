@@ -19,7 +19,7 @@ from evnlos.data.sampling import FixedPattern
 from evnlos.errors import ConfigError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording
-from evnlos.live.device import DeviceSource, NeuromorphicDriver, device_of
+from evnlos.live.device import DEVICES, DeviceSource, NeuromorphicDriver, device_of
 from evnlos.live.growing_file import GrowingFile
 from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
 from evnlos.live.streams import DvSource, WordInput
@@ -217,6 +217,10 @@ def open_live(
     if device is not None:
         return DeviceSource(lambda: NeuromorphicDriver(*device), source, idle_s=how.idle_s)
     path = Path(source)
+    if not (path.exists() or path.suffix or path.name != source or how.follow):
+        raise ConfigError(
+            f"{source} is neither a file nor one of the cameras {', '.join(DEVICES)}; check the name"
+        )
     if path.is_dir():
         if how.follow:
             raise ConfigError(f"{source} is a folder; --follow takes the event file that grows")

@@ -30,7 +30,7 @@ _MAX_INDEX_MS = 1 << 24  # 4.7 hours; a longer index would be larger than the ev
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 
 
-class _Storage:
+class Storage:
     """The file beneath HDF5, for which every write succeeds.
 
     The library can't give up a file that it failed to write: it tries again at every close, at last when the
@@ -74,7 +74,7 @@ class Hdf5Sink:
         self._wide = first.duration_us >= 2**32 or not -(2**62) < start < 2**62
         self._t_offset = 0 if self._wide else start
         self._events, self._last = 0, 0
-        self._storage = _Storage(path)
+        self._storage = Storage(path)
         with undisturbed():
             self._file = h5py.File(self._storage, "w", libver=("v110", "v110"))
             self._group = self._file.create_group("events")
