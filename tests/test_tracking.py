@@ -14,8 +14,8 @@ from evnlos.cli import main
 from evnlos.cli.invert_captures import linear_setup
 from evnlos.config import read_yaml, save_yaml
 from evnlos.data import FixedPattern, Sampling, read_capture
+from evnlos.data.fixed_pattern import save_pattern
 from evnlos.data.lab import Lab, render_captures
-from evnlos.data.sampling import save_pattern
 from evnlos.data.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import SequenceOperator

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from evnlos.calibration.captures import CaptureSet
 from evnlos.cameras import FrameCamera
-from evnlos.data.sampling import FixedPattern, reduce_by_area
+from evnlos.data.fixed_pattern import FixedPattern
+from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.setups import Setup
 from evnlos.types import Plane

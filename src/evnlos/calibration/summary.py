@@ -17,7 +17,7 @@ from evnlos.calibration.transport_fit import Residual, values_of
 from evnlos.calibration.wall_search import WALL_FILE
 from evnlos.config import save_yaml
 from evnlos.data import randomized
-from evnlos.data.sampling import PATTERN_FILE, save_pattern
+from evnlos.data.fixed_pattern import PATTERN_FILE, save_pattern
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically

@@ -22,8 +22,9 @@ from evnlos.analysis.bounds import canvas_decibel
 from evnlos.calibration.scan.importer import fill_bad
 from evnlos.cli.parsing import say
 from evnlos.data import Capture, load_pattern, pattern_of, read_capture
+from evnlos.data.fixed_pattern import object_light
 from evnlos.data.frames import read_image
-from evnlos.data.sampling import Sampling, object_light
+from evnlos.data.sampling import Sampling
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
     FrameTerm,

@@ -25,17 +25,9 @@ from evnlos.data.capture_info import (
     read_capture_info,
 )
 from evnlos.data.clocks import find_offset
+from evnlos.data.fixed_pattern import FixedPattern, correct_frames
 from evnlos.data.frames import FrameSeries, read_frame_series, read_image, warp_frames
-from evnlos.data.sampling import (
-    FixedPattern,
-    Samples,
-    Sampling,
-    correct_frames,
-    frame_homography,
-    iter_samples,
-    join_samples,
-    time_steps,
-)
+from evnlos.data.sampling import Samples, Sampling, frame_homography, iter_samples, join_samples, time_steps
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, printable
 from evnlos.events import (

@@ -1,13 +1,11 @@
-"""From what the cameras recorded to the maps a network sees: frames put right, and one sample a position.
+"""From what the cameras recorded to the maps a network sees: one sample a position.
 
-- What a frame camera adds to what it saw, dark signal and uneven response, known pixel by pixel and taken away.
 - Where the pixels of the frame camera lie on those of the event camera.
 - Samples at a working resolution: a frame, a time surface and the truth of each position.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
@@ -15,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from evnlos.config import check_made
@@ -31,146 +28,10 @@ from evnlos.events import (
     read_events,
     time_surface,
 )
-from evnlos.files import write_atomically
 from evnlos.scene import Motion, Target
-from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
 from evnlos.types import Events, Plane
 
-
-def correct_frames(
-    frames: NDArray, peak: float, dark: NDArray | None = None, flat: NDArray | None = None
-) -> NDArray[np.float32]:
-    """Return frames without dark signal and uneven response, 0..1.
-
-    (F - D) / (peak - mean D), divided by (flat - D) / mean(flat - D) where a flat field is given; clipped to
-    0..1.
-
-    Args:
-        frames: [N, H, W], digital numbers.
-        peak: Largest digital number.
-        dark: Mean of frames with the lens covered, [H, W], digital numbers.
-        flat: Mean of frames of an evenly lit surface, [H, W], digital numbers.
-
-    Raises:
-        DataError: A picture of another size, or a flat field that is nowhere brighter than the dark frame.
-    """
-    ground = np.zeros(frames.shape[1:], np.float32) if dark is None else np.asarray(dark, np.float32)
-    for name, picture in (("dark", ground), ("flat", flat)):
-        if picture is not None and np.shape(picture) != frames.shape[1:]:
-            raise DataError(f"the {name} frame is {np.shape(picture)}, the frames are {frames.shape[1:]}")
-    out = frames.astype(np.float32) - ground
-    if flat is not None:
-        response = np.asarray(flat, np.float32) - ground
-        mean = float(response.mean())
-        if mean <= 0:
-            raise DataError(
-                f"the flat field is {mean:.1f} brighter than the dark frame; record an evenly lit one"
-            )
-        # A dead pixel would become infinite; below a tenth of the mean response nothing can be said.
-        out *= np.where(response > 0.1 * mean, mean / np.maximum(response, 0.1 * mean), 0.0)
-    return np.clip(out / max(peak - float(ground.mean()), 1.0), 0.0, 1.0)
-
-
 _BLOCK_BYTES = 1 << 26  # of frames and surfaces at the sensor's resolution
-_LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less
-
-
-@dataclass(frozen=True, eq=False)
-class FixedPattern:
-    """What each pixel of a frame camera makes of the light: DN / peak = sensitivity * light + offset.
-
-    Args:
-        sensitivity: Relative sensitivity, about 1, float32 [H, W].
-        offset: Offset, white levels, float32 [H, W].
-    """
-
-    sensitivity: NDArray[np.float32]
-    offset: NDArray[np.float32]
-
-    def correct(self, frames: NDArray, peak: float) -> NDArray[np.float32]:
-        """Return the light that frames [N, H, W] (digital numbers up to `peak`) saw, white levels.
-
-        Noise can make a dark pixel slightly negative; nothing is clipped.
-
-        Raises:
-            DataError: The frames have another size than the pattern.
-        """
-        if frames.shape[1:] != self.offset.shape:
-            height, width = self.offset.shape
-            raise DataError(
-                f"the fixed pattern is of {width} x {height} pixels, the frames have {frames.shape[2]} x "
-                f"{frames.shape[1]}; calibrate the camera that took them"
-            )
-        light = frames.astype(np.float32) / np.float32(peak) - self.offset
-        return (light / np.maximum(self.sensitivity, _LEAST)).astype(np.float32)
-
-    @property
-    def digest(self) -> str:
-        """Hash of the pattern: datasets that were corrected by different patterns are not alike."""
-        return hashlib.sha256(self.sensitivity.tobytes() + self.offset.tobytes()).hexdigest()[:16]
-
-
-def save_pattern(pattern: FixedPattern, path: str | Path) -> None:
-    """Write a fixed pattern as a safetensors file, atomically."""
-    tensors = {"sensitivity": pattern.sensitivity, "offset": pattern.offset}
-    content = {name: torch.tensor(value, dtype=torch.float32) for name, value in tensors.items()}
-    write_atomically(Path(path), sealed_bytes(content, "fixed pattern"))
-
-
-def load_pattern(path: str | Path) -> FixedPattern:
-    """Read a fixed pattern.
-
-    Args:
-        path: The file, or the folder of a calibrated setup that holds it.
-
-    Raises:
-        DataError: There is no such file, it is damaged, or it holds something else.
-    """
-    path = Path(path)
-    if path.is_dir():
-        path = path / PATTERN_FILE
-    if not path.is_file():
-        raise DataError(
-            f"{path} does not exist; `evnlos calibrate` writes the fixed pattern of a setup's camera"
-        )
-    try:
-        _, tensors, _ = read_sealed(path)
-        check_floats(tensors)
-        sensitivity, offset = (tensors[name].float().numpy() for name in ("sensitivity", "offset"))
-    except (OSError, ValueError, LookupError) as error:
-        raise DataError(f"{path} holds no fixed pattern: {' '.join(str(error).split())}") from None
-    if sensitivity.ndim != 2 or sensitivity.shape != offset.shape:
-        raise DataError(
-            f"{path}: sensitivity {sensitivity.shape} and offset {offset.shape} are no pictures of one size"
-        )
-    return FixedPattern(sensitivity, offset)
-
-
-def pattern_of(setup: str | Path | None, pattern: str | Path | None = None) -> FixedPattern | None:
-    """Return the fixed pattern that a setup stands for to every command: the one in its calibrated folder.
-
-    Args:
-        setup: Word of a setup (see `load_setup`): a calibrated folder, a settings file in it, or any other
-            word; None for no setup.
-        pattern: A file or folder with another pattern, which wins.
-
-    Returns:
-        The pattern; None where neither has any.
-
-    Raises:
-        DataError: As of `load_pattern`.
-    """
-    if pattern is not None:
-        return load_pattern(pattern)
-    if setup is None:
-        return None
-    folder = Path(setup) if Path(setup).is_dir() else Path(setup).parent
-    names_folder = folder == Path(setup) or Path(setup).suffix in (".yaml", ".yml")
-    return load_pattern(folder) if names_folder and (folder / PATTERN_FILE).is_file() else None
-
-
-PATTERN_FILE = "pattern.safetensors"
-"""Name of the file in a setup's folder."""
 
 
 def frame_homography(
@@ -210,12 +71,15 @@ class Sampling:
     """Size of a pixel of the truth on the target's plane, metres."""
     scored_rows: int = 48
     """Rows in the middle of the canvas that are scored; the target never leaves them, pixels."""
-    surface: Literal["sae", "context", "hots", "trace"] = "sae"
-    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones."""
+    surface: Literal["sae", "context", "hots", "trace", "likelihood"] = "sae"
+    """Kind of the time surface; `trace` = log light smoothed over all events, also later ones; `likelihood` =
+    the target that the events of the whole sequence make most likely through the light path of `setup`."""
     tau_s: float = 0.2
     """Time constant of the time surface, seconds; of `trace`, the time in which the light changes: 1 to 5."""
     radius: int = 3
     """Radius of the neighbourhood of the surfaces `context` and `hots`, pixels."""
+    setup: str = ""
+    """Setup for the surface `likelihood`: a folder of `evnlos calibrate`, a settings file, or a name."""
 
     def __post_init__(self) -> None:
         for name in ("height", "width", "scored_rows"):
@@ -277,6 +141,10 @@ def surface_of(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) 
         edges_us: N + 1 ascending instants, microseconds.
         sampling: Kind of the surface and its settings.
     """
+    if sampling.surface == "likelihood":
+        raise ConfigError(
+            "the surface 'likelihood' is made of whole recordings; give another --sampling.surface"
+        )
     tau_us = sampling.tau_s * 1e6
     if sampling.surface == "trace":
         return event_trace(events, edges_us, tau_us)
@@ -330,14 +198,18 @@ def iter_samples(
 ) -> Iterator[Samples]:
     """Yield what `make_samples` returns in blocks, at least one, whose memory does not grow with the positions.
 
-    Of the surface `trace` alone all are held at once.
+    Of the surfaces `trace` and `likelihood` alone all are held at once.
     """
     if len(edges_us) != len(frames) + 1:
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
     shape = (sampling.height, sampling.width)
     steps = max(1, _BLOCK_BYTES // (4 * (2 * events.width * events.height + math.prod(frames.shape[1:]))))
     tau_us, mode = sampling.tau_s * 1e6, sampling.surface
-    if mode == "trace":
+    if mode == "likelihood":
+        from evnlos.inverse.sequence_statistic import event_images  # which compiles
+
+        surfaces = frame_blocks(event_images(events, edges_us, motion, sampling.setup, sampling.canvas), steps)
+    elif mode == "trace":
         surfaces = frame_blocks(event_trace(events, edges_us, tau_us), steps)
     else:
         surfaces = iter_time_surfaces(events, edges_us, tau_us, mode, radius=sampling.radius, grids=steps)
@@ -347,9 +219,11 @@ def iter_samples(
         part = slice(k * steps, k * steps + len(block))
         time_s = np.asarray(edges_us[1:][part], dtype=np.float64) * 1e-6
         position = None if motion is None else motion.position_m(time_s)
-        is_known = target is not None and position is not None
-        truth = target.rasterise(sampling.canvas, position) if is_known else None
-        light, maps = reduce_by_area(block / np.float32(peak), shape), reduce_by_area(surface, shape)
+        truth = None
+        if target is not None and position is not None:
+            truth = target.rasterise(sampling.canvas, position)
+        light = reduce_by_area(block / np.float32(peak), shape)
+        maps = surface if mode == "likelihood" else reduce_by_area(surface, shape)
         yield Samples(light, maps, truth, time_s, position, counts[part])
 
 

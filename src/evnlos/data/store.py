@@ -120,8 +120,7 @@ def read_shard(path: str | Path, steps: slice | NDArray[np.int64] | None = None)
         attributes = {key: _plain(value) for key, value in file.attrs.items()}
     frame, surface, time_s, count = (found[name] for name in ("frame", "surface", "time_s", "event_count"))
     if frame is None or surface is None or time_s is None or count is None:
-        what = "not a shard: it lacks a map or its times"
-        raise DataError(f"{path} is {what}; delete it and run the command again")
+        raise DataError(f"{path} is not a shard: it lacks a map or times; delete it and run the command again")
     truth, position_m = found["truth"], found["position_m"]
     maps = (len(time_s), *frame.shape[1:])
     is_whole = frame.shape == maps and surface.shape == (maps[0], 2, *maps[1:]) and count.shape == time_s.shape

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.data.capture import read_capture
-from evnlos.data.sampling import FixedPattern
+from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.errors import ConfigError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording

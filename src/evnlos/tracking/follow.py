@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.data.capture import Capture
-from evnlos.data.sampling import FixedPattern, reduce_by_area
+from evnlos.data.fixed_pattern import FixedPattern
+from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import BackgroundModel
 from evnlos.setups import Setup
