@@ -10,8 +10,16 @@ import numpy as np
 from evnlos.calibration import Residual, SetupFit, write_setup
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
-from evnlos.data import FixedPattern, SensorSize, Simulation, open_dataset, pattern_of, read_shard, simulate
-from evnlos.data.fixed_pattern import save_pattern
+from evnlos.data import (
+    FixedPattern,
+    SensorSize,
+    Simulation,
+    open_dataset,
+    pattern_of,
+    read_shard,
+    save_pattern,
+    simulate,
+)
 from evnlos.data.lab import Lab, render_captures
 from evnlos.optics.facets import SlopeTable
 from evnlos.scene import FontGlyphs, HandwritingGlyphs

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evnlos.data import read_capture
+from evnlos.data import correct_frames, read_capture
 from evnlos.data.clocks import find_offset
-from evnlos.data.fixed_pattern import correct_frames
 from evnlos.data.frames import find_dots, homography_from_points, registration_error, warp_frames
 from evnlos.errors import DataError
 from evnlos.types import Events

@@ -13,8 +13,7 @@ from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.cli.invert_captures import linear_setup
 from evnlos.config import read_yaml, save_yaml
-from evnlos.data import FixedPattern, Sampling, read_capture
-from evnlos.data.fixed_pattern import save_pattern
+from evnlos.data import FixedPattern, Sampling, read_capture, save_pattern
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError

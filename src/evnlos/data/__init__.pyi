@@ -9,6 +9,7 @@ from .capture_info import CaptureInfo as CaptureInfo
 from .capture_info import character_of as character_of
 from .fixed_pattern import PATTERN_FILE as PATTERN_FILE
 from .fixed_pattern import FixedPattern as FixedPattern
+from .fixed_pattern import correct_frames as correct_frames
 from .fixed_pattern import load_pattern as load_pattern
 from .fixed_pattern import object_light as object_light
 from .fixed_pattern import pattern_of as pattern_of
