@@ -225,3 +225,15 @@ def test_real_recordings_without_known_light(shared_data, name: str) -> None:
     found = fit_known_light(Manifest((LitFile(str(path)),)), QUICK)
     assert found.pixel is None and found.refractory.state != "identified"
     assert not any("flicker" in line for line in found.warnings)
+
+
+def test_the_scatter_of_pixels_knows_that_they_share_a_phase() -> None:
+    """Where a sine begins is told by all pixels' events: the harmonics' means scatter as the pixels say."""
+    recordings = [one for one in recorded(TRUTHS["continuous"], 1) if one.known.kind == "sine"][1:]
+    panels = panels_of(recordings)
+    about = panels.statistics.mean(axis=0)
+    drawn = [panels.simulate(TRUTHS["continuous"], seed) for seed in range(160)]
+    means = np.array([panels.scale.of(one) for one in drawn])
+    stated = np.mean([panels.scale.covariance(one, about) for one in drawn], axis=0)
+    whitened = np.linalg.solve(np.linalg.cholesky(stated[-4:, -4:] + 1e-6 * np.eye(4)), means[:, -4:].T)
+    assert np.linalg.eigvalsh(np.cov(whitened)).max() < 2.2  # of one phase for each pixel: 4 to 7

@@ -122,8 +122,12 @@ def _block(recording: LitRecording, binning: Binning, events: Events) -> Array:
         place = np.digitize(gaps_us * 1e-6, binning.intervals_s)
         bins = len(binning.intervals_s) + 1
         columns += list(np.bincount(where * bins + place, minlength=pixels * bins).reshape(pixels, bins).T[:-1])
-    for mark in _marks(recording, binning, index, time_s, on):
-        columns += [np.bincount(index[chosen], mark[chosen], minlength=pixels) for chosen in (on, ~on)]
+    marks = [
+        np.bincount(index[chosen], mark[chosen], minlength=pixels)
+        for mark in _marks(recording, binning, index, time_s, on)
+        for chosen in (on, ~on)
+    ]
+    columns += _with_common_phase(marks) if recording.known.kind in ("sine", "square") else marks
     return np.stack(columns, axis=1).astype(np.float64)
 
 
@@ -147,6 +151,22 @@ def _marks(
         light -= light.mean(axis=0)
         return [_at(light, recording.times_s, time_s - lag, index) for lag in (0.0, binning.lag_s)]
     return []
+
+
+def _with_common_phase(harmonics: list[Array]) -> list[Array]:
+    """Return harmonics of ON and OFF events, [N] each, that scatter as they do with a phase of all pixels.
+
+    A pixel's sine turns the common phase a little, and with it the harmonics of all: to first order each pixel
+    adds its share of that turn. The shares sum to zero, so the means stay as they are.
+
+    Args:
+        harmonics: cos of ON, of OFF, sin of ON, of OFF, and the four of the double phase.
+    """
+    cos_on, cos_off, sin_on, sin_off, *double = harmonics
+    turn = (sin_on - sin_off) / max(float((cos_on - cos_off).mean()), 1e-9)
+    along = [sin_on, sin_off, -cos_on, -cos_off, *(2 * one for one in (double[2], double[3]))]
+    along += [-2 * double[0], -2 * double[1]]
+    return [one + change.mean() * turn for one, change in zip(harmonics, along, strict=True)]
 
 
 def _passage(recording: LitRecording, index: NDArray[np.int64], time_s: Array, on: NDArray[np.bool_]) -> Array:
