@@ -123,7 +123,7 @@ def _block(recording: LitRecording, binning: Binning, events: Events) -> Array:
         bins = len(binning.intervals_s) + 1
         columns += list(np.bincount(where * bins + place, minlength=pixels * bins).reshape(pixels, bins).T[:-1])
     marks = [
-        np.bincount(index[chosen], mark[chosen], minlength=pixels)
+        np.bincount(index[chosen], mark[chosen], minlength=pixels).astype(np.float64)
         for mark in _marks(recording, binning, index, time_s, on)
         for chosen in (on, ~on)
     ]
@@ -164,8 +164,8 @@ def _with_common_phase(harmonics: list[Array]) -> list[Array]:
     """
     cos_on, cos_off, sin_on, sin_off, *double = harmonics
     turn = (sin_on - sin_off) / max(float((cos_on - cos_off).mean()), 1e-9)
-    along = [sin_on, sin_off, -cos_on, -cos_off, *(2 * one for one in (double[2], double[3]))]
-    along += [-2 * double[0], -2 * double[1]]
+    cos_2on, cos_2off, sin_2on, sin_2off = double
+    along = (sin_on, sin_off, -cos_on, -cos_off, 2 * sin_2on, 2 * sin_2off, -2 * cos_2on, -2 * cos_2off)
     return [one + change.mean() * turn for one, change in zip(harmonics, along, strict=True)]
 
 
