@@ -127,7 +127,7 @@ def _block(recording: LitRecording, binning: Binning, events: Events) -> Array:
         for mark in _marks(recording, binning, index, time_s, on)
         for chosen in (on, ~on)
     ]
-    columns += _with_common_phase(marks) if recording.known.kind in ("sine", "square") else marks
+    columns += _with_common_phase(marks) if recording.known.kind in ("sine", "square") else list(marks)
     return np.stack(columns, axis=1).astype(np.float64)
 
 
@@ -153,7 +153,7 @@ def _marks(
     return []
 
 
-def _with_common_phase(harmonics: list[Array]) -> list[Array]:
+def _with_common_phase(harmonics: Sequence[Array]) -> list[Array]:
     """Return harmonics of ON and OFF events, [N] each, that scatter as they do with a phase of all pixels.
 
     A pixel's sine turns the common phase a little, and with it the harmonics of all: to first order each pixel
