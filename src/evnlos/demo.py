@@ -119,7 +119,7 @@ def run_demo(settings: Demo) -> Path:
 
     single = [record for record in records if record.arm in [arm.name for arm in study.arms]]
     runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
-    recorded = out / "recorded" / single[0].settings["captures"]
+    recorded = [out / "recorded" / record.settings["captures"] for record in single]  # E2E sees other surfaces
     with ProgressBars() as progress:
         dataset, results = collect_results(runs, recorded, workers=settings.workers, progress=progress)
     setup = named_setup(out / "setups" / study.setup) if settings.calibrate else None
@@ -177,29 +177,23 @@ def _study(settings: Demo, test: list[str]) -> Study:
     single = Training(network=UNetConfig(width=settings.width), epochs=settings.single_epochs)
     network = replace(SEQUENCE_NETWORK, width=settings.width)
     plan = Training(batch_size=16, network=network)
-    # Trained layers need less time and smaller steps; validation characters chose both.
-    epochs, rate = (4, 1e-3) if settings.start else (8, plan.learning_rate)
-    before = replace(
-        plan,
-        epochs=settings.pretrain_epochs or epochs,
-        learning_rate=rate,
-        sequence_augmentations=2,
-        refit_embedding=bool(settings.start),
-    )
+    before = anew = replace(plan, epochs=settings.pretrain_epochs or 8, sequence_augmentations=2)
+    if settings.start:  # trained layers need less time and smaller steps; validation characters chose both
+        before = replace(anew, epochs=settings.pretrain_epochs or 4, learning_rate=1e-3, refit_embedding=True)
     # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
     after = replace(plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True)
     alone = replace(plan, epochs=settings.e2e_epochs)
     source = "calibrated" if settings.calibrate else "uncalibrated"
-    # Of the time surfaces, the one that validation characters are seen best in.
-    sampling = Sampling(surface="hots", radius=1)
+    alone_sees = Sampling(surface="hots", radius=1)  # of the time surfaces, validation characters chose it
+    sees = Sampling(surface="likelihood") if settings.calibrate else alone_sees
     return Study(
         "demo",
         "demo",
         (
-            Arm("simulation only", source, before, None, settings.start, sampling=sampling),
-            Arm("E2E, single positions", "none", None, single, sampling=sampling),
-            Arm("E2E", "none", None, alone, sampling=sampling),
-            Arm("EPNP", source, before, after, settings.start, choose=True, sampling=sampling),
+            Arm("simulation only", source, before, None, settings.start, anew, sampling=sees),
+            Arm("EPNP", source, before, after, settings.start, anew, choose=True, sampling=sees),
+            Arm("E2E, single positions", "none", None, single, sampling=alone_sees),
+            Arm("E2E", "none", None, alone, sampling=alone_sees),
         ),
         seeds=(settings.seed,),
         test=tuple(test),

@@ -28,7 +28,7 @@ from evnlos.errors import CalibrationError, DataError, MissingDependencyError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there, slug
 from evnlos.experiment.table import score_arm
 from evnlos.machine import Progress, Step, silent
-from evnlos.models import layers_of, load_weights
+from evnlos.models import load_weights
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
 from evnlos.setups import SensorSize, calibrated_file
 from evnlos.training import Training, choose_and_finetune, train
@@ -279,13 +279,13 @@ def _planned(
 ) -> tuple[list[Run], dict[str, Any]]:
     """Return the trainings of an arm's network, each from the one before it, and what decided them."""
     runs: list[Run] = []
-    begin = layers_of(arm.start, modality)[0] if arm.start else None
+    begin = arm.layers(modality)
     decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": recorded.folder.name}
     if arm.pretraining is not None:
         assert made is not None
-        settings = replace(arm.pretraining, modality=modality, seed=seed)
+        settings = replace(arm.first_training(modality), modality=modality, seed=seed)
         decides: dict[str, Any] = {"data": made.config_hash, "settings": to_dict(settings)}
-        if arm.start:
+        if begin is not None:
             decides["from"] = arm.start
         key = config_hash(decides)[:8]
         out = place.out / "runs" / f"{study.setup}-pretrained-{modality}-seed{seed}-{key}"

@@ -20,6 +20,7 @@ from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.machine import Progress, Step
+from evnlos.models import layers_of, load_weights
 from evnlos.registry import migrate
 from evnlos.training import Training
 from evnlos.types import derive_seed
@@ -46,6 +47,8 @@ class Arm:
     start: str = ""
     """Setup of installed weights of sequences; the arm's first training begins with their layers. Empty: with
     random ones."""
+    anew: Training | None = None
+    """Settings of the pre-training of networks that `start` has no layers for; None: those of the others."""
     choose: bool = False
     """Choose on captures held out of the fine-tuning how much of it is taken, if any."""
     writers: int | None = None
@@ -70,6 +73,28 @@ class Arm:
             raise ConfigError(
                 f"arm {self.name!r}: captures is {self.captures}; give at least 1, or leave out fine-tuning"
             )
+
+    def layers(self, modality: str) -> str | None:
+        """Return the name of the installed layers that a network begins with; None: they saw other surfaces.
+
+        Args:
+            modality: What the network sees.
+        """
+        if not self.start:
+            return None
+        (name,) = layers_of(self.start, modality)
+        network = load_weights(name).network
+        alike = network.sampling.surface == self.sampling.surface
+        return name if alike or not network.modality.needs_events else None
+
+    def first_training(self, modality: str) -> Training:
+        """Return the settings of the pre-training of the network that sees a modality.
+
+        Args:
+            modality: What the network sees.
+        """
+        assert self.pretraining is not None
+        return self.pretraining if self.anew is None or self.layers(modality) else self.anew
 
     @property
     def needs_setup(self) -> bool:

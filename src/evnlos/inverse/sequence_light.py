@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 
 _COARSEST = (50, 80)
 _TAIL = 1e-4
+_EXTRA, _POWERS = 40, 4  # directions and power iterations of the range finder
 _STEP_CELLS = 0.25
 _CHUNK = 16
 _MOST_NODES = 4096
@@ -236,12 +237,17 @@ def sequence_light(
 
 
 def _factors(matrix: torch.Tensor, rank: int) -> tuple[Array, Array]:
-    """Return factors [P, r] and [r, cells] of a matrix [P, cells] by its largest singular values."""
-    values, axes = torch.linalg.eigh(matrix.mT @ matrix)
-    values, axes = values.flip(0), axes.flip(1)
-    kept = min(rank, int((values > _TAIL**2 * values[0]).sum()))
+    """Return factors [P, r] and [r, cells] of a matrix [P, cells] by its largest singular values.
+
+    By a randomised range finder with power iterations (Halko, Martinsson and Tropp, SIAM Review 53, 2011), whose
+    draws are always the same ones.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        _, values, axes = torch.svd_lowrank(matrix, q=min(rank + _EXTRA, *matrix.shape), niter=_POWERS)
     if not float(values[0]) > 0:
         raise ConfigError("the camera gets no light from the target; move the target or the camera")
+    kept = min(rank, int((values > _TAIL * values[0]).sum()))
     right = axes[:, :kept].mT.contiguous()
     return (matrix @ right.mT).numpy(), right.numpy()
 

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from evnlos.cameras import CrossingLaw
 from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE
@@ -359,7 +360,9 @@ def event_images(
     solver, prior = _solver(setup, motion, span, (events.height, events.width))
     places = motion.position_m(np.asarray(edges_us[1:], np.float64) * 1e-6)
     images = []
-    for z in solver(events).solutions(PRIORS):
+    with threadpool_limits(1):  # its products are small: a second thread mostly waits
+        solutions = solver(events).solutions(PRIORS)
+    for z in solutions:
         mask = np.clip(prior.image(z), 0.0, 1.0).astype(np.float32)
         images.append(Target("events", mask, prior.target_plane.extent_m[0]).rasterise(canvas, places))
     return np.stack(images, axis=1)

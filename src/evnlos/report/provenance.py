@@ -78,11 +78,8 @@ class Commands:
                 shlex.join(["evnlos", "calibrate", *(shown or self._dataset.objects()), "--out", _SETUP])
             ]
             held += ["--pattern", _SETUP]
-        return [*calibrated, self._imported(self._dataset.objects(), self._here, held)]
-
-    def _imported(self, captures: list[str], out: str, more: list[str]) -> str:
-        words = ["evnlos", "import", *captures, "--out", out, *more, *_sampling_flags(self._dataset.sampling)]
-        return shlex.join(words)
+        flags = _sampling_flags(self._dataset.sampling)
+        return [*calibrated, _imported(self._dataset.objects(), self._here, [*held, *flags])]
 
     def _trainings(self, result: RunResult) -> Iterator[str]:
         """Yield what makes the data of each training behind a run, and trains."""
@@ -93,7 +90,7 @@ class Commands:
                 yield _unknown_settings(name, step["data"])
                 source = ["--simulate", f"{name}.yaml"]
             else:
-                yield from self._data_of(name, step["data"])
+                yield from self._data_of(name, step["data"], result.sampling)
                 source = ["--data", name]
             words = ["evnlos", "finetune" if before else "train", *source]
             words += ["--weights", before] if before else []
@@ -112,14 +109,15 @@ class Commands:
             found.append((own if k == len(result.history) else next(behind, own), step))
         return found
 
-    def _data_of(self, name: str, data: dict[str, Any]) -> Iterator[str]:
+    def _data_of(self, name: str, data: dict[str, Any], sampling: Sampling) -> Iterator[str]:
         """Yield what makes the data of a training, as its weights tell it; nothing for the report's own."""
         if name == self._here:
             return
         if data["origin"] == "captures":
             held = _flag("validation", data.get("validation", []))
             if data.get("train"):
-                yield self._imported([*data["train"], *data.get("validation", [])], name, held)
+                captures = [*data["train"], *data.get("validation", [])]
+                yield _imported(captures, name, [*held, *_sampling_flags(sampling)])
             return
         yield _unknown_settings(name, data)
         yield shlex.join(["evnlos", "simulate", "--config", f"{name}.yaml", "--out", name])
@@ -141,6 +139,10 @@ class Commands:
         same = (data["name"], data["origin"]) == (self._here, self._dataset.origin)
         known = data.get("config_hash") in (None, self._dataset.config_hash)
         return same and known and set(data.get("train", [])) <= set(self._dataset.objects())
+
+
+def _imported(captures: list[str], out: str, more: list[str]) -> str:
+    return shlex.join(["evnlos", "import", *captures, "--out", out, *more])
 
 
 def _unknown_settings(name: str, data: dict[str, Any]) -> str:

@@ -9,15 +9,16 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from evnlos.analysis import BASELINES, Evaluation, Scores, available_lpips, evaluate
-from evnlos.data import Dataset, character_of, modality_order, open_dataset
+from evnlos.data import Dataset, Sampling, character_of, modality_order, open_dataset
 from evnlos.data.pool import run_tasks
 from evnlos.errors import DataError
 from evnlos.machine import Progress, Step, silent
@@ -40,6 +41,7 @@ class RunResult:
         log: One record per epoch.
         history: The trainings behind the weights, oldest first.
         is_published: Whether the weights are pretrained ones of this name.
+        sampling: Size and kind of the maps that it sees.
     """
 
     name: str
@@ -50,6 +52,7 @@ class RunResult:
     log: list[dict[str, Any]]
     history: list[dict[str, Any]]
     is_published: bool = False
+    sampling: Sampling = field(default_factory=Sampling)
 
     @property
     def kind(self) -> str:
@@ -59,7 +62,7 @@ class RunResult:
 
 def collect_results(
     runs: list[str | Path],
-    data: str | Path,
+    data: str | Path | Sequence[Path],
     split: str = "test",
     workers: int = 1,
     progress: Progress = silent,
@@ -68,7 +71,8 @@ def collect_results(
 
     Args:
         runs: Folders of runs, weights files, or names of published weights.
-        data: The dataset's folder.
+        data: The dataset's folder; or one for each run, where they see other maps of the same recordings: the
+            last one is returned.
         split: "train", "validation", "test" or "all".
         workers: Processes, each with a network at a time; 0 = one for each core.
         progress: Called when the work begins and after each network.
@@ -78,9 +82,13 @@ def collect_results(
     """
     if not runs:
         raise DataError("no runs given; name at least one run's folder")
-    dataset = open_dataset(data)
+    folders = [Path(data)] * len(runs) if isinstance(data, str | Path) else list(data)
+    datasets = {folder: open_dataset(folder) for folder in dict.fromkeys(folders)}
     results: dict[int, RunResult] = {}
-    tasks = [(number, Path(run), dataset, split) for number, run in enumerate(runs)]
+    tasks = [
+        (number, Path(run), datasets[folder], split)
+        for number, (run, folder) in enumerate(zip(runs, folders, strict=True))
+    ]
     progress(Step("evaluate", 0, len(runs), "networks"))
     with closing(run_tasks(_evaluated, tasks, workers)) as finished:
         for number, result in finished:
@@ -88,7 +96,7 @@ def collect_results(
             progress(Step("evaluate", len(results), len(runs), "networks", result.name))
     ordered = [results[number] for number in range(len(runs))]
     ordered.sort(key=lambda r: (METHODS.index(r.method), r.sees_sequence, modality_order(r.modality)))
-    return dataset, ordered
+    return datasets[folders[-1]], ordered
 
 
 def _evaluated(task: tuple[int, Path, Dataset, str]) -> tuple[int, RunResult]:
@@ -100,7 +108,8 @@ def _evaluated(task: tuple[int, Path, Dataset, str]) -> tuple[int, RunResult]:
     refuse_seen(weights.history, dataset, split)
     evaluation = evaluate(weights, dataset, split, available_lpips())
     kind = (weights.modality.name, weights.network.sees_sequence, method_of(weights.history))
-    return number, RunResult(name, *kind, evaluation, lines, weights.history, is_published)
+    history, sampling = weights.history, weights.network.sampling
+    return number, RunResult(name, *kind, evaluation, lines, history, is_published, sampling)
 
 
 def _log_of(run: Path) -> list[dict[str, Any]]:
