@@ -169,6 +169,21 @@ def test_layers_of_another_setup_start_a_training_behind_a_new_embedding(trained
             train(tiny_dataset, replace(plan, network=other), tmp_path / "other", out)
 
 
+def test_layers_of_frames_begin_a_network_of_frames_and_events(trained) -> None:
+    """What it sees besides begins with weights of 0: at first it is the network of frames."""
+    old = load_weights(trained[0]).network
+    new = SequenceReconstructor(as_modality("fusion"), NET, old.sampling)
+    new.take_layers(old)
+    torch.manual_seed(0)
+    pooled = torch.randn(2, new.unet.channels, 16, 16)
+    torch.testing.assert_close(new.unet(pooled), old.unet(pooled[:, : old.unet.channels]))
+    with pytest.raises(ConfigError, match="sees frame"):
+        old.take_layers(new)
+    events = SequenceReconstructor(as_modality("event"), NET, old.sampling)
+    with pytest.raises(ConfigError, match="give weights like it"):
+        events.take_layers(old)
+
+
 def test_what_a_joint_network_cannot_do_is_said(trained, tiny_dataset) -> None:
     weights = load_weights(trained[0])
     samples = NlosDataset(tiny_dataset, "train", "frame")

@@ -75,17 +75,20 @@ class Arm:
             )
 
     def layers(self, modality: str) -> str | None:
-        """Return the name of the installed layers that a network begins with; None: they saw other surfaces.
+        """Return the name of the installed layers that a network begins with; None: there are none like it.
+
+        Where the layers of its modality saw other surfaces, those of its frames do.
 
         Args:
             modality: What the network sees.
         """
         if not self.start:
             return None
-        (name,) = layers_of(self.start, modality)
+        name, frames = layers_of(self.start, modality, "frame")
         network = load_weights(name).network
-        alike = network.sampling.surface == self.sampling.surface
-        return name if alike or not network.modality.needs_events else None
+        if network.sampling.surface == self.sampling.surface or not network.modality.needs_events:
+            return name
+        return frames if network.modality.needs_frames else None
 
     def first_training(self, modality: str) -> Training:
         """Return the settings of the pre-training of the network that sees a modality.

@@ -239,8 +239,8 @@ def sequence_light(
 def _factors(matrix: torch.Tensor, rank: int) -> tuple[Array, Array]:
     """Return factors [P, r] and [r, cells] of a matrix [P, cells] by its largest singular values.
 
-    By a randomised range finder with power iterations (Halko, Martinsson and Tropp, SIAM Review 53, 2011), whose
-    draws are always the same ones.
+    By a randomised range finder with power iterations, whose draws are always the same (Halko, Martinsson and
+    Tropp, SIAM Review 53, 2011).
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)

@@ -105,7 +105,7 @@ class Reconstructor(nn.Module, ABC):
             samples: The samples of single time steps.
             augmentations: Samples of each sequence, where whole sequences are seen.
             seed: Seed of every random draw.
-            is_new: Whether nothing was learned yet, so that inner scales are taken from these samples.
+            is_new: Whether inner scales are taken from these samples, as nothing was learned yet.
         """
         return samples
 
@@ -184,24 +184,28 @@ class Reconstructor(nn.Module, ABC):
         """Take what gradients trained from another reconstructor, and leave what is fitted in closed form.
 
         Args:
-            other: One of the same kind, modality and layers; its linear embedding may have another rank.
+            other: One of the same kind and layers; its linear embedding may have another rank. Groups of this
+                modality behind those that it sees begin with weights of 0.
 
         Raises:
             ConfigError: Kind, modality or the size of a layer differ.
         """
         given, own = dict(other.named_parameters()), dict(self.named_parameters())
-        if (other.kind, other.modality.name) != (self.kind, self.modality.name):
+        seen, every = list(other.modality.layout), list(self.modality.layout)
+        if other.kind != self.kind or seen != every[: len(seen)]:
             raise ConfigError(
                 f"the weights to start from are of kind {other.kind!r} and see {other.modality.name}; this "
                 f"network is of kind {self.kind!r} and sees {self.modality.name}: give weights like it"
             )
-        unlike = [n for n in own if n not in given or given[n].shape != own[n].shape]
+        part = own
+        if seen != every:
+            part = {n: v[:, : given[n].shape[1]] if v.ndim > 1 and n in given else v for n, v in own.items()}
+        unlike = [n for n, v in part.items() if n not in given or given[n].shape != v.shape]
         if unlike or len(given) != len(own):
-            raise ConfigError(
-                f"the weights to start from have other layers ({(unlike or ['more of them'])[0]}); give the "
-                "network their width, depth, blocks, shuffle, groups and number of ridges"
-            )
-        for name, value in own.items():
+            which = (unlike or ["more of them"])[0]
+            raise ConfigError(f"the weights to start from have other layers ({which}); give some like them")
+        for name, value in part.items():
+            own[name].zero_()
             value.copy_(given[name])
 
     def reduced(self, rank: int) -> Reconstructor:
