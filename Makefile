@@ -12,7 +12,7 @@ demo: $(READY)
 	$(BIN)/evnlos demo --out $(DEMO) $(if $(strip $(CAPTURES)),--captures $(CAPTURES))
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -q
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q --coverage
 
 # With the tests that take long and repeat at another instant or format what a quicker one tests.
 thorough: $(READY)

@@ -57,7 +57,8 @@ THOROUGH = (
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Take `--thorough`."""
+    """Take `--thorough` and `--coverage`."""
+    parser.addoption("--coverage", action="store_true", help="print the share of the statements that ran")
     parser.addoption("--thorough", action="store_true", help="run also what takes long and seldom breaks")
 
 
@@ -66,6 +67,10 @@ def pytest_configure(config: pytest.Config) -> None:
     hypothesis.settings.register_profile("the same", derandomize=True)
     if not config.getoption("--thorough"):
         hypothesis.settings.load_profile("the same")
+    if config.getoption("--coverage"):
+        from line_coverage import Coverage
+
+        config.pluginmanager.register(Coverage())
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
