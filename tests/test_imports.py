@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import evnlos
+from evnlos.config import save_yaml
 
 ROOMS = (
     "analysis",
@@ -155,11 +156,13 @@ def test_words_that_do_not_fit_are_refused_before_any_library_is_loaded(words: l
     assert not {"torch", "numba", "scipy", "h5py", "PIL", "pydantic"} & set(modules)
 
 
-def test_what_was_described_without_libraries_runs_with_them() -> None:
+def test_what_was_described_without_libraries_runs_with_them(tiny, tmp_path) -> None:
+    save_yaml(tiny, tmp_path / "tiny.yaml")
     code = (
         "import sys\n"
         "from evnlos.__main__ import main\n"
-        "sys.argv = ['evnlos', 'simulate', '--setup', 'main-near', '--out', 'nowhere', '--dry-run']\n"
+        f"sys.argv = ['evnlos', 'simulate', '--config', {str(tmp_path / 'tiny.yaml')!r}]\n"
+        "sys.argv += ['--out', 'nowhere', '--dry-run']\n"
         "main()\n"
         "import torch, evnlos, evnlos.setups\n"
         "assert torch.ones(2).sum() == 2 and evnlos.setups is sys.modules['evnlos.setups']\n"
