@@ -29,6 +29,7 @@ THOROUGH = (
     "test_app_upload.py::test_a_recording_is_shown[.csv]",
     "test_app_upload.py::test_a_recording_is_shown[.h5]",
     "test_app_upload.py::test_a_recording_is_shown[.npz]",
+    "test_capture_check.py::test_rates_of_false_alarms_and_of_shifts_that_are_found",
     "test_cluster.py::test_a_killed_worker_costs_nothing_but_time",
     "test_cluster.py::test_the_command_starts_a_cluster_of_its_own",
     "test_command_line.py::test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows[ascii]",

@@ -15,6 +15,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -27,7 +28,7 @@ from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, drawn, picked, s
 from evnlos.app.page import Wanted, build_page, simulated
 from evnlos.app.serve import Server, middleware, running
 from evnlos.app.solving import Networks, from_each_frame, from_weights, from_whole_sequence, own_networks
-from evnlos.app.views import event_views, found_views, message_box, seen_views, verdict_on
+from evnlos.app.views import event_views, found_views, limits_of, message_box, seen_views, verdict_box
 from evnlos.cli import main
 from evnlos.data import Sampling
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
@@ -123,7 +124,7 @@ def test_pictures_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames(
         network = networks.of(recorded)["network, frames"]
         noted[name] = from_weights(recorded, "frames", network, wall).note
         assert "supports" in from_weights(recorded, "frames", network).note  # the pictures alone do not tell
-    assert "supports" in noted["own"] and "nothing measured" in noted["rough"]
+    assert "agree on" in noted["own"] and "nothing measured" in noted["rough"]
 
 
 def test_only_networks_of_the_package_bring_a_wall_for_recordings(app_sequence, app_weights) -> None:
@@ -136,10 +137,11 @@ def test_only_networks_of_the_package_bring_a_wall_for_recordings(app_sequence, 
 
 
 def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
-    shown = [verdict_on(replace(SMALL, **one).simulation()) for one in ({"roughness": 0.02}, {"wall": "matte"})]
-    assert "measured" in shown[0].meaning and "memory, not a measurement" not in shown[0].meaning
-    assert "memory, not a measurement" in shown[1].meaning
-    assert all(one.reason.endswith(".") and "dB" in one.figures for one in shown)
+    shown = [limits_of(replace(SMALL, **one).simulation()) for one in ({"roughness": 0.02}, {"wall": "matte"})]
+    assert "measured" in shown[0].wall and "memory, not a measurement" not in shown[0].wall
+    assert "memory, not a measurement" in shown[1].wall
+    for one in shown:
+        assert one.wall[1:] in unescape(verdict_box(one)) and "dB" in verdict_box(one)
 
 
 def test_a_sheet_holds_every_position_and_asks_nobody(app_sequence, app_weights) -> None:

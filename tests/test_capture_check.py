@@ -10,7 +10,7 @@ import pytest
 
 from evnlos.cli import main
 from evnlos.data import read_capture
-from evnlos.data.capture_check import check_capture
+from evnlos.data.capture_check import _offset, check_capture
 from evnlos.data.capture_info import CAMERAS, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
 from evnlos.data.lab import Lab, render_captures
@@ -225,6 +225,42 @@ def test_a_polarity_of_a_far_higher_threshold_is_no_clock_offset(tmp_path, leak_
         shifted = replace(capture, frame_times_us=capture.frame_times_us + shift_us)
         found = {one.what: one for one in check_capture(shifted)}["clock offset"]
         assert found.level == "bad" and f"too {way}" in found.found
+
+
+def offset_level(capture, shift_us: int = 0) -> str:
+    """Return the level of the clock offset with the frames' times moved."""
+    (found,) = _offset(replace(capture, frame_times_us=capture.frame_times_us + shift_us))
+    return found.level
+
+
+@pytest.mark.parametrize(("name", "level"), [("far_4", "doubtful"), ("far_0", "good"), ("near_1", "good")])
+def test_what_pixels_do_by_themselves_is_no_bad_clock(shared_data, name, level) -> None:
+    """The captures whose pixels are furthest from the expected ones: 0.11, 0.10, 0.06 s without an offset."""
+    capture = read_capture(shared_data / "captures" / name)
+    assert offset_level(capture) == level
+    assert offset_level(capture, 300_000) == offset_level(capture, -300_000) == "bad"
+
+
+def test_the_middle_course_says_that_it_cannot_be_told(shared_data) -> None:
+    (found,) = _offset(read_capture(shared_data / "captures" / "far_4"))
+    assert "cannot be told" in found.found and "offset_us" not in found.cure and "trigger_channel" in found.cure
+
+
+def test_rates_of_false_alarms_and_of_shifts_that_are_found(shared_data, tmp_path) -> None:
+    """No false alarm on any capture; the share of shifts that is not called good."""
+    folders = sorted((shared_data / "captures").iterdir())
+    captures = [read_capture(folder) for folder in folders]
+    for name in ("two-lobes", "one-sided", "curved", "brushed", "streaks", "torch"):
+        out = tmp_path / name
+        main(["lab", "--out", str(out), "--setup", name, "--glyphs.characters", "GK4"])
+        captures += [read_capture(folder) for folder in sorted(out.glob(f"{name}_*"))]
+    assert [one.name for one in captures if offset_level(one) == "bad"] == []
+    some = [one for one in captures if one.name[-1] in "04ABGKT"]
+    for shift_us, not_good, bad in ((100_000, 0.4, 0.1), (200_000, 0.9, 0.7)):
+        found = [offset_level(one, sign * shift_us) for one in some for sign in (-1, 1)]
+        shares = sum(level != "good" for level in found), sum(level == "bad" for level in found)
+        print(f"{shift_us / 1e6:g} s: not good {shares[0]}, bad {shares[1]} of {len(found)}")
+        assert shares[0] >= not_good * len(found) and shares[1] >= bad * len(found)
 
 
 def test_frames_in_reversed_order_are_found(steady) -> None:

@@ -167,6 +167,22 @@ def explained(
     return float(1 - left.clamp_min(0) / before)
 
 
+def share_explained(
+    images: Tensor,
+    frames: Tensor,
+    position_m: NDArray,
+    average: Tensor,
+    operator: FrameOperator,
+    canvas: Plane,
+) -> float:
+    """Return what `explained` says of what a sequence's images show in the mean, the arguments being the same.
+
+    What changes from image to image is not the object.
+    """
+    shown = on_canvas(on_target_plane(images, canvas, position_m).mean(dim=0)[0], canvas, position_m)
+    return explained(shown, frames, position_m, average, operator, canvas)
+
+
 def light_gain(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> float:
     """Return how much brighter the moving light of frames is than the setup makes it from pictures.
 
@@ -261,9 +277,7 @@ def _report_of(
 ) -> ConfidenceReport:
     share = None
     if operator is not None and bool(frames.any()):
-        # What the sequence shows, at each position: what changes from picture to picture is not the object.
-        shown = on_canvas(on_target_plane(images, canvas, position_m).mean(dim=0)[0], canvas, position_m)
-        share = explained(shown, frames, position_m, confidence.mean, operator, canvas)
+        share = share_explained(images, frames, position_m, confidence.mean, operator, canvas)
     return confidence.judge(images, halves_of(network, inputs, position_m, canvas), share)
 
 

@@ -26,6 +26,7 @@ from evnlos.types import derive_seed
 
 if TYPE_CHECKING:
     from evnlos.inverse.problem import TargetPrior
+    from evnlos.models import ConfidenceReport
 
 
 _SHAPE = 4  # bars of a quarter of the target plane tell where a letter is filled and where it is open
@@ -161,6 +162,11 @@ class Identification:
     verdict: str
     warnings: tuple[str, ...] = ()
 
+    @property
+    def wall(self) -> str:
+        """What the wall allows, in one sentence that does not hang on the grid of the analysis."""
+        return f"from one frame of this wall, {self.verdict.partition(': ')[2].removesuffix('.')}"
+
     def summary(self, arrays: bool = False) -> dict[str, Any]:
         """Return plain numbers and words; with `arrays` also singular values and Picard coefficients."""
         found: dict[str, Any] = {
@@ -256,6 +262,50 @@ def identify(
         at_noise_std,
         verdict(at_camera.patterns, at_camera.stroke_m, targets.stroke_m, settings.target_size_m),
         tuple(warnings),
+    )
+
+
+QUICK = AnalysisSettings(cells=16, writers=2)
+"""A coarse question, answered while one waits; `evnlos identify` asks the fine one."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to believe of a reconstruction: the same words in each command, on the page and in the files.
+
+    Args:
+        wall: What the wall allows, whatever the method (`Identification.wall`); empty where it is unknown.
+        recording: What this recording supports (`ConfidenceReport.verdict`), or why that can't be told.
+        guessed: What the network draws without a measurement.
+    """
+
+    wall: str
+    recording: str
+    guessed: str
+
+    @property
+    def lines(self) -> list[str]:
+        """The sentences that there are."""
+        return [one for one in (self.wall, self.recording, self.guessed) if one]
+
+
+def verdict_on(
+    setup: Setup | None, report: ConfidenceReport | None, no_confidence: str | None = None
+) -> Verdict:
+    """Return the verdict on a reconstruction.
+
+    Args:
+        setup: The setup that the recording is taken to be of, where it is known and linear.
+        report: How far to believe the images, where that can be told.
+        no_confidence: Why it can't be told.
+    """
+    wall = "" if setup is None or not setup.is_linear else identify(setup, QUICK).wall
+    if report is None:
+        return Verdict(wall, no_confidence or "", "how much of the picture is guessed cannot be told")
+    if not report.measured:
+        return Verdict(wall, report.verdict, "the whole picture is the network's guess")
+    return Verdict(
+        wall, report.verdict, "what the intervals leave open is the network's guess, from its training"
     )
 
 

@@ -16,7 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.analysis.confidence import FrameOperator, confidence_of, consistent, light_gain, why_no_confidence
+from evnlos.analysis.confidence import (
+    FrameOperator,
+    confidence_of,
+    consistent,
+    light_gain,
+    share_explained,
+    why_no_confidence,
+)
 from evnlos.analysis.evaluate import check_sampling, reconstruct
 from evnlos.data import Capture, Dataset, FixedPattern, NlosDataset, Samples, capture_samples, read_capture
 from evnlos.errors import ConfigError, DataError
@@ -98,6 +105,8 @@ class Reconstruction:
         warnings: What is doubtful, one line each.
         light: Brightness of the recording in that of the given setup; None without one.
         no_confidence: Why there is no confidence, in one line; None where there is.
+        brought_from: Brightness of the recording in that which the model knows, where the frames were brought
+            to that; None where the model took them as they are.
     """
 
     images: Tensor
@@ -106,11 +115,55 @@ class Reconstruction:
     warnings: list[str] = field(default_factory=list)
     light: float | None = None
     no_confidence: str | None = None
+    brought_from: float | None = None
 
     @property
     def is_moved(self) -> bool:
         """Whether the images were moved to where the setup agrees with the frames."""
         return self.light is not None and _SAME_LIGHT[0] < self.light < _SAME_LIGHT[1]
+
+
+_LEVELS = tuple(round(0.75 ** (k / 2), 3) for k in range(-8, 9) if abs(k) > 1)
+"""Brightnesses, 0.32 to 3.2 of the known one, that are tried where the frames are poorly explained."""
+_POOR, _FINE, _BETTER = 0.97, 0.9, 0.02
+"""The share of the frames that images of the known brightness must explain for no other to be tried, what those
+of another must explain, and how much more: before another wall than the model's, some brightness always fits
+better."""
+
+
+def _in_known_light(
+    weights: Weights, samples: Samples, images: Tensor, operator: FrameOperator
+) -> tuple[Samples, Tensor, float | None]:
+    """Return samples and images at the brightness at which the images explain the frames best, and that.
+
+    A network that knows one brightness draws thinner strokes where it is less: a thin bright object and a thick
+    dim one explain nine tenths of each other's light. The rest tells them apart.
+
+    Args:
+        weights: The network, its confidence.
+        samples: A sequence of known motion.
+        images: What the network makes of it, float32 [N, H, W].
+        operator: The setup.
+
+    Returns:
+        The same, and None, where the images explain the frames well, or no other brightness clearly better.
+    """
+    assert weights.confidence is not None and samples.position_m is not None  # see why_no_confidence
+    mean, canvas, at = weights.confidence.mean, weights.sampling.canvas, samples.position_m
+    frames = torch.from_numpy(samples.frame)
+    own = share_explained(images, frames, at, mean, operator, canvas)
+    if own > _POOR:
+        return samples, images, None
+    ambient = operator.ambient.unflatten(0, operator.size)
+    still = (frames - light_gain(images, frames, operator) * (operator(images) - ambient)).mean(dim=0)
+    best = max(_FINE, own + _BETTER), samples, images, None
+    for level in _LEVELS:
+        seen = replace(samples, frame=(ambient + (frames - still) / level).float().numpy())
+        drawn = reconstruct(weights, seen.frame, seen.surface, at)
+        share = share_explained(drawn, frames, at, mean, operator, canvas)
+        if share > best[0]:
+            best = share, seen, drawn, level
+    return best[1:]
 
 
 class Model:
@@ -124,6 +177,10 @@ class Model:
 
     def __init__(self, weights: Weights, known_setup: Path | None = None) -> None:
         self.weights, self._known_setup = weights, known_setup
+
+    def known_setup(self) -> Setup | None:
+        """Return the setup that the network was trained for; None where it is unknown."""
+        return None if self._known_setup is None else load_setup(self._known_setup)
 
     def reconstruct(
         self,
@@ -160,11 +217,16 @@ class Model:
         images = reconstruct(self.weights, samples.frame, samples.surface, samples.position_m)
         unjudged = why_no_confidence(self.weights, samples)
         judge = setup
-        if judge is None and unjudged is None and self._known_setup is not None:
-            judge = load_setup(self._known_setup)  # an operator takes a second to make
+        if judge is None and unjudged is None:  # an operator takes a second to make
+            judge = self.known_setup()
         operator = None if judge is None else FrameOperator(judge, self.weights.sampling)
-        confidence = confidence_of(self.weights, samples, images, operator)
-        found = Reconstruction(images, samples, confidence, warnings, no_confidence=unjudged)
+        seen, level = samples, None
+        if operator is not None and unjudged is None and "frame" in self.weights.modality.slices:
+            seen, images, level = _in_known_light(self.weights, samples, images, operator)
+        confidence = confidence_of(self.weights, seen, images, operator)
+        found = Reconstruction(
+            images, samples, confidence, warnings, no_confidence=unjudged, brought_from=level
+        )
         if setup is None or operator is None:
             return found
         frames = torch.from_numpy(samples.frame)

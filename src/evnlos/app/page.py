@@ -20,11 +20,11 @@ from evnlos.app.views import (
     View,
     event_views,
     found_views,
+    limits_of,
     message_box,
     seen_views,
     sheet,
     verdict_box,
-    verdict_on,
     waiting_box,
 )
 from evnlos.errors import EvnlosError
@@ -90,12 +90,12 @@ def simulated(controls: Controls, target: Target, networks: Networks) -> Iterato
     found += [from_weights(recorded, name, one, wall) for name, one in networks.of(recorded).items()]
     pictures = _sheet(recorded, before, found, after)
     yield pictures, waiting_box()
-    yield pictures, verdict_box(verdict_on(recorded.simulation))
+    yield pictures, verdict_box(limits_of(recorded.simulation))
 
 
 def opening_verdict(controls: Controls) -> str:
     """Return the verdict on the setup that the page opens with."""
-    return verdict_box(verdict_on(controls.simulation()))
+    return verdict_box(limits_of(controls.simulation()))
 
 
 class Wanted:

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from evnlos.analysis import AnalysisSettings, Identification, identify
+from evnlos.analysis import Identification, identify
+from evnlos.analysis.identify import QUICK
 from evnlos.app.controls import Recorded
 from evnlos.app.solving import Reconstruction
 from evnlos.cameras import EventPixel
@@ -37,31 +38,13 @@ from evnlos.plot.event_views import (
 from evnlos.report.pictures import data_uri, grey
 from evnlos.setups import Setup
 
-_CELLS, _WRITERS = 16, 2  # a coarse question, answered while one waits; `evnlos identify` asks the fine one
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The verdict in words.
-
-    Args:
-        meaning: What a reconstruction would be, a sentence.
-        reason: What was found, a sentence.
-        figures: The same in decibels, a sentence.
-    """
-
-    meaning: str
-    reason: str
-    figures: str
-
 
 @lru_cache(maxsize=64)
 def _identified(setup: Setup) -> Identification:
-    height, width = setup.shape
-    return identify(setup, AnalysisSettings(cells=_CELLS, height=height, width=width, writers=_WRITERS))
+    return identify(setup, QUICK)
 
 
-def verdict_on(simulation: Simulation) -> Verdict:
+def limits_of(simulation: Simulation) -> Identification:
     """Return what one frame of this setup and camera can show of a target at a known place, whatever the
     method.
 
@@ -69,13 +52,7 @@ def verdict_on(simulation: Simulation) -> Verdict:
         ConfigError: The setup is geometrically impossible, or the camera gets no light.
     """
     # The event pixel is no part of the question: one answer for all of its settings.
-    found = _identified(replace(simulation.setup, pixel=EventPixel()))
-    reason, _, meaning = found.verdict.partition(": ")
-    figures = (
-        f"On handwriting, the best linear picture from one frame reaches {found.at_camera.psnr_db:.1f} dB; "
-        f"a mean character {found.mean_db:.1f} dB, an all-black picture {found.zero_db:.1f} dB."
-    )
-    return Verdict(f"From one frame, {meaning}", f"{reason}.", figures)
+    return _identified(replace(simulation.setup, pixel=EventPixel()))
 
 
 _LONGEST_SIDE = 320  # of a picture of the wall or of events: a page shows no more
@@ -233,13 +210,17 @@ def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "sequ
     )
 
 
-def verdict_box(verdict: Verdict) -> str:
-    """Return the verdict as HTML."""
-    texts = (html.escape(text) for text in (verdict.meaning, verdict.reason, verdict.figures))
-    meaning, reason, figures = texts
+def verdict_box(found: Identification) -> str:
+    """Return what a setup can show as HTML."""
+    figures = (
+        f"On handwriting, the best linear picture from one frame reaches {found.at_camera.psnr_db:.1f} dB; "
+        f"a mean character {found.mean_db:.1f} dB, an all-black picture {found.zero_db:.1f} dB."
+    )
+    wall = html.escape(f"{found.wall[:1].upper()}{found.wall[1:]}.")
+    reason = html.escape(found.verdict.partition(": ")[0])
     return (
         '<div class="ev-verdict" role="status"><strong>Can this setup show anything? </strong>'
-        f"<span>{meaning}</span><p>{reason} {figures}</p></div>"
+        f"<span>{wall}</span><p>{reason}. {figures}</p></div>"
     )
 
 

@@ -274,14 +274,16 @@ def _offset(capture: Capture) -> Iterator[Finding]:
             "record a blink of the light, or a trigger_channel",
         )
         return
-    way = "late" if lag.lag_us < 0 else "early"
+    way, told = "late" if lag.lag_us < 0 else "early", abs(lag.lag_us) > lag.unsure_us
     yield _finding(
         "clock offset",
         abs(lag.lag_us) <= lag.limit_us,
-        False,
+        not told,
         f"the frames' times are {abs(lag.lag_us) * 1e-6:.2f} s too {way} for the events (up to "
-        f"{lag.limit_us * 1e-6:.2f} s can't be told from none)",
-        _offset_cure(capture, lag.lag_us),
+        f"{lag.unsure_us * 1e-6:.2f} s cannot be told from what pixels do by themselves)",
+        _offset_cure(capture, lag.lag_us)
+        if told
+        else "to be sure, record a blink of the light, or a trigger_channel",
     )
 
 

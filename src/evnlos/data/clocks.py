@@ -221,7 +221,7 @@ _PHASES = 8  # pixels of a cell, their references spread evenly over the dead zo
 _STEPS = 8  # of the light between two frames
 _MOST_FRAMES, _MOST_BINS, _FINEST_BIN_US = 400, 4_000, 5_000
 _LAGS = 201
-_LOBE, _SHARE_OF_LOBE = 0.9, 0.1
+_LOBE, _SHARE_OF_LOBE, _SENSORS_SHARE = 0.9, 0.1, 0.05
 _NEARLY = 0.7  # of the best threshold's agreement: low thresholds agree best whatever the sensor's is
 _FEWEST_FRAMES = 6
 _DARK_SHARE = 1e-3  # of the peak
@@ -233,15 +233,18 @@ class ClockLag:
 
     Args:
         lag_us: What to add to the frames' times, microseconds.
-        limit_us: What can be told, microseconds: the largest of half a time between frames (a whole one where
-            one polarity alone tells it, from one flank of the light), a tenth of the lobe's width, and half of
-            what the lag differs by between likely thresholds.
+        limit_us: What is usual where the clocks agree, microseconds: the largest of half a time between frames
+            (a whole one where one polarity alone tells it, from one flank of the light), a tenth of the lobe's
+            width, and half of what the lag differs by between likely thresholds.
+        unsure_us: What slow pixels (late) or noisy ones (early) make at most by themselves, so that it can't be
+            told from clocks that differ, microseconds: a twentieth of the lobe's width more.
         agreement: Correlation at that lag, -1..1.
         backwards: Greatest correlation of the frames in reversed order, -1..1.
     """
 
     lag_us: int
     limit_us: int
+    unsure_us: int
     agreement: float
     backwards: float
 
@@ -306,7 +309,8 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
     between = float(np.median(np.diff(times_us)))
     is_even = pairs[0][0] == pairs[0][1]
     limit = max((0.5 if is_even else 1.0) * between, _SHARE_OF_LOBE * float(width), left_open)
-    return ClockLag(round(float(lag)), round(limit), float(top), float(backwards.max()))
+    unsure = limit + _SENSORS_SHARE * float(width)
+    return ClockLag(round(float(lag)), round(limit), round(unsure), float(top), float(backwards.max()))
 
 
 def _ratios(events: Events) -> list[tuple[float, float]]:

@@ -112,19 +112,24 @@ class ConfidenceReport:
     @property
     def verdict(self) -> str:
         """One sentence for a reader."""
+        explained = 100 * max(self.explained or 0, 0)
         if self.agreement > self.threshold and not self.measured:
             return (
-                f"nothing measured: the pictures explain {100 * max(self.explained or 0, 0):.0f} % of what the "
-                "frames show of this object; the wall is not the setup's, or not one that the weights know"
+                f"nothing measured: the pictures explain {explained:.0f} % of what the frames show of this "
+                f"object ({100 * CONFIRMED:.0f} % are required); check distance and wall: these may not be "
+                "what the weights or the setup are of"
             )
         if not self.measured:
             return (
-                "nothing measured: both halves of the sequence share "
-                f"{100 * max(self.agreement, 0):.0f} % of what tells objects apart; sequences without any "
-                "object "
-                f"share up to {100 * self.threshold:.0f} %"
+                "nothing measured: the two halves of the sequence disagree, they share "
+                f"{100 * max(self.agreement, 0):.0f} % of what distinguishes objects, where sequences without "
+                f"any object share up to {100 * self.threshold:.0f} %"
             )
-        return f"the measurement supports {100 * self.support:.0f} % of what tells this object from others"
+        frames = f", and the pictures explain {explained:.0f} % of its frames"
+        if self.explained is None:
+            frames = "; whether the pictures explain its frames is not known, which takes the calibrated setup"
+        agreed = f"{100 * min(max(self.agreement, 0), 1):.0f} %"
+        return f"both halves of the sequence agree on {agreed} of what distinguishes this object{frames}"
 
 
 @dataclass(frozen=True, eq=False)

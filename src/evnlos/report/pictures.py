@@ -14,6 +14,7 @@ import json
 import math
 import textwrap
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.analysis import load_model, score
 from evnlos.analysis.confidence import confidence_values
+from evnlos.analysis.identify import Verdict, verdict_on
 from evnlos.analysis.model import setup_for_track
 from evnlos.data import FixedPattern, read_capture
 from evnlos.data.sampling import Samples, Sampling
@@ -212,7 +214,8 @@ def reconstruct_capture(
         made from the whole recording and is drawn where the motion was stated or found; where the truth is
         known, the mean scores; where it can be told, the confidence: support, threshold, measured, verdict and,
         where a setup is known, explained;
-        else no_confidence, which says why. With a setup also `light`, the capture's brightness in that of the
+        else no_confidence, which says why. Where the frames were brought to the light that the weights know,
+        brought_from, the capture's in that. With a setup also `light`, the capture's brightness in that of the
         setup, and whether the pictures were moved; with `track` the warnings of the track.
 
     Raises:
@@ -256,6 +259,8 @@ def reconstruct_capture(
         }
         if made.light is not None:
             found |= {"light": round(made.light, 4), "moved_by_the_setup": made.is_moved}
+        if made.brought_from is not None:
+            found["brought_from"] = made.brought_from
         if confidence is not None:
             save_png(draft / "unsure.png", strip([grey(one) for one in confidence.high - confidence.low]), 2)
             write_atomically(
@@ -269,7 +274,8 @@ def reconstruct_capture(
         if samples.truth is not None:
             truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
             found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
-        found["in_words"] = _in_words(found, track)
+        verdict = verdict_on(setup or model.known_setup(), confidence, made.no_confidence)
+        found |= {"verdict": asdict(verdict), "in_words": _in_words(found, verdict, track)}
         title = f"{recording.name}, reconstructed by {found['weights']}"
         sheet = result_sheet(title, images.numpy(), samples, sampling, confidence, found["in_words"])
         save_png(draft / "result.png", sheet)
@@ -277,7 +283,7 @@ def reconstruct_capture(
     return found
 
 
-def _in_words(found: dict[str, Any], tracked: bool) -> list[str]:
+def _in_words(found: dict[str, Any], verdict: Verdict, tracked: bool) -> list[str]:
     """Return in sentences what the pictures of `reconstruct_capture` are and what of them to believe."""
     lines = []
     if found["one_picture"]:
@@ -290,16 +296,9 @@ def _in_words(found: dict[str, Any], tracked: bool) -> list[str]:
             f"the light is {found['light']:.2f} x that of the setup: its gain is not this capture's, the "
             "pictures stay as the network draws them; calibrate at this exposure, on known targets"
         )
-    confidence = found.get("confidence")
-    if confidence is None:
-        return [*lines, found["no_confidence"]]
-    words = confidence["verdict"]
-    if "explained" not in confidence:
-        words += "; not checked against the frames: give the calibrated --setup"
-    elif confidence["measured"]:
-        share = 100 * confidence["explained"]
-        words += f"; of what the average object leaves unexplained in the frames they explain {share:.0f} %"
-    return [*lines, words]
+    if "brought_from" in found:
+        lines.append(f"frames of {found['brought_from']:.2g} x the light that the weights know, brought to it")
+    return [*lines, *verdict.lines]
 
 
 _PANEL, _MARGIN, _TEXT_PX, _LINE_PX = 300, 16, 14, 19  # pixels
