@@ -6,12 +6,16 @@ READY := $(VENV)/.ready
 CAPTURES ?=
 DEMO ?= demo
 
-.PHONY: demo test thorough check site declared bench dist clean
+.PHONY: demo test coverage thorough check site declared bench dist clean
 
 demo: $(READY)
 	$(BIN)/evnlos demo --out $(DEMO) $(if $(strip $(CAPTURES)),--captures $(CAPTURES))
 
 test: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q
+
+# The same, with how many of the package's statements the tests run; kernels and started programs are not counted.
+coverage: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q --coverage
 
 # With the tests that take long and repeat at another instant or format what a quicker one tests.

@@ -63,6 +63,34 @@ def test_events_of_a_video_file(tmp_path: Path, capsys) -> None:
         assert picture.width > 500
 
 
+def test_events_of_a_part_of_a_video_and_their_instants(tmp_path: Path, capsys) -> None:
+    clip = write_animation(tmp_path / "clip.gif", moving_bar(), [30] * 12)
+    quiet = ["--pixel", "v2e_clean"]
+    call("events", clip, "--out", tmp_path / "part.npz", "--start", 0.09, "--stop", 0.21, *quiet, "--json")
+    found = json.loads(capsys.readouterr().out)
+    frames = np.stack(moving_bar())[3:8, ..., 0]
+    expected = simulate_events(frames, np.arange(3, 8) * 0.03, pixel_preset("v2e_clean"))
+    assert read_events(tmp_path / "part.npz") == expected and len(expected)
+    assert found["frames"] == 5 and found["duration_s"] == pytest.approx(0.12)
+    assert found["instants"] == len(np.unique(expected.t_us))
+    call("events", clip, "--out", tmp_path / "v2e.npz", "--mode", "v2e", *quiet)
+    assert " different times per 100 events" in capsys.readouterr().out
+    assert "later stop" in fails(capsys, "events", clip, "--out", tmp_path / "x.npz", "--start", 2, "--stop", 1)
+
+
+def test_events_of_a_folder_of_videos(tmp_path: Path, capsys) -> None:
+    (tmp_path / "clips").mkdir()
+    for name in "ab":
+        write_animation(tmp_path / "clips" / f"{name}.gif", moving_bar(), [30] * 12)
+    call("events", tmp_path / "clips", "--out", tmp_path / "events")
+    assert left_in(tmp_path / "events") == {"a.gif.h5", "b.gif.h5"}
+    before = (tmp_path / "events" / "b.gif.h5").read_bytes()
+    (tmp_path / "events" / "a.gif.h5").unlink()
+    call("events", tmp_path / "clips", "--out", tmp_path / "events", "--seed", 9)  # goes on where it was
+    assert len(read_events(tmp_path / "events" / "a.gif.h5")) > 0
+    assert (tmp_path / "events" / "b.gif.h5").read_bytes() == before
+
+
 @pytest.mark.parametrize("ending", [".h5", ".raw", ".npz", ".csv"])
 def test_events_of_an_animation_in_both_modes(tmp_path: Path, capsys, ending: str) -> None:
     clip = write_animation(tmp_path / "clip.gif", moving_bar(), [30] * 12)

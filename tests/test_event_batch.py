@@ -8,6 +8,7 @@ import torch
 
 from evnlos.errors import DataError
 from evnlos.events import (
+    EventWindows,
     event_batch,
     event_frame,
     event_histogram,
@@ -132,3 +133,24 @@ def test_intensity_of_a_recording_is_the_last_word_of_each_pixel(shared_data):
     assert (picture > 0).sum() <= len(last)
     with pytest.raises(DataError, match="adc"):
         intensity_map(Events.empty(3, 3))
+
+
+def test_windows_are_slices_by_time_and_a_loader_takes_them() -> None:
+    events = stream(3)
+    windows = EventWindows(events, 2000, "voxel", bins=4, start_us=0)
+    assert len(windows) == int(events.t_us[-1]) // 2000
+    for k in range(len(windows)):
+        part = events.between(2000 * k, 2000 * (k + 1))
+        np.testing.assert_array_equal(windows[k], voxel_grid(part, bins=4))
+    batches = list(torch.utils.data.DataLoader(windows, batch_size=2, num_workers=1))
+    np.testing.assert_array_equal(
+        torch.cat(batches).numpy(), np.stack([windows[k] for k in range(len(windows))])
+    )
+    overlapping = EventWindows(events, 2000, stride_us=500, transform=len)
+    first = int(events.t_us[0]) - 1
+    assert overlapping[1] == len(events.between(first + 500, first + 2500)) and overlapping[-1] > 0
+    for wrong in (lambda: EventWindows(events[:0], 5), lambda: EventWindows(events, 0)):
+        with pytest.raises(DataError, match="positive lengths"):
+            wrong()
+    with pytest.raises(IndexError):
+        windows[len(windows)]

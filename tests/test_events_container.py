@@ -116,3 +116,18 @@ def test_plane_coordinates_are_centred():
         Plane(0, 3, 0.5)
     with pytest.raises(DataError):
         Plane(1, 1, float("nan"))
+
+
+def test_parts_are_joined_and_tonic_takes_and_gives_them() -> None:
+    events = Events([1, 5, 5, 9], [0, 3, 1, 2], [1, 0, 1, 0], [1, 0, 0, 1], 4, 2, adc=[1, 2, 3, 4])
+    assert Events.concatenate([events[:1], events[1:3], events[3:]]) == events
+    plain = Events(events.t_us, events.x, events.y, events.p, 4, 2)
+    wrong = {"at least one": [], "one kind": [events, plain], "backwards": [events[2:], events[:2]]}
+    for text, parts in wrong.items():
+        with pytest.raises(DataError, match=text):
+            Events.concatenate(parts)
+    array = plain.to_tonic()
+    assert array.dtype.names == ("x", "y", "t", "p") and array["t"].tolist() == [1, 5, 5, 9]
+    assert Events.from_tonic(array, (4, 2, 2)) == plain
+    with pytest.raises(DataError, match="no field p"):
+        Events.from_tonic(array[["x", "y", "t"]], (4, 2, 2))

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -181,6 +182,53 @@ class Events:
         """Return the events with start_us < t_us <= stop_us, the half-open interval of the position grids."""
         first, last = np.searchsorted(self.t_us, [start_us, stop_us], side="right")
         return self[int(first) : int(last)]
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Events]) -> Events:
+        """Return streams of one sensor that follow each other in time as one.
+
+        Raises:
+            DataError: No part, parts of several sensors or with different columns, or times that run backwards.
+
+        Example:
+            >>> events = Events([10, 20], [0, 3], [1, 1], [True, False], width=4, height=2)
+            >>> Events.concatenate([events[:1], events[1:]]) == events
+            True
+        """
+        if not parts:
+            raise DataError("no events to concatenate; give at least one part")
+        kinds = {(part.width, part.height, tuple(part.columns())) for part in parts}
+        if len(kinds) > 1:
+            raise DataError(f"parts differ in sensor or columns: {sorted(kinds)}; concatenate one kind")
+        names = parts[0].columns()
+        columns = {name: np.concatenate([part.columns()[name] for part in parts]) for name in names}
+        return cls(width=parts[0].width, height=parts[0].height, **columns)
+
+    def to_tonic(self) -> NDArray:
+        """Return the events as tonic's transforms take them: a structured array with the fields x, y, t, p."""
+        found = np.empty(len(self), [("x", "<i2"), ("y", "<i2"), ("t", "<i8"), ("p", "?")])
+        found["x"], found["y"], found["t"], found["p"] = self.x, self.y, self.t_us, self.p
+        return found
+
+    @classmethod
+    def from_tonic(cls, array: NDArray, sensor_size: tuple[int, ...]) -> Events:
+        """Return the events of tonic's structured array.
+
+        Args:
+            array: Fields x, y, t (microseconds, ascending) and p.
+            sensor_size: tonic's (width, height, polarities), or (width, height).
+
+        Raises:
+            DataError: A field is missing, or the values are no stream of this sensor.
+
+        Example:
+            >>> events = Events([10, 20], [0, 3], [1, 1], [True, False], width=4, height=2)
+            >>> Events.from_tonic(events.to_tonic(), (4, 2, 2)) == events
+            True
+        """
+        if missing := {"x", "y", "t", "p"} - set(array.dtype.names or ()):
+            raise DataError(f"the array has no field {', '.join(sorted(missing))}; give x, y, t and p")
+        return cls(array["t"], array["x"], array["y"], array["p"], sensor_size[0], sensor_size[1])
 
     @classmethod
     def _trusted(cls, columns: dict[str, NDArray], width: int, height: int) -> Events:

@@ -7,11 +7,13 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 from numpy.typing import NDArray
 
@@ -97,14 +99,19 @@ class PixelChanges:
         return replace(pixel, **changes)  # type: ignore[type-var]
 
 
+_VIDEO_ENDINGS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".gif")
+
+
 @dataclass(frozen=True)
 class EventsCommand:
     """Turn any video into the events that an event camera would send: files, animations, pictures, arrays."""
 
     video: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
-    """Video file (mp4, avi, mkv, ...), GIF, APNG, WebP, pictures or a folder of them, .npy [T, H, W(, 3)]."""
+    """Video file (mp4, avi, mkv, ...), GIF, APNG, WebP, pictures or a folder of them, .npy [T, H, W(, 3)]; or a
+    folder of videos."""
     out: Path
-    """The event file; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv."""
+    """The event file; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv. Of a folder of
+    videos a folder, with an .h5 file for each; those that are there already are kept."""
     pixel: str = "davis346"
     """paper, v2e_clean, v2e_noisy, davis346, prophesee_gen3, prophesee_gen4, celex_v, voltmeter_dvs346,
     voltmeter_dvs240, or a YAML file with the settings of any event model (`kind`)."""
@@ -116,6 +123,10 @@ class EventsCommand:
     """Seed of mismatch and noise: same seed, same bytes."""
     fps: float | None = None
     """Frames per second; needed for pictures and arrays, otherwise in place of the times in the file."""
+    start: float = 0.0
+    """First frame to take, seconds in the video; the events keep the video's times."""
+    stop: float | None = None
+    """Last frame to take, seconds in the video; by default the last one."""
     slow_motion: float = 1.0
     """How many times slower than life the video plays, e.g. 8 for 240 Hz shown at 30 Hz."""
     tone: Tone = "as-is"
@@ -135,6 +146,17 @@ class EventsCommand:
 
     def run(self) -> None:
         """Simulate, with a progress bar over the frames, and print what came out."""
+        if videos := _videos_in(self.video):
+            if self.preview is not None:
+                raise ConfigError("--preview shows one video; leave it out for a folder of videos")
+            for video in videos:
+                out = self.out / f"{video.name}.h5"
+                if out.exists() and not self.force:
+                    say(f"{out}: there already")
+                    continue
+                self.out.mkdir(parents=True, exist_ok=True)
+                replace(self, video=(video,), out=out).run()
+            return
         refuse_existing(self.out, self.force)
         if self.preview is not None:
             refuse_existing(self.preview, self.force)
@@ -151,14 +173,18 @@ class EventsCommand:
         )
         if not self.force:
             check_video(video, pixel)
-        on = 0
-        clock = _Clock()
+        on = instants = 0
+        last_us = -1
+        clock = _Clock(self.start, self.stop)
         with writer:
             writer.write(Events.empty(video.width, video.height))
             for piece in video_events(clock.watched(video, self.out.name), pixel, self.mode, self.seed):
                 writer.write(piece)
                 on += int(piece.p.sum())
-        found = _found(self, video, pixel, clock, writer.events, on)
+                if len(piece):
+                    instants += int((np.diff(piece.t_us, prepend=last_us) != 0).sum())
+                    last_us = int(piece.t_us[-1])
+        found = _found(self, video, pixel, clock, writer.events, on) | {"instants": instants}
         if self.preview and look:
             if writer.events:
                 write_preview(Recording(self.out), CropOptions(), self.preview, look)
@@ -168,34 +194,50 @@ class EventsCommand:
 
 
 class _Clock:
-    """Counts frames and keeps the time of the last one while they pass by under a progress bar."""
+    """Takes the frames of a time, counts them and keeps first and last time, under a progress bar."""
 
-    frames, last_s = 0, 0.0
+    def __init__(self, start_s: float, stop_s: float | None) -> None:
+        if not 0 <= start_s < (math.inf if stop_s is None else stop_s):
+            raise ConfigError(f"--start {start_s} --stop {stop_s}: give 0 or more, and a later stop")
+        self.start_s, self.stop_s = start_s, math.inf if stop_s is None else stop_s
+        self.frames, self.first_s, self.last_s = 0, 0.0, 0.0
 
     def watched(self, video: Video, name: str) -> Iterator[tuple[float, NDArray]]:
         with ProgressBars() as progress:
             for time_s, light in frames_counted(video, progress, name, video.frames or 0):
-                self.frames, self.last_s = self.frames + 1, time_s
-                yield time_s, light
+                if time_s > self.stop_s:
+                    return
+                if time_s >= self.start_s:
+                    self.first_s = self.first_s if self.frames else time_s
+                    self.frames, self.last_s = self.frames + 1, time_s
+                    yield time_s, light
+
+
+def _videos_in(paths: tuple[Path, ...]) -> list[Path]:
+    """Return the videos of a folder of videos; nothing where it is none."""
+    if len(paths) != 1 or not paths[0].is_dir():
+        return []
+    return sorted(one for one in paths[0].iterdir() if one.suffix.lower() in _VIDEO_ENDINGS)
 
 
 def _found(
     command: EventsCommand, video: Video, pixel: PixelSettings, clock: _Clock, events: int, on: int
 ) -> dict[str, Any]:
     pixels = video.width * video.height
+    seconds = clock.last_s - clock.first_s
     return {
         "out": str(command.out),
         "width": video.width,
         "height": video.height,
         "frames": clock.frames,
-        "duration_s": clock.last_s,
+        "duration_s": seconds,
         "times_from": "fps" if video.fps else "file",
         "events": events,
         "on": on,
         "off": events - on,
         "on_off_ratio": on / (events - on) if events > on else None,
-        "rate_hz": events / clock.last_s,
-        "rate_per_pixel_hz": events / clock.last_s / pixels,
+        "rate_hz": events / seconds,
+        "rate_per_pixel_hz": events / seconds / pixels,
         "pixel": to_dict(pixel),
         "pixel_name": command.pixel,
         "mode": command.mode,
@@ -211,6 +253,7 @@ def _text(found: dict[str, Any]) -> str:
     times = "from --fps" if found["times_from"] == "fps" else "from the file"
     return (
         f"{found['out']}: {found['events']:,} events ({rate}), ON/OFF {ratio}, {amount(found['bytes'], 'B')}\n"
+        f"  {100 * found['instants'] / max(found['events'], 1):.0f} different times per 100 events\n"
         f"  {found['frames']} frames of {found['width']} x {found['height']} in {found['duration_s']:.6g} s, "
         f"times {times}, tone {found['tone']}\n"
         f"  pixel {found['pixel_name']}, mode {found['mode']}, seed {found['seed']}; "

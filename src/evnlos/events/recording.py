@@ -6,15 +6,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import astuple, dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, DataError
 from evnlos.events.files.celex import CelexOptions
 from evnlos.events.files.columns import OnError, ReadReport, trusted_events
 from evnlos.events.files.read import in_order, open_source
@@ -331,3 +332,63 @@ def summarise(pieces: Iterable[Events]) -> Summary:
         busiest=(top % width, top // width, most) if total else None,
         columns=columns,
     )
+
+
+class EventWindows:
+    """Windows of a stream as a data set: `torch.utils.data.DataLoader` takes it, with workers too.
+
+    Window k holds the events with start + k stride < t_us <= start + k stride + window, as `Events.between`;
+    what is left at the end and fills no window is left out.
+
+    Args:
+        events: The stream.
+        window_us: Length of a window, microseconds.
+        representation: What an item is: a map of `event_batch`, or None for the `Events` themselves.
+        stride_us: From one window's begin to the next one's, microseconds; by default the windows join.
+        start_us: Begin of the first window; by default just before the first event.
+        transform: Called with each item.
+        **options: Options of the representation.
+
+    Raises:
+        DataError: No event, or a length that is not positive.
+
+    Example:
+        >>> events = Events([1, 5, 9, 14], [0, 1, 0, 1], [0, 0, 0, 0], [1, 0, 1, 1], width=2, height=1)
+        >>> windows = EventWindows(events, 5, "histogram")
+        >>> len(windows), windows[0].shape, [len(one) for one in EventWindows(events, 5)]
+        (2, (2, 1, 2), [2, 1])
+    """
+
+    def __init__(
+        self,
+        events: Events,
+        window_us: int,
+        representation: str | None = None,
+        *,
+        stride_us: int | None = None,
+        start_us: int | None = None,
+        transform: Callable[[Any], Any] | None = None,
+        **options: Any,
+    ) -> None:
+        self.events, self.window_us, self.stride_us = events, window_us, stride_us or window_us
+        if not len(events) or window_us <= 0 or self.stride_us <= 0:
+            raise DataError(
+                f"{len(events)} events in windows of {window_us} us; give events and positive lengths"
+            )
+        self.start_us = int(events.t_us[0]) - 1 if start_us is None else start_us
+        self.representation, self.transform, self.options = representation, transform, options
+
+    def __len__(self) -> int:
+        span = int(self.events.t_us[-1]) - self.start_us - self.window_us
+        return max(0, span // self.stride_us + 1)
+
+    def __getitem__(self, index: int) -> Any:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"window {index} of {len(self)}")
+        begin = self.start_us + index % len(self) * self.stride_us
+        item: Any = self.events.between(begin, begin + self.window_us)
+        if self.representation is not None:
+            from evnlos.events.batch import event_batch  # whose kernels a recording does not need
+
+            item = event_batch([item], self.representation, **self.options)[0].numpy()  # type: ignore[arg-type]
+        return item if self.transform is None else self.transform(item)
