@@ -116,12 +116,11 @@ def _samples(
     times_s = scene.position_times_s(config.positions)
     edges_us = edges_from(times_s)
     frames = capture_tensors(drawn.frame_camera, wall, times_s, derive_seed(config.seed, name, "frames"))
-    if sampling.surface == "trace":  # two walks through each pixel's events: the CPU's work
+    kind = sampling.surface
+    if kind == "trace" or kind == "likelihood":  # the CPU's work, and what is refused
         surface = torch.from_numpy(surface_of(events.to_events(), edges_us, sampling)).to(device)
     else:
-        surface = time_surface_tensors(
-            events, edges_us, sampling.tau_s * 1e6, sampling.surface, radius=sampling.radius
-        )
+        surface = time_surface_tensors(events, edges_us, sampling.tau_s * 1e6, kind, radius=sampling.radius)
     shape = sampling.height, sampling.width
     return DeviceSamples(
         _reduced(frames / drawn.frame_camera.white, shape),

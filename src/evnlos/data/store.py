@@ -339,8 +339,7 @@ def open_dataset(folder: str | Path) -> Dataset:
     folder = Path(folder)
     path = folder / PAGE
     if not path.is_file():
-        found = f"{folder} is no dataset: {path.name} is missing"
-        raise DataError(f"{found}; make one with `evnlos simulate` or `import`")
+        raise DataError(f"{folder} is no dataset: {path.name} is missing; run `evnlos simulate` or `import`")
     values = read_yaml(path, LONG_YAML)
     unknown = values.keys() - _KEYS
     if unknown:
