@@ -268,6 +268,18 @@ def test_the_surface_shows_the_target(tmp_path: Path) -> None:
     assert fused.embedding.images == 4 and fused.embedding(torch.rand(1, 3, 64, 96)).shape == (1, 4, 64, 96)
 
 
+def test_the_clock_of_a_recording_does_not_matter(tmp_path: Path) -> None:
+    save_yaml(to_dict(Simulation(setup=SETUP)), tmp_path / "setup.yaml")
+    events, edges = simulated(0), np.arange(0, 8_000_001, 1_000_000)
+    late_us = 3_217_004
+    later = replace(events, t_us=events.t_us + late_us)
+    moved = replace(BENCH.motion, start_s=late_us * 1e-6)
+    setup, canvas = str(tmp_path / "setup.yaml"), Sampling().canvas
+    first = event_images(events, edges, BENCH.motion, setup, canvas)
+    assert first.shape == (8, 2, 64, 96) and first.any()
+    np.testing.assert_array_equal(event_images(later, edges + late_us, moved, setup, canvas), first)
+
+
 def test_the_surface_is_refused_without_setup_or_motion() -> None:
     events, edges = simulated(0), np.array([0, 4_000_000, 8_000_000])
     canvas = Sampling().canvas

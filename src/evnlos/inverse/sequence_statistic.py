@@ -17,7 +17,7 @@ strong prior m are the images, put where the target was at each instant.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -33,7 +33,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.event_likelihood import LikelihoodSettings, upward
 from evnlos.inverse.event_record import EventRecord, record_of
 from evnlos.inverse.sequence_light import Array, PatternPrior, SequenceLight, handwritten_prior, sequence_light
-from evnlos.scene import Motion, Target, TargetPlane
+from evnlos.scene import LineMotion, Motion, Target, TargetPlane
 from evnlos.setups import load_setup
 from evnlos.types import Events, Plane
 
@@ -49,6 +49,7 @@ _LONGEST_STEP = 1.5  # of a coefficient, standard deviations of the prior
 _FEWEST_NOISE, _SMALLEST_NOISE = 0.01, 3e-3  # as in `event_likelihood`
 _STEADY_S = 0.4
 _ACTIVE = 0.01  # weight of a silence, in that of a threshold just met, below which it is left out
+_SPAN_US = 100_000  # first and last instant are multiples of it, so that clocks that jitter share a light path
 _SAFE = 1e-3  # white levels under which no light is taken to lie
 
 
@@ -356,9 +357,14 @@ def event_images(
             "the motion is unknown, and the surface 'likelihood' needs it; state it in capture.yaml (`evnlos "
             "track` finds it)"
         )
-    span = (float(edges_us[0]) * 1e-6, float(edges_us[-1]) * 1e-6)
+    edges_us = np.asarray(edges_us, np.int64)
+    if isinstance(motion, LineMotion):  # on the motion's own clock the recordings of a setup share a light path
+        began_us = round(1e6 * motion.start_s)
+        motion, edges_us = replace(motion, start_s=0.0), edges_us - began_us
+        events = replace(events, t_us=events.t_us - began_us)
+    span = (int(edges_us[0]) // _SPAN_US * _SPAN_US * 1e-6, -(-int(edges_us[-1]) // _SPAN_US) * _SPAN_US * 1e-6)
     solver, prior = _solver(setup, motion, span, (events.height, events.width))
-    places = motion.position_m(np.asarray(edges_us[1:], np.float64) * 1e-6)
+    places = motion.position_m(edges_us[1:] * 1e-6)
     images = []
     with threadpool_limits(1):  # its products are small: a second thread mostly waits
         solutions = solver(events).solutions(PRIORS)
