@@ -17,14 +17,24 @@ from contextlib import contextmanager
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
 import pytest
 
 import chromium
 from evnlos import Events, machine, untrusted
-from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, drawn, picked, simulate_sequence
+from evnlos.app.controls import (
+    CHARACTERS,
+    INK_SIDE,
+    PRESETS,
+    Controls,
+    drawn,
+    link_of,
+    picked,
+    settings_of,
+    simulate_sequence,
+)
 from evnlos.app.page import Wanted, build_page, simulated
 from evnlos.app.serve import Server, middleware, running
 from evnlos.app.solving import Networks, from_each_frame, from_weights, from_whole_sequence, own_networks
@@ -535,6 +545,63 @@ def test_the_page_in_a_real_browser(tmp_path) -> None:
         complaints = [one for one in browser.complaints() if "SEVERE" in one]
     assert len(asked) > 20 and strangers(asked, home) == []
     assert complaints == []
+
+
+def test_the_page_on_a_phone_and_opened_by_a_link(tmp_path) -> None:
+    with browsed(tmp_path) as (home, browser):
+        browser.devtools(
+            "Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True
+        )
+        browser.open(f"{home.rstrip('/')}/?character=G&roughness=0.02&distance_m=0.4")
+        link = "document.querySelector('a.ev-button').href"
+        browser.wait(
+            f"return !document.querySelector('.ev-before') && {link}.endsWith"
+            "('?character=G&roughness=0.02&distance_m=0.4') && 1"
+        )
+        numbers = "[...document.querySelectorAll('.ev-controls input[type=number]')].map(box => box.value)"
+        assert browser.run(f"return {numbers}")[:2] == ["0.02", "40"]
+        # Pictures come first, none is wider than the screen, and they stay while one scrolls to a slider.
+        top = "document.querySelector('.ev-picture').getBoundingClientRect().top"
+        assert browser.run(f"return {top}") < 500
+        assert browser.run("return document.documentElement.scrollWidth") <= 390
+        slider = "document.querySelector('input[type=range][aria-label*=\"Ambient light\"]')"
+        browser.run(f"{slider}.scrollIntoView({{block: 'end'}})")
+        browser.wait(f"return {slider}.getBoundingClientRect().bottom < 845 && window.scrollY > 100")
+        assert 0 <= browser.run(f"return {top}") < 400
+        x, y = browser.run(
+            f"const b = {slider}.getBoundingClientRect(); return [b.left + 20, b.top + b.height / 2]"
+        )
+        assert browser.run(f"return document.elementFromPoint({x}, {y}) === {slider}")
+        # What is downloaded is a picture.
+        assert browser.run("return evnlosSave(document.querySelector('button[onclick*=Save]'))") > 10_000
+        unnamed = (
+            "[...document.querySelectorAll('input, button, canvas, a.ev-button')]"
+            ".filter(one => one.offsetParent && !one.getAttribute('aria-label')"
+            " && !one.closest('label') && !one.textContent.trim()).length"
+        )
+        assert browser.run(f"return {unnamed}") == 0
+        browser.open(f"{home.rstrip('/')}/?roughness=9")
+        browser.wait("return document.querySelector('.ev-message')?.textContent.includes('give 0.01 to 0.3')")
+
+
+def test_a_link_says_the_settings_and_no_more() -> None:
+    changed = Controls("matte", 0.02, 0.4, event_noise_hz=0.5)
+    query = dict(parse_qsl(link_of(changed, "Q").removeprefix("?")))
+    assert settings_of(query, Controls(columns=64)) == (replace(changed, columns=64), "Q", "")
+    assert settings_of({"ink": "ff", "theme": "dark"}, Controls()) == (Controls(), "R", "ff")
+    assert link_of(Controls(), ink="00") == "?ink=00"
+    for wrong in (
+        {"roughness": "9"},
+        {"roughness": "nan"},
+        {"wall": "glass"},
+        {"character": "??"},
+        {"ambient": "x"},
+    ):
+        with pytest.raises(ConfigError):
+            settings_of(wrong, Controls())
+    for values in PRESETS.values():
+        preset = replace(Controls(), **values)
+        assert settings_of(dict(parse_qsl(link_of(preset, "R")[1:])), Controls())[0] == preset
 
 
 def test_drawings_and_uploads_in_a_real_browser(zipped_capture, tmp_path) -> None:

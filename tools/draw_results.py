@@ -1,9 +1,12 @@
-"""Draw the table of results from its records: PSNR of each method from frames, events and both, with intervals.
+"""Draw what the pages on results show: the table from its records, a film of learned results, a fine-tuning.
 
-python tools/draw_results.py        # docs/figures/results_near.png
+python tools/draw_results.py                                        # docs/figures/results_near.png
+python tools/draw_results.py film                                   # docs/figures/learned_film.webp
+python tools/draw_results.py finetune mine near-frame mine-frame    # docs/figures/finetune.png
 """
 
 import json
+import sys
 from pathlib import Path
 
 import matplotlib
@@ -37,7 +40,80 @@ def scores(method: str, modality: str) -> np.ndarray:
     return np.array(found)
 
 
+def draw_film() -> None:
+    """Draw hidden object, wall, linear and learned result of a simulated sequence, one position a picture."""
+    from PIL import Image
+
+    from evnlos.app.controls import Controls, picked, simulate_sequence
+    from evnlos.app.solving import from_each_frame, from_weights, own_networks
+    from evnlos.data import Sampling
+    from evnlos.report.pictures import grey
+
+    recorded = simulate_sequence(Controls(), picked("R"))
+    networks = own_networks(())
+    name, network = next(item for item in networks.of(recorded).items() if "frames" in item[0])
+    learned = from_weights(recorded, name, network, networks.wall_of(recorded))
+    truth, frames = recorded.truth(Sampling()), recorded.frames
+    assert truth is not None and frames is not None
+    columns = {
+        "hidden object": grey(truth),
+        "wall, as the camera sees it": grey(frames / recorded.peak, 0.05, 0.4),
+        "linear, from one frame": grey(from_each_frame(recorded).images),
+        "learned, from all frames": grey(learned.images),
+    }
+    pictures = []
+    for k in range(len(truth)):
+        figure, axes = plt.subplots(1, len(columns), figsize=(9.6, 1.75), layout="constrained")
+        for axis, (title, images) in zip(axes, columns.items(), strict=True):
+            axis.imshow(images[k], cmap="gray", vmin=0, vmax=255, aspect="equal")
+            axis.set_title(title, fontsize=10)
+            axis.set_axis_off()
+        figure.canvas.draw()
+        pictures.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
+        plt.close(figure)
+    path = ROOT / "docs" / "figures" / "learned_film.webp"
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=120, loop=0, quality=60, method=6
+    )
+
+
+def draw_finetune(data: str, before: str, after: str) -> None:
+    """Draw frame, both networks' images and truth of the middle position of each test character."""
+    from evnlos.data import NlosDataset, open_dataset
+    from evnlos.models import load_weights
+
+    models = {"before": load_weights(before), "after fine-tuning": load_weights(after)}
+    samples = {title: NlosDataset(open_dataset(data), "test", one.modality) for title, one in models.items()}
+    images = {title: one.network.infer(samples[title].inputs) for title, one in models.items()}
+    first = samples["before"]
+    columns = {"frame of the wall": first.inputs[:, 0].float(), **images, "truth": first.truth.float()}
+    names = np.unique(first.names)
+    figure, axes = plt.subplots(len(names), len(columns), figsize=(8, 1.4 * len(names)), layout="constrained")
+    for row, name in zip(axes, names, strict=True):
+        places = np.flatnonzero(first.names == name)
+        for axis, (title, pictures) in zip(row, columns.items(), strict=True):
+            high = None if title.startswith("frame") else 1
+            axis.imshow(pictures[places[len(places) // 2]].numpy(), cmap="gray", vmin=0, vmax=high)
+            axis.set_axis_off()
+            if name == names[0]:
+                axis.set_title(title, fontsize=10)
+    figure.savefig(ROOT / "docs" / "figures" / "finetune.png", dpi=110)
+
+
 def main() -> None:
+    """Draw the figure that is asked for."""
+    match sys.argv[1:]:
+        case []:
+            draw_table()
+        case ["film"]:
+            draw_film()
+        case ["finetune", data, before, after]:
+            draw_finetune(data, before, after)
+        case other:
+            sys.exit(f"{' '.join(other)} is no figure; {__doc__}")
+
+
+def draw_table() -> None:
     """Draw each method's mean as a mark, its four characters as dots, the seeds' deviation as a bar."""
     figure, axes = plt.subplots(figsize=(8, 5.2), layout="constrained")
     for row, method in enumerate(METHODS):

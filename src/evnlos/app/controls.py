@@ -8,9 +8,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
+from urllib.parse import urlencode
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +133,57 @@ class Controls:
             sampling=COARSE,
             seed=self.seed,
         )
+
+
+PRESETS: dict[str, dict[str, object]] = {
+    "usual": {},
+    "polished metal": {"roughness": 0.02},
+    "dull metal": {"roughness": 0.1},
+    "matte paint: nothing is seen": {"wall": "matte"},
+    "far away": {"distance_m": 0.5},
+    "fast": {"speed_m_s": 0.1},
+    "noisy camera": {"frame_noise": 5.0, "event_noise_hz": 0.5},
+    "bright room": {"ambient": 0.5},
+}
+"""Settings to begin with, by name: what differs from the usual ones."""
+_LINKED = ("wall", *(name for name in Controls.__dataclass_fields__ if name not in ("wall", "columns", "seed")))
+
+
+def link_of(controls: Controls, character: str = "", ink: str = "") -> str:
+    """Return the query of an address that opens the page with these settings.
+
+    Example:
+        >>> link_of(Controls(roughness=0.02), "G")
+        '?character=G&roughness=0.02'
+    """
+    usual = Controls()
+    query: dict[str, object] = {"ink": ink} if ink else {"character": character}
+    query |= {name: getattr(controls, name) for name in _LINKED}
+    changed = {name: value for name, value in query.items() if value != getattr(usual, name, None)}
+    return "?" + urlencode(changed)
+
+
+def settings_of(query: Mapping[str, str], opening: Controls) -> tuple[Controls, str, str]:
+    """Return controls, character and drawing of an address that `link_of` made.
+
+    Args:
+        query: Names and values; names that are none of ours are left alone.
+        opening: What holds where nothing is said.
+
+    Raises:
+        ConfigError: A value that cannot be.
+    """
+    character, ink = query.get("character", "R"), query.get("ink", "")
+    if character not in CHARACTERS or len(character) != 1 or len(ink) > 2 * INK_SIDE**2:
+        raise ConfigError(f"character is {character[:20]!r}; give one of {CHARACTERS}")
+    given: dict[str, Any] = {}
+    for name in _LINKED:
+        if name in query:
+            try:
+                given[name] = query[name] if name == "wall" else float(query[name])
+            except ValueError:
+                raise ConfigError(f"{name} is {query[name][:20]!r}; give a number") from None
+    return replace(opening, **given), character, ink
 
 
 CHARACTERS = UPPER_CASE + DIGITS

@@ -55,6 +55,44 @@
     }
   }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-sequence"] });
 
+  // The address of the settings: copied, or opened where the browser lets no page copy.
+  window.evnlosShare = (link) => {
+    if (!navigator.clipboard) return true;
+    navigator.clipboard.writeText(link.href).then(() => {
+      link.textContent = "Copied";
+      setTimeout(() => { link.textContent = "Copy link"; }, 2000);
+    });
+    return false;
+  };
+  // All pictures at the position that is looked at, with their titles, as one PNG.
+  window.evnlosSave = async (button) => {
+    const sheet = button.closest(".ev-sheet"), k = Number(sheet.style.getPropertyValue("--k"));
+    const figures = [...sheet.querySelectorAll("figure:not(.ev-setup)")], WIDTH = 320, ROW = 260, COLUMNS = 4;
+    const canvas = document.createElement("canvas"), ink = canvas.getContext("2d");
+    canvas.width = WIDTH * COLUMNS;
+    canvas.height = ROW * Math.ceil(figures.length / COLUMNS);
+    ink.fillStyle = "#fff";
+    ink.fillRect(0, 0, canvas.width, canvas.height);
+    for (const [i, figure] of figures.entries()) {
+      const picture = figure.querySelector(".ev-picture"), box = picture.getBoundingClientRect(), image = new Image();
+      image.src = picture.style.backgroundImage.slice(5, -2);
+      await image.decode();
+      const many = picture.style.backgroundSize.includes("var"), count = many ? Number(sheet.style.getPropertyValue("--n")) : 1;
+      const height = image.height / count, x = (i % COLUMNS) * WIDTH, y = Math.floor(i / COLUMNS) * ROW;
+      const zoom = Math.min((WIDTH - 16) / box.width, (ROW - 50) / box.height);
+      ink.fillStyle = "#222";
+      ink.font = "14px sans-serif";
+      ink.fillText(figure.querySelector("figcaption").innerText.replaceAll("\n", "  "), x + 8, y + 20, WIDTH - 16);
+      ink.imageSmoothingEnabled = false;
+      ink.drawImage(image, 0, many ? k * height : 0, image.width, height, x + 8, y + 30, box.width * zoom, box.height * zoom);
+    }
+    const link = document.createElement("a");
+    link.download = "evnlos.png";
+    link.href = canvas.toDataURL("image/png");
+    link.click();
+    return link.href.length;
+  };
+
   // A number typed beside a slider keeps to the slider's ends.
   document.addEventListener("change", (event) => {
     const box = event.target, range = box.closest?.(".block")?.querySelector("input[type=range]");

@@ -10,10 +10,22 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from evnlos.app.controls import CHARACTERS, INK_SIDE, Controls, Recorded, drawn, picked, simulate_sequence
+from evnlos.app.controls import (
+    CHARACTERS,
+    INK_SIDE,
+    PRESETS,
+    Controls,
+    Recorded,
+    drawn,
+    link_of,
+    picked,
+    settings_of,
+    simulate_sequence,
+)
 from evnlos.app.solving import Networks, Reconstruction, from_each_frame, from_weights, from_whole_sequence
 from evnlos.app.upload import read_upload_apart
 from evnlos.app.views import (
@@ -28,6 +40,7 @@ from evnlos.app.views import (
     waiting_box,
 )
 from evnlos.errors import EvnlosError
+from evnlos.plot.setup import setup_drawing
 from evnlos.scene import Target
 
 HEAD = """<header class="ev-head"><h1>Seeing around a corner</h1>
@@ -69,7 +82,9 @@ UPLOADS_AT_ONCE = 4
 _drawing = threading.Lock()  # what was read and checked takes seconds, and the cores are the page's
 
 
-def simulated(controls: Controls, target: Target, networks: Networks) -> Iterator[tuple[str, str]]:
+def simulated(
+    controls: Controls, target: Target, networks: Networks, link: str = ""
+) -> Iterator[tuple[str, str]]:
     """Yield (sheet, verdict) of a simulated sequence three times: without networks, with them, with the
     verdict.
 
@@ -77,6 +92,7 @@ def simulated(controls: Controls, target: Target, networks: Networks) -> Iterato
         controls: Setup and camera.
         target: What is hidden.
         networks: The page's networks.
+        link: Address of these settings.
 
     Raises:
         EvnlosError: The settings can't be.
@@ -85,10 +101,12 @@ def simulated(controls: Controls, target: Target, networks: Networks) -> Iterato
     before, after = seen_views(recorded), event_views(recorded)
     found = [from_whole_sequence(recorded), from_each_frame(recorded)]
     assert recorded.simulation is not None  # it was simulated
-    yield _sheet(recorded, before, found, after), waiting_box()
+    drawing = setup_drawing(recorded.simulation.setup)
+    about = link, drawing.svg.replace(' xmlns="http://www.w3.org/2000/svg"', "") if drawing else ""
+    yield _sheet(recorded, before, found, after, *about), waiting_box()
     wall = networks.wall_of(recorded)
     found += [from_weights(recorded, name, one, wall) for name, one in networks.of(recorded).items()]
-    pictures = _sheet(recorded, before, found, after)
+    pictures = _sheet(recorded, before, found, after, *about)
     yield pictures, waiting_box()
     yield pictures, verdict_box(limits_of(recorded.simulation))
 
@@ -153,9 +171,11 @@ def uploaded(path: str | None, scratch: Path, limit_bytes: int, networks: Networ
     return pictures, message_box("; ".join(notes), wrong=False)
 
 
-def _sheet(recorded: Recorded, before: list[View], found: list[Reconstruction], after: list[View]) -> str:
+def _sheet(
+    recorded: Recorded, before: list[View], found: list[Reconstruction], after: list[View], *about: str
+) -> str:
     views = [*before, *found_views(found), *after]
-    return sheet(views, recorded.times_s - recorded.edges_us[0] * 1e-6, recorded.name)
+    return sheet(views, recorded.times_s - recorded.edges_us[0] * 1e-6, recorded.name, *about)
 
 
 def _without_folder(text: str, path: str, scratch: Path) -> str:
@@ -188,11 +208,12 @@ def build_page(
     gr = gradio
     with gr.Blocks(title="evnlos", analytics_enabled=False, fill_width=True, delete_cache=(600, 3600)) as page:
         gr.HTML(HEAD, elem_id="ev-about")
-        with gr.Tab("Simulate a sequence"), gr.Row(equal_height=False):
-            with gr.Column(scale=1, min_width=290):
+        with gr.Tab("Simulate a sequence"), gr.Row(equal_height=False, elem_classes="ev-work"):
+            with gr.Column(scale=1, min_width=290, elem_classes="ev-controls"):
+                preset = gr.Dropdown(list(PRESETS), value="usual", label="Begin with")
                 controls = _controls(gr, opening)
-            with gr.Column(scale=4, min_width=480):
-                verdict = gr.HTML(first[1])
+            with gr.Column(scale=4, min_width=480, elem_classes="ev-results"):
+                verdict = gr.HTML(first[1], elem_classes="ev-said")
                 pictures = gr.HTML(first[0], elem_id="ev-opening")
         with gr.Tab("Your recording"):
             gr.Markdown(
@@ -208,8 +229,9 @@ def build_page(
         quiet: dict[str, Any] = {"show_progress": "hidden", "api_visibility": "private"}
         for control in controls:
             control.change(run, controls, [pictures, verdict], trigger_mode="always_last", **quiet)
+        preset.input(lambda name: _values(replace(opening, **PRESETS[name])), preset, controls[3:], **quiet)
         # The page opens with a sequence that is there already; only its verdict may still be on its way.
-        page.load(lambda: opening_verdict(opening), None, verdict, **quiet)
+        page.load(_open_link(gr, opening), None, [*controls, verdict], **quiet)
         wanted = Wanted()
 
         def begin(path: str | None, request: Any) -> tuple[str, str]:
@@ -279,6 +301,29 @@ def _controls(gr: Any, opening: Controls) -> list[Any]:
     return [how, character, ink, wall, rough, distance, speed, ambient, noise, on, off, event_noise]
 
 
+def _values(controls: Controls) -> list[Any]:
+    """Return what the controls of setup and cameras show."""
+    wall = _MATTE if controls.wall == "matte" else _METAL
+    one = controls
+    seen = [wall, one.roughness, 100 * one.distance_m, 100 * one.speed_m_s, one.ambient, one.frame_noise]
+    return [*seen, one.threshold_on, one.threshold_off, one.event_noise_hz]
+
+
+def _open_link(gr: Any, opening: Controls) -> Callable[[Any], list[Any]]:
+    def load(request: Any) -> list[Any]:
+        query = dict(request.query_params)
+        try:
+            controls, character, ink = settings_of(query, opening)
+        except EvnlosError as error:
+            return [gr.skip()] * 12 + [message_box(f"the link cannot be opened: {error}")]
+        if (controls, character, ink) == (opening, "R", ""):
+            return [gr.skip()] * 12 + [opening_verdict(opening)]
+        return [_DRAW if ink else _PICK, character, ink, *_values(controls), gr.skip()]
+
+    load.__annotations__["request"] = gr.Request  # Gradio hands it to who names it
+    return load
+
+
 def _on_controls(gr: Any, opening: Controls, networks: Networks) -> Callable[..., Iterator[tuple[str, str]]]:
     def run(
         how: str,
@@ -309,7 +354,8 @@ def _on_controls(gr: Any, opening: Controls, networks: Networks) -> Callable[...
                 opening.seed,
             )
             target = drawn(ink) if how == _DRAW else picked(character)
-            yield from simulated(chosen, target, networks)
+            link = link_of(chosen, character, ink if how == _DRAW else "")
+            yield from simulated(chosen, target, networks, link)
         except EvnlosError as error:
             yield gr.skip(), message_box(str(error))
 

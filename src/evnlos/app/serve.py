@@ -312,13 +312,13 @@ def running(server: Server, weights: tuple[Path, ...] = ()) -> Iterator[str]:
         import gradio
     except ImportError:
         raise MissingDependencyError("the page needs Gradio: pip install 'evnlos[app]'") from None
-    from evnlos.app.controls import Controls, picked
+    from evnlos.app.controls import Controls, link_of, picked
     from evnlos.app.page import build_page, simulated, theme
     from evnlos.app.solving import own_networks
 
     networks = own_networks(weights)
     controls = Controls(columns=server.columns)
-    pieces = simulated(controls, picked("R"), networks)
+    pieces = simulated(controls, picked("R"), networks, link_of(controls, "R"))
     first = next(pieces)
     if not networks.own:  # those of the package are small and quick
         first = next(pieces)

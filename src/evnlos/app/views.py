@@ -88,7 +88,7 @@ def seen_views(recorded: Recorded) -> list[View]:
     views = []
     truth = recorded.truth(Sampling())
     if truth is not None:
-        views.append(View("Hidden object", "24 cm x 12 cm around the corner; nobody sees this", grey(truth)))
+        views.append(View("Hidden object", "the truth, 24 cm x 12 cm; no camera sees it", grey(truth)))
     if recorded.frames is not None:
         views.append(_wall_view(recorded))
     events, edges = smaller(recorded.events, _LONGEST_SIDE), recorded.edges_us
@@ -174,7 +174,13 @@ _GROUPS = {
 }
 
 
-def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "sequence") -> str:
+def sheet(
+    views: Sequence[View],
+    times_s: NDArray[np.float64],
+    name: str = "sequence",
+    link: str = "",
+    drawing: str = "",
+) -> str:
     """Return views in their groups, above them a slider over the positions and a button that plays them.
 
     Moving the slider asks nobody: all positions are in the page already.
@@ -183,6 +189,8 @@ def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "sequ
         views: The views.
         times_s: Instant of each position, [N], seconds.
         name: What the sequence is called, for people who listen to the page.
+        link: Address of these settings, or nothing.
+        drawing: The setup from above as SVG, or nothing.
     """
     count = len(times_s)
     start = count // 2
@@ -194,7 +202,13 @@ def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "sequ
         "Play</button>",
         f'<label>Position <input type="range" class="ev-position" min="0" max="{count - 1}" step="1" '
         f'value="{start}" aria-label="Position of the hidden object" oninput="evnlosMove(this)"></label>',
-        f'<output class="ev-now" data-texts="{texts}">{words[start]}</output></div>',
+        f'<output class="ev-now" data-texts="{texts}">{words[start]}</output>',
+        '<button type="button" class="ev-button" onclick="evnlosSave(this)">Download</button>',
+        '<a class="ev-button" onclick="return evnlosShare(this)" '
+        f'href="{html.escape(link, True)}">Copy link</a>'
+        if link
+        else "",
+        "</div>",
     ]
     for group, title in _GROUPS.items():
         chosen = [view for view in views if view.group == group]
@@ -202,6 +216,8 @@ def sheet(views: Sequence[View], times_s: NDArray[np.float64], name: str = "sequ
             parts.append(f'<h3 class="ev-title">{title}</h3><div class="ev-row ev-{group}">')
             parts += [_figure(view, start) for view in chosen]
             parts.append("</div>")
+    if drawing:
+        parts.append(f'<h3 class="ev-title">The setup</h3><figure class="ev-setup">{drawing}</figure>')
     content = "".join(parts)
     mark = zlib.crc32(content.encode())  # tells the page that another sequence is shown
     return (

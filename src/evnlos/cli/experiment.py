@@ -274,9 +274,11 @@ class AppCommand:
 
     def run(self) -> None:
         """Run the page until it is interrupted."""
+        say("starting: the first images are computed before the page opens, about 20 s")
         serve(self.server, self.weights, lambda address: print(f"{address}  (Ctrl+C stops it)", flush=True))
         # A visitor's picture may be in the making still, in compiled code on a thread of its own, which the
         # interpreter would tear apart at its end; nothing of it is wanted any more.
+        say("stopped")
         sys.stdout.flush()
         os._exit(0)
 
