@@ -123,7 +123,7 @@ def test_networks_of_the_package_see_more_than_least_squares(app_sequence) -> No
     single = from_each_frame(app_sequence).psnr_db.mean()
     for name in ("network, frames", "network, both"):
         assert found[name].psnr_db.mean() > single + 2, name
-        assert "all frames" in found[name].note and "supports" in found[name].note
+        assert "all frames" in found[name].note and "agree on" in found[name].note
 
 
 def test_pictures_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames() -> None:
@@ -133,7 +133,7 @@ def test_pictures_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames(
         wall = networks.wall_of(recorded)
         network = networks.of(recorded)["network, frames"]
         noted[name] = from_weights(recorded, "frames", network, wall).note
-        assert "supports" in from_weights(recorded, "frames", network).note  # the pictures alone do not tell
+        assert "agree on" in from_weights(recorded, "frames", network).note  # the pictures alone do not tell
     assert "agree on" in noted["own"] and "nothing measured" in noted["rough"]
 
 

@@ -61,7 +61,7 @@ def made(tmp_path_factory):
         )
         steps += [{"settings": {"epochs": 3}, "data": {"name": "near", "origin": "captures"}}]
         found = Evaluation(image, truth, of, score(image, truth), blank)
-        runs.append(RunResult(method.lower(), "frame", False, method, found, [], steps))
+        runs.append(RunResult(method.lower(), "frame", False, method, found, [], steps, sampling=sampling))
     return data, runs
 
 

@@ -102,7 +102,10 @@ def simulated(
     found = [from_whole_sequence(recorded), from_each_frame(recorded)]
     assert recorded.simulation is not None  # it was simulated
     drawing = setup_drawing(recorded.simulation.setup)
-    about = link, drawing.svg.replace(' xmlns="http://www.w3.org/2000/svg"', "") if drawing else ""
+    about = (
+        link,
+        drawing.svg.replace(" xmlns='http://www.w3.org/2000/svg'", "") if drawing else "",
+    )  # within HTML it has none
     yield _sheet(recorded, before, found, after, *about), waiting_box()
     wall = networks.wall_of(recorded)
     found += [from_weights(recorded, name, one, wall) for name, one in networks.of(recorded).items()]
