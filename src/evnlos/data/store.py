@@ -70,6 +70,7 @@ def write_shard(
         finally:
             with undisturbed():
                 file.close()
+                del file  # while no signal can strike in what frees it
         if storage.failure is not None:
             raise storage.failure
 
