@@ -1,10 +1,13 @@
 """Threads of parallel loops sleep while they wait, unless the user has chosen otherwise."""
 
 import importlib
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -116,3 +119,48 @@ def test_ctrl_c_waits_for_work_that_must_not_break_off() -> None:
         signal.raise_signal(signal.SIGINT)
         done.append("work")
     assert done == ["work"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+class _Freed:
+    """What frees itself slowly, where Python lets no exception out."""
+
+    def __init__(self, begun: Path) -> None:
+        self.begun = begun
+
+    def __del__(self) -> None:
+        self.begun.touch()
+        until = time.monotonic() + 1.0
+        while time.monotonic() < until:
+            pass
+
+
+def _free(begun: Path | None) -> None:
+    if begun is not None:
+        one = _Freed(begun)
+        del one
+        time.sleep(60)
+
+
+def _leave_pool(folder: Path) -> None:
+    """Leave a pool while its tasks free something."""
+    tasks = [folder / "0", folder / "1"]
+    pool = run_tasks(_free, [None, *tasks], 2)
+    next(pool)
+    while not all(task.exists() for task in tasks):
+        time.sleep(0.01)
+    began = time.monotonic()
+    pool.close()
+    assert time.monotonic() - began < 4  # killed after 5 s
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows ends processes without a signal")
+def test_a_worker_that_is_struck_while_it_frees_something_ends_in_silence(tmp_path: Path) -> None:
+    code = (
+        f"from test_threads import _leave_pool; from pathlib import Path; _leave_pool(Path({str(tmp_path)!r}))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "Traceback" not in ended.stderr

@@ -22,7 +22,11 @@ def main() -> None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         if wishes:  # a library kept the interruption to itself
             raise KeyboardInterrupt
-        run()
+        try:
+            run()
+        finally:
+            if is_heard and not isinstance(sys.exception(), KeyboardInterrupt):
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # what Python still tidies up is not interrupted
     except KeyboardInterrupt:
         pass
     except Exception:  # an interrupted import may end in any error

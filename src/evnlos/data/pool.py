@@ -32,6 +32,7 @@ Engine = Callable[[Callable[[Any], str], Iterable[Any], int], Generator[str, Non
 """Runs a function on each task with so many processes, and yields the results as they come."""
 
 _TRIES = 3
+_AGAIN_S = 0.02
 _GRACE_S = 5.0  # in which a worker may leave what it writes
 
 
@@ -147,23 +148,39 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
     except BaseException:
         running = list((pool._processes or {}).values())  # the manager takes them away as they end
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in running:
-            process.terminate()
         until = time.monotonic() + _GRACE_S
+        while time.monotonic() < until and (running := [one for one in running if one.is_alive()]):
+            for process in running:  # again and again: a task in the queue may begin after the first time
+                process.terminate()
+            wait_for([process.sentinel for process in running], _GRACE_S / 20)
         for process in running:
-            process.join(max(0.0, until - time.monotonic()))
-            if process.is_alive():
-                process.kill()
+            process.kill()
         raise
 
 
 def _begin() -> None:
     """Prepare a worker: one thread, an end that leaves no half-written file, and no life after its parent."""
     one_thread()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    sys.unraisablehook = _end_anew
+    signal.signal(signal.SIGTERM, _end)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), name="parent", daemon=True).start()
+
+
+def _end(*_: object) -> None:
+    """End the task at hand, and this worker with it."""
+    sys.exit(128 + signal.SIGTERM)
+
+
+def _end_anew(lost: Any) -> None:
+    """End a moment later where the signal struck what lets no exception out, as a library's callback."""
+    if lost.exc_type is not SystemExit:
+        sys.__unraisablehook__(lost)
+        return
+    again = threading.Timer(_AGAIN_S, signal.raise_signal, (signal.SIGTERM,))
+    again.daemon = True
+    again.start()
 
 
 def _end_with(parent: int) -> None:
