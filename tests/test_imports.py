@@ -98,6 +98,7 @@ def test_names_come_when_they_are_asked_for() -> None:
             getattr(evnlos, wrong)
 
 
+HEAVY = ("numpy", "torch", "numba", "scipy", "h5py", "PIL", "pydantic")
 HELP_OF_ALL = """
 import contextlib, importlib, io, json, sys
 if {libraries}:
@@ -108,14 +109,13 @@ for verb in main.VERBS:
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         main.main([verb, "--help"])
-    heavy = [name for name in ("torch", "numba", "scipy", "h5py", "PIL", "pydantic") if name in sys.modules]
-    said[verb] = (out.getvalue(), heavy)
+    said[verb] = (out.getvalue(), [name for name in {heavy} if name in sys.modules])
 print(json.dumps(said))
 """
 
 
 def help_of_all(*, libraries: bool) -> dict[str, tuple[str, list[str]]]:
-    code = HELP_OF_ALL.format(libraries=libraries)
+    code = HELP_OF_ALL.format(libraries=libraries, heavy=HEAVY)
     out = subprocess.check_output([sys.executable, "-c", code], text=True, env=os.environ | {"COLUMNS": "100"})
     return json.loads(out)
 
@@ -153,7 +153,30 @@ def test_words_that_do_not_fit_are_refused_before_any_library_is_loaded(words: l
     exit_code, *modules = done.stdout.split()
     assert exit_code == "2"
     assert done.stderr.count("\n") == 1 and says in done.stderr and "Traceback" not in done.stderr
-    assert not {"torch", "numba", "scipy", "h5py", "PIL", "pydantic"} & set(modules)
+    assert not set(HEAVY) & set(modules)
+
+
+def cpu_s(words: list[str]) -> float:
+    """Return the least CPU time of three runs; bytecode was compiled before, as an installation keeps it."""
+    resource = pytest.importorskip("resource")
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    times = []
+    for _ in range(4):  # the first compiles
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, *words], env=environment, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        times.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(times[1:])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["demo", "--help"], ["simulate", "--help"], ["calibrate", "--help"], ["train", "--lerning-rate", "1"]],
+)
+def test_help_and_wrong_words_are_answered_within_half_a_second_of_cpu(words: list[str]) -> None:
+    """A machine on which NumPy and the parser alone take 0.17 s and more gets as much longer."""
+    yardstick = cpu_s(["-c", "import numpy, tyro, yaml"])
+    assert cpu_s(["-m", "evnlos", *words]) < max(0.5, 3 * yardstick)
 
 
 def test_what_was_described_without_libraries_runs_with_them(tiny, tmp_path) -> None:

@@ -254,6 +254,7 @@ def in_one_line(box: str) -> str:
 
 
 WORK_LIBRARIES = (
+    "numpy",
     "torch",
     "numba",
     "llvmlite",
@@ -292,10 +293,11 @@ class _StandIn:
     def __getitem__(self, _: Any) -> _StandIn:
         return self
 
-    def __or__(self, _: Any) -> Any:
+    def __or__(self, *_: Any) -> Any:
         return self
 
-    __ror__ = __or__
+    __ror__ = __neg__ = __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __or__
+    __truediv__ = __rtruediv__ = __floordiv__ = __pow__ = __matmul__ = __lshift__ = __invert__ = __or__
 
     def __mro_entries__(self, _: tuple[Any, ...]) -> tuple[type, ...]:
         return ()

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -207,13 +208,15 @@ class Walker:
 
     def __post_init__(self) -> None:
         check_lengths(width_m=self.width_m, height_m=self.height_m)
-        knots = np.array(self.path, np.float64)
-        if knots.ndim != 2 or knots.shape[1:] != (3,) or len(knots) < 2 or not (np.diff(knots[:, 0]) > 0).all():
+        try:
+            times, _, ys = zip(*((float(t), float(x), float(y)) for t, x, y in self.path), strict=True)
+        except (TypeError, ValueError):
+            times = ys = ()
+        if len(times) < 2 or not all(before < after for before, after in pairwise(times)):
             raise ConfigError("a walker's path needs two or more (seconds, x, y) with ascending times")
-        if not knots[:, 2].min() > self.width_m:
+        if not min(ys) > self.width_m:
             raise ConfigError(
-                f"a walker's path reaches y = {knots[:, 2].min():g} m; keep more than {self.width_m:g} m "
-                "behind the wall"
+                f"a walker's path reaches y = {min(ys):g} m; keep more than {self.width_m:g} m behind the wall"
             )
 
     def position_m(self, t_s: float) -> Array | None:

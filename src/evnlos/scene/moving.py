@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -101,16 +102,15 @@ class LineMotion:
     z_m: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("start_m", "direction"):
-            pair = np.asarray(getattr(self, name), dtype=np.float64)
-            if pair.shape != (2,) or not np.isfinite(pair).all():
-                raise DataError(f"LineMotion.{name} is {getattr(self, name)}; give two finite numbers (x, y)")
+        for name, pair in {"start_m": self.start_m, "direction": self.direction}.items():
+            if not hasattr(pair, "__len__") or len(pair) != 2 or not all(map(math.isfinite, pair)):
+                raise DataError(f"LineMotion.{name} is {pair}; give two finite numbers (x, y)")
             object.__setattr__(self, name, (float(pair[0]), float(pair[1])))
-        if not (np.isfinite(self.speed_m_s) and self.speed_m_s >= 0):
+        if not (math.isfinite(self.speed_m_s) and self.speed_m_s >= 0):
             raise DataError(f"LineMotion.speed_m_s is {self.speed_m_s}; give 0 or more metres per second")
-        if not np.hypot(*self.direction) > 0:
+        if not math.hypot(*self.direction) > 0:
             raise DataError("LineMotion.direction is (0, 0); give a direction with a length")
-        if not np.isfinite(self.start_s):
+        if not math.isfinite(self.start_s):
             raise DataError(f"LineMotion.start_s is {self.start_s}; give finite seconds")
         _check_distance("LineMotion", self.z_m)
         check_made(self)
