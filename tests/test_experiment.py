@@ -8,10 +8,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from evnlos.analysis.confidence import FrameOperator
 from evnlos.cli import main
 from evnlos.config import save_yaml
-from evnlos.data import FixedPattern, Sampling, SensorSize, Simulation, character_of, open_dataset, save_pattern
+from evnlos.data import (
+    Dataset,
+    FixedPattern,
+    NlosDataset,
+    Sampling,
+    SensorSize,
+    Simulation,
+    character_of,
+    open_dataset,
+    read_shard,
+    save_pattern,
+    write_shard,
+)
 from evnlos.data.simulate import split_of
 from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import (
@@ -29,6 +43,7 @@ from evnlos.experiment import (
     merge_folds,
     on_sequences,
     read_records,
+    retrieved,
     run_simulated,
     run_study,
     summary_table,
@@ -36,7 +51,7 @@ from evnlos.experiment import (
 )
 from evnlos.models import UNetConfig, layers_of, load_weights
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
-from evnlos.setups import RadiometricSetup
+from evnlos.setups import RadiometricSetup, load_setup
 from evnlos.training import Training
 from watching import Watch
 
@@ -90,7 +105,9 @@ def test_every_arm_seed_and_refinement_has_its_record(records, place) -> None:
     for record in records:
         assert set(record.scores["psnr_db"]) == {"lab_4"} == set(record.positions)
         assert record.scores["psnr_db"]["lab_4"] == pytest.approx(np.mean(record.positions["lab_4"]), abs=1e-3)
-        assert {"zero", "mean", "nearest"} <= set(record.baselines)
+        assert {"zero", "mean", "placed", "nearest"} <= set(record.baselines)
+        by = {name: np.mean(list(table["psnr_db"].values())) for name, table in record.baselines.items()}
+        assert by["placed"] > by["mean"]  # the motion is known
 
 
 def test_a_second_run_does_nothing_again(records, place) -> None:
@@ -107,6 +124,25 @@ def test_single_positions_are_scored_averaged_where_asked(records, apart) -> Non
     assert new.arm == "E2E, averaged" and new.settings["run"] == single.settings["run"]
     assert new.scores["psnr_db"]["lab_4"] != single.scores["psnr_db"]["lab_4"]
     assert run_study(study, apart) == []
+
+
+def test_the_simulated_object_that_explains_a_sequence_best_is_a_baseline(apart) -> None:
+    """Frames of two simulated glyphs under another light: the search finds each of them."""
+    study = replace(STUDY, name="search", arms=ARMS[1:2], modalities=("frame",), seeds=(0,), retrieval=True)
+    found = {record.arm: record for record in run_study(study, apart)}
+    assert set(found) == {"simulation only", "simulation only + consistency", "retrieval"}
+    assert found["retrieval"].settings["simulation"] and run_study(study, apart) == []
+    made = open_dataset(next((apart.out / "simulations").iterdir()))
+    operator = FrameOperator(load_setup(apart.out / "setups" / "lab"), SAMPLING)
+    (dimmer := apart.out / "dimmer").mkdir()
+    names = made.objects()
+    for name in names:
+        samples, attributes = read_shard(made.shard(name))
+        frame = 0.4 * (samples.frame - samples.frame.mean(axis=0)) + np.linspace(0, 0.3, 48, dtype=np.float32)
+        write_shard(dimmer / f"{name}.h5", replace(samples, frame=frame), attributes)
+    seen = Dataset(dimmer, "captures", SAMPLING, {"test": names})
+    truth = NlosDataset(made, "all", "frame").truth.float()
+    torch.testing.assert_close(retrieved(made, seen, "test", operator), truth, rtol=0, atol=1e-3)
 
 
 def test_other_networks_under_the_name_of_a_record_are_scored_anew(records, apart) -> None:

@@ -21,6 +21,7 @@ from evnlos.data import Dataset, Modality, NlosDataset, Sampling, character_of, 
 from evnlos.errors import DataError
 from evnlos.metrics import psnr
 from evnlos.models import Weights, on_target_plane
+from evnlos.models.confidence import SIDE, on_canvas
 from evnlos.setups import Setup
 from evnlos.types import Plane
 
@@ -35,11 +36,14 @@ class Comparison:
     Args:
         nearest: For each sample the true image of the training object whose measurement is most like its own,
             float32 [N, H, W]: the answer of pure memory, with no network and no physics.
+        placed: The mean target of the training objects, drawn where the target is, float32 [N, H, W]: what the
+            known motion alone tells.
         nearer_to_truth: Whether each reconstruction is nearer to the truth than to every training image,
             bool [N].
     """
 
     nearest: Tensor
+    placed: Tensor
     nearer_to_truth: NDArray[np.bool_]
 
 
@@ -76,9 +80,13 @@ def compare_with_training(
     parts = [slice(first, first + _TOGETHER) for first in range(0, len(images), _TOGETHER)]
     truth, spread = samples.truth[:, rows].float(), _Spread(samples.modality)
     closest_db = torch.full((len(images),), -torch.inf)
+    target = torch.zeros(SIDE, SIDE)  # mean of the training objects
     difference = torch.empty(len(names), len(images), samples.modality.channels)  # mean squares, [G, N, C]
     for number, (name, (step, away_m)) in enumerate(zip(names, nearest_of, strict=True)):
         inputs, true = _read(dataset, name, samples.modality)
+        seen_m = known[number]
+        assert seen_m is not None
+        target += on_target_plane(true, dataset.sampling.canvas, seen_m).mean(dim=(0, 1)) / len(names)
         for part in parts:
             seen = inputs[step[part]]
             spread.add(seen)
@@ -92,7 +100,8 @@ def compare_with_training(
         _, true = _read(dataset, names[number], samples.modality)
         for chosen in torch.nonzero(owner == number)[:, 0].split(_TOGETHER):
             nearest[chosen] = _shifted(true[step[chosen]], away_m[chosen] / pitch_m)[:, rows]
-    return Comparison(nearest, (psnr(images, truth) > closest_db).numpy())
+    placed = on_canvas(target, dataset.sampling.canvas, at_m)[:, rows].contiguous()
+    return Comparison(nearest, placed, (psnr(images, truth) > closest_db).numpy())
 
 
 class _Spread:
@@ -145,7 +154,12 @@ def _shifted(images: Tensor, shift_px: Tensor) -> Tensor:
     return F.grid_sample(images[:, None].float(), grid, align_corners=False)[:, 0]
 
 
-BASELINES = {"zero": "all-black", "mean": "mean image", "nearest": "nearest neighbour"}
+BASELINES = {
+    "zero": "all-black",
+    "mean": "mean image",
+    "placed": "mean target at its place",
+    "nearest": "nearest neighbour",
+}
 """Heading of each baseline."""
 
 CHECKS = {
@@ -165,8 +179,9 @@ class Evaluation:
         truth: True pictures, the same shape.
         names: Object of each picture, [N].
         scores: Scores of each picture.
-        baselines: Scores of the all-black picture ("zero"), of the mean training picture ("mean"), and of the
-            true picture of the training object whose measurement is most like this one ("nearest").
+        baselines: Scores of the all-black picture ("zero"), of the mean training picture ("mean"), of the mean
+            target of the training objects where the target is ("placed"), and of the true picture of the
+            training object whose measurement is most like this one ("nearest").
         checks: Shares of the pictures: "read", whose character the independent reader names correctly;
             "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
             the truth than to any training picture. Only what could be found out.
@@ -267,7 +282,7 @@ def assess(
     checks = _reading(dataset, split, images, truth, samples.names)
     learned = dataset.split.get("train") and split in ("test", "validation")
     if learned and (found := compare_with_training(images, samples, dataset, split)) is not None:
-        blank["nearest"] = found.nearest
+        blank |= {"placed": found.placed, "nearest": found.nearest}
         checks["nearer_to_truth"] = round(float(found.nearer_to_truth.mean()), 4)
     baselines = {name: score(image, truth, perceptual) for name, image in blank.items()}
     return Evaluation(images, truth, samples.names, score(images, truth, perceptual), baselines, checks)

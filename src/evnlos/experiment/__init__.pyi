@@ -28,5 +28,6 @@ from .table import difference as difference
 from .table import gain_table as gain_table
 from .table import generalization_table as generalization_table
 from .table import means_of as means_of
+from .table import retrieved as retrieved
 from .table import summary_table as summary_table
 from .table import write_generalization as write_generalization

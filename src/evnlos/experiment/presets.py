@@ -68,6 +68,7 @@ def captures(setup: str) -> Study:
             Arm("EPNP uncalibrated", "uncalibrated", PRETRAINING, UNCALIBRATED),
             _EPNP,
         ),
+        retrieval=True,
     )
 
 
@@ -191,7 +192,7 @@ def sequence(setup: str) -> Study:
         Arm("simulation only sequence", "calibrated", _SEQUENCE, None),
         Arm("EPNP sequence", "calibrated", _SEQUENCE, _SEQUENCE_FINETUNING),
     )
-    return Study("sequence", setup, arms, writers=44, average=True)
+    return Study("sequence", setup, arms, writers=44, average=True, retrieval=True)
 
 
 def on_sequences(study: Study) -> Study:

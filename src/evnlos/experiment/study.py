@@ -151,6 +151,8 @@ class Study:
     average: bool = False
     """Also score the images of networks of single positions after they are aligned along the known motion and
     averaged over the sequence."""
+    retrieval: bool = False
+    """Also score the simulated object that explains the frames of a sequence best."""
     correct_pattern: bool = True
     """Take the frame camera's fixed pattern, as the calibration found it, from all frames."""
 
@@ -228,6 +230,7 @@ def _merged(group: list[Record], setup: str) -> Record:
     baselines = {
         name: {metric: {k: v for r in group for k, v in r.baselines[name][metric].items()} for metric in table}
         for name, table in first.baselines.items()
+        if all(name in record.baselines for record in group)
     }
     counts = [len(record.positions) for record in group]
     checks = {

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -20,14 +21,28 @@ from torch import Tensor
 from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling
 from evnlos.analysis.confidence import ConfidenceCheck, FrameOperator, consistent, risk_coverage
 from evnlos.analysis.scores import Interval, paired_difference
-from evnlos.config import to_dict
-from evnlos.data import Dataset, NlosDataset, Sampling, as_modality, character_of, modality_order, read_shard
+from evnlos.config import from_dict, to_dict
+from evnlos.data import (
+    Dataset,
+    NlosDataset,
+    Sampling,
+    Simulation,
+    as_modality,
+    character_of,
+    modality_order,
+    read_shard,
+    read_shard_index,
+)
 from evnlos.errors import DataError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there
 from evnlos.files import write_atomically
+from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.machine import Progress
-from evnlos.models import aligned_mean, fit_linear, load_weights
+from evnlos.models import aligned_mean, fit_linear, load_weights, on_target_plane
+from evnlos.models.confidence import SIDE
+from evnlos.optics import MatrixTransport
 from evnlos.setups import load_setup
+from evnlos.types import Plane, derive_seed
 
 if TYPE_CHECKING:
     from evnlos.experiment.presets import GeneralizationResult
@@ -102,10 +117,9 @@ def score_arm(
     if len(runs) > 1:
         together = torch.stack(pictures).mean(dim=0)
         score_variants(together, ENSEMBLE, {"runs": [run.name for run, _ in runs]}, means)
-    if study.name != "captures":
-        return new
     for name, make in _without_network(study, arm, modality, samples, means, made, recorded, place):
-        blank = record(name, 0, {"captures": recorded.folder.name})
+        simulation = {"simulation": made.config_hash} if made is not None else {}
+        blank = record(name, 0, {"captures": recorded.folder.name} | simulation)
         if not is_scored(blank, there):
             score(blank, make(), means)
     return new
@@ -121,10 +135,15 @@ def _without_network(
     recorded: Dataset,
     place: Place,
 ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
-    """Yield the baselines that belong to an arm, each with what makes its pictures: linear, classical."""
-    if arm.pretraining is None:
+    """Yield the baselines that belong to an arm, each with what makes its pictures."""
+    if study.name == "captures" and arm.pretraining is None:
         yield "linear, captures", lambda: _linear(recorded, modality, samples)
-    if arm.finetuning is None and made is not None:
+    if arm.finetuning is not None or made is None:
+        return
+    if study.retrieval and modality == "frame" and arm.source == "calibrated":
+        setup = place.out / "setups" / study.setup
+        yield "retrieval", lambda: retrieved(made, recorded, study.split, _operator(setup, arm.sampling))
+    if study.name == "captures":
         yield "linear, simulation", lambda: _linear(made, modality, samples)
         if modality == "frame":
             start = mean_image.expand(len(samples), -1, -1)
@@ -134,6 +153,60 @@ def _without_network(
 def _linear(data: Dataset, modality: str, samples: NlosDataset) -> Tensor:
     known = NlosDataset(data, "train", modality)
     return fit_linear(known.inputs, known.truth, known.names, modality=known.modality)(samples.inputs)
+
+
+def retrieved(made: Dataset, recorded: Dataset, split: str, operator: FrameOperator) -> Tensor:
+    """Return the simulated object that explains the frames of each sequence best, drawn where the target was.
+
+    With y the frames, A the light path and x an object at the known places, each less its mean over the
+    sequence, it has the least |y - g A x|^2 at its own best brightness g >= 0: the largest
+    (x^T A^T y)^2 / (x^T A^T A x), from the normal equations of all time steps together. What stands still
+    counts for nothing.
+
+    Args:
+        made: The simulation whose objects are searched, all splits of it.
+        recorded: The captures.
+        split: Which of them.
+        operator: The calibrated setup.
+
+    Returns:
+        float32 [N, H, W], 0..1.
+
+    Raises:
+        DataError: A motion is unknown, or the simulation's targets are.
+    """
+    config = from_dict(Simulation, made.config, source=str(made.folder))
+    names, canvas = made.objects(), made.sampling.canvas
+    size_m = config.glyphs.target_plane.size_m
+    plane = Plane(SIDE, SIDE, size_m / SIDE)
+    targets = torch.cat([_middle_target(made, name, size_m) for name in names]).flatten(1).double()  # [G, n n]
+    cells = Plane(operator.rows.stop - operator.rows.start, canvas.width, canvas.pitch_m)
+    transport = MatrixTransport(operator.matrix, cells, operator.size)
+    strip_gram = operator.matrix.T @ operator.matrix
+    found = []
+    for name in recorded.objects(split):
+        samples, _ = read_shard(recorded.shard(name))
+        if samples.position_m is None:
+            raise DataError(f"the motion of {name} is unknown; retrieval draws objects at known places")
+        sight = SequenceOperator(transport, plane, samples.position_m)
+        frames = torch.from_numpy(samples.frame)
+        back = sight.adjoint(frames - frames.mean(dim=0)).flatten().double()
+        power = ((targets @ sight.gram(strip_gram, math.inf)) * targets).sum(dim=1)
+        best = int(((targets @ back).clamp_min(0).square() / power.clamp_min(1e-12)).argmax())
+        target = config.glyphs.target(names[best], derive_seed(config.seed, "glyph"))
+        found.append(torch.from_numpy(target.rasterise(canvas, samples.position_m)))
+    return torch.cat(found)
+
+
+def _middle_target(made: Dataset, name: str, size_m: float) -> Tensor:
+    """Return the target of a simulated object, as the time step in the middle shows it, [1, 32, 32]."""
+    path = made.shard(name)
+    middle = read_shard_index(path).length // 2
+    samples, _ = read_shard(path, slice(middle, middle + 1))
+    if samples.truth is None or samples.position_m is None:
+        raise DataError(f"{path} has no truth; simulate with known targets")
+    canvas = made.sampling.canvas
+    return on_target_plane(torch.from_numpy(samples.truth), canvas, samples.position_m, size_m)[:, 0]
 
 
 def _consistent(study: Study, arm: Arm, recorded: Dataset, place: Place, images: Tensor) -> Tensor:
@@ -185,6 +258,8 @@ def summary_table(records: list[Record], metric: str = "psnr_db") -> str:
     digits = _PLACES.get(metric, 3)
     lines = [f"| {metric} | {' | '.join(modalities)} |", "|---|" + "---|" * len(modalities)]
     for name, title in BASELINES.items():
+        if not any(name in r.baselines for r in records):
+            continue
         cells = []
         for modality in modalities:
             values = [
