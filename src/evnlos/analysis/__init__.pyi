@@ -12,6 +12,7 @@ from .evaluate import CHECKS as CHECKS
 from .evaluate import Evaluation as Evaluation
 from .evaluate import assess as assess
 from .evaluate import check_sampling as check_sampling
+from .evaluate import confusion as confusion
 from .evaluate import evaluate as evaluate
 from .evaluate import reconstruct as reconstruct
 from .identify import Identification as Identification

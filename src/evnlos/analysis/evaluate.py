@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -185,6 +187,8 @@ class Evaluation:
         checks: Shares of the pictures: "read", whose character the independent reader names correctly;
             "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
             the truth than to any training picture. Only what could be found out.
+        read_as: Object -> character -> how many of its pictures the reader takes for it; empty where nothing
+            could be read.
         confidence_checks: What the network's confidence said of each sequence, beside what was true; empty
             where it has none, or a motion is unknown.
     """
@@ -195,6 +199,7 @@ class Evaluation:
     scores: Scores
     baselines: dict[str, Scores]
     checks: dict[str, float] = field(default_factory=dict)
+    read_as: dict[str, dict[str, int]] = field(default_factory=dict)
     confidence_checks: list[ConfidenceCheck] = field(default_factory=list)
 
     def characters(self) -> list[str]:
@@ -216,6 +221,7 @@ class Evaluation:
             **table(self.scores),
             "baselines": {name: table(scores) for name, scores in self.baselines.items()},
             "checks": self.checks,
+            "read_as": self.read_as,
             "confidence": [to_dict(one) for one in self.confidence_checks],
         }
 
@@ -279,30 +285,53 @@ def assess(
     blank = {"zero": torch.zeros_like(truth)}
     if mean_image is not None:
         blank["mean"] = mean_image.float()[rows].expand_as(truth).contiguous()
-    checks = _reading(dataset, split, images, truth, samples.names)
+    checks, read_as = _reading(dataset, split, images, truth, samples.names)
     learned = dataset.split.get("train") and split in ("test", "validation")
     if learned and (found := compare_with_training(images, samples, dataset, split)) is not None:
         blank |= {"placed": found.placed, "nearest": found.nearest}
         checks["nearer_to_truth"] = round(float(found.nearer_to_truth.mean()), 4)
     baselines = {name: score(image, truth, perceptual) for name, image in blank.items()}
-    return Evaluation(images, truth, samples.names, score(images, truth, perceptual), baselines, checks)
+    scores = score(images, truth, perceptual)
+    return Evaluation(images, truth, samples.names, scores, baselines, checks, read_as)
 
 
 def _reading(
     dataset: Dataset, split: str, images: Tensor, truth: Tensor, names: np.ndarray
-) -> dict[str, float]:
-    """Return how often the independent reader names the character, on reconstructions and on the truth."""
+) -> tuple[dict[str, float], dict[str, dict[str, int]]]:
+    """Return how often the reader names the character, of reconstructions and truth, and what it names."""
     answers = [character_of(name) for name in names]
     places = [read_shard(dataset.shard(name))[0].position_m for name in dataset.objects(split)]
     if not set(answers) <= set(CHARACTERS) or any(place is None for place in places):
-        return {}
+        return {}, {}
     scored = Plane(dataset.sampling.scored_rows, dataset.sampling.width, dataset.sampling.pitch_m)
     position = np.concatenate([place for place in places if place is not None])
-    found = {}
-    for key, pictures in (("read", images), ("read_truth", truth)):
-        read = read_characters(on_target_plane(pictures, scored, position))
-        found[key] = round(float(np.mean([a == b for a, b in zip(read, answers, strict=True)])), 4)
-    return found
+    found, named = {}, list[str]()
+    for key, pictures in (("read_truth", truth), ("read", images)):
+        named = read_characters(on_target_plane(pictures, scored, position))
+        found[key] = round(float(np.mean([a == b for a, b in zip(named, answers, strict=True)])), 4)
+    read_as: dict[str, dict[str, int]] = {}
+    for (name, character), count in Counter(zip(names.tolist(), named, strict=True)).most_common():
+        read_as.setdefault(name, {})[character] = count
+    return found, read_as
+
+
+def confusion(seen: Sequence[dict[str, dict[str, int]]]) -> str:
+    """Return what the reader takes for something else, the most first, as "G as C 12 %"; shares of each object.
+
+    Args:
+        seen: As `Record.read_as`, of one or several records.
+    """
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    for one in seen:
+        for name, read in one.items():
+            counts[character_of(name)].update(read)
+    wrong = [
+        (count / read.total(), f"{true} as {character}")
+        for true, read in counts.items()
+        for character, count in read.items()
+        if character != true
+    ]
+    return ", ".join(f"{words} {share:.0%}" for share, words in sorted(wrong, key=lambda pair: -pair[0]))
 
 
 def reconstruct(

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 import tyro
 
-from evnlos.analysis import BASELINES, CHECKS
+from evnlos.analysis import BASELINES, CHECKS, confusion
 from evnlos.cli.parsing import say
 from evnlos.cli.recordings import Flat, Presets, result
 from evnlos.config import load_yaml, to_dict
@@ -219,6 +219,8 @@ def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
     print("\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows))
     for name, share in found["checks"].items():
         print(f"{CHECKS[name]}: {share:.0%}")
+    if words := confusion([found["read_as"]]):
+        print(f"taken for another character: {words}")
     if confidence_checks := found["confidence"]:
         said = ("support", "skill", "measured", "coverage", "width")
         mean = {key: sum(one[key] for one in confidence_checks) / len(confidence_checks) for key in said}

@@ -247,6 +247,7 @@ def _merged(group: list[Record], setup: str) -> Record:
         baselines=baselines,
         checks=checks,
         settings={"arm": first.arm, "runs": runs},
+        read_as={name: seen for record in group for name, seen in record.read_as.items()},
     )
 
 
@@ -293,6 +294,7 @@ class Record:
         baselines: Baseline -> metric -> object -> mean.
         checks: Shares of pictures (see `evnlos.analysis.CHECKS`).
         settings: Everything that decided the weights.
+        read_as: Object -> character -> how many of its pictures the reader takes for it.
     """
 
     study: str
@@ -306,6 +308,7 @@ class Record:
     baselines: dict[str, dict[str, dict[str, float]]]
     checks: dict[str, float]
     settings: dict[str, Any]
+    read_as: dict[str, dict[str, int]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -345,7 +348,8 @@ def scores_of(evaluation: Evaluation) -> tuple[dict, dict, dict]:
 def keep_scores(blank: Record, evaluation: Evaluation, folder: Path, progress: Progress) -> Record:
     """Fill a record with an evaluation's scores, write it, tell of it, and return it."""
     scores, positions, baselines = scores_of(evaluation)
-    record = replace(blank, scores=scores, positions=positions, baselines=baselines, checks=evaluation.checks)
+    record = replace(blank, scores=scores, positions=positions, baselines=baselines)
+    record = replace(record, checks=evaluation.checks, read_as=evaluation.read_as)
     write_record(record, folder)
     progress(Step(f"score {record.name}", 1, 1, "networks", record))
     return record

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling
+from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling, confusion
 from evnlos.analysis.confidence import ConfidenceCheck, FrameOperator, consistent, risk_coverage
 from evnlos.analysis.scores import Interval, paired_difference
 from evnlos.config import from_dict, to_dict
@@ -316,20 +316,22 @@ def gain_table(records: list[Record], arm: str = "EPNP", other: str = "E2E") -> 
 
 
 def checks_table(records: list[Record]) -> str:
-    """Return Markdown: shares of pictures whose character is recognized, and that are no memory."""
-    found: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
+    """Return Markdown: shares of pictures that are recognized and that are no memory, and the confusion."""
+    found: dict[tuple[str, str], list[Record]] = defaultdict(list)
     for record in records:
         name = record.arm if record.seed >= 0 else f"{record.arm}, ensemble"
-        found[name, record.modality].append(record.checks)
+        found[name, record.modality].append(record)
     lines = [
-        "| | recognized | of the true pictures | nearer to the truth than to any capture |",
-        "|---|---|---|---|",
+        "| | recognized | of the true pictures | nearer to the truth than to any capture | taken for another |",
+        "|---|---|---|---|---|",
     ]
-    for (arm, modality), checks in found.items():
+    for (arm, modality), own in found.items():
+        checks = [record.checks for record in own]
         cells = []
         for key in ("read", "read_truth", "nearer_to_truth"):
             values = [c[key] for c in checks if key in c]
             cells.append(f"{100 * np.mean(values):.0f} %" if values else "")
+        cells.append(confusion([record.read_as for record in own]))
         lines.append(f"| {arm} {modality} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
