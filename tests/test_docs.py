@@ -135,3 +135,12 @@ def test_files_that_pages_name_exist() -> None:
     for page in PAGES:
         for name in re.findall(r"`([\w/]+\.py)`", page.read_text()):
             assert any(path == name or path.endswith(f"/{name}") for path in there), f"{page.name}: {name}"
+
+
+def test_a_page_on_recordings_that_nobody_can_have_says_how_to_make_their_like() -> None:
+    pages = {path: path.read_text() for path in (*DOCS.glob("*.md"), DOCS.parent / "README.md")}
+    cites = {path for path, text in pages.items() if re.search(r"captures/(near|far)_|--captures-of", text)}
+    cites -= {DOCS / name for name in ("lab.md", "live.md")}  # that page itself; captures one records
+    assert len(cites) >= 7
+    for path in cites:
+        assert "lab.md#published-captures" in pages[path], path

@@ -9,12 +9,24 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from PIL import Image
 
+from evnlos.cli import main
 from evnlos.config import from_dict, load_yaml, read_yaml, save_yaml
 from evnlos.data import SensorSize, read_capture
-from evnlos.data.lab import SENSOR_SPREAD, Lab, lab_preset, render_captures
+from evnlos.data.lab import (
+    PUBLISHED,
+    SENSOR_SPREAD,
+    Lab,
+    compare_published,
+    content_digest,
+    lab_preset,
+    published_lab,
+    render_captures,
+)
 from evnlos.data.simulations import default
 from evnlos.errors import ConfigError, DataError
+from evnlos.events import write_events
 from evnlos.optics.angular_spectrum import Diffraction
 from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, Scene
 from evnlos.setups import PaperSetup, RadiometricSetup, setup_names, setup_preset
@@ -358,3 +370,36 @@ def test_settings_survive_a_file(tmp_path):
     lab = small(setup={"occluders_m": (((-0.14, 0.0, 0.2), (-0.1, 0.0, 0.2), (-0.1, 0.05, 0.2)),)})
     save_yaml(lab, tmp_path / "lab.yaml")
     assert load_yaml(Lab, tmp_path / "lab.yaml") == lab
+
+
+def test_a_published_set_is_rendered_and_compared_with_its_checksums(tmp_path, capsys) -> None:
+    """Bytes are those of one kind of processor; the number of events is the same to a hundredth everywhere."""
+    words = ["lab", "--set", "near", "--glyphs.characters", "J", "--out", str(tmp_path)]
+    main(words)
+    shown = capsys.readouterr()
+    same = "1 of them have the published SHA-256" in shown.out
+    assert same or "near_J: " in shown.err
+    folder = tmp_path / "near_J"
+    capture = read_capture(folder)
+    digest, events = read_yaml(PUBLISHED)["near"]["J"]
+    assert abs(len(capture.events) - events) <= 0.01 * events and (content_digest(capture) == digest) == same
+    assert compare_published("near", [folder]).keys() == (set() if same else {"near_J"})
+    brighter = Image.fromarray(np.asarray(Image.open(folder / "frames" / "0003.png")) + np.uint8(1))
+    brighter.save(folder / "frames" / "0003.png")
+    assert compare_published("near", [folder]).keys() == {"near_J"}
+    write_events(folder / "events.raw", capture.events[:1000])
+    with pytest.raises(DataError, match="it is another capture"):
+        compare_published("near", [folder])
+
+
+def test_published_sets_are_listed_whole_and_state_all_settings(tmp_path) -> None:
+    listed = read_yaml(PUBLISHED)
+    for name, captures in listed.items():
+        lab = published_lab(name)
+        assert {one[-1] for one in lab.glyphs.objects()} == set(captures)
+        assert all(len(digest) == 64 and events > 0 for digest, events in captures.values())
+        with pytest.raises(ConfigError, match="states all settings"):
+            published_lab(name, Lab(seed=1))
+    with pytest.raises(ConfigError, match="near, far"):
+        published_lab("middle")
+    assert set(listed) == {"near", "far"}

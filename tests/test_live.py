@@ -20,6 +20,7 @@ from PIL import Image
 
 from evnlos import EvnlosError
 from evnlos.analysis import reconstruct
+from evnlos.analysis.identify import verdict_on
 from evnlos.cli import main
 from evnlos.data import STANDARD_MODALITIES, Sampling, capture_samples, read_capture, reduce_by_area
 from evnlos.errors import ConfigError, DataError, EventFileError
@@ -32,7 +33,8 @@ from evnlos.live.packet import Chunk, ChunkQueue, Packet, PacketError, pack, unp
 from evnlos.live.run import RateOptions, Run, RunStatistics, latency_table
 from evnlos.live.sources import Replay, SourceOptions, TimedFrame, capture_replay, open_live
 from evnlos.live.udp import UdpSender, UdpSource, send_timed
-from evnlos.models import UNetConfig, Weights, save_weights
+from evnlos.models import UNetConfig, Weights, published_setup, save_weights
+from evnlos.setups import load_setup
 from evnlos.types import Events
 
 ABOUT = {"height": 16, "width": 24, "scored_rows": 12, "tau_s": 0.05}
@@ -607,6 +609,9 @@ def test_headless_writes_video_and_table(event_weights: Path, tmp_path: Path, ca
     main([*call, "--speed", "2", "--rate", "40", "--json"])
     table = recorded(out, capsys)
     assert table["events"] == 3000 and table["modality"] == "event"
+    assert (
+        table["verdict"]["wall"] == "" and "single time steps" in table["verdict"]["recording"]
+    )  # no setup known
     assert 0 < table["recorded"] + table["not_recorded"] <= table["pictures"]
     assert table["latency_ms"]["network"]["p50"] > 0
     if video_kind() == "mp4":
@@ -663,6 +668,10 @@ def test_without_weights_published_ones_of_single_positions_are_taken(
         assert (
             table["weights"] == name and table["modality"] == name.partition("-")[2] and table["pictures"] > 0
         )
+        wall = verdict_on(load_setup(published_setup(name)), None).wall
+        assert (
+            wall and table["verdict"]["wall"] == wall
+        )  # what `identify` and `reconstruct` say of the same setup
     with pytest.raises(SystemExit) as stop:
         main(["live", str(tmp_path / "walk.raw"), "--weights", "near-event-sequence", "--headless"])
     assert stop.value.code == 2 and "near-event or near-frame, which come with" in capsys.readouterr().err
@@ -854,3 +863,7 @@ def test_a_run_with_a_page_shows_its_pictures(event_weights: Path, tmp_path: Pat
     assert b'"ended": true' in seen[-2]
     shown = capsys.readouterr()
     assert f"http://127.0.0.1:{port}/" in shown.err and "oldest new event to picture" in shown.out
+    state = json.loads(
+        next(line for line in reversed(seen) if b'"ended": true' in line).removeprefix(b"data: ")
+    )
+    assert len(state["verdict"]) == 2 and all(line in shown.out for line in state["verdict"])

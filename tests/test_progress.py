@@ -8,9 +8,11 @@ import time
 import numpy as np
 import pytest
 
+from evnlos.analysis import evaluate
 from evnlos.cli import main
 from evnlos.errors import ConfigError
 from evnlos.machine import ProgressBars, Step, show_progress
+from evnlos.models import UNetConfig, Weights
 
 
 @pytest.fixture(autouse=True)
@@ -149,6 +151,24 @@ def test_networks_at_work_are_told_with_their_epochs(tmp_path) -> None:
     part, text = _epochs_at_work(runs)
     assert part == 0.5
     assert text == "half epoch 3/4, new epoch 1/4"
+
+
+def test_invert_tells_its_captures_and_its_solvers(tiny_captures, tmp_path, capsys) -> None:
+    words = ["invert", str(tiny_captures[0]), "--setup", "main-near", "--cells", "8", "--columns", "16"]
+    for more, told in (
+        (["--positions", "2"], "invert: 0 of 1 motions"),
+        (["--from", "frames"], "invert: 0 of 1"),
+    ):
+        main([*words, *more, "--progress", "lines", "--out", str(tmp_path / "i.png")])
+        assert told in capsys.readouterr().err
+
+
+def test_evaluate_tells_its_stages(tiny_dataset) -> None:
+    network = UNetConfig(width=4, depth=1, rank=0).build("frame", tiny_dataset.sampling)
+    steps: list[Step] = []
+    evaluate(Weights(network), tiny_dataset, "all", progress=steps.append)
+    assert [one.done for one in steps] == [0, 1, 2, 3] and {one.total for one in steps} == {3}
+    assert [one.within for one in steps][1:3] == ["scores and baselines", "confidence"]
 
 
 def test_a_result_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys) -> None:

@@ -21,6 +21,7 @@ from evnlos.analysis.scores import CHARACTERS, Perceptual, Scores, read_characte
 from evnlos.config import to_dict
 from evnlos.data import Dataset, Modality, NlosDataset, Sampling, character_of, read_shard, read_shard_index
 from evnlos.errors import DataError
+from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
 from evnlos.models import Weights, on_target_plane
 from evnlos.models.confidence import SIDE, on_canvas
@@ -232,6 +233,7 @@ def evaluate(
     split: str = "test",
     perceptual: Perceptual | None = None,
     setup: Setup | None = None,
+    progress: Progress = silent,
 ) -> Evaluation:
     """Reconstruct a split of a dataset and score it.
 
@@ -244,20 +246,26 @@ def evaluate(
         perceptual: LPIPS, where its weights are at hand.
         setup: The calibrated setup that the confidence asks how much of the frames the pictures explain;
             weights of events alone see no frames, and are not asked.
+        progress: Called as each of three stages begins and as the last has ended.
 
     Raises:
         DataError: The split is empty, or its samples were made in another way than those of the training.
     """
     check_sampling(weights, dataset.sampling)
     samples = NlosDataset(dataset, split, weights.modality)
+    progress(Step("evaluate", 0, 3, "stages", within=f"reconstruct {len(samples)} images"))
     images = weights.network.infer(samples.inputs, samples.position_m, samples.names)
+    progress(Step("evaluate", 1, 3, "stages", within="scores and baselines"))
     found = assess(images, samples, dataset, split, weights.mean_image, perceptual)
+    progress(Step("evaluate", 2, 3, "stages", within="confidence"))
     if weights.confidence is None or np.isnan(samples.position_m).any():
+        progress(Step("evaluate", 3, 3, "stages"))
         return found
     canvas = dataset.sampling.canvas
     checks_frames = setup is not None and "frame" in weights.modality.slices
     operator = FrameOperator(setup, dataset.sampling) if setup is not None and checks_frames else None
     confidence_checks = check_confidence(weights.network, weights.confidence, samples, images, canvas, operator)
+    progress(Step("evaluate", 3, 3, "stages"))
     return replace(found, confidence_checks=confidence_checks)
 
 

@@ -27,6 +27,7 @@ from evnlos.analysis.confidence import (
 from evnlos.analysis.evaluate import check_sampling, reconstruct
 from evnlos.data import Capture, Dataset, FixedPattern, NlosDataset, Samples, capture_samples, read_capture
 from evnlos.errors import ConfigError, DataError
+from evnlos.machine import Progress, counted, silent
 from evnlos.metrics import psnr
 from evnlos.models import ConfidenceReport, Weights, load_weights, published_setup, published_single
 from evnlos.setups import Setup, load_setup
@@ -296,7 +297,11 @@ class PositionsPoint:
 
 @torch.inference_mode()
 def curve_over_positions(
-    weights: Weights, dataset: Dataset, split: str = "test", counts: tuple[int, ...] = (1, 2, 5, 10, 20, 40)
+    weights: Weights,
+    dataset: Dataset,
+    split: str = "test",
+    counts: tuple[int, ...] = (1, 2, 5, 10, 20, 40),
+    progress: Progress = silent,
 ) -> list[PositionsPoint]:
     """Reconstruct each sequence from some of its positions and score the picture at all of them.
 
@@ -309,6 +314,7 @@ def curve_over_positions(
         dataset: Where the samples are.
         split: "train", "validation", "test" or "all".
         counts: Numbers of positions, each from 1 to the positions of a sequence.
+        progress: Called after each of the numbers.
 
     Raises:
         DataError: The network sees single time steps, the motion of an object is unknown, a count is more than
@@ -330,7 +336,7 @@ def curve_over_positions(
     network.eval()
     rows = dataset.sampling.scored
     found = []
-    for count, parts_of in chosen.items():
+    for count, parts_of in counted(chosen.items(), progress, "positions", len(chosen), "numbers of them"):
         means = {}
         for name, mine in sequences.items():
             places = torch.from_numpy(samples.position_m[mine].astype(np.float32))

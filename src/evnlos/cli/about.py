@@ -214,6 +214,12 @@ def script(shell: Shell) -> str:
     return printed.getvalue().replace("complete -F ", "complete -o default -F ")
 
 
+_HERE = {
+    "captures": "; evnlos lab --set near --out captures renders a set whose checksums the package holds",
+    "weights": "; the package evnlos-weights brings them (evnlos weights lists what is there)",
+}
+
+
 @dataclass(frozen=True)
 class FetchCommand:
     """Get published captures, weights or examples: each file is checked against its listed SHA-256."""
@@ -294,7 +300,7 @@ class FetchCommand:
         if not addresses:
             raise ConfigError(
                 f"no address of published {self.kind} is known; give --address, or set {ADDRESS_VARIABLE} to a "
-                "URL or a folder"
+                f"URL or a folder{_HERE.get(self.kind, '')}"
             )
         for address in addresses:
             try:

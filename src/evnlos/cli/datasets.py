@@ -35,7 +35,7 @@ from evnlos.data import (
     randomized,
     simulate,
 )
-from evnlos.data.lab import Lab, lab_of, render_captures
+from evnlos.data.lab import Lab, compare_published, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
 from evnlos.data.simulations import PRESETS, estimate, find_faults, repair
 from evnlos.data.store import PAGE
@@ -151,6 +151,9 @@ class LabCommand:
     one-sided, curved, brushed, streaks, torch: outside the simulator's model), a settings file, or a folder
     that `evnlos calibrate` wrote; by default main-near. A name but a room's leaves light and cameras to the
     lab."""
+    set: Literal["near", "far"] | None = None
+    """A published set: 36 captures each, whose settings, seed and checksums the package holds. What is rendered
+    is compared with them. Beside it only --glyphs.characters counts."""
     config: Path | None = None
     """YAML file with settings of the laboratory."""
     workers: int = 1
@@ -165,14 +168,20 @@ class LabCommand:
         return lab_of(word, settings)
 
     def run(self) -> None:
-        """Render, with a progress bar over the captures."""
-        for note in self.settings.glyphs.notes():
+        """Render, with a progress bar over the captures; compare a published set with its checksums."""
+        lab, record = self.settings, "lab.yaml"
+        if self.set is not None:
+            lab, record = published_lab(self.set, lab), f"{self.set}.lab.yaml"
+        for note in lab.glyphs.notes():
             say(note)
         with ProgressBars() as progress:
-            rendered = render_captures(
-                self.settings, self.out, workers=self.workers, progress=progress, force=self.force
-            )
-        print(f"{self.out}: {len(rendered)} captures; settings and the drawn sensor in {self.out / 'lab.yaml'}")
+            rendered = render_captures(lab, self.out, None, self.workers, progress, self.force, record)
+            differing = compare_published(self.set, rendered, progress) if self.set else {}
+        print(f"{self.out}: {len(rendered)} captures; settings and the drawn sensor in {self.out / record}")
+        if self.set is not None:
+            print(f"{len(rendered) - len(differing)} of them have the published SHA-256")
+        for name, text in differing.items():
+            say(f"note: {name}: {text}; another processor or library rounds otherwise")
 
 
 @dataclass(frozen=True)
@@ -219,14 +228,8 @@ class CaptureCommand:
             cure = f"did you mean {near[0]}?" if near else f"give one of {', '.join(CAMERAS)}"
             camera = "no --camera" if self.camera is None else f"--camera {self.camera!r} is not known"
             raise ConfigError(f"{camera}; {cure}, or --width and --height of its sensor")
-        name, columns, rows, events, frames = known or (
-            self.camera or "my camera",
-            0,
-            0,
-            "events.raw",
-            "frames",
-        )
-        folder = self.folders[0]
+        name, columns, rows, events, frames = known or ("", 0, 0, "events.raw", "frames")
+        name, folder = name or self.camera or "my camera", self.folders[0]
         path = begin_capture(folder, self.width or columns, self.height or rows, name, events, frames)
         print(f"{path}: edit it, put the recordings beside it, then: evnlos capture check {folder}")
 

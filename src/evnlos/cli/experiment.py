@@ -12,7 +12,7 @@ import json
 import os
 import sys
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -283,6 +283,12 @@ class AppCommand:
         os._exit(0)
 
 
+_LIVE_CONFIDENCE = (
+    "no confidence: live images are of single time steps; record the sequence (evnlos capture record), then "
+    "evnlos reconstruct tells what it supports"
+)
+
+
 @dataclass(frozen=True)
 class LiveCommand:
     """Reconstruct while events come in: a replay, a file that grows, a camera, or a stream."""
@@ -313,11 +319,13 @@ class LiveCommand:
         """Show or record pictures until the source ends, and print how quick they were."""
         import torch
 
+        from evnlos.analysis.identify import verdict_on
+        from evnlos.analysis.model import load_model
         from evnlos.data import load_pattern
         from evnlos.live.display import Page, Recorder, check_folder
         from evnlos.live.engine import Engine
         from evnlos.live.run import latency_table
-        from evnlos.models import load_weights, published_for
+        from evnlos.models import published_for
 
         if self.threads < 1:
             raise ConfigError(f"threads is {self.threads}; give at least 1")
@@ -326,23 +334,28 @@ class LiveCommand:
         if out is not None:
             check_folder(out)
         name = self.weights
-        weights = None if name is None else load_weights(name)
+        model = None if name is None else load_model(name)
         pattern = load_pattern(self.pattern) if self.pattern else None
         source = open_live(self.source, self.listening, pattern)
         recorder = None
         try:
             with ExitStack() as stack:
-                if weights is None:
+                if model is None:
                     modality = "frame" if source.has_frames else "event"
                     name = published_for(None, modality, is_motion_known=False)
-                    weights = load_weights(name)
+                    model = load_model(name)
                     say(f"{name} makes the pictures: weights of the package, for its own setup; see --weights")
-                engine = Engine(weights)
+                engine = Engine(model.weights)
+                verdict = verdict_on(model.known_setup(), None, _LIVE_CONFIDENCE)
                 run = Run(source, engine, self.pace)
                 sinks = []
                 if not self.headless:
                     page = stack.enter_context(
-                        Page(run.statistics.now, self.port, f"{source.name}, {engine.modality.name}")
+                        Page(
+                            lambda: run.statistics.now() | {"verdict": verdict.lines},
+                            self.port,
+                            f"{source.name}, {engine.modality.name}",
+                        )
                     )
                     sinks.append(page)
                     say(f"{page.url} shows the pictures; Ctrl-C ends")
@@ -354,7 +367,11 @@ class LiveCommand:
                 run.go(sinks)
         finally:
             source.close()
-        summary = run.statistics.summary() | {"weights": str(name), "modality": engine.modality.name}
+        summary = run.statistics.summary() | {
+            "weights": str(name),
+            "modality": engine.modality.name,
+            "verdict": asdict(verdict),
+        }
         if out is not None and recorder is not None:
             summary |= {"recorded": recorder.recorded, "not_recorded": recorder.left_out}
             out.mkdir(parents=True, exist_ok=True)
@@ -362,7 +379,7 @@ class LiveCommand:
         if self.json:
             print(json.dumps(summary | {"out": None if out is None else str(out)}))
             return
-        print(latency_table(summary))
+        print("\n".join([*verdict.lines, latency_table(summary)]))
         if recorder is not None:
             video = f"{recorder.path.name} ({recorder.recorded} pictures) and " if recorder.recorded else ""
             print(f"{out}: {video}latency.json")

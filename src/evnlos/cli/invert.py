@@ -16,6 +16,7 @@ import tyro
 from evnlos.cli.parsing import drawn, say
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
+from evnlos.machine import ProgressBars
 
 REGULARIZATION_TIKHONOV = 4.0  # best on eight characters of one setup, docs/inversion.md
 REGULARIZATION_TV = 0.3  # likewise
@@ -97,14 +98,23 @@ class InvertCommand:
         photograph = read_photograph(self.files[0], self.emission_exponent)
         occluded = bool(photograph.occluders) and not self.no_occluder
         options = {"occluded": occluded, "bin": self.bin}
-        inversion = prepare_inversion(photograph, degree=self.background_degree, **options)
         names: list[Literal["tikhonov", "tv"]]
         names = ["tikhonov", "tv"] if self.solver == "all" else [self.solver]
-        solved = {name: inversion.solve(name, regularization, rule, self.noise_sigma) for name in names}
-        if self.solver == "all" and occluded:
-            options["occluded"] = False
-            control = prepare_inversion(photograph, degree=inversion.degree, **options)
-            solved["without occluder"] = control.solve("tikhonov", regularization, rule, self.noise_sigma)
+        controlled = self.solver == "all" and occluded
+        solved = {}
+        with ProgressBars() as progress:
+            with progress.stage("invert", "light path", 0, 1 + len(names) + controlled):
+                inversion = prepare_inversion(photograph, degree=self.background_degree, **options)
+            for done, name in enumerate(names, 1):
+                with progress.stage("invert", name, done, 1 + len(names) + controlled):
+                    solved[name] = inversion.solve(name, regularization, rule, self.noise_sigma)
+            if controlled:
+                options["occluded"] = False
+                with progress.stage("invert", "without occluder", 1 + len(names), 2 + len(names)):
+                    control = prepare_inversion(photograph, degree=inversion.degree, **options)
+                    solved["without occluder"] = control.solve(
+                        "tikhonov", regularization, rule, self.noise_sigma
+                    )
         found: dict[str, Any] = {
             "file": str(self.files[0]),
             "wall": list(inversion.operator.shape),
@@ -143,7 +153,8 @@ class InvertCommand:
         options = StillOptions(
             self.dark, solvers, regularization, rule, self.noise_sigma, self.background_degree, self.bin
         )
-        found, pictures = invert_stills(self.files, setup, options)
+        with ProgressBars() as progress, progress.stage("invert", f"{len(self.files)} pictures"):
+            found, pictures = invert_stills(self.files, setup, options)
         panels = [
             (f"{file.stem}, {name}", image[None])
             for name, images in pictures.items()
@@ -189,7 +200,8 @@ class InvertCommand:
             self.static,
             self.subsets,
         )
-        found, pictures = invert_captures(self.files, options)
+        with ProgressBars() as progress:
+            found, pictures = invert_captures(self.files, options, progress)
         most = max(row["positions"] for row in found["rows"])
         best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
         panels = [(name, image[None]) for name, image in best.items()]
@@ -207,7 +219,8 @@ class InvertCommand:
             raise ConfigError(
                 "--from takes whole sequences of known motion; leave --positions, --track, --solver"
             )
-        found, pictures = estimate_captures(self.files, setup, evidence, self.pattern)
+        with ProgressBars() as progress:
+            found, pictures = estimate_captures(self.files, setup, evidence, self.pattern, progress)
         for doubt in sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
         panels = [(name, image[None]) for name, image in pictures.items()]

@@ -40,6 +40,7 @@ from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
 from evnlos.inverse.tikhonov import Rule
+from evnlos.machine import Progress, Step, counted, silent
 from evnlos.metrics import psnr
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
@@ -81,12 +82,12 @@ def linear_setup(word: Path | str) -> Setup:
 
 
 def invert_captures(
-    folders: Sequence[Path], options: SequenceOptions
+    folders: Sequence[Path], options: SequenceOptions, progress: Progress = silent
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and the targets [cells, cells] by name, of every capture and solver."""
     clock = time.perf_counter()
     setup = linear_setup(options.setup)
-    captures = [read_capture(folder) for folder in folders]
+    captures = [read_capture(one) for one in counted(folders, progress, "read", len(folders), "captures")]
     pattern = pattern_of(options.setup, options.pattern)
     height, width = captures[0].frames.shape[1:]
     if any(capture.frames.shape != captures[0].frames.shape for capture in captures):
@@ -98,7 +99,9 @@ def invert_captures(
     light = torch.stack([object_light(c.frames[1:], c.peak, setup, shape, pattern) for c in captures])
     pictures: dict[str, torch.Tensor] = {}
     rows: list[dict[str, Any]] = []
-    for motion, members in _by_motion(captures, options, setup):
+    groups = _by_motion(captures, options, setup, progress)
+    total = len(groups)
+    for done, (motion, members) in enumerate(counted(groups, progress, "invert", total, "motions")):
         size = _target_size_m(captures[members[0]], _is_tracked(captures[members[0]], options))
         target_plane = Plane(options.cells, options.cells, size / options.cells)
         transport = matrix_of(setup.resized((height, width)).operator(strip_of(motion, target_plane), shape))
@@ -110,6 +113,7 @@ def invert_captures(
                 )
                 images = light[members][:, chosen]
                 for solver in options.solvers:
+                    progress(Step("invert", done, total, "motions", within=f"{solver}, {count} positions"))
                     found = _solve(problem, images, solver, options.regularization[solver])
                     for member, image in zip(members, found, strict=True):
                         name = captures[member].name
@@ -135,7 +139,7 @@ def _solve(problem: SequenceProblem, images: torch.Tensor, solver: str, factor: 
 
 
 def _by_motion(
-    captures: Sequence[Capture], options: SequenceOptions, setup: Setup
+    captures: Sequence[Capture], options: SequenceOptions, setup: Setup, progress: Progress
 ) -> list[tuple[NDArray[np.float64], list[int]]]:
     """Return each motion [N, 2], metres, of frames 1..N with the captures that share it."""
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
@@ -143,6 +147,7 @@ def _by_motion(
         if _is_tracked(capture, options):
             from evnlos.tracking import track_capture, track_warnings
 
+            progress(Step("track", k, len(captures), "captures", within=capture.name))
             found = track_capture(capture, setup)
             for warning in track_warnings(capture, setup, found):
                 say(f"warning: {capture.name}: {warning}")
@@ -280,7 +285,11 @@ _FURTHEST = 0.15  # of fitted thresholds from the setup's, relative
 
 
 def estimate_captures(
-    folders: Sequence[Path], word: Path, evidence: Literal["frames", "events", "both"], pattern: Path | None
+    folders: Sequence[Path],
+    word: Path,
+    evidence: Literal["frames", "events", "both"],
+    pattern: Path | None,
+    progress: Progress = silent,
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and of each capture the target [cells, cells] and its standard deviation, by name.
 
@@ -289,6 +298,7 @@ def estimate_captures(
         word: Their setup.
         evidence: What the likelihood is made of.
         pattern: Fixed pattern of the frame camera; without it an offset of each pixel is integrated out.
+        progress: Called as each capture is done.
 
     Raises:
         ConfigError: The setup is not linear, its event model states no law, or a motion is unknown.
@@ -297,7 +307,7 @@ def estimate_captures(
     known = None if pattern is None else load_pattern(pattern)
     lights: dict[Any, Any] = {}
     rows, pictures = [], {}
-    for folder in folders:
+    for folder in counted(folders, progress, "invert", len(folders), "captures"):
         capture = read_capture(folder)
         motion = capture.motion
         if motion is None:

@@ -180,10 +180,12 @@ class EvaluateCommand:
         split = self.split or ("test" if dataset.split.get("test") else "all")
         refuse_seen(weights.history, dataset, split)
         metric = load_lpips(self.vgg, self.lpips_heads) if self.vgg or self.lpips_heads else available_lpips()
-        curve = curve_over_positions(weights, dataset, split, self.positions) if self.positions else []
         word = calibrated_folder(self.setup) if self.setup else published_setup(self.weights)
-        known = load_setup(word) if word else None
-        found = evaluate(weights, dataset, split, metric, known).summary()
+        known, curve = load_setup(word) if word else None, []
+        with ProgressBars() as progress:
+            if self.positions:
+                curve = curve_over_positions(weights, dataset, split, self.positions, progress)
+            found = evaluate(weights, dataset, split, metric, known, progress).summary()
         about = {
             "weights": str(self.weights),
             "modality": weights.modality.name,

@@ -1,10 +1,12 @@
 """Synthetic captures of a rendered laboratory, whose sensor is drawn from ranges of its own.
 
 - Pseudo-real captures: recordings that the training simulator did not make, for people without a camera.
+- Published sets of them, by name, whose content is known by its SHA-256.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -14,8 +16,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from evnlos.cameras import EventPixel, FrameCamera
+from evnlos.cameras import EventPixel, FrameCamera, V2ePixel
 from evnlos.config import check_made, differing_keys, from_dict, read_yaml, save_yaml, to_dict
+from evnlos.data.capture import Capture, read_capture
 from evnlos.data.pool import processes, run_tasks
 from evnlos.data.simulate import check_ranges, check_sequences, sequence_bytes, varied
 from evnlos.errors import ConfigError, DataError
@@ -23,10 +26,15 @@ from evnlos.events import write_events
 from evnlos.files import new_folder
 from evnlos.machine import Progress, Step, silent
 from evnlos.registry import __version__
-from evnlos.scene import FontGlyphs, Glyphs, LineMotion, Scene
+from evnlos.scene import FontGlyphs, Glyphs, LineMotion, Scene, find_font
 from evnlos.setups import RadiometricSetup, Setup, named_setup, setup_preset
 from evnlos.setups.load import is_name
 from evnlos.types import derive_seed
+
+PUBLISHED = Path(__file__).with_name("published_captures.yaml")
+"""For each published set: character -> SHA-256 of its capture's content, and its number of events."""
+_PUBLISHED_GAIN = {"near": 1.7, "far": 1.0}  # white levels of the brightest pixel
+_ROUNDING = 0.01  # share of the events by which processors and versions of libraries may differ
 
 SENSOR_SPREAD: dict[str, tuple[float, float]] = {
     "setup.pixel.threshold_on": (0.18, 0.28),
@@ -167,6 +175,87 @@ def lab_of(word: str | Path, lab: Lab | None = None) -> Lab:
     return replace(lab, name=name, setup=in_the_lab(setup))
 
 
+def published_lab(name: str, asked: Lab | None = None) -> Lab:
+    """Return the lab of a published set of 36 captures, "near" (0.30 m) or "far" (0.50 m).
+
+    Wall, geometry and light are those that the calibration of the documentation's recordings found, in round
+    numbers. The sensor is v2e's pixel in steps of 4 ms, with a camera whose pattern is fixed.
+
+    Args:
+        name: Name of the set.
+        asked: The default lab, with the characters to render where they are not all.
+
+    Raises:
+        ConfigError: There is no set of this name, or `asked` differs in more than its characters.
+        MissingDependencyError: The font (of `evnlos[fonts]`) is not installed.
+    """
+    if name not in _PUBLISHED_GAIN:
+        raise ConfigError(f"there is no published set {name!r}; give one of {', '.join(_PUBLISHED_GAIN)}")
+    characters = getattr((asked or Lab()).glyphs, "characters", "")
+    if asked is not None and asked != replace(Lab(), glyphs=FontGlyphs(characters=characters)):
+        raise ConfigError(f"the set {name!r} states all settings; give --glyphs.characters beside it at most")
+    glyphs = FontGlyphs(family="Nunito Bold", characters=characters)
+    find_font(glyphs.family, strict=True)
+    setup = replace(
+        setup_preset(f"main-{name}"),
+        gain=_PUBLISHED_GAIN[name],
+        ambient=0.055,
+        ambient_gradient=(0.1, 0.0),
+        frame_camera=FrameCamera(0.016, 10_000.0, 12.0, prnu=0.02, dsnu_e=10.0, pattern_seed=28),
+        pixel=V2ePixel(0.19, 0.22, 0.04, 40.0, 0.02, 0.3, 1e-3, pattern_seed=28),
+        time_step_s=0.004,
+    )
+    return Lab(name=name, glyphs=glyphs, setup=setup, spread={}, seed=28)
+
+
+def content_digest(capture: Capture) -> str:
+    """Return the SHA-256 of what a capture holds: events, frames and their times, and the target's mask.
+
+    How the files are packed has no part in it, nor has `capture.yaml`.
+    """
+    found, events = hashlib.sha256(), capture.events
+    mask = b"" if capture.target is None else np.round(capture.target.mask * 255).astype(np.uint8)
+    for values in (
+        np.asarray(events.t_us, "<i8"),
+        np.asarray(events.x, "<u2"),
+        np.asarray(events.y, "<u2"),
+        np.asarray(events.p, np.uint8),
+        np.asarray(capture.frame_times_us, "<i8"),
+        capture.frames,
+        mask,
+    ):
+        found.update(np.ascontiguousarray(values).tobytes() if isinstance(values, np.ndarray) else values)
+    return found.hexdigest()
+
+
+def compare_published(name: str, folders: list[Path], progress: Progress = silent) -> dict[str, str]:
+    """Compare captures with the published ones, and return what differs, a line for each capture that does.
+
+    Args:
+        name: Set, as for `published_lab`.
+        folders: Capture folders of the set.
+        progress: Called as each is read.
+
+    Raises:
+        DataError: A capture is another one: its number of events is more than a hundredth off.
+    """
+    listed, differing = read_yaml(PUBLISHED)[name], dict[str, str]()
+    for done, folder in enumerate(folders):
+        progress(Step(f"compare {name}", done, len(folders), "captures", folder))
+        digest, events = listed[folder.name.removeprefix(f"{name}_")]
+        capture = read_capture(folder)
+        count = len(capture.events)
+        if abs(count - events) > _ROUNDING * events:
+            raise DataError(
+                f"{folder} holds {count:,} events, the published one {events:,}; it is another capture: "
+                "delete it and render it again"
+            )
+        if content_digest(capture) != digest:
+            differing[folder.name] = f"{count:,} events, published {events:,}"
+    progress(Step(f"compare {name}", len(folders), len(folders), "captures"))
+    return differing
+
+
 def render_captures(
     lab: Lab,
     out: str | Path,
@@ -174,6 +263,7 @@ def render_captures(
     workers: int = 1,
     progress: Progress = silent,
     force: bool = False,
+    record: str = "lab.yaml",
 ) -> list[Path]:
     """Render one capture folder per object, and `lab.yaml` beside them.
 
@@ -187,6 +277,7 @@ def render_captures(
         workers: Processes; 0 means one for each core.
         progress: Called when the work begins and as each capture is in place, with its folder.
         force: Whether to begin although the machine's memory will hardly do.
+        record: Name of the file with the settings; labs whose files have different names share a folder.
 
     Returns:
         The capture folders, in the order of `names`.
@@ -215,7 +306,7 @@ def render_captures(
     if names:
         drawn.setup.resized(_SKETCH).observe(_scene(drawn, names[0]))
     out.mkdir(parents=True, exist_ok=True)
-    _record(lab, drawn, out)
+    _record(lab, drawn, out / record)
     missing = [(drawn, name, folder) for name, folder in folders.items() if not folder.is_dir()]
     what, total, there = f"render {out.name}", len(folders), len(folders) - len(missing)
     progress(Step(what, there, total, "captures"))
@@ -225,9 +316,9 @@ def render_captures(
     return list(folders.values())
 
 
-def _record(lab: Lab, drawn: Lab, out: Path) -> None:
-    """Write `lab.yaml`, or refuse a folder that was begun with other settings."""
-    path, asked = out / "lab.yaml", to_dict(lab)
+def _record(lab: Lab, drawn: Lab, path: Path) -> None:
+    """Write the settings, or refuse a folder that was begun with other ones."""
+    asked = to_dict(lab)
     if path.is_file():
         before = read_yaml(path).get("lab")
         differing = ["lab: missing"]
@@ -236,7 +327,7 @@ def _record(lab: Lab, drawn: Lab, out: Path) -> None:
         differing = [line for line in differing if not line.startswith("glyphs.characters:")]
         if differing:
             raise DataError(
-                f"{out} was begun with other settings ({'; '.join(differing[:3])}); give another folder"
+                f"{path.parent} was begun with other settings ({'; '.join(differing[:3])}); give another folder"
             )
     sensor = {"pixel": to_dict(drawn.setup.pixel), "frame_camera": to_dict(drawn.setup.frame_camera)}
     save_yaml({"evnlos": __version__, "lab": asked, "drawn": sensor}, path)
