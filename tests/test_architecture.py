@@ -108,6 +108,7 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/torch_v2e.py",
     "inverse/corner.py",
     "lab/light_path.py",
+    "models/sequence.py",
     "optics/corner.py",
     "optics/facets.py",
     "optics/radiometric.py",

@@ -11,10 +11,15 @@ from evnlos import EvnlosError, evaluate, train
 from evnlos.analysis import StreamingReconstructor, curve_over_positions
 from evnlos.analysis.model import choices
 from evnlos.cli import main
-from evnlos.data import NlosDataset, Sampling, as_modality
+from evnlos.config import save_yaml, to_dict
+from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse import SequenceOperator
 from evnlos.models import SequenceConfig, SequenceReconstructor, UNetConfig, aligned_mean, load_weights
-from evnlos.scene import FontGlyphs
+from evnlos.models.sequence import PooledFrames
+from evnlos.optics import MatrixTransport
+from evnlos.scene import FontGlyphs, HandwritingGlyphs
+from evnlos.setups import RadiometricSetup
 from evnlos.training import Training
 from evnlos.types import Plane
 from watching import stopped
@@ -196,3 +201,93 @@ def test_what_a_joint_network_cannot_do_is_said(trained, tiny_dataset) -> None:
         StreamingReconstructor(weights)
     with pytest.raises(ConfigError, match="rank"):
         replace(NET, rank=0)
+
+
+SOLVING = replace(NET, frames="likelihood", prior_weights=(0.3, 3.0))
+
+
+def test_frames_are_solved_as_one_gaussian_posterior() -> None:
+    """Against all rows of all frames at once, with the offset in a dense covariance."""
+    torch.manual_seed(0)
+    solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5, 4.0))
+    for name, buffer in solver.named_buffers():
+        buffer.copy_(torch.randn_like(buffer) * {"basis": 0.3, "patterns": 0.3}.get(name, 0.1))
+    solver.static.copy_(2.0 * torch.rand(len(solver.static)))
+    solver.reach.copy_(torch.tensor([[-0.06, -0.01], [0.06, 0.01]]))
+    places = torch.stack([torch.linspace(-0.05, 0.05, 5), 0.1 * torch.linspace(-0.05, 0.05, 5)], dim=1)
+    frames, kept = torch.rand(5, 24, 36), torch.tensor([[1.0, 1, 1, 1, 1], [1, 0, 1, 0, 0]])
+    found = solver(frames, places, kept)
+
+    light = solver.light.double()
+    away = (frames - solver.ambient).flatten(1).double() @ solver.basis.double()
+    carrier = MatrixTransport(light.flatten(1), solver.sampling.canvas, (1, len(light)))
+    drawn = SequenceOperator(carrier, solver.target_plane, places.double().numpy()).drawn
+    seen = torch.stack([torch.einsum("thw,rhw->tr", drawn(p), light) for p in solver.patterns.double()], dim=2)
+    x, y = places[:, :1].double() / 0.06, places[:, 1:].double() / 0.01
+    along = torch.cat([x**0, x, x**2, x**3, y, x * y, y**2], dim=1) @ solver.along.double()
+    away = away - along - torch.einsum("thw,rhw->tr", drawn(solver.mean.double()), light)
+    for some, images in zip(kept.bool(), found, strict=True):
+        rows, data = seen[some].flatten(0, 1), away[some].flatten()
+        count = int(some.sum())
+        offset = torch.ones(count, count, dtype=torch.float64)
+        covariance = torch.eye(len(rows), dtype=torch.float64)
+        covariance += torch.kron(offset, torch.diag(solver.static.double()))
+        pushed = torch.linalg.solve(covariance, torch.cat([rows, data[:, None]], dim=1))
+        for weight, image in zip(solver.weights, images, strict=True):
+            normal = rows.T @ pushed[:, :-1] + weight * torch.eye(rows.shape[1], dtype=torch.float64)
+            z = torch.linalg.solve(normal, rows.T @ pushed[:, -1])
+            expected = solver.mean + torch.tensordot(z, solver.patterns.double(), dims=1)
+            torch.testing.assert_close(image.double(), expected, rtol=1e-3, atol=1e-3 * float(expected.std()))
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory):
+    """A simulation whose samples name the file of its setup."""
+    folder = tmp_path_factory.mktemp("solved")
+    setup = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72))
+    save_yaml(to_dict(setup), folder / "setup.yaml")
+    sampling = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24, setup=str(folder / "setup.yaml"))
+    config = Simulation(
+        glyphs=HandwritingGlyphs(characters="ABCEFHLT", writers=2),
+        setup=setup,
+        sampling=sampling,
+        positions=8,
+        validation=0.2,
+        vary={"setup.gain": (0.66, 0.74), "setup.ambient": (0.05, 0.07)},
+    )
+    return simulate(config, folder / "simulation"), folder / "run"
+
+
+def test_frames_solved_through_the_light_path_show_the_target(solved) -> None:
+    dataset, out = solved
+    plan = replace(PLAN, network=SOLVING)
+    weights = load_weights(train(dataset, plan, out).folder)
+    samples = NlosDataset(dataset, "validation", "frame")
+    network = weights.network
+    assert isinstance(network, SequenceReconstructor) and network.frames is not None
+    name = samples.names[0]
+    mine = torch.from_numpy(np.flatnonzero(samples.names == name))
+    places = torch.from_numpy(samples.position_m[mine])
+    plane = network.grid.mean(samples.truth[mine], places)
+    inputs = samples.inputs[mine].float()
+    pooled = network.pooled(inputs, places)
+    mean = network.grid.of_target(network.frames.mean, 0.08)
+    error, blind = ((image - plane).square().mean() for image in (pooled[0], mean))
+    assert error < 0.5 * blind
+    assert evaluate(weights, dataset, "train").scores.mean()["psnr_db"] > 12
+
+    def change() -> float:
+        """Return what ambient light that was not foreseen changes."""
+        light, brighter = (network.pooled(inputs + more, places)[0] for more in (0.0, 0.01))
+        return float((brighter - light).square().mean())
+
+    known = change()
+    network.frames.static.zero_()
+    assert known < 0.2 * change()
+
+
+def test_frames_are_not_solved_without_a_setup(tiny_dataset, tmp_path) -> None:
+    with pytest.raises(ConfigError, match="setup is empty"):
+        train(tiny_dataset, replace(PLAN, network=SOLVING), tmp_path / "run")
+    with pytest.raises(ConfigError, match="prior_weights is"):
+        replace(SOLVING, prior_weights=(0.0,))

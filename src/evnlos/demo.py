@@ -176,13 +176,14 @@ def _study(settings: Demo, test: list[str]) -> Study:
     """Return the comparison of E2E and EPNP, with one seed."""
     single = Training(network=UNetConfig(width=settings.width), epochs=settings.single_epochs)
     network = replace(SEQUENCE_NETWORK, width=settings.width)
-    plan = Training(batch_size=16, network=network)
+    alone = Training(epochs=settings.e2e_epochs, batch_size=16, network=network)
+    solving = replace(network, frames="likelihood") if settings.calibrate else network
+    plan = Training(batch_size=16, network=solving)
     before = anew = replace(plan, epochs=settings.pretrain_epochs or 8, sequence_augmentations=2)
     if settings.start:  # trained layers need less time and smaller steps; validation characters chose both
         before = replace(anew, epochs=settings.pretrain_epochs or 4, learning_rate=1e-3, refit_embedding=True)
     # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
     after = replace(plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True)
-    alone = replace(plan, epochs=settings.e2e_epochs)
     source = "calibrated" if settings.calibrate else "uncalibrated"
     alone_sees = Sampling(surface="hots", radius=1)  # of the time surfaces, validation characters chose it
     sees = Sampling(surface="likelihood") if settings.calibrate else alone_sees

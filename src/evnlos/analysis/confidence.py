@@ -20,6 +20,7 @@ from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.models import Confidence, ConfidenceReport, Reconstructor, Weights, halves_of, on_target_plane
 from evnlos.models.confidence import on_canvas
+from evnlos.models.sequence import canvas_matrix
 from evnlos.setups import Setup
 from evnlos.types import Plane
 
@@ -45,7 +46,7 @@ class FrameOperator:
 
     def __init__(self, setup: Setup, sampling: Sampling) -> None:
         self.size = (sampling.height, sampling.width)
-        self.matrix, source = _matrix(setup, sampling)
+        self.matrix, source = canvas_matrix(setup, sampling)
         self.ambient = torch.from_numpy(reduce_by_area(setup.ambient_light().numpy(), self.size)).flatten()
         first = (sampling.height - source.height) // 2
         self.rows = slice(first, first + source.height)
@@ -106,18 +107,6 @@ def consistent(
     move = (spread * found.image.squeeze(-2)).unflatten(1, (-1, pictures.shape[2]))
     moved[:, operator.rows] += move
     return moved.clamp(0, 1)
-
-
-def _matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
-    """Return the matrix from canvas cells to sample pixels, and the cells: rows that the target reaches."""
-    cells, height = setup.target_cells(), sampling.height
-    if cells is not None:
-        height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
-    plane = Plane(height, sampling.width, sampling.pitch_m)
-    matrix = setup.operator(plane, dtype=torch.float32).dense(torch.float32)
-    images = matrix.T.reshape(-1, *setup.shape).numpy()
-    small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(len(images), -1)
-    return torch.from_numpy(small).T.contiguous(), plane
 
 
 _BEYOND_NOISE = 0.05

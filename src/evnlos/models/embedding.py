@@ -194,7 +194,7 @@ class LinearEmbeddings(nn.Module):
 
     One regression on all would mix them by their noise in the samples that it was fitted to; apart, the
     network behind weighs them, image by image and place by place. A map that shows the target already (the
-    surface `likelihood`) stays as it is.
+    surface `likelihood`) stays as it is, and one that is undone elsewhere gives no image.
 
     Args:
         modality: What is seen; each of its G groups has an embedding.
@@ -202,6 +202,7 @@ class LinearEmbeddings(nn.Module):
         rank: Most components of all groups together, at least one for each.
         ridge_multipliers: As in `LinearEmbedding`.
         solved: Name of a map that shows the target already; groups of it alone are not embedded.
+        left_out: Name of a map that is undone elsewhere; groups of it alone give no image.
 
     Raises:
         ConfigError: The rank is less than the number of groups.
@@ -214,10 +215,12 @@ class LinearEmbeddings(nn.Module):
         rank: int,
         ridge_multipliers: tuple[float, ...],
         solved: str = "",
+        left_out: str = "",
     ) -> None:
         super().__init__()
         self.modality = modality
-        embedded = [group for group in modality.groups if group.maps != (solved,)]
+        self._shown = [group for group in modality.groups if group.maps != (left_out,)]
+        embedded = [group for group in self._shown if group.maps != (solved,)]
         ranks = dict(zip(modality.layout, modality.ranks(rank), strict=True))
         self.groups = nn.ModuleDict(
             {
@@ -226,8 +229,9 @@ class LinearEmbeddings(nn.Module):
             }
         )
         self.shape = (modality.channels, *size)
-        self.images = modality.channels + sum(
-            part.images - group.channels for group, (_, part) in zip(embedded, self._parts, strict=True)
+        self.images = sum(
+            self.groups[group.name].images if group in embedded else group.channels  # type: ignore[misc]
+            for group in self._shown
         )
 
     @property
@@ -272,9 +276,10 @@ class LinearEmbeddings(nn.Module):
         if tuple(x.shape[1:]) != self.shape:
             wanted = ", ".join(str(side) for side in self.shape)
             raise DataError(f"input is {tuple(x.shape)}; this network's embedding takes [B, {wanted}]")
+        slices, names = self.modality.slices, [group.name for group in self._shown]
         parts = [
-            self.groups[name](x[:, own]) if name in self.groups else x[:, own].float()
-            for name, own in self.modality.slices.items()
+            self.groups[name](x[:, slices[name]]) if name in self.groups else x[:, slices[name]].float()
+            for name in names
         ]
         return torch.cat(parts, dim=1)
 

@@ -1,10 +1,16 @@
-"""The reconstructor of whole sequences: all time steps seen from the target plane, pooled, one image of it."""
+"""The reconstructor of whole sequences: all time steps seen from the target plane, pooled, one image of it.
+
+- The target plane among the pixels of the canvas, and the way there and back.
+- What all frames of a sequence say of the target, through the light path of a setup: closed form.
+- The network behind what is pooled.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,11 +19,17 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_modality
+from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse.sequence_light import handwritten_prior
+from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.models.confidence import on_canvas
 from evnlos.models.embedding import InputNormalization, LinearEmbeddings, fit_input
 from evnlos.models.reconstructor import RECONSTRUCTORS, Drawn, Reconstructor
 from evnlos.models.unet import PARTS, ResidualUNet, UNetConfig
+from evnlos.optics import MatrixTransport
+from evnlos.scene import TargetPlane
+from evnlos.setups import Setup, load_setup
 from evnlos.types import Plane, derive_seed
 
 PLANE_M = 0.1
@@ -37,9 +49,19 @@ class SequenceConfig(UNetConfig):
 
     kind: str = "sequence"
     """Kind of the reconstructor."""
+    frames: Literal["embedding", "likelihood"] = "embedding"
+    """How frames become images of the target: the mean of the linear `embedding` of each, or the targets that
+    all frames together make most likely through the light path of the samples' setup (`likelihood`)."""
+    prior_weights: tuple[float, ...] = (0.1, 0.5, 2.0, 10.0)
+    """Weights of the prior over its own at which the frames are solved for the target, one image each; for
+    `likelihood`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.prior_weights or not all(0 < weight < np.inf for weight in self.prior_weights):
+            raise ConfigError(
+                f"SequenceConfig.prior_weights is {self.prior_weights}; give at least one, all above 0"
+            )
         if not self.rank:
             raise ConfigError(
                 "SequenceConfig.rank is 0; a sequence network pools its linear embedding: give a rank"
@@ -80,11 +102,18 @@ class TargetGrid:
             images: Images of the canvas.
             position_m: The plane's centre on the canvas at each, (x, y) in metres, [N, 2].
         """
-        place = self._place_m + position_m.float().cpu()[:, None, None]  # [N, P, P, 2]
-        grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
-        inside = (grid.abs() <= 1).all(dim=-1)  # [N, P, P]
+        grid, inside = self._grid(images, position_m)
         moved = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
         return moved * inside[:, None], inside
+
+    def inside(self, images: Tensor, position_m: Tensor) -> Tensor:
+        """Return which pixels of the plane lie on the canvas at each position, bool [N, P, P]."""
+        return self._grid(images, position_m)[1]
+
+    def _grid(self, images: Tensor, position_m: Tensor) -> tuple[Tensor, Tensor]:
+        place = self._place_m + position_m.float().cpu()[:, None, None]  # [N, P, P, 2]
+        grid = (place / (self._canvas_m / 2)).to(images.device)  # -1..1 from edge to edge
+        return grid, (grid.abs() <= 1).all(dim=-1)
 
     def mean(self, images: Tensor, position_m: Tensor) -> Tensor:
         """Return the plane [P, P] that images [N, H, W] of all positions show: their mean."""
@@ -99,6 +128,12 @@ class TargetGrid:
         canvas = self._canvas
         fine = Plane(canvas.height * FINER, canvas.width * FINER, canvas.pitch_m / FINER)
         return F.avg_pool2d(on_canvas(plane, fine, position_m, self._side_m), FINER)
+
+    def of_target(self, target: Tensor, size_m: float) -> Tensor:
+        """Return targets [..., h, h] of a side in metres as seen on the square, [..., P, P]; 0 beside them."""
+        places = (self._place_m / (size_m / 2)).to(target)[None]
+        images = target.reshape(1, -1, *target.shape[-2:])
+        return F.grid_sample(images, places, align_corners=False).reshape(*target.shape[:-2], *2 * [self.side])
 
 
 def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: Sampling) -> Tensor:
@@ -119,13 +154,213 @@ def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: 
     return found
 
 
+_COMPONENTS, _COEFFICIENTS, _CELLS_ACROSS = 200, 150, 32  # of light path, prior, target
+_FEWEST = 8  # objects to tell gain, offset and noise from
+_ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
+_RIDGE = 1e-6
+_AT_ONCE = 1024  # frames
+
+
+def canvas_matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
+    """Return the matrix of a setup from canvas cells to sample pixels, and the cells.
+
+    The cells are the rows of the canvas that the target reaches.
+
+    Args:
+        setup: A linear setup.
+        sampling: Size of samples and canvas.
+
+    Returns:
+        float32 [h w, cells], white levels per unit of brightness, and the plane of the cells.
+
+    Raises:
+        ConfigError: The setup is not linear.
+    """
+    cells, height = setup.target_cells(), sampling.height
+    if cells is not None:
+        height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
+    plane = Plane(height, sampling.width, sampling.pitch_m)
+    matrix = setup.operator(plane, dtype=torch.float32).dense(torch.float32)
+    images = matrix.T.reshape(-1, *setup.shape).numpy()
+    small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(len(images), -1)
+    return torch.from_numpy(small).T.contiguous(), plane
+
+
+class PooledFrames(nn.Module):
+    """All frames of a sequence solved for the target, [N, H, W] -> [S, P, P]: one linear-Gaussian estimate.
+
+    In the main components of the light path, in units of their noise, a frame k with the target at p_k is
+
+        c_k = B^T (y_k - ambient) = along(p_k) + A_k (m + V z) + offset + noise
+
+    with A_k the canvas seen from the target plane, m and V mean and patterns of a Gaussian prior over targets,
+    `along` the light of what moves with the target (a polynomial of its place), and an offset that is the same
+    in all frames of a sequence: ambient light that was not foreseen. With the offset integrated out, J = A V
+    and C what is left, the estimate at a weight w of the prior is
+
+        z_w = (sum_k J_k^T C^-1 J_k + w)^-1 sum_k J_k^T C^-1 (c_k - along - A_k m)
+
+    Light path and prior are those of the setup; the error of a component (noise, and how far the simulated
+    setups scatter), the scatter of the offset, and what moves along are taken from simulated samples. These
+    numbers are not trained by gradients, and need no setup any more once they are there.
+
+    Args:
+        sampling: Size of the maps and their pitch on the target's canvas.
+        prior_weights: Weights of the prior, one image each.
+    """
+
+    ambient: Tensor
+    basis: Tensor
+    light: Tensor
+    along: Tensor
+    reach: Tensor
+    static: Tensor
+    mean: Tensor
+    patterns: Tensor
+
+    def __init__(self, sampling: Sampling, prior_weights: tuple[float, ...]) -> None:
+        super().__init__()
+        self.sampling, self.weights = sampling, prior_weights
+        self.target_plane = Plane(_CELLS_ACROSS, _CELLS_ACROSS, TargetPlane().size_m / _CELLS_ACROSS)
+        height, width, rank = (
+            sampling.height,
+            sampling.width,
+            min(_COMPONENTS, sampling.height * sampling.width),
+        )
+        self.register_buffer("ambient", torch.zeros(height, width))
+        self.register_buffer("basis", torch.zeros(height * width, rank))
+        self.register_buffer("light", torch.zeros(rank, height, width))
+        self.register_buffer("along", torch.zeros(_ALONG, rank))
+        self.register_buffer("reach", torch.tensor([[0.0, 0.0], [1.0, 1.0]]))
+        self.register_buffer("static", torch.zeros(rank))
+        self.register_buffer("mean", torch.zeros(self.target_plane.shape))
+        self.register_buffer("patterns", torch.zeros(_COEFFICIENTS, *self.target_plane.shape))
+        self._last: tuple[bytes, tuple[Tensor, Tensor, Tensor]] | None = None
+
+    @property
+    def images(self) -> int:
+        """Images that come out for each sequence."""
+        return len(self.weights)
+
+    def fit(
+        self, setup: Setup, frames: Tensor, truth: Tensor, position_m: Tensor, names: NDArray[np.str_]
+    ) -> None:
+        """Take light path and prior from a setup, and the errors from samples of it.
+
+        Args:
+            setup: A linear setup.
+            frames: Simulated frames, white levels, [N, H, W].
+            truth: True images on the canvas, [N, H, W].
+            position_m: The target's centre at each, (x, y) in metres, [N, 2].
+            names: Object of each, [N].
+
+        Raises:
+            ConfigError: The setup is not linear.
+            DataError: There are fewer than 8 objects.
+        """
+        objects = np.unique(names, return_inverse=True)[1]
+        owner, count = torch.from_numpy(objects), int(objects.max()) + 1
+        if count < _FEWEST:
+            raise DataError(f"{count} objects to tell light from noise; give {_FEWEST} or more")
+        matrix, cells = canvas_matrix(setup, self.sampling)
+        values, axes = torch.linalg.eigh((matrix.T @ matrix).double())
+        kept = min(self.basis.shape[1], int((values > _RIDGE**2 * values[-1]).sum()))
+        values, axes = values.flip(0)[:kept], axes.flip(1)[:, :kept]
+        basis = ((matrix.double() @ axes) / values.sqrt()).float()  # [h w, r]
+        carry = (axes * values.sqrt()).float()  # [cells, r]
+        size = (self.sampling.height, self.sampling.width)
+        ambient = torch.from_numpy(reduce_by_area(setup.ambient_light().numpy(), size))
+        first = (size[0] - cells.height) // 2
+        rows = slice(first, first + cells.height)
+        parts = [slice(at, at + _AT_ONCE) for at in range(0, len(frames), _AT_ONCE)]
+        code = torch.cat([(frames[part].float() - ambient).flatten(1) @ basis for part in parts])
+        clean = torch.cat([truth[part][:, rows].float().flatten(1) @ carry for part in parts])
+
+        def mean_of(values: Tensor) -> Tensor:
+            total = values.new_zeros((count, *values.shape[1:])).index_add_(0, owner, values)
+            return total / torch.bincount(owner).reshape(-1, *[1] * (values.ndim - 1))
+
+        moving, seen = clean - mean_of(clean)[owner], code - mean_of(code)[owner]
+        gain = mean_of((moving * seen).sum(dim=1)) / mean_of(moving.square().sum(dim=1)).clamp_min(1e-12)
+        left = code - gain[owner, None] * clean
+        self.reach.copy_(torch.stack([position_m.amin(dim=0), position_m.amax(dim=0)]))
+        terms = self._terms(position_m)
+        gram = (terms.T @ terms).double() + _RIDGE * len(terms) * torch.eye(_ALONG, dtype=torch.float64)
+        along = torch.linalg.solve(gram, (terms.T @ left).double()).float()
+        left = left - terms @ along
+        offset = mean_of(left)
+        noise = (left - offset[owner]).double()
+        # Few samples do not tell the noise of all components, which is at least that of the camera.
+        level = float(ambient.mean()) + 0.1 * setup.gain
+        pixels = setup.shape[0] * setup.shape[1] / (size[0] * size[1])  # of the sensor, a sample pixel
+        least = float(setup.frame_camera.noise_variance(torch.tensor(level))) / pixels
+        variance, turn = torch.linalg.eigh(noise.T @ noise / len(noise))
+        white = (turn / variance.clamp_min(least).sqrt()).T
+        shifts = (offset - offset.mean(dim=0)).double() @ white.T
+        static, turn = torch.linalg.eigh(shifts.T @ shifts / count)
+        white = (turn.T @ white).float()
+        for buffer in (self.basis, self.light, self.along, self.static):
+            buffer.zero_()
+        self.ambient.copy_(ambient)
+        self.basis[:, :kept] = basis @ white.T
+        self.light[:kept, rows] = (white @ carry.T).unflatten(1, cells.shape)
+        self.along[:, :kept] = along @ white.T
+        self.static[:kept] = static.clamp_min(0).float()
+        prior = handwritten_prior(self.target_plane, _COEFFICIENTS)
+        self.mean.copy_(torch.from_numpy(prior.mean).unflatten(0, self.target_plane.shape))
+        self.patterns.copy_(torch.from_numpy(prior.patterns.T.copy()).unflatten(1, self.target_plane.shape))
+        self._last = None
+
+    def forward(self, frames: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
+        """Return the solutions of subsets of the time steps, targets [K, S, h, h].
+
+        Args:
+            frames: White levels, [N, H, W].
+            position_m: The target's centre at each, (x, y) in metres, [N, 2].
+            kept: 1 where a subset has a time step, else 0, [K, N].
+        """
+        rows, known, single = self._rows(position_m)  # J [N, k, r], along + A m [N, r], J J^T [N, k, k]
+        away = ((frames.float() - self.ambient).flatten(1) @ self.basis - known).double()
+        kept, static = kept.double(), self.static.double()
+        share = static / (1.0 + kept.sum(dim=1, keepdim=True) * static)  # what an offset hides, [K, r]
+        summed, shifts = torch.tensordot(kept, rows, dims=1), kept @ away  # [K, k, r], [K, r]
+        information = torch.tensordot(kept, single, dims=1) - (summed * share[:, None]) @ summed.mT
+        score = kept @ (rows @ away[:, :, None])[..., 0] - (summed @ (share * shifts)[:, :, None])[..., 0]
+        own = torch.eye(len(self.patterns), dtype=torch.float64, device=frames.device)
+        found = []
+        for weight in self.weights:
+            root = torch.linalg.cholesky(information + weight * own)
+            z = torch.cholesky_solve(score[..., None], root)[..., 0].float()
+            found.append(self.mean + torch.tensordot(z, self.patterns, dims=1))
+        return torch.stack(found, dim=1)
+
+    def _rows(self, position_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rows, known light and their products; sequences of the same places share them."""
+        key = position_m.cpu().numpy().tobytes()
+        if self._last is None or self._last[0] != key:
+            carrier = MatrixTransport(self.light.flatten(1), self.sampling.canvas, (1, len(self.light)))
+            seen = SequenceOperator(carrier, self.target_plane, position_m.cpu().double().numpy()).matrix()
+            rows = (seen @ self.patterns.flatten(1).T).mT.double()  # [N, k, r]; sums lose digits in float32
+            known = self._terms(position_m) @ self.along + seen @ self.mean.flatten()
+            self._last = key, (rows, known, rows @ rows.mT)
+        return self._last[1]
+
+    def _terms(self, position_m: Tensor) -> Tensor:
+        """Return the terms of the polynomial, [N, 7]; a place beyond all that were seen is the nearest one."""
+        low, high = self.reach
+        at = position_m.to(self.reach).clamp(low, high)
+        x, y = ((at - (low + high) / 2) / ((high - low) / 2).clamp_min(1e-6)).unbind(dim=1)
+        return torch.stack([torch.ones_like(x), x, x**2, x**3, y, x * y, y**2], dim=1)
+
+
 class SequenceReconstructor(Reconstructor):
     """All time steps -> the target plane: embed each, look at it from the plane, take the mean, then a U-Net.
 
     The linear embedding of each time step is read at the plane's own pixels, wherever the plane was then. The
     mean over the time steps has less noise the more there are, so weaker ridges, sharper and noisier, become
-    useful. What is trained by gradients is the U-Net behind the mean. Pooling over a set after Zaheer et al.,
-    Deep Sets, NeurIPS 2017; the alignment is the known motion.
+    useful. Frames may be solved for the target all at once instead (`PooledFrames`). What is trained by
+    gradients is the U-Net behind it. Pooling over a set after Zaheer et al., Deep Sets, NeurIPS 2017; the
+    alignment is the known motion.
 
     Args:
         modality: What it sees.
@@ -145,9 +380,16 @@ class SequenceReconstructor(Reconstructor):
         size = (sampling.height, sampling.width)
         self.normalization = InputNormalization(modality, settings.scaling)
         solved = "surface" if sampling.surface == "likelihood" else ""
-        self.embedding = LinearEmbeddings(modality, size, settings.rank, settings.ridge_multipliers, solved)
-        self.scale = PooledScale(self.embedding.images)
-        self.unet = ResidualUNet(self.embedding.images, settings)
+        own = [modality.slices[group.name] for group in modality.groups if group.maps == ("frame",)]
+        self._frame = own[0].start if own and settings.frames == "likelihood" else None
+        left_out = "" if self._frame is None else "frame"
+        self.embedding = LinearEmbeddings(
+            modality, size, settings.rank, settings.ridge_multipliers, solved, left_out
+        )
+        self.frames = None if self._frame is None else PooledFrames(sampling, settings.prior_weights)
+        images = self.embedding.images + (0 if self.frames is None else self.frames.images)
+        self.scale = PooledScale(images)
+        self.unet = ResidualUNet(images, settings)
         self.grid = TargetGrid(sampling)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -183,17 +425,16 @@ class SequenceReconstructor(Reconstructor):
 
         Raises:
             DataError: The motion of an object is unknown.
+            ConfigError: Frames are to be solved through the light path of a setup, and none is named.
         """
         inputs, truth, names = [], [], []
+        self._check_motion(samples)
+        if is_new and self.frames is not None:
+            self._fit_frames(samples)
         draw = np.random.default_rng(derive_seed(seed, "views"))
         device = next(self.parameters()).device
         for name in dict.fromkeys(samples.names.tolist()):
             mine = np.flatnonzero(samples.names == name)
-            if np.isnan(samples.position_m[mine]).any():
-                raise DataError(
-                    f"the motion of {name} is unknown, and a sequence network pools positions; give it in "
-                    "capture.yaml, or train on single time steps (--network.kind unet)"
-                )
             places = torch.from_numpy(samples.position_m[mine])
             plane = self.grid.mean(samples.truth[torch.from_numpy(mine)], places).half()
             kept = torch.zeros(augmentations, len(mine))
@@ -207,6 +448,29 @@ class SequenceReconstructor(Reconstructor):
         if is_new:
             self.scale.fit(found.inputs)
         return found
+
+    def _check_motion(self, samples: NlosDataset) -> None:
+        unknown = samples.names[np.isnan(samples.position_m).any(axis=1)]
+        if len(unknown):
+            raise DataError(
+                f"the motion of {unknown[0]} is unknown, and a sequence network pools positions; "
+                "give it in capture.yaml, or train on single time steps (--network.kind unet)"
+            )
+
+    def _fit_frames(self, samples: NlosDataset) -> None:
+        """Fit what is solved for frames to the setup that the samples name, and to the samples."""
+        assert self.frames is not None
+        if not self.sampling.setup:
+            raise ConfigError(
+                "Sampling.setup is empty, and network.frames is 'likelihood', which undoes the light path of a "
+                "setup: make the samples with --sampling.setup FOLDER of `evnlos calibrate`"
+            )
+        device = self.frames.basis.device
+        frames, places = samples.inputs[:, self._frame], torch.from_numpy(samples.position_m)
+        self.frames.cpu().fit(
+            load_setup(self.sampling.setup), frames.cpu(), samples.truth.cpu(), places, samples.names
+        )
+        self.frames.to(device)
 
     def draw(self, inputs: Tensor, position_m: Tensor, at_m: Tensor) -> Tensor:
         """Return images of one object at positions `at_m`, [M, H, W], from its sequence."""
@@ -247,16 +511,23 @@ class SequenceReconstructor(Reconstructor):
         total = seen = torch.zeros((), device=inputs.device)
         for start in range(0, len(inputs), 64):
             part = slice(start, start + 64)
-            embedded = self.embedding(self.normalization(inputs[part].float()))
-            light, inside = self.grid.seen(embedded, position_m[part])
-            weights = kept[:, part].to(light)
-            total = total + torch.tensordot(weights, light, dims=1)
-            seen = seen + torch.tensordot(weights, inside.to(light), dims=1)
+            inside = self.grid.inside(inputs, position_m[part])
+            weights = kept[:, part].to(inputs.device)
+            seen = seen + torch.tensordot(weights, inside.float(), dims=1)
+            if self.embedding.images:
+                embedded = self.embedding(self.normalization(inputs[part].float()))
+                light, _ = self.grid.seen(embedded, position_m[part])
+                total = total + torch.tensordot(weights.to(light), light, dims=1)
         if not bool((seen > 0).flatten(1).any(dim=1).all()):
             raise DataError(
                 "the target plane is off the canvas at every time step; give positions within the travel"
             )
-        return total / seen[:, None].clamp_min(1)
+        maps = [total / seen[:, None].clamp_min(1)] if self.embedding.images else []
+        if self.frames is not None:
+            with torch.autocast(inputs.device.type, enabled=False):
+                solved = self.frames(inputs[:, self._frame], position_m, kept.to(inputs.device))
+            maps.insert(0, self.grid.of_target(solved, self.frames.target_plane.extent_m[0]))
+        return torch.cat(maps, dim=1)
 
     @classmethod
     def today(cls, name: str, modality: Modality) -> str:
