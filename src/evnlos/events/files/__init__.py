@@ -2,7 +2,6 @@
 
 from evnlos.events.files.aedat4 import write_aedat4
 from evnlos.events.files.celex import CelexOptions
-from evnlos.events.files.celex_write import write_celex_frames
 from evnlos.events.files.columns import ReadReport, Stream
 from evnlos.events.files.frames_triggers import (
     FrameReader,
@@ -18,6 +17,7 @@ from evnlos.events.files.frames_triggers import (
 )
 from evnlos.events.files.read import iter_events, read_events, read_events_report
 from evnlos.events.files.registry import FORMATS, EventWriter, write_events
+from evnlos.events.files.word_write import write_celex_frames
 
 __all__ = [
     "FORMATS",

@@ -169,39 +169,6 @@ def decode_evt2(words, state, t_us, x, y, p, width, height):
     return count
 
 
-@njit(cache=True)
-def encode_evt2(t_us, x, y, p, high, words):
-    """Write EVT2 words; `high` is the high part of the time before them, -1 at the start; return how many."""
-    count = 0
-    for index in range(len(t_us)):
-        new = t_us[index] >> 6
-        if new != high:
-            while high >= 0 and (new >> 28) > (high >> 28):
-                words[count] = np.uint32(0x8FFFFFFF)
-                words[count + 1] = np.uint32(0x80000000)
-                count += 2
-                high = ((high >> 28) + 1) << 28
-            high = new
-            words[count] = np.uint32(0x80000000 | (new & 0xFFFFFFF))
-            count += 1
-        low = t_us[index] & 0x3F
-        words[count] = np.uint32(
-            (np.int64(p[index]) << 28) | (low << 22) | (np.int64(x[index]) << 11) | np.int64(y[index])
-        )
-        count += 1
-    return count
-
-
-@njit(cache=True)
-def encoded_size_evt2(t_us, before) -> int:
-    """Return an upper bound of the words that `encode_evt2` writes after an event at `before`."""
-    count = len(t_us)
-    for index in range(len(t_us)):
-        count += 2 * ((t_us[index] >> 34) - (before >> 34)) + ((t_us[index] >> 6) != (before >> 6))
-        before = t_us[index]
-    return count + 1
-
-
 _KNOWN = (0, 1, 8, 10, 14, 15)
 
 
@@ -287,50 +254,3 @@ def decode_evt21(words, state, t_us, x, y, p, width, height):
 def decode_evt21_swapped(words, state, t_us, x, y, p, width, height):
     """Decode words whose fields lie in the low half."""
     return _decode(words, state, t_us, x, y, p, width, height, True)
-
-
-@njit(cache=True)
-def encode_evt21(t_us, x, y, p, high, words):
-    """Write words; `high` is the high part of the time before them, -1 at the start; return how many."""
-    count = 0
-    index = 0
-    while index < len(t_us):
-        new = t_us[index] >> 6
-        if new != high:
-            while high >= 0 and (new >> 28) > (high >> 28):
-                words[count] = (np.int64(0x8FFFFFFF) - (np.int64(1) << 32)) << 32
-                words[count + 1] = (np.int64(0x80000000) - (np.int64(1) << 32)) << 32
-                count += 2
-                high = ((high >> 28) + 1) << 28
-            high = new
-            words[count] = ((np.int64(0x80000000) | (new & 0xFFFFFFF)) - (np.int64(1) << 32)) << 32
-            count += 1
-        # A word starts at a multiple of 32, as the sensors send it.
-        start = np.int64(x[index]) & ~np.int64(31)
-        fields = (np.int64(p[index]) << 28) | ((t_us[index] & 0x3F) << 22) | (start << 11) | np.int64(y[index])
-        mask = np.int64(0)
-        last = np.int64(-1)
-        first = index
-        while (
-            index < len(t_us)
-            and t_us[index] == t_us[first]
-            and y[index] == y[first]
-            and p[index] == p[first]
-            and last < np.int64(x[index]) < start + 32
-        ):
-            last = np.int64(x[index])
-            mask |= np.int64(1) << (last - start)
-            index += 1
-        words[count] = (fields << 32) | mask
-        count += 1
-    return count
-
-
-@njit(cache=True)
-def encoded_size_evt21(t_us, before) -> int:
-    """Return an upper bound of the words that `encode_evt21` writes after an event at `before`."""
-    count = 2 * len(t_us) + 2
-    for index in range(len(t_us)):
-        count += 2 * ((t_us[index] >> 34) - (before >> 34))
-        before = t_us[index]
-    return count

@@ -1,11 +1,9 @@
-"""Writing EVT3 words.
-
-- EVT3: words of 16 bits that change one thing at a time (row, column, time) or add 8 or 12 pixels at once.
-"""
+"""Reading EVT3: words of 16 bits that change one thing at a time (row, column, time) or add 8 or 12 pixels."""
 
 from __future__ import annotations
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -14,7 +12,6 @@ from numpy.typing import NDArray
 from evnlos.events.files.words import (
     BACKWARDS,
     BASE,
-    CHUNK,
     CLOCK,
     CLOCK_BACK,
     CLOCK_JUMP,
@@ -29,83 +26,19 @@ from evnlos.events.files.words import (
     TRIGGERS,
     UNDATED,
     UNKNOWN,
+    clock_falls,
+    hold_back,
     mend_clock,
     note,
+    sum_table,
 )
-
-
-@njit(cache=True)
-def _run_length(t_us, x, y, p, start):
-    """Return how many events from `start` fit one 12-pixel vector: same time, row, sign, columns ascending."""
-    stop = start + 1
-    while (
-        stop < len(t_us)
-        and t_us[stop] == t_us[start]
-        and y[stop] == y[start]
-        and p[stop] == p[start]
-        and x[stop] > x[stop - 1]
-        and x[stop] - x[start] < 12
-    ):
-        stop += 1
-    return stop - start
-
-
-@njit(cache=True)
-def encode_evt3(t_us, x, y, p, high, words):
-    """Write EVT3 words; `high` is the high part of the time before them, -1 at the start; return how many."""
-    low, row = np.int64(-1), np.int64(-1)
-    count = 0
-    index = 0
-    while index < len(t_us):
-        new = t_us[index] >> 12
-        if new != high:
-            while high >= 0 and (new >> 12) > (high >> 12):
-                words[count] = np.uint16(0x8FFF)
-                words[count + 1] = np.uint16(0x8000)
-                count += 2
-                high = ((high >> 12) + 1) << 12
-            high = new
-            words[count] = np.uint16(0x8000 | (new & 0xFFF))
-            count += 1
-            low = np.int64(-1)
-        if (t_us[index] & 0xFFF) != low:
-            low = t_us[index] & 0xFFF
-            words[count] = np.uint16(0x6000 | low)
-            count += 1
-        if y[index] != row:
-            row = np.int64(y[index])
-            words[count] = np.uint16(row)
-            count += 1
-        sign = np.int64(0x800) if p[index] else np.int64(0)
-        run = _run_length(t_us, x, y, p, index)
-        if run > 2:
-            bits = np.int64(0)
-            for step in range(run):
-                bits |= np.int64(1) << np.int64(x[index + step] - x[index])
-            words[count] = np.uint16(0x3000 | sign | np.int64(x[index]))
-            words[count + 1] = np.uint16(0x4000 | bits)
-            count += 2
-            index += run
-        else:
-            words[count] = np.uint16(0x2000 | sign | np.int64(x[index]))
-            count += 1
-            index += 1
-    return count
-
-
-@njit(cache=True)
-def encoded_size_evt3(t_us, before) -> int:
-    """Return an upper bound of the words that `encode_evt3` writes after an event at `before`."""
-    count = 4 * len(t_us) + 4
-    for index in range(len(t_us)):
-        count += 2 * ((t_us[index] >> 24) - (before >> 24))
-        before = t_us[index]
-    return count
-
 
 WRAP_US = 1 << 24
 _HIGH_TURN = 1 << 12
-SLACK = 12
+_CHUNK = 4096  # words
+_GROUPS = 13  # whether the chunk before held vectors or their bases
+# Kinds of word, a bit each: unknown; vectors; vectors and their bases.
+_UNKNOWN, _VECTORS, _OF_VECTORS = np.uint32(1 << 1), np.uint32(3 << 4), np.uint32(7 << 3)
 _ROW_SEEN, _BASE_SEEN = 8, 9  # further slots of the state
 # Clock before a jump of which it is not known yet whether it comes back; high + 1, 0 = none.
 _OLD_HIGH, _OLD_BASE = 10, 11
@@ -122,17 +55,9 @@ def _events_per_word() -> NDArray[np.uint8]:
     return np.where(kind == 5, np.bitwise_count(words & 0xFF), count).astype(np.uint8)
 
 
-@njit(cache=True)
-def _sum_table(words, table):
-    total = 0
-    for word in words:
-        total += table[word]
-    return total
-
-
 def bound_evt3(words: NDArray[np.uint16]) -> int:
-    """Return how many events `words` can hold at most, and the room that decoding needs behind them."""
-    return int(_sum_table(words, _events_per_word())) + SLACK
+    """Return how many events `words` can hold at most."""
+    return int(sum_table(words, _events_per_word()))
 
 
 @njit(cache=True)
@@ -244,92 +169,213 @@ def _decode_carefully(words, first, stop, state, t_us, x, y, p, width, height):
     return count
 
 
-@njit(cache=True)
-def _largest(values):
-    largest = np.uint16(0)
-    for value in values:
-        largest = max(largest, value)
-    return largest
+class _Scratch(NamedTuple):
+    """Room for one chunk; what is used of it stays in the first-level cache.
 
-
-@njit(cache=True)
-def _decode_chunk(words, state, places, counts, t_us, x, y, p, width, height):
-    """Decode words among which nothing is unusual; return the number of events, or -1 where something is.
-
-    A vector writes all twelve places of its mask's table, which is faster than looking at each bit; that needs
-    `SLACK` places behind the last event. Places are counted without a sign, or every access would be checked
-    for a negative index.
+    | symbol | meaning | of |
+    |---|---|---|
+    | clock | word of the low time that holds | each word |
+    | word | the word itself | each word with events |
+    | held | columns since the base of vectors, row, low time, base: 16 bits each | each word with events |
+    | events | column, row, low time, sign: the words that hold them, 16 bits each | each event |
+    | fields, parts | the memory of `held` and `events`, in 16 bits | |
     """
-    newest, base = state[NEWEST], state[BASE]
-    high, low = base + (state[CLOCK] & ~np.int64(0xFFF)), state[CLOCK] & 0xFFF
-    row, column, polarity = np.uint16(state[ROW]), state[COLUMN], state[POLARITY] != 0
-    unusual = (state[STARTED] == 0) | (state[_ROW_SEEN] == 0) | (state[_OLD_HIGH] != 0)
-    base_seen, dense = state[_BASE_SEEN] != 0, state[_DENSE]
-    time = max(high + low, newest)
-    count = np.uint64(0)
-    for index in range(len(words)):
-        word = words[index]
-        kind = word >> 12
-        value = np.int64(word & 0xFFF)
-        if kind == 2:
-            t_us[count] = time
-            x[count] = np.uint16(value & 0x7FF)
-            y[count] = row
-            p[count] = value > 0x7FF
-            newest = time
-            count += np.uint64(1)
-        elif kind == 0:
-            row = np.uint16(value & 0x7FF)
-        elif kind == 6:
-            unusual |= low - value > JITTER_US
-            low = value
-            time = max(high + low, newest)
-        elif kind == 4 or kind == 5:
-            unusual |= not base_seen
-            mask = value if kind == 4 else value & 0xFF
-            end = count + np.uint64(SLACK)
-            start = np.uint16(column)
-            t_out, x_out, y_out, p_out = t_us[count:end], x[count:end], y[count:end], p[count:end]
-            for place in range(SLACK):
-                t_out[place] = time
-            for place in range(SLACK):
-                x_out[place] = start + np.uint16(places[mask, place])
-            for place in range(SLACK):
-                y_out[place] = row
-            for place in range(SLACK):
-                p_out[place] = polarity
-            newest = time if mask else newest
-            column += 12 if kind == 4 else 8
-            count += counts[mask]
-        elif kind == 3:
-            column = value & 0x7FF
-            polarity = value > 0x7FF
-            base_seen = True
-        elif kind == 8:
-            new = base + (value << 12)
-            unusual |= (new < high) | (new > high + (NEAR << 12))
-            dense += 1
-            low = low if new == high else np.int64(0)
-            high = new
-            time = max(high + low, newest)
-        else:
-            unusual |= kind != 7 and kind != 14 and kind != 15
-    events = np.int64(count)
-    if unusual or _largest(x[:events]) >= width or _largest(y[:events]) >= height:
-        return np.int64(-1)
-    state[CLOCK], state[NEWEST] = (high - base) | low, newest
-    state[ROW], state[COLUMN], state[POLARITY], state[_BASE_SEEN] = row, column, polarity, base_seen
-    state[_DENSE] = dense
-    return events
+
+    clock: NDArray[np.uint16]
+    word: NDArray[np.uint16]
+    held: NDArray[np.uint64]
+    events: NDArray[np.uint64]
+    fields: NDArray[np.uint16]
+    parts: NDArray[np.uint16]
+
+
+def _scratch() -> _Scratch:
+    clock, word = np.empty(_CHUNK, np.uint16), np.empty(_CHUNK, np.uint16)
+    held, events = np.empty(_CHUNK, np.uint64), np.empty(12 * (_CHUNK + 1), np.uint64)
+    return _Scratch(clock, word, held, events, held.view(np.uint16), events.view(np.uint16))
 
 
 @njit(cache=True)
-def _decode_block(words, state, places, counts, t_us, x, y, p, width, height):
+def _gather_singles(words, seen, low, row, scratch):
+    """Note row and low time of each single event up to the next high time; there are no vectors.
+
+    Every word writes, and an event moves on: a branch would be mispredicted at every third word. Places are
+    counted without a sign, or every access would be checked for a negative index. Returned are the words that
+    were taken, the events, the kinds of word seen, and the words of low time and row that hold then.
+    """
+    clock, parts = scratch.clock, scratch.parts
+    at, count, size = np.uint64(0), np.uint64(0), np.uint64(len(words))
+    while at < size:
+        word = words[at]
+        if word >= 0x8000:
+            break
+        kind = word >> 12
+        seen |= np.uint32(1) << np.uint32(kind)
+        row = word if word < 0x1000 else row
+        low = word if kind == 6 else low
+        clock[at] = low
+        place = np.uint64(4) * count
+        parts[place] = word
+        parts[place + np.uint64(1)] = row
+        parts[place + np.uint64(2)] = low
+        count += np.uint64(kind == 2)
+        at += np.uint64(1)
+    return np.int64(at), np.int64(count), seen, low, row
+
+
+@njit(cache=True)
+def _gather_groups(words, seen, low, row, base, shift, scratch):
+    """Note what holds at each word with events, single ones or vectors, up to the next high time.
+
+    Returned are the words that were taken, those with events, the kinds seen, and what holds then.
+    """
+    clock, fields, kept = scratch.clock, scratch.fields, scratch.word
+    at, count, size = np.uint64(0), np.uint64(0), np.uint64(len(words))
+    while at < size:
+        word = words[at]
+        if word >= 0x8000:
+            break
+        kind = np.uint32(word >> 12)
+        seen |= np.uint32(1) << kind
+        row = word if word < 0x1000 else row
+        low = word if kind == 6 else low
+        clock[at] = low
+        place = np.uint64(4) * count
+        fields[place] = shift
+        fields[place + np.uint64(1)] = row
+        fields[place + np.uint64(2)] = low
+        fields[place + np.uint64(3)] = base
+        kept[count] = word
+        step = np.uint16(0x8C0000 >> 4 * kind & 0xF)  # kind 4 has 12 columns, kind 5 has 8
+        shift = np.uint16(0) if kind == 3 else np.uint16(shift + step)
+        base = word if kind == 3 else base
+        count += np.uint64(0x34 >> kind & 1)  # kinds 2, 4 and 5
+        at += np.uint64(1)
+    return np.int64(at), np.int64(count), seen, low, row, base, shift
+
+
+@njit(cache=True)
+def _expand(count, places, counts, scratch):
+    """Make events of `count` words with events; return their number.
+
+    Each writes 6 or 12 places of its mask's row, which is faster than looking at each bit.
+    """
+    masks, held = scratch.word[:count], scratch.held[:count]
+    for index in range(count):  # vector code: words become masks, bases columns and signs
+        word, value, kind = masks[index], held[index], masks[index] >> 12
+        single = (
+            value & np.uint64(0xFFFFFFFF0000)
+            | np.uint64(word & np.uint16(0x7FF))
+            | np.uint64(word) << np.uint64(48)
+        )
+        held[index] = single if kind == 2 else value + (value >> np.uint64(48) & np.uint64(0x7FF))
+        mask = word & np.uint16(0xFFF if kind == 4 else 0xFF)
+        masks[index] = np.uint16(1) if kind == 2 else mask
+    filled, events = np.uint64(0), scratch.events
+    for index in range(np.uint64(count)):
+        mask, value = np.uint64(masks[index]), held[index]
+        many = np.uint64(counts[mask])
+        for place in range(np.uint64(6)):
+            events[filled + place] = value + np.uint64(places[mask, place])
+        if many > 6:
+            for place in range(np.uint64(6), np.uint64(12)):
+                events[filled + place] = value + np.uint64(places[mask, place])
+        filled += many
+    return np.int64(filled)
+
+
+@njit(cache=True)
+def _unpack(events, high, column_mask, sign_place, t_us, x, y, p):
+    """Fill the columns, one loop each for vector code; return the largest x and y."""
+    largest_x, largest_y = np.uint16(0), np.uint16(0)
+    for index in range(len(t_us)):
+        t_us[index] = high + np.int64(events[index] >> np.uint64(32) & np.uint64(0xFFF))
+    for index in range(len(x)):
+        column = np.uint16(events[index] & column_mask)
+        x[index] = column
+        largest_x = max(largest_x, column)
+    for index in range(len(y)):
+        row = np.uint16(events[index] >> np.uint64(16) & np.uint64(0x7FF))
+        y[index] = row
+        largest_y = max(largest_y, row)
+    for index in range(len(p)):
+        p[index] = (events[index] >> sign_place & np.uint64(1)) != 0
+    return largest_x, largest_y
+
+
+@njit(cache=True)
+def _decode_chunk(words, has_vectors, state, places, counts, scratch, t_us, x, y, p, width, height):
+    """Decode words among which nothing is unusual, and no vectors unless `has_vectors`.
+
+    Returned is the number of events; -1 where something is unusual, -2 where vectors are.
+    """
+    if state[STARTED] == 0 or state[_ROW_SEEN] == 0 or state[_OLD_HIGH] != 0 or state[COLUMN] > 0x7FF:
+        return np.int64(-1)
+    seen = np.uint32(0)
+    newest, dense = state[NEWEST], state[_DENSE]
+    high = state[BASE] + (state[CLOCK] & ~np.int64(0xFFF))
+    low, row = np.uint16(0x6000 | (state[CLOCK] & 0xFFF)), np.uint16(state[ROW])
+    base, shift = np.uint16(0x3000 | (state[POLARITY] << 11) | (state[COLUMN] & 0x7FF)), np.uint16(0)
+    first = count = 0
+    while first < len(words):
+        kind = words[first] >> 12
+        if 8 < kind < 14:
+            return np.int64(-1)
+        if kind >= 14:
+            first += 1
+            continue
+        if kind == 8:
+            new = state[BASE] + (np.int64(words[first] & 0xFFF) << 12)
+            if new < high or new > high + (NEAR << 12):
+                return np.int64(-1)
+            low = low if new == high else np.uint16(0x6000)
+            high = new
+            dense += 1
+            first += 1
+            continue
+        before = low
+        if has_vectors:
+            taken, groups, seen, low, row, base, shift = _gather_groups(
+                words[first:], seen, low, row, base, shift, scratch
+            )
+            found = _expand(groups, places, counts, scratch)
+            column_mask, sign_place = np.uint64(0xFFFF), np.uint64(59)
+        else:
+            taken, found, seen, low, row = _gather_singles(words[first:], seen, low, row, scratch)
+            column_mask, sign_place = np.uint64(0x7FF), np.uint64(11)
+        first += taken
+        events, clock = scratch.events[:found], scratch.clock[:taken]
+        latest = np.int64(before & 0xFFF)
+        is_behind = newest > high + latest or clock_falls(clock, before)
+        if is_behind and hold_back(clock, latest, events, max(newest - high, np.int64(0))):
+            return np.int64(-1)
+        end = count + found
+        out = t_us[count:end], x[count:end], y[count:end], p[count:end]
+        largest_x, largest_y = _unpack(events, high, column_mask, sign_place, *out)
+        if largest_x >= width or largest_y >= height:
+            return np.int64(-1)
+        newest = t_us[end - 1] if found else newest
+        count = end
+    if seen & _OF_VECTORS and not has_vectors:
+        return np.int64(-2)
+    if seen & _UNKNOWN or (seen & _VECTORS and not state[_BASE_SEEN]):
+        return np.int64(-1)
+    state[_GROUPS] = seen & _OF_VECTORS != 0
+    state[_BASE_SEEN] |= seen >> 3 & 1
+    state[CLOCK], state[NEWEST], state[_DENSE] = (high - state[BASE]) | np.int64(low & 0xFFF), newest, dense
+    state[ROW], state[COLUMN], state[POLARITY] = row & 0x7FF, np.int64(base & 0x7FF) + shift, base >> 11 & 1
+    return count
+
+
+@njit(cache=True)
+def _decode_block(words, state, places, counts, scratch, t_us, x, y, p, width, height):
     count = 0
-    for first in range(0, len(words), CHUNK):
-        chunk = words[first : first + CHUNK]
+    for first in range(0, len(words), _CHUNK):
+        chunk = words[first : first + _CHUNK]
         out = t_us[count:], x[count:], y[count:], p[count:]
-        found = _decode_chunk(chunk, state, places, counts, *out, width, height)
+        found = _decode_chunk(chunk, state[_GROUPS] != 0, state, places, counts, scratch, *out, width, height)
+        if found == -2:
+            found = _decode_chunk(chunk, True, state, places, counts, scratch, *out, width, height)
         if found < 0:
             found = _decode_carefully(words, first, first + len(chunk), state, *out, width, height)
         count += found
@@ -337,15 +383,15 @@ def _decode_block(words, state, places, counts, t_us, x, y, p, width, height):
 
 
 @cache
-def _mask_table() -> tuple[NDArray[np.uint8], NDArray[np.uint64]]:
+def _mask_table() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the places of the bits set in each mask of 12, and how many they are."""
-    places = np.zeros((4096, SLACK), np.uint8)
+    places = np.zeros((4096, 12), np.uint8)
     for mask in range(4096):
         bits = [bit for bit in range(12) if mask >> bit & 1]
         places[mask, : len(bits)] = bits
-    return places, np.bitwise_count(np.arange(4096, dtype=np.uint16)).astype(np.uint64)
+    return places, np.bitwise_count(np.arange(4096, dtype=np.uint16))
 
 
 def decode_evt3(words, state, t_us, x, y, p, width, height):
     """Decode a block: quickly, and once more with care where a chunk holds anything unusual."""
-    return _decode_block(words, state, *_mask_table(), t_us, x, y, p, width, height)
+    return _decode_block(words, state, *_mask_table(), _scratch(), t_us, x, y, p, width, height)

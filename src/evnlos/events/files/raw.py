@@ -18,6 +18,7 @@ import numpy as np
 
 from evnlos.errors import DataError
 from evnlos.events.files import evt2, evt3
+from evnlos.events.files import word_write as write
 from evnlos.events.files.columns import SALVAGE, FileSink, ReadReport
 from evnlos.events.files.words import WordCodec, WordSource
 from evnlos.types import Events
@@ -295,9 +296,11 @@ class _Encoder:
 
 
 _ENCODERS = {
-    "EVT2": _Encoder("2.0", np.dtype("<u4"), evt2.WRAP_US, 1 << 6, evt2.encoded_size_evt2, evt2.encode_evt2),
-    "EVT21": _Encoder("2.1", np.dtype("<i8"), evt2.WRAP_US, 1 << 6, evt2.encoded_size_evt21, evt2.encode_evt21),
-    "EVT3": _Encoder("3.0", np.dtype("<u2"), evt3.WRAP_US, 1 << 12, evt3.encoded_size_evt3, evt3.encode_evt3),
+    "EVT2": _Encoder("2.0", np.dtype("<u4"), evt2.WRAP_US, 1 << 6, write.encoded_size_evt2, write.encode_evt2),
+    "EVT21": _Encoder(
+        "2.1", np.dtype("<i8"), evt2.WRAP_US, 1 << 6, write.encoded_size_evt21, write.encode_evt21
+    ),
+    "EVT3": _Encoder("3.0", np.dtype("<u2"), evt3.WRAP_US, 1 << 12, write.encoded_size_evt3, write.encode_evt3),
 }
 
 

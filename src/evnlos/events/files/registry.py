@@ -22,7 +22,6 @@ from evnlos.events.files import (
     aedat3,
     aedat4,
     celex,
-    celex_write,
     container_write,
     csv,
     fixed_words,
@@ -32,6 +31,7 @@ from evnlos.events.files import (
     raw,
     ros,
     ros_bags,
+    word_write,
 )
 from evnlos.events.files.celex import CelexOptions
 from evnlos.events.files.columns import Columns, ReadReport, Sink, refuse_topic, unreadable
@@ -175,13 +175,13 @@ FORMATS = (
     _ros("DB3", ros_bags.DB3_SIGNATURE, ros_bags.Db3File),
     _ros("MCAP", mcap.SIGNATURE, mcap.McapFile, lambda path, first, _: container_write.McapSink(path, first)),
     _ros("BAG", ros_bags.BAG_SIGNATURE, ros_bags.BagFile),
-    Format("CELEX", (".bin",), celex.sniff_celex, _celex(celex.CelexSource), celex_write.CelexSink),
+    Format("CELEX", (".bin",), celex.sniff_celex, _celex(celex.CelexSource), word_write.CelexSink),
     Format(  # read as CELEX: the header tells the event formats apart
         "CELEX0",
         (),
         lambda _: False,
         _celex(celex.CelexSource),
-        lambda path, first, target: celex_write.CelexSink(path, first, target, event_format=0),
+        lambda path, first, target: word_write.CelexSink(path, first, target, event_format=0),
     ),
     Format(
         "CSV",

@@ -3,7 +3,7 @@
 - The state that a word decoder carries from block to block: clock, row, and a tally of faults.
 - Reading files that are a text header and then a row of words: RAW (EVT2, EVT2.1, EVT3) and DAT.
 - Bit errors in the clock words (TIME_HIGH) of EVT3, which cameras are known to send. A reader that takes such a
-  word for a turn of the clock shifts all that follows by 2^24 us, 16.77 s.
+  word for a turn of the clock shifts all that follows by 2^24 us, 16.77 s. And the jitter of its low words.
 """
 
 from __future__ import annotations
@@ -229,6 +229,15 @@ class WordSource:
             enlarge(columns, count, max(count + need, expected + expected // 16))
 
 
+@njit(cache=True)
+def sum_table(words: NDArray, table: NDArray) -> int:
+    """Return the sum of table[word] over all words."""
+    total = 0
+    for word in words:
+        total += table[word]
+    return total
+
+
 _ENOUGH = 8  # clock words in a row that were near each other: only a clock that runs on can jump
 NEAR = 10
 """Steps of TIME_HIGH, 4.096 ms each, that a clock makes in a recording without long silences."""
@@ -287,3 +296,37 @@ def mend_clock(words, index, high, low, dense):
             if wrong > _MOST_WRONG or (value - new) & 0xFFF > 1:
                 return -1
     return -2
+
+
+@njit(cache=True)
+def clock_falls(clock, low):
+    """Return whether the low time falls from one word to the next; `low` is the one before them."""
+    falls = clock[0] < low
+    after = clock[1:]
+    for index in range(len(after)):
+        falls |= after[index] < clock[index]
+    return falls
+
+
+@njit(cache=True)
+def hold_back(clock, latest, events, newest):
+    """Let no event be earlier than the one before it (`newest` at the start).
+
+    Args:
+        clock: Words of the low time.
+        latest: Low time before them, microseconds.
+        events: What holds at each event.
+        newest: The last event before them, microseconds since the high time.
+
+    Returns:
+        Whether a low time is later than one that follows by more than cameras' jitter: that is a fault.
+    """
+    latest, is_fault = max(latest, newest), newest > 0xFFF
+    for word in clock:
+        low = np.int64(word & 0xFFF)
+        latest = max(latest, low)
+        is_fault |= latest - low > JITTER_US
+    for index in range(len(events)):
+        newest = max(newest, np.int64(events[index] >> np.uint64(32) & np.uint64(0xFFF)))
+        events[index] = events[index] & ~np.uint64(0xFFF << 32) | np.uint64(newest) << np.uint64(32)
+    return is_fault

@@ -1,4 +1,8 @@
-"""Synthetic CeleX-V recordings, for tests and demonstrations: the layout of the camera's own files."""
+"""Writing words: EVT2, EVT2.1, EVT3, and CeleX-V.
+
+- EVT2, EVT2.1 and EVT3: the words of Prophesee's RAW files, which `raw` puts behind their header.
+- Synthetic CeleX-V recordings, for tests and demonstrations: the layout of the camera's own files.
+"""
 
 from __future__ import annotations
 
@@ -201,3 +205,152 @@ def write_celex_frames(path: Path, frames: NDArray[np.uint8 | np.uint16]) -> Non
             file.write(
                 struct.pack("<I", PICTURE_BYTES + 1) + groups.tobytes() + b"\0" + struct.pack("<qI", 0, 0)
             )
+
+
+@njit(cache=True)
+def encode_evt2(t_us, x, y, p, high, words):
+    """Write EVT2 words; `high` is the high part of the time before them, -1 at the start; return how many."""
+    count = 0
+    for index in range(len(t_us)):
+        new = t_us[index] >> 6
+        if new != high:
+            while high >= 0 and (new >> 28) > (high >> 28):
+                words[count] = np.uint32(0x8FFFFFFF)
+                words[count + 1] = np.uint32(0x80000000)
+                count += 2
+                high = ((high >> 28) + 1) << 28
+            high = new
+            words[count] = np.uint32(0x80000000 | (new & 0xFFFFFFF))
+            count += 1
+        low = t_us[index] & 0x3F
+        words[count] = np.uint32(
+            (np.int64(p[index]) << 28) | (low << 22) | (np.int64(x[index]) << 11) | np.int64(y[index])
+        )
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def encoded_size_evt2(t_us, before) -> int:
+    """Return an upper bound of the words that `encode_evt2` writes after an event at `before`."""
+    count = len(t_us)
+    for index in range(len(t_us)):
+        count += 2 * ((t_us[index] >> 34) - (before >> 34)) + ((t_us[index] >> 6) != (before >> 6))
+        before = t_us[index]
+    return count + 1
+
+
+@njit(cache=True)
+def encode_evt21(t_us, x, y, p, high, words):
+    """Write words; `high` is the high part of the time before them, -1 at the start; return how many."""
+    count = 0
+    index = 0
+    while index < len(t_us):
+        new = t_us[index] >> 6
+        if new != high:
+            while high >= 0 and (new >> 28) > (high >> 28):
+                words[count] = (np.int64(0x8FFFFFFF) - (np.int64(1) << 32)) << 32
+                words[count + 1] = (np.int64(0x80000000) - (np.int64(1) << 32)) << 32
+                count += 2
+                high = ((high >> 28) + 1) << 28
+            high = new
+            words[count] = ((np.int64(0x80000000) | (new & 0xFFFFFFF)) - (np.int64(1) << 32)) << 32
+            count += 1
+        # A word starts at a multiple of 32, as the sensors send it.
+        start = np.int64(x[index]) & ~np.int64(31)
+        fields = (np.int64(p[index]) << 28) | ((t_us[index] & 0x3F) << 22) | (start << 11) | np.int64(y[index])
+        mask = np.int64(0)
+        last = np.int64(-1)
+        first = index
+        while (
+            index < len(t_us)
+            and t_us[index] == t_us[first]
+            and y[index] == y[first]
+            and p[index] == p[first]
+            and last < np.int64(x[index]) < start + 32
+        ):
+            last = np.int64(x[index])
+            mask |= np.int64(1) << (last - start)
+            index += 1
+        words[count] = (fields << 32) | mask
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def encoded_size_evt21(t_us, before) -> int:
+    """Return an upper bound of the words that `encode_evt21` writes after an event at `before`."""
+    count = 2 * len(t_us) + 2
+    for index in range(len(t_us)):
+        count += 2 * ((t_us[index] >> 34) - (before >> 34))
+        before = t_us[index]
+    return count
+
+
+@njit(cache=True)
+def _run_length(t_us, x, y, p, start):
+    """Return how many events from `start` fit one 12-pixel vector: same time, row, sign, columns ascending."""
+    stop = start + 1
+    while (
+        stop < len(t_us)
+        and t_us[stop] == t_us[start]
+        and y[stop] == y[start]
+        and p[stop] == p[start]
+        and x[stop] > x[stop - 1]
+        and x[stop] - x[start] < 12
+    ):
+        stop += 1
+    return stop - start
+
+
+@njit(cache=True)
+def encode_evt3(t_us, x, y, p, high, words):
+    """Write EVT3 words; `high` is the high part of the time before them, -1 at the start; return how many."""
+    low, row = np.int64(-1), np.int64(-1)
+    count = 0
+    index = 0
+    while index < len(t_us):
+        new = t_us[index] >> 12
+        if new != high:
+            while high >= 0 and (new >> 12) > (high >> 12):
+                words[count] = np.uint16(0x8FFF)
+                words[count + 1] = np.uint16(0x8000)
+                count += 2
+                high = ((high >> 12) + 1) << 12
+            high = new
+            words[count] = np.uint16(0x8000 | (new & 0xFFF))
+            count += 1
+            low = np.int64(-1)
+        if (t_us[index] & 0xFFF) != low:
+            low = t_us[index] & 0xFFF
+            words[count] = np.uint16(0x6000 | low)
+            count += 1
+        if y[index] != row:
+            row = np.int64(y[index])
+            words[count] = np.uint16(row)
+            count += 1
+        sign = np.int64(0x800) if p[index] else np.int64(0)
+        run = _run_length(t_us, x, y, p, index)
+        if run > 2:
+            bits = np.int64(0)
+            for step in range(run):
+                bits |= np.int64(1) << np.int64(x[index + step] - x[index])
+            words[count] = np.uint16(0x3000 | sign | np.int64(x[index]))
+            words[count + 1] = np.uint16(0x4000 | bits)
+            count += 2
+            index += run
+        else:
+            words[count] = np.uint16(0x2000 | sign | np.int64(x[index]))
+            count += 1
+            index += 1
+    return count
+
+
+@njit(cache=True)
+def encoded_size_evt3(t_us, before) -> int:
+    """Return an upper bound of the words that `encode_evt3` writes after an event at `before`."""
+    count = 4 * len(t_us) + 4
+    for index in range(len(t_us)):
+        count += 2 * ((t_us[index] >> 24) - (before >> 24))
+        before = t_us[index]
+    return count
