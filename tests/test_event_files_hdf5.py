@@ -164,3 +164,58 @@ def test_links_are_not_followed_in_a_search(tmp_path):
             file[f"b/{name}"] = [0]
     with pytest.raises(EventFileError, match="link"):
         read_events(tmp_path / "a.h5")
+
+
+def packed(path, count: int, t: str, length: int, **how) -> tuple[Events, dict[str, list[int]]]:
+    """Write packed columns; return the events and the bytes where each column's chunks stand."""
+    draw = np.random.default_rng(count)
+    events = Events(
+        np.sort(draw.integers(0, 10**6, count)),
+        draw.integers(0, 640, count),
+        draw.integers(0, 480, count),
+        draw.integers(0, 2, count) > 0,
+        width=640,
+        height=480,
+    )
+    with h5py.File(path, "w") as file:
+        for name, dtype in (("t", t), ("x", "u2"), ("y", ">i4"), ("p", "i1")):
+            values = getattr(events, "t_us" if name == "t" else name) / (
+                1e6 if t == "f8" and name == "t" else 1
+            )
+            file.create_dataset(
+                f"events/{name}", data=values.astype(dtype), chunks=(min(length, count),), **how
+            )
+        file["t_offset"] = 0 if t == "f8" else 7
+        ids = {name: file[f"events/{name}"].id for name in "txyp"}
+        places = {
+            name: [one.get_chunk_info(k).byte_offset + 40 for k in range(one.get_num_chunks())]
+            for name, one in ids.items()
+        }
+    moved = events.t_us + (0 if t == "f8" else 7)
+    return Events(moved, events.x, events.y, events.p, width=640, height=480), places
+
+
+@pytest.mark.parametrize("fletcher32", [False, True])
+@pytest.mark.parametrize("shuffle", [False, True])
+@pytest.mark.parametrize("compression", [None, "gzip", "lzf"])
+def test_packings_are_read_alike(compression, shuffle, fletcher32, tmp_path):
+    """Whole chunks of deflate are unpacked here, others by the library: nobody can tell which."""
+    how = {"compression": compression, "shuffle": shuffle, "fletcher32": fletcher32}
+    for count, t, length in ((1, "u4", 8192), (20_001, "u4", 8192), (16_384, "i8", 8192), (9000, "f8", 3000)):
+        events, _ = packed(tmp_path / "a.h5", count, t, length, **how)
+        assert read_events(tmp_path / "a.h5", width=640, height=480) == events
+        pieces = list(iter_events(tmp_path / "a.h5", n_events=5000, width=640, height=480))
+        assert Events.concatenate(pieces) == events
+
+
+@pytest.mark.parametrize("fletcher32", [False, True])
+def test_a_flipped_bit_of_a_packed_chunk_is_told(fletcher32, tmp_path):
+    how = {"compression": "gzip", "shuffle": True, "fletcher32": fletcher32}
+    _, places = packed(tmp_path / "a.h5", 20_001, "u4", 8192, **how)
+    good = (tmp_path / "a.h5").read_bytes()
+    for place in (place for column in places.values() for place in column):
+        damaged = bytearray(good)
+        damaged[place] ^= 4
+        (tmp_path / "a.h5").write_bytes(damaged)
+        with pytest.raises(EventFileError, match="HDF5 cannot read it"):
+            read_events(tmp_path / "a.h5", width=640, height=480)

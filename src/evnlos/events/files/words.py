@@ -230,7 +230,7 @@ class WordSource:
 
 
 @njit(cache=True)
-def sum_table(words: NDArray, table: NDArray) -> int:
+def sum_table(words, table):
     """Return the sum of table[word] over all words."""
     total = 0
     for word in words:
