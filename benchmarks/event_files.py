@@ -2,7 +2,7 @@
 
 Writes the files that it reads, interleaves the packages, prints millions of events per second of processor time
 (median of the rounds) and the ratio to each rival (median of the ratios within a round). Rivals are optional:
-those that cannot be imported (pip install evutils faery) are left out.
+those that cannot be imported (pip install evutils faery expelliarmus evlib) are left out.
 
     python benchmarks/event_files.py
     python benchmarks/event_files.py --events 3000000 --rounds 5 --only CeleX
@@ -20,7 +20,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"):
+THREADS = "OMP_NUM_THREADS NUMBA_NUM_THREADS OPENBLAS_NUM_THREADS RAYON_NUM_THREADS POLARS_MAX_THREADS"
+for name in THREADS.split():
     os.environ.setdefault(name, "1")
 
 import numpy as np  # noqa: E402
@@ -89,6 +90,19 @@ def rival_readers() -> dict[str, Callable[[Path], object]]:
         found["faery"] = lambda path: faery.events_stream_from_file(path).to_array()
     except ImportError:
         pass
+    try:
+        from expelliarmus import Wizard
+
+        # it has to be told the format, which stands in the names of the files written here
+        found["expelliarmus"] = lambda path: Wizard(encoding=path.stem.split("_")[-1].lower()).read(str(path))
+    except ImportError:
+        pass
+    try:
+        import evlib
+
+        found["evlib"] = lambda path: evlib.load_events(str(path)).collect()
+    except ImportError:
+        pass
     return found
 
 
@@ -134,8 +148,8 @@ def files(folder: Path, count: int) -> Iterator[tuple[str, Path, int]]:
             write_events(path, events, format=name)
             yield f"{name} {stream}", path, len(events)
         if stream == "uniform":
-            write_dat(folder / "uniform.dat", events)
-            yield "DAT uniform", folder / "uniform.dat", len(events)
+            write_dat(folder / "uniform_DAT.dat", events)
+            yield "DAT uniform", folder / "uniform_DAT.dat", len(events)
     celex = celex_events(count)
     write_events(folder / "rows_EI_100M.bin", celex)
     yield "CeleX 1 rows", folder / "rows_EI_100M.bin", len(celex)
@@ -155,7 +169,7 @@ def main() -> None:
         f"{arguments.events:,} events, one thread, processor time, medians of {arguments.rounds} interleaved "
         "rounds; millions of events per second.",
         "",
-        machine("numpy", "evutils", "faery"),
+        machine("numpy", "evutils", "faery", "expelliarmus", "evlib"),
         "",
         f"| file | bytes per event | {' | '.join(readers)} | ratios |\n|---|---|{'---|' * len(readers)}---|",
     ]

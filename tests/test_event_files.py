@@ -233,7 +233,7 @@ def test_evt3_jitter_of_a_camera_is_clamped(tmp_path):
 
 
 def camera_words(seed: int, has_vectors: bool, jitter_us: int) -> np.ndarray:
-    """Return 30,000 EVT3 words as a camera sends them: rows, single events, vectors, times that waver, silence."""
+    """Return 30,000 EVT3 words as a camera sends them: rows, single events, vectors, times that waver."""
     draw = np.random.default_rng(seed)
     likely = np.array([3, 8, has_vectors, 2 * has_vectors, has_vectors, 3, 0.02, 0.01, 0.01])
     kinds = draw.choice([0, 2, 3, 4, 5, 6, 8, 7, 14], 30_000, p=likely / likely.sum())
@@ -256,7 +256,7 @@ def camera_words(seed: int, has_vectors: bool, jitter_us: int) -> np.ndarray:
 @pytest.mark.parametrize("jitter_us", [0, 5, 70])
 @pytest.mark.parametrize("has_vectors", [False, True])
 def test_evt3_is_read_quickly_as_it_is_with_care(has_vectors, jitter_us, tmp_path):
-    """A trigger edge among some thousand words has them decoded one by one: nothing may come out differently."""
+    """A trigger edge among a thousand words has them decoded one by one: nothing may come out differently."""
     for seed in range(4):
         words = camera_words(seed, has_vectors, jitter_us)
         edges = np.insert(words, np.arange(100, len(words), 1000), 0xA001)

@@ -314,6 +314,15 @@ def trusted_events(columns: Columns, width: int, height: int) -> Events:
 
 
 @njit(cache=True)
+def is_ascending(t_us):
+    """Return whether no time is before its predecessor's, in vector code (`index - 1` would not be)."""
+    backwards, later = False, t_us[1:]
+    for index in range(len(later)):
+        backwards |= later[index] < t_us[index]
+    return not backwards
+
+
+@njit(cache=True)
 def _is_clean(t_us, x, y, width, height, newest):
     """Return whether all events are inside the sensor and in order, in loops for vector code."""
     largest_x, largest_y = np.uint16(0), np.uint16(0)
@@ -322,9 +331,7 @@ def _is_clean(t_us, x, y, width, height, newest):
     for value in y:
         largest_y = max(largest_y, value)
     backwards = len(t_us) > 0 and t_us[0] < newest
-    for index in range(1, len(t_us)):
-        backwards |= t_us[index] < t_us[index - 1]
-    return largest_x < width and largest_y < height and not backwards
+    return largest_x < width and largest_y < height and not backwards and is_ascending(t_us)
 
 
 @njit(cache=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from evnlos.events.files.columns import is_ascending
 from evnlos.events.files.words import (
     BACKWARDS,
     BASE,
@@ -28,7 +29,6 @@ from evnlos.events.files.words import (
 
 WRAP_US = 1 << 34
 _HIGH_TURN = 1 << 28
-_RUN = 16  # words
 
 
 def bound_evt2(words: NDArray[np.uint32]) -> int:
@@ -107,45 +107,30 @@ def _unpack(words, x, y, p):
 def _decode_chunk(words, state, events, t_us, x, y, p, width, height):
     """Decode words among which nothing is unusual; return the number of events, or -1 where something is.
 
-    Runs of `_RUN` words that are all events have their times in vector code; order, columns and geometry are
-    looked at afterwards, in vector code too.
+    Order, columns and geometry are looked at afterwards, in vector code.
     """
     high, newest, base = state[CLOCK], state[NEWEST], state[BASE]
     unusual = state[STARTED] == 0
     # Without a sign no access is checked for a negative index.
-    run, size = np.uint64(_RUN), np.uint64(len(words))
+    size = np.uint64(len(words))
     count = first = np.uint64(0)
     while first < size:
-        stop = min(first + run, size)
-        kinds = np.uint32(0)
-        for index in range(first, stop):
-            kinds |= words[index]
-        if kinds < 0x20000000 and stop - first == run:
-            for index in range(run):
-                word = words[first + index]
-                t_us[count + index] = base + np.int64((word >> np.uint32(22)) & np.uint32(0x3F))
-                events[count + index] = word
-            count += run
+        word = words[first]
+        first += np.uint64(1)
+        if word < 0x20000000:
+            t_us[count] = base + np.int64((word >> np.uint32(22)) & np.uint32(0x3F))
+            events[count] = word
+            count += np.uint64(1)
         else:
-            for index in range(first, stop):
-                word = words[index]
-                if word < 0x20000000:
-                    t_us[count] = base + np.int64((word >> np.uint32(22)) & np.uint32(0x3F))
-                    events[count] = word
-                    count += np.uint64(1)
-                else:
-                    new = np.int64(word & 0xFFFFFFF)
-                    unusual |= (word >> 28) != 8 or new < high
-                    base += (new - high) << 6
-                    high = new
-        first = stop
+            new = np.int64(word & 0xFFFFFFF)
+            unusual |= (word >> 28) != 8 or new < high
+            base += (new - high) << 6
+            high = new
     found = np.int64(count)
     if found:
         unusual |= t_us[0] < newest
         newest = t_us[found - 1]
-    for index in range(1, found):
-        unusual |= t_us[index] < t_us[index - 1]
-    if unusual:
+    if unusual or not is_ascending(t_us[:found]):
         return np.int64(-1)
     largest_x, largest_y = _unpack(events[:found], x[:found], y[:found], p[:found])
     if largest_x >= width or largest_y >= height:

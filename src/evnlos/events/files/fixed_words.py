@@ -19,7 +19,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evnlos.events.files.columns import SALVAGE, Columns, ReadReport, allocate, cut, join, unreadable
+from evnlos.events.files.columns import (
+    SALVAGE,
+    Columns,
+    ReadReport,
+    allocate,
+    cut,
+    is_ascending,
+    join,
+    unreadable,
+)
 from evnlos.events.files.raw import parse_raw_header, raw_format_names, raw_geometry, read_raw_header
 from evnlos.events.files.words import (
     BACKWARDS,
@@ -105,10 +114,7 @@ def _unpack(words, base, t_us, x, y, p):
         largest_x = max(largest_x, x[index])
     for index in range(len(words)):
         largest_y = max(largest_y, y[index])
-    backwards = False
-    for index in range(1, len(words)):
-        backwards |= t_us[index] < t_us[index - 1]
-    return largest_x, largest_y, (bits >> 60) & 0xF, not backwards
+    return largest_x, largest_y, (bits >> 60) & 0xF, is_ascending(t_us)
 
 
 @njit(cache=True)

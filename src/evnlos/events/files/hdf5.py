@@ -192,8 +192,8 @@ class Hdf5Source:
             if chunk > _MOST_CHUNK_BYTES:
                 found = f"{self._called(name)} has chunks of {chunk / 1e6:.0f} MB"
                 raise unreadable(self.path, 0, found, "write it in smaller ones (h5repack -l CHUNK=65536)")
-            room = dataset.id.get_num_chunks() * math.prod(dataset.chunks) if dataset.chunks else dataset.size
-            if room < dataset.size or need > stored * MOST_DEFLATED:
+            is_cut = bool(chunk) and dataset.id.get_num_chunks() * chunk < need
+            if is_cut or need > stored * MOST_DEFLATED:
                 found = f"{self._called(name)} announces {need} bytes, {stored} are stored"
                 raise unreadable(self.path, 0, found, _CURE)
         if len(set(lengths.values())) != 1:
@@ -306,7 +306,7 @@ def _entries_of(dataset: h5py.Dataset, name: str, start: int, stop: int) -> NDAr
 def _read_chunks(values: NDArray, dataset: h5py.Dataset, start: int, stop: int, offset: int = 0) -> bool:
     """Fill `values` with the entries start..stop plus `offset`, chunk by chunk, faster than the library.
 
-    False: packing or chunks are of another kind, or damaged; the library is to read them and to say what is wrong.
+    False where packing or chunks are of another kind, or damaged: the library reads them or says what is wrong.
     """
     kind, size = dataset.dtype, dataset.dtype.itemsize
     length = dataset.chunks[0] if dataset.chunks else 0
