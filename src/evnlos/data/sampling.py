@@ -79,7 +79,8 @@ class Sampling:
     radius: int = 3
     """Radius of the neighbourhood of the surfaces `context` and `hots`, pixels."""
     setup: str = ""
-    """Setup for the surface `likelihood`: a folder of `evnlos calibrate`, a settings file, or a name."""
+    """Setup whose light path the surface `likelihood`, and networks with `frames: likelihood`, undo: a folder
+    of `evnlos calibrate`, a settings file, or a name."""
 
     def __post_init__(self) -> None:
         for name in ("height", "width", "scored_rows"):

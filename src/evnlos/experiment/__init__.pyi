@@ -2,17 +2,17 @@
 
 from .conditions import Condition as Condition
 from .conditions import Finding as Finding
+from .conditions import Simulated as Simulated
 from .conditions import base_simulation as base_simulation
 from .conditions import conditions as conditions
 from .conditions import conditions_table as conditions_table
+from .conditions import run_simulated as run_simulated
 from .conditions import sweep_parameters as sweep_parameters
 from .presets import STUDIES as STUDIES
 from .presets import GeneralizationResult as GeneralizationResult
 from .presets import generalization as generalization
 from .presets import on_sequences as on_sequences
-from .run import Simulated as Simulated
 from .run import captures_of as captures_of
-from .run import run_simulated as run_simulated
 from .run import run_study as run_study
 from .study import Arm as Arm
 from .study import Place as Place

@@ -184,13 +184,16 @@ def sequence(setup: str) -> Study:
     """Return the comparison of E2E and EPNP where all time steps of a sequence are seen together.
 
     A sequence is one sample: the simulation has four times the writers of the other studies. The images of an
-    end-to-end network of single positions, aligned and averaged, are the stronger E2E.
+    end-to-end network of single positions, aligned and averaged, are the stronger E2E. What knows the
+    calibrated light path sees the target that all frames, and all events, make most likely through it.
     """
+    before = replace(_SEQUENCE, network=replace(_SEQUENCE_NETWORK, frames="likelihood"))
+    sees = Sampling(surface="likelihood")
     arms = (
         Arm("E2E, single positions", "none", None, END_TO_END),
         Arm("E2E sequence", "none", None, replace(_SEQUENCE, epochs=60)),
-        Arm("simulation only sequence", "calibrated", _SEQUENCE, None),
-        Arm("EPNP sequence", "calibrated", _SEQUENCE, _SEQUENCE_FINETUNING),
+        Arm("simulation only sequence", "calibrated", before, None, sampling=sees),
+        Arm("EPNP sequence", "calibrated", before, _SEQUENCE_FINETUNING, sampling=sees),
     )
     return Study("sequence", setup, arms, writers=44, average=True, retrieval=True)
 

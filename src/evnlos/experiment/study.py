@@ -1,6 +1,5 @@
-"""What an experiment is: arms that are compared on the same captures, modalities, and seeds.
-
-- Results of experiments as small JSON files that can be kept, compared and put into tables.
+"""What an experiment is (arms compared on the same captures, modalities, and seeds), and its results as small
+JSON files that can be kept, compared and put into tables.
 """
 
 from __future__ import annotations
@@ -104,15 +103,17 @@ class Arm:
         """Whether the captures have to be calibrated first."""
         return self.source == "calibrated" or self.sampling.surface == "likelihood"
 
-    def with_light_path(self, setup: Path) -> Arm:
+    def with_light_path(self, setup: Path, *, sees_events: bool = True) -> Arm:
         """Return the arm with a setup for the surface `likelihood`, where it is made and names none.
 
         Args:
             setup: Folder of the calibrated setup.
+            sees_events: Whether a network sees the surface; else a quick one takes its place.
         """
-        if self.sampling.surface != "likelihood" or self.sampling.setup:
+        if self.sampling.surface != "likelihood":
             return self
-        return replace(self, sampling=replace(self.sampling, setup=str(setup)))
+        seen = replace(self.sampling, setup=self.sampling.setup or str(setup))
+        return replace(self, sampling=seen if sees_events else replace(seen, surface=Sampling().surface))
 
 
 @dataclass(frozen=True)
