@@ -1,5 +1,6 @@
 """Experiments: resumable, honest about what was held out, and put into tables that say what the records say."""
 
+import importlib
 import json
 import shutil
 import sys
@@ -402,7 +403,8 @@ def test_the_command_names_what_is_wrong(tmp_path, capsys) -> None:
 
 def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeypatch) -> None:
     from evnlos.data.simulations import paper
-    from evnlos.experiment import conditions as simulated
+
+    simulated = importlib.import_module("evnlos.experiment.conditions")
 
     sets = simulated.simulations(simulated.Simulated(tmp_path))
     assert [len(c.glyphs.objects()) for c in sets.values()] == [39 * 26, 26, 36]
