@@ -163,6 +163,21 @@ def test_invert_tells_its_captures_and_its_solvers(tiny_captures, tmp_path, caps
         assert told in capsys.readouterr().err
 
 
+def test_the_demo_shows_a_first_reconstruction_with_published_weights(tmp_path, capsys, monkeypatch) -> None:
+    began, later = time.process_time(), list[str]()
+    monkeypatch.setattr("evnlos.cli.experiment.run_demo", lambda settings: later.append(str(settings.out)))
+    words = ["demo", "--out", str(tmp_path / "demo"), "--quiet"]
+    main(words)
+    assert time.process_time() - began < 60
+    shown = capsys.readouterr().out
+    assert (tmp_path / "demo" / "first" / "summary.json").is_file() and "lab_S by near-frame-sequence" in shown
+    assert [path.name for path in (tmp_path / "demo" / "captures").glob("lab_*")] == ["lab_S"]
+    main(words)
+    main(["demo", "--out", str(tmp_path / "wrong"), "--captures", str(tmp_path / "nowhere"), "--quiet"])
+    assert capsys.readouterr().out == "" and not (tmp_path / "wrong").exists()  # once; and the demo refuses
+    assert len(later) == 3
+
+
 def test_evaluate_tells_its_stages(tiny_dataset) -> None:
     network = UNetConfig(width=4, depth=1, rank=0).build("frame", tiny_dataset.sampling)
     steps: list[Step] = []

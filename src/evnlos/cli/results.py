@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,7 @@ from evnlos.analysis.bounds import SequenceAnalysisSettings
 from evnlos.analysis.linearized import AnalysisSettings
 from evnlos.cli.parsing import drawn, say
 from evnlos.cli.recordings import Flat, Folders, check_writable, result
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, EvnlosError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
 from evnlos.tracking import Tracking
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from evnlos.analysis import Identification
     from evnlos.data import Capture
+    from evnlos.data.lab import Lab
     from evnlos.tracking import Track
 
 
@@ -86,6 +88,42 @@ class ReconstructCommand:
             print(line)
         if "scores" in found:
             print("  ".join(f"{name} {value}" for name, value in found["scores"].items() if value is not None))
+
+
+def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool = False) -> None:
+    """Reconstruct one of the demo's captures with published weights, before anything is trained.
+
+    Args:
+        demo: Folder of the demo; the result is its folder `first`, and made once.
+        captures: Capture folders, or folders above them.
+        lab: Renders the demo's captures where there are none.
+        force: Begin although the machine's memory will hardly do.
+    """
+    from evnlos.data.lab import render_captures
+    from evnlos.report import reconstruct_capture
+
+    out = demo / "first"
+    if out.exists():
+        return
+    given = (path for one in captures for path in (one, *sorted(one.glob("*"))))
+    capture = next((path for path in given if (path / "capture.yaml").is_file()), None)
+    if capture is None and captures:
+        return  # the demo says so
+    try:
+        with ProgressBars() as progress:
+            if capture is None:
+                names = [name for name in lab.glyphs.objects() if name.endswith("_S")]
+                capture = render_captures(lab, demo / "captures", names, 1, progress, force)[0]
+            with progress.stage("first reconstruction", capture.name):
+                found = reconstruct_capture(capture, None, out)
+    except EvnlosError as error:
+        say(f"note: no first reconstruction: {error}")
+        return
+    print(
+        "\n".join(
+            [f"{out / 'result.png'}: {capture.name} by {found['weights']}, published", *found["in_words"]]
+        )
+    )
 
 
 @dataclass(frozen=True)
