@@ -419,3 +419,11 @@ def test_long_silences_are_no_clock_errors(tmp_path):
     events = Events(gaps, np.zeros(400, int), np.zeros(400, int), np.ones(400, bool), 8, 8)
     write_events(tmp_path / "a.raw", events, format="EVT3")
     assert read_events(tmp_path / "a.raw") == events
+
+
+def test_a_recording_without_a_whole_frame_is_an_error_of_the_file(tmp_path):
+    path = tmp_path / "MipiData_F_100M.bin"
+    write_celex_frames(path, np.zeros((1, 800, 1280), np.uint8))
+    path.write_bytes(path.read_bytes()[:500_000])
+    with pytest.raises(EventFileError, match="no whole frame"):
+        read_frames(path, on_error="salvage")

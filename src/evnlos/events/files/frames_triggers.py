@@ -213,6 +213,8 @@ def read_timed_frames(
 ) -> Frames:
     """Return the frames of a file with their times; arguments as those of `read_frames`."""
     how: dict[str, Any] = {"bits": bits, "fpn": fpn, "on_error": on_error, "celex": celex, "topic": topic}
+    if next(iter_frames(path, **how), None) is None:
+        raise unreadable(Path(path), 0, "no whole frame in it", "give another file")
     images, t_us = gather_frames(lambda: iter_frames(path, **how), Path(path), memory_left() // 4)
     return Frames(np.asarray(images), t_us)
 
