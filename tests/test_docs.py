@@ -144,3 +144,10 @@ def test_a_page_on_recordings_that_nobody_can_have_says_how_to_make_their_like()
     assert len(cites) >= 7
     for path in cites:
         assert "lab.md#published-captures" in pages[path], path
+
+
+def test_no_page_to_start_with_asks_for_a_compiler() -> None:
+    """All that is needed comes as wheels (`tools/distributions.py` builds ours, which is pure Python)."""
+    for page in (ROOT / "README.md", *(DOCS / f"{name}.md" for name in ("install", "tour", "quickstart"))):
+        assert not re.search(r"\bgcc\b|\bclang\b|build-essential", page.read_text()), page.name
+    assert "no compiler" in (DOCS / "install.md").read_text()
