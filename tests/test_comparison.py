@@ -81,6 +81,8 @@ def test_no_face_that_the_reader_learned_draws_what_it_reads() -> None:
 def test_what_is_taken_for_another_character_is_said_in_shares() -> None:
     seen = [{"near_G": {"G": 3, "C": 1}, "near_K": {"K": 4}}, {"near_G": {"C": 2, "G": 1, "6": 1}}]
     assert confusion(seen) == "G as C 38%, G as 6 12%" and confusion([]) == ""
+    many = {"near_G": dict.fromkeys("ABCDEFHIJK", 10)}
+    assert confusion([many]).endswith("G as I 10%, 2 more")
 
 
 def test_training_a_reader_repeats_itself_and_learns() -> None:

@@ -167,6 +167,25 @@ def test_a_study_is_estimated_first_and_can_be_forced(records, place, monkeypatc
     assert run_study(STUDY, replace(place, force=True)) == []
 
 
+def test_an_augmented_arm_learns_from_more_and_is_scored_on_the_same(records, apart) -> None:
+    arm = replace(ARMS[0], name="E2E augmented", augment=True)
+    study = replace(STUDY, name="more", arms=(arm,), modalities=("frame",), seeds=(0,))
+    (new,) = run_study(study, apart)
+    learned = open_dataset(apart.out / "recorded" / new.settings["captures"])
+    plain = open_dataset(
+        next(path for path in (apart.out / "recorded").iterdir() if "augmented" not in path.name)
+    )
+    assert set(learned.objects("train")) > set(plain.objects("train"))
+    assert learned.objects("test") == plain.objects("test") == list(new.scores["psnr_db"])
+    assert (
+        load_weights(apart.out / "runs" / new.settings["run"]).history[-1]["data"]["name"]
+        == learned.folder.name
+    )
+    assert run_study(study, apart) == []
+    with pytest.raises(ConfigError, match="only an end-to-end training is augmented"):
+        replace(ARMS[2], augment=True)
+
+
 def test_networks_trained_at_a_time_are_those_trained_one_by_one(records, place, tmp_path) -> None:
     for part in ("setups", "simulations", "recorded"):
         shutil.copytree(place.out / part, tmp_path / part)

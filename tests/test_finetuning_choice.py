@@ -2,16 +2,30 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from evnlos.data import NlosDataset
-from evnlos.errors import ConfigError
+from evnlos.analysis.confidence import FrameOperator
+from evnlos.config import from_dict
+from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
+from evnlos.errors import ConfigError, DataError
 from evnlos.metrics import psnr
 from evnlos.models import UNetConfig, load_weights
-from evnlos.training import Training, between, choose_and_finetune, read_choice, train
+from evnlos.scene import HandwritingGlyphs
+from evnlos.setups import RadiometricSetup, SensorSize
+from evnlos.training import (
+    MOST_ASYMMETRY,
+    Training,
+    asymmetry,
+    augmented,
+    between,
+    choose_and_finetune,
+    read_choice,
+    train,
+)
 
 SMALL = UNetConfig(width=8, depth=1, blocks=1, rank=8)
 
@@ -87,3 +101,71 @@ def test_nothing_to_choose_from_is_refused(tiny_dataset, pretrained, tmp_path) -
     run = choose_and_finetune(one, (Training(epochs=1, network=SMALL),), tmp_path / "one", pretrained)
     choice = read_choice(run.folder)
     assert choice is not None and choice.candidate is None
+
+
+def captured(folder: Path, offset_y_m: float = 0.0, characters: str = "ABCEFGHJKLRT") -> Dataset:
+    """Return objects before a wall, whose camera looks at the middle of their height or so far beside it."""
+    setup = RadiometricSetup(cell_m=0.005, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72))
+    across_m, _ = setup.offset_m()
+    config = Simulation(
+        glyphs=HandwritingGlyphs(characters=characters, writers=1),
+        setup=replace(setup, target_offset_m=(across_m, offset_y_m)),
+        sampling=Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24),
+        positions=8,
+        validation=0.0,
+        held_out="T",
+    )
+    return simulate(config, folder)
+
+
+def frames_of(dataset: Dataset, truth: np.ndarray) -> np.ndarray:
+    """Return the frames that the setup of a dataset makes of true images [N, H, W], without noise."""
+    operator = FrameOperator(from_dict(Simulation, dataset.config).setup, dataset.sampling)
+    return operator(torch.from_numpy(truth)).numpy()
+
+
+def test_further_captures_are_what_the_setup_would_make_of_their_truth(tmp_path) -> None:
+    dataset = captured(tmp_path / "d")
+    more = augmented(dataset, "frame")
+    assert more.config["augmented"]["asymmetry"] < MOST_ASYMMETRY
+    names = more.objects("train")
+    assert len(names) == 4 * len(dataset.objects("train")) and more.objects("test") == dataset.objects("test")
+    kinds = {"writer": 11, "mirror": 11, "mean00": 10, "mean01": 10, "mean02": 2}
+    assert {key: sum(name.startswith(key) for name in names) for key in kinds} == kinds
+    for name in (names[0], names[11], names[22], names[-1]):
+        samples, _ = read_shard(more.shard(name))
+        assert samples.truth is not None
+        off = samples.frame - frames_of(dataset, samples.truth)
+        assert abs(off.mean()) < 2e-3 and off.std() < 0.01, name
+        assert samples.truth.min() >= 0 and samples.truth.max() <= 1
+    assert augmented(dataset, "frame").folder == more.folder
+
+
+def test_events_have_mirror_images_and_no_means(tmp_path) -> None:
+    dataset = captured(tmp_path / "d")
+    names = augmented(dataset, "fusion").objects("train")
+    assert len(names) == 2 * len(dataset.objects("train"))
+    assert not [name for name in names if name.startswith("mean")]
+
+
+def test_captures_of_a_setup_that_is_not_symmetric_are_not_mirrored(tmp_path) -> None:
+    dataset = captured(tmp_path / "d", offset_y_m=0.04)
+    assert asymmetry(dataset) > MOST_ASYMMETRY
+    assert augmented(dataset, "event").objects("train") == dataset.objects("train")
+    names = augmented(dataset, "frame").objects("train")
+    assert len(names) == 2 * len(dataset.objects("train")) and not [
+        n for n in names if n.startswith("mirrored")
+    ]
+
+
+def test_few_captures_tell_no_symmetry(tmp_path) -> None:
+    dataset = captured(tmp_path / "d", characters="ABCT")
+    with pytest.raises(DataError, match="3 captures tell no symmetry"):
+        asymmetry(dataset)
+    assert len(augmented(dataset, "frame").objects("train")) == 6
+
+
+@pytest.mark.parametrize(("offset_y_m", "is_symmetric"), [(0.0, True), (0.02, False)])
+def test_asymmetry_tells_a_camera_two_centimetres_off(offset_y_m, is_symmetric, tmp_path) -> None:
+    found = asymmetry(captured(tmp_path / "d", offset_y_m))
+    assert (found <= MOST_ASYMMETRY) == is_symmetric, found

@@ -30,6 +30,7 @@ from evnlos.types import Plane
 
 _TOGETHER = 128  # samples compared at a time
 _SMALLEST = 1e-3
+_MOST_NAMED = 8  # of what is taken for something else
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +340,9 @@ def confusion(seen: Sequence[dict[str, dict[str, int]]]) -> str:
         for character, count in read.items()
         if character != true
     ]
-    return ", ".join(f"{words} {share:.0%}" for share, words in sorted(wrong, key=lambda pair: -pair[0]))
+    wrong.sort(key=lambda pair: -pair[0])
+    more = [f"{len(wrong) - _MOST_NAMED} more"] if len(wrong) > _MOST_NAMED else []
+    return ", ".join([f"{words} {share:.0%}" for share, words in wrong[:_MOST_NAMED]] + more)
 
 
 def reconstruct(

@@ -54,8 +54,8 @@ _EPNP = Arm("EPNP", "calibrated", PRETRAINING, FINETUNING)
 def captures(setup: str) -> Study:
     """Return the main comparison: E2E, simulation alone, EPNP on the uncalibrated and the calibrated one.
 
-    E2E is there twice: with our network, whose linear embedding it learns from the captures, and as the paper
-    has it, with a U-Net that sees the maps.
+    E2E is there three times: with our network, whose linear embedding it learns from the captures, the same
+    with exact further captures, and as the paper has it, with a U-Net that sees the maps.
     """
     plain = replace(END_TO_END, network=_PLAIN)
     return Study(
@@ -64,6 +64,7 @@ def captures(setup: str) -> Study:
         (
             Arm("E2E plain", "none", None, plain),
             _E2E,
+            replace(_E2E, name="E2E augmented", augment=True),
             Arm("simulation only", "calibrated", PRETRAINING, None),
             Arm("EPNP uncalibrated", "uncalibrated", PRETRAINING, UNCALIBRATED),
             _EPNP,
@@ -185,13 +186,16 @@ def sequence(setup: str) -> Study:
 
     A sequence is one sample: the simulation has four times the writers of the other studies. The images of an
     end-to-end network of single positions, aligned and averaged, are the stronger E2E. What knows the
-    calibrated light path sees the target that all frames, and all events, make most likely through it.
+    calibrated light path sees the target that all frames, and all events, make most likely through it. Both
+    E2E have exact further captures, too.
     """
     before = replace(_SEQUENCE, network=replace(_SEQUENCE_NETWORK, frames="likelihood"))
     sees = Sampling(surface="likelihood")
     arms = (
         Arm("E2E, single positions", "none", None, END_TO_END),
+        Arm("E2E, single positions, augmented", "none", None, END_TO_END, augment=True),
         Arm("E2E sequence", "none", None, replace(_SEQUENCE, epochs=60)),
+        Arm("E2E sequence, augmented", "none", None, replace(_SEQUENCE, epochs=60), augment=True),
         Arm("simulation only sequence", "calibrated", before, None, sampling=sees),
         Arm("EPNP sequence", "calibrated", before, _SEQUENCE_FINETUNING, sampling=sees),
     )

@@ -35,7 +35,7 @@ from evnlos.experiment.table import score_arm
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import calibrated_file
-from evnlos.training import Training, choose_and_finetune, train
+from evnlos.training import Training, augmented, choose_and_finetune, train
 from evnlos.types import derive_seed
 
 
@@ -105,7 +105,8 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
         recorded = _import(study, arm, place, progress)
         made = _simulate(study, arm, place, progress)
         for modality in study.modalities:
-            plans = [_planned(study, arm, modality, seed, made, recorded, place) for seed in study.seeds]
+            learned = augmented(recorded, modality) if arm.augment else recorded
+            plans = [_planned(study, arm, modality, seed, made, learned, place) for seed in study.seeds]
             networks.append(_Network(study, arm, modality, plans, made, recorded, place))
     if place.trainings != 1 and not torch.cuda.is_available():  # on a GPU one after the other
         return _together(networks, place.trainings, progress)
@@ -305,8 +306,7 @@ def _planned(
             "settings": to_dict(settings),
             "from": start and Path(start).name,
         }
-        if arm.choose:
-            decides["choose"] = True
+        decides |= {"choose": True} if arm.choose else {}
         key = config_hash(decides)[:8]
         out = place.out / "runs" / f"{study.setup}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
         runs.append(Run(recorded, settings, out, start, arm.choose))

@@ -52,6 +52,8 @@ class Arm:
     """Choose on captures held out of the fine-tuning how much of it is taken, if any."""
     writers: int | None = None
     """Writers of the simulated characters; None is as many as the study says."""
+    augment: bool = False
+    """Train end to end on exact further captures too (`evnlos.training.augmented`)."""
     captures: int | None = None
     """Captures to train on; None is all that are there, otherwise the first of a seeded order."""
     sampling: Sampling = field(default_factory=Sampling)
@@ -66,6 +68,8 @@ class Arm:
             )
         if self.pretraining is None and self.finetuning is None:
             raise ConfigError(f"arm {self.name!r} trains nothing; give pre-training, fine-tuning or both")
+        if self.augment and self.pretraining is not None:
+            raise ConfigError(f"arm {self.name!r}: only an end-to-end training is augmented; leave it off")
         if self.choose and (self.pretraining is None or self.finetuning is None):
             raise ConfigError(f"arm {self.name!r}: only a fine-tuning can be chosen; give both trainings")
         if self.captures is not None and self.captures < 1:
@@ -233,21 +237,18 @@ def _merged(group: list[Record], setup: str) -> Record:
         for name, table in first.baselines.items()
         if all(name in record.baselines for record in group)
     }
-    counts = [len(record.positions) for record in group]
     checks = {
-        key: float(np.average([r.checks[key] for r in group], weights=counts))
+        key: float(np.average([r.checks[key] for r in group], weights=[len(r.positions) for r in group]))
         for key in first.checks
         if all(key in record.checks for record in group)
     }
-    positions = {name: values for record in group for name, values in record.positions.items()}
-    runs = [record.settings.get("run") for record in group]
     merged = replace(first, study=first.study.partition("/")[0], setup=setup, scores=scores)
     return replace(
         merged,
-        positions=positions,
+        positions={name: values for record in group for name, values in record.positions.items()},
         baselines=baselines,
         checks=checks,
-        settings={"arm": first.arm, "runs": runs},
+        settings={"arm": first.arm, "runs": [record.settings.get("run") for record in group]},
         read_as={name: seen for record in group for name, seen in record.read_as.items()},
     )
 
@@ -325,8 +326,7 @@ def slug(text: str) -> str:
         >>> slug("EPNP + consistency")
         'epnp-consistency'
     """
-    words = "".join(c if c.isalnum() else " " for c in text.lower()).split()
-    return "-".join(words)
+    return "-".join("".join(c if c.isalnum() else " " for c in text.lower()).split())
 
 
 def scores_of(evaluation: Evaluation) -> tuple[dict, dict, dict]:

@@ -1,7 +1,10 @@
 """Names of `evnlos.training`; `__init__.py` reads this list."""
 
+from .choice import MOST_ASYMMETRY as MOST_ASYMMETRY
 from .choice import Choice as Choice
 from .choice import alternatives as alternatives
+from .choice import asymmetry as asymmetry
+from .choice import augmented as augmented
 from .choice import between as between
 from .choice import choose_and_finetune as choose_and_finetune
 from .choice import read_choice as read_choice

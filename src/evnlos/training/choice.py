@@ -1,11 +1,17 @@
-"""Fine-tuning that cannot lose: how much of it, if any, is chosen on captures that it did not learn from."""
+"""How to learn from few captures: no more than helps, and from more than were taken.
+
+- Fine-tuning that cannot lose: how much of it, if any, is chosen on captures that it did not learn from.
+- Exact further captures: upside down where the setup is symmetric, and means of two.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +19,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.config import save_yaml, to_dict, write_atomically
-from evnlos.data import Dataset, NlosDataset
-from evnlos.errors import ConfigError
+from evnlos.config import config_hash, save_yaml, to_dict, write_atomically
+from evnlos.data import Dataset, NlosDataset, Samples, as_modality, open_dataset, read_shard, write_shard
+from evnlos.data.store import claim_dataset
+from evnlos.errors import ConfigError, DataError
 from evnlos.files import directory_lock
 from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
-from evnlos.models import Reconstructor, Weights, load_weights, save_weights
+from evnlos.models import Reconstructor, Weights, fit_linear, load_weights, save_weights
 from evnlos.training.settings import Training
 from evnlos.training.train import TrainingResult, about_run, check_run, train
 from evnlos.types import derive_seed
@@ -209,3 +216,128 @@ def _choice(gains: NDArray[np.float64]) -> Choice:
 
 def _records(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+MOST_ASYMMETRY = 1.05
+"""Up to this `asymmetry` a setup counts as symmetric, and captures upside down as captures."""
+_FEWEST = 4  # captures that tell symmetry
+_ALIKE_PX = 0.05  # places that differ by less are the same
+
+
+def asymmetry(dataset: Dataset) -> float:
+    """Return by which factor captures upside down, learned from too, make predictions worse.
+
+    A linear light path is fitted to half of the training objects, without and with the same ones upside down,
+    and predicts frames and events of the other half. The worst of their channels counts; symmetric: up to 1.
+
+    Args:
+        dataset: Captures with known targets, at least four of them to learn from.
+
+    Raises:
+        DataError: There are fewer.
+    """
+    samples = NlosDataset(dataset, "train", "fusion")
+    objects = np.unique(samples.names)
+    if len(objects) < _FEWEST:
+        raise DataError(f"{len(objects)} captures tell no symmetry; give at least {_FEWEST} to learn from")
+    truth, seen = samples.truth.float()[:, None], samples.inputs.float()
+    errors = torch.zeros(2, seen.shape[1])  # without and with those upside down; of each channel
+    half = np.isin(samples.names, objects[::2])
+    for known in (half, ~half):
+        chosen = torch.from_numpy(known)
+        alone = truth[chosen], seen[chosen], samples.names[known]
+        both = *(torch.cat([part, part.flip(-2)]) for part in alone[:2]), np.tile(alone[2], 2)
+        for error, (x, y, names) in zip(errors, (alone, both), strict=True):
+            predicted = fit_linear(x, y.flatten(1, 2), names)(truth[~chosen])
+            error += (predicted.reshape(-1, *seen.shape[1:]) - seen[~chosen]).square().sum(dim=(0, 2, 3))
+    without, together = errors.clamp_min(1e-9)
+    return float((together / without).max())
+
+
+def augmented(dataset: Dataset, modality: str) -> Dataset:
+    """Return captures with exact further ones to learn from, in a folder beside theirs; made where missing.
+
+    - Upside down, where the setup is symmetric: four captures and more show an `asymmetry` of at most
+      `MOST_ASYMMETRY`.
+    - For networks of frames alone: weighted means of two captures at the same places, as many as there are
+      captures by then. Light adds, so w y1 + (1 - w) y2 is the frame of w x1 + (1 - w) x2, under whatever
+      ambient light; the weights add up to 1, so that no truth leaves 0..1 and nothing is clipped. Only its
+      noise is less than a capture's. Events are not linear in the light: there are no means of them.
+
+    Args:
+        dataset: Captures with known targets and motions.
+        modality: What the network sees.
+
+    Raises:
+        DataError: A target or a motion is unknown.
+    """
+    names = dataset.objects("train")
+    factor = _measured(dataset.folder) if len(names) >= _FEWEST else math.inf
+    parts = {name: [(name, False)] for name in names}
+    if factor <= MOST_ASYMMETRY:
+        parts |= {f"mirrored_{name}": [(name, True)] for name in names}
+    if not as_modality(modality).needs_events:
+        parts |= _pairs(dataset, [one for (one,) in parts.values()])
+    listed = {name: [list(one) for one in own] for name, own in parts.items()}
+    about = {"asymmetry": round(factor, 3) if math.isfinite(factor) else None, "objects": listed}
+    new = replace(
+        dataset,
+        folder=dataset.folder.with_name(f"{dataset.folder.name}-augmented-{config_hash(about)[:8]}"),
+        split=dataset.split | {"train": list(parts)},
+        config=dataset.config | {"augmented": about},
+    )
+    with claim_dataset(new):
+        for name in new.missing():
+            found = [_turned(dataset, *part) for part in parts.get(name, [(name, False)])]
+            weight = float(np.random.default_rng(derive_seed(0, name, "weight")).uniform())
+            samples = found[0] if len(found) == 1 else _mean(found[0], found[1], weight)
+            write_shard(new.shard(name), samples, {"object": name, "config_hash": new.config_hash})
+    return new
+
+
+@lru_cache(maxsize=8)
+def _measured(folder: Path) -> float:
+    """Return the asymmetry of a dataset's captures; several networks ask for it."""
+    return asymmetry(open_dataset(folder))
+
+
+def _pairs(dataset: Dataset, objects: list[tuple[str, bool]]) -> dict[str, list[tuple[str, bool]]]:
+    """Return as many pairs of objects, that were at the same places at the same steps, as there are objects."""
+    draw, found = np.random.default_rng(derive_seed(0, "pairs")), dict[str, list[tuple[str, bool]]]()
+    places = [_turned(dataset, *one).position_m for one in objects]
+    near_m = _ALIKE_PX * dataset.sampling.pitch_m
+    for number, (one, at) in enumerate(zip(objects, places, strict=True)):
+        assert at is not None
+        alike = [
+            other
+            for other, there in zip(objects, places, strict=True)
+            if other != one
+            and there is not None
+            and there.shape == at.shape
+            and np.ptp([at, there], 0).max() < near_m
+        ]
+        if alike:
+            found[f"mean{number:03d}"] = [one, alike[draw.integers(len(alike))]]
+    return found
+
+
+def _turned(dataset: Dataset, name: str, is_turned: bool) -> Samples:
+    """Return an object's samples, upside down or as they are."""
+    samples, _ = read_shard(dataset.shard(name))
+    if samples.truth is None or samples.position_m is None:
+        raise DataError(f"target or motion of {name} is unknown; learn from captures with both")
+    if not is_turned:
+        return samples
+    maps = {key: np.flip(getattr(samples, key), -2) for key in ("frame", "surface", "truth")}
+    return replace(samples, **maps, position_m=samples.position_m * np.array([1.0, -1.0]))
+
+
+def _mean(one: Samples, other: Samples, weight: float) -> Samples:
+    """Return the frames and truth of a weighted mean of two objects; it has no events."""
+    assert one.truth is not None and other.truth is not None
+    frame, truth = (
+        (weight * a + (1 - weight) * b).astype(np.float32)
+        for a, b in ((one.frame, other.frame), (one.truth, other.truth))
+    )
+    nothing = np.zeros_like(one.surface), np.zeros_like(one.event_count)
+    return replace(one, frame=frame, truth=truth, surface=nothing[0], event_count=nothing[1])
