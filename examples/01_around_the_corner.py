@@ -15,8 +15,7 @@ from evnlos import EventCamera, EventPixel, FrameCamera, Scene, Target, psnr, ti
 from evnlos.data import Sampling, object_light
 from evnlos.inverse import SequenceOperator, SequenceProblem
 from evnlos.inverse.sequence_problem import strip_gram_of
-from evnlos.plot.event_views import signed_pictures, slice_pictures
-from evnlos.plot.figures import Column, film
+from evnlos.plot.figures import Column, film, signed_pictures, slice_pictures
 from evnlos.report.pictures import grey, save_animation
 from evnlos.scene import FontGlyphs
 from evnlos.setups import load_setup

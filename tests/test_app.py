@@ -43,7 +43,7 @@ from evnlos.cli import main
 from evnlos.data import Sampling
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
 from evnlos.models import load_weights
-from evnlos.plot.event_views import CloudSize, cloud_pictures, signed_pictures, smaller, time_slices
+from evnlos.plot.figures import CloudSize, cloud_pictures, signed_pictures, smaller, time_slices
 
 SMALL = Controls(columns=24)
 

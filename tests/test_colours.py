@@ -12,7 +12,7 @@ import evnlos
 from evnlos import Events
 from evnlos.events.recording import summarise
 from evnlos.events.volume import OFF_RGB, ON_HEX, ON_RGB, WORDS
-from evnlos.plot.event_views import signed_pictures
+from evnlos.plot.figures import signed_pictures
 from evnlos.plot.preview import PreviewOptions, preview_pictures
 from evnlos.report.pictures import polarity
 

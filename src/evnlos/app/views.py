@@ -27,7 +27,7 @@ from evnlos.cameras import EventPixel
 from evnlos.data import Sampling, Simulation
 from evnlos.events import time_surface
 from evnlos.events.volume import WORDS
-from evnlos.plot.event_views import (
+from evnlos.plot.figures import (
     CloudSize,
     cloud_pictures,
     signed_pictures,

@@ -133,7 +133,7 @@ class CornerCommand:
             self._film()
             return
         from evnlos.inverse import estimate_corner, read_penumbra
-        from evnlos.plot.figures import draw_corner
+        from evnlos.plot.setup import draw_corner
         from evnlos.tracking import track_bearings
 
         sector, video = self._sector(), self._video()

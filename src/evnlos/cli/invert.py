@@ -20,6 +20,7 @@ from evnlos.machine import ProgressBars
 
 REGULARIZATION_TIKHONOV = 4.0  # best on eight characters of one setup, docs/inversion.md
 REGULARIZATION_TV = 0.3  # likewise
+_EXPLAINED = 2.0  # times the camera's noise that frames may keep
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class InvertCommand:
     static: float = 1.0
     """Captures: standard deviation of a pixel's constant offset over that of its noise."""
     cells: int = 24
-    """Captures: cells per side of the target plane."""
+    """Captures: cells per side of the target plane; with --changing along its longer side."""
     columns: int = 64
     """Captures: columns to which frames are reduced, pixels."""
     subsets: int = 1
@@ -53,6 +54,9 @@ class InvertCommand:
     """Captures: estimate the target from these by one likelihood of the whole sequence and a Gaussian prior of
     handwriting, with the uncertainty of each cell; none = the solvers, which take frames. Events need the
     thresholds and the optics of this very sensor: it is said where they do not fit."""
+    changing: tuple[float, float] | None = None
+    """One capture: nothing moves as a whole; estimate a film of a hidden plane of this width and height,
+    metres, whose middle is that of the setup's target plane: an image per frame, with an error of each cell."""
     solver: Literal["all", "tikhonov", "tv"] = "all"
     """Smooth (`tikhonov`), sharp and not below 0 (`tv`), or both and, as a control, without the occluders."""
     regularization: str = "cv"
@@ -171,6 +175,9 @@ class InvertCommand:
         from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
+        if self.changing is not None:
+            self._film(setup, self.changing)
+            return
         if self.evidence is not None:
             self._estimate(setup, self.evidence)
             return
@@ -210,6 +217,56 @@ class InvertCommand:
         _save_arrays(self.out, arrays)
         table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{found['seconds']} s"
         print(json.dumps(found) if self.json else table)
+
+    def _film(self, word: Path, sides_m: tuple[float, float]) -> None:
+        from evnlos.cli.invert_captures import linear_setup
+        from evnlos.data import pattern_of, read_capture
+        from evnlos.data.fixed_pattern import object_light
+        from evnlos.inverse import estimate_film
+        from evnlos.plot.results import draw_inversion
+        from evnlos.types import Plane
+
+        if len(self.files) != 1 or self.evidence is not None or self.positions or self.track:
+            raise ConfigError("--changing takes the frames of one capture; leave --from, --positions, --track")
+        if not (min(sides_m) > 0 and max(sides_m) < np.inf and self.cells >= 2):
+            raise ConfigError(
+                f"--changing is {sides_m[0]:g} x {sides_m[1]:g} m of {self.cells} cells; give sides above 0 "
+                "and 2 cells or more"
+            )
+        clock = time.perf_counter()
+        setup, capture = linear_setup(word), read_capture(self.files[0])
+        if not capture.has_frames:
+            raise ConfigError(f"{self.files[0]} has no frames; --changing takes frames")
+        pitch = max(sides_m) / self.cells
+        across, down = (max(1, round(side / pitch)) for side in sides_m)
+        plane = Plane(down, across, pitch)
+        height, width = capture.frames.shape[1:]
+        columns = min(self.columns, width)
+        shape = (max(1, round(height * columns / width)), columns)
+        pattern = pattern_of(word, self.pattern)
+        light = object_light(capture.frames, capture.peak, setup, shape, pattern).double()
+        level = light.mean(dim=0) + setup.ambient_light(shape)
+        averaged = height * width / (shape[0] * shape[1])  # of the sensor's pixels, each with its own noise
+        noise = (setup.frame_camera.noise_variance(level) / averaged).sqrt()
+        operator = setup.resized((height, width)).operator(plane, shape)
+        found = estimate_film(operator, light, capture.frame_times_us * 1e-6, noise, static=self.static)
+        shown = np.linspace(0, len(found.mean) - 1, min(6, len(found.mean))).round().astype(int)
+        panels = [(f"{found.times_s[k]:.2f} s", torch.from_numpy(found.mean[k])[None]) for k in shown]
+        result: dict[str, Any] = {
+            "setup": str(word),
+            "capture": capture.name,
+            "images": len(found.mean),
+            "cells": list(plane.shape),
+            "prior": found.prior._asdict(),
+            "noise_factor": found.noise_factor,
+            "evidence": found.evidence,
+            "picture": drawn(self.out, lambda: draw_inversion(self.out, panels)),
+        }
+        _save_arrays(
+            self.out, {"times_s": found.times_s, "film": found.mean, "film_deviation": found.deviation}
+        )
+        result["seconds"] = round(time.perf_counter() - clock, 1)
+        print(json.dumps(result) if self.json else film_text(result))
 
     def _estimate(self, setup: Path, evidence: Literal["frames", "events", "both"]) -> None:
         from evnlos.cli.invert_captures import estimate_captures, sequence_doubts, sequence_text
@@ -253,6 +310,21 @@ def to_text(found: dict[str, Any]) -> str:
     for name, row in found["solutions"].items():
         r = f"{row['r']:8.3f}" if "r" in row else f"{'-':>8}"
         lines.append(f"{name:18}{row['regularization']:10.2e}{row['misfit']:10.5f}{row['iterations']:12d}{r}")
+    lines.append("; ".join([*([found["picture"]] if found["picture"] else []), f"{found['seconds']} s"]))
+    return "\n".join(lines)
+
+
+def film_text(found: dict[str, Any]) -> str:
+    """Return the figures of a film as lines for people."""
+    prior, (height, width) = found["prior"], found["cells"]
+    lines = [
+        f"{found['capture']}: {found['images']} images of {width} x {height} cells",
+        f"prior of the largest likelihood: cells change by {prior['deviation']:.3g}, rest within "
+        f"{prior['deviation'] * prior['resting']:.3g}, at {100 * prior['speed_m_s']:.3g} cm per second",
+        f"noise {found['noise_factor']:.2f} times the camera's",
+    ]
+    if found["noise_factor"] > _EXPLAINED:
+        lines.append("warning: no plane at this place explains the frames; check setup and ambient light")
     lines.append("; ".join([*([found["picture"]] if found["picture"] else []), f"{found['seconds']} s"]))
     return "\n".join(lines)
 

@@ -1,5 +1,10 @@
 """Names of `evnlos.inverse`; `__init__.py` reads this list."""
 
+from .changing import FilmEstimate as FilmEstimate
+from .changing import FilmPrior as FilmPrior
+from .changing import ModeSeries as ModeSeries
+from .changing import estimate_film as estimate_film
+from .changing import smooth_modes as smooth_modes
 from .corner import CornerPicture as CornerPicture
 from .corner import FloorSector as FloorSector
 from .corner import Penumbra as Penumbra

@@ -1,4 +1,8 @@
-"""The wall under a shift-variant transport: a strip of cells on which the target is drawn, and a matrix."""
+"""The wall under a shift-variant transport: a strip of cells on which the target is drawn, and a matrix.
+
+- A target that moves as a whole.
+- A hidden plane that changes in place: a film.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, DataError
 from evnlos.optics.interpolation import spline_coefficients, spline_weights
-from evnlos.optics.operator import MatrixTransport
+from evnlos.optics.operator import LinearTransport, MatrixTransport
 from evnlos.optics.wall import ambient_map, check_gain, checked_times
-from evnlos.scene import LineMotion, Motion, Target
+from evnlos.scene import Film, LineMotion, Motion, Target
 from evnlos.types import Plane
 
 _CHUNK = 64  # positions drawn and carried over at a time
@@ -191,3 +195,56 @@ def coarsest_keyframe_step_m(transport: MatrixTransport, size_m: float) -> float
         if float((wall._between_keys(places) - direct).std()) <= _KEYFRAME_ERROR * float(direct.std()):
             return step
     return strip.pitch_m / 2
+
+
+class FilmWall:
+    """What a linear transport makes of a hidden plane that changes in place, at any instant.
+
+    irradiance(t) = A x(t) + ambient, with x(t) the film on the operator's cells.
+
+    Args:
+        operator: From the plane's cells [h, w] to white levels of the camera's pixels, gain included
+            (`Setup.operator`).
+        film: The plane, known at every instant.
+        ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
+        speed_px_s: Upper bound of how fast edges move in the camera's image, pixels per second; an event camera
+            chooses its steps by it, frames do not need it.
+
+    Raises:
+        ConfigError: The ambient light is negative or not finite.
+        DataError: The film does not have the size of the operator's plane, or the ambient light not that of
+            the image.
+    """
+
+    def __init__(
+        self,
+        operator: LinearTransport,
+        film: Film,
+        *,
+        ambient: float | ArrayLike | torch.Tensor = 0.0,
+        speed_px_s: float = 0.0,
+    ) -> None:
+        if film.images.shape[1:] != operator.source.shape:
+            raise DataError(
+                f"the film is {film.images.shape[1:]}, the plane has {operator.source.shape} cells; "
+                "make them agree"
+            )
+        self.operator, self.film = operator, film
+        self.ambient = ambient_map(ambient, operator.shape)
+        self._speed = float(speed_px_s)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the camera image, pixels."""
+        return self.operator.shape
+
+    @property
+    def speed_px_s(self) -> float:
+        """Upper bound of the speed of edges in the image, pixels per second, as it was given."""
+        return self._speed
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return white levels at times `t_s`, seconds, [] or [T]: float32 [H, W] or [T, H, W]."""
+        times = checked_times(t_s)
+        light = self.operator(torch.from_numpy(self.film.at(times).astype(np.float64)))
+        return (self.ambient + light.clamp(min=0)).to(torch.float32)

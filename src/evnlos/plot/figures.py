@@ -2,28 +2,26 @@
 
 - An empty matplotlib figure, or one line that says what to install.
 - Films of a sequence: one column per stage of the light path, one image per position; NumPy and Pillow.
-- What a corner shows: the hidden side over bearing and time, and who moves there.
+- Events as pictures on any background: a space-time cloud, and slices through it; NumPy and Pillow.
 """
 
 from __future__ import annotations
 
 import io
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.errors import DataError, MissingDependencyError
+from evnlos.events import event_histogram
+from evnlos.events.volume import OFF_RGB, ON_RGB
 from evnlos.files import write_atomically
-
-if TYPE_CHECKING:
-    from evnlos.inverse import CornerPicture, FloorSector
-    from evnlos.tracking import BearingTracks
+from evnlos.types import Events
 
 
 def new_figure(size: tuple[float, float]) -> Any:
@@ -149,77 +147,193 @@ def _how(column: Column, width_px: int) -> Image.Resampling:
     return Image.Resampling.NEAREST if column.pictures.shape[2] <= width_px else Image.Resampling.BOX
 
 
-_TRACKS = ("#d95f02", "#1b9e77", "#7570b3", "#e7298a")  # apart in hue, and drawn with other dashes
+_FAINTEST = 0.35  # how strongly a single event is drawn where many are usual
+_CLEAR, _BOX, _PLANE, _LATER, _ON, _OFF, _ON_NOW, _OFF_NOW = range(8)
 
 
-def draw_corner(
-    path: str | Path,
-    picture: CornerPicture,
-    found: BearingTracks,
-    floor: NDArray,
-    sector: FloorSector,
-    sentence: str,
-    truth_deg: ArrayLike | None = None,
-) -> Path:
-    """Draw what a corner shows: the floor that was used, the hidden side over time, its certainty, the tracks.
+@dataclass(frozen=True)
+class CloudSize:
+    """How large a cloud is drawn, pixels.
 
     Args:
-        path: The picture, PNG, SVG or PDF.
-        picture: The hidden side over bearing and time.
-        found: Who moves there.
-        floor: A frame of the video, [H, W], any unit of light.
-        sector: The part of it that was used.
-        sentence: What is seen, in words.
-        truth_deg: True bearings [walkers, T], degrees, where they are known.
-
-    Returns:
-        The path.
+        width: Columns of the picture.
+        height: Rows of the picture.
+        most: Events that are drawn, evenly taken from all.
 
     Raises:
-        MissingDependencyError: matplotlib is not installed.
+        DataError: A side below 64 pixels.
     """
-    figure = new_figure((11.0, 6.4))
-    left, right = figure.subfigures(1, 2, width_ratios=(1, 2.15))
-    above, below = left.subplots(2, 1, height_ratios=(1, 0.8))
-    above.imshow(floor, cmap="gray", vmin=0, vmax=float(np.percentile(floor, 99)))
-    turn = np.linspace(0, 1, 40)
-    edge, wall, end = (np.array(point) for point in (sector.edge, sector.wall, sector.end))
-    ends = [np.arctan2(*(point - edge)[::-1]) for point in (wall, end)]
-    sweep = (ends[1] - ends[0] + np.pi) % (2 * np.pi) - np.pi
-    arc = edge + sector.reach_px * np.stack([f(ends[0] + turn * sweep) for f in (np.cos, np.sin)], axis=1)
-    above.fill(*np.concatenate([edge[None], arc]).T, facecolor="#2b7bba40", edgecolor="#2b7bba", lw=1.2)
-    above.plot(*np.stack([edge, wall]).T, color="k", lw=2)
-    above.plot(*edge, "o", color="#d95f02", ms=6)
-    above.set(xlim=(-0.5, floor.shape[1] - 0.5), ylim=(floor.shape[0] - 0.5, -0.5), xticks=(), yticks=())
-    above.set_title("floor used (blue), edge (dot), wall's foot (black)", fontsize=9)
-    extent = (picture.times_s[0], picture.times_s[-1], picture.bearings_deg[0], picture.bearings_deg[-1])
-    axes = right.subplots(2, 1, sharex=True, sharey=True)
-    percent, sure = 100 * picture.mean.T, np.abs(picture.mean / picture.deviation).T
-    top = max(float(np.percentile(np.abs(percent), 99.7)), 1e-9)
-    how = {"origin": "lower", "aspect": "auto", "extent": extent}
-    shown = axes[0].imshow(percent, **how, cmap=signed_map(), vmin=-top, vmax=top)
-    right.colorbar(shown, ax=axes[0], label="% of the floor's light per degree", pad=0.01)
-    axes[0].set_title("hidden side, most probable change of its light", fontsize=9)
-    shown = axes[1].imshow(sure, **how, cmap="gray_r", vmin=0, vmax=6)
-    right.colorbar(shown, ax=axes[1], label="standard deviations over 0", pad=0.01)
-    axes[1].set_title("how sure that is, and who moves: tracks with 90 % intervals", fontsize=9)
-    axes[1].set_xlabel("time, s")
-    if truth_deg is not None:
-        for k, row in enumerate(np.asarray(truth_deg)):
-            label = "truth" if k == 0 else None
-            axes[1].plot(picture.times_s, row, ":", color="#2b7bba", lw=1.8, label=label, zorder=4)
-    for k, track in enumerate(found.tracks):
-        colour, (low, high) = _TRACKS[k % len(_TRACKS)], track.interval_90
-        axes[1].fill_between(picture.times_s, low, high, color=colour, alpha=0.4, lw=0)
-        style = ("-", "--", "-.")[k % 3]
-        axes[1].plot(picture.times_s, track.bearing_deg, style, color=colour, lw=1.4, label=f"person {k + 1}")
-        below.plot(picture.times_s, 100 * np.where(track.there, track.brightness, np.nan), style, color=colour)
-    for axis in axes:
-        axis.set(ylabel="bearing about the edge, degrees", xlim=extent[:2], ylim=extent[2:])
-    if found.tracks or truth_deg is not None:
-        axes[1].legend(fontsize=8, loc="lower right", framealpha=0.9)
-    below.set(xlabel="time, s", ylabel="% of the floor's light", xlim=(picture.times_s[0], picture.times_s[-1]))
-    below.axhline(0, color="0.7", lw=0.8, zorder=0)
-    below.set_title("what each adds to the floor" if found.tracks else "nobody is seen", fontsize=9)
-    figure.suptitle("\n".join(textwrap.wrap(sentence, 130)), fontsize=10)
-    return save_figure(figure, path, dpi=100)
+
+    width: int = 480
+    height: int = 264
+    most: int = 20_000
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 64 or self.most < 1:
+            raise DataError(f"the cloud is {self.width} x {self.height}; give 64 x 64 pixels or more")
+
+    def axes(self) -> NDArray[np.float64]:
+        """Return where the box begins and where time, x and y lead, (column, row) each, [4, 2]."""
+        wide, high = self.width - 8, self.height - 8
+        return np.array(
+            [[4, 4 + 0.13 * high], [0.74 * wide, -0.13 * high], [0.26 * wide, 0.33 * high], [0, 0.54 * high]]
+        )
+
+
+def cloud_pictures(
+    events: Events, edges_us: NDArray[np.int64], size: CloudSize | None = None
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the events as points in time, x and y, once for each position: what was, what is, what comes.
+
+    Time runs to the right, x towards the viewer, y downwards, all parallel. Events of the position shine, those
+    before are fainter, those to come are grey; a frame stands at the position's instant.
+
+    Args:
+        events: The events.
+        edges_us: N + 1 ascending instants, microseconds; position k has the events in (edge k, edge k + 1].
+        size: Size of the pictures.
+
+    Returns:
+        Numbers of colours, uint8 [N, H, W], and the colours, uint8 [8, 4], RGBA; 0 is transparent.
+
+    Example:
+        >>> events = Events([5, 15], [0, 3], [1, 1], [True, False], width=4, height=2)
+        >>> pictures, colours = cloud_pictures(events, np.array([0, 10, 20]))
+        >>> pictures.shape, colours.shape, colours[0].tolist()
+        ((2, 264, 480), (8, 4), [0, 0, 0, 0])
+    """
+    size = size or CloudSize()
+    begin, along, across, down = size.axes()
+    start_us, stop_us = int(edges_us[0]), int(edges_us[-1])
+    shown = events.between(start_us, stop_us)
+    shown = shown[:: max(1, -(-len(shown) // size.most))]
+    share_t = (shown.t_us - start_us) / max(stop_us - start_us, 1)
+    share_x, share_y = (shown.x + 0.5) / events.width, (shown.y + 0.5) / events.height
+    place = begin + share_t[:, None] * along + share_x[:, None] * across + share_y[:, None] * down
+    column, row = np.floor(place).astype(np.int64).T
+    blank = Image.new("L", (size.width, size.height), _CLEAR)
+    _edges(ImageDraw.Draw(blank), begin, along, across, down)
+    base = np.array(blank)
+    _dot(base, row, column, np.full(len(shown), _LATER, np.uint8))
+    before = np.searchsorted(shown.t_us, edges_us, side="right")
+    old, new = (
+        np.where(shown.p, _ON, _OFF).astype(np.uint8),
+        np.where(shown.p, _ON_NOW, _OFF_NOW).astype(np.uint8),
+    )
+    pictures = np.empty((len(edges_us) - 1, size.height, size.width), np.uint8)
+    for k in range(len(pictures)):
+        past = slice(before[max(k - 1, 0)], before[k])
+        _dot(base, row[past], column[past], old[past])
+        image = Image.fromarray(base)
+        at = begin + (edges_us[k + 1] - start_us) / max(stop_us - start_us, 1) * along
+        _frame(ImageDraw.Draw(image), at, across, down)
+        picture = np.array(image)
+        now = slice(before[k], before[k + 1])
+        _dot(picture, row[now], column[now], new[now])
+        _dot(picture, row[now] + 1, column[now], new[now])
+        pictures[k] = picture
+    colours = [(0, 0, 0, 0), (128, 134, 145, 120), (128, 134, 145, 255), (128, 134, 145, 56)]
+    colours += [(*ON_RGB, 110), (*OFF_RGB, 110), (*ON_RGB, 255), (*OFF_RGB, 255)]
+    return pictures, np.array(colours, np.uint8)
+
+
+def signed_pictures(maps: NDArray, top: float | None = None, faintest: float = _FAINTEST) -> NDArray[np.uint8]:
+    """Return maps of ON and OFF as RGBA pictures, transparent where there is nothing.
+
+    Args:
+        maps: [..., 2, H, W], ON first, 0 or more.
+        top: Value that is drawn opaque; None: the 99th percentile of what is above 0.
+        faintest: Opacity of the smallest value above 0, 0..1.
+
+    Returns:
+        uint8 [..., H, W, 4].
+
+    Example:
+        >>> signed_pictures(np.array([[[1.0, 0.0]], [[0.0, 0.0]]])).tolist()
+        [[[226, 120, 0, 255], [0, 0, 0, 0]]]
+    """
+    maps = np.asarray(maps, np.float32)
+    lit = maps[maps > 0]
+    if top is None:
+        top = float(np.percentile(lit, 99)) if len(lit) else 1.0
+    total = maps.sum(axis=-3)
+    share = np.where(total > 0, maps[..., 0, :, :] / np.maximum(total, 1e-12), 0.0)[..., None]
+    strength = np.clip(maps.max(axis=-3) / max(top, 1e-12), 0, 1)
+    alpha = np.where(total > 0, faintest + (1 - faintest) * strength, 0.0)[..., None]
+    colour = share * np.array(ON_RGB) + (1 - share) * np.array(OFF_RGB)
+    picture = np.concatenate([np.where(alpha > 0, colour, 0), 255 * alpha], axis=-1)
+    return np.round(picture).astype(np.uint8)
+
+
+def time_slices(events: Events, edges_us: NDArray[np.int64], bins: int = 240) -> tuple[NDArray, NDArray]:
+    """Return slices through the middle of the cloud: x over time, and y over time.
+
+    Each counts the events of the middle eighth of the other axis.
+
+    Args:
+        events: The events.
+        edges_us: First and last of them bound the time, microseconds.
+        bins: Columns: steps of time.
+
+    Returns:
+        Counts of ON and OFF, float32 [2, width, bins] and [2, height, bins].
+
+    Raises:
+        DataError: Fewer than one bin.
+    """
+    if bins < 1:
+        raise DataError(f"bins is {bins}; give at least 1")
+    start_us, stop_us = int(edges_us[0]), int(edges_us[-1])
+    shown = events.between(start_us, stop_us)
+    step = np.minimum((shown.t_us - start_us) * bins // max(stop_us - start_us, 1), bins - 1)
+    slices = []
+    for own, side, other, length in (
+        (shown.x, events.width, shown.y, events.height),
+        (shown.y, events.height, shown.x, events.width),
+    ):
+        half = max(length / 16, 0.5)
+        inside = np.abs(other + 0.5 - length / 2) <= half
+        index = ((~shown.p[inside]).astype(np.int64) * side + own[inside]) * bins + step[inside]
+        counts = np.bincount(index, minlength=2 * side * bins)
+        slices.append(counts.astype(np.float32).reshape(2, side, bins))
+    return slices[0], slices[1]
+
+
+def smaller(events: Events, side_px: int) -> Events:
+    """Return events of a large sensor on one of at most `side_px` pixels per side; blocks of pixels become one.
+
+    Example:
+        >>> smaller(Events([1], [9], [3], [1], width=10, height=4), 5)
+        Events(1 events, 5 x 2, 1..1 us, 100 % ON)
+    """
+    factor = -(-max(events.width, events.height) // side_px)
+    if factor == 1:
+        return events
+    width, height = -(-events.width // factor), -(-events.height // factor)
+    x, y = (np.asarray(one // factor, np.uint16) for one in (events.x, events.y))
+    return Events(events.t_us, x, y, events.p, width, height)
+
+
+def slice_pictures(events: Events, edges_us: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return the events of each position where they happened, RGBA, uint8 [N, H, W, 4]."""
+    return signed_pictures(event_histogram(events, edges_us))
+
+
+def _dot(picture: NDArray[np.uint8], row: NDArray, column: NDArray, colour: NDArray[np.uint8]) -> None:
+    """Paint dots two pixels wide; those beyond the picture are cut."""
+    for side in (0, 1):
+        r, c = np.clip(row, 0, picture.shape[0] - 1), np.clip(column + side, 0, picture.shape[1] - 1)
+        picture[r, c] = colour
+
+
+def _edges(draw: ImageDraw.ImageDraw, begin: NDArray, along: NDArray, across: NDArray, down: NDArray) -> None:
+    for a, b, edge in ((across, down, along), (along, down, across), (along, across, down)):
+        for one in (0, 1):
+            for other in (0, 1):
+                corner = begin + one * a + other * b
+                draw.line([*corner, *(corner + edge)], fill=_BOX)
+
+
+def _frame(draw: ImageDraw.ImageDraw, at: NDArray, across: NDArray, down: NDArray) -> None:
+    corners = [at, at + across, at + across + down, at + down, at]
+    draw.line([tuple(corner) for corner in corners], fill=_PLANE, width=2)

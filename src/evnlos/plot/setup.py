@@ -2,15 +2,18 @@
 
 - A setup, to scale, seen from above; SVG in the colours of the page that it stands on.
 - The wall's kernel: curves, what they do to a letter, and the cosine law beside them (paper Fig. 5).
+- What a corner shows: the hidden side over bearing and time, and who moves there.
 - Time stamps of a few rows of pixels, stream beside stream: layers show where a simulator counts in frames.
 """
 
 from __future__ import annotations
 
 import html
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,10 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.events.volume import OFF_HEX, ON_HEX
 from evnlos.optics import DiffuseReflection, tpsf_kernel, tpsf_profile
-from evnlos.plot.figures import new_figure, save_figure
+from evnlos.plot.figures import new_figure, save_figure, signed_map
 from evnlos.scene import FontGlyphs
 from evnlos.setups import Setup
 from evnlos.types import Events, Plane
+
+if TYPE_CHECKING:
+    from evnlos.inverse import CornerPicture, FloorSector
+    from evnlos.tracking import BearingTracks
 
 _WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
 _LIGHT, _SIGHT = "#c9760b", "#2f7bd6"  # distinguished with every common kind of colour blindness
@@ -307,3 +314,79 @@ def draw_time_stamps(
     panels[0].set_ylabel("column, pixels")
     panels[-1].legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=2)
     return save_figure(figure, path, dpi=110)
+
+
+_TRACKS = ("#d95f02", "#1b9e77", "#7570b3", "#e7298a")  # apart in hue, and drawn with other dashes
+
+
+def draw_corner(
+    path: str | Path,
+    picture: CornerPicture,
+    found: BearingTracks,
+    floor: NDArray,
+    sector: FloorSector,
+    sentence: str,
+    truth_deg: ArrayLike | None = None,
+) -> Path:
+    """Draw what a corner shows: the floor that was used, the hidden side over time, its certainty, the tracks.
+
+    Args:
+        path: The picture, PNG, SVG or PDF.
+        picture: The hidden side over bearing and time.
+        found: Who moves there.
+        floor: A frame of the video, [H, W], any unit of light.
+        sector: The part of it that was used.
+        sentence: What is seen, in words.
+        truth_deg: True bearings [walkers, T], degrees, where they are known.
+
+    Returns:
+        The path.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    figure = new_figure((11.0, 6.4))
+    left, right = figure.subfigures(1, 2, width_ratios=(1, 2.15))
+    above, below = left.subplots(2, 1, height_ratios=(1, 0.8))
+    above.imshow(floor, cmap="gray", vmin=0, vmax=float(np.percentile(floor, 99)))
+    turn = np.linspace(0, 1, 40)
+    edge, wall, end = (np.array(point) for point in (sector.edge, sector.wall, sector.end))
+    ends = [np.arctan2(*(point - edge)[::-1]) for point in (wall, end)]
+    sweep = (ends[1] - ends[0] + np.pi) % (2 * np.pi) - np.pi
+    arc = edge + sector.reach_px * np.stack([f(ends[0] + turn * sweep) for f in (np.cos, np.sin)], axis=1)
+    above.fill(*np.concatenate([edge[None], arc]).T, facecolor="#2b7bba40", edgecolor="#2b7bba", lw=1.2)
+    above.plot(*np.stack([edge, wall]).T, color="k", lw=2)
+    above.plot(*edge, "o", color="#d95f02", ms=6)
+    above.set(xlim=(-0.5, floor.shape[1] - 0.5), ylim=(floor.shape[0] - 0.5, -0.5), xticks=(), yticks=())
+    above.set_title("floor used (blue), edge (dot), wall's foot (black)", fontsize=9)
+    extent = (picture.times_s[0], picture.times_s[-1], picture.bearings_deg[0], picture.bearings_deg[-1])
+    axes = right.subplots(2, 1, sharex=True, sharey=True)
+    percent, sure = 100 * picture.mean.T, np.abs(picture.mean / picture.deviation).T
+    top = max(float(np.percentile(np.abs(percent), 99.7)), 1e-9)
+    how = {"origin": "lower", "aspect": "auto", "extent": extent}
+    shown = axes[0].imshow(percent, **how, cmap=signed_map(), vmin=-top, vmax=top)
+    right.colorbar(shown, ax=axes[0], label="% of the floor's light per degree", pad=0.01)
+    axes[0].set_title("hidden side, most probable change of its light", fontsize=9)
+    shown = axes[1].imshow(sure, **how, cmap="gray_r", vmin=0, vmax=6)
+    right.colorbar(shown, ax=axes[1], label="standard deviations over 0", pad=0.01)
+    axes[1].set_title("how sure that is, and who moves: tracks with 90 % intervals", fontsize=9)
+    axes[1].set_xlabel("time, s")
+    if truth_deg is not None:
+        for k, row in enumerate(np.asarray(truth_deg)):
+            label = "truth" if k == 0 else None
+            axes[1].plot(picture.times_s, row, ":", color="#2b7bba", lw=1.8, label=label, zorder=4)
+    for k, track in enumerate(found.tracks):
+        colour, (low, high) = _TRACKS[k % len(_TRACKS)], track.interval_90
+        axes[1].fill_between(picture.times_s, low, high, color=colour, alpha=0.4, lw=0)
+        style = ("-", "--", "-.")[k % 3]
+        axes[1].plot(picture.times_s, track.bearing_deg, style, color=colour, lw=1.4, label=f"person {k + 1}")
+        below.plot(picture.times_s, 100 * np.where(track.there, track.brightness, np.nan), style, color=colour)
+    for axis in axes:
+        axis.set(ylabel="bearing about the edge, degrees", xlim=extent[:2], ylim=extent[2:])
+    if found.tracks or truth_deg is not None:
+        axes[1].legend(fontsize=8, loc="lower right", framealpha=0.9)
+    below.set(xlabel="time, s", ylabel="% of the floor's light", xlim=(picture.times_s[0], picture.times_s[-1]))
+    below.axhline(0, color="0.7", lw=0.8, zorder=0)
+    below.set_title("what each adds to the floor" if found.tracks else "nobody is seen", fontsize=9)
+    figure.suptitle("\n".join(textwrap.wrap(sentence, 130)), fontsize=10)
+    return save_figure(figure, path, dpi=100)

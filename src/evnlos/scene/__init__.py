@@ -1,7 +1,7 @@
 """What is hidden and how it moves."""
 
 from evnlos.scene.databases import Handwritten, list_emnist, list_sd19, read_emnist, read_sd19
-from evnlos.scene.drawings import drawing
+from evnlos.scene.drawings import Film, closing_hand, drawing
 from evnlos.scene.fonts import (
     DIGITS,
     UPPER_CASE,
@@ -40,6 +40,7 @@ __all__ = [
     "UPPER_CASE",
     "DrawingGlyphs",
     "EmnistGlyphs",
+    "Film",
     "Font",
     "FontGlyphs",
     "GlyphSet",
@@ -58,6 +59,7 @@ __all__ = [
     "Target",
     "TargetPlane",
     "character_name",
+    "closing_hand",
     "drawing",
     "find_font",
     "fit_to_target_plane",

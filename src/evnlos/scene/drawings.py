@@ -1,18 +1,20 @@
 """Drawings: a square to draw shapes on, from -1 to 1, and objects that are no characters.
 
 - Things to hide that are no characters: icons, people, vehicles, doodles, several at once, in grey levels.
+- Films: images of a hidden plane that is known at every instant while it changes; a hand that closes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, DataError
 from evnlos.types import derive_seed
 
 _SUPERSAMPLING = 4
@@ -299,3 +301,73 @@ _SHAPES: dict[str, list[Drawing]] = {
 }
 KINDS = (*_SHAPES, "several", "grey")
 """Kinds of drawings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A hidden plane that changes in place, known at every instant: linear between its images.
+
+    Args:
+        images: Brightness of the plane's samples, float32 [N, h, w], 0 or more.
+        times_s: Instants of the images, [N], seconds, increasing; before the first and after the last the film
+            rests.
+
+    Raises:
+        DataError: No images, times that do not increase or fit them, or brightness that is negative or NaN.
+
+    Example:
+        >>> film = Film(np.stack([np.zeros((1, 2)), np.ones((1, 2))]), [0.0, 1.0])
+        >>> film.at([0.25, 3.0]).tolist()
+        [[[0.25, 0.25]], [[1.0, 1.0]]]
+    """
+
+    images: NDArray
+    times_s: ArrayLike
+
+    def __post_init__(self) -> None:
+        images = np.array(self.images, np.float32)  # a copy: the caller's array stays his own
+        times = np.array(self.times_s, np.float64)
+        if images.ndim != 3 or times.shape != images.shape[:1] or not images.size:
+            raise DataError(f"Film has images {images.shape} at times {times.shape}; give [N, h, w] and [N]")
+        if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+            raise DataError("Film.times_s do not increase; give finite seconds in order")
+        if not (images.min() >= 0 and images.max() < np.inf):
+            raise DataError(f"Film.images hold {images.min()}..{images.max()}; give finite values from 0")
+        object.__setattr__(self, "images", images)
+        object.__setattr__(self, "times_s", times)
+
+    def at(self, t_s: ArrayLike) -> NDArray[np.float32]:
+        """Return the plane at times `t_s`, seconds, [] or [T]: float32 [h, w] or [T, h, w]."""
+        times = np.asarray(self.times_s)
+        place = np.interp(np.asarray(t_s, np.float64), times, np.arange(len(times)))
+        before = np.minimum(place.astype(np.intp), max(len(times) - 2, 0))
+        share = (place - before)[..., None, None].astype(np.float32)
+        after = np.minimum(before + 1, len(times) - 1)
+        return (1 - share) * self.images[before] + share * self.images[after]
+
+
+def closing_hand(closed: float, size_px: int = 96) -> NDArray[np.float32]:
+    """Draw a hand: palm, thumb and four fingers, which draw in one after the other as it closes.
+
+    Args:
+        closed: 0 is the open hand, 1 the fist.
+        size_px: Side of the image, pixels.
+
+    Returns:
+        float32 [size_px, size_px], 0..1.
+
+    Raises:
+        ConfigError: `closed` is outside 0..1.
+    """
+    if not 0 <= closed <= 1:
+        raise ConfigError(f"closed is {closed}; give 0 (open) to 1 (fist)")
+    c = Canvas(size_px, np.random.default_rng(0))
+    c.disc(0.0, 0.38, 0.42, 0.46, level=1.0)
+    for finger, (x, lean, reach) in enumerate(
+        ((-0.33, -0.28, 0.62), (-0.12, -0.09, 0.82), (0.11, 0.07, 0.8), (0.32, 0.24, 0.66))
+    ):
+        left = reach * (1 - float(np.clip(1.6 * closed - 0.2 * finger, 0, 1)))
+        c.line([(x, 0.1), (x + lean * left, 0.1 - left)], 0.17, level=1.0)
+    out = 1 - closed
+    c.line([(0.3, 0.5), (0.4 + 0.36 * out, 0.3 - 0.18 * out)], 0.19, level=1.0)
+    return c.image()

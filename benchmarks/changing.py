@@ -1,0 +1,163 @@
+"""How much better is a film of a hidden plane that changes than the best image of something rigid?
+
+    python benchmarks/changing.py [SEED]
+
+Rough aluminium at 0.3 m, 32 x 48 pixels, a plane of 10 cm, 6 s at 10 frames per second, noise of the default
+frame camera with its fixed pattern taken off, ambient light 0.05. The wall is rendered from cells of 1.6 mm
+and solved on cells of 3.1 mm. PSNR of the film on the solver's cells, clipped to 0..1, mean over the frames,
+dB.
+
+Baselines, each with whatever the truth can give it: "blind" is the mean image of the other films; "static" one
+Tikhonov image of the mean frame; "rigid" one image that moves along the true path of the film's light
+(`SequenceProblem`); "frame by frame" Tikhonov of each frame. The three take the regularization weight that is
+best by the truth. "limit" is the mean of the true film: nothing that rests does better. "film"
+(`estimate_film`) sees the frames alone; "covered" is the share of its cells that lie within the stated 90 %
+intervals; "film over rigid" is over the better one of "static" and "rigid".
+"""
+
+import sys
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from evnlos.cameras import FrameCamera
+from evnlos.inverse import Gradient, Problem, SequenceOperator, SequenceProblem, estimate_film
+from evnlos.inverse.sequence_problem import matrix_of, strip_of
+from evnlos.inverse.tikhonov import Spectrum
+from evnlos.metrics import psnr
+from evnlos.optics import FilmWall, MatrixTransport
+from evnlos.scene import Film, closing_hand, drawing
+from evnlos.setups import RadiometricSetup
+from evnlos.types import Plane
+
+SIDE, SHAPE, SECONDS, RATE_HZ, AMBIENT = 64, (32, 48), 6.0, 10.0, 0.05
+FINE, COARSE = Plane(SIDE, SIDE, 0.1 / SIDE), Plane(SIDE // 2, SIDE // 2, 0.2 / SIDE)
+WEIGHTS = np.logspace(-9, 0, 37)
+
+
+def hand() -> Film:
+    """Return a hand that closes and opens every 3 s."""
+    times = np.arange(0, SECONDS + 0.01, 0.02)
+    return Film(np.stack([closing_hand(0.5 - 0.5 * np.cos(2 * np.pi * t / 3), SIDE) for t in times]), times)
+
+
+def show() -> Film:
+    """Return a screen that fades from one icon to the next within 0.3 s, every second."""
+    icons = [
+        drawing(kind, 0, 0, SIDE)
+        for kind in ("icon", "person", "vehicle", "doodle", "icon", "person", "vehicle")
+    ]
+    times = [t for k in range(len(icons)) for t in (k - 0.15, k + 0.15)]
+    images = [icon for k in range(len(icons)) for icon in (icons[k - 1] if k else icons[0], icons[k])]
+    return Film(np.stack(images), times)
+
+
+def parts() -> Film:
+    """Return a disc that circles, a bar that grows and one that blinks: nothing common in their motions."""
+    times = np.arange(0, SECONDS + 0.01, 0.02)
+    y, x = (v[:, None] if k == 0 else v for k, v in enumerate([(np.arange(SIDE) + 0.5) / SIDE * 2 - 1] * 2))
+    images = []
+    for t in times:
+        turn = 2 * np.pi * t / 4
+        disc = (x + 0.5 * np.cos(turn)) ** 2 + (y + 0.5 * np.sin(turn)) ** 2 < 0.2**2
+        bar = (np.abs(x - 0.85) < 0.1) & (y > 0.8 - 1.6 * (t / SECONDS))
+        blink = (np.abs(y + 0.85) < 0.1) & (np.abs(x) < 0.5)
+        images.append(np.maximum(disc | bar, blink * (0.5 + 0.5 * np.sin(2 * np.pi * t / 1.5))))
+    return Film(np.stack(images).astype(np.float32), times)
+
+
+FILMS: dict[str, Callable[[], Film]] = {"hand closes": hand, "screen fades": show, "parts move apart": parts}
+
+
+def coarse(images: NDArray) -> torch.Tensor:
+    """Return images [T, h, w] on the solver's cells."""
+    return torch.nn.functional.avg_pool2d(torch.from_numpy(images).double()[:, None], 2)[:, 0]
+
+
+def decibel(found: torch.Tensor, truth: torch.Tensor) -> float:
+    return float(psnr(found.clamp(0, 1), truth).mean())
+
+
+def path_of(truth: torch.Tensor) -> NDArray:
+    """Return the middle of the light of each true frame, relative to the mean, [T, 2], metres."""
+    light = truth.sum(dim=(1, 2)).clamp(min=1e-9)
+    places = [
+        (truth.sum(dim=1 + k) * torch.from_numpy(axis)).sum(dim=1) / light
+        for k, axis in enumerate((COARSE.x_m, COARSE.y_m))
+    ]
+    found = torch.stack(places, dim=1).numpy()
+    return found - found.mean(axis=0)
+
+
+@lru_cache(maxsize=4)
+def operator_of(setup: RadiometricSetup, plane: Plane) -> MatrixTransport:
+    return matrix_of(setup.operator(plane))
+
+
+def compare(name: str, seed: int, roughness: float) -> dict[str, float]:
+    """Return the PSNR of each method for one film, dB, and the coverage of the stated intervals."""
+    setup = RadiometricSetup(roughness=roughness, strip_m=(0.1, 0.1), ambient=AMBIENT).resized(SHAPE)
+    film, camera = FILMS[name](), FrameCamera(exposure_s=0.016)
+    wall = FilmWall(operator_of(setup, FINE), film, ambient=setup.ambient_light())
+    times = np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ + 0.02
+    seen = camera.capture(wall, times, seed).astype(np.float64) / camera.white
+    sensitivity, offset_e = camera.fixed_pattern(SHAPE, seed)
+    frames = torch.from_numpy((seen - offset_e / camera.full_well_e) / sensitivity)
+    light = frames - setup.ambient_light().double()
+    truth = coarse(film.at(times))
+    operator = operator_of(setup, COARSE)
+    noise = camera.noise_variance(frames.mean(dim=0)).sqrt()
+
+    def best(images: Callable[[float], torch.Tensor], scale: float) -> float:
+        return max(decibel(images(scale * weight).expand_as(truth), truth) for weight in WEIGHTS.tolist())
+
+    prior = Gradient("dark")
+    still = Spectrum(Problem(operator, light.mean(dim=0)), prior)
+    each = Spectrum(Problem(operator, light), prior)
+    places = path_of(truth)
+    strip = operator_of(setup, strip_of(places, COARSE))
+    sight = SequenceOperator(strip, COARSE, places)
+    problem = SequenceProblem(sight, 1.0)
+
+    def rigid(weight: float) -> torch.Tensor:
+        return on_plane(sight.drawn(problem.tikhonov(light, weight).image), strip.source)
+
+    others = [coarse(FILMS[other]().at(times)).mean(dim=0) for other in FILMS if other != name]
+    found = estimate_film(operator, light, times, noise)
+    low, high = (torch.from_numpy(bound) for bound in found.interval())
+    return {
+        "blind": decibel(torch.stack(others).mean(dim=0).expand_as(truth), truth),
+        "static": best(still.image, still.scale),
+        "rigid": best(rigid, problem.scale),
+        "limit": decibel(truth.mean(dim=0).expand_as(truth), truth),
+        "frame by frame": best(each.image, each.scale),
+        "film": decibel(torch.from_numpy(found.mean), truth),
+        "covered": float(((truth >= low) & (truth <= high)).double().mean()),
+    }
+
+
+def on_plane(strips: torch.Tensor, strip: Plane) -> torch.Tensor:
+    """Return strips [T, h, w] on the solver's cells; the two differ by less than a cell."""
+    y, x = (
+        np.abs(a[:, None] - b).argmin(axis=0) for a, b in ((strip.y_m, COARSE.y_m), (strip.x_m, COARSE.x_m))
+    )
+    return strips[:, y][:, :, x]
+
+
+def row(name: str, run: dict[str, float]) -> str:
+    gain = run["film"] - max(run["static"], run["rigid"])
+    cells = [f"{value:.2f}" for key, value in run.items() if key != "covered"]
+    return f"| {name} | {' | '.join(cells)} | {gain:+.2f} | {100 * run['covered']:.0f} % |"
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    print("| | blind | static | rigid | limit | frame by frame | film | film over rigid | covered |")
+    print("|" + "---|" * 9)
+    for wall_roughness in (0.05, 0.02):
+        for film_name in FILMS:
+            found = compare(film_name, int(sys.argv[1]) if len(sys.argv) > 1 else 0, wall_roughness)
+            print(row(f"{film_name}, roughness {wall_roughness:g}", found), flush=True)

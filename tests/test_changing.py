@@ -1,0 +1,214 @@
+"""A film of a hidden plane that changes, against whole covariances; its intervals hold the truth."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from evnlos.cameras import FrameCamera
+from evnlos.cli.main import main
+from evnlos.errors import ConfigError, DataError
+from evnlos.events import write_events
+from evnlos.inverse import FilmPrior, Gradient, estimate_film, smooth_modes
+from evnlos.optics import FilmWall, MatrixTransport
+from evnlos.scene import Film, closing_hand
+from evnlos.setups import load_setup
+from evnlos.types import Events, Plane
+
+PLANE = Plane(4, 5, 0.01)
+TIMES = np.array([0.0, 0.1, 0.2, 0.35, 0.4, 0.6])
+
+
+def draw(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+def covariances(prior: FilmPrior, operator: MatrixTransport, static: float, noise: float):
+    """Return covariances of the film [T C, T C] and of the data, and the map between them.
+
+    Slow reference: modes by singular values, nothing eliminated.
+    """
+    blank = torch.eye(20, dtype=torch.float64).reshape(20, 4, 5)
+    smooth = Gradient("dark").adjoint(Gradient("dark")(blank)).reshape(20, 20).numpy()
+    kernel = np.linalg.inv(smooth + (PLANE.pitch_m / prior.length_m) ** 2 * np.eye(20))
+    root = np.linalg.cholesky(kernel / kernel.diagonal().mean())
+    matrix = operator.matrix.numpy()
+    basis = root @ np.linalg.svd(matrix @ root)[2].T  # [C, K]
+    slope = Gradient("dark")(torch.from_numpy(basis.T.copy()).unflatten(1, (4, 5))).square().sum(dim=(1, 2, 3))
+    wave = np.sqrt(slope.numpy() / (basis**2).sum(axis=0)) / PLANE.pitch_m
+    apart = np.abs(TIMES[:, None] - TIMES)
+    film = sum(
+        np.kron(
+            np.exp(-apart * prior.speed_m_s * wave[k]) + prior.resting**2, np.outer(basis[:, k], basis[:, k])
+        )
+        for k in range(20)
+    )
+    film = prior.deviation**2 * np.asarray(film)
+    whole = np.kron(np.eye(len(TIMES)), matrix)
+    offset = np.kron(np.ones((len(TIMES), len(TIMES))), np.eye(len(matrix)))
+    data = whole @ film @ whole.T + noise**2 * (np.eye(len(whole)) + static**2 * offset)
+    return film, data, whole
+
+
+@pytest.mark.parametrize("static", [0.0, 2.0])
+def test_the_film_is_the_posterior_of_whole_covariances(static: float) -> None:
+    prior, noise = FilmPrior(0.4, 0.7, 0.03, 0.004), 0.05
+    operator = MatrixTransport(torch.from_numpy(draw(24, 20) / 5), PLANE, (4, 6))
+    frames = torch.from_numpy(draw(6, 4, 6, seed=1) * 0.2)
+    kept = frames.clone()
+    found = estimate_film(operator, frames, TIMES, torch.full((4, 6), noise), static=static, prior=prior)
+    assert torch.equal(frames, kept)
+    noise *= found.noise_factor
+    film, data, whole = covariances(prior, operator, static, noise)
+    gain = film @ whole.T @ np.linalg.inv(data)
+    mean = gain @ frames.numpy().reshape(-1)
+    variance = (film - gain @ whole @ film).diagonal()
+    np.testing.assert_allclose(found.mean.reshape(-1), mean, atol=1e-8)
+    np.testing.assert_allclose(found.deviation.reshape(-1) ** 2, variance, rtol=1e-6)
+    empty = noise**2 * (np.eye(len(data)) + static**2 * np.kron(np.ones((6, 6)), np.eye(24)))
+    y = frames.numpy().reshape(-1)
+
+    def log_density(covariance: np.ndarray) -> float:
+        return -0.5 * float(y @ np.linalg.solve(covariance, y) + np.linalg.slogdet(covariance)[1])
+
+    assert found.evidence == pytest.approx(log_density(data) - log_density(empty), rel=1e-7)
+
+
+def test_a_series_of_a_mode_is_that_of_its_covariance() -> None:
+    gain, keep = (
+        np.array([0.0, 0.5, 30.0]),
+        np.exp(-np.array([0.0, 0.1, 0.3, 0.2, 0.1])[:, None] * [1.0, 2.0, 9.0]),
+    )
+    z = draw(5, 3) * 3
+    found = smooth_modes(z, gain, keep, 1.5, 0.4)
+    total = 0.0
+    for k, g in enumerate(gain):
+        steps = np.cumsum(-np.log(keep[:, k]))
+        signal = np.exp(-np.abs(steps[:, None] - steps)) + 1.5**2
+        data = g * g * signal + np.eye(5) + 0.4**2
+        back = g * signal @ np.linalg.inv(data)
+        np.testing.assert_allclose(found.mean[:, k], back @ z[:, k], atol=1e-11)
+        np.testing.assert_allclose(found.variance[:, k], (signal - g * back @ signal).diagonal(), rtol=1e-9)
+        total -= 0.5 * (z[:, k] @ np.linalg.solve(data, z[:, k]) + np.linalg.slogdet(2 * np.pi * data)[1])
+    assert found.log_likelihood == pytest.approx(total, rel=1e-10)
+
+
+def test_intervals_hold_films_of_the_prior_and_the_likelihood_finds_it() -> None:
+    """Of films drawn from the prior, 90 % intervals hold 90 %, also where the frames choose the prior."""
+    truth = FilmPrior(0.4, 0.7, 0.01, 0.02)
+    operator = MatrixTransport(torch.from_numpy(draw(24, 20) / 5), PLANE, (4, 6))
+    film, _, _ = covariances(truth, operator, 0.0, 0.05)
+    root = np.linalg.cholesky(film + 1e-12 * np.eye(len(film)))
+    held, errors = {"given": [], "found": []}, []
+    for seed in range(20):
+        x = (root @ draw(len(film), seed=seed)).reshape(6, 4, 5)
+        frames = operator(torch.from_numpy(x)) + 0.05 * torch.from_numpy(draw(6, 4, 6, seed=seed + 100))
+        for name, prior in (("given", truth), ("found", None)):
+            estimate = estimate_film(operator, frames, TIMES, torch.full((4, 6), 0.05), static=0.0, prior=prior)
+            low, high = estimate.interval()
+            held[name].append(((x >= low) & (x <= high)).mean())
+            if prior is None:
+                errors.append(np.log(estimate.prior.deviation * np.hypot(1, estimate.prior.resting) / 0.488))
+    assert np.mean(held["given"]) == pytest.approx(0.9, abs=0.03)
+    assert np.mean(held["found"]) == pytest.approx(0.88, abs=0.05)
+    assert abs(np.mean(errors)) < 0.3
+
+
+def test_noise_that_is_stated_too_low_is_found() -> None:
+    operator = MatrixTransport(torch.from_numpy(draw(60, 4)), Plane(2, 2, 0.01), (6, 10))
+    frames = torch.from_numpy(0.3 * draw(40, 6, 10, seed=3))
+    found = estimate_film(operator, frames, np.arange(40) / 10, torch.full((6, 10), 0.1))
+    assert found.noise_factor == pytest.approx(3.0, rel=0.05)
+
+
+def test_a_film_is_known_at_every_instant_and_its_wall_is_linear() -> None:
+    images = np.stack([closing_hand(0.0, 8), closing_hand(1.0, 8)])
+    film = Film(images, [1.0, 3.0])
+    np.testing.assert_allclose(film.at(1.5), 0.75 * images[0] + 0.25 * images[1], atol=1e-6)
+    np.testing.assert_array_equal(film.at([0.0, 9.0]), images)
+    operator = MatrixTransport(torch.from_numpy(np.abs(draw(12, 64))), Plane(8, 8, 0.01), (3, 4))
+    wall = FilmWall(operator, film, ambient=0.25)
+    light = operator(torch.from_numpy(film.at([1.5, 2.0]).astype(np.float64))) + 0.25
+    torch.testing.assert_close(wall.irradiance([1.5, 2.0]).double(), light, rtol=1e-6, atol=0)
+    assert wall.irradiance(2.0).shape == wall.shape == (3, 4)
+    assert FrameCamera().capture(wall, [1.0, 2.0]).shape == (2, 3, 4)
+
+
+def test_a_fist_is_smaller_than_a_hand() -> None:
+    areas = [closing_hand(closed).mean() for closed in (0.0, 0.3, 0.6, 1.0)]
+    assert areas == sorted(areas, reverse=True)
+    assert areas[-1] < 0.75 * areas[0]
+
+
+@pytest.mark.parametrize(
+    ("images", "times"),
+    [(np.zeros((2, 3, 3)), [0.0]), (np.zeros((2, 3, 3)), [1.0, 1.0]), (-np.ones((1, 3, 3)), [0.0])],
+)
+def test_films_that_are_none_are_refused(images: np.ndarray, times: list[float]) -> None:
+    with pytest.raises(DataError):
+        Film(images, times)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    operator = MatrixTransport(torch.from_numpy(draw(24, 20)), PLANE, (4, 6))
+    frames, noise = torch.zeros(6, 4, 6), torch.ones(4, 6)
+    with pytest.raises(DataError):
+        estimate_film(operator, frames[:, :3], TIMES, noise)
+    with pytest.raises(DataError):
+        estimate_film(operator, frames, TIMES[::-1], noise)
+    with pytest.raises(DataError):
+        estimate_film(operator, frames, TIMES, 0 * noise)
+    with pytest.raises(DataError):
+        estimate_film(operator, torch.full_like(frames, float("nan")), TIMES, noise)
+    with pytest.raises(ConfigError):
+        estimate_film(operator, frames, TIMES, noise, static=-1.0)
+    with pytest.raises(ConfigError):
+        estimate_film(operator, frames, TIMES, noise, prior=FilmPrior(0.0, 1.0, 1.0, 1.0))
+    with pytest.raises(ConfigError):
+        closing_hand(1.5)
+    with pytest.raises(DataError):
+        FilmWall(operator, Film(np.zeros((1, 3, 3)), [0.0]))
+
+
+def test_the_command_makes_a_film_of_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = {
+        "kind": "radiometric",
+        "strip_m": [0.1, 0.1],
+        "roughness": 0.05,
+        "sensor": {"height": 20, "width": 32},
+    }
+    settings["frame_camera"] = {"exposure_s": 0.016, "prnu": 0.0, "dsnu_e": 0.0}
+    (tmp_path / "setup.yaml").write_text(yaml.safe_dump({"setup": settings}))
+    setup = load_setup(tmp_path / "setup.yaml")
+    film = Film(np.stack([closing_hand(closed, 16) for closed in (0.0, 1.0)]), [0.2, 1.0])
+    plane = Plane(16, 16, 0.1 / 16)
+    times = np.arange(12) / 10
+    wall = FilmWall(setup.operator(plane), film, ambient=setup.ambient_light())
+    folder = tmp_path / "hand"
+    folder.mkdir()
+    table = ["t_us,file"]
+    for k, frame in enumerate(setup.frame_camera.capture(wall, times)):
+        Image.fromarray(frame).save(folder / f"{k}.png")
+        table.append(f"{round(1e6 * times[k])},{k}.png")
+    (folder / "frames.csv").write_text("\n".join(table))
+    write_events(folder / "events.npz", Events([0, 1_100_000], [0, 1], [0, 1], [True, False], 32, 20))
+    about = {"camera": {"name": "simulated", "width": 32, "height": 20}, "events": "events.npz"}
+    (folder / "capture.yaml").write_text(yaml.safe_dump(about))
+    words = ["invert", str(folder), "--setup", str(tmp_path / "setup.yaml"), "--changing", "0.1", "0.1"]
+    main([*words, "--cells", "16", "--out", str(tmp_path / "film.png"), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["cells"] == [16, 16]
+    assert 0.9 < found["noise_factor"] < 1.15
+    arrays = np.load(tmp_path / "film.npz")
+    truth = film.at(arrays["times_s"])
+    rest = truth - truth.mean(axis=0)
+    assert ((arrays["film"] - truth) ** 2).mean() < 0.04
+    assert np.corrcoef((arrays["film"] - arrays["film"].mean(axis=0)).ravel(), rest.ravel())[0, 1] > 0.7
+    inside = np.abs(arrays["film"] - truth) <= 1.645 * arrays["film_deviation"]
+    assert inside.mean() > 0.85
+    with pytest.raises(SystemExit):
+        main([*words, "--track"])
