@@ -5,6 +5,7 @@ import contextlib
 import io
 import re
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import evnlos
 import evnlos.types
 from evnlos.cli import VERBS
 from evnlos.cli.about import script
+from evnlos.models import RECONSTRUCTORS
 
 SOURCE = Path(evnlos.__file__).parent
 ROOT = SOURCE.parent.parent
@@ -99,9 +101,13 @@ def test_every_flag_that_a_page_shows_exists() -> None:
     for page in PAGES:
         for command in commands_on(page):
             verb = command.split()[1] if len(command.split()) > 1 else ""
+            known = flags.get(verb, set()) | {"--help", "--version", "--log-level"}
+            for kind in re.findall(r"--network\.kind (\w+)", command):
+                names = [item.name.replace("_", "-") for item in fields(RECONSTRUCTORS[kind])]
+                known |= {f"--network.{name}" for name in names}
             for flag in re.findall(r"(?<=\s)--[a-z][\w.-]*", command):
                 checked += 1
-                if flag not in flags.get(verb, set()) | {"--help", "--version", "--log-level"}:
+                if flag not in known:
                     wrong.append(f"{page.name}: {command}: {flag}")
     assert checked > 150
     assert not wrong

@@ -1,23 +1,28 @@
 """Train the layers that a pre-training may begin with: one network per modality, over walls of many kinds.
 
 What a network of whole sequences learns by gradients is how letters look behind a linear estimate in the plane
-of the target; the wall itself is in the closed-form embedding, which is fitted again for each setup. So these
+of the target; the wall itself is in the closed-form part, which is fitted again for each setup. So these
 layers carry over from wall to wall. The walls here are drawn at random from round and brushed metal, at many
-distances; no capture, no font of the captures and no room of `evnlos lab` is among them.
+distances; no capture, no font of the captures and no room of `evnlos lab` is among them. Frames are solved at
+once through the light path of each wall; light and roughness scatter about what the solution takes them for, as
+calibrations do.
 
-    python tools/train_generic.py --out generic
+    python tools/train_generic.py --out generic --modalities frame
+    python tools/train_generic.py --out generic-events --modalities event fusion
     cp generic/generic-*.safetensors packages/evnlos-weights/src/evnlos_weights/
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from evnlos.cameras import EventPixel, FrameCamera
-from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation, simulate
+from evnlos.config import save_yaml, to_dict
+from evnlos.data import STANDARD_MODALITIES, Sampling, Simulation, as_modality, simulate
 from evnlos.demo import SEQUENCE_NETWORK
 from evnlos.machine import ProgressBars
 from evnlos.models import layers_of, load_weights, save_weights, with_rank
@@ -26,8 +31,15 @@ from evnlos.setups import RadiometricSetup
 from evnlos.training import Training, train
 
 
-def wall(number: int, writers: int) -> Simulation:
-    """Return the simulation of one wall: its own geometry, metal, light, cameras and writers."""
+def wall(number: int, writers: int, file: Path, *, sees_events: bool) -> Simulation:
+    """Return the simulation of one wall: its own geometry, metal, light, cameras and writers.
+
+    Args:
+        number: Of the wall.
+        writers: Writers of its objects, 36 each.
+        file: Where the wall's setup is written, for what is solved through it.
+        sees_events: Whether a network sees the events; else the pixel sends none.
+    """
     draw = np.random.default_rng((20261123, number))
     rough = draw.uniform(0.03, 0.10)
     distance = draw.uniform(0.24, 0.40)
@@ -55,6 +67,10 @@ def wall(number: int, writers: int) -> Simulation:
             logarithm="true",
         ),
     )
+    if not sees_events:
+        setup = replace(setup, pixel=EventPixel(10.0, 10.0, 0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0))
+    save_yaml(to_dict(setup), file)
+    scatter = {"gain": 0.08, "ambient": 0.08, "roughness": 0.03, "roughness_y": 0.03}
     return Simulation(
         glyphs=HandwritingGlyphs(
             characters=UPPER_CASE + DIGITS,
@@ -64,8 +80,13 @@ def wall(number: int, writers: int) -> Simulation:
         ),
         motion=LineMotion((-0.08, 0.0), 0.02),
         setup=setup,
-        sampling=Sampling(surface="hots", radius=1),
+        sampling=Sampling(surface="hots" if sees_events else "sae", radius=1, setup=str(file)),
         validation=0.03,
+        vary={
+            f"setup.{name}": ((1 - part) * getattr(setup, name), (1 + part) * getattr(setup, name))
+            for name, part in scatter.items()
+        },
+        setups=2,
         seed=number,
     )
 
@@ -80,20 +101,24 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2, help="rounds over the walls (default: 2)")
     parser.add_argument("--modalities", nargs="*", default=list(STANDARD_MODALITIES), help="what is seen")
     options = parser.parse_args()
+    sees_events = any(as_modality(name).needs_events for name in options.modalities)
+    options.out.mkdir(parents=True, exist_ok=True)
     data = []
     with ProgressBars() as progress:
         for number in range(options.walls):
             folder = options.out / f"wall{number}"
-            data.append(simulate(wall(number, options.writers), folder, 2, progress=progress))
+            one = wall(number, options.writers, folder.with_suffix(".yaml"), sees_events=sees_events)
+            data.append(simulate(one, folder, 2, progress=progress))
         total = options.rounds * options.walls
         for modality in options.modalities:
+            frames = "embedding" if as_modality(modality).needs_events else "likelihood"
             last: Path | None = None
             for step in range(total):
                 plan = Training(
                     modality=modality,
                     epochs=options.epochs,
                     batch_size=16,
-                    network=SEQUENCE_NETWORK,
+                    network=replace(SEQUENCE_NETWORK, frames=frames),
                     sequence_augmentations=2,
                     refit_embedding=step > 0,
                     # The rate falls from wall to wall along the cosine that one long training would have.
@@ -105,7 +130,8 @@ def main() -> None:
                 last = run
             assert last is not None
             # Whoever begins with these layers fits an embedding of his own.
-            slim = with_rank(load_weights(last), 8)
+            found = load_weights(last)
+            slim = found if frames == "likelihood" else with_rank(found, 8)
             save_weights(options.out / f"{layers_of('generic', modality)[0]}.safetensors", slim)
 
 

@@ -2,6 +2,7 @@
 
 - The trainings of an experiment: one after the other, or several at a time on the cores of a CPU.
 - Experiments, flat and resumable: calibrate, simulate, import, pre-train, fine-tune, score, record.
+- Folds of an experiment, so that all together test every character once.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from evnlos.data import (
 from evnlos.data.capture_info import character_of
 from evnlos.data.pool import processes, run_tasks
 from evnlos.data.simulations import default, randomized
-from evnlos.errors import CalibrationError, DataError, MissingDependencyError
+from evnlos.errors import CalibrationError, ConfigError, DataError, MissingDependencyError
 from evnlos.experiment.study import Arm, Place, Record, Study, slug
 from evnlos.experiment.table import score_arm
 from evnlos.machine import Progress, Step, silent
@@ -311,3 +312,80 @@ def _planned(
         out = place.out / "runs" / f"{study.setup}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
         runs.append(Run(recorded, settings, out, start, arm.choose))
     return runs, decided
+
+
+def folds_of(study: Study, folds: int, characters: Sequence[str]) -> list[Study]:
+    """Return a study for each fold of the characters, so that all together test every character once.
+
+    The folds are two halves. Each half has one calibration, and so one pre-training, that saw nothing but the
+    other half's captures; a fold's fine-tuning and end-to-end training see all captures but the fold's.
+
+    Args:
+        study: What to compare; its own test characters are replaced.
+        folds: Number of folds, even.
+        characters: What the captures show.
+
+    Raises:
+        ConfigError: The number of folds is odd, below 2, or more than there are characters.
+    """
+    known = sorted(set(characters))
+    if folds < 2 or folds % 2 or folds > len(known):
+        raise ConfigError(f"folds is {folds}; give an even number from 2 to {len(known)}, one per character")
+    order = np.random.default_rng(derive_seed(0, "folds")).permutation(len(known))
+    parts = [tuple(known[i] for i in sorted(part)) for part in np.array_split(order, folds)]
+    found = []
+    for half, name in enumerate(("a", "b")):
+        own = parts[half * folds // 2 : (half + 1) * folds // 2]
+        unseen = tuple(character for part in own for character in part)
+        calibration = replace(study.calibration, exclude=(*study.calibration.exclude, *unseen))
+        for part in own:
+            number = parts.index(part) + 1
+            found.append(
+                replace(
+                    study,
+                    name=f"{study.name}-folds/{number}-of-{folds}",
+                    setup=f"{study.setup}-{name}",
+                    test=part,
+                    calibration=calibration,
+                )
+            )
+    return found
+
+
+def merge_folds(records: Sequence[Record], setup: str) -> list[Record]:
+    """Return one record per arm, modality and seed over all folds; those that lack a fold are left out.
+
+    Args:
+        records: Records of the studies of `folds_of`.
+        setup: Name of the setup, without that of its half.
+    """
+    groups: dict[tuple[str, str, int], list[Record]] = {}
+    for record in records:
+        if record.setup in (f"{setup}-a", f"{setup}-b"):
+            groups.setdefault((record.arm, record.modality, record.seed), []).append(record)
+    most = max((len(group) for group in groups.values()), default=0)
+    return [_merged(group, setup) for group in groups.values() if len(group) == most]
+
+
+def _merged(group: list[Record], setup: str) -> Record:
+    first = group[0]
+    scores = {metric: {k: v for r in group for k, v in r.scores[metric].items()} for metric in first.scores}
+    baselines = {
+        name: {metric: {k: v for r in group for k, v in r.baselines[name][metric].items()} for metric in table}
+        for name, table in first.baselines.items()
+        if all(name in record.baselines for record in group)
+    }
+    checks = {
+        key: float(np.average([r.checks[key] for r in group], weights=[len(r.positions) for r in group]))
+        for key in first.checks
+        if all(key in record.checks for record in group)
+    }
+    merged = replace(first, study=first.study.partition("/")[0], setup=setup, scores=scores)
+    return replace(
+        merged,
+        positions={name: values for record in group for name, values in record.positions.items()},
+        baselines=baselines,
+        checks=checks,
+        settings={"arm": first.arm, "runs": [record.settings.get("run") for record in group]},
+        read_as={name: seen for record in group for name, seen in record.read_as.items()},
+    )

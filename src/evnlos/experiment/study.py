@@ -5,7 +5,6 @@ JSON files that can be kept, compared and put into tables.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +21,6 @@ from evnlos.machine import Progress, Step
 from evnlos.models import layers_of, load_weights
 from evnlos.registry import migrate
 from evnlos.training import Training
-from evnlos.types import derive_seed
 
 Source = Literal["calibrated", "uncalibrated", "none"]
 
@@ -85,13 +83,16 @@ class Arm:
         Args:
             modality: What the network sees.
         """
-        if not self.start:
+        if not self.start or self.pretraining is None:
             return None
         name, frames = layers_of(self.start, modality, "frame")
         network = load_weights(name).network
-        if network.sampling.surface == self.sampling.surface or not network.modality.needs_events:
-            return name
-        return frames if network.modality.needs_frames else None
+        if network.modality.needs_events and network.sampling.surface != self.sampling.surface:
+            if not network.modality.needs_frames:
+                return None
+            name, network = frames, load_weights(frames).network
+        given, own = (getattr(one, "frames", "") for one in (network.settings, self.pretraining.network))
+        return name if given == own else None
 
     def first_training(self, modality: str) -> Training:
         """Return the settings of the pre-training of the network that sees a modality.
@@ -174,83 +175,6 @@ class Study:
     def split(self) -> str:
         """The split that is scored."""
         return "validation" if self.validation else "test"
-
-
-def folds_of(study: Study, folds: int, characters: Sequence[str]) -> list[Study]:
-    """Return a study for each fold of the characters, so that all together test every character once.
-
-    The folds are two halves. Each half has one calibration, and so one pre-training, that saw nothing but the
-    other half's captures; a fold's fine-tuning and end-to-end training see all captures but the fold's.
-
-    Args:
-        study: What to compare; its own test characters are replaced.
-        folds: Number of folds, even.
-        characters: What the captures show.
-
-    Raises:
-        ConfigError: The number of folds is odd, below 2, or more than there are characters.
-    """
-    known = sorted(set(characters))
-    if folds < 2 or folds % 2 or folds > len(known):
-        raise ConfigError(f"folds is {folds}; give an even number from 2 to {len(known)}, one per character")
-    order = np.random.default_rng(derive_seed(0, "folds")).permutation(len(known))
-    parts = [tuple(known[i] for i in sorted(part)) for part in np.array_split(order, folds)]
-    found = []
-    for half, name in enumerate(("a", "b")):
-        own = parts[half * folds // 2 : (half + 1) * folds // 2]
-        unseen = tuple(character for part in own for character in part)
-        calibration = replace(study.calibration, exclude=(*study.calibration.exclude, *unseen))
-        for part in own:
-            number = parts.index(part) + 1
-            found.append(
-                replace(
-                    study,
-                    name=f"{study.name}-folds/{number}-of-{folds}",
-                    setup=f"{study.setup}-{name}",
-                    test=part,
-                    calibration=calibration,
-                )
-            )
-    return found
-
-
-def merge_folds(records: Sequence[Record], setup: str) -> list[Record]:
-    """Return one record per arm, modality and seed over all folds; those that lack a fold are left out.
-
-    Args:
-        records: Records of the studies of `folds_of`.
-        setup: Name of the setup, without that of its half.
-    """
-    groups: dict[tuple[str, str, int], list[Record]] = {}
-    for record in records:
-        if record.setup in (f"{setup}-a", f"{setup}-b"):
-            groups.setdefault((record.arm, record.modality, record.seed), []).append(record)
-    most = max((len(group) for group in groups.values()), default=0)
-    return [_merged(group, setup) for group in groups.values() if len(group) == most]
-
-
-def _merged(group: list[Record], setup: str) -> Record:
-    first = group[0]
-    scores = {metric: {k: v for r in group for k, v in r.scores[metric].items()} for metric in first.scores}
-    baselines = {
-        name: {metric: {k: v for r in group for k, v in r.baselines[name][metric].items()} for metric in table}
-        for name, table in first.baselines.items()
-        if all(name in record.baselines for record in group)
-    }
-    checks = {
-        key: float(np.average([r.checks[key] for r in group], weights=[len(r.positions) for r in group]))
-        for key in first.checks
-        if all(key in record.checks for record in group)
-    }
-    merged = replace(first, study=first.study.partition("/")[0], setup=setup, scores=scores)
-    return replace(
-        merged,
-        positions={name: values for record in group for name, values in record.positions.items()},
-        baselines=baselines,
-        checks=checks,
-        settings={"arm": first.arm, "runs": [record.settings.get("run") for record in group]},
-        read_as={name: seen for record in group for name, seen in record.read_as.items()},
-    )
 
 
 @dataclass(frozen=True)
