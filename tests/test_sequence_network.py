@@ -15,6 +15,7 @@ from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import SequenceOperator
+from evnlos.inverse.sequence_light import EVENT_PRIORS
 from evnlos.models import SequenceConfig, SequenceReconstructor, UNetConfig, aligned_mean, load_weights
 from evnlos.models.sequence import PooledFrames
 from evnlos.optics import MatrixTransport
@@ -203,13 +204,13 @@ def test_what_a_joint_network_cannot_do_is_said(trained, tiny_dataset) -> None:
         replace(NET, rank=0)
 
 
-SOLVING = replace(NET, frames="likelihood", prior_weights=(0.3, 3.0))
+SOLVING = replace(NET, rank=200, frames="likelihood", prior_weights=(0.3, 3.0))
 
 
 def test_frames_are_solved_as_one_gaussian_posterior() -> None:
     """Against all rows of all frames at once, with the offset in a dense covariance."""
     torch.manual_seed(0)
-    solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5, 4.0))
+    solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5, 4.0), 200)
     for name, buffer in solver.named_buffers():
         buffer.copy_(torch.randn_like(buffer) * {"basis": 0.3, "patterns": 0.3}.get(name, 0.1))
     solver.static.copy_(2.0 * torch.rand(len(solver.static)))
@@ -291,3 +292,22 @@ def test_frames_are_not_solved_without_a_setup(tiny_dataset, tmp_path) -> None:
         train(tiny_dataset, replace(PLAN, network=SOLVING), tmp_path / "run")
     with pytest.raises(ConfigError, match="prior_weights is"):
         replace(SOLVING, prior_weights=(0.0,))
+
+
+def test_events_solved_for_the_target_begin_with_the_layers_of_frames_solved_so() -> None:
+    """Each image with those of the frames' image whose prior is nearest."""
+    sampling = Sampling(surface="likelihood", setup="near")
+    settings = replace(SOLVING, prior_weights=(10.0, 2.2, 0.25))
+    frames = settings.build("frame", sampling)
+    events = settings.build("event", sampling)
+    events.take_layers(frames)
+    assert EVENT_PRIORS == (0.3, 2.0)
+    given, own = (one.get_parameter("unet.stem.weight").unflatten(1, (-1, 4)) for one in (frames, events))
+    torch.testing.assert_close(own, given[:, [2, 1]])
+    torch.testing.assert_close(
+        events.get_parameter("unet.head.weight"), frames.get_parameter("unet.head.weight")
+    )
+    assert events.modality.name == "event" and frames.modality.name == "frame"
+    embedded = NET.build("frame", sampling)
+    with pytest.raises(ConfigError, match="sees event"):
+        events.take_layers(embedded)

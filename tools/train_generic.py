@@ -130,8 +130,8 @@ def main() -> None:
                 last = run
             assert last is not None
             # Whoever begins with these layers fits an embedding of his own.
-            found = load_weights(last)
-            slim = found if frames == "likelihood" else with_rank(found, 8)
+            slim = with_rank(load_weights(last), 8)
+            slim.network.sampling = replace(slim.network.sampling, setup="")
             save_weights(options.out / f"{layers_of('generic', modality)[0]}.safetensors", slim)
 
 

@@ -20,7 +20,7 @@ from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.models import Confidence, ConfidenceReport, Reconstructor, Weights, halves_of, on_target_plane
 from evnlos.models.confidence import on_canvas
-from evnlos.models.sequence import canvas_matrix
+from evnlos.models.embedding import canvas_matrix
 from evnlos.setups import Setup
 from evnlos.types import Plane
 

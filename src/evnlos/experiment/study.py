@@ -78,7 +78,8 @@ class Arm:
     def layers(self, modality: str) -> str | None:
         """Return the name of the installed layers that a network begins with; None: there are none like it.
 
-        Where the layers of its modality saw other surfaces, those of its frames do.
+        Where the layers of its modality saw other surfaces, those of frames do, for events only if they are
+        solved for the target as those frames were.
 
         Args:
             modality: What the network sees.
@@ -88,7 +89,7 @@ class Arm:
         name, frames = layers_of(self.start, modality, "frame")
         network = load_weights(name).network
         if network.modality.needs_events and network.sampling.surface != self.sampling.surface:
-            if not network.modality.needs_frames:
+            if not network.modality.needs_frames and self.sampling.surface != "likelihood":
                 return None
             name, network = frames, load_weights(frames).network
         given, own = (getattr(one, "frames", "") for one in (network.settings, self.pretraining.network))

@@ -29,6 +29,10 @@ from evnlos.types import Plane
 
 Array = NDArray[np.float64]
 
+EVENT_PRIORS = (0.3, 2.0)
+"""Weights of the prior, over its own, at which the events of a sequence are solved for the target: one image
+each."""
+
 _COARSEST = (50, 80)
 _TAIL = 1e-4
 _EXTRA, _POWERS = 40, 4  # directions and power iterations of the range finder

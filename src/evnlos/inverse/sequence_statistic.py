@@ -32,7 +32,14 @@ from evnlos.cameras.streams import WHITE_DN
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.event_likelihood import LikelihoodSettings, upward
 from evnlos.inverse.event_record import EventRecord, record_of
-from evnlos.inverse.sequence_light import Array, PatternPrior, SequenceLight, handwritten_prior, sequence_light
+from evnlos.inverse.sequence_light import (
+    EVENT_PRIORS,
+    Array,
+    PatternPrior,
+    SequenceLight,
+    handwritten_prior,
+    sequence_light,
+)
 from evnlos.scene import LineMotion, Motion, Target, TargetPlane
 from evnlos.setups import load_setup
 from evnlos.types import Events, Plane
@@ -41,8 +48,6 @@ Single = NDArray[np.float32]
 
 CELLS, COEFFICIENTS, RANK = 32, 120, 120
 """Cells along a side of the target, patterns of its prior, factors of the light path."""
-PRIORS = (0.3, 2.0)
-"""Weights of the prior, over its own, at which the events are solved for the target: one image each."""
 _COARSE = 3  # every third row and column makes the first estimate
 _COARSE_STEPS, _FINE_STEPS = 9, 2
 _LONGEST_STEP = 1.5  # of a coefficient, standard deviations of the prior
@@ -334,7 +339,7 @@ def event_images(
 ) -> Single:
     """Return the target that all events of a sequence show, where it is at each edge: float32 [N, 2, h, w].
 
-    One image with a weak prior, one with a strong one (`PRIORS`): the first is sharp and noisy.
+    One image with a weak prior, one with a strong one (`EVENT_PRIORS`): the first is sharp and noisy.
 
     Args:
         events: The stream of the whole sequence.
@@ -367,7 +372,7 @@ def event_images(
     places = motion.position_m(edges_us[1:] * 1e-6)
     images = []
     with threadpool_limits(1):  # its products are small: a second thread mostly waits
-        solutions = solver(events).solutions(PRIORS)
+        solutions = solver(events).solutions(EVENT_PRIORS)
     for z in solutions:
         mask = np.clip(prior.image(z), 0.0, 1.0).astype(np.float32)
         images.append(Target("events", mask, prior.target_plane.extent_m[0]).rasterise(canvas, places))

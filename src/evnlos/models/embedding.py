@@ -10,9 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from evnlos.data import Modality
+from evnlos.data import Modality, Sampling
+from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.models.reconstructor import LinearEstimate, fit_linear
+from evnlos.setups import Setup
+from evnlos.types import Plane
 
 Scaling = Literal["dataset", "picture"]
 
@@ -282,6 +285,31 @@ class LinearEmbeddings(nn.Module):
             for name in names
         ]
         return torch.cat(parts, dim=1)
+
+
+def canvas_matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
+    """Return the matrix of a setup from canvas cells to sample pixels, and the cells.
+
+    The cells are the rows of the canvas that the target reaches.
+
+    Args:
+        setup: A linear setup.
+        sampling: Size of samples and canvas.
+
+    Returns:
+        float32 [h w, cells], white levels per unit of brightness, and the plane of the cells.
+
+    Raises:
+        ConfigError: The setup is not linear.
+    """
+    cells, height = setup.target_cells(), sampling.height
+    if cells is not None:
+        height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
+    plane = Plane(height, sampling.width, sampling.pitch_m)
+    matrix = setup.operator(plane, dtype=torch.float32).dense(torch.float32)
+    images = matrix.T.reshape(-1, *setup.shape).numpy()
+    small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(len(images), -1)
+    return torch.from_numpy(small).T.contiguous(), plane
 
 
 @torch.inference_mode()

@@ -21,10 +21,10 @@ from torch import Tensor, nn
 from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_modality
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.sequence_light import handwritten_prior
+from evnlos.inverse.sequence_light import EVENT_PRIORS, handwritten_prior
 from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.models.confidence import on_canvas
-from evnlos.models.embedding import InputNormalization, LinearEmbeddings, fit_input
+from evnlos.models.embedding import InputNormalization, LinearEmbeddings, canvas_matrix, fit_input
 from evnlos.models.reconstructor import RECONSTRUCTORS, Drawn, Reconstructor
 from evnlos.models.unet import PARTS, ResidualUNet, UNetConfig
 from evnlos.optics import MatrixTransport
@@ -154,36 +154,11 @@ def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: 
     return found
 
 
-_COMPONENTS, _COEFFICIENTS, _CELLS_ACROSS = 200, 150, 32  # of light path, prior, target
+_COEFFICIENTS, _CELLS_ACROSS = 150, 32  # of prior, target
 _FEWEST = 8  # objects to tell gain, offset and noise from
 _ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
 _RIDGE = 1e-6
 _AT_ONCE = 1024  # frames
-
-
-def canvas_matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
-    """Return the matrix of a setup from canvas cells to sample pixels, and the cells.
-
-    The cells are the rows of the canvas that the target reaches.
-
-    Args:
-        setup: A linear setup.
-        sampling: Size of samples and canvas.
-
-    Returns:
-        float32 [h w, cells], white levels per unit of brightness, and the plane of the cells.
-
-    Raises:
-        ConfigError: The setup is not linear.
-    """
-    cells, height = setup.target_cells(), sampling.height
-    if cells is not None:
-        height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
-    plane = Plane(height, sampling.width, sampling.pitch_m)
-    matrix = setup.operator(plane, dtype=torch.float32).dense(torch.float32)
-    images = matrix.T.reshape(-1, *setup.shape).numpy()
-    small = reduce_by_area(images, (sampling.height, sampling.width)).reshape(len(images), -1)
-    return torch.from_numpy(small).T.contiguous(), plane
 
 
 class PooledFrames(nn.Module):
@@ -207,6 +182,7 @@ class PooledFrames(nn.Module):
     Args:
         sampling: Size of the maps and their pitch on the target's canvas.
         prior_weights: Weights of the prior, one image each.
+        rank: Most components of the light path.
     """
 
     ambient: Tensor
@@ -218,15 +194,12 @@ class PooledFrames(nn.Module):
     mean: Tensor
     patterns: Tensor
 
-    def __init__(self, sampling: Sampling, prior_weights: tuple[float, ...]) -> None:
+    def __init__(self, sampling: Sampling, prior_weights: tuple[float, ...], rank: int) -> None:
         super().__init__()
         self.sampling, self.weights = sampling, prior_weights
         self.target_plane = Plane(_CELLS_ACROSS, _CELLS_ACROSS, TargetPlane().size_m / _CELLS_ACROSS)
-        height, width, rank = (
-            sampling.height,
-            sampling.width,
-            min(_COMPONENTS, sampling.height * sampling.width),
-        )
+        height, width = sampling.height, sampling.width
+        rank = min(rank, height * width)
         self.register_buffer("ambient", torch.zeros(height, width))
         self.register_buffer("basis", torch.zeros(height * width, rank))
         self.register_buffer("light", torch.zeros(rank, height, width))
@@ -334,6 +307,14 @@ class PooledFrames(nn.Module):
             found.append(self.mean + torch.tensordot(z, self.patterns, dims=1))
         return torch.stack(found, dim=1)
 
+    def keep(self, rank: int) -> None:
+        """Forget all but the `rank` components that carry most light; see `LinearEmbeddings.keep`."""
+        if not 1 <= rank <= len(self.light):
+            raise ConfigError(f"the rank is to be {rank}; the frames have {len(self.light)}: give 1 or more")
+        most = self.light.square().sum(dim=(1, 2)).topk(rank).indices.sort().values
+        self.basis, self.along = self.basis[:, most].clone(), self.along[:, most].clone()
+        self.light, self.static = self.light[most].clone(), self.static[most].clone()
+
     def _rows(self, position_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rows, known light and their products; sequences of the same places share them."""
         key = position_m.cpu().numpy().tobytes()
@@ -380,14 +361,22 @@ class SequenceReconstructor(Reconstructor):
         size = (sampling.height, sampling.width)
         self.normalization = InputNormalization(modality, settings.scaling)
         solved = "surface" if sampling.surface == "likelihood" else ""
-        own = [modality.slices[group.name] for group in modality.groups if group.maps == ("frame",)]
-        self._frame = own[0].start if own and settings.frames == "likelihood" else None
-        left_out = "" if self._frame is None else "frame"
+        left_out = "frame" if settings.frames == "likelihood" else ""
+        own = [modality.slices[group.name] for group in modality.groups if group.maps == (left_out,)]
+        self._frame = own[0].start if own else None
         self.embedding = LinearEmbeddings(
             modality, size, settings.rank, settings.ridge_multipliers, solved, left_out
         )
-        self.frames = None if self._frame is None else PooledFrames(sampling, settings.prior_weights)
-        images = self.embedding.images + (0 if self.frames is None else self.frames.images)
+        self.frames = (
+            None if self._frame is None else PooledFrames(sampling, settings.prior_weights, settings.rank)
+        )
+        images = self.embedding.images + (0 if self.frames is None else len(settings.prior_weights))
+        priors = {
+            ("frame",): settings.prior_weights if left_out else (),
+            ("surface",): EVENT_PRIORS if solved else (),
+        }
+        found = [weight for group in modality.groups for weight in priors.get(group.maps, ())]  # type: ignore[arg-type]
+        self._priors = found if len(found) == images else []  # of the images, where all of them are solved
         self.scale = PooledScale(images)
         self.unet = ResidualUNet(images, settings)
         self.grid = TargetGrid(sampling)
@@ -477,10 +466,36 @@ class SequenceReconstructor(Reconstructor):
         plane = self(self.pooled(inputs, position_m)[None])[0, 0]
         return self.grid.on_canvas(plane, at_m)
 
+    @torch.no_grad()
+    def take_layers(self, other: Reconstructor) -> None:
+        """Take what gradients trained from another reconstructor, and leave what is fitted in closed form.
+
+        Events that are solved for the target take the layers of frames that were: each image those of the image
+        whose prior is nearest.
+
+        Args:
+            other: One of the same kind and layers.
+
+        Raises:
+            ConfigError: Kind, modality or the size of a layer differ.
+        """
+        given = getattr(other, "_priors", [])
+        if given and self._priors and not self.modality.needs_frames and other.modality.needs_frames:
+            away = np.log(self._priors)[:, None] - np.log(given)
+            stem, cell = other.get_parameter("unet.stem.weight"), self.settings.shuffle**2
+            other = deepcopy(other)
+            other.modality = self.modality
+            chosen = stem.unflatten(1, (-1, cell))[:, np.abs(away).argmin(axis=1)]
+            other.get_submodule("unet.stem").weight = nn.Parameter(chosen.flatten(1, 2))
+        super().take_layers(other)
+
     def reduced(self, rank: int) -> Reconstructor:
         """Return a copy whose linear embedding has fewer components, the strongest."""
         copy = deepcopy(self)
-        copy.embedding.keep(rank)
+        if copy.frames is not None:
+            copy.frames.keep(rank)
+        if copy.embedding.groups:
+            copy.embedding.keep(rank)
         copy.settings = replace(copy.settings, rank=rank)
         return copy
 
