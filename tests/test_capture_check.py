@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +10,14 @@ import numpy as np
 import pytest
 
 from evnlos.cli import main
-from evnlos.data import read_capture
+from evnlos.data import CaptureInfo, read_capture
 from evnlos.data.capture_check import _offset, check_capture
-from evnlos.data.capture_info import CAMERAS, begin_capture, read_capture_info
+from evnlos.data.capture_info import CAMERAS, AlignmentInfo, CameraInfo, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize
-from evnlos.errors import DataError
+from evnlos.data.store import read_shard
+from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs
 from evnlos.setups import RadiometricSetup
 from evnlos.types import Events
@@ -283,3 +285,51 @@ def test_pixels_without_noise_send_what_is_expected() -> None:
     sent = expected_counts(level, 0.1)
     assert sent[:10].sum() == pytest.approx(9.5, abs=0.51) and sent[1:10] == pytest.approx(1.0, abs=1e-6)
     assert sent[10:].sum() == pytest.approx(-9.0, abs=0.51) and abs(sent[10]) < 0.01
+
+
+@pytest.fixture(scope="module", params=["frames", "events"])
+def one_camera(request, tiny_captures, tmp_path_factory) -> tuple[Path, str]:
+    """A capture without its frames or without its events, and which of them it lacks."""
+    folder = tmp_path_factory.mktemp("one") / "one_A"
+    shutil.copytree(tiny_captures[0], folder)
+    path = folder / "capture.yaml"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith(f"{request.param}:")]
+    path.write_text("\n".join([*lines, f"{request.param}: null"]) + "\n")
+    (folder / {"frames": "frames.csv", "events": "events.raw"}[request.param]).unlink()
+    return folder, request.param
+
+
+def test_a_capture_of_one_camera_is_checked_imported_and_reconstructed(one_camera, tmp_path, capsys) -> None:
+    folder, lacking = one_camera
+    main(["capture", "check", str(folder), "--json"])
+    found = {one["what"]: one for one in json.loads(capsys.readouterr().out)["findings"]}
+    assert found[lacking]["level"] == "doubtful" and "alone" in found[lacking]["found"]
+    assert ("event rate" in found, "saturation" in found) == (lacking == "frames", lacking == "events")
+    assert "clock offset" not in found
+    main(["import", str(folder), "--out", str(tmp_path / "data")])
+    samples, _ = read_shard(tmp_path / "data" / "one_A.h5")
+    assert samples.frame.any() == (lacking == "events") and samples.surface.any() == (lacking == "frames")
+    assert (samples.event_count.sum() > 0) == (lacking == "frames") and samples.truth is not None
+    main(["reconstruct", str(folder), "--out", str(tmp_path / "out"), "--json"])
+    told = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert told["modality"] == {"frames": "event", "events": "frame"}[lacking]
+    assert "light" not in told and (tmp_path / "out" / "result.png").is_file()
+
+
+def test_what_a_capture_of_one_camera_lacks_is_named(one_camera, tmp_path, capsys) -> None:
+    folder, lacking = one_camera
+    weights = {"frames": "near-frame-sequence", "events": "near-event-sequence"}[lacking]
+    with pytest.raises(SystemExit) as end:
+        main(["reconstruct", str(folder), "--weights", weights, "--out", str(tmp_path / "out")])
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and f"{lacking}: null in capture.yaml" in said and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(DataError, match=f"needs {lacking} too"):
+        read_capture(folder)
+
+
+def test_a_capture_without_any_camera_or_a_clock_of_nothing_is_refused() -> None:
+    with pytest.raises(ConfigError, match="state one of them"):
+        CaptureInfo(CameraInfo(8, 8), events=None, frames=None)
+    with pytest.raises(ConfigError, match="leave alignment out"):
+        CaptureInfo(CameraInfo(8, 8), events=None, alignment=AlignmentInfo(offset_us="auto"))

@@ -206,7 +206,11 @@ class Model:
                 sequences is not told the motion.
         """
         tracked = setup_for_track(setup) if track else None
-        capture = recording if isinstance(recording, Capture) else read_capture(recording)
+        eyes = self.weights.modality
+        if not isinstance(recording, Capture):
+            recording = read_capture(recording, needs_frames=False, needs_events=False)
+        capture = recording
+        capture.info.check_cameras(capture.name, frames=track or eyes.needs_frames, events=eyes.needs_events)
         samples = capture_samples(capture, self.weights.sampling, pattern)
         warnings: list[str] = []
         if tracked is not None:
@@ -228,7 +232,7 @@ class Model:
         found = Reconstruction(
             images, samples, confidence, warnings, no_confidence=unjudged, brought_from=level
         )
-        if setup is None or operator is None:
+        if setup is None or operator is None or not capture.has_frames:
             return found
         frames = torch.from_numpy(samples.frame)
         found = replace(found, light=light_gain(images, frames, operator))

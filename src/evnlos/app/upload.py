@@ -271,12 +271,14 @@ def _read_capture(folder: Path) -> Recorded:
     width, height = info.camera.width, info.camera.height
     if width * height > _MOST_PIXELS:
         raise DataError(f"the camera has {width} x {height} pixels; at most {_MOST_PIXELS:,} are shown")
+    info.check_cameras(folder.name, frames=False, events=True)
+    assert info.events is not None
     recording = Recording(inside(folder, info.events), width=width, height=height)
     if not _first_events(recording)[1]:
         raise DataError(
             f"{info.events} holds {MOST_EVENTS:,} events or more; cut it with evnlos convert before you zip it"
         )
-    capture = read_capture(folder, _MOST_FRAME_BYTES)
+    capture = read_capture(folder, _MOST_FRAME_BYTES, needs_frames=False)
     frames, edges = capture.frames[1:], capture.frame_times_us
     if not len(frames):
         raise DataError("the capture has one frame; a position needs two, with events between")
@@ -289,7 +291,7 @@ def _read_capture(folder: Path) -> Recorded:
         capture.name,
         capture.events,
         np.asarray(edges),
-        _own(frames),
+        _own(frames) if capture.has_frames else None,
         capture.peak,
         motion=capture.motion,
         target=capture.target,

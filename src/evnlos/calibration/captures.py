@@ -186,7 +186,7 @@ def read_capture_set(
         raise DataError(
             f"{len(chosen)} capture(s) are left to calibrate on; give {FEWEST} or more, best 20, of one setup"
         )
-    captures = [read_capture(paths[name]) for name in chosen]
+    captures = [read_capture(paths[name], needs_events=False) for name in chosen]
     if target_size_m is not None:
         captures = [replace(capture, target=None) for capture in captures]
     for capture in captures:

@@ -160,6 +160,9 @@ def fit_setup(
         seed=settings.seed,
         target_size_m=settings.start.glyphs.target_plane.size_m if settings.targets == "unknown" else None,
     )
+    alone = [one.name for one in (*fit.captures, *held.captures) if not one.has_events]
+    if settings.events and alone:
+        raise DataError(f"{alone[0]} holds frames alone, no events; fit the frames alone (--no-events)")
     start, fixed = _at_known_distance(settings, fit)
     residuals: dict[str, Residual] = {}
     wall = start if isinstance(start, RadiometricSetup) and _is_any(settings, fit) else None

@@ -242,7 +242,7 @@ class CaptureCommand:
         with ProgressBars() as progress:
             for folder in counted(self.folders, progress, "check", len(self.folders), "captures"):
                 try:
-                    capture = read_capture(folder, needs_frames=False)
+                    capture = read_capture(folder, needs_frames=False, needs_events=False)
                     found[str(folder)] = check_capture(capture)
                 except EvnlosError as error:
                     if len(self.folders) == 1:

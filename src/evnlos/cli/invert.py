@@ -234,9 +234,7 @@ class InvertCommand:
                 "and 2 cells or more"
             )
         clock = time.perf_counter()
-        setup, capture = linear_setup(word), read_capture(self.files[0])
-        if not capture.has_frames:
-            raise ConfigError(f"{self.files[0]} has no frames; --changing takes frames")
+        setup, capture = linear_setup(word), read_capture(self.files[0], needs_events=False)
         pitch = max(sides_m) / self.cells
         across, down = (max(1, round(side / pitch)) for side in sides_m)
         plane = Plane(down, across, pitch)

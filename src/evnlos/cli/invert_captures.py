@@ -87,7 +87,8 @@ def invert_captures(
     """Return the figures, and the targets [cells, cells] by name, of every capture and solver."""
     clock = time.perf_counter()
     setup = linear_setup(options.setup)
-    captures = [read_capture(one) for one in counted(folders, progress, "read", len(folders), "captures")]
+    reads = counted(folders, progress, "read", len(folders), "captures")
+    captures = [read_capture(one, needs_events=False) for one in reads]
     pattern = pattern_of(options.setup, options.pattern)
     height, width = captures[0].frames.shape[1:]
     if any(capture.frames.shape != captures[0].frames.shape for capture in captures):
@@ -308,12 +309,10 @@ def estimate_captures(
     lights: dict[Any, Any] = {}
     rows, pictures = [], {}
     for folder in counted(folders, progress, "invert", len(folders), "captures"):
-        capture = read_capture(folder)
+        capture = read_capture(folder, needs_frames=evidence != "events", needs_events=evidence != "frames")
         motion = capture.motion
         if motion is None:
-            raise ConfigError(
-                f"{folder}: the motion is unknown; state it in capture.yaml (`evnlos track` finds it)"
-            )
+            raise ConfigError(f"{folder}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
         size = capture.info.target_size_m
         prior = handwritten_prior(Plane(_CELLS, _CELLS, size / _CELLS), _COEFFICIENTS)
         span = (float(capture.frame_times_us[0]) * 1e-6, float(capture.frame_times_us[-1]) * 1e-6)

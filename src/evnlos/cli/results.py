@@ -154,7 +154,7 @@ class TrackCommand:
         check_writable(self.out)
         with ProgressBars() as progress:
             with progress.stage("track", "read the capture", 0, 3):
-                capture = read_capture(self.capture)
+                capture = read_capture(self.capture, needs_events=False)
             with progress.stage("track", "render the light of the setup", 1, 3):
                 setup = None if self.setup is None else linear_setup(self.setup)
                 pattern = pattern_of(self.setup, self.pattern)

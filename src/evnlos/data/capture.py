@@ -20,14 +20,13 @@ from evnlos.data.capture_info import (
     FilterInfo,
     TargetInfo,
     character_of,
-    digest_of,
     inside,
     read_capture_info,
 )
 from evnlos.data.clocks import find_offset
-from evnlos.data.fixed_pattern import FixedPattern, correct_frames
-from evnlos.data.frames import FrameSeries, read_frame_series, read_image, warp_frames
-from evnlos.data.sampling import Samples, Sampling, frame_homography, iter_samples, join_samples, time_steps
+from evnlos.data.fixed_pattern import FixedPattern, mapped, prepare_frames
+from evnlos.data.frames import read_frame_series, read_image
+from evnlos.data.sampling import Samples, Sampling, iter_samples, join_samples, time_steps
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, printable
 from evnlos.events import (
@@ -41,7 +40,7 @@ from evnlos.events import (
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.types import Events
-from evnlos.untrusted import check_memory, no_file
+from evnlos.untrusted import no_file
 
 _HELD_BYTES = 1 << 26  # frames of an import that take more are read as they are asked for
 _MOST_US = 2**62  # of a time stamp: differences of two fit into 64 bits
@@ -73,6 +72,11 @@ class Capture:
     def has_frames(self) -> bool:
         """Whether a frame camera was there; else the frames are black and only mark the time steps."""
         return self.info.frames is not None
+
+    @property
+    def has_events(self) -> bool:
+        """Whether an event camera was there; else there is no event."""
+        return self.info.events is not None
 
     @property
     def peak(self) -> int:
@@ -116,6 +120,7 @@ def read_capture(
     events_topic: str | None = None,
     frames_topic: str | None = None,
     needs_frames: bool = True,
+    needs_events: bool = True,
     lazy_frames: bool = False,
 ) -> Capture:
     """Read a capture folder (`capture.yaml`, event file, frames, mask), or one file of events and frames.
@@ -128,11 +133,12 @@ def read_capture(
         events_topic: Stream of the events, of a file that holds several.
         frames_topic: Stream of its frames.
         needs_frames: Whether a capture of an event camera alone is refused; else black frames mark its steps.
+        needs_events: Whether a capture of a frame camera alone is refused; else it has no events.
         lazy_frames: Whether frames that take more memory are a `FrameStack`, in place of an error.
 
     Raises:
         DataError: A file is missing, a frame has another size than the camera, clock or pixels do not fit, or
-            there are no frames where they are needed.
+            there are no frames or events where they are needed.
         ConfigError: `capture.yaml` has an unknown key or a wrong type.
         EventFileError: The event file is damaged.
         MissingDependencyError: A file needs an optional package.
@@ -142,7 +148,8 @@ def read_capture(
         raise DataError(f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)")
     info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic)
     name, folder = _name_of(folder), folder.parent if folder.is_file() else folder
-    is_alone = info.frames is None and not needs_frames
+    info.check_cameras(folder, frames=needs_frames, events=needs_events)
+    is_alone = info.frames is None
     series = None if is_alone else read_frame_series(folder, info, most_frame_bytes, lazy_frames)
     events, told = _read_events(folder, info)
     if series is None:
@@ -150,15 +157,15 @@ def read_capture(
         notes = [f"no frames: {len(frames)} time steps", *told]
     else:
         notes = [f"{len(series.images)} frames from {series.what}", *told]
-        frames, told = _prepare_frames(folder, info, series)
+        frames, told = prepare_frames(folder, info, series)
         times_us, in_time = _place_in_time(folder, info, events, frames, series.times_us)
         notes += told + in_time
     roi = info.roi
     if roi is not None:
         events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
-        frames = _mapped(frames, lambda one: one[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
+        frames = mapped(frames, lambda one: one[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
         notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
-    if not len(events):
+    if info.events is not None and not len(events):
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
     target = _read_target(folder, info.target)
     held = cast(Any, frames) if is_alone or isinstance(frames, FrameStack) else np.ascontiguousarray(frames)
@@ -171,7 +178,10 @@ def _name_of(path: Path) -> str:
 
 
 def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
-    path, camera = inside(folder, info.events), info.camera
+    camera = info.camera
+    if info.events is None:
+        return Events.empty(camera.width, camera.height), ["no events"]
+    path = inside(folder, info.events)
     options = CelexOptions(clock_mhz=camera.clock_mhz) if camera.clock_mhz is not None else None
     events = read_events(path, width=camera.width, height=camera.height, celex=options, topic=info.events_topic)
     if not len(events):
@@ -197,49 +207,13 @@ def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
     return events, notes
 
 
-def _mapped(frames: Any, work: Callable[[NDArray], NDArray]) -> Any:
-    """Return frames with `work` done on them; on those that are read as they are asked for, block by block."""
-    return frames.mapped(work) if isinstance(frames, FrameStack) else work(frames)
-
-
-def _prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[Any, list[str]]:
-    """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
-    frames, notes = series.images, []
-    size = frames.shape[1:]
-    peak = float(np.iinfo(frames.dtype).max)
-    dark, flat = (read_image(inside(folder, name), size) if name else None for name in (info.dark, info.flat))
-    is_corrected = dark is not None or flat is not None
-    if is_corrected:
-        notes.append(f"frames corrected by {' and '.join(name for name in (info.dark, info.flat) if name)}")
-    if info.frames_turned:
-        notes.append("frames turned by 180 degrees")
-    matrix, shape = None, (info.camera.height, info.camera.width)
-    if info.registration is not None:
-        matrix, how = frame_homography(folder, info.registration, info)
-        if not isinstance(frames, FrameStack):
-            needed = 16 * len(frames) * shape[0] * shape[1]
-            check_memory(needed, f"{folder}: registering its frames", "leave frames out")
-        covered = 100 * float(warp_frames(frames[:1], matrix, shape)[1].mean())
-        notes.append(f"frames registered by {how}; they cover {covered:.0f} % of the events' view")
-
-    def prepared(block: NDArray) -> NDArray:
-        changed = correct_frames(block, peak, dark, flat) if is_corrected else None
-        if info.frames_turned:
-            block = block[:, ::-1, ::-1]
-            changed = None if changed is None else changed[:, ::-1, ::-1]
-        if matrix is not None:
-            changed = warp_frames(block / np.float32(peak) if changed is None else changed, matrix, shape)[0]
-        return block if changed is None else np.round(changed * 65_535).astype(np.uint16)
-
-    return _mapped(frames, prepared), notes
-
-
 def _place_in_time(
     folder: Path, info: CaptureInfo, events: Events, frames: NDArray, times_us: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], list[str]]:
     """Return the frames' times on the events' clock."""
     alignment = info.alignment
     if alignment.trigger_channel is not None:
+        assert info.events is not None
         triggers = read_triggers(inside(folder, info.events), topic=info.events_topic)
         chosen = triggers.t_us[triggers.rising & (triggers.channel == alignment.trigger_channel)]
         if len(chosen) != len(frames):
@@ -297,7 +271,9 @@ def _samples_of(capture: Capture, sampling: Sampling, pattern: FixedPattern | No
     if not capture.has_frames:
         frames = frames[:, :1, :1]
     elif pattern is not None:
-        frames, peak = _mapped(frames, partial(pattern.correct, peak=peak)), 1.0
+        frames, peak = mapped(frames, partial(pattern.correct, peak=peak)), 1.0
+    if not capture.has_events:  # nothing is in its maps, of whatever kind they are
+        sampling = replace(sampling, surface="sae")
     known = {"motion": capture.motion, "target": capture.target}
     yield from iter_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
 
@@ -351,8 +327,9 @@ def import_captures(
         if not path.is_file() and not (path / "capture.yaml").is_file():
             raise DataError(f"{path} is no capture: capture.yaml is missing; see `evnlos import --help`")
     topics: dict[str, Any] = {"events_topic": events_topic, "frames_topic": frames_topic}
-    read = partial(read_capture, most_frame_bytes=_HELD_BYTES, **topics, needs_frames=False, lazy_frames=True)
-    described = {name: digest_of(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
+    optional = {"needs_frames": False, "needs_events": False}
+    read = partial(read_capture, most_frame_bytes=_HELD_BYTES, **topics, **optional, lazy_frames=True)
+    described = {name: _digest_of(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
     config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
@@ -387,3 +364,12 @@ def _split(names: list[str], test: list[str], validation: list[str]) -> dict[str
             raise DataError(f"{name} is held out for testing and for validation; choose one")
         split["test" if in_test else "validation" if in_validation else "train"].append(name)
     return split
+
+
+def _digest_of(info: CaptureInfo) -> str:
+    """Return the hash of a description; settings of files with several streams count where they are made."""
+    values = to_dict(info)
+    for key in ("events_topic", "frames_topic", "recording"):
+        if values[key] is None:
+            del values[key]
+    return config_hash(values)

@@ -55,12 +55,17 @@ def check_capture(capture: Capture) -> list[Finding]:
         cure = "a network of events needs none; for calibration and fusion record a frame camera beside it"
         alone = Finding("frames", "doubtful", "none: an event camera alone", cure)
         return [alone, *_events(capture), *_flicker(capture)]
+    if not capture.has_events:
+        cure = "a network of frames needs none; for fusion and a finer track record an event camera beside it"
+        alone = Finding("events", "doubtful", "none: a frame camera alone", cure)
+        return [*_light(capture), *_movement(capture), alone, *_frame_times(capture)]
     return [
         *_light(capture),
         *_movement(capture),
         *_events(capture),
         *_flicker(capture),
         *_clock(capture),
+        *_frame_times(capture),
         *_offset(capture),
     ]
 
@@ -240,7 +245,10 @@ def _clock(capture: Capture) -> Iterator[Finding]:
         f"events cover {100 * share:.0f} % of the frames' time (95 % is safe)",
         "check alignment in capture.yaml: offset_us, auto, or a trigger_channel",
     )
-    steps = np.diff(frames)
+
+
+def _frame_times(capture: Capture) -> Iterator[Finding]:
+    steps = np.diff(capture.frame_times_us)
     uneven = float(np.abs(steps - np.median(steps)).max() / max(float(np.median(steps)), 1.0))
     yield _finding(
         "frame times",
@@ -353,7 +361,8 @@ def check_picture(capture: Capture) -> Image.Image:
 
 def _event_rate(events: Events, times_us: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
     """Return events per second in equal bins over events and frames, and the bins' middles in seconds."""
-    low, high = min(events.t_us[0], times_us[0]), max(events.t_us[-1], times_us[-1]) + 1
+    ends = np.concatenate([events.t_us[:1], events.t_us[-1:], times_us[[0, -1]]])
+    low, high = ends.min(), ends.max() + 1
     counts, edges = np.histogram(events.t_us, _BINS, (float(low), float(high)))
     return counts / (np.diff(edges) * 1e-6), (edges[1:] + edges[:-1]) / 2e6
 

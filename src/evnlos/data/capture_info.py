@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from evnlos.config import config_hash, from_dict, read_yaml, to_dict
+from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError, DataError
 from evnlos.events.recording import Recording
 from evnlos.files import write_atomically
@@ -185,8 +185,8 @@ class CaptureInfo:
 
     camera: CameraInfo
     """The camera."""
-    events: str = "events.raw"
-    """The event file, as the camera wrote it."""
+    events: str | None = "events.raw"
+    """The event file, as the camera wrote it; null for a frame camera alone."""
     frames: str | None = "frames.csv"
     """Frames: a table t_us,file; a video; a folder of pictures; an AEDAT file or ROS bag, also the same file as
     `events`; a CeleX-V recording of mode F; null for an event camera alone, whose time steps are then at
@@ -217,6 +217,20 @@ class CaptureInfo:
     """Notes about the setup: distance_m, wall, ambient."""
     recording: RecordingInfo | None = None
     """How it was recorded, where `evnlos capture record` did."""
+
+    def __post_init__(self) -> None:
+        if self.events is None and self.frames is None:
+            raise ConfigError("events and frames are null; state one of them")
+        if self.events is None and self.alignment != AlignmentInfo():
+            raise ConfigError("alignment is to the events' clock, and events is null; leave alignment out")
+
+    def check_cameras(self, name: str | Path, *, frames: bool, events: bool) -> None:
+        """Raise `DataError` where a capture has no frames, or no events, and they are needed."""
+        for is_needed, key, other in ((frames, "frames", "events"), (events, "events", "frames")):
+            if is_needed and getattr(self, key) is None:
+                raise DataError(
+                    f"{name} holds {other} alone ({key}: null in capture.yaml); this needs {key} too"
+                )
 
     @property
     def target_size_m(self) -> float:
@@ -261,9 +275,8 @@ def _info_of_recording(path: Path, events_topic: str | None, frames_topic: str |
 
 
 _TEMPLATE = """\
-# One capture: a hidden target moves past, an event camera and a frame camera watch the wall.
-# Lines that begin with # are notes, or settings that you may need; `evnlos capture check FOLDER` reads what you
-# recorded and says what is wrong with it.
+# One capture: a hidden target moves past, an event camera, a frame camera or both watch the wall.
+# Lines with # are notes, or settings that you may need; `evnlos capture check FOLDER` says what is wrong.
 
 camera:
   name: {name}
@@ -273,7 +286,8 @@ camera:
   # exposure_s: 0.01         # of a frame; the calibration blurs by it
   # clock_mhz: 100           # CeleX-V only, where the file's name does not say it
 
-events: {events}           # as the camera wrote it; the format is found from its content
+events: {events}           # as the camera wrote it; the format is found from its content; null for a frame
+                             # camera alone, whose size is then above
 frames: {frames}               # a folder of pictures, a video, a table t_us,file, an AEDAT file or a ROS bag;
                              # null for an event camera alone
 # frames_turned: true        # pictures that the CeleX-V program exported are turned by 180 degrees
@@ -371,7 +385,8 @@ def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
     if not path.is_relative_to(folder.resolve()):
         raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
     if not there:
-        raise DataError(f"{path} does not exist; {folder / by} names it, or leaves its name to the default")
+        how = f"{folder / by} names it, or leaves its name to the default; null where there is no such camera"
+        raise DataError(f"{path} does not exist; {how}")
     return path
 
 
@@ -383,12 +398,3 @@ def character_of(name: str) -> str:
         ('R', 'A')
     """
     return name.rsplit("_", 1)[-1]
-
-
-def digest_of(info: CaptureInfo) -> str:
-    """Return the hash of a description; settings of files with several streams count where they are made."""
-    values = to_dict(info)
-    for key in ("events_topic", "frames_topic", "recording"):
-        if values[key] is None:
-            del values[key]
-    return config_hash(values)

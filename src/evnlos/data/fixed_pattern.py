@@ -8,18 +8,24 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.data.sampling import reduce_by_area
+from evnlos.data.capture_info import CaptureInfo, inside
+from evnlos.data.frames import FrameSeries, read_image, warp_frames
+from evnlos.data.sampling import frame_homography, reduce_by_area
 from evnlos.errors import DataError
+from evnlos.events import FrameStack
 from evnlos.files import write_atomically
 from evnlos.setups import Setup
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
+from evnlos.untrusted import check_memory
 
 
 def correct_frames(
@@ -54,6 +60,43 @@ def correct_frames(
         # A dead pixel would become infinite; below a tenth of the mean response nothing can be said.
         out *= np.where(response > 0.1 * mean, mean / np.maximum(response, 0.1 * mean), 0.0)
     return np.clip(out / max(peak - float(ground.mean()), 1.0), 0.0, 1.0)
+
+
+def mapped(frames: Any, work: Callable[[NDArray], NDArray]) -> Any:
+    """Return frames with `work` done on them; on those that are read as they are asked for, block by block."""
+    return frames.mapped(work) if isinstance(frames, FrameStack) else work(frames)
+
+
+def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[Any, list[str]]:
+    """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
+    frames, notes = series.images, []
+    size = frames.shape[1:]
+    peak = float(np.iinfo(frames.dtype).max)
+    dark, flat = (read_image(inside(folder, name), size) if name else None for name in (info.dark, info.flat))
+    is_corrected = dark is not None or flat is not None
+    if is_corrected:
+        notes.append(f"frames corrected by {' and '.join(name for name in (info.dark, info.flat) if name)}")
+    if info.frames_turned:
+        notes.append("frames turned by 180 degrees")
+    matrix, shape = None, (info.camera.height, info.camera.width)
+    if info.registration is not None:
+        matrix, how = frame_homography(folder, info.registration, info)
+        if not isinstance(frames, FrameStack):
+            needed = 16 * len(frames) * shape[0] * shape[1]
+            check_memory(needed, f"{folder}: registering its frames", "leave frames out")
+        covered = 100 * float(warp_frames(frames[:1], matrix, shape)[1].mean())
+        notes.append(f"frames registered by {how}; they cover {covered:.0f} % of the events' view")
+
+    def prepared(block: NDArray) -> NDArray:
+        changed = correct_frames(block, peak, dark, flat) if is_corrected else None
+        if info.frames_turned:
+            block = block[:, ::-1, ::-1]
+            changed = None if changed is None else changed[:, ::-1, ::-1]
+        if matrix is not None:
+            changed = warp_frames(block / np.float32(peak) if changed is None else changed, matrix, shape)[0]
+        return block if changed is None else np.round(changed * 65_535).astype(np.uint16)
+
+    return mapped(frames, prepared), notes
 
 
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less

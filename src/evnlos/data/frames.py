@@ -73,10 +73,8 @@ def read_frame_series(
             no rate is stated.
         EventFileError: A recording of the camera is damaged.
     """
-    if info.frames is None:
-        raise DataError(
-            f"{folder} holds events alone (frames: null in capture.yaml); this needs frames as well"
-        )
+    info.check_cameras(folder, frames=True, events=False)
+    assert info.frames is not None
     path = inside(folder, info.frames)
     most = min(memory_left() // 4, 1 << 31) if most_bytes is None else most_bytes
     size = None if info.registration is not None else (info.camera.height, info.camera.width)

@@ -197,8 +197,9 @@ def reconstruct_capture(
 
     Args:
         capture: A capture folder; its target may be unknown.
-        weights: A weights file, a run's folder or a name of `published`; None: the published frame weights of
-            the setup whose distance is nearest, of whole sequences where the motion is known or found.
+        weights: A weights file, a run's folder or a name of `published`; None: the published weights for frames
+            (for events where there are no frames) of the setup whose distance is nearest, of whole sequences
+            where the motion is known or found.
         out: The folder for the pictures; must not exist or be empty. It is there with all of them, or
             not at all.
         zoom: Size of a pixel in the pictures.
@@ -226,10 +227,11 @@ def reconstruct_capture(
     out = Path(out)
     if track:
         setup_for_track(setup)  # before anything is read
-    recording = read_capture(capture)
+    recording = read_capture(capture, needs_frames=False, needs_events=False)
     if weights is None:
         distance_m = recording.distance_m or (None if setup is None else setup.default_distance_m)
-        weights = published_for(distance_m, "frame", is_motion_known=track or recording.motion is not None)
+        kind = "frame" if recording.has_frames else "event"
+        weights = published_for(distance_m, kind, is_motion_known=track or recording.motion is not None)
     model = load_model(weights)
     sampling = model.weights.sampling
     check_folder(out)
@@ -314,7 +316,7 @@ def result_sheet(
     confidence: ConfidenceReport | None,
     lines: Sequence[str],
 ) -> NDArray[np.uint8]:
-    """Return one labelled picture of a reconstruction, at the position in the middle of the sequence.
+    """Return one labelled picture, uint8 [H', W', 3], of a reconstruction at the position in the middle.
 
     Args:
         title: First line.
@@ -323,16 +325,16 @@ def result_sheet(
         sampling: Size and pitch of the maps.
         confidence: Ends of each pixel's interval; None where they can't be told.
         lines: What it means, in sentences.
-
-    Returns:
-        RGB, uint8 [H', W', 3].
     """
     k = len(images) // 2
-    panels: list[tuple[str, NDArray[np.uint8]]] = [
-        (f"wall, position {k + 1} of {len(images)} (contrast stretched)", stretched(samples.frame[k])),
-        (f"its events ({WORDS})", polarity(samples.surface[k])),
-        ("reconstruction", grey(images[k])),
-    ]
+    panels: list[tuple[str, NDArray[np.uint8]]] = []
+    at = f"position {k + 1} of {len(images)}"
+    if samples.frame.any():
+        panels.append((f"wall, {at} (contrast stretched)", stretched(samples.frame[k])))
+    if samples.surface.any():
+        panels.append((f"its events ({WORDS})", polarity(samples.surface[k])))
+    seen = len(panels)
+    panels.append((f"reconstruction, {at}", grey(images[k])))
     if confidence is not None:
         ends = ("lower", confidence.low[k]), ("upper", confidence.high[k])
         panels += [(f"90 % interval: {name} end", grey(end)) for name, end in ends]
@@ -357,7 +359,7 @@ def result_sheet(
         draw.text((left, above), name, _INK, font)
         image = Image.fromarray(np.ascontiguousarray(picture)).convert("RGB")
         sheet.paste(image.resize((width, height), Image.Resampling.NEAREST), box[:2])
-        if i >= 2:  # on the target's plane
+        if i >= seen:  # on the target's plane
             start, stop = box[2] - 10 - round(_BAR_M / sampling.pitch_m * width / sampling.width), box[2] - 10
             draw.rectangle((start, box[3] - 12, stop, box[3] - 9), _PAPER, _INK)
             text = f"{1e2 * _BAR_M:g} cm"

@@ -133,9 +133,8 @@ def track_capture(
     frames = capture.frames / np.float32(capture.peak)
     if pattern is not None:
         frames = pattern.correct(capture.frames, capture.peak)
-    return track_frames(
-        frames, capture.frame_times_us.astype(np.float64) * 1e-6, capture.events, setup, settings
-    )
+    events = capture.events if capture.has_events else None
+    return track_frames(frames, capture.frame_times_us.astype(np.float64) * 1e-6, events, setup, settings)
 
 
 def track_frames(
