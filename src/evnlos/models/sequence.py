@@ -161,6 +161,12 @@ _RIDGE = 1e-6
 _AT_ONCE = 1024  # frames
 
 
+def _forget(frames: nn.Module, _: object) -> None:
+    """Forget the rows of the last sequence, which were those of other numbers."""
+    assert isinstance(frames, PooledFrames)
+    frames._last = None
+
+
 class PooledFrames(nn.Module):
     """All frames of a sequence solved for the target, [N, H, W] -> [S, P, P]: one linear-Gaussian estimate.
 
@@ -209,6 +215,7 @@ class PooledFrames(nn.Module):
         self.register_buffer("mean", torch.zeros(self.target_plane.shape))
         self.register_buffer("patterns", torch.zeros(_COEFFICIENTS, *self.target_plane.shape))
         self._last: tuple[bytes, tuple[Tensor, Tensor, Tensor]] | None = None
+        self.register_load_state_dict_post_hook(_forget)
 
     @property
     def images(self) -> int:
@@ -314,10 +321,11 @@ class PooledFrames(nn.Module):
         most = self.light.square().sum(dim=(1, 2)).topk(rank).indices.sort().values
         self.basis, self.along = self.basis[:, most].clone(), self.along[:, most].clone()
         self.light, self.static = self.light[most].clone(), self.static[most].clone()
+        self._last = None
 
     def _rows(self, position_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rows, known light and their products; sequences of the same places share them."""
-        key = position_m.cpu().numpy().tobytes()
+        key = str(self.light.device).encode() + position_m.cpu().numpy().tobytes()
         if self._last is None or self._last[0] != key:
             carrier = MatrixTransport(self.light.flatten(1), self.sampling.canvas, (1, len(self.light)))
             seen = SequenceOperator(carrier, self.target_plane, position_m.cpu().double().numpy()).matrix()
