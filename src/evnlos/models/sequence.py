@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -58,7 +59,7 @@ class SequenceConfig(UNetConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.prior_weights or not all(0 < weight < np.inf for weight in self.prior_weights):
+        if not self.prior_weights or not all(0 < weight < math.inf for weight in self.prior_weights):
             raise ConfigError(
                 f"SequenceConfig.prior_weights is {self.prior_weights}; give at least one, all above 0"
             )
