@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from evnlos.analysis import evaluate, load_model, reconstruct
-from evnlos.analysis.confidence import FrameOperator, confidence_of, explained, light_gain, risk_coverage
+from evnlos.analysis.confidence import confidence_of, explained, light_gain, risk_coverage
 from evnlos.analysis.identify import QUICK, identify, verdict_on
 from evnlos.app.views import verdict_box
 from evnlos.cli import main
@@ -18,6 +18,7 @@ from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modali
 from evnlos.errors import DataError
 from evnlos.models import (
     ConfidenceReport,
+    FrameOperator,
     UNetConfig,
     UNetReconstructor,
     Weights,

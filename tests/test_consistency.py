@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from evnlos.analysis.confidence import FrameOperator, consistent
+from evnlos.analysis.confidence import consistent
 from evnlos.cameras import FrameCamera
 from evnlos.data import Sampling, SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
+from evnlos.models import FrameOperator
 from evnlos.scene import Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup
 

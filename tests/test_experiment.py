@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.analysis.confidence import FrameOperator
 from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.data import (
@@ -50,7 +49,7 @@ from evnlos.experiment import (
     summary_table,
     write_record,
 )
-from evnlos.models import UNetConfig, layers_of, load_weights
+from evnlos.models import FrameOperator, UNetConfig, layers_of, load_weights
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.setups import RadiometricSetup, load_setup
 from evnlos.training import Training

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.analysis.confidence import FrameOperator
 from evnlos.config import from_dict
 from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
 from evnlos.errors import ConfigError, DataError
 from evnlos.metrics import psnr
-from evnlos.models import UNetConfig, load_weights
+from evnlos.models import FrameOperator, UNetConfig, load_weights
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.training import (

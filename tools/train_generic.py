@@ -8,8 +8,9 @@ once through the light path of each wall; light and roughness scatter about what
 calibrations do.
 
     python tools/train_generic.py --out generic --modalities frame
-    python tools/train_generic.py --out generic-events --modalities event fusion
-    cp generic/generic-*.safetensors packages/evnlos-weights/src/evnlos_weights/
+    python tools/train_generic.py --out generic-fusion --modalities fusion
+    python tools/train_generic.py --out generic-event --modalities event --rounds 1 --epochs 4
+    cp generic*/generic-*.safetensors packages/evnlos-weights/src/evnlos_weights/
 """
 
 from __future__ import annotations

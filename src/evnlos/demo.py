@@ -75,6 +75,11 @@ class Demo:
     seed: int = 0
     """Seed of every draw."""
 
+    @property
+    def lab(self) -> Lab:
+        """The laboratory whose captures are rendered where none are given."""
+        return Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=self.seed)
+
 
 def run_demo(settings: Demo) -> Path:
     """Run the main job, or what is left of it, and return the path of the report.
@@ -90,7 +95,7 @@ def run_demo(settings: Demo) -> Path:
     notes = []
     folders = captures
     if not folders:
-        lab = Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=settings.seed)
+        lab = settings.lab
         notes.append(
             "The captures of this page are not recordings: they were rendered with a wall of rough aluminium, "
             "cameras and noise that only calibration can tell the simulator. Give --captures for recordings."
@@ -278,7 +283,7 @@ def run_mismatch(
     found = []
     for name in setups or known:
         if captures is None:
-            lab = lab_of(name, Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS)))
+            lab = lab_of(name, Demo().lab)
             folders = render_captures(
                 lab, base.out / "captures" / name, workers=base.workers, progress=progress, force=base.force
             )

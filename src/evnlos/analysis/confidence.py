@@ -15,53 +15,21 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from evnlos.data import NlosDataset, Samples, Sampling
-from evnlos.data.sampling import reduce_by_area
+from evnlos.data import NlosDataset, Samples
 from evnlos.errors import DataError
-from evnlos.models import Confidence, ConfidenceReport, Reconstructor, Weights, halves_of, on_target_plane
+from evnlos.models import (
+    Confidence,
+    ConfidenceReport,
+    FrameOperator,
+    Reconstructor,
+    Weights,
+    halves_of,
+    on_target_plane,
+)
 from evnlos.models.confidence import on_canvas
-from evnlos.models.embedding import canvas_matrix
-from evnlos.setups import Setup
 from evnlos.types import Plane
 
 _TOLERANCE, _MOST_STEPS = 1e-3, 200
-
-
-class FrameOperator:
-    """What a calibrated setup makes of a picture on the canvas: frame = A x + ambient, at the samples' size.
-
-    Args:
-        setup: The calibrated setup (`load_setup` of the calibrated folder).
-        sampling: Size of samples and canvas.
-
-    Attributes:
-        matrix: A, float32 [h w, cells]: white levels per unit of brightness of a canvas cell.
-        ambient: Ambient light, float32 [h w], white levels.
-        rows: Rows of the canvas that hold cells; beyond them the target never is.
-        sigma: Standard deviation of the noise of a sample pixel, white levels.
-
-    Raises:
-        ConfigError: The setup is not linear.
-    """
-
-    def __init__(self, setup: Setup, sampling: Sampling) -> None:
-        self.size = (sampling.height, sampling.width)
-        self.matrix, source = canvas_matrix(setup, sampling)
-        self.ambient = torch.from_numpy(reduce_by_area(setup.ambient_light().numpy(), self.size)).flatten()
-        first = (sampling.height - source.height) // 2
-        self.rows = slice(first, first + source.height)
-        self._camera, shape = setup.frame_camera, setup.shape
-        self._pixels = shape[0] * shape[1] / (self.size[0] * self.size[1])  # of the sensor, a sample pixel
-        self.sigma = float(self.variance(self.ambient.mean() + 0.1 * setup.gain).sqrt())
-
-    def __call__(self, pictures: Tensor) -> Tensor:
-        """Return the frames [N, h, w] that the setup makes of pictures [N, H, W]."""
-        light = pictures[:, self.rows].flatten(1) @ self.matrix.T + self.ambient  # [N, h w]
-        return light.unflatten(1, self.size)
-
-    def variance(self, level: Tensor) -> Tensor:
-        """Return the variance of a sample pixel at a level, white levels squared: light, reading, rounding."""
-        return self._camera.noise_variance(level) / self._pixels
 
 
 def consistent(

@@ -16,14 +16,14 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from evnlos.analysis.confidence import ConfidenceCheck, FrameOperator, check_confidence
+from evnlos.analysis.confidence import ConfidenceCheck, check_confidence
 from evnlos.analysis.scores import CHARACTERS, Perceptual, Scores, read_characters, score
 from evnlos.config import to_dict
 from evnlos.data import Dataset, Modality, NlosDataset, Sampling, character_of, read_shard, read_shard_index
 from evnlos.errors import DataError
 from evnlos.machine import Progress, Step, silent
 from evnlos.metrics import psnr
-from evnlos.models import Weights, on_target_plane
+from evnlos.models import FrameOperator, Weights, on_target_plane
 from evnlos.models.confidence import SIDE, on_canvas
 from evnlos.setups import Setup
 from evnlos.types import Plane

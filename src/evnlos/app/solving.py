@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.analysis import reconstruct
-from evnlos.analysis.confidence import FrameOperator, confidence_of, consistent, why_no_confidence
+from evnlos.analysis.confidence import confidence_of, consistent, why_no_confidence
 from evnlos.app.controls import COARSE, Recorded
 from evnlos.data import STANDARD_MODALITIES, Sampling, as_modality, object_light
 from evnlos.errors import DataError
 from evnlos.inverse import SequenceOperator, SequenceProblem
 from evnlos.metrics import psnr
-from evnlos.models import Weights, load_weights, published, published_for, published_setup
+from evnlos.models import FrameOperator, Weights, load_weights, published, published_for, published_setup
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import Setup, load_setup

@@ -22,14 +22,12 @@ from evnlos.app.serve import Server, serve
 from evnlos.cli.parsing import drawn, say
 from evnlos.cli.recordings import Flat
 from evnlos.data import STANDARD_MODALITIES
-from evnlos.data.lab import Lab
-from evnlos.demo import LAB_CHARACTERS, Demo, run_demo
+from evnlos.demo import Demo, run_demo
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import SourceOptions, open_live
 from evnlos.machine import ProgressBars
-from evnlos.scene import FontGlyphs
 
 if TYPE_CHECKING:
     from evnlos.experiment import Arm, Study
@@ -46,8 +44,8 @@ class DemoCommand:
         from evnlos.cli.results import show_first
 
         one = self.settings
-        show_first(one.out, one.captures, Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=one.seed))
-        run_demo(self.settings)
+        show_first(one.out, one.captures, one.lab, one.force)
+        run_demo(one)
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ class ReconstructCommand:
             print("  ".join(f"{name} {value}" for name, value in found["scores"].items() if value is not None))
 
 
-def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool = False) -> None:
+def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool) -> None:
     """Reconstruct one of the demo's captures with published weights, before anything is trained.
 
     Args:

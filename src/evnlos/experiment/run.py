@@ -19,14 +19,7 @@ import torch
 
 from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
-from evnlos.data import (
-    Dataset,
-    Simulation,
-    as_modality,
-    import_captures,
-    load_pattern,
-    simulate,
-)
+from evnlos.data import Dataset, Simulation, as_modality, import_captures, load_pattern, simulate
 from evnlos.data.capture_info import character_of
 from evnlos.data.pool import processes, run_tasks
 from evnlos.data.simulations import default, randomized
@@ -307,7 +300,8 @@ def _planned(
             "settings": to_dict(settings),
             "from": start and Path(start).name,
         }
-        decides |= {"choose": True} if arm.choose else {}
+        if arm.choose:
+            decides["choose"] = True
         key = config_hash(decides)[:8]
         out = place.out / "runs" / f"{study.setup}-{slug(arm.name)}-{modality}-seed{seed}-{key}"
         runs.append(Run(recorded, settings, out, start, arm.choose))

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling, confusion
-from evnlos.analysis.confidence import ConfidenceCheck, FrameOperator, consistent, risk_coverage
+from evnlos.analysis.confidence import ConfidenceCheck, consistent, risk_coverage
 from evnlos.analysis.scores import Interval, paired_difference
 from evnlos.config import from_dict, to_dict
 from evnlos.data import (
@@ -36,9 +36,9 @@ from evnlos.data import (
 from evnlos.errors import DataError
 from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_scores, records_there
 from evnlos.files import write_atomically
-from evnlos.inverse.sequence_problem import SequenceOperator
+from evnlos.inverse.sequence_problem import SequenceOperator, strip_gram_of
 from evnlos.machine import Progress
-from evnlos.models import aligned_mean, fit_linear, load_weights, on_target_plane
+from evnlos.models import FrameOperator, aligned_mean, fit_linear, load_weights, on_target_plane
 from evnlos.models.confidence import SIDE
 from evnlos.optics import MatrixTransport
 from evnlos.setups import load_setup
@@ -182,7 +182,7 @@ def retrieved(made: Dataset, recorded: Dataset, split: str, operator: FrameOpera
     targets = torch.cat([_middle_target(made, name, size_m) for name in names]).flatten(1).double()  # [G, n n]
     cells = Plane(operator.rows.stop - operator.rows.start, canvas.width, canvas.pitch_m)
     transport = MatrixTransport(operator.matrix, cells, operator.size)
-    strip_gram = operator.matrix.T @ operator.matrix
+    strip_gram = strip_gram_of(transport)
     found = []
     for name in recorded.objects(split):
         samples, _ = read_shard(recorded.shard(name))

@@ -1,6 +1,7 @@
 """Reconstructors, their closed-form parts, the confidence in their images, and their weights on disk."""
 
 from evnlos.models.confidence import Confidence, ConfidenceReport, halves_of, on_target_plane
+from evnlos.models.embedding import FrameOperator
 from evnlos.models.reconstructor import (
     RECONSTRUCTORS,
     LinearEstimate,
@@ -29,6 +30,7 @@ __all__ = [
     "RECONSTRUCTORS",
     "Confidence",
     "ConfidenceReport",
+    "FrameOperator",
     "LinearEstimate",
     "Reconstructor",
     "ReconstructorSettings",

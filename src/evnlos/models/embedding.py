@@ -1,4 +1,8 @@
-"""What a network knows before its first step: the scale of its inputs, and the light path undone linearly."""
+"""What a network knows before its first step.
+
+- The scale of its inputs, and the light path undone linearly.
+- The light path itself, on the samples' pixels.
+"""
 
 from __future__ import annotations
 
@@ -287,21 +291,45 @@ class LinearEmbeddings(nn.Module):
         return torch.cat(parts, dim=1)
 
 
-def canvas_matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
-    """Return the matrix of a setup from canvas cells to sample pixels, and the cells.
-
-    The cells are the rows of the canvas that the target reaches.
+class FrameOperator:
+    """What a calibrated setup makes of a picture on the canvas: frame = A x + ambient, at the samples' size.
 
     Args:
-        setup: A linear setup.
+        setup: The calibrated setup (`load_setup` of the calibrated folder).
         sampling: Size of samples and canvas.
 
-    Returns:
-        float32 [h w, cells], white levels per unit of brightness, and the plane of the cells.
+    Attributes:
+        matrix: A, float32 [h w, cells]: white levels per unit of brightness of a canvas cell.
+        ambient: Ambient light, float32 [h w], white levels.
+        rows: Rows of the canvas that hold cells; beyond them the target never is.
+        sigma: Standard deviation of the noise of a sample pixel, white levels.
 
     Raises:
         ConfigError: The setup is not linear.
     """
+
+    def __init__(self, setup: Setup, sampling: Sampling) -> None:
+        self.size = (sampling.height, sampling.width)
+        self.matrix, source = _matrix(setup, sampling)
+        self.ambient = torch.from_numpy(reduce_by_area(setup.ambient_light().numpy(), self.size)).flatten()
+        first = (sampling.height - source.height) // 2
+        self.rows = slice(first, first + source.height)
+        self._camera, shape = setup.frame_camera, setup.shape
+        self._pixels = shape[0] * shape[1] / (self.size[0] * self.size[1])  # of the sensor, a sample pixel
+        self.sigma = float(self.variance(self.ambient.mean() + 0.1 * setup.gain).sqrt())
+
+    def __call__(self, pictures: Tensor) -> Tensor:
+        """Return the frames [N, h, w] that the setup makes of pictures [N, H, W]."""
+        light = pictures[:, self.rows].flatten(1) @ self.matrix.T + self.ambient  # [N, h w]
+        return light.unflatten(1, self.size)
+
+    def variance(self, level: Tensor) -> Tensor:
+        """Return the variance of a sample pixel at a level, white levels squared: light, reading, rounding."""
+        return self._camera.noise_variance(level) / self._pixels
+
+
+def _matrix(setup: Setup, sampling: Sampling) -> tuple[Tensor, Plane]:
+    """Return the matrix from canvas cells to sample pixels, and the cells: rows that the target reaches."""
     cells, height = setup.target_cells(), sampling.height
     if cells is not None:
         height = min(height, 2 * round(cells.extent_m[0] / sampling.pitch_m / 2))
@@ -333,7 +361,7 @@ def fit_input(
         keep_normalization: Whether a network with weights keeps the scale that it has.
     """
     measures = normalization.scaling == "dataset" and (is_new or not keep_normalization)
-    embeds = is_new and embedding is not None
+    embeds = is_new and embedding is not None and len(embedding.groups) > 0
     if not measures and not embeds:
         return
     inputs, truth, names = subset(MOST_SAMPLES)

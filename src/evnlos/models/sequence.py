@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_modality
-from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.sequence_light import EVENT_PRIORS, handwritten_prior
 from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.models.confidence import on_canvas
-from evnlos.models.embedding import InputNormalization, LinearEmbeddings, canvas_matrix, fit_input
+from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmbeddings, fit_input
 from evnlos.models.reconstructor import RECONSTRUCTORS, Drawn, Reconstructor
 from evnlos.models.unet import PARTS, ResidualUNet, UNetConfig
 from evnlos.optics import MatrixTransport
@@ -169,7 +168,7 @@ def _forget(frames: nn.Module, _: object) -> None:
 
 
 class PooledFrames(nn.Module):
-    """All frames of a sequence solved for the target, [N, H, W] -> [S, P, P]: one linear-Gaussian estimate.
+    """All frames of a sequence solved for the target, [N, H, W] -> [S, h, h]: one linear-Gaussian estimate.
 
     In the main components of the light path, in units of their noise, a frame k with the target at p_k is
 
@@ -243,16 +242,13 @@ class PooledFrames(nn.Module):
         owner, count = torch.from_numpy(objects), int(objects.max()) + 1
         if count < _FEWEST:
             raise DataError(f"{count} objects to tell light from noise; give {_FEWEST} or more")
-        matrix, cells = canvas_matrix(setup, self.sampling)
+        operator = FrameOperator(setup, self.sampling)
+        matrix, ambient, rows = operator.matrix, operator.ambient.unflatten(0, operator.size), operator.rows
         values, axes = torch.linalg.eigh((matrix.T @ matrix).double())
         kept = min(self.basis.shape[1], int((values > _RIDGE**2 * values[-1]).sum()))
         values, axes = values.flip(0)[:kept], axes.flip(1)[:, :kept]
         basis = ((matrix.double() @ axes) / values.sqrt()).float()  # [h w, r]
         carry = (axes * values.sqrt()).float()  # [cells, r]
-        size = (self.sampling.height, self.sampling.width)
-        ambient = torch.from_numpy(reduce_by_area(setup.ambient_light().numpy(), size))
-        first = (size[0] - cells.height) // 2
-        rows = slice(first, first + cells.height)
         parts = [slice(at, at + _AT_ONCE) for at in range(0, len(frames), _AT_ONCE)]
         code = torch.cat([(frames[part].float() - ambient).flatten(1) @ basis for part in parts])
         clean = torch.cat([truth[part][:, rows].float().flatten(1) @ carry for part in parts])
@@ -272,11 +268,8 @@ class PooledFrames(nn.Module):
         offset = mean_of(left)
         noise = (left - offset[owner]).double()
         # Few samples do not tell the noise of all components, which is at least that of the camera.
-        level = float(ambient.mean()) + 0.1 * setup.gain
-        pixels = setup.shape[0] * setup.shape[1] / (size[0] * size[1])  # of the sensor, a sample pixel
-        least = float(setup.frame_camera.noise_variance(torch.tensor(level))) / pixels
         variance, turn = torch.linalg.eigh(noise.T @ noise / len(noise))
-        white = (turn / variance.clamp_min(least).sqrt()).T
+        white = (turn / variance.clamp_min(operator.sigma**2).sqrt()).T
         shifts = (offset - offset.mean(dim=0)).double() @ white.T
         static, turn = torch.linalg.eigh(shifts.T @ shifts / count)
         white = (turn.T @ white).float()
@@ -284,7 +277,7 @@ class PooledFrames(nn.Module):
             buffer.zero_()
         self.ambient.copy_(ambient)
         self.basis[:, :kept] = basis @ white.T
-        self.light[:kept, rows] = (white @ carry.T).unflatten(1, cells.shape)
+        self.light[:kept, rows] = (white @ carry.T).unflatten(1, (-1, operator.size[1]))
         self.along[:, :kept] = along @ white.T
         self.static[:kept] = static.clamp_min(0).float()
         prior = handwritten_prior(self.target_plane, _COEFFICIENTS)
@@ -379,7 +372,7 @@ class SequenceReconstructor(Reconstructor):
         self.frames = (
             None if self._frame is None else PooledFrames(sampling, settings.prior_weights, settings.rank)
         )
-        images = self.embedding.images + (0 if self.frames is None else len(settings.prior_weights))
+        images = self.embedding.images + (0 if self.frames is None else self.frames.images)
         priors = {
             ("frame",): settings.prior_weights if left_out else (),
             ("surface",): EVENT_PRIORS if solved else (),
@@ -535,13 +528,14 @@ class SequenceReconstructor(Reconstructor):
         total = seen = torch.zeros((), device=inputs.device)
         for start in range(0, len(inputs), 64):
             part = slice(start, start + 64)
-            inside = self.grid.inside(inputs, position_m[part])
             weights = kept[:, part].to(inputs.device)
-            seen = seen + torch.tensordot(weights, inside.float(), dims=1)
             if self.embedding.images:
                 embedded = self.embedding(self.normalization(inputs[part].float()))
-                light, _ = self.grid.seen(embedded, position_m[part])
+                light, inside = self.grid.seen(embedded, position_m[part])
                 total = total + torch.tensordot(weights.to(light), light, dims=1)
+            else:
+                inside = self.grid.inside(inputs, position_m[part])
+            seen = seen + torch.tensordot(weights, inside.float(), dims=1)
         if not bool((seen > 0).flatten(1).any(dim=1).all()):
             raise DataError(
                 "the target plane is off the canvas at every time step; give positions within the travel"

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from evnlos.config import config_hash, save_yaml, to_dict, write_atomically
 from evnlos.data import Dataset, NlosDataset, Samples, as_modality, open_dataset, read_shard, write_shard
-from evnlos.data.store import claim_dataset
+from evnlos.data.store import claim_dataset, read_shard_index
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import directory_lock
 from evnlos.machine import Progress, Step, silent
@@ -304,32 +304,35 @@ def _measured(folder: Path) -> float:
 def _pairs(dataset: Dataset, objects: list[tuple[str, bool]]) -> dict[str, list[tuple[str, bool]]]:
     """Return as many pairs of objects, that were at the same places at the same steps, as there are objects."""
     draw, found = np.random.default_rng(derive_seed(0, "pairs")), dict[str, list[tuple[str, bool]]]()
-    places = [_turned(dataset, *one).position_m for one in objects]
+    places = [_places(dataset, *one) for one in objects]
     near_m = _ALIKE_PX * dataset.sampling.pitch_m
     for number, (one, at) in enumerate(zip(objects, places, strict=True)):
-        assert at is not None
         alike = [
             other
             for other, there in zip(objects, places, strict=True)
-            if other != one
-            and there is not None
-            and there.shape == at.shape
-            and np.ptp([at, there], 0).max() < near_m
+            if other != one and there.shape == at.shape and np.ptp([at, there], 0).max() < near_m
         ]
         if alike:
             found[f"mean{number:03d}"] = [one, alike[draw.integers(len(alike))]]
     return found
 
 
+def _places(dataset: Dataset, name: str, is_turned: bool) -> NDArray[np.float64]:
+    """Return where an object was at each step, upside down or as it was; its maps are left on disk."""
+    index = read_shard_index(dataset.shard(name))
+    if not index.has_truth or index.position_m is None:
+        raise DataError(f"target or motion of {name} is unknown; learn from captures with both")
+    return index.position_m * np.array([1.0, -1.0 if is_turned else 1.0])
+
+
 def _turned(dataset: Dataset, name: str, is_turned: bool) -> Samples:
     """Return an object's samples, upside down or as they are."""
+    places = _places(dataset, name, is_turned)
     samples, _ = read_shard(dataset.shard(name))
-    if samples.truth is None or samples.position_m is None:
-        raise DataError(f"target or motion of {name} is unknown; learn from captures with both")
     if not is_turned:
         return samples
     maps = {key: np.flip(getattr(samples, key), -2) for key in ("frame", "surface", "truth")}
-    return replace(samples, **maps, position_m=samples.position_m * np.array([1.0, -1.0]))
+    return replace(samples, **maps, position_m=places)
 
 
 def _mean(one: Samples, other: Samples, weight: float) -> Samples:

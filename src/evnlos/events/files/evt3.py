@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from evnlos.events.files.columns import is_ascending
 from evnlos.events.files.words import (
     BACKWARDS,
     BASE,
@@ -26,7 +27,6 @@ from evnlos.events.files.words import (
     TRIGGERS,
     UNDATED,
     UNKNOWN,
-    clock_falls,
     hold_back,
     mend_clock,
     note,
@@ -346,7 +346,7 @@ def _decode_chunk(words, has_vectors, state, places, counts, scratch, t_us, x, y
         first += taken
         events, clock = scratch.events[:found], scratch.clock[:taken]
         latest = np.int64(before & 0xFFF)
-        is_behind = newest > high + latest or clock_falls(clock, before)
+        is_behind = newest > high + latest or clock[0] < before or not is_ascending(clock)
         if is_behind and hold_back(clock, latest, events, max(newest - high, np.int64(0))):
             return np.int64(-1)
         end = count + found

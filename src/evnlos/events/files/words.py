@@ -299,16 +299,6 @@ def mend_clock(words, index, high, low, dense):
 
 
 @njit(cache=True)
-def clock_falls(clock, low):
-    """Return whether the low time falls from one word to the next; `low` is the one before them."""
-    falls = clock[0] < low
-    after = clock[1:]
-    for index in range(len(after)):
-        falls |= after[index] < clock[index]
-    return falls
-
-
-@njit(cache=True)
 def hold_back(clock, latest, events, newest):
     """Let no event be earlier than the one before it (`newest` at the start).
 
