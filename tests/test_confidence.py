@@ -1,5 +1,6 @@
 """What pictures are worth: support, intervals, and the verdict where nothing was measured."""
 
+import copy
 import json
 from dataclasses import asdict, replace
 from html import unescape
@@ -31,7 +32,7 @@ from evnlos.models import (
 from evnlos.models.confidence import COVERAGE, fit_confidence, on_canvas
 from evnlos.report import reconstruct_capture
 from evnlos.report.sections import limits_section
-from evnlos.setups import RadiometricSetup
+from evnlos.setups import RadiometricSetup, load_setup
 from evnlos.types import Plane
 
 CANVAS = Plane(48, 96, 0.0025)
@@ -353,6 +354,16 @@ def test_all_say_the_same_of_a_setup_and_of_a_recording(default_capture, tmp_pat
     assert meaning in page and meaning in unescape(limits_section(limits)) and meaning in limits.verdict
     main(["identify", str(published_setup("near-frame-sequence")), "--quiet"])
     assert meaning in capsys.readouterr().out  # on its finer grid
+
+
+def test_own_weights_know_the_setup_that_their_samples_name(tmp_path) -> None:
+    """As long as it is there: a file that was moved, or a name of another machine, is an unknown setup."""
+    path, weights = published_setup("near-frame-sequence"), load_weights("near-frame-sequence")
+    for named, known in ((str(path), load_setup(path)), (str(tmp_path / "moved"), None), ("", None)):
+        own = replace(weights, network=copy.deepcopy(weights.network))
+        own.network.sampling = replace(weights.sampling, setup=named)
+        save_weights(tmp_path / "own.pt", own)
+        assert load_model(tmp_path / "own.pt").known_setup() == known
 
 
 def test_each_verdict_says_what_is_guessed() -> None:

@@ -172,8 +172,8 @@ class Model:
 
     Args:
         weights: The network, its history, its confidence.
-        known_setup: Settings of the calibrated setup that the network was trained for, a YAML file; None where
-            they are unknown.
+        known_setup: Settings of the calibrated setup that the network was trained for, a YAML file; None for
+            the setup that the training's samples name, if it is still there.
     """
 
     def __init__(self, weights: Weights, known_setup: Path | None = None) -> None:
@@ -181,7 +181,14 @@ class Model:
 
     def known_setup(self) -> Setup | None:
         """Return the setup that the network was trained for; None where it is unknown."""
-        return None if self._known_setup is None else load_setup(self._known_setup)
+        if self._known_setup is not None:
+            return load_setup(self._known_setup)
+        named = self.weights.sampling.setup
+        try:
+            found = load_setup(named) if named else None
+        except (ConfigError, DataError):  # moved, or of another machine
+            return None
+        return found if found is not None and found.is_linear else None
 
     def reconstruct(
         self,

@@ -55,7 +55,7 @@ class ReconstructCommand:
     """The calibrated setup: the folder that `calibrate` wrote, or the settings file in it. Its fixed pattern is
     taken from the frames, the pictures are moved to where its wall agrees with the frames, and it is printed
     how much of the frames they explain. No name such as main-near: that needs the light and the camera of this
-    very setup. Without it, published weights explain the frames by the setup that they were trained for."""
+    very setup. Without it, the setup that the weights were trained for explains the frames, if known."""
     track: bool = False
     """Find the motion in the recording, as `evnlos track` does, also where capture.yaml states it; needs
     --setup, and takes about a minute."""
