@@ -1,7 +1,7 @@
 """All events of a sequence as two images of the target: what a network of whole sequences sees of them.
 
-The estimate of `event_likelihood`, in single precision and in a second: from every third row and column first,
-which need a ninth of the work, then from all pixels. Mean thresholds are those of the setup, and the filter
+The estimate of `event_likelihood`, in single precision and in a second: from every fourth row and column
+first, which need a sixteenth of the work, then from all pixels. Mean thresholds are those of the setup, and the filter
 counts as a delay 1 / w. What the last iteration leaves, information A and score b about the coefficients z of
 the prior, is all that the events say of the target there; its solutions z = (A + m)^-1 b at a weak and at a
 strong prior m are the images, put where the target was at each instant.
@@ -48,8 +48,9 @@ Single = NDArray[np.float32]
 
 CELLS, COEFFICIENTS, RANK = 32, 120, 120
 """Cells along a side of the target, patterns of its prior, factors of the light path."""
-_COARSE = 3  # every third row and column makes the first estimate
-_COARSE_STEPS, _FINE_STEPS = 9, 2
+_COARSE = 4  # every fourth row and column makes the first estimate
+_COARSE_STEPS, _ANNEALED, _FINE_STEPS = 14, 6, 2  # at most; with errors of a crossing that shrink to the least
+_SETTLED = 0.1  # step of a coefficient, standard deviations of the prior, after which no other is made
 _LONGEST_STEP = 1.5  # of a coefficient, standard deviations of the prior
 _FEWEST_NOISE, _SMALLEST_NOISE = 0.01, 3e-3  # as in `event_likelihood`
 _STEADY_S = 0.4
@@ -189,7 +190,7 @@ class EventSolver:
         row, column = np.divmod(record.pixel, events.width)
         first = record.of_pixels((row % _COARSE == 0) & (column % _COARSE == 0))
         unknown = np.zeros(self._seen.shape[2] + 1)
-        shares = np.minimum(np.arange(_COARSE_STEPS) / (_COARSE_STEPS - 3), 1.0)
+        shares = np.minimum(np.arange(_COARSE_STEPS) / _ANNEALED, 1.0)
         noises = self.settings.first_noise ** (1 - shares) * last**shares
         self.improve(first, unknown, noises)
         return self.improve(record, unknown, np.full(_FINE_STEPS, last))
@@ -200,7 +201,8 @@ class EventSolver:
         Args:
             record: The events.
             unknown: Coefficients and what is added to the leak, [k + 1], to start from.
-            noises: Least errors of a crossing, log units, one an iteration.
+            noises: Least errors of a crossing, log units, one an iteration; where it is the last one and the
+                step was short, no other is made.
         """
         count, trust = len(unknown) - 1, np.ones(int(record.measured.sum()))
         known = np.append(np.ones(count), self.settings.leak_error**-2)
@@ -209,7 +211,10 @@ class EventSolver:
             information, score = self._equations(record, unknown, float(least), trust)
             step = np.linalg.solve(information + np.diag(known), score - known * unknown)
             score = score + information @ unknown
-            unknown += step * min(1.0, _LONGEST_STEP / max(float(np.abs(step[:count]).max()), 1e-12))
+            longest = max(float(np.abs(step[:count]).max()), 1e-12)
+            unknown += step * min(1.0, _LONGEST_STEP / longest)
+            if least == noises[-1] and longest < _SETTLED:
+                break
         leak = information[:count, count]
         share = leak / (information[count, count] + known[count])
         return EventStatistic(
