@@ -1,10 +1,10 @@
 """All events of a sequence as two images of the target: what a network of whole sequences sees of them.
 
 The estimate of `event_likelihood`, in single precision and in a second: from every fourth row and column
-first, which need a sixteenth of the work, then from all pixels. Mean thresholds are those of the setup, and the filter
-counts as a delay 1 / w. What the last iteration leaves, information A and score b about the coefficients z of
-the prior, is all that the events say of the target there; its solutions z = (A + m)^-1 b at a weak and at a
-strong prior m are the images, put where the target was at each instant.
+first, which need a sixteenth of the work, then from all pixels. Mean thresholds are those of the setup, and the
+filter counts as a delay 1 / w. What the last iteration leaves, information A and score b about the coefficients
+z of the prior, is all that the events say of the target there; its solutions z = (A + m)^-1 b at a weak and at
+a strong prior m are the images, put where the target was at each instant.
 
 | symbol | meaning | unit |
 |---|---|---|
