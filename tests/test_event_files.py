@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from evnlos.errors import DataError, EventFileError, EvnlosError
-from evnlos.events import keep_known_polarity, read_events, read_events_report, write_events
+from evnlos.events import iter_events, keep_known_polarity, read_events, read_events_report, write_events
 from evnlos.types import Events
 
 WRITABLE = [
@@ -265,6 +265,47 @@ def test_evt3_is_read_quickly_as_it_is_with_care(has_vectors, jitter_us, tmp_pat
         careful, noted = read_events_report(write_raw(tmp_path / "careful.raw", head, edges, "<u2"))
         assert quick == careful and found.faults == noted.faults and noted.triggers == 30
         assert len(quick) > 10_000 and found.clean == (jitter_us < 64)
+
+
+def evt2_words(draw: np.random.Generator, count: int, every: int, kinds: list[int]) -> np.ndarray:
+    """Return EVT2 words: events in order of time, a word of the clock about every `every`, and others."""
+    high = np.cumsum(draw.random(count) * every < 1)
+    low = draw.integers(0, 64, count)
+    low = low[np.lexsort((low, high))]
+    events = draw.integers(0, 2, count) << 28 | low << 22 | draw.integers(0, 1280, count) << 11
+    words = (events | draw.integers(0, 720, count)).tolist()
+    starts = np.flatnonzero(np.diff(high, prepend=-1))
+    mixed = {int(at): [0x8000_0000 | int(high[at])] for at in starts}
+    for kind in kinds:
+        at = int(draw.integers(1, count))
+        mixed.setdefault(at, []).append(kind << 28 | int(draw.integers(0, 1 << 20)))
+    return np.array([word for at in range(count) for word in (*mixed.get(at, []), words[at])], np.int64)
+
+
+@pytest.mark.parametrize("every", [1, 7, 60, 500, 30_000])
+def test_evt2_is_read_quickly_as_it_is_with_care(every, tmp_path):
+    """Among few and many words of the clock, in chunks with and without what has them decoded one by one."""
+    draw = np.random.default_rng(every)
+    head = "% evt 2.0\n% geometry 1280x720\n"
+    for kinds in ([], [10], [10, 10, 14, 15]):
+        words = evt2_words(draw, 20_000, every, kinds)
+        t_us, x, y, p, high = [], [], [], [], 0
+        for word in words.tolist():  # as slow and as obvious as can be
+            if word >> 28 == 8:
+                high = word & 0xFFFFFFF
+            elif word >> 28 < 2:
+                t_us.append(high << 6 | word >> 22 & 63)
+                x.append(word >> 11 & 0x7FF)
+                y.append(word & 0x7FF)
+                p.append(word >> 28 == 1)
+        events, report = read_events_report(write_raw(tmp_path / "a.raw", head, words, "<u4"))
+        assert report.clean and report.triggers == kinds.count(10)
+        assert events == Events(t_us, x, y, p, width=1280, height=720)
+        assert Events.concatenate(list(iter_events(tmp_path / "a.raw", n_events=777))) == events
+    at = np.flatnonzero(words >> 28 < 2)[9_000]
+    words[at] = words[at] & ~0x7FF | 720  # a row that the sensor has not
+    _, report = read_events_report(write_raw(tmp_path / "b.raw", head, words, "<u4"))
+    assert report.faults == {"out_of_range": 1} and report.events == 19_999
 
 
 def test_salvage_drops_an_outlier_not_what_follows_it(tmp_path):

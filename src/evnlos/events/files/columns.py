@@ -324,12 +324,12 @@ def is_ascending(t_us):
 
 @njit(cache=True)
 def _is_clean(t_us, x, y, width, height, newest):
-    """Return whether all events are inside the sensor and in order, in loops for vector code."""
+    """Return whether all events are inside the sensor and in order, in loops by index for vector code."""
     largest_x, largest_y = np.uint16(0), np.uint16(0)
-    for value in x:
-        largest_x = max(largest_x, value)
-    for value in y:
-        largest_y = max(largest_y, value)
+    for index in range(len(x)):
+        largest_x = max(largest_x, x[index])
+    for index in range(len(y)):
+        largest_y = max(largest_y, y[index])
     backwards = len(t_us) > 0 and t_us[0] < newest
     return largest_x < width and largest_y < height and not backwards and is_ascending(t_us)
 

@@ -29,6 +29,8 @@ from evnlos.events.files.words import (
 
 WRAP_US = 1 << 34
 _HIGH_TURN = 1 << 28
+_NO_EVENT = np.uint32(0x20000000)  # words of events are below
+_GROUP = 16  # words that are looked at together
 
 
 def bound_evt2(words: NDArray[np.uint32]) -> int:
@@ -87,53 +89,67 @@ def _decode_carefully(words, first, state, t_us, x, y, p, width, height):
 
 
 @njit(cache=True)
-def _unpack(words, x, y, p):
-    """Split events into columns, one loop each for vector code; return the largest x and y."""
-    largest_x, largest_y = np.uint16(0), np.uint16(0)
-    for index in range(len(words)):
-        column = np.uint16((words[index] >> np.uint32(11)) & np.uint32(0x7FF))
-        x[index] = column
-        largest_x = max(largest_x, column)
-    for index in range(len(words)):
-        row = np.uint16(words[index] & np.uint32(0x7FF))
-        y[index] = row
-        largest_y = max(largest_y, row)
-    for index in range(len(words)):
-        p[index] = (words[index] >> np.uint32(28)) != 0
-    return largest_x, largest_y
+def _find_others(words, places):
+    """Put the places of the words that are no events into `places`; return how many they are.
+
+    Groups of words among which there is none are passed over in vector code. `places` has one more place
+    than `words`: what is written behind the last one found is overwritten or left.
+    """
+    # Without a sign no access is checked for a negative index.
+    size, group = np.uint64(len(words)), np.uint64(_GROUP)
+    found = first = np.uint64(0)
+    while first < size:
+        bits, whole = np.uint32(0), first + group <= size
+        if whole:
+            for index in range(_GROUP):
+                bits |= words[first + np.uint64(index)]
+        if not whole or bits >= _NO_EVENT:
+            for index in range(first, min(first + group, size)):
+                places[found] = index
+                found += np.uint64(words[index] >= _NO_EVENT)
+        first += group
+    return found
 
 
 @njit(cache=True)
-def _decode_chunk(words, state, events, t_us, x, y, p, width, height):
+def _decode_chunk(words, state, places, t_us, x, y, p, width, height):
     """Decode words among which nothing is unusual; return the number of events, or -1 where something is.
 
-    Order, columns and geometry are looked at afterwards, in vector code.
+    The events between two words of the clock are split into columns in one loop of vector code; their order
+    and their places on the sensor are looked at afterwards.
     """
     high, newest, base = state[CLOCK], state[NEWEST], state[BASE]
     unusual = state[STARTED] == 0
-    # Without a sign no access is checked for a negative index.
-    size = np.uint64(len(words))
+    largest_x, largest_y = np.uint16(0), np.uint16(0)
+    others = _find_others(words, places)
+    places[others] = len(words)
     count = first = np.uint64(0)
-    while first < size:
-        word = words[first]
-        first += np.uint64(1)
-        if word < 0x20000000:
-            t_us[count] = base + np.int64((word >> np.uint32(22)) & np.uint32(0x3F))
-            events[count] = word
-            count += np.uint64(1)
-        else:
+    for other in range(others + np.uint64(1)):
+        last = np.uint64(places[other])
+        shift = first - count
+        for index in range(count, last - shift):
+            word = words[index + shift]
+            column = np.uint16((word >> np.uint32(11)) & np.uint32(0x7FF))
+            row = np.uint16(word & np.uint32(0x7FF))
+            t_us[index] = base + np.int64((word >> np.uint32(22)) & np.uint32(0x3F))
+            x[index] = column
+            y[index] = row
+            p[index] = (word >> np.uint32(28)) != 0
+            largest_x = max(largest_x, column)
+            largest_y = max(largest_y, row)
+        count = last - shift
+        if other < others:
+            word = words[last]
             new = np.int64(word & 0xFFFFFFF)
             unusual |= (word >> 28) != 8 or new < high
             base += (new - high) << 6
             high = new
+        first = last + np.uint64(1)
     found = np.int64(count)
     if found:
-        unusual |= t_us[0] < newest
+        unusual |= t_us[0] < newest or not is_ascending(t_us[:found])
         newest = t_us[found - 1]
-    if unusual or not is_ascending(t_us[:found]):
-        return np.int64(-1)
-    largest_x, largest_y = _unpack(events[:found], x[:found], y[:found], p[:found])
-    if largest_x >= width or largest_y >= height:
+    if unusual or largest_x >= width or largest_y >= height:
         return np.int64(-1)
     state[CLOCK], state[NEWEST], state[BASE] = high, newest, base
     return found
@@ -142,12 +158,12 @@ def _decode_chunk(words, state, events, t_us, x, y, p, width, height):
 @njit(cache=True)
 def decode_evt2(words, state, t_us, x, y, p, width, height):
     """Decode a block: quickly, and once more with care where a chunk holds anything unusual."""
-    events = np.empty(CHUNK, np.uint32)
+    places = np.empty(CHUNK + 1, np.uint32)
     count = 0
     for first in range(0, len(words), CHUNK):
         chunk = words[first : first + CHUNK]
         out = t_us[count:], x[count:], y[count:], p[count:]
-        found = _decode_chunk(chunk, state, events, *out, width, height)
+        found = _decode_chunk(chunk, state, places, *out, width, height)
         if found < 0:
             found = _decode_carefully(chunk, first, state, *out, width, height)
         count += found

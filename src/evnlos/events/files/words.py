@@ -60,7 +60,7 @@ def note(state: np.ndarray, kind: int, index: int) -> None:
 
 
 _ROOM = 16  # a decoder may write that many places behind its last event
-_BLOCK_BYTES = 1 << 20  # stays in the second-level cache between reading and decoding
+_BLOCK_BYTES = 1 << 18  # with its events it stays in the second-level cache between reading and decoding
 
 # (words, state, t_us, x, y, p, width, height) -> number of events written
 Decode = Callable[..., Any]
