@@ -308,6 +308,46 @@ def test_evt2_is_read_quickly_as_it_is_with_care(every, tmp_path):
     assert report.faults == {"out_of_range": 1} and report.events == 19_999
 
 
+@pytest.mark.parametrize("every", [1, 40, 2_000])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_evt21_is_read_quickly_as_it_is_with_care(swapped, every, tmp_path):
+    """Masks of one column and of many, at the sensor's edge too, empty ones, and other words among them."""
+    draw = np.random.default_rng(every)
+    layout = "legacy" if swapped else "little"
+    for width, kinds in ((1280, []), (2048, []), (2048, [10, 10, 14, 15])):
+        fields = evt2_words(draw, 6_000, every, kinds)
+        masks = 1 << draw.integers(0, 32, len(fields))
+        many = draw.random(len(fields)) < 0.4
+        masks[many] = draw.integers(1 << 20, 1 << 32, int(many.sum())) >> draw.integers(0, 20)
+        masks[draw.integers(0, len(fields), 2 * len(kinds))] = 0
+        is_event, column = fields >> 28 < 2, fields >> 11 & 0x7FF
+        last = np.floor(np.log2(np.maximum(masks, 1))).astype(int)
+        fields[is_event] += np.clip(width - 1 - last - column, None, width // 3)[is_event] << 11
+        t_us, x, y, p, high = [], [], [], [], 0
+        for word, mask in zip(fields.tolist(), masks.tolist(), strict=True):
+            if word >> 28 == 8:
+                high = word & 0xFFFFFFF
+            for bit in range(32 * (word >> 28 < 2)):
+                if mask >> bit & 1:
+                    t_us.append(high << 6 | word >> 22 & 63)
+                    x.append((word >> 11 & 0x7FF) + bit)
+                    y.append(word & 0x7FF)
+                    p.append(word >> 28 == 1)
+        upper, lower = (masks, fields) if swapped else (fields, masks)
+        words = upper.astype(np.uint64) << np.uint64(32) | lower.astype(np.uint64)
+        head = f"% evt 2.1\n% format EVT21;endianness={layout};width={width};height=720\n"
+        path = tmp_path / "a.raw"
+        path.write_bytes(head.encode() + b"% end\n" + words.astype("<u8").tobytes())
+        events, report = read_events_report(path)
+        assert report.clean and report.triggers == kinds.count(10)
+        assert events == Events(t_us, x, y, p, width=width, height=720)
+        assert Events.concatenate(list(iter_events(path, n_events=777))) == events
+        at = int(np.flatnonzero(is_event & (masks > 0))[3_000])
+        words[at] |= np.uint64(0x7FF << 32 * (not swapped))  # a row that the sensor has not
+        path.write_bytes(head.encode() + b"% end\n" + words.astype("<u8").tobytes())
+        assert read_events_report(path)[1].faults == {"out_of_range": int(masks[at]).bit_count()}
+
+
 def test_salvage_drops_an_outlier_not_what_follows_it(tmp_path):
     times = [0, 100, 200, 300, 400, 500]
     words = [w for t in times for w in (0x8000_0000 | (t >> 6), ((t & 63) << 22))]

@@ -6,8 +6,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite.ir import Constant, IntType
 from numba import njit
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from evnlos.events.files.columns import is_ascending
@@ -31,6 +35,12 @@ WRAP_US = 1 << 34
 _HIGH_TURN = 1 << 28
 _NO_EVENT = np.uint32(0x20000000)  # words of events are below
 _GROUP = 16  # words that are looked at together
+_MASKS = 1024  # words of EVT2.1 that are decoded at once
+
+# Of each byte of a mask: how many bits it has, and where they are, as a column stands in a word.
+_BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")
+_COUNTS = _BITS.sum(1).astype(np.uint8)
+_COLUMNS = (np.argsort(1 - _BITS, axis=1, kind="stable") << 11).astype(np.uint32)
 
 
 def bound_evt2(words: NDArray[np.uint32]) -> int:
@@ -193,7 +203,8 @@ def bound_evt21_swapped(words: NDArray[np.int64]) -> int:
 
 
 @njit(cache=True)
-def _decode(words, state, t_us, x, y, p, width, height, swapped):
+def _decode_masks_carefully(words, first, state, t_us, x, y, p, width, height, swapped):
+    """Decode word by word and note every fault; `first` is the number of the first word in its block."""
     high, newest, base = state[CLOCK], state[NEWEST], state[BASE]
     started = state[STARTED] != 0
     count = 0
@@ -206,20 +217,20 @@ def _decode(words, state, t_us, x, y, p, width, height, swapped):
         kind = fields >> 28
         if kind <= 1:
             if not started:
-                note(state, UNDATED, index)
+                note(state, UNDATED, first + index)
                 continue
             row, column = fields & 0x7FF, (fields >> 11) & 0x7FF
             time = base + ((fields >> 22) & 0x3F)
             if time < newest:
                 if time < newest - JITTER_US:
-                    note(state, BACKWARDS, index)
+                    note(state, BACKWARDS, first + index)
                 else:
                     time = newest
             newest = time
             while mask:
                 if mask & 1:
                     if column >= width or row >= height:
-                        note(state, OUT_OF_RANGE, index)
+                        note(state, OUT_OF_RANGE, first + index)
                     else:
                         t_us[count] = time
                         x[count] = column
@@ -234,7 +245,7 @@ def _decode(words, state, t_us, x, y, p, width, height, swapped):
                 if high - new > _HIGH_TURN // 2:
                     base += WRAP_US
                 else:
-                    note(state, CLOCK_BACK, index)
+                    note(state, CLOCK_BACK, first + index)
                     newest = base + ((new - high) << 6)
             base += (new - high) << 6
             high = new
@@ -242,16 +253,77 @@ def _decode(words, state, t_us, x, y, p, width, height, swapped):
         elif kind == 10:
             state[TRIGGERS] += 1
         elif kind != 14 and kind != 15:
-            note(state, UNKNOWN, index)
+            note(state, UNKNOWN, first + index)
     state[CLOCK], state[NEWEST], state[BASE], state[STARTED] = high, newest, base, started
+    return count
+
+
+def _count_below(_, mask):
+    """Return how many bits are below the lowest one of `mask` that is set."""
+
+    def generate(_, builder, signature, arguments):
+        return builder.cttz(arguments[0], Constant(IntType(1), 0))
+
+    return mask(mask), generate
+
+
+_place_of_lowest: Any = intrinsic(_count_below)  # (mask)
+
+
+@njit(cache=True)
+def _spread(halves, swapped, events):
+    """Write one word of EVT2 for each bit of each mask, and every other word as it is; return how many.
+
+    The upper half of a word (the lower, where `swapped`) is a word of EVT2, the other a mask of columns from
+    there on. Eight bits write eight places, and the events among them stay. -1 is returned where a column may
+    pass the 11 bits that it has, or a mask is empty.
+    """
+    count, is_unusual = np.uint64(0), False
+    upper, lower = np.uint64(not swapped), np.uint64(swapped)
+    for index in range(np.uint64(len(halves)) // np.uint64(2)):
+        fields = np.uint32(halves[np.uint64(2) * index + upper])
+        mask = np.uint32(halves[np.uint64(2) * index + lower])
+        if fields >= _NO_EVENT:
+            mask = np.uint32(1)
+        else:
+            is_unusual |= mask == 0 or (fields & np.uint32(0x3FF800)) > np.uint32(2016 << 11)
+        if mask & np.uint32(mask - np.uint32(1)):
+            for _ in range(4):
+                byte = mask & np.uint32(0xFF)
+                for place in range(np.uint64(8)):
+                    events[count + place] = fields + _COLUMNS[byte, place]
+                count += np.uint64(_COUNTS[byte])
+                fields += np.uint32(8 << 11)
+                mask >>= np.uint32(8)
+        else:
+            events[count] = fields + (_place_of_lowest(mask) << np.uint32(11))
+            count += np.uint64(1)
+    return np.int64(-1) if is_unusual else np.int64(count)
+
+
+@njit(cache=True)
+def _decode_masks(words, state, t_us, x, y, p, width, height, swapped):
+    """Decode a block by way of EVT2: quickly, and once more with care where a chunk holds anything unusual."""
+    events, places = np.empty(32 * _MASKS + 8, np.uint32), np.empty(32 * _MASKS + 1, np.uint32)
+    halves = words.view(np.uint32)
+    count = 0
+    for first in range(0, len(words), _MASKS):
+        chunk = words[first : first + _MASKS]
+        out = t_us[count:], x[count:], y[count:], p[count:]
+        found = _spread(halves[2 * first : 2 * (first + _MASKS)], swapped, events)
+        if found >= 0:
+            found = _decode_chunk(events[:found], state, places, *out, width, height)
+        if found < 0:
+            found = _decode_masks_carefully(chunk, first, state, *out, width, height, swapped)
+        count += found
     return count
 
 
 def decode_evt21(words, state, t_us, x, y, p, width, height):
     """Decode words whose fields lie in the high half."""
-    return _decode(words, state, t_us, x, y, p, width, height, False)
+    return _decode_masks(words, state, t_us, x, y, p, width, height, False)
 
 
 def decode_evt21_swapped(words, state, t_us, x, y, p, width, height):
     """Decode words whose fields lie in the low half."""
-    return _decode(words, state, t_us, x, y, p, width, height, True)
+    return _decode_masks(words, state, t_us, x, y, p, width, height, True)
