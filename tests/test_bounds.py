@@ -14,6 +14,8 @@ from evnlos.analysis import (
     sequence_bounds,
 )
 from evnlos.cameras import CrossingLaw, EventPixel, FrameCamera, simulate_events
+from evnlos.config import from_dict
+from evnlos.data import Capture, CaptureInfo
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
     EventRecord,
@@ -55,6 +57,24 @@ def law(**changes: float) -> CrossingLaw:
     return replace(
         EventPixel(0.1, 0.12, 0.02, leak_rate_hz=0.0, shot_noise_rate_hz=0.0).crossing_law(), **changes
     )
+
+
+def test_a_question_about_a_capture_has_its_motion_and_its_frames() -> None:
+    info = from_dict(
+        CaptureInfo,
+        {"camera": {"width": 12, "height": 8}, "motion": {"start_m": -0.03, "speed_m_s": 0.03}},
+        source="a test",
+    )
+    times = np.arange(1, 21) * 50_000
+    nothing = Events(*np.zeros((4, 0)), width=12, height=8)
+    capture = Capture("x", info, nothing, np.zeros((20, 8, 12), np.uint8), times, None)
+    asked = SequenceAnalysisSettings.of_capture(capture)
+    assert (asked.positions, asked.counts, asked.speed_m_s) == (20, (1, 20), 0.03)
+    assert asked.duration_s == pytest.approx(1.0) and asked.travel_m == pytest.approx(0.03)
+    found = sequence_bounds(SETUP, replace(asked, coefficients=12, writers=1, cells=8))
+    assert [one.kind for one in found.events] == ["continuous"] and len(found.frames_db) == 2
+    unknown = replace(capture, info=replace(info, motion=None))
+    assert SequenceAnalysisSettings.of_capture(unknown).positions == 40
 
 
 def test_the_light_is_that_of_the_setup(light: SequenceLight) -> None:

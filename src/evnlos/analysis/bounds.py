@@ -20,7 +20,7 @@ import torch
 
 from evnlos.cameras import EVENT_MODELS, CrossingLaw, PixelSettings
 from evnlos.cameras.streams import WHITE_DN
-from evnlos.data import Sampling
+from evnlos.data import Capture, Sampling
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
     EventRecord,
@@ -65,6 +65,8 @@ class SequenceAnalysisSettings:
     """Standard deviation of the error of a crossing beside the event model's own, log units."""
     other_noises: tuple[float, ...] = (0.08, 0.02, 0.01)
     """The same, tried for the setup's own event model only."""
+    other_models: bool = True
+    """Whether the event models that share the thresholds of the setup's own are asked as well."""
     silences: bool = False
     """Whether the time without events at the end of a pixel's record counts, as a weak row."""
     fpn_corrected: bool = True
@@ -87,6 +89,20 @@ class SequenceAnalysisSettings:
     def motion(self) -> LineMotion:
         """The motion."""
         return LineMotion((-self.travel_m / 2, 0.0), self.speed_m_s)
+
+    @classmethod
+    def of_capture(cls, capture: Capture) -> SequenceAnalysisSettings:
+        """Return the question of one position and of all of a capture, for its own event model alone.
+
+        Args:
+            capture: Its motion and the number of its frames count; the default's where the motion is unknown.
+        """
+        frames, motion, plain = len(capture.frame_times_us), capture.motion, cls()
+        if motion is not None and motion.speed_m_s > 0 and frames > 1:
+            lasts_s = frames * float(np.median(np.diff(capture.frame_times_us))) * 1e-6
+            plain = cls(motion.speed_m_s * lasts_s, motion.speed_m_s, frames, (1, frames))
+        counts = (1, plain.positions)
+        return replace(plain, counts=counts, other_noises=(), other_models=False)
 
     @property
     def duration_s(self) -> float:
@@ -193,7 +209,8 @@ def sequence_bounds(
     frames = [pixels * frame_information(light, z, setup, settings) for z in references]
     found = []
     typical = float(light(references[0]).mean()) * WHITE_DN
-    for kind, pixel in _models(setup.pixel).items():
+    own = {str(getattr(setup.pixel, "kind", "")): setup.pixel}
+    for kind, pixel in (_models(setup.pixel) if settings.other_models else own).items():
         law = pixel.crossing_law(typical)
         if law is None:
             continue

@@ -118,30 +118,31 @@ class ExperimentCommand:
         alone.get(self.name, self._on_captures)()
 
     def _on_captures(self) -> None:
+        from evnlos import experiment
         from evnlos.data import character_of
-        from evnlos.experiment import Place, captures_of, folds_of, merge_folds, read_records, run_study
         from evnlos.machine import Step
 
         study = self._study()
         assert self.captures is not None
-        folders = tuple(captures_of(self.captures, self.captures_of))
-        place = Place(folders, self.out, self.workers, self.trainings, self.force)
+        folders = tuple(experiment.captures_of(self.captures, self.captures_of))
+        place = experiment.Place(folders, self.out, self.workers, self.trainings, self.force)
         name, studies = study.name, [study]
         if self.folds:
             if self.validation:
                 raise ConfigError("folds test every character: leave out --validation, or --folds")
-            studies = folds_of(study, self.folds, [character_of(folder.name) for folder in folders])
+            studies = experiment.folds_of(study, self.folds, [character_of(folder.name) for folder in folders])
             name += "-folds"
         with ProgressBars() as progress:
             for done, one in enumerate(studies):
                 if self.folds:
                     progress(Step("folds", done, len(studies), "folds"))
-                run_study(one, place, progress)
-        records = read_records(self.out / "records" / name)
+                experiment.run_study(one, place, progress)
+        records = experiment.read_records(self.out / "records" / name)
         if self.folds:
-            records = merge_folds(records, self.captures_of)
+            records = experiment.merge_folds(records, self.captures_of)
         records = [r for r in records if r.setup == self.captures_of and r.split == study.split]
         text = _tables(name, records, self.metric)
+        text += experiment.bounds_table(self.out / "setups" / study.setup, folders[0], self.captures_of)
         write_atomically(self.out / f"{name}-{self.captures_of}-{study.split}.md", text.encode())
         print(text)
 
@@ -242,6 +243,7 @@ class ExperimentCommand:
 
     def _mismatch(self) -> None:
         from evnlos.demo import Demo, mismatch_table, run_mismatch
+        from evnlos.experiment import bounds_table
 
         base = Demo(out=self.out, test=self.test, workers=self.workers, force=self.force, robust=self.robust)
         base = replace(
@@ -253,7 +255,12 @@ class ExperimentCommand:
         )
         with ProgressBars() as progress:
             found = run_mismatch(base, self.setups, self.captures, self.seeds, progress)
-        print(mismatch_table(found))
+        text, captures = mismatch_table(found), self.captures or self.out / "captures"
+        for setup in [one.setup for one in found if not one.refused]:
+            fitted = self.out / f"{setup}-seed{self.seeds[0]}" / "setups" / "demo"
+            text += bounds_table(fitted, min((captures / setup).glob("*/capture.yaml")).parent, setup)
+        write_atomically(self.out / "mismatch.md", text.encode())
+        print(text)
 
 
 def _tables(name: str, records: list, metric: str) -> str:

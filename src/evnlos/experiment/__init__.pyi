@@ -22,6 +22,7 @@ from .study import Record as Record
 from .study import Study as Study
 from .study import read_records as read_records
 from .study import write_record as write_record
+from .table import bounds_table as bounds_table
 from .table import character_table as character_table
 from .table import checks_table as checks_table
 from .table import difference as difference

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling, confusion
+from evnlos.analysis.bounds import SequenceAnalysisSettings, sequence_bounds
 from evnlos.analysis.confidence import ConfidenceCheck, consistent, risk_coverage
 from evnlos.analysis.scores import Interval, paired_difference
 from evnlos.config import from_dict, to_dict
@@ -30,6 +31,7 @@ from evnlos.data import (
     as_modality,
     character_of,
     modality_order,
+    read_capture,
     read_shard,
     read_shard_index,
 )
@@ -41,7 +43,7 @@ from evnlos.machine import Progress
 from evnlos.models import FrameOperator, aligned_mean, fit_linear, load_weights, on_target_plane
 from evnlos.models.confidence import SIDE
 from evnlos.optics import MatrixTransport
-from evnlos.setups import load_setup
+from evnlos.setups import calibrated_file, load_setup
 from evnlos.types import Plane, derive_seed
 
 if TYPE_CHECKING:
@@ -342,6 +344,21 @@ def _cell(values: list[float] | None, digits: int) -> str:
     if len(values) == 1:
         return f"{values[0]:.{digits}f}"
     return f"{np.mean(values):.{digits}f} +- {np.std(values, ddof=1):.{digits}f}"
+
+
+def bounds_table(setup: Path, capture: Path, name: str) -> str:
+    """Return Markdown: what the best linear estimate is worth on a calibrated setup, at a capture's motion.
+
+    Args:
+        setup: Folder of the setup; where it is not calibrated the text is empty.
+        capture: Folder of a capture.
+        name: What to call the setup.
+    """
+    if not calibrated_file(setup).is_file():
+        return ""
+    asked = SequenceAnalysisSettings.of_capture(read_capture(capture, needs_frames=False, needs_events=False))
+    found = sequence_bounds(load_setup(setup), asked, f"best linear estimate, {name}")
+    return f"\n{found.table()}\n"
 
 
 def write_generalization(found: list[GeneralizationResult], path: Path) -> None:

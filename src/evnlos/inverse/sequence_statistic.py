@@ -201,8 +201,7 @@ class EventSolver:
         Args:
             record: The events.
             unknown: Coefficients and what is added to the leak, [k + 1], to start from.
-            noises: Least errors of a crossing, log units, one an iteration; where it is the last one and the
-                step was short, no other is made.
+            noises: Least errors of a crossing, log units, one an iteration; a short step at the last ends it.
         """
         count, trust = len(unknown) - 1, np.ones(int(record.measured.sum()))
         known = np.append(np.ones(count), self.settings.leak_error**-2)
