@@ -149,6 +149,7 @@ def _epochs(
     trained = [p for p in network.parameters() if p.requires_grad]
     optimiser = torch.optim.Adam(trained, lr=settings.learning_rate)
     loss_of, half = LOSSES[settings.loss], _half(settings, device)
+    progress(Step(f"{what}: gather its samples", 0, 1, "sets"))  # a minute, where a network pools sequences
     steps = _source(dataset, network, settings, processes)
     held_out = held_out_samples(dataset, network.modality, device) if leads else None
 
