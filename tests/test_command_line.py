@@ -17,6 +17,8 @@ from evnlos.cli import VERBS, main
 from evnlos.cli.about import script
 from evnlos.cli.main import command_of
 from evnlos.cli.parsing import say
+from evnlos.data import captures_in
+from evnlos.types import matching_paths
 
 SOURCE = Path(evnlos.__file__).parent
 PAGE = (SOURCE.parent.parent / "docs" / "command_line.md").read_text()
@@ -138,3 +140,18 @@ def test_the_doctor_survives_a_part_that_raises(monkeypatch) -> None:
     parts = {part.name: part for part in doctor.examine()}
     assert parts["GPU"].needed and "ImportError: libcudart.so" in parts["GPU"].found and parts["GPU"].cure
     assert parts["reader"].there and parts["numba"].there
+
+
+def test_a_pattern_stands_for_the_captures_that_it_matches(tiny_captures, tmp_path, capsys) -> None:
+    """Windows' shells, and quotes in the others, hand patterns on; the program looks for what they match."""
+    above = tiny_captures[0].parent
+    pattern = str(above / tiny_captures[0].name[:-1]) + "?"
+    matching = captures_in([Path(pattern)])
+    assert matching == sorted(path for path in tiny_captures if path.match(pattern))
+    assert captures_in([above]) == captures_in([above / "*"]) == sorted(tiny_captures)
+    main(["import", pattern, "--out", str(tmp_path / "data"), "--no-check-pictures", "--json"])
+    split = json.loads(capsys.readouterr().out)["split"]
+    assert sum(map(len, split.values())) == len(matching) > 1
+    odd = tmp_path / "odd[1]"  # brackets are a pattern's, and this is a name
+    shutil.copytree(tiny_captures[0], odd)
+    assert matching_paths([odd, "nothing/*"]) == [odd, Path("nothing/*")]

@@ -139,9 +139,33 @@ def test_help_needs_no_library_of_the_work_and_says_the_same() -> None:
         (["train", "--out", "run", "--epochs", "many"], "many"),
         (["events", "clip.mp4", "--thresholdon", "0.2", "--out", "e.h5"], "--thresholdon"),
         (["trian"], "did you mean 'train'"),
+        (["simulate", "--setup", "main-naer", "--out", "d"], "perhaps you meant 'main-near'"),
+        (["lab", "--setup=nope", "--out", "d"], "'nope'"),
+        (["identify", "main-near", "nope"], "'nope'"),
+        (["invert", "capture", "--setup", "nope.yaml"], "nope.yaml does not exist"),
+        (["report", "run", "--data", "d", "--setup", "simulate-papr"], "perhaps you meant 'simulate-paper'"),
+        (["simulate", "--config", "nope.yaml", "--out", "d"], "nope.yaml does not exist"),
+        (["simulate", "--setup.pixel.kind", "nope", "--out", "d"], "no event model of kind 'nope'"),
+        (["train", "--network.kind", "senquence", "--out", "d"], "did you mean 'sequence'"),
+        (["train", "--data", "nope", "--out", "d"], "nope is no dataset"),
+        (["events", "clip.mp4", "--pixel", "davis", "--out", "e.h5"], "did you mean 'davis346'"),
+        (["reconstruct", "capture", "--weights", "nope"], "near-frame-sequence"),
+        (["finetune", "--data", "d", "--out", "run", "--weights", "nope"], "near-frame-sequence"),
+        (["weights", "nope"], "near-frame-sequence"),
+        (["track", "nope"], "nope is not a folder"),
+        (["calibrate", "nope", "--out", "d"], "nope is not a folder"),
+        (["capture", "check", "nope"], "nope is not a folder"),
+        (["capture", "init", "nope", "--camera", "evk5"], "did you mean evk4"),
+        (["verify", "nope"], "nope is no dataset"),
+        (["demo", "--captures", "nope/*"], "nope/* matches nothing"),
+        (["experiment", "nope"], "mismatch"),
+        (["experiment", "mismatch", "--setups", "nope"], "two-lobes"),
+        (["live", "nope"], "centuryarks-vga"),
     ],
 )
-def test_words_that_do_not_fit_are_refused_before_any_library_is_loaded(words: list[str], says: str) -> None:
+def test_words_and_names_of_nothing_are_refused_before_any_library_is_loaded(
+    words: list[str], says: str
+) -> None:
     code = (
         "import sys\n"
         "from evnlos.__main__ import main\n"
@@ -171,9 +195,16 @@ def cpu_s(words: list[str]) -> float:
 
 @pytest.mark.parametrize(
     "words",
-    [["demo", "--help"], ["simulate", "--help"], ["calibrate", "--help"], ["train", "--lerning-rate", "1"]],
+    [
+        ["demo", "--help"],
+        ["calibrate", "--help"],
+        ["train", "--lerning-rate", "1"],
+        ["simulate", "--setup", "nope", "--out", "d"],
+        ["reconstruct", "capture", "--weights", "nope"],
+        ["experiment", "nope"],
+    ],
 )
-def test_help_and_wrong_words_are_answered_within_half_a_second_of_cpu(words: list[str]) -> None:
+def test_help_wrong_words_and_unknown_names_are_answered_within_half_a_second_of_cpu(words: list[str]) -> None:
     """A machine on which NumPy and the parser alone take 0.17 s and more gets as much longer."""
     yardstick = cpu_s(["-c", "import numpy, tyro, yaml"])
     assert cpu_s(["-m", "evnlos", *words]) < max(0.5, 3 * yardstick)

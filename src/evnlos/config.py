@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.registry import NESTED, Kinded, migrate
 from evnlos.untrusted import open_regular
@@ -167,7 +167,7 @@ def read_yaml(path: str | Path, most_bytes: int = _MOST_BYTES) -> dict[str, Any]
         _check_plain(text, most_bytes // _BYTES_A_NODE)
         values = yaml.load(text, _Loader)
     except FileNotFoundError:
-        raise ConfigError(f"{path} does not exist; give the path of a YAML file") from None
+        raise UnknownNameError(f"{path} does not exist; give the path of a YAML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} can't be read as a YAML file: {error}") from None
     except (yaml.YAMLError, RecursionError, ValueError, ArithmeticError, LookupError, TypeError) as error:

@@ -14,12 +14,12 @@ import numpy as np
 
 from evnlos.calibration import CALIBRATION_VALUES_FILE, Calibration
 from evnlos.config import write_atomically
-from evnlos.data import STANDARD_MODALITIES
+from evnlos.data import STANDARD_MODALITIES, captures_in
 from evnlos.data.capture_info import character_of
 from evnlos.data.lab import Lab, lab_of, render_captures
 from evnlos.data.sampling import Sampling
 from evnlos.data.simulations import default
-from evnlos.errors import CalibrationError, ConfigError
+from evnlos.errors import CalibrationError, UnknownNameError
 from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
 from evnlos.machine import Progress, ProgressBars, silent
 from evnlos.models import GENERIC, SequenceConfig, UNetConfig, layers_of, published
@@ -85,11 +85,11 @@ def run_demo(settings: Demo) -> Path:
     """Run the main job, or what is left of it, and return the path of the report.
 
     Raises:
-        ConfigError: One of the captures is none.
+        UnknownNameError: One of the captures is none.
         CalibrationError: No setup fits the captures.
     """
     began, out = time.perf_counter(), settings.out
-    captures = _captures_in(settings.captures)
+    captures = captures_in(settings.captures)
     place = Place((), out, settings.workers, trainings=settings.workers, force=settings.force)
     out.mkdir(parents=True, exist_ok=True)
     notes = []
@@ -149,23 +149,6 @@ def _with_layers(settings: Demo) -> tuple[Demo, list[str]]:
         return settings, []
     why += ": the pre-training began with random ones, and needs twice the epochs for less."
     return replace(settings, start=""), [why]
-
-
-def _captures_in(given: tuple[Path, ...]) -> list[Path]:
-    """Return the capture folders among some paths, and in folders among them; files are passed over."""
-    found = []
-    for path in given:
-        inside = (
-            [path] if (path / "capture.yaml").is_file() else [f.parent for f in path.glob("*/capture.yaml")]
-        )
-        if not inside and not path.exists():
-            raise ConfigError(f"{path} matches nothing; give capture folders, or the folder above them")
-        if not inside and path.is_dir():
-            raise ConfigError(f"{path} holds no capture.yaml; give capture folders, or the folder above them")
-        found += inside
-    if given and not found:
-        raise ConfigError(f"{given[0]} is no capture folder; give folders with a capture.yaml")
-    return sorted(found)
 
 
 def _of_calibration(setup: Path) -> list[str]:
@@ -274,14 +257,10 @@ def run_mismatch(
         progress: Called as the captures are rendered.
 
     Raises:
-        ConfigError: A setup is unknown, or its folder holds no captures.
+        UnknownNameError: A setup is unknown, or its folder holds no captures.
     """
-    known = tuple(ROOMS) if captures is None else _setups_in(captures)
-    unknown = [name for name in setups if name not in known]
-    if unknown:
-        raise ConfigError(f"setup {unknown[0]!r} is unknown; give some of {', '.join(known)}")
     found = []
-    for name in setups or known:
+    for name in mismatch_setups(setups, captures):
         if captures is None:
             lab = lab_of(name, Demo().lab)
             folders = render_captures(
@@ -303,11 +282,24 @@ def run_mismatch(
     return found
 
 
-def _setups_in(captures: Path) -> tuple[str, ...]:
-    names = sorted({file.parent.parent.name for file in Path(captures).glob("*/*/capture.yaml")})
-    if not names:
-        raise ConfigError(f"{captures} holds no folders of captures; give the folder above them")
-    return tuple(names)
+def mismatch_setups(asked: tuple[str, ...] = (), captures: Path | None = None) -> tuple[str, ...]:
+    """Return the names of the setups that `run_mismatch` goes through.
+
+    Args:
+        asked: As its `setups`.
+        captures: As its `captures`.
+
+    Raises:
+        UnknownNameError: A setup is unknown, or there is no folder of captures.
+    """
+    folders = [] if captures is None else Path(captures).glob("*/*/capture.yaml")
+    known = tuple(ROOMS) if captures is None else sorted({file.parent.parent.name for file in folders})
+    if not known:
+        raise UnknownNameError(f"{captures} holds no folders of captures; give the folder above them")
+    for name in asked:
+        if name not in known:
+            raise UnknownNameError(f"setup {name!r} is unknown; give some of {', '.join(known)}")
+    return asked or tuple(known)
 
 
 def finding(setup: str, outs: list[Path]) -> Finding:

@@ -2,11 +2,16 @@
 
 - What the package can't work without, and how an installation gets it back; needs none of it itself.
 - Is this installation whole? Each part, what was found, and what to do where it is missing.
+- A command described without the libraries that its work needs, so that help comes at once.
 """
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import importlib
+import importlib.abc
+import importlib.machinery
 import importlib.metadata
 import importlib.util
 import os
@@ -14,9 +19,10 @@ import platform
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from evnlos.errors import EvnlosError
 from evnlos.registry import __version__
@@ -289,3 +295,101 @@ def _can_write(folder: Path) -> bool:
             return True
     except OSError:
         return False
+
+
+WORK_LIBRARIES = (
+    "numpy",
+    "torch",
+    "numba",
+    "llvmlite",
+    "scipy",
+    "h5py",
+    "PIL",
+    "safetensors",
+    "pydantic",
+    "threadpoolctl",
+)
+"""What takes most of a start, or brings that along, and describes no flag."""
+
+
+class _StandIn:
+    """What a name of a library that is not imported stands for, as far as a module's top level uses it.
+
+    It decorates without effect, is a base class of nothing, and stands in annotations.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __repr__(self) -> str:
+        return self._name
+
+    def __getattr__(self, name: str) -> _StandIn:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _StandIn(f"{self._name}.{name}")
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        if len(arguments) == 1 and not named and callable(arguments[0]):
+            return arguments[0]  # what it decorates
+        return _StandIn(f"{self._name}()")
+
+    def __getitem__(self, _: Any) -> _StandIn:
+        return self
+
+    def __or__(self, *_: Any) -> Any:
+        return self
+
+    __ror__ = __neg__ = __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __or__
+    __truediv__ = __rtruediv__ = __floordiv__ = __pow__ = __matmul__ = __lshift__ = __invert__ = __or__
+
+    def __mro_entries__(self, _: tuple[Any, ...]) -> tuple[type, ...]:
+        return ()
+
+
+class _StandInLibraries(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Import modules of `WORK_LIBRARIES` as modules that hold a `_StandIn` under every name."""
+
+    def find_spec(
+        self, name: str, path: Any = None, target: Any = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """Return a module of nothing for a library that takes long, and leave all others to Python."""
+        if name.partition(".")[0] not in WORK_LIBRARIES:
+            return None
+        return importlib.machinery.ModuleSpec(name, self, is_package=True)
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> Any:
+        """Return the module that Python makes itself."""
+
+    def exec_module(self, module: Any) -> None:
+        """Let the module have every name."""
+        stand_in = _StandIn(module.__name__)
+        module.__getattr__ = stand_in.__getattr__
+
+
+@contextlib.contextmanager
+def without_work_libraries() -> Iterator[None]:
+    """Import modules of this package without `WORK_LIBRARIES`: enough to describe a command, not to run it.
+
+    Afterwards what was imported meanwhile is forgotten, as far as it is of this package or of those libraries.
+    """
+    finder, before, collects = _StandInLibraries(), set(sys.modules), gc.isenabled()
+    kept = {name: dict(vars(module)) for name, module in sys.modules.items() if _is_ours(name)}
+    sys.meta_path.insert(0, finder)
+    gc.disable()  # a tenth of the time, and next to nothing to collect
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+        sys.meta_path.remove(finder)
+        for name in set(sys.modules) - before:
+            if _is_ours(name) or name.partition(".")[0] in WORK_LIBRARIES:
+                del sys.modules[name]
+        for name, names in kept.items():  # a package holds its modules as attributes, too
+            for added in set(vars(sys.modules[name])) - set(names):
+                delattr(sys.modules[name], added)
+
+
+def _is_ours(name: str) -> bool:
+    return name.partition(".")[0] == "evnlos"

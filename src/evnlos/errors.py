@@ -42,6 +42,10 @@ class DataError(EvnlosError):
     """An array, image or dataset does not hold what it should."""
 
 
+class UnknownNameError(ConfigError, DataError):
+    """A name stands for nothing: there is no such setup, pixel, experiment, kind, weights or capture."""
+
+
 class CalibrationError(DataError):
     """The simulator cannot be fitted to captures, or the fit does not stand on those held out."""
 

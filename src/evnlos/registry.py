@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from typing import Any, ClassVar, Generic, TypeVar
 
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, UnknownNameError
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -67,17 +67,27 @@ class Registry(Generic[T]):
         return cls
 
     def __getitem__(self, kind: str) -> T:
+        if isinstance(kind, str) and kind in self._classes:
+            return self._classes[kind]
+        self.check(kind)
+        return self.register(next(iter(entry_points(group=self.group, name=kind))).load())
+
+    def check(self, kind: str) -> None:
+        """Refuse a kind that there is not; what another package offers is not loaded.
+
+        Raises:
+            ConfigError: The kind is no text.
+            UnknownNameError: There is no such kind; the nearest is named.
+        """
         if not isinstance(kind, str):
             raise ConfigError(
                 f"the kind of a {self.what} is a {type(kind).__name__}; give one of {', '.join(self)}"
             )
-        if kind in self._classes:
-            return self._classes[kind]
-        for point in entry_points(group=self.group, name=str(kind)):
-            return self.register(point.load())
+        if kind in self:
+            return
         near = difflib.get_close_matches(str(kind), list(self), n=1)
         cure = f"did you mean {near[0]!r}?" if near else f"give one of {', '.join(self)}"
-        raise ConfigError(f"there is no {self.what} of kind {kind!r}; {cure}")
+        raise UnknownNameError(f"there is no {self.what} of kind {kind!r}; {cure}")
 
     def __iter__(self) -> Iterator[str]:
         found = dict.fromkeys(self._classes)

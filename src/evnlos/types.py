@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -297,6 +299,20 @@ class Plane:
         return (
             self.center_m[1] + (np.arange(self.height, dtype=np.float64) - (self.height - 1) / 2) * self.pitch_m
         )
+
+
+def matching_paths(given: Iterable[str | Path]) -> list[Path]:
+    """Return paths in which a pattern, such as shots/*, stands for what it matches, as most shells have it.
+
+    Args:
+        given: Paths and patterns; what is there is no pattern, and a pattern that matches nothing stays.
+    """
+    found: list[Path] = []
+    for word in given:
+        is_pattern = glob.has_magic(str(word)) and not Path(word).exists()
+        matches = sorted(glob.glob(str(word))) if is_pattern else []  # noqa: PTH207 - it may be absolute
+        found += map(Path, matches or [word])
+    return found
 
 
 def derive_seed(seed: int, *names: str | int) -> int:

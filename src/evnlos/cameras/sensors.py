@@ -38,7 +38,7 @@ from evnlos.cameras.pixels.readout import LogLevel, ReadoutPixel, ValuesArray
 from evnlos.cameras.random_numbers import check_seed
 from evnlos.cameras.streams import Frames, check_light, check_times
 from evnlos.config import load_yaml
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.types import Events
 
 
@@ -132,7 +132,7 @@ def pixel_preset(name: str) -> EventPixel | BrownianPixel:
     if name.lower() not in PRESETS:
         near = difflib.get_close_matches(name.lower(), PRESETS, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"give one of {', '.join(PRESETS)}"
-        raise ConfigError(f"there is no pixel preset {name!r}; {hint}")
+        raise UnknownNameError(f"there is no pixel preset {name!r}; {hint}")
     return PRESETS[name.lower()]()
 
 

@@ -1,8 +1,9 @@
-"""`evnlos cite`, `evnlos completion` and `evnlos fetch`: what to quote, what to type, what others published.
+"""`evnlos cite`, `completion`, `fetch` and `verify`: what to quote, to type and to have, and what is whole.
 
 - `evnlos cite`: BibTeX for exactly what a simulation, a dataset or a run uses.
 - `evnlos completion`: a script that completes commands and flags.
 - `evnlos fetch`: captures, weights and examples from an address or a folder, each file checked.
+- `evnlos verify`: a dataset in, the list of its faulty shards out, mended if asked.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from evnlos.cli.parsing import check_there
 from evnlos.config import read_yaml
 from evnlos.errors import ConfigError, DataError, EvnlosError, printable
 from evnlos.registry import __version__, migrate
@@ -311,3 +313,58 @@ class FetchCommand:
             f"no published {self.kind} can be reached ({'; '.join(failed)[:400]}); look at the network, or "
             "give --address with another URL or a folder"
         )
+
+
+@dataclass(frozen=True)
+class VerifyCommand:
+    """Check every shard of a dataset against its checksums, its name and its settings."""
+
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of the dataset."""
+    repair: bool = False
+    """Simulate faulty and missing objects again."""
+    workers: int = 0
+    """Processes for the repair; 0 = one for each core."""
+    force: bool = False
+    """Begin the repair although the machine's memory will hardly do."""
+    json: bool = False
+    """Print one JSON object."""
+
+    def check_names(self) -> None:
+        """Refuse a dataset that is not there."""
+        from evnlos.data import open_dataset
+
+        check_there(open_dataset, self.dataset)
+
+    def run(self) -> None:
+        """Check, report, and repair where asked."""
+        from evnlos.cli.recordings import result
+        from evnlos.data import open_dataset
+        from evnlos.data.simulations import find_faults, repair
+        from evnlos.data.store import PAGE
+        from evnlos.machine import ProgressBars
+
+        dataset = open_dataset(self.dataset)
+        total = len(dataset.objects())
+        with ProgressBars() as progress:
+            faults = find_faults(dataset, progress)
+        about = {"dataset": str(self.dataset), "objects": total, "faults": {f.name: f.reason for f in faults}}
+        if not self.json:
+            for fault in faults:
+                place = dataset.folder / PAGE if fault.name == PAGE else dataset.shard(fault.name)
+                print(f"{place}: {fault.reason}")
+        if not faults:
+            result(self.json, about | {"repaired": 0}, f"{self.dataset}: {total} objects, all whole")
+        elif not self.repair:
+            if self.json:
+                print(json.dumps(about | {"repaired": 0}))
+            shards = sum(fault.name != PAGE for fault in faults)
+            page = f" and {PAGE} is not as it was written" if shards < len(faults) else ""
+            raise DataError(
+                f"{self.dataset}: {shards} of {total} shards are faulty{page}; --repair makes shards again"
+            )
+        else:
+            with ProgressBars() as progress:
+                repair(dataset, faults, self.workers, progress, self.force)
+            text = f"{self.dataset}: {len(faults)} of {len(faults)} faulty shards made again"
+            result(self.json, about | {"repaired": len(faults)}, text)

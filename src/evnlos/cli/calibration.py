@@ -21,8 +21,8 @@ from evnlos.calibration.scan.film import FilmReading
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import drawn, say
-from evnlos.cli.recordings import Flat, Folders, Presets, check_writable
+from evnlos.cli.parsing import check_there, check_writable, drawn, say
+from evnlos.cli.recordings import Flat, Folders, Presets
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
 from evnlos.lab import Phone
@@ -71,6 +71,12 @@ class CalibrateCommand:
         start = settings.start
         start = replace(start, setup=replace(start.setup, pixel=load_pixel(word)))
         return replace(settings, start=start, events=False)
+
+    def check_names(self) -> None:
+        """Refuse a capture that is not there."""
+        from evnlos.data import read_capture
+
+        check_there(read_capture, *self.captures)
 
     def run(self) -> None:
         """Fit, print what was found before and after, and write the files."""

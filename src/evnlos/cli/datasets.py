@@ -1,10 +1,8 @@
-"""Commands that make and check data: `simulate`, `lab`, `capture`, `import`, `verify`.
+"""Commands that make and check data: `simulate`, `lab`, `capture`, `import`.
 
-- `evnlos simulate`: config in, dataset of shards out.
-- `evnlos lab`: a setup in, pseudo-real capture folders out.
+- `evnlos simulate`: config in, dataset of shards out. `evnlos lab`: a setup in, pseudo-real captures out.
 - `evnlos capture`: begin a capture folder, and check what was recorded into it.
 - `evnlos import`: capture folders in, dataset of shards out.
-- `evnlos verify`: a dataset in, the list of its faulty shards out, mended if asked.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ import tyro
 from tqdm import tqdm
 
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import say
+from evnlos.cli.parsing import check_there, say
 from evnlos.cli.recordings import Flat, Folders, Presets, result
 from evnlos.data import (
     Capture,
@@ -31,16 +29,16 @@ from evnlos.data import (
     check_picture,
     import_captures,
     load_pattern,
-    open_dataset,
     randomized,
+    read_capture,
     simulate,
 )
+from evnlos.data.capture_info import CAMERAS, begin_capture
 from evnlos.data.lab import Lab, compare_published, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
-from evnlos.data.simulations import PRESETS, estimate, find_faults, repair
-from evnlos.data.store import PAGE
-from evnlos.errors import ConfigError, DataError, EvnlosError
-from evnlos.files import write_atomically
+from evnlos.data.simulations import PRESETS, estimate
+from evnlos.errors import ConfigError, DataError, EvnlosError, UnknownNameError
+from evnlos.files import check_folder, write_atomically
 from evnlos.machine import ProgressBars, counted
 from evnlos.setups import load_setup
 from evnlos.setups.base import is_camera
@@ -119,8 +117,7 @@ class SimulateCommand:
             raise ConfigError(f"--scheduler {self.scheduler} needs --engine dask")
         total = len(config.glyphs.objects())
         if self.dry_run:
-            for line in estimate(config, self.workers, share).lines(self.out):
-                print(line)
+            print("\n".join(estimate(config, self.workers, share).lines(self.out)))
             return
         engine = run_tasks if self.engine == "local" else partial(run_on_dask, scheduler=self.scheduler)
         with ProgressBars() as progress:
@@ -219,23 +216,26 @@ class CaptureCommand:
             raise ConfigError(f"{len(self.folders)} folders; {self.action} takes one, check one or more")
         {"init": self._init, "record": self._record, "check": self._check}[self.action]()
 
-    def _init(self) -> None:
-        from evnlos.data.capture_info import CAMERAS, begin_capture
-
-        known, own_size = CAMERAS.get((self.camera or "").lower()), self.width and self.height
-        if known is None and not own_size:
-            near = difflib.get_close_matches((self.camera or "").lower(), CAMERAS, n=1)
+    def check_names(self) -> None:
+        """Refuse a camera that is not known and whose sensor is not stated, and a capture that is not there."""
+        camera = (self.camera or "").lower()
+        if self.action == "init" and camera not in CAMERAS and not (self.width and self.height):
+            near = difflib.get_close_matches(camera, CAMERAS, n=1)
             cure = f"did you mean {near[0]}?" if near else f"give one of {', '.join(CAMERAS)}"
             camera = "no --camera" if self.camera is None else f"--camera {self.camera!r} is not known"
-            raise ConfigError(f"{camera}; {cure}, or --width and --height of its sensor")
-        name, columns, rows, events, frames = known or ("", 0, 0, "events.raw", "frames")
-        name, folder = name or self.camera or "my camera", self.folders[0]
-        path = begin_capture(folder, self.width or columns, self.height or rows, name, events, frames)
+            raise UnknownNameError(f"{camera}; {cure}, or --width and --height of its sensor")
+        if self.action == "check" and len(self.folders) == 1:
+            check_there(read_capture, *self.folders)
+
+    def _init(self) -> None:
+        self.check_names()
+        folder, other = self.folders[0], (self.camera or "my camera", 0, 0, "events.raw", "frames")
+        name, columns, rows, *files = CAMERAS.get((self.camera or "").lower(), other)
+        path = begin_capture(folder, self.width or columns, self.height or rows, name, *files)
         print(f"{path}: edit it, put the recordings beside it, then: evnlos capture check {folder}")
 
     def _check(self) -> None:
         """Tell of each capture in full, or of several in a table with what is not good below it."""
-        from evnlos.data import read_capture
         from evnlos.data.capture_check import Finding, check_capture, finding_line, findings_table
 
         found, failed = dict[str, list[Finding]](), dict[str, str]()
@@ -268,7 +268,6 @@ class CaptureCommand:
             raise SystemExit(1)
 
     def _record(self) -> None:
-        from evnlos.files import check_folder
         from evnlos.live.record import record_capture
         from evnlos.live.sources import SourceOptions, open_live
 
@@ -325,6 +324,10 @@ class ImportCommand:
     sampling: Sampling = field(default_factory=Sampling)
     """Resolution and representation."""
 
+    def check_names(self) -> None:
+        """Refuse a capture that is not there."""
+        check_there(read_capture, *self.captures)
+
     def run(self) -> None:
         """Import, with a progress bar over the captures."""
         with ProgressBars() as progress:
@@ -355,46 +358,3 @@ class ImportCommand:
             drawn = io.BytesIO()
             check_picture(capture).save(drawn, "PNG")
             write_atomically(folder / f"{capture.name}.png", drawn.getvalue())
-
-
-@dataclass(frozen=True)
-class VerifyCommand:
-    """Check every shard of a dataset against its checksums, its name and its settings."""
-
-    dataset: Annotated[Path, tyro.conf.Positional]
-    """Folder of the dataset."""
-    repair: bool = False
-    """Simulate faulty and missing objects again."""
-    workers: int = 0
-    """Processes for the repair; 0 = one for each core."""
-    force: bool = False
-    """Begin the repair although the machine's memory will hardly do."""
-    json: bool = False
-    """Print one JSON object."""
-
-    def run(self) -> None:
-        """Check, report, and repair where asked."""
-        dataset = open_dataset(self.dataset)
-        total = len(dataset.objects())
-        with ProgressBars() as progress:
-            faults = find_faults(dataset, progress)
-        about = {"dataset": str(self.dataset), "objects": total, "faults": {f.name: f.reason for f in faults}}
-        if not self.json:
-            for fault in faults:
-                place = dataset.folder / PAGE if fault.name == PAGE else dataset.shard(fault.name)
-                print(f"{place}: {fault.reason}")
-        if not faults:
-            result(self.json, about | {"repaired": 0}, f"{self.dataset}: {total} objects, all whole")
-        elif not self.repair:
-            if self.json:
-                print(json.dumps(about | {"repaired": 0}))
-            shards = sum(fault.name != PAGE for fault in faults)
-            page = f" and {PAGE} is not as it was written" if shards < len(faults) else ""
-            raise DataError(
-                f"{self.dataset}: {shards} of {total} shards are faulty{page}; --repair makes shards again"
-            )
-        else:
-            with ProgressBars() as progress:
-                repair(dataset, faults, self.workers, progress, self.force)
-            text = f"{self.dataset}: {len(faults)} of {len(faults)} faulty shards made again"
-            result(self.json, about | {"repaired": len(faults)}, text)

@@ -18,15 +18,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from evnlos import experiment
 from evnlos.app.serve import Server, serve
 from evnlos.cli.parsing import drawn, say
 from evnlos.cli.recordings import Flat
-from evnlos.data import STANDARD_MODALITIES
-from evnlos.demo import Demo, run_demo
-from evnlos.errors import ConfigError
+from evnlos.data import STANDARD_MODALITIES, captures_in
+from evnlos.demo import Demo, mismatch_setups, mismatch_table, run_demo, run_mismatch
+from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
-from evnlos.live.sources import SourceOptions, open_live
+from evnlos.live.sources import SourceOptions, check_source, open_live
 from evnlos.machine import ProgressBars
 
 if TYPE_CHECKING:
@@ -39,6 +40,10 @@ class DemoCommand:
 
     settings: Flat[Demo] = field(default_factory=Demo)
 
+    def check_names(self) -> None:
+        """Refuse captures that are not there."""
+        captures_in(self.settings.captures)
+
     def run(self) -> None:
         """Show a first reconstruction, run the demo, and print the table and the path of the report."""
         from evnlos.cli.results import show_first
@@ -46,6 +51,10 @@ class DemoCommand:
         one = self.settings
         show_first(one.out, one.captures, one.lab, one.force)
         run_demo(one)
+
+
+_WITHOUT_CAPTURES = ("simulation", "conditions", "generalization", "mismatch")
+"""Experiments that are no study on captures."""
 
 
 @dataclass(frozen=True)
@@ -107,18 +116,20 @@ class ExperimentCommand:
     metric: Literal["psnr_db", "psnr_box_db", "ssim", "ms_ssim", "haarpsi", "gmsd", "lpips"] = "psnr_db"
     """What the printed tables show; the records hold all."""
 
+    def check_names(self) -> None:
+        """Refuse the name of no experiment."""
+        if self.name == "mismatch":
+            mismatch_setups(self.setups, self.captures)
+        known = (*experiment.STUDIES, *_WITHOUT_CAPTURES)
+        if self.name not in known:
+            raise UnknownNameError(f"experiment {self.name!r} is unknown; give one of {', '.join(known)}")
+
     def run(self) -> None:
         """Run what is left, with a line of progress, and print the tables."""
-        alone = {
-            "simulation": self._simulation,
-            "conditions": self._conditions,
-            "generalization": self._generalization,
-            "mismatch": self._mismatch,
-        }
-        alone.get(self.name, self._on_captures)()
+        self.check_names()
+        getattr(self, f"_{self.name}" if self.name in _WITHOUT_CAPTURES else "_on_captures")()
 
     def _on_captures(self) -> None:
-        from evnlos import experiment
         from evnlos.data import character_of
         from evnlos.machine import Step
 
@@ -148,16 +159,9 @@ class ExperimentCommand:
 
     def _study(self) -> Study:
         """Return the named study with what the command line changes."""
-        from evnlos.experiment import STUDIES, on_sequences
-
-        if self.name not in STUDIES:
-            raise ConfigError(
-                f"experiment {self.name!r} is unknown; give one of {', '.join(STUDIES)}, simulation, "
-                "conditions, generalization, mismatch"
-            )
         if self.captures is None:
             raise ConfigError(f"the experiment {self.name} needs --captures, the folder of the capture folders")
-        study = STUDIES[self.name](self.captures_of)
+        study = experiment.STUDIES[self.name](self.captures_of)
         unknown = set(self.arms) - {arm.name for arm in study.arms}
         if unknown:
             there = ", ".join(repr(arm.name) for arm in study.arms)
@@ -176,7 +180,7 @@ class ExperimentCommand:
             validation=self.validation,
             writers=self.writers or study.writers,
         )
-        study = on_sequences(study) if self.sequence else study
+        study = experiment.on_sequences(study) if self.sequence else study
         return replace(study, arms=tuple(self._in_epochs(arm) for arm in study.arms))
 
     def _in_epochs(self, arm: Arm) -> Arm:
@@ -190,9 +194,7 @@ class ExperimentCommand:
         return replace(arm, pretraining=pre, finetuning=fine)
 
     def _simulation(self) -> None:
-        from evnlos.experiment import Simulated, read_records, run_simulated
-
-        settings = Simulated(
+        settings = experiment.Simulated(
             self.out, modalities=self.modalities, seeds=self.seeds, workers=self.workers, force=self.force
         )
         epochs = {
@@ -203,28 +205,25 @@ class ExperimentCommand:
         changed = {name: replace(getattr(settings, name), epochs=n) for name, n in epochs.items() if n}
         settings = replace(settings, writers=self.writers or settings.writers, **changed)
         with ProgressBars() as progress:
-            run_simulated(settings, progress)
-        text = ""
+            experiment.run_simulated(settings, progress)
+        text, everything = "", experiment.read_records(self.out / "records" / "simulation")
         for tested in ("nist", "comic"):
-            records = [r for r in read_records(self.out / "records" / "simulation") if r.setup == tested]
+            records = [record for record in everything if record.setup == tested]
             text += _tables("simulation", records, self.metric) + "\n"
         write_atomically(self.out / "simulation.md", text.encode())
         print(text)
 
     def _conditions(self) -> None:
-        from evnlos.experiment import base_simulation, conditions, conditions_table, sweep_parameters
-
-        chosen = conditions(base_simulation(self.writers or 2))
+        chosen = experiment.conditions(experiment.base_simulation(self.writers or 2))
         with ProgressBars() as progress:
-            findings = sweep_parameters(
+            findings = experiment.sweep_parameters(
                 chosen, self.out / "conditions", self.workers, progress=progress, force=self.force
             )
-        text = conditions_table(findings) + "\n"
+        text = experiment.conditions_table(findings) + "\n"
         write_atomically(self.out / "conditions.md", text.encode())
         print(text)
 
     def _generalization(self) -> None:
-        from evnlos.experiment import generalization, generalization_table, write_generalization
         from evnlos.plot.results import draw_confidence
 
         weights = self.weights
@@ -232,19 +231,18 @@ class ExperimentCommand:
             raise ConfigError("generalization needs --weights, a weights file or a run's folder")
         setup = self.out / "setups" / self.captures_of
         with ProgressBars() as progress:
-            found = generalization(weights, setup, self.out, self.workers, progress=progress, force=self.force)
+            found = experiment.generalization(
+                weights, setup, self.out, self.workers, progress=progress, force=self.force
+            )
         name = f"generalization-{self.captures_of}-{weights.stem}"
-        write_generalization(found, self.out / f"{name}.json")
-        text = generalization_table(found) + "\n"
+        experiment.write_generalization(found, self.out / f"{name}.json")
+        text = experiment.generalization_table(found) + "\n"
         write_atomically(self.out / f"{name}.md", text.encode())
         print(text)
         shown, checks = self.out / f"{name}.png", {one.name: one.confidence_checks for one in found}
         drawn(shown, lambda: draw_confidence(checks, shown))
 
     def _mismatch(self) -> None:
-        from evnlos.demo import Demo, mismatch_table, run_mismatch
-        from evnlos.experiment import bounds_table
-
         base = Demo(out=self.out, test=self.test, workers=self.workers, force=self.force, robust=self.robust)
         base = replace(
             base,
@@ -258,19 +256,21 @@ class ExperimentCommand:
         text, captures = mismatch_table(found), self.captures or self.out / "captures"
         for setup in [one.setup for one in found if not one.refused]:
             fitted = self.out / f"{setup}-seed{self.seeds[0]}" / "setups" / "demo"
-            text += bounds_table(fitted, min((captures / setup).glob("*/capture.yaml")).parent, setup)
+            first = min((captures / setup).glob("*/capture.yaml")).parent
+            text += experiment.bounds_table(fitted, first, setup)
         write_atomically(self.out / "mismatch.md", text.encode())
         print(text)
 
 
 def _tables(name: str, records: list, metric: str) -> str:
-    from evnlos.experiment import character_table, checks_table, gain_table, summary_table
-
-    parts = [f"# {name}, {records[0].setup}, {records[0].split} characters", summary_table(records, metric)]
+    parts = [
+        f"# {name}, {records[0].setup}, {records[0].split} characters",
+        experiment.summary_table(records, metric),
+    ]
     arms = {record.arm for record in records if record.seed >= 0}
     if {"EPNP", "E2E"} <= arms:
-        parts += [gain_table(records), character_table(records, ("E2E", "EPNP"), metric)]
-    parts.append(checks_table(records))
+        parts += [experiment.gain_table(records), experiment.character_table(records, ("E2E", "EPNP"), metric)]
+    parts.append(experiment.checks_table(records))
     return "\n\n".join(parts) + "\n"
 
 
@@ -325,6 +325,10 @@ class LiveCommand:
     """Print one JSON object at the end."""
     listening: Flat[SourceOptions] = field(default_factory=SourceOptions)
     pace: Flat[RateOptions] = field(default_factory=RateOptions)
+
+    def check_names(self) -> None:
+        """Refuse a source that is nothing."""
+        check_source(self.source, self.listening.follow)
 
     def run(self) -> None:
         """Show or record pictures until the source ends, and print how quick they were."""

@@ -14,6 +14,7 @@ import torch
 import tyro
 
 from evnlos.cli.parsing import drawn, say
+from evnlos.cli.recordings import Folders
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
@@ -27,7 +28,7 @@ _EXPLAINED = 2.0  # times the camera's noise that frames may keep
 class InvertCommand:
     """Invert a photograph of a matte wall, or whole sequences of captures, by the operator alone."""
 
-    files: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    files: Folders
     """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --setup, or
     pictures of the wall with a measured --setup."""
     setup: Path | None = None

@@ -18,14 +18,23 @@ import torch
 import tyro
 
 from evnlos.analysis import BASELINES, CHECKS, confusion
-from evnlos.cli.parsing import say
+from evnlos.cli.parsing import check_there, say
 from evnlos.cli.recordings import Flat, Presets, result
 from evnlos.config import load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
 from evnlos.data.live import Place
 from evnlos.errors import ConfigError, DataError, printable
 from evnlos.machine import ProgressBars
-from evnlos.models import GENERIC, Weights, describe_network, load_weights, published, save_weights, with_rank
+from evnlos.models import (
+    GENERIC,
+    Weights,
+    describe_network,
+    find_weights,
+    load_weights,
+    published,
+    save_weights,
+    with_rank,
+)
 from evnlos.models.confidence import COVERAGE
 from evnlos.training import (
     Training,
@@ -254,6 +263,11 @@ class WeightsCommand:
     """What `evnlos evaluate --json` printed of these weights, to be kept in the copy."""
     json: bool = False
     """Print one JSON object."""
+
+    def check_names(self) -> None:
+        """Refuse weights that are not there."""
+        if self.weights is not None:
+            check_there(find_weights, self.weights)
 
     def run(self) -> None:
         """Read the weights, print, and write the copy where one is requested."""

@@ -28,16 +28,16 @@ from evnlos.cli.parsing import (
     PROGRESS_FLAG,
     QUIET_FLAG,
     VARIABLE,
-    WORK_LIBRARIES,
     PlainOutput,
     UnfitWordsError,
+    check_names,
+    flag_value,
     listen,
     parse,
     todays_words,
-    without_work_libraries,
 )
-from evnlos.doctor import examine, fault_behind
-from evnlos.errors import ConfigError, EvnlosError, printable
+from evnlos.doctor import WORK_LIBRARIES, examine, fault_behind, without_work_libraries
+from evnlos.errors import ConfigError, EvnlosError, UnknownNameError, printable
 from evnlos.machine import PROGRESS, SHOWN, sleep_while_waiting
 from evnlos.registry import Kinded, __version__, kind_of
 
@@ -49,7 +49,7 @@ VERBS: dict[str, str] = {
     "simulate": "datasets.SimulateCommand",
     "capture": "datasets.CaptureCommand",
     "import": "datasets.ImportCommand",
-    "verify": "datasets.VerifyCommand",
+    "verify": "about.VerifyCommand",
     "lab": "datasets.LabCommand",
     "calibrate": "calibration.CalibrateCommand",
     "scan": "calibration.ScanCommand",
@@ -241,13 +241,14 @@ def _unknown(verb: str) -> str:
 
 
 def _answer_at_once(verb: str, rest: list[str]) -> None:
-    """Print help, or refuse words that do not fit, before the libraries of the work are imported.
+    """Print help, or refuse what does not fit and names of nothing, before the work's libraries are imported.
 
     Where the words fit, or where only those libraries can tell, nothing happens: a setup, a file of settings or
     a kind that another package brings decides which flags there are.
 
     Raises:
         UnfitWordsError: A word does not fit.
+        UnknownNameError: A name stands for nothing.
         SystemExit: Help was asked for, and printed.
     """
     if verb == "doctor" or set(WORK_LIBRARIES) & set(sys.modules):
@@ -256,14 +257,33 @@ def _answer_at_once(verb: str, rest: list[str]) -> None:
     try:
         with without_work_libraries():
             command = command_of(verb)
-            if not (hasattr(command, "PRESETS") and any(_DECIDES.match(word) for word in rest)):
-                parse(command, rest, verb, _defaults(command, rest))
-    except UnfitWordsError as error:
+            if hasattr(command, "PRESETS") and any(_DECIDES.match(word) for word in rest):
+                check_names(rest)
+                _check_kinds(_preset(command, rest), rest)
+            else:
+                made = parse(command, rest, verb, _defaults(command, rest))
+                check_names(rest)
+                getattr(made, "check_names", tuple)()
+    except (UnfitWordsError, UnknownNameError) as error:
         refusal = error
     except Exception:  # a library was needed after all
         LOG.debug("%s is not described without its libraries", verb, exc_info=True)
     if refusal is not None:
         raise refusal
+
+
+def _check_kinds(settings: Any, words: list[str], prefix: str = "--") -> None:
+    """Refuse a flag `--FIELD.kind KIND` of a kind that there is not, as far as the settings have its field.
+
+    Raises:
+        UnknownNameError: There is one.
+    """
+    for item in fields(settings):
+        here, flag = getattr(settings, item.name), f"{prefix}{item.name}"
+        if isinstance(here, Kinded) and (kind := flag_value(words, f"{flag}.kind")) is not None:
+            here.registry.check(kind)
+        if is_dataclass(here) and not isinstance(here, type):
+            _check_kinds(here, words, f"{flag}.")
 
 
 _DECIDES = re.compile(r"--(config|setup|pixel|[\w.-]+\.kind)(=|$)")  # what decides which flags there are
@@ -279,23 +299,19 @@ def _command(verb: str, rest: list[str]) -> Any:
 
 def _defaults(command: type[Any], rest: list[str]) -> Any:
     """Return the command with what --preset, --config, --setup and --pixel name as defaults of the flags."""
-    presets = getattr(command, "PRESETS", None)
-    if presets is None:
+    if not hasattr(command, "PRESETS"):
         return None
     import tyro
 
     from evnlos.config import load_yaml
 
-    preset, config = _flag(rest, "--preset"), _flag(rest, "--config")
-    if preset is not None and preset not in presets:
-        raise UnfitWordsError(f"--preset is {preset!r}; give one of {', '.join(presets)}")
-    settings = presets[preset or "default"]()
+    settings, config = _preset(command, rest), flag_value(rest, "--config")
     if config is not None:
         settings = load_yaml(type(settings), config)
-    word = _flag(rest, "--setup")
+    word = flag_value(rest, "--setup")
     if word is not None and hasattr(command, "with_setup"):
         settings = command.with_setup(settings, word)
-    word = _flag(rest, "--pixel")
+    word = flag_value(rest, "--pixel")
     if word is not None and hasattr(command, "with_pixel"):
         settings = command.with_pixel(settings, word)
     settings = _of_kinds(settings, rest)
@@ -305,6 +321,14 @@ def _defaults(command: type[Any], rest: list[str]) -> Any:
         if item.default is MISSING and item.default_factory is MISSING
     }
     return command(**required | {"settings": settings})
+
+
+def _preset(command: type[Any], rest: list[str]) -> Any:
+    """Return the settings that --preset names."""
+    preset = flag_value(rest, "--preset") or "default"
+    if preset not in command.PRESETS:
+        raise UnfitWordsError(f"--preset is {preset!r}; give one of {', '.join(command.PRESETS)}")
+    return command.PRESETS[preset]()
 
 
 def _of_kinds(settings: Any, words: list[str], prefix: str = "--") -> Any:
@@ -317,7 +341,7 @@ def _of_kinds(settings: Any, words: list[str], prefix: str = "--") -> Any:
         here, flag = getattr(settings, item.name), f"{prefix}{item.name}"
         if not is_dataclass(here) or isinstance(here, type):
             continue
-        kind = _flag(words, f"{flag}.kind") if isinstance(here, Kinded) else None
+        kind = flag_value(words, f"{flag}.kind") if isinstance(here, Kinded) else None
         if kind is not None and kind != kind_of(here):
             before, here = here, here.registry[kind]()  # type: ignore[union-attr] - a family's settings
             if hasattr(here, "with_cameras_of"):
@@ -326,16 +350,6 @@ def _of_kinds(settings: Any, words: list[str], prefix: str = "--") -> Any:
         if here is not getattr(settings, item.name):
             settings = replace(settings, **{item.name: here})
     return settings
-
-
-def _flag(arguments: list[str], name: str) -> str | None:
-    """Return the value of a flag, given as `--flag value` or `--flag=value`."""
-    for i, argument in enumerate(arguments):
-        if argument == name and i + 1 < len(arguments):
-            return arguments[i + 1]
-        if argument.startswith(f"{name}="):
-            return argument.split("=", 1)[1]
-    return None
 
 
 def _overview() -> str:

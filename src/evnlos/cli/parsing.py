@@ -2,15 +2,13 @@
 
 - Notes on stderr: how much a command says beside its result (`--log-level`, EVNLOS_LOG).
 - From the words after a verb to its command; what does not fit is one line, not the parser's box.
-- The description of a command without the libraries that its work needs, so that help comes at once.
+- What names on a command line stand for, before the libraries of the work are there.
 """
 
 from __future__ import annotations
 
 import contextlib
-import gc
-import importlib.abc
-import importlib.machinery
+import importlib
 import io
 import logging
 import os
@@ -253,99 +251,69 @@ def in_one_line(box: str) -> str:
     return "; ".join(f"{part[0]} {', '.join(part[1:])}".strip() for part in kept).rstrip(".")
 
 
-WORK_LIBRARIES = (
-    "numpy",
-    "torch",
-    "numba",
-    "llvmlite",
-    "scipy",
-    "h5py",
-    "PIL",
-    "safetensors",
-    "pydantic",
-    "threadpoolctl",
-)
-"""What takes most of a start, or brings that along, and describes no flag."""
+_RESOLVERS = {  # flag -> module and function of what its word stands for
+    "--config": ("config", "read_yaml"),
+    "--setup": ("setups", "load_setup"),
+    "--pixel": ("cameras", "load_pixel"),
+    "--weights": ("models", "find_weights"),
+    "--data": ("data", "open_dataset"),
+}
 
 
-class _StandIn:
-    """What a name of a library that is not imported stands for, as far as a module's top level uses it.
+def check_names(words: list[str]) -> None:
+    """Refuse a flag's word that is no file or folder, and stands for no setup, pixel or weights.
 
-    It decorates without effect, is a base class of nothing, and stands in annotations.
+    Raises:
+        UnknownNameError: There is one.
     """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __repr__(self) -> str:
-        return self._name
-
-    def __getattr__(self, name: str) -> _StandIn:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return _StandIn(f"{self._name}.{name}")
-
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        if len(arguments) == 1 and not named and callable(arguments[0]):
-            return arguments[0]  # what it decorates
-        return _StandIn(f"{self._name}()")
-
-    def __getitem__(self, _: Any) -> _StandIn:
-        return self
-
-    def __or__(self, *_: Any) -> Any:
-        return self
-
-    __ror__ = __neg__ = __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __or__
-    __truediv__ = __rtruediv__ = __floordiv__ = __pow__ = __matmul__ = __lshift__ = __invert__ = __or__
-
-    def __mro_entries__(self, _: tuple[Any, ...]) -> tuple[type, ...]:
-        return ()
+    for flag, (room, resolver) in _RESOLVERS.items():
+        if word := flag_value(words, flag):
+            check_there(getattr(importlib.import_module(f"evnlos.{room}"), resolver), word)
 
 
-class _StandInLibraries(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Import modules of `WORK_LIBRARIES` as modules that hold a `_StandIn` under every name."""
+def check_there(resolve: Callable[[Any], object], *words: str | Path) -> None:
+    """Have what resolves words refuse those that are no file or folder, and names of nothing.
 
-    def find_spec(
-        self, name: str, path: Any = None, target: Any = None
-    ) -> importlib.machinery.ModuleSpec | None:
-        """Return a module of nothing for a library that takes long, and leave all others to Python."""
-        if name.partition(".")[0] not in WORK_LIBRARIES:
-            return None
-        return importlib.machinery.ModuleSpec(name, self, is_package=True)
+    Args:
+        resolve: Called with each word that is no path of anything.
+        words: The words.
 
-    def create_module(self, spec: importlib.machinery.ModuleSpec) -> Any:
-        """Return the module that Python makes itself."""
-
-    def exec_module(self, module: Any) -> None:
-        """Let the module have every name."""
-        stand_in = _StandIn(module.__name__)
-        module.__getattr__ = stand_in.__getattr__
-
-
-@contextlib.contextmanager
-def without_work_libraries() -> Iterator[None]:
-    """Import modules of this package without `WORK_LIBRARIES`: enough to describe a command, not to run it.
-
-    Afterwards what was imported meanwhile is forgotten, as far as it is of this package or of those libraries.
+    Raises:
+        UnknownNameError: There is one.
     """
-    finder, before, collects = _StandInLibraries(), set(sys.modules), gc.isenabled()
-    kept = {name: dict(vars(module)) for name, module in sys.modules.items() if _is_ours(name)}
-    sys.meta_path.insert(0, finder)
-    gc.disable()  # a tenth of the time, and next to nothing to collect
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
-        sys.meta_path.remove(finder)
-        for name in set(sys.modules) - before:
-            if _is_ours(name) or name.partition(".")[0] in WORK_LIBRARIES:
-                del sys.modules[name]
-        for name, names in kept.items():  # a package holds its modules as attributes, too
-            for added in set(vars(sys.modules[name])) - set(names):
-                delattr(sys.modules[name], added)
+    for word in words:
+        if not Path(word).exists():
+            resolve(word)
 
 
-def _is_ours(name: str) -> bool:
-    return name.partition(".")[0] == "evnlos"
+def flag_value(words: list[str], flag: str) -> str | None:
+    """Return the value of a flag, given as `--flag value` or `--flag=value`; None where it is not given."""
+    for word, following in zip(words, [*words[1:], None], strict=False):
+        if word == flag and following is not None:
+            return following
+        if word.startswith(f"{flag}="):
+            return word.partition("=")[2]
+    return None
+
+
+def check_writable(path: Path) -> None:
+    """Raise where a result could not be written, before it is worked for; nothing is made or changed.
+
+    Args:
+        path: File or folder that the command will write, or will make along with the folders above it.
+
+    Raises:
+        ConfigError: It, or the nearest folder above it that exists, cannot be written.
+    """
+    place = path.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if place != path.absolute() and not place.is_dir():
+        raise ConfigError(f"{path} cannot be made: {place} is a file; give another --out")
+    if not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)) or _is_read_only(place):
+        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another --out")
+
+
+def _is_read_only(place: Path) -> bool:
+    """Return whether a file system takes no file, which an administrator's rights hide."""
+    return hasattr(os, "statvfs") and bool(os.statvfs(place).f_flag & os.ST_RDONLY)

@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -25,11 +24,18 @@ from evnlos.events.files.columns import OnError
 from evnlos.events.recording import WINDOW_US, Box, CropOptions, Recording, Summary, summarise
 from evnlos.machine import ProgressBars, Step
 from evnlos.plot.preview import Background, PreviewOptions, Style, preview_pictures
-from evnlos.types import Events
+from evnlos.types import Events, matching_paths
 
 T = TypeVar("T")
-Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
-"""One or more folders, given without a flag."""
+_PATHS = tyro.constructors.PrimitiveConstructorSpec(
+    "*",
+    "PATH [PATH ...]",
+    lambda words: tuple(matching_paths(words)),
+    lambda value: isinstance(value, tuple),
+    lambda paths: [str(path) for path in paths],
+)
+Folders = Annotated[tuple[Path, ...], tyro.conf.Positional, _PATHS]
+"""One or more folders, or patterns that match some, given without a flag."""
 Flat = Annotated[T, tyro.conf.arg(name="")]
 """Settings whose flags carry no prefix."""
 Presets = Mapping[str, Callable[[], T]]
@@ -82,29 +88,6 @@ def refuse_existing(path: Path, force: bool) -> None:
     """Raise where a file would be replaced without --force."""
     if path.exists() and not force:
         raise ConfigError(f"{path} exists; give another name, or --force to replace it")
-
-
-def check_writable(path: Path) -> None:
-    """Raise where a result could not be written, before it is worked for; nothing is made or changed.
-
-    Args:
-        path: File or folder that the command will write, or will make along with the folders above it.
-
-    Raises:
-        ConfigError: It, or the nearest folder above it that exists, cannot be written.
-    """
-    place = path.absolute()
-    while not place.exists() and place != place.parent:
-        place = place.parent
-    if place != path.absolute() and not place.is_dir():
-        raise ConfigError(f"{path} cannot be made: {place} is a file; give another --out")
-    if not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)) or _is_read_only(place):
-        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another --out")
-
-
-def _is_read_only(place: Path) -> bool:
-    """Return whether a file system takes no file, which an administrator's rights hide."""
-    return hasattr(os, "statvfs") and bool(os.statvfs(place).f_flag & os.ST_RDONLY)
 
 
 def counted(pieces: Iterable[Events], name: str, total: int | None = None) -> Iterator[Events]:

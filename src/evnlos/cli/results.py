@@ -20,8 +20,8 @@ import tyro
 
 from evnlos.analysis.bounds import SequenceAnalysisSettings
 from evnlos.analysis.linearized import AnalysisSettings
-from evnlos.cli.parsing import drawn, say
-from evnlos.cli.recordings import Flat, Folders, check_writable, result
+from evnlos.cli.parsing import check_there, check_writable, drawn, say
+from evnlos.cli.recordings import Flat, Folders, result
 from evnlos.errors import ConfigError, EvnlosError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
@@ -62,6 +62,12 @@ class ReconstructCommand:
     json: bool = False
     """Print one JSON object."""
 
+    def check_names(self) -> None:
+        """Refuse a capture that is not there."""
+        from evnlos.data import read_capture
+
+        check_there(read_capture, self.capture)
+
     def run(self) -> None:
         """Reconstruct and print where the pictures are."""
         from evnlos.data import pattern_of
@@ -95,20 +101,21 @@ def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool) -> N
 
     Args:
         demo: Folder of the demo; the result is its folder `first`, and made once.
-        captures: Capture folders, or folders above them.
+        captures: Capture folders, patterns of them, or folders above them.
         lab: Renders the demo's captures where there are none.
         force: Begin although the machine's memory will hardly do.
+
+    Raises:
+        UnknownNameError: There is no capture in what was given.
     """
+    from evnlos.data import captures_in
     from evnlos.data.lab import render_captures
     from evnlos.report import reconstruct_capture
 
     out = demo / "first"
     if out.exists():
         return
-    given = (path for one in captures for path in (one, *sorted(one.glob("*"))))
-    capture = next((path for path in given if (path / "capture.yaml").is_file()), None)
-    if capture is None and captures:
-        return  # the demo says so
+    capture = next(iter(captures_in(captures)), None)
     try:
         with ProgressBars() as progress:
             if capture is None:
@@ -143,6 +150,12 @@ class TrackCommand:
     json: bool = False
     """Print one JSON object."""
     settings: Flat[Tracking] = field(default_factory=Tracking)
+
+    def check_names(self) -> None:
+        """Refuse a capture that is not there."""
+        from evnlos.data import read_capture
+
+        check_there(read_capture, self.capture)
 
     def run(self) -> None:
         """Follow, print, write the picture."""
@@ -272,6 +285,12 @@ class IdentifyCommand:
     """Also print the expected PSNR of the best linear estimate of a moving target, from frames, from events and
     from both, over the number of positions and for each event model; half a minute for each setup."""
     sequence: SequenceAnalysisSettings = field(default_factory=SequenceAnalysisSettings)
+
+    def check_names(self) -> None:
+        """Refuse a word that stands for no setup."""
+        from evnlos.setups import load_setup
+
+        check_there(load_setup, *self.setups, *self.setup)
 
     def run(self) -> None:
         """Identify and print."""

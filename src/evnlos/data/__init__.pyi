@@ -2,6 +2,7 @@
 
 from .capture import Capture as Capture
 from .capture import capture_samples as capture_samples
+from .capture import captures_in as captures_in
 from .capture import import_captures as import_captures
 from .capture import read_capture as read_capture
 from .capture_check import check_picture as check_picture

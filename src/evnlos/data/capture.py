@@ -28,7 +28,7 @@ from evnlos.data.fixed_pattern import FixedPattern, mapped, prepare_frames
 from evnlos.data.frames import read_frame_series, read_image
 from evnlos.data.sampling import Samples, Sampling, iter_samples, join_samples, time_steps
 from evnlos.data.store import Dataset, claim_dataset, write_shard
-from evnlos.errors import DataError, printable
+from evnlos.errors import DataError, UnknownNameError, printable
 from evnlos.events import (
     CelexOptions,
     FrameStack,
@@ -39,7 +39,7 @@ from evnlos.events import (
 )
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import LineMotion, Scene, Target
-from evnlos.types import Events
+from evnlos.types import Events, matching_paths
 from evnlos.untrusted import no_file
 
 _HELD_BYTES = 1 << 26  # frames of an import that take more are read as they are asked for
@@ -113,6 +113,25 @@ class Capture:
         return Scene(self.target, motion, duration_s=max(float(self.frame_times_us[-1]) * 1e-6, 1e-6))
 
 
+def captures_in(given: Iterable[Path]) -> list[Path]:
+    """Return the capture folders among some paths or patterns, and in folders among them; files are left out.
+
+    Raises:
+        UnknownNameError: A path does not exist, or there is no capture in any.
+    """
+    found, paths = list[Path](), matching_paths(given)
+    for path in paths:
+        is_one = (path / "capture.yaml").is_file()
+        inside = [path] if is_one else [file.parent for file in path.glob("*/capture.yaml")]
+        if not inside and not path.is_file():
+            what = "holds no capture.yaml" if path.exists() else "matches nothing"
+            raise UnknownNameError(f"{path} {what}; give capture folders, or the folder above them")
+        found += inside
+    if paths and not found:
+        raise UnknownNameError(f"{paths[0]} is no capture folder; give folders with a capture.yaml")
+    return sorted(found)
+
+
 def read_capture(
     folder: str | Path,
     most_frame_bytes: int | None = None,
@@ -145,7 +164,9 @@ def read_capture(
     """
     folder = Path(folder)
     if not folder.is_dir() and not folder.is_file():
-        raise DataError(f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)")
+        raise UnknownNameError(
+            f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)"
+        )
     info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic)
     name, folder = _name_of(folder), folder.parent if folder.is_file() else folder
     info.check_cameras(folder, frames=needs_frames, events=needs_events)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from evnlos.config import LONG_YAML, config_hash, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data.sampling import Samples, Sampling
-from evnlos.errors import DataError
+from evnlos.errors import DataError, UnknownNameError
 from evnlos.events.files.container_write import Storage
 from evnlos.files import directory_lock, is_empty, new_file
 from evnlos.machine import undisturbed
@@ -340,7 +340,7 @@ def open_dataset(folder: str | Path) -> Dataset:
     folder = Path(folder)
     path = folder / PAGE
     if not path.is_file():
-        raise DataError(f"{folder} is no dataset: {path.name} is missing; run `evnlos simulate` or `import`")
+        raise UnknownNameError(f"{folder} is no dataset: {PAGE} is missing; run `evnlos simulate` or `import`")
     values = read_yaml(path, LONG_YAML)
     unknown = values.keys() - _KEYS
     if unknown:

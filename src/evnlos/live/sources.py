@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evnlos.data.capture import read_capture
 from evnlos.data.fixed_pattern import FixedPattern
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording
 from evnlos.live.device import DEVICES, DeviceSource, NeuromorphicDriver, device_of
@@ -216,11 +216,8 @@ def open_live(
     device = device_of(source)
     if device is not None:
         return DeviceSource(lambda: NeuromorphicDriver(*device), source, idle_s=how.idle_s)
+    check_source(source, how.follow)
     path = Path(source)
-    if not (path.exists() or path.suffix or path.name != source or how.follow):
-        raise ConfigError(
-            f"{source} is neither a file nor one of the cameras {', '.join(DEVICES)}; check the name"
-        )
     if path.is_dir():
         if how.follow:
             raise ConfigError(f"{source} is a folder; --follow takes the event file that grows")
@@ -229,6 +226,23 @@ def open_live(
         return GrowingFile(path, width=how.width, height=how.height, idle_s=how.idle_s)
     recording = Recording(path, width=how.width, height=how.height)
     return Replay(recording.pieces(CropOptions(known_polarity=True)), speed=how.speed, name=str(path))
+
+
+def check_source(source: str, follow: bool = False) -> None:
+    """Refuse a source that is no address, no camera, and no path of a file.
+
+    Args:
+        source: As for `open_live`.
+        follow: Whether the file may come later.
+
+    Raises:
+        UnknownNameError: It is none.
+    """
+    path, is_elsewhere = Path(source), source == "-" or "://" in source or device_of(source) is not None
+    if not (is_elsewhere or path.exists() or path.suffix or path.name != source or follow):
+        raise UnknownNameError(
+            f"{source} is neither a file nor one of the cameras {', '.join(DEVICES)}; check the name"
+        )
 
 
 def capture_replay(

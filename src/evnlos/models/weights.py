@@ -21,7 +21,7 @@ import torch
 
 from evnlos.config import from_dict, to_dict
 from evnlos.data import MODALITIES, STANDARD_MODALITIES, Modality, Sampling
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.models.confidence import Confidence
 from evnlos.models.reconstructor import Reconstructor, ReconstructorSettings
@@ -79,7 +79,7 @@ def published() -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def no_weights(what: str) -> DataError:
+def no_weights(what: str) -> UnknownNameError:
     """Return the error that names all ways to weights.
 
     Args:
@@ -87,7 +87,7 @@ def no_weights(what: str) -> DataError:
     """
     known = ", ".join(published())
     names = f"a name of installed ones ({known})" if known else "install evnlos-weights for pretrained ones"
-    return DataError(
+    return UnknownNameError(
         f"{what}; give a weights file, a run whose training has ended, or {names}, or set {VARIABLE} to a "
         "folder that holds them"
     )
@@ -265,18 +265,13 @@ def with_rank(weights: Weights, rank: int) -> Weights:
     return replace(weights, network=weights.network.reduced(rank))
 
 
-def load_weights(path: str | Path) -> Weights:
-    """Read weights; a run's folder stands for the `weights.safetensors` in it.
-
-    Args:
-        path: A safetensors file, the folder of a run whose training has ended, or a name of `published`.
+def find_weights(word: str | Path) -> Path:
+    """Return the file that `load_weights` reads.
 
     Raises:
-        DataError: The file is missing, is not a weights file of this package, does not fit its own config or
-            its digest, or there are weights here that have a published name.
+        DataError: There is none, or there are weights here that have a published name.
     """
-    known = published()
-    given = Path(path)
+    known, given = published(), Path(word)
     if not given.exists() and (name := todays_weights(str(given))) in known:
         given = Path(name)
     path = given / "weights.safetensors" if given.is_dir() else given
@@ -287,9 +282,23 @@ def load_weights(path: str | Path) -> Weights:
                 f"give {given.absolute()} for that, or rename it"
             )
         path = known[str(given)]
-    is_known = path in known.values()
     if not path.is_file():
         raise no_weights(f"{path} does not exist")
+    return path
+
+
+def load_weights(path: str | Path) -> Weights:
+    """Read weights; a run's folder stands for the `weights.safetensors` in it.
+
+    Args:
+        path: A safetensors file, the folder of a run whose training has ended, or a name of `published`.
+
+    Raises:
+        DataError: As of `find_weights`; or the file is not a weights file of this package, or does not fit its
+            own config or its digest.
+    """
+    path = find_weights(path)
+    is_known = path in published().values()
     try:
         text, tensors, is_sealed = read_sealed(path)
         about = json.loads(text)

@@ -25,7 +25,7 @@ from evnlos.cameras import (
     V2ePixel,
 )
 from evnlos.config import from_dict, read_yaml
-from evnlos.errors import ConfigError
+from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.lab import Lobe, Mount, Reflection, Torch
 from evnlos.registry import migrate
 from evnlos.setups.base import CAMERA_FIELDS, SensorSize, Setup
@@ -260,7 +260,7 @@ def setup_preset(name: str, distance_m: float | None = None) -> RadiometricSetup
     if wall not in _WALLS or (place or "near") not in _DISTANCES:
         near = difflib.get_close_matches(name, setup_names(), n=1)
         hint = f"; perhaps you meant {near[0]!r}" if near else ""
-        raise ConfigError(
+        raise UnknownNameError(
             f"the setup {name!r} is unknown; choose one of {', '.join(_WALLS)} with -near or -far{hint}"
         )
     return replace(_WALLS[wall], distance_m=_DISTANCES[place or "near"] if distance_m is None else distance_m)
@@ -314,7 +314,8 @@ def load_setup(word: str | Path) -> Setup:
             f"{word} holds no {CALIBRATED_FILE}; give the folder that `calibrate` wrote, a file or a name"
         )
     if path.suffix in (".yaml", ".yml"):
-        raise ConfigError(f"{path} does not exist; give a settings file or one of {', '.join(setup_names())}")
+        cure = f"give a settings file or one of {', '.join(setup_names())}"
+        raise UnknownNameError(f"{path} does not exist; {cure}")
     return _named(str(word))
 
 
@@ -366,7 +367,7 @@ def _named(name: str) -> Setup:
         presets = [one for one in NAMED if one.startswith("simulate-")]
         near = difflib.get_close_matches(name, presets, n=1)
         hint = f"; perhaps you meant {near[0]!r}" if near else ""
-        raise ConfigError(f"simulate has no preset {name[9:]!r}; give one of {', '.join(presets)}{hint}")
+        raise UnknownNameError(f"simulate has no preset {name[9:]!r}; give one of {', '.join(presets)}{hint}")
     return setup_preset(name)  # which refuses it
 
 
