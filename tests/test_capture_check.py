@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evnlos.cli import main
-from evnlos.data import CaptureInfo, read_capture
+from evnlos.data import CaptureInfo, open_dataset, read_capture
 from evnlos.data.capture_check import _offset, check_capture
 from evnlos.data.capture_info import CAMERAS, AlignmentInfo, CameraInfo, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
@@ -20,6 +20,7 @@ from evnlos.data.store import read_shard
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs
 from evnlos.setups import RadiometricSetup
+from evnlos.training import Training, train
 from evnlos.types import Events
 
 
@@ -307,6 +308,9 @@ def test_a_capture_of_one_camera_is_checked_imported_and_reconstructed(one_camer
     assert ("event rate" in found, "saturation" in found) == (lacking == "frames", lacking == "events")
     assert "clock offset" not in found
     main(["import", str(folder), "--out", str(tmp_path / "data")])
+    with pytest.raises(DataError, match=f"one_A was recorded without {lacking}.* --modality"):
+        train(open_dataset(tmp_path / "data"), Training(modality="fusion"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
     samples, _ = read_shard(tmp_path / "data" / "one_A.h5")
     assert samples.frame.any() == (lacking == "events") and samples.surface.any() == (lacking == "frames")
     assert (samples.event_count.sum() > 0) == (lacking == "frames") and samples.truth is not None

@@ -292,6 +292,10 @@ def test_frames_solved_through_the_light_path_show_the_target(solved) -> None:
 def test_frames_are_not_solved_without_a_setup(tiny_dataset, tmp_path) -> None:
     with pytest.raises(ConfigError, match="setup is empty"):
         train(tiny_dataset, replace(PLAN, network=SOLVING), tmp_path / "run")
+    gone = replace(tiny_dataset, sampling=replace(tiny_dataset.sampling, setup="gone.yaml"))
+    with pytest.raises(ConfigError, match="does not exist"):
+        train(gone, replace(PLAN, network=SOLVING), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
     with pytest.raises(ConfigError, match="prior_weights is"):
         replace(SOLVING, prior_weights=(0.0,))
 

@@ -350,8 +350,11 @@ def import_captures(
     topics: dict[str, Any] = {"events_topic": events_topic, "frames_topic": frames_topic}
     optional = {"needs_frames": False, "needs_events": False}
     read = partial(read_capture, most_frame_bytes=_HELD_BYTES, **topics, **optional, lazy_frames=True)
-    described = {name: _digest_of(read_capture_info(path, **topics)) for name, path in sorted(paths.items())}
+    infos = {name: read_capture_info(path, **topics) for name, path in sorted(paths.items())}
+    described = {name: _digest_of(info) for name, info in infos.items()}
     config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
+    lacks = {n: kind for n, one in infos.items() for kind in ("frames", "events") if not getattr(one, kind)}
+    config |= {"lacks": lacks} if lacks else {}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
     first = next(iter(paths.values()))
     captures: dict[str, Capture] = {_name_of(first): read(first)}

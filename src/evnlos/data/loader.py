@@ -219,6 +219,19 @@ class InMemoryDataset(torch.utils.data.Dataset):
         return self.inputs[index].float(), self.truth[index].unsqueeze(-3).float()
 
 
+def _check_cameras(dataset: Dataset, objects: list[str], modality: Modality) -> None:
+    """Raise `DataError` where a capture was recorded without what the modality shows: its maps are empty."""
+    lacks = dataset.config.get("lacks")
+    lacks = lacks if isinstance(lacks, dict) else {}
+    for name in objects:
+        for what, recorded, other in (("frames", "frame", "event"), ("events", "surface", "frame")):
+            if lacks.get(name) == what and any(recorded in group.maps for group in modality.groups):
+                raise DataError(
+                    f"{name} was recorded without {what}, and the modality is {modality.name}; give --modality "
+                    f"{other}, or leave the capture out"
+                )
+
+
 class NlosDataset(InMemoryDataset):
     """The samples of a split: item i is (input [C, H, W], truth [1, H, W]), float32, read when it is requested.
 
@@ -251,6 +264,7 @@ class NlosDataset(InMemoryDataset):
     def __init__(self, dataset: Dataset, split: str, modality: str | Modality) -> None:
         self.modality = as_modality(modality)
         objects = dataset.objects(split)
+        _check_cameras(dataset, objects, self.modality)
         self._shards = [dataset.shard(name) for name in objects]
         places, lengths, shapes = [], [], {}
         for path in self._shards:

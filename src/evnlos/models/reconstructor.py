@@ -96,6 +96,9 @@ class Reconstructor(nn.Module, ABC):
             keep_normalization: Whether a reconstructor with weights keeps the scale of the earlier data.
         """
 
+    def check_samples(self, samples: NlosDataset, *, is_new: bool) -> None:
+        """Raise what `training_samples`, with these arguments, would refuse; no sample is read."""
+
     def training_samples(
         self, samples: NlosDataset, augmentations: int, seed: int, *, is_new: bool
     ) -> InMemoryDataset:
@@ -151,9 +154,7 @@ class Reconstructor(nn.Module, ABC):
                 "capture.yaml (`evnlos track` finds it)"
             )
         places = torch.from_numpy(np.asarray(position_m, dtype=np.float32))
-        owners = np.zeros(len(inputs), dtype=np.int64)
-        if names is not None:
-            owners = np.unique(names, return_inverse=True)[1]
+        owners = np.zeros(len(inputs), np.int64) if names is None else np.unique(names, return_inverse=True)[1]
         images = inputs.new_zeros((len(inputs), *inputs.shape[-2:]), dtype=torch.float32)
         for owner in range(int(owners.max()) + 1):
             mine = torch.from_numpy(np.flatnonzero(owners == owner)).to(inputs.device)
@@ -162,10 +163,7 @@ class Reconstructor(nn.Module, ABC):
         return images
 
     def freeze(self, parts: tuple[str, ...]) -> None:
-        """Keep the weights of some parts as they are.
-
-        Args:
-            parts: Names of `parts`.
+        """Keep the weights of some parts, by their names in `parts`, as they are.
 
         Raises:
             ConfigError: There is no such part, or nothing would be left to train.

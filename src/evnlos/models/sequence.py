@@ -419,7 +419,7 @@ class SequenceReconstructor(Reconstructor):
             ConfigError: Frames are to be solved through the light path of a setup, and none is named.
         """
         inputs, truth, names = [], [], []
-        self._check_motion(samples)
+        self.check_samples(samples, is_new=is_new)
         if is_new and self.frames is not None:
             self._fit_frames(samples)
         draw = np.random.default_rng(derive_seed(seed, "views"))
@@ -440,22 +440,27 @@ class SequenceReconstructor(Reconstructor):
             self.scale.fit(found.inputs)
         return found
 
-    def _check_motion(self, samples: NlosDataset) -> None:
+    def check_samples(self, samples: NlosDataset, *, is_new: bool) -> None:
+        """Refuse samples of unknown motion, and those without a setup where frames are solved through one."""
         unknown = samples.names[np.isnan(samples.position_m).any(axis=1)]
         if len(unknown):
             raise DataError(
                 f"the motion of {unknown[0]} is unknown, and a sequence network pools positions; "
                 "give it in capture.yaml, or train on single time steps (--network.kind unet)"
             )
-
-    def _fit_frames(self, samples: NlosDataset) -> None:
-        """Fit what is solved for frames to the setup that the samples name, and to the samples."""
-        assert self.frames is not None
+        if not is_new or self.frames is None:
+            return
         if not self.sampling.setup:
             raise ConfigError(
                 "Sampling.setup is empty, and network.frames is 'likelihood', which undoes the light path of a "
                 "setup: make the samples with --sampling.setup FOLDER of `evnlos calibrate`"
             )
+        load_setup(self.sampling.setup)  # which refuses one that is not there
+
+    def _fit_frames(self, samples: NlosDataset) -> None:
+        """Fit what is solved for frames to the setup that the samples name, and to the samples."""
+        assert self.frames is not None
+        assert self.sampling.setup
         device = self.frames.basis.device
         frames, places = samples.inputs[:, self._frame], torch.from_numpy(samples.position_m)
         self.frames.cpu().fit(
