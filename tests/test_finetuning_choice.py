@@ -11,6 +11,7 @@ import torch
 from evnlos.config import from_dict
 from evnlos.data import Dataset, NlosDataset, Sampling, Simulation, read_shard, simulate
 from evnlos.errors import ConfigError, DataError
+from evnlos.machine import Step
 from evnlos.metrics import psnr
 from evnlos.models import FrameOperator, UNetConfig, load_weights
 from evnlos.scene import HandwritingGlyphs
@@ -125,7 +126,10 @@ def frames_of(dataset: Dataset, truth: np.ndarray) -> np.ndarray:
 
 def test_further_captures_are_what_the_setup_would_make_of_their_truth(tmp_path) -> None:
     dataset = captured(tmp_path / "d")
-    more = augmented(dataset, "frame")
+    steps = list[Step]()
+    more = augmented(dataset, "frame", steps.append)
+    assert [one.done for one in steps if one.unit == "fits"] == [0, 1, 2, 3, 4]
+    assert any(one.unit == "captures" for one in steps)
     assert more.config["augmented"]["asymmetry"] < MOST_ASYMMETRY
     names = more.objects("train")
     assert len(names) == 4 * len(dataset.objects("train")) and more.objects("test") == dataset.objects("test")

@@ -99,7 +99,7 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
         recorded = _import(study, arm, place, progress)
         made = _simulate(study, arm, place, progress)
         for modality in study.modalities:
-            learned = augmented(recorded, modality) if arm.augment else recorded
+            learned = augmented(recorded, modality, progress) if arm.augment else recorded
             plans = [_planned(study, arm, modality, seed, made, learned, place) for seed in study.seeds]
             networks.append(_Network(study, arm, modality, plans, made, recorded, place))
     if place.trainings != 1 and not torch.cuda.is_available():  # on a GPU one after the other

@@ -224,7 +224,7 @@ _FEWEST = 4  # captures that tell symmetry
 _ALIKE_PX = 0.05  # places that differ by less are the same
 
 
-def asymmetry(dataset: Dataset) -> float:
+def asymmetry(dataset: Dataset, progress: Progress = silent) -> float:
     """Return by which factor captures upside down, learned from too, make predictions worse.
 
     A linear light path is fitted to half of the training objects, without and with the same ones upside down,
@@ -232,29 +232,36 @@ def asymmetry(dataset: Dataset) -> float:
 
     Args:
         dataset: Captures with known targets, at least four of them to learn from.
+        progress: Called as fits are done.
 
     Raises:
         DataError: There are fewer.
     """
-    samples = NlosDataset(dataset, "train", "fusion")
+    lacks = (dataset.config.get("lacks") or {}).values()  # captures of one camera tell it by that one
+    modality = "event" if "frames" in lacks else "frame" if "events" in lacks else "fusion"
+    samples = NlosDataset(dataset, "train", modality)
     objects = np.unique(samples.names)
     if len(objects) < _FEWEST:
         raise DataError(f"{len(objects)} captures tell no symmetry; give at least {_FEWEST} to learn from")
     truth, seen = samples.truth.float()[:, None], samples.inputs.float()
     errors = torch.zeros(2, seen.shape[1])  # without and with those upside down; of each channel
     half = np.isin(samples.names, objects[::2])
+    fits = 0
     for known in (half, ~half):
         chosen = torch.from_numpy(known)
         alone = truth[chosen], seen[chosen], samples.names[known]
         both = *(torch.cat([part, part.flip(-2)]) for part in alone[:2]), np.tile(alone[2], 2)
         for error, (x, y, names) in zip(errors, (alone, both), strict=True):
+            progress(Step("how symmetric the setup is", fits, 4, "fits"))
+            fits += 1
             predicted = fit_linear(x, y.flatten(1, 2), names)(truth[~chosen])
             error += (predicted.reshape(-1, *seen.shape[1:]) - seen[~chosen]).square().sum(dim=(0, 2, 3))
+    progress(Step("how symmetric the setup is", 4, 4, "fits"))
     without, together = errors.clamp_min(1e-9)
     return float((together / without).max())
 
 
-def augmented(dataset: Dataset, modality: str) -> Dataset:
+def augmented(dataset: Dataset, modality: str, progress: Progress = silent) -> Dataset:
     """Return captures with exact further ones to learn from, in a folder beside theirs; made where missing.
 
     - Upside down, where the setup is symmetric: four captures and more show an `asymmetry` of at most
@@ -267,12 +274,13 @@ def augmented(dataset: Dataset, modality: str) -> Dataset:
     Args:
         dataset: Captures with known targets and motions.
         modality: What the network sees.
+        progress: Called while symmetry is looked for, and as captures are made.
 
     Raises:
         DataError: A target or a motion is unknown.
     """
     names = dataset.objects("train")
-    factor = _measured(dataset.folder) if len(names) >= _FEWEST else math.inf
+    factor = _measured(dataset.folder, progress) if len(names) >= _FEWEST else math.inf
     parts = {name: [(name, False)] for name in names}
     if factor <= MOST_ASYMMETRY:
         parts |= {f"mirrored_{name}": [(name, True)] for name in names}
@@ -287,7 +295,8 @@ def augmented(dataset: Dataset, modality: str) -> Dataset:
         config=dataset.config | {"augmented": about},
     )
     with claim_dataset(new):
-        for name in new.missing():
+        for done, name in enumerate(missing := new.missing()):
+            progress(Step(f"learn from {new.folder.name}", done, len(missing), "captures", name))
             found = [_turned(dataset, *part) for part in parts.get(name, [(name, False)])]
             weight = float(np.random.default_rng(derive_seed(0, name, "weight")).uniform())
             samples = found[0] if len(found) == 1 else _mean(found[0], found[1], weight)
@@ -296,9 +305,9 @@ def augmented(dataset: Dataset, modality: str) -> Dataset:
 
 
 @lru_cache(maxsize=8)
-def _measured(folder: Path) -> float:
+def _measured(folder: Path, progress: Progress) -> float:
     """Return the asymmetry of a dataset's captures; several networks ask for it."""
-    return asymmetry(open_dataset(folder))
+    return asymmetry(open_dataset(folder), progress)
 
 
 def _pairs(dataset: Dataset, objects: list[tuple[str, bool]]) -> dict[str, list[tuple[str, bool]]]:
