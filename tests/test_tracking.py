@@ -1,8 +1,10 @@
 """Tracking: shifts, velocities and the smoother against known motion and slow references."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import SequenceOperator
 from evnlos.inverse.operators import Gradient, normal_matrix
 from evnlos.inverse.sequence_problem import matrix_of, strip_of
-from evnlos.models import SequenceConfig, Weights, save_weights
+from evnlos.models import SequenceConfig, Weights, published_setup, save_weights
 from evnlos.optics import SlidingWall, View
 from evnlos.plot.results import draw_track
 from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
@@ -560,3 +562,20 @@ def test_a_folder_without_a_setup_is_no_photograph(capture, capsys) -> None:
     with pytest.raises(SystemExit):
         main(["invert", str(capture[0])])
     assert "give one NPZ file, or capture folders and --setup" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["near_G", pytest.param("far_G", marks=pytest.mark.thorough)])
+def test_the_page_on_motion_says_what_the_command_prints(name, shared_data, tmp_path, capsys) -> None:
+    """Its offset was that of an older version once; a last digit may differ between machines."""
+    page = (Path(__file__).parents[1] / "docs" / "motion.md").read_text()
+    row = next(line for line in page.splitlines() if line.startswith(f"| {name} |"))
+    error, strokes, deviation, x, y, speed = (float(value) for value in re.findall(r"-?[0-9.]+", row))
+    setup = published_setup(f"{name.partition('_')[0]}-frame-sequence")
+    track = ["track", str(shared_data / "captures" / name), "--setup", str(setup), "--json"]
+    main([*track, "--out", str(tmp_path / "track.png")])
+    found = json.loads(capsys.readouterr().out)
+    assert 1e3 * found["position_error"] == pytest.approx(error, abs=0.005)
+    assert strokes == pytest.approx(error / 11, abs=5e-4)
+    assert 1e3 * found["position_sigma"] == pytest.approx(deviation, abs=0.002)
+    assert [1e3 * value for value in found["position_offset"]] == pytest.approx([x, y], abs=0.02)
+    assert found["speed_error_percent"] == pytest.approx(speed, abs=0.03)
