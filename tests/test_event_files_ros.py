@@ -249,6 +249,16 @@ def test_faults_of_a_db3_name_the_message(tmp_path):
     assert len(found) == 30 and "message 3: " in report.first["left_over"]
 
 
+def test_a_db3_that_was_cut_is_an_error(tmp_path, shared_data):
+    """SQLite takes missing bytes of the last page for zeros: three of them would cost an event unsaid."""
+    path = tmp_path / "a.db3"
+    path.write_bytes((shared_data / "recordings" / "ros2_evt3_640x480.db3").read_bytes()[:-3])
+    with pytest.raises(EventFileError, match="2920445 bytes where its header announces 2920448; it was cut"):
+        read_events(path)
+    found, report = read_events_report(path)
+    assert report.truncated and len(found) == 343_473
+
+
 @pytest.mark.parametrize("frame_id", ["", "a", "ab", "abc", "abcd"])
 @pytest.mark.parametrize("encoding", ["mono", "libcaer", "libcaer_cmp"])
 def test_padding_follows_the_strings(encoding, frame_id, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 from evnlos.errors import EventFileError
 from evnlos.events import iter_events, read_events, write_events
-from evnlos.events.files import words
+from evnlos.events.files import read, words
 from evnlos.types import Events
 
 FILES = [
@@ -97,6 +97,27 @@ def test_damage_in_the_middle_of_a_stream(name, tmp_path, monkeypatch):
     assert before > 5_000
     pieces = list(iter_events(path, n_events=100, on_error="salvage"))
     joined(pieces)  # the constructor checks order and range over all pieces
+
+
+@pytest.mark.parametrize("ahead", [600, 1 << 17])
+@pytest.mark.parametrize("wrong", [1, 300])
+def test_events_dated_too_late_cost_themselves_alone(wrong, ahead, tmp_path, monkeypatch):
+    """At the end of a block they are no fault yet: only what follows tells."""
+    monkeypatch.setattr(words, "_BLOCK_BYTES", 4096)
+    monkeypatch.setattr(read, "_LOOK_AHEAD", ahead)
+    events = sample(20_000)
+    late = np.arange(1024 - wrong, 1024)
+    data = np.where(np.isin(np.arange(20_000), late), events.t_us + 2**31, events.t_us)
+    path = tmp_path / "e.raw"
+    both = np.empty(40_000, np.uint32)  # a word of the clock before each event
+    both[::2] = 0x8000_0000 | data >> 6
+    both[1::2] = (
+        events.p.astype(np.uint32) << 28 | (data & 63) << 22 | events.x.astype(np.uint32) << 11 | events.y
+    )
+    path.write_bytes(b"% evt 2.0\n% geometry 64x48\n% end\n" + both.astype("<u4").tobytes())
+    found = joined(list(iter_events(path, n_events=100, on_error="salvage")))
+    kept = ~np.isin(np.arange(20_000), late)
+    assert found == Events(events.t_us[kept], events.x[kept], events.y[kept], events.p[kept], 64, 48)
 
 
 @pytest.mark.parametrize(

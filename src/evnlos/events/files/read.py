@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from evnlos.errors import EventFileError
 from evnlos.events.files.celex import CelexOptions
@@ -18,6 +19,7 @@ from evnlos.events.files.columns import (
     allocate,
     check_on_error,
     cut,
+    is_ascending,
     join,
     trusted_events,
 )
@@ -237,19 +239,55 @@ def keep_in_order(columns: Columns) -> Columns:
     return {name: column[kept] for name, column in columns.items()}
 
 
-def keep_after(columns: Columns, newest_us: int) -> Columns:
-    """Return the events not earlier than `newest_us`."""
-    if not len(columns["t_us"]) or columns["t_us"][0] >= newest_us:
-        return columns
-    return cut(columns, int(np.searchsorted(columns["t_us"], newest_us)), len(columns["t_us"]))
+_LOOK_AHEAD = 1 << 17
+"""Events that salvage reads before it lets go of those in front of them."""
+
+
+def _kept(t_us: NDArray[np.int64], newest_us: int) -> NDArray[np.bool_]:
+    """Return a mask of the largest set of events in order that are not earlier than `newest_us`."""
+    kept = t_us >= newest_us
+    kept[kept] = _longest_ascent(t_us[kept])
+    return kept
 
 
 def in_order(blocks: Iterable[Columns], report: ReadReport) -> Iterator[Columns]:
-    """Yield the blocks, in salvage mode without events that are earlier than one before them."""
-    newest = np.iinfo(np.int64).min
+    """Yield the blocks, in salvage mode without events that are out of order.
+
+    Where some are, those in front and the next `_LOOK_AHEAD` are judged together, and of them the largest set
+    in order stays: events dated too late cost themselves, not all that follow. None is earlier than one that
+    was yielded.
+    """
+    if report.strict:
+        yield from (block for block in blocks if len(block["t_us"]))
+        return
+    held: list[Columns] = []
+    newest = last = np.iinfo(np.int64).min
+    total, are_ordered = 0, True
     for block in blocks:
-        if report.faults.get("backwards"):
-            block = keep_after(keep_in_order(block), newest)
-        if len(block["t_us"]):
-            newest = int(block["t_us"][-1])
-            yield block
+        t_us = block["t_us"]
+        if not len(t_us):
+            continue
+        are_ordered = are_ordered and bool(t_us[0] >= last) and is_ascending(t_us)
+        held.append(block)
+        total, last = total + len(t_us), t_us[-1]
+        while are_ordered and total - len(held[0]["t_us"]) >= _LOOK_AHEAD:
+            newest = held[0]["t_us"][-1]
+            total -= len(held[0]["t_us"])
+            yield held.pop(0)
+        if not are_ordered and total >= 2 * _LOOK_AHEAD:
+            joined, split = join(held), total - _LOOK_AHEAD
+            kept = _kept(joined["t_us"], newest)[:split]
+            front, rest = cut(joined, 0, split), cut(joined, split, total)
+            front = {name: column[kept] for name, column in front.items()}
+            if len(front["t_us"]):
+                newest = front["t_us"][-1]
+                yield front
+            held, total = [rest], _LOOK_AHEAD
+            are_ordered = bool(rest["t_us"][0] >= newest) and is_ascending(rest["t_us"])
+    if are_ordered:
+        yield from held
+    elif held:
+        joined = join(held)
+        kept = _kept(joined["t_us"], newest)
+        if kept.any():
+            yield {name: column[kept] for name, column in joined.items()}

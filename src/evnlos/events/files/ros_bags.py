@@ -226,6 +226,7 @@ class Db3File:
             found = f"messages may still stand in {self.path.name}-wal beside it, which is not read"
             cure = f"close the recorder, or open and close the bag with ros2 bag info, or {SALVAGE}"
             self.report.fault("truncated", 0, found, cure)
+        self._check_size()
         with self._errors():
             base = self._open()
         with closing(base):
@@ -239,6 +240,17 @@ class Db3File:
                     self.report.fault("left_over", row, "it holds no bytes of a message", _SALVAGE)
                 else:
                     yield Message(wanted[found[0]], row, found[1], found[2])
+
+    def _check_size(self) -> None:
+        """Report a file that is shorter than its header says: SQLite takes what is missing for zeros."""
+        with open_regular(self.path) as file:
+            head = file.read(100)
+        page = int.from_bytes(head[16:18], "big")
+        announced = (1 << 16 if page == 1 else page) * int.from_bytes(head[28:32], "big")
+        if head[24:28] == head[92:96] and self._size < announced:  # else the writer did not keep that number
+            found = f"the file has {self._size} bytes where its header announces {announced}"
+            cure = f"it was cut: copy the file again or {SALVAGE}"
+            self.report.fault("truncated", self._size, found, cure)
 
     def _row(self, base: sqlite3.Connection, row: int) -> tuple[int, int, bytes] | None:
         """Return topic, time of receipt and bytes of a message; None where it is damaged."""
