@@ -180,6 +180,28 @@ def test_words_and_names_of_nothing_are_refused_before_any_library_is_loaded(
     assert not set(HEAVY) & set(modules)
 
 
+def test_what_stands_in_for_a_library_cannot_be_gone_through() -> None:
+    """A show's order of patterns is drawn while its command is described: a loop over it took all memory."""
+    code = (
+        "from evnlos.doctor import without_work_libraries\n"
+        "with without_work_libraries():\n"
+        "    import numpy as np\n"
+        "    drawn = np.random.default_rng(0).permutation(3).tolist()\n"
+        "    for use in (iter, list, enumerate, lambda drawn: 3 in drawn):\n"
+        "        try:\n            use(drawn)\n"
+        "        except TypeError:\n            print('refused')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["refused"] * 4
+
+
+def test_a_scan_with_a_show_is_planned(tmp_path: Path) -> None:
+    words = "--plane 0.16 0.08 --pitch 0.02 --display 1920 1080 --show page --targets RK --target-m 0.08"
+    command = [sys.executable, "-m", "evnlos", "scan", "plan", str(tmp_path / "tray"), *words.split()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and (tmp_path / "tray" / "show.html").is_file()
+
+
 def cpu_s(words: list[str]) -> float:
     """Return the least CPU time of three runs; bytecode was compiled before, as an installation keeps it."""
     resource = pytest.importorskip("resource")

@@ -315,8 +315,11 @@ WORK_LIBRARIES = (
 class _StandIn:
     """What a name of a library that is not imported stands for, as far as a module's top level uses it.
 
-    It decorates without effect, is a base class of nothing, and stands in annotations.
+    It decorates without effect, is a base class of nothing, and stands in annotations. It holds nothing to go
+    through: by `__getitem__` alone it would never end.
     """
+
+    __iter__ = None
 
     def __init__(self, name: str) -> None:
         self._name = name

@@ -151,7 +151,7 @@ def check_folder(folder: str | Path) -> None:
     """
     folder = Path(folder)
     if (folder.is_symlink() and not folder.exists()) or not is_empty(folder):
-        raise DataError(f"{folder} is not an empty folder; give a new one with --out")
+        raise DataError(f"{folder} is not an empty folder; give the name of a new one")
 
 
 @contextmanager
