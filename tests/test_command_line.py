@@ -155,3 +155,42 @@ def test_a_pattern_stands_for_the_captures_that_it_matches(tiny_captures, tmp_pa
     odd = tmp_path / "odd[1]"  # brackets are a pattern's, and this is a name
     shutil.copytree(tiny_captures[0], odd)
     assert matching_paths([odd, "nothing/*"]) == [odd, Path("nothing/*")]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["simulate", "--out", "file/x"],
+        ["demo", "--out", "file/x"],
+        ["lab", "--out", "file/x"],
+        ["import", "CAPTURE", "--out", "file/x"],
+        ["calibrate", "CAPTURE", "--out", "file/x"],
+        ["train", "--data", "DATA", "--out", "file/x"],
+        ["finetune", "--weights", "near-frame", "--data", "DATA", "--out", "file/x"],
+        ["report", "run", "--data", "DATA", "--out", "file/x.html"],
+        ["identify", "main-near", "--out", "file/x"],
+        ["reconstruct", "CAPTURE", "--out", "file/x"],
+        ["invert", "CAPTURE", "--setup", "main-near", "--out", "file/x.png"],
+        ["track", "CAPTURE", "--out", "file/x.png"],
+        ["experiment", "simulation", "--out", "file/x"],
+        ["live", "CAPTURE", "--out", "file/x"],
+        ["events", "clip.gif", "--out", "file/x.h5"],
+        ["convert", "CAPTURE/events.raw", "file/x.h5"],
+        ["preview", "CAPTURE/events.raw", "--out", "file/x.gif"],
+        ["corner", "clip.gif", "--edge", "9", "9", "--wall", "9", "0", "--end", "0", "9", "--out", "file/x"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_where_a_result_goes_is_looked_at_before_it_is_worked_for(
+    words, tiny_captures, tiny_dataset, tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("in the way")
+    given = {"CAPTURE": str(tiny_captures[0]), "DATA": str(tiny_dataset.folder)}
+    for name, path in given.items():
+        words = [word.replace(name, path) for word in words]
+    monkeypatch.setattr(command_of(words[0]), "run", lambda self: pytest.fail("it began"))
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and said.count("\n") == 1 and "file is a file; give another place" in said

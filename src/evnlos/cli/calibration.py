@@ -21,7 +21,7 @@ from evnlos.calibration.scan.film import FilmReading
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import check_there, check_writable, drawn, say
+from evnlos.cli.parsing import check_there, drawn, say
 from evnlos.cli.recordings import Flat, Folders, Presets
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
@@ -92,7 +92,6 @@ class CalibrateCommand:
         from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
         from evnlos.plot.results import draw_calibration
 
-        check_writable(self.out)
         check_out(self.out, self.force)
         with ProgressBars() as progress:
             fit = fit_setup(self.captures, self.settings, progress)

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
 from importlib.resources import files
+from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TextIO, cast
 
@@ -31,6 +32,7 @@ from evnlos.cli.parsing import (
     PlainOutput,
     UnfitWordsError,
     check_names,
+    check_writable,
     flag_value,
     listen,
     parse,
@@ -290,11 +292,19 @@ _DECIDES = re.compile(r"--(config|setup|pixel|[\w.-]+\.kind)(=|$)")  # what deci
 
 
 def _command(verb: str, rest: list[str]) -> Any:
-    """Return the command that the words ask for."""
+    """Return the command that the words ask for.
+
+    Raises:
+        ConfigError: A word does not fit, or the result could not be written, before it is worked for.
+    """
     command = command_of(verb)
     if verb == "doctor" and set(rest) <= {"--json"}:  # the parser itself may be what is missing
         return command(json="--json" in rest)
-    return parse(command, rest, verb, _defaults(command, rest))
+    made = parse(command, rest, verb, _defaults(command, rest))
+    for one in (made, getattr(made, "settings", None)):
+        if isinstance(out := getattr(one, "out", None), Path) and not getattr(made, "dry_run", False):
+            check_writable(out)
+    return made
 
 
 def _defaults(command: type[Any], rest: list[str]) -> Any:

@@ -309,9 +309,9 @@ def check_writable(path: Path) -> None:
     while not place.exists() and place != place.parent:
         place = place.parent
     if place != path.absolute() and not place.is_dir():
-        raise ConfigError(f"{path} cannot be made: {place} is a file; give another --out")
+        raise ConfigError(f"{path} cannot be made: {place} is a file; give another place")
     if not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)) or _is_read_only(place):
-        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another --out")
+        raise ConfigError(f"{path} cannot be written: {place} is not writable; give another place")
 
 
 def _is_read_only(place: Path) -> bool:

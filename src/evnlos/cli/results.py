@@ -20,7 +20,7 @@ import tyro
 
 from evnlos.analysis.bounds import SequenceAnalysisSettings
 from evnlos.analysis.linearized import AnalysisSettings
-from evnlos.cli.parsing import check_there, check_writable, drawn, say
+from evnlos.cli.parsing import check_there, drawn, say
 from evnlos.cli.recordings import Flat, Folders, result
 from evnlos.errors import ConfigError, EvnlosError
 from evnlos.files import write_atomically
@@ -74,7 +74,6 @@ class ReconstructCommand:
         from evnlos.report import reconstruct_capture
         from evnlos.setups import calibrated_folder, load_setup
 
-        check_writable(self.out)
         folder = calibrated_folder(self.setup) if self.setup else None
         pattern = pattern_of(folder, self.pattern)
         setup = load_setup(folder) if folder else None
@@ -164,7 +163,6 @@ class TrackCommand:
         from evnlos.plot.results import draw_track
         from evnlos.tracking import track_capture, track_warnings
 
-        check_writable(self.out)
         with ProgressBars() as progress:
             with progress.stage("track", "read the capture", 0, 3):
                 capture = read_capture(self.capture, needs_events=False)
@@ -304,8 +302,6 @@ class IdentifyCommand:
             raise ConfigError(
                 f"no setup given; give a settings file, --all, or names: {', '.join(setup_names())}"
             )
-        if self.out is not None:
-            check_writable(self.out)
         setups = [named_setup(name) for name in names]
         found, limits, stages = [], {}, len(setups) * (1 + self.bounds)
         with ProgressBars() as progress:
@@ -371,7 +367,6 @@ class ReportCommand:
         from evnlos.report.tables import baselines_of
         from evnlos.setups import named_setup
 
-        check_writable(self.out)
         with ProgressBars() as progress:
             dataset, results = collect_results(list(self.runs), self.data, self.split, progress=progress)
             with progress.stage("report", "what the setup can show", 0, 2):
