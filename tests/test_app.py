@@ -148,8 +148,8 @@ def test_only_networks_of_the_package_bring_a_wall_for_recordings(app_sequence, 
 
 def test_the_verdict_tells_a_mirror_from_a_matte_wall() -> None:
     shown = [limits_of(replace(SMALL, **one).simulation()) for one in ({"roughness": 0.02}, {"wall": "matte"})]
-    assert "measured" in shown[0].wall and "memory, not a measurement" not in shown[0].wall
-    assert "memory, not a measurement" in shown[1].wall
+    assert "measured" in shown[0].wall and "not from the measurement" not in shown[0].wall
+    assert "not from the measurement" in shown[1].wall
     for one in shown:
         assert one.wall[1:] in unescape(verdict_box(one)) and "dB" in verdict_box(one)
 

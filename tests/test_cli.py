@@ -322,7 +322,7 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
     assert "EPNP sequence fusion" in shown and "E2E event" in shown and "report:" in shown
     assert "EPNP - strongest E2E" in shown and "was not fitted to this setup" in shown
     page = (tmp_path / "demo" / "report.html").read_text()
-    assert "not recordings" not in page
+    assert "Synthetic captures" not in page
     # A second call takes up what is there: nothing is made again, the table is the same.
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
     table, again = [line for line in shown.splitlines() if line.startswith("|")], capsys.readouterr().out

@@ -198,7 +198,7 @@ def test_a_sharp_setup_shows_more_than_a_matte_wall():
     assert easy.at_camera.psnr_db > matte.at_camera.psnr_db + 1 > matte.mean_db + 1
     assert easy.at_camera.patterns > easy.at_noise_std.patterns
     assert matte.at_camera.finest_m is None
-    assert "memory" in matte.verdict and "memory, not a measurement" not in easy.verdict
+    assert "training data" in matte.verdict and "not from the measurement" not in easy.verdict
     averaged = identify(setup_preset("easy"), settings=dataclasses.replace(settings, frames=100))
     assert averaged.at_camera.noise == pytest.approx(easy.at_camera.noise / 10)
     assert averaged.at_camera.patterns > easy.at_camera.patterns
@@ -237,7 +237,7 @@ def test_picard_and_picture():
     [
         ((0.005, 0.006), "strokes of 8.0 mm are measured"),
         ((0.012, 0.019), "rough shape"),
-        ((0.012, 0.021), "memory, not a measurement"),
+        ((0.012, 0.021), "not from the measurement"),
         ((None, 0.004), "lying bars down to 4.0 mm, upright ones not at all"),
         ((None, None), "no bars at all"),
     ],

@@ -97,8 +97,8 @@ def run_demo(settings: Demo) -> Path:
     if not folders:
         lab = settings.lab
         notes.append(
-            "The captures of this page are not recordings: they were rendered with a wall of rough aluminium, "
-            "cameras and noise that only calibration can tell the simulator. Give --captures for recordings."
+            "Synthetic captures: a rough aluminium wall and cameras were rendered. The simulator does not know "
+            "their parameters and has to estimate them by calibration."
         )
         notes += lab.glyphs.notes()
         with ProgressBars() as progress:

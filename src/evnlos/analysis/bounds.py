@@ -66,7 +66,7 @@ class SequenceAnalysisSettings:
     other_noises: tuple[float, ...] = (0.08, 0.02, 0.01)
     """The same, tried for the setup's own event model only."""
     other_models: bool = True
-    """Whether the event models that share the thresholds of the setup's own are asked as well."""
+    """Whether the event models that share the thresholds of the setup's own are tried as well."""
     silences: bool = False
     """Whether the time without events at the end of a pixel's record counts, as a weak row."""
     fpn_corrected: bool = True

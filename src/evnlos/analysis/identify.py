@@ -49,7 +49,7 @@ def verdict(
 
     Example:
         >>> verdict(3, (None, None), 0.008, 0.08).split(": ")[1]
-        "a legible reconstruction will be the network's memory, not a measurement."
+        'a legible reconstruction would come from the training data, not from the measurement.'
     """
     upright, lying = finest_m
     resolved = [width for width in finest_m if width is not None]
@@ -64,10 +64,10 @@ def verdict(
     if finest is not None and finest <= stroke_m:
         meaning = f"strokes of {1e3 * stroke_m:.1f} mm are measured"
     elif finest is not None and finest <= target_size_m / _SHAPE:
-        fine = f"strokes of {1e3 * stroke_m:.1f} mm"
-        meaning = f"the rough shape is measured, {fine} are not: their detail will be memory"
+        fine = f"strokes of {1e3 * stroke_m:.1f} mm are too fine for this wall"
+        meaning = f"the rough shape is measured, {fine}: their detail would come from the training data"
     else:
-        meaning = "a legible reconstruction will be the network's memory, not a measurement"
+        meaning = "a legible reconstruction would come from the training data, not from the measurement"
     return f"With this wall and noise {patterns} patterns can be distinguished, and {bars}: {meaning}."
 
 
