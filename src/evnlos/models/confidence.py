@@ -116,14 +116,14 @@ class ConfidenceReport:
         if self.agreement > self.threshold and not self.measured:
             return (
                 f"nothing measured, do not trust this reconstruction: it explains {explained:.0f} % of what "
-                f"this object adds to the frames ({100 * CONFIRMED:.0f} % are required); check distance and wall, "
-                "which may not be those of the weights or of the setup"
+                f"this object adds to the frames ({100 * CONFIRMED:.0f} % are required); check distance and "
+                "wall, which may not be those of the weights or of the setup"
             )
         if not self.measured:
             return (
                 "nothing measured, what you see is the network's guess: the two halves of the sequence "
-                f"disagree, they share {100 * max(self.agreement, 0):.0f} % of what distinguishes objects, where "
-                f"sequences without any object share up to {100 * self.threshold:.0f} %"
+                f"disagree, they share {100 * max(self.agreement, 0):.0f} % of what distinguishes objects, "
+                f"where sequences without any object share up to {100 * self.threshold:.0f} %"
             )
         frames = f", and the pictures explain {explained:.0f} % of its frames"
         if self.explained is None:
