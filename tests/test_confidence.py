@@ -17,6 +17,7 @@ from evnlos.cli import main
 from evnlos.config import load_yaml
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate_object
 from evnlos.errors import DataError
+from evnlos.machine import Step
 from evnlos.models import (
     ConfidenceReport,
     FrameOperator,
@@ -302,7 +303,10 @@ def test_reconstruct_and_evaluate_say_what_the_pictures_are_worth(
     main(["evaluate", "--weights", str(tmp_path / "w.safetensors"), "--data", str(tiny_dataset.folder)])
     assert "confidence: support" in capsys.readouterr().out
     out = tmp_path / "out"
-    found = reconstruct_capture(tiny_captures[0], tmp_path / "w.safetensors", out, setup=lab_setup().setup)
+    steps = list[Step]()
+    known = {"setup": lab_setup().setup, "progress": steps.append}
+    found = reconstruct_capture(tiny_captures[0], tmp_path / "w.safetensors", out, **known)
+    assert [(one.done, one.total) for one in steps] == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert set(found["confidence"]) == {"support", "agreement", "threshold", "measured", "verdict", "explained"}
     low, high = np.load(out / "interval.npy")
     shown = np.load(out / "reconstruction.npy")

@@ -77,11 +77,9 @@ class ReconstructCommand:
         folder = calibrated_folder(self.setup) if self.setup else None
         pattern = pattern_of(folder, self.pattern)
         setup = load_setup(folder) if folder else None
-        stages = "follow the target, reconstruct" if self.track else "reconstruct, compare with the wall"
-        with ProgressBars() as progress, progress.stage(f"reconstruct {self.capture.name}", stages):
-            found = reconstruct_capture(
-                self.capture, self.weights, self.out, pattern=pattern, setup=setup, track=self.track
-            )
+        known = {"pattern": pattern, "setup": setup, "track": self.track}
+        with ProgressBars() as progress:
+            found = reconstruct_capture(self.capture, self.weights, self.out, **known, progress=progress)
         for warning in found.get("warnings", []):
             say(f"warning: {warning}")
         if self.json:
@@ -120,8 +118,7 @@ def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool) -> N
             if capture is None:
                 names = [name for name in lab.glyphs.objects() if name.endswith("_S")]
                 capture = render_captures(lab, demo / "captures", names, 1, progress, force)[0]
-            with progress.stage("first reconstruction", capture.name):
-                found = reconstruct_capture(capture, None, out)
+            found = reconstruct_capture(capture, None, out, progress=progress)
     except EvnlosError as error:
         say(f"note: no first reconstruction: {error}")
         return

@@ -31,6 +31,7 @@ from evnlos.data import FixedPattern, read_capture
 from evnlos.data.sampling import Samples, Sampling
 from evnlos.events.volume import OFF_RGB, ON_RGB, WORDS
 from evnlos.files import check_folder, new_folder, write_atomically
+from evnlos.machine import Progress, Step, silent
 from evnlos.models import ConfidenceReport, published_for
 from evnlos.setups import Setup
 
@@ -184,6 +185,7 @@ def reconstruct_capture(
     pattern: FixedPattern | None = None,
     setup: Setup | None = None,
     track: bool = False,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Reconstruct all positions of a capture and write them as pictures.
 
@@ -191,17 +193,15 @@ def reconstruct_capture(
     surface, reconstruction and, where known, truth, side by side) and `reconstruction.npy` (float32
     [N, H, W], 0..1). Where the weights hold a confidence and the motion is known, also
     `interval.npy` (the ends of each pixel's interval, float32 [2, N, H, W]) and `unsure.png`, a strip of the
-    intervals' lengths (black is sure, white is anything). `result.png` is one labelled picture of it all (wall,
-    events, reconstruction, interval, truth where known, path, and what it means in words), `summary.json` what
-    this returns.
+    intervals' lengths (black is sure, white is anything). `result.png` shows it all, with labels and in words;
+    `summary.json` holds what this returns.
 
     Args:
         capture: A capture folder; its target may be unknown.
         weights: A weights file, a run's folder or a name of `published`; None: the published weights for frames
             (for events where there are no frames) of the setup whose distance is nearest, of whole sequences
             where the motion is known or found.
-        out: The folder for the pictures; must not exist or be empty. It is there with all of them, or
-            not at all.
+        out: The folder for the pictures, new or empty; it is there with all of them, or not at all.
         zoom: Size of a pixel in the pictures.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
         setup: The calibrated setup; the pictures are then moved to where the wall agrees with the frames, if
@@ -209,15 +209,15 @@ def reconstruct_capture(
             Without one, that is told by the setup of published weights, and the pictures stay.
         track: Find the motion in the recording with the setup, also where it is stated; the truth, where it is
             known, stays where the capture states it.
+        progress: Called at each of three stages, and at the end.
 
     Returns:
         Capture, weights, modality, number of positions, and whether all of them show one picture, which was
         made from the whole recording and is drawn where the motion was stated or found; where the truth is
         known, the mean scores; where it can be told, the confidence: support, threshold, measured, verdict and,
-        where a setup is known, explained;
-        else no_confidence, which says why. Where the frames were brought to the light that the weights know,
-        brought_from, the capture's in that. With a setup also `light`, the capture's brightness in that of the
-        setup, and whether the pictures were moved; with `track` the warnings of the track.
+        where a setup is known, explained; else no_confidence, which says why. Where the frames were brought to
+        the light that the weights know, brought_from. With a setup also `light`, the capture's brightness in
+        that of the setup, and whether the pictures were moved; with `track` the warnings of the track.
 
     Raises:
         ConfigError: `track` without a setup.
@@ -227,6 +227,8 @@ def reconstruct_capture(
     out = Path(out)
     if track:
         setup_for_track(setup)  # before anything is read
+    what = f"reconstruct {Path(capture).name}"
+    progress(Step(what, 0, 3, "stages", within="read the capture"))
     recording = read_capture(capture, needs_frames=False, needs_events=False)
     if weights is None:
         distance_m = recording.distance_m or (None if setup is None else setup.default_distance_m)
@@ -235,20 +237,19 @@ def reconstruct_capture(
     model = load_model(weights)
     sampling = model.weights.sampling
     check_folder(out)
+    progress(Step(what, 1, 3, "stages", within="reconstruct, compare with the wall"))
     made = model.reconstruct(recording, setup, pattern, track)
     images, samples, confidence = made.images, made.samples, made.confidence
     pictures = [grey(image) for image in images]
-    is_one = model.weights.network.sees_sequence
+    progress(Step(what, 2, 3, "stages", within="draw, ask what the wall allows"))
     with new_folder(out) as draft:
         for k, picture in enumerate(pictures):
             save_png(draft / f"position_{k:02d}.png", picture, zoom)
         save_png(draft / "strip.png", strip(pictures), 2)
         shown = []
         for k, picture in enumerate(pictures):
-            row = [stretched(samples.frame[k]), polarity(samples.surface[k]), picture]
-            if samples.truth is not None:
-                row.append(grey(samples.truth[k]))
-            shown.append(strip(row, columns=4))
+            seen = [stretched(samples.frame[k]), polarity(samples.surface[k]), picture]
+            shown.append(strip(seen + ([] if samples.truth is None else [grey(samples.truth[k])]), columns=4))
         rate_hz = 1e6 / float(np.median(np.diff(recording.frame_times_us)))
         save_animation(draft / "animation.gif", shown, rate_hz, 2)
         write_atomically(draft / "reconstruction.npy", _npy(images.numpy()))
@@ -257,7 +258,7 @@ def reconstruct_capture(
             "weights": str(weights),
             "modality": model.weights.modality.name,
             "positions": len(pictures),
-            "one_picture": is_one,
+            "one_picture": model.weights.network.sees_sequence,
         }
         if made.light is not None:
             found |= {"light": round(made.light, 4), "moved_by_the_setup": made.is_moved}
@@ -265,14 +266,12 @@ def reconstruct_capture(
             found["brought_from"] = made.brought_from
         if confidence is not None:
             save_png(draft / "unsure.png", strip([grey(one) for one in confidence.high - confidence.low]), 2)
-            write_atomically(
-                draft / "interval.npy", _npy(torch.stack([confidence.low, confidence.high]).numpy())
-            )
+            ends = torch.stack([confidence.low, confidence.high]).numpy()
+            write_atomically(draft / "interval.npy", _npy(ends))
             found["confidence"] = confidence_values(confidence)
         else:
             found["no_confidence"] = made.no_confidence
-        if track:
-            found["warnings"] = made.warnings
+        found |= {"warnings": made.warnings} if track else {}
         if samples.truth is not None:
             truth = torch.from_numpy(samples.truth)[:, sampling.scored].contiguous()
             found["scores"] = score(images[:, sampling.scored].contiguous(), truth).mean()
@@ -282,6 +281,7 @@ def reconstruct_capture(
         sheet = result_sheet(title, images.numpy(), samples, sampling, confidence, found["in_words"])
         save_png(draft / "result.png", sheet)
         write_atomically(draft / "summary.json", (json.dumps(found, indent=2) + "\n").encode())
+    progress(Step(what, 3, 3, "stages"))
     return found
 
 
