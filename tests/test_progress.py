@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 import time
 
 import numpy as np
@@ -156,7 +155,7 @@ def test_networks_at_work_are_told_with_their_epochs(tmp_path) -> None:
 def test_invert_tells_its_captures_and_its_solvers(tiny_captures, tmp_path, capsys) -> None:
     words = ["invert", str(tiny_captures[0]), "--setup", "main-near", "--cells", "8", "--columns", "16"]
     for more, told in (
-        (["--positions", "2"], "invert: 0 of 1 motions"),
+        (["--positions", "2"], "invert: 0 of 1 motions (light path of the setup)"),
         (["--from", "frames"], "invert: 0 of 1"),
     ):
         main([*words, *more, "--progress", "lines", "--out", str(tmp_path / "i.png")])
@@ -173,9 +172,9 @@ def test_the_demo_shows_a_first_reconstruction_with_published_weights(tmp_path, 
     assert (tmp_path / "demo" / "first" / "summary.json").is_file() and "lab_S by near-frame-sequence" in shown
     assert [path.name for path in (tmp_path / "demo" / "captures").glob("lab_*")] == ["lab_S"]
     main(words)
-    main(["demo", "--out", str(tmp_path / "wrong"), "--captures", str(tmp_path / "nowhere"), "--quiet"])
-    assert capsys.readouterr().out == "" and not (tmp_path / "wrong").exists()  # once; and the demo refuses
-    assert len(later) == 3
+    with pytest.raises(SystemExit):
+        main(["demo", "--out", str(tmp_path / "wrong"), "--captures", str(tmp_path / "nowhere"), "--quiet"])
+    assert capsys.readouterr().out == "" and not (tmp_path / "wrong").exists() and len(later) == 2
 
 
 def test_evaluate_tells_its_stages(tiny_dataset) -> None:
@@ -184,13 +183,3 @@ def test_evaluate_tells_its_stages(tiny_dataset) -> None:
     evaluate(Weights(network), tiny_dataset, "all", progress=steps.append)
     assert [one.done for one in steps] == [0, 1, 2, 3] and {one.total for one in steps} == {3}
     assert [one.within for one in steps][1:3] == ["scores and baselines", "confidence"]
-
-
-def test_a_result_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys) -> None:
-    (tmp_path / "file").touch()
-    for words in (["track", "no"], ["reconstruct", "no"], ["identify", "main-near"], ["calibrate", "no"]):
-        began = time.monotonic()
-        with pytest.raises(SystemExit):
-            main([*words, "--out", str(tmp_path / "file" / "below")])
-        assert "is a file; give another --out" in capsys.readouterr().err
-        assert time.monotonic() - began < 5, sys.argv

@@ -105,6 +105,7 @@ def invert_captures(
     for done, (motion, members) in enumerate(counted(groups, progress, "invert", total, "motions")):
         size = _target_size_m(captures[members[0]], _is_tracked(captures[members[0]], options))
         target_plane = Plane(options.cells, options.cells, size / options.cells)
+        progress(Step("invert", done, total, "motions", within="light path of the setup"))
         transport = matrix_of(setup.resized((height, width)).operator(strip_of(motion, target_plane), shape))
         gram = strip_gram_of(transport)
         for count in options.positions or (len(motion),):
