@@ -352,6 +352,8 @@ def test_all_say_the_same_of_a_setup_and_of_a_recording(default_capture, tmp_pat
     assert found["verdict"]["wall"] == limits.wall and found["verdict"]["recording"] == report.verdict
     assert found["confidence"]["verdict"] == report.verdict
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["verdict"] == found["verdict"]
+    assert found["one_picture"] and found["positions"] > 1  # one image, one file of it
+    assert len(list((tmp_path / "out").glob("position_*.png"))) == 1
     assert [one for one in found["verdict"].values() if one not in found["in_words"]] == []
     meaning = limits.wall.partition(", ")[2]
     page = unescape(verdict_box(limits))

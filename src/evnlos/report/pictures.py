@@ -189,12 +189,10 @@ def reconstruct_capture(
 ) -> dict[str, Any]:
     """Reconstruct all positions of a capture and write them as pictures.
 
-    Writes `position_00.png` and on, `strip.png` (rows of positions), `animation.gif` (wall frame,
-    surface, reconstruction and, where known, truth, side by side) and `reconstruction.npy` (float32
-    [N, H, W], 0..1). Where the weights hold a confidence and the motion is known, also
-    `interval.npy` (the ends of each pixel's interval, float32 [2, N, H, W]) and `unsure.png`, a strip of the
-    intervals' lengths (black is sure, white is anything). `result.png` shows it all, with labels and in words;
-    `summary.json` holds what this returns.
+    Writes `position_00.png` and on, `strip.png`, `animation.gif` (frame, surface, image, truth if known) and
+    `reconstruction.npy` (float32 [N, H, W], 0..1). Where the weights hold a confidence and the motion is known,
+    also `interval.npy` (ends of the intervals, float32 [2, N, H, W]) and `unsure.png` (their lengths). Where
+    all positions show one image, that in the middle stands for them. `result.png` shows all, in words, too.
 
     Args:
         capture: A capture folder; its target may be unknown.
@@ -205,8 +203,7 @@ def reconstruct_capture(
         zoom: Size of a pixel in the pictures.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
         setup: The calibrated setup; the pictures are then moved to where the wall agrees with the frames, if
-            these are as bright as it makes them, and the confidence says how much of the frames they explain.
-            Without one, that is told by the setup of published weights, and the pictures stay.
+            these are as bright as it makes them. Without one, the setup of published weights explains them.
         track: Find the motion in the recording with the setup, also where it is stated; the truth, where it is
             known, stays where the capture states it.
         progress: Called at each of three stages, and at the end.
@@ -240,12 +237,13 @@ def reconstruct_capture(
     progress(Step(what, 1, 3, "stages", within="reconstruct, compare with the wall"))
     made = model.reconstruct(recording, setup, pattern, track)
     images, samples, confidence = made.images, made.samples, made.confidence
-    pictures = [grey(image) for image in images]
+    pictures, once = [grey(image) for image in images], model.weights.network.sees_sequence
+    own = slice(len(pictures) // 2, len(pictures) // 2 + 1) if once else slice(None)  # no copies of others
     progress(Step(what, 2, 3, "stages", within="draw, ask what the wall allows"))
     with new_folder(out) as draft:
-        for k, picture in enumerate(pictures):
-            save_png(draft / f"position_{k:02d}.png", picture, zoom)
-        save_png(draft / "strip.png", strip(pictures), 2)
+        for k in range(len(pictures))[own]:
+            save_png(draft / f"position_{k:02d}.png", pictures[k], zoom)
+        save_png(draft / "strip.png", strip(pictures[own]), 2)
         shown = []
         for k, picture in enumerate(pictures):
             seen = [stretched(samples.frame[k]), polarity(samples.surface[k]), picture]
@@ -258,14 +256,16 @@ def reconstruct_capture(
             "weights": str(weights),
             "modality": model.weights.modality.name,
             "positions": len(pictures),
-            "one_picture": model.weights.network.sees_sequence,
+            "one_picture": once,
         }
         if made.light is not None:
             found |= {"light": round(made.light, 4), "moved_by_the_setup": made.is_moved}
         if made.brought_from is not None:
             found["brought_from"] = made.brought_from
         if confidence is not None:
-            save_png(draft / "unsure.png", strip([grey(one) for one in confidence.high - confidence.low]), 2)
+            save_png(
+                draft / "unsure.png", strip([grey(one) for one in (confidence.high - confidence.low)[own]]), 2
+            )
             ends = torch.stack([confidence.low, confidence.high]).numpy()
             write_atomically(draft / "interval.npy", _npy(ends))
             found["confidence"] = confidence_values(confidence)
