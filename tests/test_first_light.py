@@ -198,8 +198,15 @@ def test_half_a_film_is_refused(
 
 def test_a_scan_without_a_show_is_refused(tmp_path: Path) -> None:
     write_plan(replace(PLAN, show="pictures", targets=""), tmp_path / "tray")
-    for path, found in ((tmp_path / "nowhere", "does not exist"), (Path(__file__), "is not a folder")):
-        with pytest.raises(ConfigError, match=f"{path} {found}; give the folder that `evnlos scan plan` made"):
+    cases = (
+        (tmp_path / "nowhere", "does not exist"),
+        (Path(__file__), "is not a folder"),
+        (tmp_path, "holds no"),
+    )
+    for path, found in cases:
+        with pytest.raises(
+            ConfigError, match=f"{path} {found}.*; give the folder that `evnlos scan plan` made"
+        ):
             import_film(path, tmp_path / "film.mp4")
     with pytest.raises(ConfigError, match=r"holds no show\.yaml.*--show page"):
         import_film(tmp_path / "tray", tmp_path / "film.mp4")

@@ -247,10 +247,12 @@ def read_scan_info(folder: str | Path) -> ScanInfo:
     Raises:
         ConfigError: Folder or file is missing, or it has an unknown key, a wrong type or a value out of range.
     """
-    if not Path(folder).is_dir():
+    path = Path(folder) / SCAN_FILE
+    if not path.is_file():
         what = "is not a folder" if Path(folder).exists() else "does not exist"
+        what = f"holds no {SCAN_FILE}" if Path(folder).is_dir() else what
         raise ConfigError(f"{folder} {what}; give the folder that `evnlos scan plan` made")
-    return load_yaml(ScanInfo, Path(folder) / SCAN_FILE)
+    return load_yaml(ScanInfo, path)
 
 
 def write_scan_frames(path: Path, scan_frames: list[ScanFrame]) -> None:
