@@ -1,8 +1,9 @@
-"""How fast do event files become arrays, next to other Python packages, on one thread?
+"""How fast do event files become arrays, next to the public readers of each format, on one thread?
 
-Writes the files that it reads, interleaves the packages, prints millions of events per second of processor time
-(median of the rounds) and the ratio to each rival (median of the ratios within a round). Rivals are optional:
-those that cannot be imported (pip install evutils faery expelliarmus evlib) are left out.
+Writes the files that it reads, interleaves the readers, and prints millions of events per second of processor
+time (medians of the rounds) and how many times as fast as the fastest other reader evnlos is: the median of the
+ratios within a round, and the ratio of the best rounds. Rivals are optional: those that cannot be imported (pip
+install evutils faery expelliarmus evlib rosbags mcap evt3 aedat dv) are left out, as are those that fail.
 
     python benchmarks/event_files.py
     python benchmarks/event_files.py --events 3000000 --rounds 5 --only CeleX
@@ -12,7 +13,6 @@ those that cannot be imported (pip install evutils faery expelliarmus evlib) are
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
 import statistics
 import tempfile
@@ -66,6 +66,14 @@ def write_dat(path: Path, events: Events) -> None:
     words[:, 0] = events.t_us
     words[:, 1] = events.x | events.y.astype(np.uint32) << 14 | events.p.astype(np.uint32) << 28
     path.write_bytes(head + bytes([12, 8]) + words.tobytes())
+
+
+def write_legacy(path: Path, source: Path) -> None:
+    """Write an EVT2.1 file with the halves of its words exchanged, the order that evutils reads."""
+    data = source.read_bytes()
+    at = data.index(b"% end\n") + 6
+    halves = np.frombuffer(data[at:], "<u4").reshape(-1, 2)[:, ::-1]
+    path.write_bytes(data[:at].replace(b"endianness=little", b"endianness=legacy") + halves.tobytes())
 
 
 def celex_events(count: int, seed: int = 0) -> Events:
@@ -147,55 +155,77 @@ def files(folder: Path, count: int) -> Iterator[tuple[str, Path, int]]:
             path = folder / f"{stream}_{name}{'.h5' if name == 'HDF5' else '.raw'}"
             write_events(path, events, format=name)
             yield f"{name} {stream}", path, len(events)
+            if name == "EVT21":
+                write_legacy(folder / f"{stream}_legacy.raw", path)
+                yield f"EVT21 {stream}, legacy order", folder / f"{stream}_legacy.raw", len(events)
         if stream == "uniform":
             write_dat(folder / "uniform_DAT.dat", events)
             yield "DAT uniform", folder / "uniform_DAT.dat", len(events)
+
+
+def tables(folder: Path, count: int) -> Iterator[tuple[str, Path, int, dict[str, Callable[[Path], object]]]]:
+    """Yield title, file, number of events and readers of each line of the table."""
+    import recordings
+
+    rivals = rival_readers()
+    for title, path, many in files(folder, count):
+        yield title, path, many, rivals
+    for title, path, many, names in recordings.files(folder, count):
+        yield title, path, many, recordings.readers(names, many)
     celex = celex_events(count)
     write_events(folder / "rows_EI_100M.bin", celex)
-    yield "CeleX 1 rows", folder / "rows_EI_100M.bin", len(celex)
+    # no rival reads it: beside our own EVT2 in the same rounds
+    evt2 = {"evnlos, EVT2": lambda _: read_events(folder / "rows_EVT2.raw")}
+    yield "CeleX 1 rows", folder / "rows_EI_100M.bin", len(celex), evt2
+
+
+def line_of(title: str, path: Path, count: int, times: dict[str, list[float]]) -> str:
+    """Return a line of the table: the fastest other reader, and the rest."""
+    speeds = {name: count / statistics.median(taken) / 1e6 for name, taken in times.items()}
+    others = sorted((name for name in speeds if name != "evnlos"), key=lambda name: -speeds[name])
+    ours, cells = times["evnlos"], [title, f"{path.stat().st_size / count:.2f}", f"{speeds['evnlos']:.0f}"]
+    if others:
+        first = times[others[0]]
+        cells += [f"{others[0]} {speeds[others[0]]:.0f}", f"{ratio(ours, first):.2f}"]
+        cells += [
+            f"{min(first) / min(ours):.2f}",
+            ", ".join(f"{name} {speeds[name]:.0f}" for name in others[1:]),
+        ]
+    else:
+        cells += ["none reads it", "-", "-", ""]
+    return f"| {' | '.join(cells)} |"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--events", type=int, default=10_000_000)
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--only", default="", help="rows whose name holds this, and EVT2 rows for CeleX-V")
+    parser.add_argument("--only", default="", help="lines whose title holds this")
     parser.add_argument("--write", help="file for the table")
     arguments = parser.parse_args()
-    readers = {"evnlos": read_events} | rival_readers()
     lines = [
         "# Event files",
         "",
-        f"{arguments.events:,} events, one thread, processor time, medians of {arguments.rounds} interleaved "
-        "rounds; millions of events per second.",
+        f"{arguments.events:,} events (ECF: 524,288), one thread, processor time, medians of "
+        f"{arguments.rounds} interleaved rounds; millions of events per second.",
         "",
-        machine("numpy", "evutils", "faery", "expelliarmus", "evlib"),
+        machine(
+            *["numpy", "evutils", "faery", "expelliarmus", "evlib", "rosbags", "mcap", "evt3", "aedat", "dv"]
+        ),
         "",
-        f"| file | bytes per event | {' | '.join(readers)} | ratios |\n|---|---|{'---|' * len(readers)}---|",
+        "| file | bytes per event | evnlos | fastest other | times as fast | best rounds | other readers |",
+        "|---|---|---|---|---|---|---|",
     ]
     print("\n".join(lines))
     with tempfile.TemporaryDirectory() as folder:
-        evt2 = Path(folder) / "rows_EVT2.raw"
-        for title, path, count in files(Path(folder), arguments.events):
+        for title, path, count, rivals in tables(Path(folder), arguments.events):
             if arguments.only.lower() not in title.lower():
                 continue
-            chosen = readers
-            if title.startswith("CeleX"):  # no rival reads it: beside our own EVT2 in the same rounds
-                chosen = {"evnlos": read_events, "evnlos EVT2": lambda _: read_events(evt2)}
-            times = measure(path, chosen, arguments.rounds, count)
-            speeds = {name: count / statistics.median(taken) / 1e6 for name, taken in times.items()}
-            cells = " | ".join(f"{speeds[name]:.0f}" if name in speeds else "-" for name in readers)
-            ratios = [
-                f"{ratio(times['evnlos'], times[name]):.2f} x {name}" for name in times if name != "evnlos"
-            ]
-            lines.append(f"| {title} | {path.stat().st_size / count:.2f} | {cells} | {', '.join(ratios)} |")
+            times = measure(path, {"evnlos": read_events} | rivals, arguments.rounds, count)
+            lines.append(line_of(title, path, count, times))
             print(lines[-1], flush=True)
     if arguments.write:
         Path(arguments.write).write_text("\n".join(lines) + "\n")
-
-
-def installed(name: str) -> bool:
-    return importlib.util.find_spec(name) is not None
 
 
 if __name__ == "__main__":

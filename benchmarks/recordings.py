@@ -1,23 +1,15 @@
-"""How fast do ROS bags, Prophesee's HDF5 (ECF) and AEDAT become arrays, next to public readers, on one thread?
+"""ROS bags, Prophesee's HDF5 (ECF) and AEDAT, and their public readers, for the table of `event_files.py`.
 
-Writes the files that it reads, interleaves the readers, and prints millions of events per second of processor
-time and the ratio to each rival (medians over the rounds). `rosbags` and `mcap` stop at the message: what they
-hand over is decoded by the package `evt3` or by NumPy (mono), as their users must. Rivals are optional: those
-that cannot be imported (pip install rosbags mcap evt3 evlib evutils dv) are left out.
-
-    python benchmarks/recordings.py
-    python benchmarks/recordings.py --write benchmarks/results/recordings.md
+`rosbags` and `mcap` stop at the message: what they hand over is decoded by the package `evt3` or by NumPy
+(mono), as their users must.
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
-import statistics
 import struct
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -35,10 +27,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import numpy as np  # noqa: E402
 
 from ecf_files import write_ecf  # noqa: E402
-from event_files import measure, ratio, rows  # noqa: E402
-from evnlos.events import read_events, write_events  # noqa: E402
+from event_files import rows  # noqa: E402
+from evnlos.events import write_events  # noqa: E402
 from evnlos.types import Events  # noqa: E402
-from machine import machine  # noqa: E402
 from ros_files import PACKET, Cdr, Recording, Ros1, mono, packet, write_bag, write_db3, write_mcap  # noqa: E402
 
 _PACKET_BYTES = 1 << 15
@@ -152,6 +143,17 @@ RIVALS: dict[str, Callable[[int], Reader]] = {
 }  # fmt: skip
 
 
+def readers(names: tuple[str, ...], count: int) -> dict[str, Reader]:
+    """Return those of the named readers that can be imported."""
+    found: dict[str, Reader] = {}
+    for name in names:
+        try:
+            found[name] = RIVALS[name](count)
+        except ImportError as error:
+            print(f"    {name}: {error}")
+    return found
+
+
 def evt3_messages(folder: Path, events: Events, make: type[Cdr]) -> Recording:
     write_events(folder / "words.raw", events)
     data = (folder / "words.raw").read_bytes()
@@ -206,7 +208,9 @@ def files(folder: Path, count: int) -> Iterator[tuple[str, Path, int, tuple[str,
     cdr = evt3_messages(folder, events, Cdr)
     bag2 = folder / "bag2"  # rosbags wants a folder with metadata.yaml
     bag2.mkdir()
-    yield "ROS 2 .db3, evt3", write_db3(bag2 / "a.db3", cdr), count, ("rosbags",)
+    write_db3(bag2 / "a.db3", cdr)
+    metadata(bag2 / "a.db3", len(cdr))
+    yield "ROS 2 .db3, evt3", bag2 / "a.db3", count, ("rosbags",)
     yield (
         "ROS 1 .bag, evt3",
         write_bag(folder / "a.bag", evt3_messages(folder, events, Ros1), per_chunk=24),
@@ -241,49 +245,3 @@ def metadata(path: Path, count: int) -> None:
         f"  topics_with_message_count: [{{topic_metadata: {topic}, message_count: {count}}}]\n"
         "  compression_format: ''\n  compression_mode: ''\n"
     )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--events", type=int, default=4_000_000)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--only", default="", help="rows whose name holds this")
-    parser.add_argument("--write", help="file for the table")
-    arguments = parser.parse_args()
-    lines = [
-        "# ROS bags, ECF and AEDAT",
-        "",
-        f"{arguments.events:,} events (ECF: {1 << 19:,}), one thread, processor time, medians of "
-        f"{arguments.rounds} interleaved rounds; millions of events per second.",
-        "",
-        machine("numpy", *RIVALS),
-        "",
-        "| file | bytes per event | evnlos | rivals | ratios |\n|---|---|---|---|---|",
-    ]
-    print("\n".join(lines))
-    with tempfile.TemporaryDirectory() as folder:
-        for title, path, count, names in files(Path(folder), arguments.events):
-            if arguments.only.lower() not in title.lower():
-                continue
-            if path.suffix == ".db3":
-                metadata(path, -(-path.stat().st_size // _PACKET_BYTES))
-            readers: dict[str, Reader] = {"evnlos": read_events}
-            for name in names:
-                try:
-                    readers[name] = RIVALS[name](count)
-                except ImportError as error:
-                    print(f"    {name}: {error}")
-            times = measure(path, readers, arguments.rounds, count)
-            speeds = {name: count / statistics.median(taken) / 1e6 for name, taken in times.items()}
-            others = [name for name in names if name in speeds]
-            cells = ", ".join(f"{name} {speeds[name]:.1f}" for name in others) or "none reads it"
-            ratios = ", ".join(f"{ratio(times['evnlos'], times[name]):.2f} x {name}" for name in others) or "-"
-            size = path.stat().st_size / count
-            lines.append(f"| {title} | {size:.2f} | {speeds['evnlos']:.1f} | {cells} | {ratios} |")
-            print(lines[-1], flush=True)
-    if arguments.write:
-        Path(arguments.write).write_text("\n".join(lines) + "\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -37,9 +37,8 @@ _NO_EVENT = np.uint32(0x20000000)  # words of events are below
 _GROUP = 16  # words that are looked at together
 _MASKS = 1024  # words of EVT2.1 that are decoded at once
 
-# Of each byte of a mask: how many bits it has, and where they are, as a column stands in a word.
+# Of each byte of a mask: where its bits are, as a column stands in a word.
 _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")
-_COUNTS = _BITS.sum(1).astype(np.uint8)
 _COLUMNS = (np.argsort(1 - _BITS, axis=1, kind="stable") << 11).astype(np.uint32)
 
 
@@ -192,14 +191,44 @@ def looks_swapped(words: NDArray[np.int64]) -> bool:
     return bool(((words[0] >> 28) & 15) == 8 and ((words[0] >> 60) & 15) != 8)
 
 
-def bound_evt21(words: NDArray[np.int64]) -> int:
+def _bit_count(_, mask):
+    """Return how many bits of `mask` are set."""
+
+    def generate(_, builder, signature, arguments):
+        return builder.ctpop(arguments[0])
+
+    return mask(mask), generate
+
+
+def _zeros_below(_, mask):
+    """Return how many bits are below the lowest one of `mask` that is set."""
+
+    def generate(_, builder, signature, arguments):
+        return builder.cttz(arguments[0], Constant(IntType(1), 0))
+
+    return mask(mask), generate
+
+
+_count_bits: Any = intrinsic(_bit_count)  # (mask)
+_count_below: Any = intrinsic(_zeros_below)  # (mask)
+
+
+@njit(cache=True)
+def bound_evt21(words):
     """Return how many events `words` can hold at most."""
-    return int(np.bitwise_count(words & 0xFFFFFFFF).sum())
+    count = np.int64(0)
+    for index in range(len(words)):
+        count += np.int64(_count_bits(np.uint32(words[index])))
+    return count
 
 
-def bound_evt21_swapped(words: NDArray[np.int64]) -> int:
+@njit(cache=True)
+def bound_evt21_swapped(words):
     """Return how many events `words` can hold at most when the fields lie in their low halves."""
-    return int(np.bitwise_count((words >> 32) & 0xFFFFFFFF).sum())
+    count = np.int64(0)
+    for index in range(len(words)):
+        count += np.int64(_count_bits(np.uint32(words[index] >> 32)))
+    return count
 
 
 @njit(cache=True)
@@ -258,18 +287,6 @@ def _decode_masks_carefully(words, first, state, t_us, x, y, p, width, height, s
     return count
 
 
-def _count_below(_, mask):
-    """Return how many bits are below the lowest one of `mask` that is set."""
-
-    def generate(_, builder, signature, arguments):
-        return builder.cttz(arguments[0], Constant(IntType(1), 0))
-
-    return mask(mask), generate
-
-
-_place_of_lowest: Any = intrinsic(_count_below)  # (mask)
-
-
 @njit(cache=True)
 def _spread(halves, swapped, events):
     """Write one word of EVT2 for each bit of each mask, and every other word as it is; return how many.
@@ -289,14 +306,14 @@ def _spread(halves, swapped, events):
             is_unusual |= mask == 0 or (fields & np.uint32(0x3FF800)) > np.uint32(2016 << 11)
         if mask & np.uint32(mask - np.uint32(1)):
             for _ in range(4):
-                byte = mask & np.uint32(0xFF)
+                byte = np.uint32(mask & np.uint32(0xFF))
                 for place in range(np.uint64(8)):
                     events[count + place] = fields + _COLUMNS[byte, place]
-                count += np.uint64(_COUNTS[byte])
+                count += np.uint64(_count_bits(byte))
                 fields += np.uint32(8 << 11)
                 mask >>= np.uint32(8)
         else:
-            events[count] = fields + (_place_of_lowest(mask) << np.uint32(11))
+            events[count] = fields + (_count_below(mask) << np.uint32(11))
             count += np.uint64(1)
     return np.int64(-1) if is_unusual else np.int64(count)
 
