@@ -249,6 +249,21 @@ def test_faults_of_a_db3_name_the_message(tmp_path):
     assert len(found) == 30 and "message 3: " in report.first["left_over"]
 
 
+def test_a_topic_whose_sensor_changes_is_an_error(tmp_path):
+    """Two sensors in one topic are two cameras, or damage."""
+    sizes = (64, 48), (64, 48), (32, 24)
+    words = mono([5_000, 7_000], [3, 31], [2, 20], [1, 0])
+    messages = [
+        ("/e", PACKET, k, packet(words, seq=k, base_ns=k * 10**6, size=size)) for k, size in enumerate(sizes)
+    ]
+    path = write_mcap(tmp_path / "a.mcap", messages)
+    with pytest.raises(EventFileError, match="a packet of 32 x 24 pixels after one of 64 x 48; give width="):
+        read_events(path)
+    found, report = read_events_report(path)
+    assert len(found) == 6 and report.faults == {"header": 1}
+    assert len(read_events(path, width=64, height=48)) == 6
+
+
 def test_a_db3_that_was_cut_is_an_error(tmp_path, shared_data):
     """SQLite takes missing bytes of the last page for zeros: three of them would cost an event unsaid."""
     path = tmp_path / "a.db3"

@@ -128,6 +128,7 @@ class RosSource:
             if parsed is None:
                 continue
             place[0] = message.offset
+            self._compare_size(parsed, message.offset)
             if isinstance(parsed, EventArray):
                 yield from self._columns(message, parsed, check)
             elif parsed.encoding == "trigger":
@@ -138,6 +139,14 @@ class RosSource:
                 words.follow(parsed.seq, message.offset)
                 yield from self._columns(message, parsed, check)
         yield from words.decoded()
+
+    def _compare_size(self, parsed: Packet | EventArray, offset: int) -> None:
+        """Report a packet whose sensor is another one than the first packet's."""
+        sides, first = (parsed.width, parsed.height), (self.report.width, self.report.height)
+        is_told = isinstance(parsed, EventArray) or parsed.encoding != "trigger"
+        if is_told and self.report.geometry_from == "header" and sides != first:
+            found = f"a packet of {sides[0]} x {sides[1]} pixels after one of {first[0]} x {first[1]}"
+            self.report.fault("header", offset, found, f"give width= and height=, or {SALVAGE}")
 
     def _columns(self, message: Message, parsed: Packet | EventArray, check: ColumnCheck) -> Iterator[Columns]:
         unknown = 0
