@@ -11,7 +11,7 @@ import pytest
 
 from evnlos.cli import main
 from evnlos.data import CaptureInfo, open_dataset, read_capture
-from evnlos.data.capture_check import _offset, check_capture
+from evnlos.data.capture_check import Finding, _offset, check_capture
 from evnlos.data.capture_info import CAMERAS, AlignmentInfo, CameraInfo, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
 from evnlos.data.lab import Lab, render_captures
@@ -55,6 +55,26 @@ def test_a_target_that_did_not_move_is_named(capture) -> None:
     still = (100 + 3 * draw.standard_normal(capture.frames.shape)).astype(np.uint8)
     found = levels(replace(capture, frames=still))
     assert found["movement"] == "bad" and found["wall contrast"] == "bad" and "region" not in found
+
+
+def test_a_motion_that_is_not_that_of_the_light_is_named(capture) -> None:
+    """The light goes where the target goes; how far, only the setup tells."""
+
+    def found(**changes) -> Finding:
+        motion = replace(capture.info.motion, **changes)
+        one = replace(capture, info=replace(capture.info, motion=motion))
+        return next(one for one in check_capture(one) if one.what == "motion")
+
+    assert found(speed_m_s=0.03).level == "good"
+    for direction, level in (((-1.0, 0.0), "bad"), ((0.0, 1.0), "bad"), ((0.87, 0.5), "doubtful")):
+        assert found(direction=direction).level == level
+    backwards = found(speed_m_s=-0.02)
+    assert (
+        backwards.level == "bad" and "speed_m_s is -0.02" in backwards.found and "direction" in backwards.cure
+    )
+    stops = np.minimum(np.arange(len(capture.frames)), len(capture.frames) // 4)
+    halted = levels(replace(capture, frames=capture.frames[stops]))
+    assert halted["motion"] != "good"
 
 
 def test_light_that_leaves_the_picture_is_named(capture) -> None:

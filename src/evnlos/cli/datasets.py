@@ -33,6 +33,7 @@ from evnlos.data import (
     read_capture,
     simulate,
 )
+from evnlos.data.capture_check import Finding, check_capture
 from evnlos.data.capture_info import CAMERAS, begin_capture
 from evnlos.data.lab import Lab, compare_published, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
@@ -236,8 +237,6 @@ class CaptureCommand:
 
     def _check(self) -> None:
         """Tell of each capture in full, or of several in a table with what is not good below it."""
-        from evnlos.data.capture_check import Finding, check_capture, finding_line, findings_table
-
         found, failed = dict[str, list[Finding]](), dict[str, str]()
         with ProgressBars() as progress:
             for folder in counted(self.folders, progress, "check", len(self.folders), "captures"):
@@ -296,6 +295,35 @@ class CaptureCommand:
         text = f"{folder}: {done.events:,} events and {done.frames:,} frames in {done.seconds:.1f} s{lost}"
         about = asdict(done) | {"folder": str(folder)}
         result(self.json, about, f"{text}; next: evnlos capture check {folder}")
+
+
+_MARKS = {"good": "  good   ", "doubtful": "? look   ", "bad": "! BAD    "}
+
+
+def finding_line(one: Finding) -> str:
+    """Return a finding as a line for people, with its cure where there is one."""
+    return f"{_MARKS[one.level]}{one.what}: {one.found}" + (f"; {one.cure}" if one.cure else "")
+
+
+def findings_table(found: dict[str, list[Finding]], failed: dict[str, str]) -> str:
+    """Return a row for each capture and a column for each look (. good, ? look, ! bad), and below what to mend.
+
+    Args:
+        found: Findings by capture.
+        failed: What is wrong with captures that can't be read.
+    """
+    looks = list(dict.fromkeys(one.what for several in found.values() for one in several))
+    width = max(map(len, [*found, *failed]))
+    lines = [f"{'':<{width}}  {k:>2} {look}" for k, look in enumerate(looks, 1)]
+    lines.append(f"{'':<{width}}  " + " ".join(f"{k:>2}" for k in range(1, len(looks) + 1)))
+    marks, wrong = {"good": " .", "doubtful": " ?", "bad": " !"}, list[str]()
+    for name, several in found.items():
+        by_look = {one.what: marks[one.level] for one in several}
+        lines.append(f"{name:<{width}}  " + " ".join(by_look.get(look, "  ") for look in looks))
+        wrong += [f"{name}: {finding_line(one).strip()}" for one in several if one.level != "good"]
+    lines += [f"{name:<{width}}  can't be read: {text}" for name, text in failed.items()]
+    good = sum(all(one.level == "good" for one in several) for several in found.values())
+    return "\n".join([*lines, "", *wrong, f"{good} of {len(found) + len(failed)} captures are good in all"])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.data.capture import Capture
 from evnlos.data.clocks import LEAST_AGREEMENT, find_lag
+from evnlos.data.fixed_pattern import light_path
 from evnlos.data.sampling import reduce_by_area
+from evnlos.errors import DataError
 from evnlos.events import event_histogram, find_hot_pixels, frame_blocks
 from evnlos.events.cleaning import find_flicker
 from evnlos.events.volume import OFF_RGB, ON_RGB
@@ -46,7 +48,7 @@ class Finding:
 
 
 def check_capture(capture: Capture) -> list[Finding]:
-    """Return what a capture is worth, check by check: light, contrast, movement, place, events, clock.
+    """Return what a capture is worth, check by check: light, contrast, movement, motion, place, events, clock.
 
     Args:
         capture: A capture that could be read.
@@ -58,45 +60,17 @@ def check_capture(capture: Capture) -> list[Finding]:
     if not capture.has_events:
         cure = "a network of frames needs none; for fusion and a finer track record an event camera beside it"
         alone = Finding("events", "doubtful", "none: a frame camera alone", cure)
-        return [*_light(capture), *_movement(capture), alone, *_frame_times(capture)]
+        return [*_light(capture), *_movement(capture), *_motion(capture), alone, *_frame_times(capture)]
     return [
         *_light(capture),
         *_movement(capture),
+        *_motion(capture),
         *_events(capture),
         *_flicker(capture),
         *_clock(capture),
         *_frame_times(capture),
         *_offset(capture),
     ]
-
-
-_MARKS = {"good": "  good   ", "doubtful": "? look   ", "bad": "! BAD    "}
-
-
-def finding_line(one: Finding) -> str:
-    """Return a finding as a line for people, with its cure where there is one."""
-    return f"{_MARKS[one.level]}{one.what}: {one.found}" + (f"; {one.cure}" if one.cure else "")
-
-
-def findings_table(found: dict[str, list[Finding]], failed: dict[str, str]) -> str:
-    """Return a row for each capture and a column for each look (. good, ? look, ! bad), and below what to mend.
-
-    Args:
-        found: Findings by capture.
-        failed: What is wrong with captures that can't be read.
-    """
-    looks = list(dict.fromkeys(one.what for several in found.values() for one in several))
-    width = max(map(len, [*found, *failed]))
-    lines = [f"{'':<{width}}  {k:>2} {look}" for k, look in enumerate(looks, 1)]
-    lines.append(f"{'':<{width}}  " + " ".join(f"{k:>2}" for k in range(1, len(looks) + 1)))
-    marks, wrong = {"good": " .", "doubtful": " ?", "bad": " !"}, list[str]()
-    for name, several in found.items():
-        by_look = {one.what: marks[one.level] for one in several}
-        lines.append(f"{name:<{width}}  " + " ".join(by_look.get(look, "  ") for look in looks))
-        wrong += [f"{name}: {finding_line(one).strip()}" for one in several if one.level != "good"]
-    lines += [f"{name:<{width}}  can't be read: {text}" for name, text in failed.items()]
-    good = sum(all(one.level == "good" for one in several) for several in found.values())
-    return "\n".join([*lines, "", *wrong, f"{good} of {len(found) + len(failed)} captures are good in all"])
 
 
 def _finding(what: str, good: bool, bearable: bool, found: str, cure: str) -> Finding:
@@ -171,6 +145,30 @@ def _movement(capture: Capture) -> Iterator[Finding]:
         outside < 1.2,
         f"the border changes {outside:.2f} times as much as the inside (below 0.7 is safe)",
         "turn the camera to where the light moves, or take a wider lens or region",
+    )
+
+
+def _motion(capture: Capture) -> Iterator[Finding]:
+    """Compare the stated path p with the light's z, complex numbers: z = a + k p, and k should have angle 0."""
+    try:
+        motion = capture.motion
+    except DataError as error:
+        yield Finding("motion", "bad", str(error), "turn direction round if the target goes back")
+        return
+    if motion is None or len(capture.frames) < 5:
+        return
+    stated = motion.position_m(capture.frame_times_us * 1e-6)
+    z, p = ((one - one.mean(axis=0)) @ [1, 1j] for one in (light_path(capture.frames), stated))
+    k = np.vdot(p, z) / max(np.vdot(p, p).real, 1e-12)
+    explained = 1 - np.vdot(z - k * p, z - k * p).real / max(np.vdot(z, z).real, 1e-12)
+    angle = abs(float(np.degrees(np.angle(k))))
+    yield _finding(
+        "motion",
+        angle < 15 and explained > 0.8,
+        angle < 45 and explained > 0.4,
+        f"the light's path is {angle:.0f} degrees off the stated one (15 is safe), which explains "
+        f"{100 * max(explained, 0):.0f} % of it (80 % is safe)",
+        "mend direction, start_m and start_us of motion, or leave motion out and let `evnlos track` find it",
     )
 
 

@@ -198,6 +198,26 @@ def pattern_of(setup: str | Path | None, pattern: str | Path | None = None) -> F
 
 PATTERN_FILE = "pattern.safetensors"
 """Name of the file in a setup's folder."""
+_BLOCK = 6  # pixels: single ones tell nothing of the light
+
+
+def light_path(frames: NDArray) -> NDArray[np.float64]:
+    """Return the middle of the light that moves through frames, (x, y) in pixels, [N, 2].
+
+    It is the mean place, weighted by brightness, of what is brighter by more than three tenths of the largest
+    rise than it is in the darkest tenth of the time; blocks of six pixels average the noise.
+
+    Args:
+        frames: Frames of a resting camera, of any unit, [N, H, W].
+    """
+    size = frames.shape[1:]
+    height, width = (max(1, round(side / _BLOCK)) for side in size)
+    blocks = reduce_by_area(frames.astype(np.float32), (height, width))
+    rise = blocks - np.quantile(blocks, 0.1, axis=0)
+    weight = np.maximum(rise - 0.3 * np.quantile(rise, 0.99), 1e-6)
+    x, y = ((np.arange(n) + 0.5) * side / n for n, side in ((width, size[1]), (height, size[0])))
+    total = weight.sum(axis=(1, 2))
+    return np.stack([weight.sum(axis=1) @ x, weight.sum(axis=2) @ y], axis=1) / total[:, None]
 
 
 def object_light(
