@@ -149,6 +149,16 @@ def test_the_frequency_of_the_lamps_is_found(hertz, seconds):
     assert still is not None and not still.is_there
 
 
+@pytest.mark.parametrize("shape", [(9, 12), (3, 2), (260, 346)])
+def test_rates_are_those_of_counting_one_by_one(shape):
+    events = scattered(3, 20_000, shape[1], shape[0], 3_999_999)
+    counts = np.zeros((2, 16, 4000))
+    for t_us, x, y, p in zip(events.t_us, events.x, events.y, events.p, strict=True):
+        part = 4 * (4 * int(y) // shape[0]) + 4 * int(x) // shape[1]
+        counts[int(p), part, (t_us - events.t_us[0]) // 1000] += 1
+    assert find_flicker(events) == flicker_line(counts[..., : (events.t_us[-1] - events.t_us[0]) // 1000 + 1])
+
+
 def test_too_short_for_a_frequency():
     assert find_flicker(scattered(1)) is None and find_flicker(Events.empty(3, 2)) is None
     with pytest.raises(DataError, match="500 ms are needed"):

@@ -12,6 +12,7 @@ from math import comb
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError, DataError
@@ -125,6 +126,13 @@ def find_flicker(events: Events) -> FlickerLine | None:
     return rates.line()
 
 
+@njit(cache=True)
+def _count(t_us, x, y, p, start_us, rows, columns, counts):
+    """Count each event in counts[polarity, rows[y] + columns[x], milliseconds since `start_us`]."""
+    for i in range(len(t_us)):
+        counts[np.int64(p[i]), rows[y[i]] + columns[x[i]], (t_us[i] - start_us) // 1000] += 1
+
+
 class _Rates:
     """ON and OFF events a millisecond in 4 x 4 parts of the sensor; a spectrum for each 4.1 s of them."""
 
@@ -137,21 +145,23 @@ class _Rates:
     def add(self, events: Events) -> None:
         if self._last_ms < 0:
             self._first_us = int(events.t_us[0])
-        in_ms = (events.t_us - self._first_us) // 1000
-        part = (events.y.astype(np.int64) * _PARTS // events.height) * _PARTS
-        part += events.x.astype(np.int64) * _PARTS // events.width
-        part += events.p * _PARTS**2
-        self._last_ms = int(in_ms[-1])
-        for segment in np.unique(in_ms // _SEGMENT_MS):
+        # The part that a row and a column are in, once each: to divide for every event takes long.
+        rows, columns = (np.arange(side) * _PARTS // side for side in events.shape)
+        span_us, done = _SEGMENT_MS * 1000, 0
+        while done < len(events):
+            segment = (int(events.t_us[done]) - self._first_us) // span_us
             if segment != self._segment:
                 self._powers += _powers(self._open)
                 self._seen |= self._open.any(axis=-1)
                 self._open[:] = 0
                 self._closed += 1
-                self._segment = int(segment)
-            mine = slice(*np.searchsorted(in_ms, [segment * _SEGMENT_MS, (segment + 1) * _SEGMENT_MS]))
-            place = part[mine] * _SEGMENT_MS + in_ms[mine] % _SEGMENT_MS
-            self._open += np.bincount(place, minlength=self._open.size).reshape(self._open.shape)
+                self._segment = segment
+            start_us = self._first_us + segment * span_us
+            stop = int(np.searchsorted(events.t_us, start_us + span_us))
+            mine = events[done:stop]
+            _count(mine.t_us, mine.x, mine.y, mine.p, start_us, rows * _PARTS, columns, self._open)
+            done = stop
+        self._last_ms = (int(events.t_us[-1]) - self._first_us) // 1000
 
     def line(self) -> FlickerLine | None:
         """Return the strongest line; None of less than 0.5 s."""
