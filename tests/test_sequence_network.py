@@ -10,17 +10,18 @@ import torch
 from evnlos import EvnlosError, evaluate, train
 from evnlos.analysis import StreamingReconstructor, curve_over_positions
 from evnlos.analysis.model import choices
+from evnlos.analysis.scores import aligned_mean
 from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import SequenceOperator
+from evnlos.inverse import SequenceOperator, fit_local_changes, local_changes
 from evnlos.inverse.sequence_light import EVENT_PRIORS
-from evnlos.models import SequenceConfig, SequenceReconstructor, UNetConfig, aligned_mean, load_weights
+from evnlos.models import FrameOperator, SequenceConfig, SequenceReconstructor, UNetConfig, load_weights
 from evnlos.models.sequence import PooledFrames
 from evnlos.optics import MatrixTransport
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
-from evnlos.setups import RadiometricSetup
+from evnlos.setups import RadiometricSetup, load_setup
 from evnlos.training import Training
 from evnlos.types import Plane
 from watching import stopped
@@ -241,6 +242,22 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
             torch.testing.assert_close(image.double(), expected, rtol=1e-3, atol=1e-3 * float(expected.std()))
 
 
+def test_local_changes_are_found_beside_what_all_targets_share() -> None:
+    """Against least squares with a prior of one pixel after the other."""
+    torch.manual_seed(1)
+    light, common = torch.rand(30, 5, 7), torch.randn(30, 4)
+    rest = 0.1 * torch.randn(30, 5, 7) + torch.einsum("nc,chw->nhw", common, torch.randn(4, 5, 7))
+    found = fit_local_changes(light, rest, common, spread=0.5)
+    changes = local_changes(light).double()
+    free = torch.eye(30).double() - common.double() @ torch.linalg.pinv(common.double())
+    sizes = torch.stack([(free @ c.flatten(1)).square().mean().sqrt() for c in changes.unbind(-1)])
+    for row, column in ((0, 0), (2, 3), (4, 6)):
+        x, y = free @ changes[:, row, column] / sizes, free @ rest[:, row, column].double()
+        known = y.square().mean() / (0.25 * light.double().square().mean())
+        wanted = torch.linalg.inv(x.T @ x + known * torch.eye(5)) @ (x.T @ y) / sizes
+        torch.testing.assert_close(found[row, column].double(), wanted, rtol=1e-3, atol=1e-4)
+
+
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory):
     """A simulation whose samples name the file of its setup."""
@@ -317,3 +334,36 @@ def test_events_solved_for_the_target_begin_with_the_layers_of_frames_solved_so(
     embedded = NET.build("frame", sampling)
     with pytest.raises(ConfigError, match="sees event"):
         events.take_layers(embedded)
+
+
+def test_captures_correct_the_light_path_that_frames_are_solved_through(solved, tmp_path) -> None:
+    """A wall that is 5 % brighter here and moves its light there; what it explains of other captures grows."""
+    dataset, _ = solved
+    sampling, samples = dataset.sampling, NlosDataset(dataset, "train", "frame")
+    setup, names = load_setup(sampling.setup), list(dict.fromkeys(samples.names.tolist()))
+    truth, places = samples.truth.float(), torch.from_numpy(samples.position_m)
+    operator = FrameOperator(setup, sampling)
+    plain = operator(truth)
+    wave = torch.sin(torch.arange(sampling.width) / 3.0)
+    draw = torch.Generator().manual_seed(3)
+    wrong = plain * (1 + 0.05 * wave) + 0.3 * wave * local_changes(plain)[..., 1]
+    seen = wrong + operator.sigma * torch.randn(wrong.shape, generator=draw)
+    fitted = PooledFrames(sampling, (1.0,), 200)
+    fitted.fit(setup, samples.inputs[:, 0].float(), truth, places, samples.names)
+    known = torch.from_numpy(np.isin(samples.names, names[:8]))
+    own = ~known
+
+    def left() -> float:
+        light = truth[own].flatten(1) @ fitted.light.flatten(1).T
+        away = (
+            (wrong[own] - fitted.ambient).flatten(1) @ fitted.basis
+            - fitted._terms(places[own]) @ fitted.along
+            - light
+        )
+        return float((away - away.mean(dim=0)).square().mean())
+
+    before = left()
+    fitted.correct(seen[known][:24], truth[known][:24], places[known][:24], samples.names[known.numpy()][:24])
+    assert left() == before  # of three captures nothing is learned
+    fitted.correct(seen[known], truth[known], places[known], samples.names[known.numpy()])
+    assert left() < 0.5 * before

@@ -3,6 +3,7 @@
 - Scores of pictures against the truth: on the whole scored canvas and on the target's own box.
 - Intervals for differences between methods, by a paired bootstrap over objects.
 - An independent reader: a small network that names a character, trained on clean glyphs alone.
+- What images of single time steps make of a whole sequence: their mean along the motion.
 - LPIPS with the VGG16 trunk: Zhang et al., CVPR 2018, version 0.1, from files that the user has.
 """
 
@@ -21,11 +22,13 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
+from evnlos.data import Sampling
 from evnlos.errors import DataError
 from evnlos.metrics import HAAR_LEAST_SIDE, gmsd, haarpsi, ms_ssim, psnr, ssim
+from evnlos.models.sequence import TargetGrid
 from evnlos.tensor_file import read_sealed
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
@@ -296,3 +299,21 @@ def _installed_heads() -> Path:
     found = importlib.util.find_spec("lpips")
     folder = Path(found.origin).parent if found and found.origin else Path("lpips")
     return folder / "weights" / "v0.1" / "vgg.pth"
+
+
+def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: Sampling) -> Tensor:
+    """Return images [N, H, W] of which each object's are replaced by their mean along the motion.
+
+    What images of single time steps make of a whole sequence without a network of sequences.
+
+    Args:
+        images: Images of single time steps on the canvas, [N, H, W].
+        position_m: The target's centre at each, (x, y) in metres, [N, 2].
+        names: Object of each, [N].
+        sampling: Size of the maps and their pitch on the target's canvas.
+    """
+    grid, found, places = TargetGrid(sampling), torch.zeros_like(images), torch.from_numpy(position_m)
+    for name in np.unique(names):
+        mine = torch.from_numpy(np.flatnonzero(names == name))
+        found[mine] = grid.on_canvas(grid.mean(images[mine], places[mine]), places[mine])
+    return found

@@ -21,7 +21,7 @@ from torch import Tensor
 from evnlos.analysis import BASELINES, assess, available_lpips, check_sampling, confusion
 from evnlos.analysis.bounds import SequenceAnalysisSettings, sequence_bounds
 from evnlos.analysis.confidence import ConfidenceCheck, consistent, risk_coverage
-from evnlos.analysis.scores import Interval, paired_difference
+from evnlos.analysis.scores import Interval, aligned_mean, paired_difference
 from evnlos.config import from_dict, to_dict
 from evnlos.data import (
     Dataset,
@@ -40,7 +40,7 @@ from evnlos.experiment.study import Arm, Place, Record, Study, is_scored, keep_s
 from evnlos.files import write_atomically
 from evnlos.inverse.sequence_problem import SequenceOperator, strip_gram_of
 from evnlos.machine import Progress
-from evnlos.models import FrameOperator, aligned_mean, fit_linear, load_weights, on_target_plane
+from evnlos.models import FrameOperator, fit_linear, load_weights, on_target_plane
 from evnlos.models.confidence import SIDE
 from evnlos.optics import MatrixTransport
 from evnlos.setups import calibrated_file, load_setup

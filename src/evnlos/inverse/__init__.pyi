@@ -28,6 +28,8 @@ from .operators import Gradient as Gradient
 from .operators import LinearOperator as LinearOperator
 from .operators import LogChange as LogChange
 from .operators import Solution as Solution
+from .operators import fit_local_changes as fit_local_changes
+from .operators import local_changes as local_changes
 from .operators import log_change as log_change
 from .operators import operator_norm as operator_norm
 from .problem import BackgroundModel as BackgroundModel

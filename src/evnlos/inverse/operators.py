@@ -3,6 +3,7 @@
 - Conjugate gradients for a batch of symmetric systems.
 - What every solver hands back.
 - The event form of the inverse problem: changes of log light as a linear function of the hidden scene.
+- Small local errors of an operator: brightness, place and blur of its images, pixel by pixel.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Literal, Protocol
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from torch.nn.functional import pad
 
 from evnlos.cameras.pixel import EventPixel
 from evnlos.errors import ConfigError, DataError
@@ -314,3 +316,47 @@ def log_change(events: Events, edges_us: ArrayLike, pixel: EventPixel) -> torch.
     """
     counts = torch.from_numpy(event_histogram(events, np.asarray(edges_us)))  # [N, 2, H, W]
     return pixel.threshold_on * counts[:, 0] - pixel.threshold_off * counts[:, 1]
+
+
+def local_changes(images: torch.Tensor) -> torch.Tensor:
+    """Return what small errors of brightness, place and blur change in images [..., h, w]: [..., h, w, 5].
+
+    The image itself, its differences along x and y, and its second differences along both, per pixel.
+
+    Example:
+        >>> local_changes(torch.arange(9.0).reshape(3, 3))[1, 1].tolist()
+        [4.0, 1.0, 3.0, 0.0, 0.0]
+    """
+    wide, high = (pad(images, size, mode="replicate") for size in ((1, 1, 0, 0), (0, 0, 1, 1)))
+    left, right, up, down = wide[..., :-2], wide[..., 2:], high[..., :-2, :], high[..., 2:, :]
+    changes = (right - left) / 2, (down - up) / 2, left + right - 2 * images, up + down - 2 * images
+    return torch.stack([images, *changes], dim=-1)
+
+
+def fit_local_changes(
+    light: torch.Tensor, rest: torch.Tensor, common: torch.Tensor, spread: float = 0.02
+) -> torch.Tensor:
+    """Return how much of each of the `local_changes` of light each pixel sees beside it, [h, w, 5].
+
+    At pixel u and time step k: rest(u, k) = sum_j m_j(u) change_j(light)(u, k) + common(k) c(u) + noise. Least
+    squares with a Gaussian prior on m: no change is much larger than a share `spread` of the light.
+
+    Args:
+        light: What the operator predicts, [N, h, w].
+        rest: What was seen beside it, [N, h, w].
+        common: What is the same whatever the target, a column each, [N, c]; it is given away.
+        spread: Typical size of a change, in that of the light.
+    """
+    basis = torch.linalg.qr(common).Q
+
+    def left(images: torch.Tensor) -> torch.Tensor:
+        flat = images.flatten(1)
+        return (flat - basis @ (basis.T @ flat)).view_as(images)
+
+    rest, free = left(rest), torch.stack([left(change) for change in local_changes(light).unbind(-1)])
+    sizes = free.square().mean(dim=(1, 2, 3)).sqrt().clamp_min(1e-12)
+    free = free / sizes[:, None, None, None]
+    gram, seen = torch.einsum("inhw,jnhw->hwij", free, free), torch.einsum("inhw,nhw->hwi", free, rest)
+    known = rest.square().mean(dim=0) / (spread**2 * light.square().mean().clamp_min(1e-12))
+    own = gram + known[..., None, None] * torch.eye(5)
+    return torch.cholesky_solve(seen[..., None], torch.linalg.cholesky(own))[..., 0] / sizes

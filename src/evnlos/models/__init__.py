@@ -9,7 +9,7 @@ from evnlos.models.reconstructor import (
     ReconstructorSettings,
     fit_linear,
 )
-from evnlos.models.sequence import SequenceConfig, SequenceReconstructor, aligned_mean
+from evnlos.models.sequence import SequenceConfig, SequenceReconstructor
 from evnlos.models.unet import ResidualUNet, UNetConfig, UNetReconstructor
 from evnlos.models.weights import (
     GENERIC,
@@ -41,7 +41,6 @@ __all__ = [
     "UNetConfig",
     "UNetReconstructor",
     "Weights",
-    "aligned_mean",
     "describe_network",
     "find_weights",
     "fit_linear",

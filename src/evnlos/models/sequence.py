@@ -21,12 +21,13 @@ from torch import Tensor, nn
 
 from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse.operators import fit_local_changes, local_changes
 from evnlos.inverse.sequence_light import EVENT_PRIORS, handwritten_prior
 from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.models.confidence import on_canvas
 from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmbeddings, fit_input
 from evnlos.models.reconstructor import RECONSTRUCTORS, Drawn, Reconstructor
-from evnlos.models.unet import PARTS, ResidualUNet, UNetConfig
+from evnlos.models.unet import PARTS, PooledScale, ResidualUNet, UNetConfig
 from evnlos.optics import MatrixTransport
 from evnlos.scene import TargetPlane
 from evnlos.setups import Setup, load_setup
@@ -136,29 +137,11 @@ class TargetGrid:
         return F.grid_sample(images, places, align_corners=False).reshape(*target.shape[:-2], *2 * [self.side])
 
 
-def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: Sampling) -> Tensor:
-    """Return images [N, H, W] of which each object's are replaced by their mean along the motion.
-
-    What images of single time steps make of a whole sequence without a network of sequences.
-
-    Args:
-        images: Images of single time steps on the canvas, [N, H, W].
-        position_m: The target's centre at each, (x, y) in metres, [N, 2].
-        names: Object of each, [N].
-        sampling: Size of the maps and their pitch on the target's canvas.
-    """
-    grid, found, places = TargetGrid(sampling), torch.zeros_like(images), torch.from_numpy(position_m)
-    for name in np.unique(names):
-        mine = torch.from_numpy(np.flatnonzero(names == name))
-        found[mine] = grid.on_canvas(grid.mean(images[mine], places[mine]), places[mine])
-    return found
-
-
 _COEFFICIENTS, _CELLS_ACROSS = 150, 32  # of prior, target
 _FEWEST = 8  # objects to tell gain, offset and noise from
+_FEWEST_CAPTURES, _MOST_FRAMES, _WAVES = 4, 2048, 12  # that correct the light path; waves over the travel
 _ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
-_RIDGE = 1e-6
-_AT_ONCE = 1024  # frames
+_RIDGE, _AT_ONCE = 1e-6, 1024  # frames
 
 
 def _forget(frames: nn.Module, _: object) -> None:
@@ -285,6 +268,45 @@ class PooledFrames(nn.Module):
         self.patterns.copy_(torch.from_numpy(prior.patterns.T.copy()).unflatten(1, self.target_plane.shape))
         self._last = None
 
+    def correct(self, frames: Tensor, truth: Tensor, position_m: Tensor, names: NDArray[np.str_]) -> None:
+        """Take from captures with known targets what the setup's light path gets wrong at each pixel.
+
+        Brightness, place and blur of the light (`fit_local_changes`), then what moves along; waves over the
+        travel take what is the same for all targets at a place. Fewer than 4 captures change nothing.
+
+        Args:
+            frames: White levels, [N, H, W].
+            truth: True images on the canvas, [N, H, W].
+            position_m: The target's centre at each, (x, y) in metres, [N, 2].
+            names: Capture of each, [N].
+        """
+        found, owner = np.unique(names, return_inverse=True)
+        if (count := len(found)) < _FEWEST_CAPTURES:
+            return
+        some = torch.from_numpy(np.flatnonzero(owner * len(owner) < _MOST_FRAMES * count))
+        frames, truth, position_m = frames[some].float(), truth[some].float(), position_m[some]
+        own = F.one_hot(torch.from_numpy(owner)[some]).float()
+        steady = own / own.sum(dim=0).sqrt()
+        terms, size = self._terms(position_m), self.ambient.shape
+        clean = truth.flatten(1) @ self.light.flatten(1).T
+        code = (frames - self.ambient).flatten(1) @ self.basis - terms @ self.along
+        moving, seen = (values - steady @ (steady.T @ values) for values in (clean, code))
+        gain = (moving * seen).sum() / moving.square().sum().clamp_min(1e-12)
+        gram = (self.basis.T @ self.basis).double()
+        gram += _RIDGE**2 * gram.diagonal().amax() * torch.eye(len(gram))
+        back = torch.cholesky_solve(self.basis.T.double(), torch.linalg.cholesky(gram)).float()  # [r, H W]
+        light = (clean @ back).unflatten(1, size)
+        waves = torch.cos(math.pi / 2 * (terms[:, 1:2] + 1) * torch.arange(1, _WAVES + 1))
+        common = torch.cat([own, terms[:, 1:], waves], dim=1)
+        maps = fit_local_changes(light, frames - self.ambient - gain * light, common)
+        cells = self.light.flatten(1).T.clone()  # [cells, r]
+        for part in torch.arange(len(cells)).split(_AT_ONCE // 2):
+            images = (cells[part] @ back).unflatten(1, size)
+            cells[part] += (local_changes(images) * maps).sum(dim=-1).flatten(1) @ self.basis
+        self.along += torch.linalg.lstsq(terms, code - gain * (truth.flatten(1) @ cells)).solution
+        self.light.copy_(cells.T.view_as(self.light))
+        self._last = None
+
     def forward(self, frames: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
         """Return the solutions of subsets of the time steps, targets [K, S, h, h].
 
@@ -381,6 +403,7 @@ class SequenceReconstructor(Reconstructor):
         self._priors = found if len(found) == images else []  # of the images, where all of them are solved
         self.scale = PooledScale(images)
         self.unet = ResidualUNet(images, settings)
+        self._corrects = False
         self.grid = TargetGrid(sampling)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -389,6 +412,7 @@ class SequenceReconstructor(Reconstructor):
 
     def fit(self, subset: Callable[[int], Drawn], seed: int, *, is_new: bool, keep_normalization: bool) -> None:
         """Fit the normalization and, where the weights are random, the linear embedding."""
+        self._corrects = not is_new  # a training that goes on has the corrected light path in its checkpoint
         fit_input(
             self.normalization,
             self.embedding,
@@ -420,8 +444,8 @@ class SequenceReconstructor(Reconstructor):
         """
         inputs, truth, names = [], [], []
         self.check_samples(samples, is_new=is_new)
-        if is_new and self.frames is not None:
-            self._fit_frames(samples)
+        if self.frames is not None and (is_new or self._corrects):
+            self._fit_frames(samples, is_new=is_new)
         draw = np.random.default_rng(derive_seed(seed, "views"))
         device = next(self.parameters()).device
         for name in dict.fromkeys(samples.names.tolist()):
@@ -457,15 +481,21 @@ class SequenceReconstructor(Reconstructor):
             )
         load_setup(self.sampling.setup)  # which refuses one that is not there
 
-    def _fit_frames(self, samples: NlosDataset) -> None:
-        """Fit what is solved for frames to the setup that the samples name, and to the samples."""
+    def _fit_frames(self, samples: NlosDataset, *, is_new: bool) -> None:
+        """Take what frames are solved through from the samples' setup, or correct it by captures."""
         assert self.frames is not None
-        assert self.sampling.setup
-        device = self.frames.basis.device
-        frames, places = samples.inputs[:, self._frame], torch.from_numpy(samples.position_m)
-        self.frames.cpu().fit(
-            load_setup(self.sampling.setup), frames.cpu(), samples.truth.cpu(), places, samples.names
-        )
+        self._corrects = False
+        if is_new and not self.sampling.setup:
+            raise ConfigError(
+                "Sampling.setup is empty, and network.frames is 'likelihood', which undoes the light path of a "
+                "setup: make the samples with --sampling.setup FOLDER of `evnlos calibrate`"
+            )
+        device, places = self.frames.basis.device, torch.from_numpy(samples.position_m)
+        known = samples.inputs[:, self._frame].cpu(), samples.truth.cpu(), places, samples.names
+        if is_new:
+            self.frames.cpu().fit(load_setup(self.sampling.setup), *known)
+        else:
+            self.frames.cpu().correct(*known)
         self.frames.to(device)
 
     def draw(self, inputs: Tensor, position_m: Tensor, at_m: Tensor) -> Tensor:
@@ -558,33 +588,6 @@ class SequenceReconstructor(Reconstructor):
         if name.startswith("unet.standardise."):
             return f"scale.{name.rpartition('.')[2]}"
         return InputNormalization.today(name, modality)
-
-
-class PooledScale(nn.Module):
-    """Bring each pooled map [B, S, P, P] to mean 0 and standard deviation 1 over a dataset.
-
-    Args:
-        images: Number of maps S.
-    """
-
-    mean: Tensor
-    size: Tensor
-
-    def __init__(self, images: int) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(images))
-        self.register_buffer("size", torch.ones(images))
-
-    @torch.no_grad()
-    def fit(self, maps: Tensor) -> None:
-        """Take mean and spread of each map from pooled maps [M, S, P, P]."""
-        values = maps.float()
-        self.mean.copy_(values.mean(dim=(0, 2, 3)))
-        self.size.copy_(values.std(dim=(0, 2, 3)).clamp_min(1e-6))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map [B, S, P, P] to the same in units of the dataset's spread."""
-        return (x - self.mean[:, None, None]) / self.size[:, None, None]
 
 
 def _subset(number: int, steps: int, draw: np.random.Generator) -> NDArray[np.int64]:

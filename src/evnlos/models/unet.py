@@ -166,6 +166,33 @@ class ResidualUNet(nn.Module):
         return torch.sigmoid(x[..., :height, :width].float())
 
 
+class PooledScale(nn.Module):
+    """Bring each pooled map [B, S, P, P] to mean 0 and standard deviation 1 over a dataset.
+
+    Args:
+        images: Number of maps S.
+    """
+
+    mean: Tensor
+    size: Tensor
+
+    def __init__(self, images: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(images))
+        self.register_buffer("size", torch.ones(images))
+
+    @torch.no_grad()
+    def fit(self, maps: Tensor) -> None:
+        """Take mean and spread of each map from pooled maps [M, S, P, P]."""
+        values = maps.float()
+        self.mean.copy_(values.mean(dim=(0, 2, 3)))
+        self.size.copy_(values.std(dim=(0, 2, 3)).clamp_min(1e-6))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, S, P, P] to the same in units of the dataset's spread."""
+        return (x - self.mean[:, None, None]) / self.size[:, None, None]
+
+
 class UNetReconstructor(Reconstructor):
     """One time step -> one image: normalization, linear embedding (where `settings.rank` is not 0), U-Net.
 
