@@ -148,7 +148,7 @@ def test_help_needs_no_library_of_the_work_and_says_the_same() -> None:
         (["simulate", "--setup.pixel.kind", "nope", "--out", "d"], "no event model of kind 'nope'"),
         (["train", "--network.kind", "senquence", "--out", "d"], "did you mean 'sequence'"),
         (["train", "--data", "nope", "--out", "d"], "nope is no dataset"),
-        (["events", "clip.mp4", "--pixel", "davis", "--out", "e.h5"], "did you mean 'davis346'"),
+        (["events", "pyproject.toml", "--pixel", "davis", "--out", "e.h5"], "did you mean 'davis346'"),
         (["reconstruct", "capture", "--weights", "nope"], "near-frame-sequence"),
         (["finetune", "--data", "d", "--out", "run", "--weights", "nope"], "near-frame-sequence"),
         (["weights", "nope"], "near-frame-sequence"),
@@ -161,6 +161,13 @@ def test_help_needs_no_library_of_the_work_and_says_the_same() -> None:
         (["experiment", "nope"], "mismatch"),
         (["experiment", "mismatch", "--setups", "nope"], "two-lobes"),
         (["live", "nope"], "centuryarks-vga"),
+        (["experiment", "captures", "--captures", "d", "--arms", "nope"], "EPNP uncalibrated"),
+        (["train", "--simulate", "nope.yaml", "--out", "d"], "nope.yaml does not exist"),
+        (["invert", "nope", "--setup", "main-near"], "nope: no such file"),
+        (["pixel", "fit", "nope", "--light", "sine", "10", "0.5", "--out", "d"], "nope: no such file"),
+        (["events", "nope.mp4", "--out", "e.h5"], "nope.mp4: no such file"),
+        (["clean", "nope.raw", "e.h5"], "nope.raw: no such file"),
+        (["corner", "nope.mp4", "--edge", "9", "9", "--wall", "9", "0", "--end", "0", "9"], "no such file"),
     ],
 )
 def test_words_and_names_of_nothing_are_refused_before_any_library_is_loaded(

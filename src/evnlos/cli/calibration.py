@@ -21,7 +21,7 @@ from evnlos.calibration.scan.film import FilmReading
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import check_there, drawn, say
+from evnlos.cli.parsing import check_files, check_there, drawn, say
 from evnlos.cli.recordings import Flat, Folders, Presets
 from evnlos.config import to_dict
 from evnlos.errors import ConfigError
@@ -327,6 +327,10 @@ class PixelCommand:
     json: bool = False
     """Print one JSON object."""
     settings: Flat[PixelFitSettings] = field(default_factory=PixelFitSettings)
+
+    def check_names(self) -> None:
+        """Refuse a recording that is not there."""
+        check_files(self.recording)
 
     def run(self) -> None:
         """Fit, print what was found, and write the files."""

@@ -14,7 +14,7 @@ import tyro
 from numpy.typing import NDArray
 
 from evnlos.cameras.video import Tone, Video, open_video
-from evnlos.cli.parsing import drawn, say
+from evnlos.cli.parsing import check_files, drawn, say
 from evnlos.cli.recordings import Flat, refuse_existing, result
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
@@ -126,6 +126,11 @@ class CornerCommand:
     """simulate: replace the video where it exists."""
     json: bool = False
     """Print one JSON object."""
+
+    def check_names(self) -> None:
+        """Refuse a video that is not there."""
+        if not self.simulate:
+            check_files(self.video)
 
     def run(self) -> None:
         """Look past the corner, or film one."""

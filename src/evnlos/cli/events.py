@@ -21,7 +21,7 @@ from evnlos.cameras.event_model import Phase, PixelSettings
 from evnlos.cameras.pixel import EventPixel, Logarithm, Mode
 from evnlos.cameras.sensors import load_pixel
 from evnlos.cameras.video import Tone, Video, check_video, open_video, video_events
-from evnlos.cli.parsing import say
+from evnlos.cli.parsing import check_files, say
 from evnlos.cli.recordings import (
     EventFile,
     Flat,
@@ -143,6 +143,10 @@ class EventsCommand:
     """Replace the file where it exists, and begin although the machine's memory will hardly do."""
     json: bool = False
     """Print one JSON object."""
+
+    def check_names(self) -> None:
+        """Refuse a video that is not there."""
+        check_files(*self.video)
 
     def run(self) -> None:
         """Simulate, with a progress bar over the frames, and print what came out."""
@@ -293,6 +297,10 @@ class CleanCommand:
     """Replace the file where it exists."""
     json: bool = False
     """Print one JSON object."""
+
+    def check_names(self) -> None:
+        """Refuse a recording that is not there."""
+        check_files(self.file)
 
     def run(self) -> None:
         """Look and clean, with a progress bar over the events of each."""

@@ -123,6 +123,10 @@ class ExperimentCommand:
         known = (*experiment.STUDIES, *_WITHOUT_CAPTURES)
         if self.name not in known:
             raise UnknownNameError(f"experiment {self.name!r} is unknown; give one of {', '.join(known)}")
+        if self.name in experiment.STUDIES:
+            there = [arm.name for arm in experiment.STUDIES[self.name](self.captures_of).arms]
+            if unknown := [arm for arm in self.arms if arm not in there]:
+                raise UnknownNameError(f"arm {unknown[0]!r} is unknown; {self.name} has {', '.join(there)}")
 
     def run(self) -> None:
         """Run what is left, with a line of progress, and print the tables."""
@@ -162,10 +166,6 @@ class ExperimentCommand:
         if self.captures is None:
             raise ConfigError(f"the experiment {self.name} needs --captures, the folder of the capture folders")
         study = experiment.STUDIES[self.name](self.captures_of)
-        unknown = set(self.arms) - {arm.name for arm in study.arms}
-        if unknown:
-            there = ", ".join(repr(arm.name) for arm in study.arms)
-            raise ConfigError(f"arm {sorted(unknown)[0]!r} is unknown; {self.name} has {there}")
         if self.writers and any(arm.writers for arm in study.arms):
             raise ConfigError(
                 f"--writers {self.writers} would change nothing: {self.name} compares numbers of writers; "

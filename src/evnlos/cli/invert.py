@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import tyro
 
-from evnlos.cli.parsing import drawn, say
+from evnlos.cli.parsing import check_files, drawn, say
 from evnlos.cli.recordings import Folders
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
@@ -77,6 +77,10 @@ class InvertCommand:
     """The picture; the numbers go to the same name with .npz."""
     json: bool = False
     """Print one JSON object."""
+
+    def check_names(self) -> None:
+        """Refuse captures and pictures that are not there."""
+        check_files(*self.files)
 
     def run(self) -> None:
         """Invert, print the figures, write the picture."""

@@ -20,7 +20,7 @@ import tyro
 from evnlos.analysis import BASELINES, CHECKS, confusion
 from evnlos.cli.parsing import check_there, say
 from evnlos.cli.recordings import Flat, Presets, result
-from evnlos.config import load_yaml, to_dict
+from evnlos.config import load_yaml, read_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
 from evnlos.data.live import Place
 from evnlos.errors import ConfigError, DataError, printable
@@ -75,6 +75,11 @@ class TrainCommand:
     json: bool = False
     """Print one JSON object."""
     settings: Flat[Training] = field(default_factory=Training)
+
+    def check_names(self) -> None:
+        """Refuse settings of a simulation that are not there."""
+        if self.simulate is not None:
+            check_there(read_yaml, self.simulate)
 
     def run(self) -> None:
         """Train, with a progress bar over the epochs."""

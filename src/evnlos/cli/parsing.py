@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import importlib
 import io
 import logging
@@ -18,8 +19,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
-from evnlos.errors import ConfigError, MissingDependencyError, printable
+from evnlos.errors import ConfigError, MissingDependencyError, UnknownNameError, printable
 from evnlos.machine import PROGRESS, SHOWN, show_progress
+from evnlos.untrusted import no_file
 
 LEVELS = ("debug", "info", "warning", "error")
 """What is said, most first: where an error came from; notes; only warnings; only errors."""
@@ -257,6 +259,7 @@ _RESOLVERS = {  # flag -> module and function of what its word stands for
     "--pixel": ("cameras", "load_pixel"),
     "--weights": ("models", "find_weights"),
     "--data": ("data", "open_dataset"),
+    "--glyphs.family": ("scene.fonts", "find_font"),
 }
 
 
@@ -284,6 +287,17 @@ def check_there(resolve: Callable[[Any], object], *words: str | Path) -> None:
     for word in words:
         if not Path(word).exists():
             resolve(word)
+
+
+def check_files(*paths: Path) -> None:
+    """Refuse files that are not there; what may be a pattern of names is left to those who expand it.
+
+    Raises:
+        UnknownNameError: There is one.
+    """
+    for path in paths:
+        if not (path.exists() or glob.has_magic(str(path))):
+            raise UnknownNameError(no_file(path))
 
 
 def flag_value(words: list[str], flag: str) -> str | None:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from evnlos.errors import ConfigError, DataError, MissingDependencyError
+from evnlos.errors import ConfigError, DataError, MissingDependencyError, UnknownNameError
 
 FONT_SUFFIXES = (".ttf", ".otf", ".ttc", ".otc")
 COMIC_FALLBACKS = ("Comic Neue", "Comic Sans MS", "Comic Relief", "Kalam", "Indie Flower", "Caveat")
@@ -118,7 +118,7 @@ def find_font(name: str | os.PathLike[str], *, strict: bool = False) -> Font:
     if found is None:
         if find_spec("fontpkg") is None:
             raise MissingDependencyError(f"{_unknown(text, faces)}; pip install evnlos[fonts] brings open ones")
-        raise ConfigError(_unknown(text, faces))
+        raise UnknownNameError(_unknown(text, faces))
     if strict and found.note:
         raise MissingDependencyError(found.note)
     return found
