@@ -1,7 +1,9 @@
 """Every command, as a user types it: right input does the job, wrong input is one line and exit code 2."""
 
+import html
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -69,6 +71,34 @@ def runs(recorded, tiny_dataset, tmp_path_factory) -> dict[str, Path]:
         call("train", "--data", recorded, "--modality", modality, "--out", e2e, "--epochs", 2, *NETWORK)
         found |= {p.name: p for p in (pre, epnp, e2e)}
     return found
+
+
+def test_the_page_is_made_again_by_its_own_script(
+    runs, recorded, tiny, tiny_captures, tmp_path, monkeypatch, capsys
+) -> None:
+    """In an empty folder with the captures, the simulation's settings and the files that the page shows."""
+    capsys.readouterr()
+    names = ["epnp-frame", "e2e-frame"]
+    call("report", *[runs[one] for one in names], "--data", recorded, "--out", tmp_path / "a.html", "--json")
+    first = json.loads(capsys.readouterr().out)
+    page = html.unescape((tmp_path / "a.html").read_text())
+    script = re.search(r"To make it again.*?<pre>(.*?)</pre>", page, re.DOTALL)[1]
+    again = tmp_path / "again"
+    again.mkdir()
+    for one in tiny_captures:
+        shutil.copytree(one, again / one.name)
+    for name, text in re.findall(r"<h3>([^<]*[.]yaml)</h3><pre>(.*?)</pre>", page, re.DOTALL):
+        (again / name).write_text(text)
+    (simulation,) = re.findall(r"^# (.*[.]yaml): settings of hash", script, re.MULTILINE)
+    save_yaml(tiny, again / simulation)
+    monkeypatch.chdir(again)
+    for line in script.splitlines():
+        if not line.startswith("#"):
+            capsys.readouterr()
+            main(shlex.split(line)[1:])
+    call("report", *names, "--data", recorded.name, "--out", again / "b.html", "--json")
+    second = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert second["runs"] == first["runs"] and second["baselines"] == first["baselines"]
 
 
 WITHOUT_OUT = (
