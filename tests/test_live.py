@@ -18,6 +18,7 @@ import pytest
 import torch
 from PIL import Image
 
+import chromium
 from evnlos import EvnlosError
 from evnlos.analysis import reconstruct
 from evnlos.analysis.identify import verdict_on
@@ -153,6 +154,23 @@ def test_a_replay_goes_at_its_speed(speed: float) -> None:
             assert part.events.t_us[0] > part.until_us - 5000 * speed - 1
     assert joined([part.events for part in found]) == events
     assert clock.now() - begun == pytest.approx(events.duration_us / 1e6 / speed, abs=0.0051)
+
+
+def test_a_replay_begins_again_when_it_has_ended_or_is_asked_to() -> None:
+    clock, events = Turned(), stream(200, 3)
+    whole = list(Replay([events], clock=clock).chunks(NEVER))
+    twice = Replay(lambda: iter([events]), clock=clock, repeat=True)
+    parts = twice.chunks(NEVER)
+    found = [next(parts) for _ in range(2 * len(whole))]
+    assert [number for number, part in enumerate(found) if part.restart] == [len(whole)]
+    assert joined([part.events for part in found[len(whole) :]]) == events
+    asked = Replay([events], clock=clock)
+    parts = asked.chunks(NEVER)
+    next(parts)
+    asked.again.set()
+    rest = list(parts)  # from the beginning to the end, once
+    assert rest[0].restart and joined([part.events for part in rest]) == events
+    assert list(Replay([], repeat=True).chunks(NEVER)) == []
 
 
 def test_frames_are_replayed_at_their_instants_with_all_events_before_them() -> None:
@@ -786,6 +804,58 @@ def test_other_hosts_and_addresses_are_refused(page: Page) -> None:
         stop.value.close()
     with pytest.raises(ConfigError, match="can't be used"):
         Page(dict, page.port)
+
+
+def test_a_replay_begins_again_for_a_page_of_this_machine_only(page: Page) -> None:
+    def ask(shown: Page, **headers: str) -> int:
+        request = urllib.request.Request(shown.url + "again", method="POST", headers=headers)
+        try:
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                return answer.status
+        except urllib.error.HTTPError as error:
+            error.close()
+            return error.code
+
+    assert ask(page) == 404  # a camera's
+    again = threading.Event()
+    with Page(RunStatistics(Replay([]), ChunkQueue(10)).now, again=again) as shown:
+        home = shown.url.removesuffix("/")
+        assert ask(shown, Origin="http://evil.example") == ask(shown, Host="evil.example") == 403
+        assert not again.is_set()
+        assert ask(shown, Origin=home) == 200 and again.is_set()
+
+
+def test_the_page_of_a_replay_on_a_phone(engine: Engine, tmp_path: Path) -> None:
+    if chromium.missing():
+        pytest.skip(f"{chromium.missing()}: apt-get install chromium chromium-driver")
+    again, image = threading.Event(), np.zeros((16, 24), np.float32)
+    status = RunStatistics(Replay([]), ChunkQueue(10)).now
+    title = "walk.raw, event"
+    with (
+        Page(lambda: status() | {"verdict": ["nothing is certain"]}, title=title, again=again) as page,
+        chromium.Chromium(tmp_path / "profile") as browser,
+    ):
+        browser.devtools(
+            "Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True
+        )
+        browser.open(page.url)
+        told = "return document.querySelector('[role=status]').textContent"
+        browser.wait(f"{told}.includes('waiting for its first events')")
+        page.show(
+            Picture(3, 1_500_000, 0.0, image, np.zeros((2, 16, 24), np.float32), image, 5, Timing(*[0.01] * 5))
+        )
+        browser.wait("return document.querySelectorAll('img').length === 3")
+        assert browser.run("return document.documentElement.scrollWidth") <= 390
+        assert browser.run(
+            "return [...document.images].every(one => one.alt && one.getBoundingClientRect().right <= 390)"
+        )
+        browser.wait("return document.querySelector('#verdict').textContent === 'nothing is certain'")
+        # By keys: hold the picture, and then from the beginning.
+        browser.press("\ue004 ")
+        browser.wait("return document.querySelector('#hold').getAttribute('aria-pressed') === 'true'")
+        browser.press("\ue004 ")
+        assert again.wait(10)
+        assert [one for one in browser.complaints() if "SEVERE" in one] == []
 
 
 def test_the_stream_brings_each_new_picture_and_the_end(page: Page, engine: Engine) -> None:

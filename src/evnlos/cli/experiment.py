@@ -365,13 +365,11 @@ class LiveCommand:
                 run = Run(source, engine, self.pace)
                 sinks = []
                 if not self.headless:
-                    page = stack.enter_context(
-                        Page(
-                            lambda: run.statistics.now() | {"verdict": verdict.lines},
-                            self.port,
-                            f"{source.name}, {engine.modality.name}",
-                        )
+                    title, again = f"{source.name}, {engine.modality.name}", getattr(source, "again", None)
+                    page = Page(
+                        lambda: run.statistics.now() | {"verdict": verdict.lines}, self.port, title, again
                     )
+                    stack.enter_context(page)
                     sinks.append(page)
                     say(f"{page.url} shows the pictures; Ctrl-C ends")
                     if source.waits:

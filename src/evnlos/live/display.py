@@ -73,6 +73,7 @@ class Page:
         status: Returns what is shown beside the picture, as plain values.
         port: Port on 127.0.0.1; 0 takes a free one.
         title: What is shown, for the head of the page.
+        again: Set when a viewer wishes the replay to begin again; None where that can't be.
 
     Attributes:
         url: Address of the page.
@@ -83,21 +84,23 @@ class Page:
         ConfigError: The port can't be used.
     """
 
-    def __init__(self, status: Callable[[], dict[str, Any]], port: int = 0, title: str = "live") -> None:
-        self._status, self._title = status, title
-        self._changed = threading.Condition()
+    def __init__(
+        self,
+        status: Callable[[], dict[str, Any]],
+        port: int = 0,
+        title: str = "live",
+        again: threading.Event | None = None,
+    ) -> None:
+        self._status, self._title, self.again = status, title, again
+        self._changed, self._encoding, self._ended = threading.Condition(), threading.Lock(), False
         self._picture: Picture | None = None
         self._message: tuple[int, bytes] = (-1, b"")
-        self._encoding = threading.Lock()
-        self._ended = False
         self.viewers = threading.BoundedSemaphore(_MOST_VIEWERS)
         self.seen = threading.Event()
         try:
             self._server = _Server((_HOST, port), _handler(self))
         except (OSError, OverflowError) as error:
-            raise ConfigError(
-                f"port {port} can't be used ({error}); give another one, or 0 for a free one"
-            ) from None
+            raise ConfigError(f"port {port} can't be used ({error}); give another, or 0 for any") from None
         self._server.daemon_threads = True
         self._server.block_on_close = False
         self.port: int = self._server.server_address[1]
@@ -135,7 +138,7 @@ class Page:
 
     def state(self) -> dict[str, Any]:
         """Return what is shown beside the picture."""
-        return {"title": self._title, "ended": self._ended, **self._status()}
+        return {"title": self._title, "ended": self._ended, "again": self.again is not None, **self._status()}
 
     def stream(self, write: Callable[[bytes], object]) -> None:
         """Write messages until the run ends or the viewer leaves: each picture, or a sign of life."""
@@ -180,7 +183,7 @@ class _Server(ThreadingHTTPServer):
 
 def _handler(page: Page) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        """Three addresses: the page, its stream, and the state as JSON."""
+        """The page, its stream, the state as JSON, and the wish for a new beginning."""
 
         timeout = _SILENT_S
 
@@ -203,6 +206,17 @@ def _handler(page: Page) -> type[BaseHTTPRequestHandler]:
                     page.viewers.release()
             else:
                 self.send_error(404)
+
+        def do_POST(self) -> None:
+            """Begin the replay again, for a page of this machine."""
+            host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+            if not names_this_machine(host) or origin not in (None, f"http://{host}"):
+                self.send_error(403)
+            elif self.path != "/again" or page.again is None:
+                self.send_error(404)
+            else:
+                page.again.set()
+                self._send("text/plain", b"")
 
         def _head(self, kind: str, length: int | None = None) -> None:
             self.send_response(200)

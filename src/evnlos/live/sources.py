@@ -6,8 +6,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -49,12 +51,17 @@ class Replay:
     events are due, so that the wait for the end of a step counts as latency.
 
     Args:
-        pieces: Events in the order of time, such as `iter_events` yields.
+        pieces: Events in the order of time, such as `iter_events` yields; or what returns them, for a replay
+            that begins again.
         frames: Frames in the order of time; none for events alone.
         speed: How many times faster than life, 0.001 to 1000.
         step_s: Length of a chunk, seconds of the clock.
         clock: The clock that it goes by.
         name: What it is, for a message.
+        repeat: Whether it begins again when it has ended.
+
+    Attributes:
+        again: Set it, and the replay begins again.
 
     Raises:
         ConfigError: Speed or step are outside their range.
@@ -62,13 +69,14 @@ class Replay:
 
     def __init__(
         self,
-        pieces: Iterable[Events],
+        pieces: Iterable[Events] | Callable[[], Iterable[Events]],
         frames: Sequence[TimedFrame] = (),
         *,
         speed: float = 1.0,
         step_s: float = 0.002,
         clock: Clock | None = None,
         name: str = "replay",
+        repeat: bool = False,
     ) -> None:
         if not 1e-3 <= speed <= 1e3:
             raise ConfigError(f"speed is {speed}; give 0.001 to 1000 times true speed")
@@ -77,6 +85,7 @@ class Replay:
         self.name, self.has_frames, self.waits = name, bool(frames), True
         self._pieces, self._frames, self._clock = pieces, list(frames), clock or SystemClock()
         self._speed, self._step_us = speed, max(round(step_s * 1e6 * speed), 1)
+        self._repeat, self.again = repeat, threading.Event()
 
     def faults(self) -> dict[str, int]:
         """Return nothing: a recording is checked when it is opened."""
@@ -86,8 +95,22 @@ class Replay:
         """Do nothing: nothing is held."""
 
     def chunks(self, stop: Callable[[], bool]) -> Iterator[Chunk]:
-        """Yield the chunks when they are due."""
-        reader, frames = _Reader(self._pieces), self._frames
+        """Yield the chunks when they are due; where it begins again, the first one says so."""
+        is_new = False
+        while True:
+            self.again.clear()
+            is_empty = True
+            for chunk in self._once(stop):
+                yield replace(chunk, restart=is_new)
+                is_new = is_empty = False
+                if self.again.is_set():
+                    break
+            is_new = True
+            if stop() or is_empty or not (self._repeat or self.again.is_set()):
+                return
+
+    def _once(self, stop: Callable[[], bool]) -> Iterator[Chunk]:
+        reader, frames = _Reader(self._pieces() if callable(self._pieces) else self._pieces), self._frames
         starts = [t for t in (reader.next_us, frames[0].t_us if frames else None) if t is not None]
         if not starts:
             return
@@ -164,6 +187,8 @@ class SourceOptions:
     """Read a file while it grows, in place of replaying it."""
     speed: float = 1.0
     """Speed of a replay: 1 = as it happened, 10 = ten times faster."""
+    repeat: bool = False
+    """Begin a replay again when it ends, until Ctrl-C."""
     idle: float = 10.0
     """End when a growing file or, after the first packet, a network brought nothing for so many seconds, or a
     camera that went away does not come back; 0 = wait for ever."""
@@ -221,11 +246,12 @@ def open_live(
     if path.is_dir():
         if how.follow:
             raise ConfigError(f"{source} is a folder; --follow takes the event file that grows")
-        return capture_replay(path, how.speed, pattern)
+        return capture_replay(path, how.speed, pattern, repeat=how.repeat)
     if how.follow:
         return GrowingFile(path, width=how.width, height=how.height, idle_s=how.idle_s)
     recording = Recording(path, width=how.width, height=how.height)
-    return Replay(recording.pieces(CropOptions(known_polarity=True)), speed=how.speed, name=str(path))
+    pieces = partial(recording.pieces, CropOptions(known_polarity=True))
+    return Replay(pieces, speed=how.speed, name=str(path), repeat=how.repeat)
 
 
 def check_source(source: str, follow: bool = False) -> None:
@@ -246,7 +272,11 @@ def check_source(source: str, follow: bool = False) -> None:
 
 
 def capture_replay(
-    folder: Path, speed: float = 1.0, pattern: FixedPattern | None = None, clock: Clock | None = None
+    folder: Path,
+    speed: float = 1.0,
+    pattern: FixedPattern | None = None,
+    clock: Clock | None = None,
+    repeat: bool = False,
 ) -> Replay:
     """Return a replay of a capture, events and frames.
 
@@ -255,6 +285,7 @@ def capture_replay(
         speed: How many times faster than life.
         pattern: Fixed pattern to take from the frames.
         clock: The clock to go by.
+        repeat: Whether it begins again when it has ended.
 
     Raises:
         DataError: The capture is damaged.
@@ -268,7 +299,7 @@ def capture_replay(
         images = capture.frames / np.float32(capture.peak)
     times = capture.frame_times_us[: len(images)]
     frames = [TimedFrame(int(t), image) for t, image in zip(times, images, strict=True)]
-    return Replay([capture.events], frames, speed=speed, clock=clock, name=str(folder))
+    return Replay([capture.events], frames, speed=speed, clock=clock, name=str(folder), repeat=repeat)
 
 
 def _address(source: str) -> tuple[str, int]:
