@@ -171,7 +171,7 @@ def _study(settings: Demo, test: list[str]) -> Study:
     if settings.start:  # trained layers need less time and smaller steps; validation characters chose both
         before = replace(anew, epochs=settings.pretrain_epochs or 4, learning_rate=1e-3, refit_embedding=True)
     # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
-    after = replace(plan, epochs=settings.finetune_epochs, learning_rate=2e-4, keep_normalization=True)
+    after = replace(plan, epochs=settings.finetune_epochs, learning_rate=5e-4, keep_normalization=True)
     source = "calibrated" if settings.calibrate else "uncalibrated"
     alone_sees = Sampling(surface="hots", radius=1)  # of the time surfaces, validation characters chose it
     sees = Sampling(surface="likelihood") if settings.calibrate else alone_sees

@@ -299,10 +299,10 @@ class PooledFrames(nn.Module):
         waves = torch.cos(math.pi / 2 * (terms[:, 1:2] + 1) * torch.arange(1, _WAVES + 1))
         common = torch.cat([own, terms[:, 1:], waves], dim=1)
         maps = fit_local_changes(light, frames - self.ambient - gain * light, common)
-        cells = self.light.flatten(1).T.clone()  # [cells, r]
-        for part in torch.arange(len(cells)).split(_AT_ONCE // 2):
-            images = (cells[part] @ back).unflatten(1, size)
-            cells[part] += (local_changes(images) * maps).sum(dim=-1).flatten(1) @ self.basis
+        # of light that is a sum of `back`, the changes are the sum of those of `back`
+        turn = (local_changes(back.unflatten(1, size)) * maps).sum(dim=-1).flatten(1) @ self.basis  # [r, r]
+        cells = self.light.flatten(1).T  # [cells, r]
+        cells = cells + cells @ turn
         self.along += torch.linalg.lstsq(terms, code - gain * (truth.flatten(1) @ cells)).solution
         self.light.copy_(cells.T.view_as(self.light))
         self._last = None
