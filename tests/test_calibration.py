@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -510,3 +511,35 @@ def test_a_cutoff_with_which_most_of_those_tried_agree_is_not_identified(fit) ->
         one = replace(fit, pixel=replace(fit.pixel, cutoff_range_hz=agree))
         (row,) = [r for r in rows_of(one, PIXEL, CAMERA) if r.name == "setup.pixel.cutoff_hz"]
         assert words in row.note
+
+
+def rows_printed(text: str) -> dict[str, list[str]]:
+    """Return the cells behind the name of each row of the tables that `calibrate` prints."""
+    cells = (re.split(r"  +", line.strip()) for line in text.splitlines())
+    return {name: values for name, *values in cells if len(values) > 1 and "before" not in values}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("group", "end"), [("near", "### Far"), ("far", "Camera, distance")])
+def test_the_page_on_calibration_says_what_the_command_prints(
+    group, end, shared_data, tmp_path, capsys
+) -> None:
+    """Its cutoff was that of an older version once; what is fitted may differ by a part of its error."""
+    page = (Path(__file__).parents[1] / "docs" / "calibration.md").read_text()
+    stated = rows_printed(page.split(f"### {group.title()} (")[1].split(end)[0])
+    captures = [str(path) for path in sorted((shared_data / "captures").glob(f"{group}_*"))]
+    main(["calibrate", *captures, "--out", str(tmp_path / "setup"), "--exclude", "G", "K", "4", "9"])
+    check_rows(stated, rows_printed(capsys.readouterr().out))
+
+
+def check_rows(stated: dict[str, list[str]], found: dict[str, list[str]]) -> None:
+    assert set(stated) <= set(found) and len(stated) > 30
+    for name, (before, after, *rest) in stated.items():
+        try:
+            error = float(rest[0])
+        except (IndexError, ValueError):  # a unit, where there is no error
+            error = 0.0
+        limit = max(0.2 * error, 0.002)
+        assert float(found[name][0]) == pytest.approx(float(before), rel=0.03, abs=limit), name
+        assert float(found[name][1]) == pytest.approx(float(after), rel=0.03, abs=limit), name
+        assert rest[-1:] == found[name][2:][-1:], name
