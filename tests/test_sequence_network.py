@@ -147,7 +147,7 @@ def test_a_killed_joint_run_goes_on_to_the_same_bytes(trained, tiny_dataset, tmp
     stopped(train, tiny_dataset, PLAN, tmp_path / "again", after=2)
     train(tiny_dataset, PLAN, tmp_path / "again")
     one, other = (load_weights(run).network.state_dict() for run in (out, tmp_path / "again"))
-    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert [name for name in one if not torch.equal(one[name], other[name])] == []
 
 
 def test_fine_tuning_keeps_the_kind_and_frozen_parts(trained, tiny_dataset, tmp_path) -> None:
@@ -367,3 +367,16 @@ def test_captures_correct_the_light_path_that_frames_are_solved_through(solved, 
     assert left() == before  # of three captures nothing is learned
     fitted.correct(seen[known], truth[known], places[known], samples.names[known.numpy()])
     assert left() < 0.5 * before
+
+
+def test_a_killed_fine_tuning_corrects_the_light_path_once(solved, tmp_path) -> None:
+    dataset, out = solved
+    plan = replace(PLAN, network=SOLVING)
+    before = load_weights(train(dataset, plan, out).folder).network
+    tuned = replace(plan, epochs=3, keep_normalization=True)
+    whole = load_weights(train(dataset, tuned, tmp_path / "fine", out).folder).network
+    stopped(train, dataset, tuned, tmp_path / "again", out, after=2)
+    again = load_weights(train(dataset, tuned, tmp_path / "again", out).folder).network
+    assert not torch.equal(before.frames.light, whole.frames.light)
+    one, other = whole.state_dict(), again.state_dict()
+    assert [name for name in one if not torch.equal(one[name], other[name])] == []

@@ -285,8 +285,7 @@ class PooledFrames(nn.Module):
             return
         some = torch.from_numpy(np.flatnonzero(owner * len(owner) < _MOST_FRAMES * count))
         frames, truth, position_m = frames[some].float(), truth[some].float(), position_m[some]
-        own = F.one_hot(torch.from_numpy(owner)[some]).float()
-        steady = own / own.sum(dim=0).sqrt()
+        steady = F.normalize(F.one_hot(torch.from_numpy(owner)[some]).float(), dim=0)  # a column a capture
         terms, size = self._terms(position_m), self.ambient.shape
         clean = truth.flatten(1) @ self.light.flatten(1).T
         code = (frames - self.ambient).flatten(1) @ self.basis - terms @ self.along
@@ -297,14 +296,15 @@ class PooledFrames(nn.Module):
         back = torch.cholesky_solve(self.basis.T.double(), torch.linalg.cholesky(gram)).float()  # [r, H W]
         light = (clean @ back).unflatten(1, size)
         waves = torch.cos(math.pi / 2 * (terms[:, 1:2] + 1) * torch.arange(1, _WAVES + 1))
-        common = torch.cat([own, terms[:, 1:], waves], dim=1)
+        common = torch.cat([steady, terms[:, 1:], waves], dim=1)
         maps = fit_local_changes(light, frames - self.ambient - gain * light, common)
         # of light that is a sum of `back`, the changes are the sum of those of `back`
         turn = (local_changes(back.unflatten(1, size)) * maps).sum(dim=-1).flatten(1) @ self.basis  # [r, r]
-        cells = self.light.flatten(1).T  # [cells, r]
-        cells = cells + cells @ turn
-        self.along += torch.linalg.lstsq(terms, code - gain * (truth.flatten(1) @ cells)).solution
-        self.light.copy_(cells.T.view_as(self.light))
+        moved = (torch.eye(len(turn)) + turn).T @ self.light.flatten(1)  # [r, cells]
+        left = code - gain * (truth.flatten(1) @ moved.T)
+        gram = (terms.T @ terms).double() + _RIDGE * len(terms) * torch.eye(_ALONG)
+        self.along += torch.linalg.solve(gram, (terms.T @ left).double()).float()
+        self.light.copy_(moved.view_as(self.light))
         self._last = None
 
     def forward(self, frames: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
