@@ -19,6 +19,7 @@ from evnlos.calibration import (
     Calibration,
     Residual,
     calibration_values,
+    expectation,
     fit_setup,
     fit_transport,
     read_capture_set,
@@ -472,6 +473,13 @@ def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targe
     drawn = load_yaml(Simulation, tmp_path / "known" / "training.yaml").vary["setup.pixel.threshold_on"]
     narrow = fit.training.vary["setup.pixel.threshold_on"]
     assert drawn[1] - drawn[0] > 2 * (narrow[1] - narrow[0])  # no wall fits: sensors and walls are randomized
+
+
+def test_less_is_expected_of_events_whose_counts_are_left(fit) -> None:
+    for after, less in ((0.47, False), (0.54, True)):
+        left = Residual(before=0.62, after=after, noise=0.46)
+        said = expectation(replace(fit, residuals={**fit.residuals, "counts held out": left}))
+        assert ("54 % of their counts is left where noise leaves 46 %" in said) == less
 
 
 def test_the_gain_of_unknown_targets_is_called_arbitrary(fit) -> None:

@@ -37,6 +37,7 @@ from .pixel_report import fit_known_light as fit_known_light
 from .pixel_statistics import simulated_events as simulated_events
 from .summary import CALIBRATION_VALUES_FILE as CALIBRATION_VALUES_FILE
 from .summary import calibration_values as calibration_values
+from .summary import expectation as expectation
 from .summary import residual_table as residual_table
 from .summary import rows_of as rows_of
 from .summary import table as table

@@ -29,6 +29,9 @@ TRAINING_FILE, CALIBRATION_VALUES_FILE = "training.yaml", "calibration.json"
 TARGETS = "targets"
 """Folder, beside the setup's file, of the known targets' pictures."""
 
+_SOME_OF_COUNTS = (
+    1.1  # of what noise alone leaves of the counts held out, above which less is expected of events
+)
 _MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25
 _GOOD, _FAIR, _POOR = 3.0, 6.0, 10.0  # per cent of the light beside the noise
 
@@ -209,7 +212,14 @@ def expectation(fit: SetupFit) -> str:
         what = "about level with end-to-end training; only fine-tuned networks"
     else:
         what = "behind end-to-end training; measure the wall instead (evnlos scan)"
-    events = "; events: not to be trusted without fine-tuning" if _event_warnings(fit) else ""
+    counts, events = fit.residuals.get("counts held out"), ""
+    if _event_warnings(fit):
+        events = "; events: not to be trusted without fine-tuning"
+    elif counts is not None and counts.after > _SOME_OF_COUNTS * counts.noise:
+        events = (
+            f"; events: expect less, {100 * counts.after:.0f} % of their counts is left where noise leaves "
+            f"{100 * counts.noise:.0f} %"
+        )
     return f"EPNP on this setup: {what} ({share:.1f} % of the light unexplained beside the noise){events}"
 
 
