@@ -84,19 +84,6 @@ def test_a_stage_that_says_nothing_itself_moves(capsys) -> None:
     assert "track: 2 of 3 stages (follow the target), 0 s" in capsys.readouterr().err
 
 
-def test_work_within_work_is_told_by_the_inner_one_alone(capsys) -> None:
-    show_progress("lines")
-    with ProgressBars() as outer:
-        outer(Step("render", 19, 19, "captures"))
-        with ProgressBars() as inner:
-            inner(Step("train", 1, 3, "networks"))
-            time.sleep(0.3)
-        told = capsys.readouterr().err
-        time.sleep(0.2)
-    assert "train: 1 of 3" in told and "render" not in told
-    assert "render: 19 of 19" in capsys.readouterr().err
-
-
 def test_compiling_is_told_apart_from_standing_still(capsys, monkeypatch) -> None:
     from numba import njit
 

@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from evnlos.errors import ConfigError
 
@@ -174,9 +174,6 @@ class ProgressBars:
         ...     progress(Step("simulate letters", 3, 26, "objects"))
     """
 
-    _latest: ClassVar[ProgressBars | None] = None
-    """Which told a step last: others, around it, only show steps of their own."""
-
     def __init__(self, quiet: bool = False) -> None:
         self._how = "none" if quiet else _progress_shown()
         self._step: Step | None = None
@@ -189,7 +186,6 @@ class ProgressBars:
         """Show a step; a new piece of work begins where its name is another one."""
         if self._how == "none":
             return
-        ProgressBars._latest = self
         with self._lock:
             if self._step is None or step.what != self._step.what:
                 self._finish()
@@ -218,8 +214,7 @@ class ProgressBars:
     def _beat(self) -> None:
         while not self._end.wait(_BEAT_S):
             with self._lock:
-                if ProgressBars._latest in (self, None):
-                    self._show()
+                self._show()
 
     def _show(self) -> None:
         step, now = self._step, time.monotonic()
@@ -282,8 +277,6 @@ class ProgressBars:
         with self._lock:
             self._finish()
             self._step = None
-        if ProgressBars._latest is self:
-            ProgressBars._latest = None
 
     def __enter__(self) -> ProgressBars:
         return self
