@@ -153,7 +153,7 @@ def test_pictures_that_do_not_explain_the_frames_are_not_measured() -> None:
     assert good.measured and good.support == pytest.approx(min(good.agreement, 0.9, 1))
     assert poor.measured and poor.support == pytest.approx(min(poor.agreement, 0.8))
     assert not wrong.measured and wrong.support == 0
-    assert "explain 60 % of what the frames" in wrong.verdict and float(wrong.high.min()) == 1
+    assert "explains 60 % of what this object adds" in wrong.verdict and float(wrong.high.min()) == 1
 
 
 def test_intervals_cover_unseen_sequences_as_often_as_they_say() -> None:

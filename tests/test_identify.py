@@ -252,7 +252,7 @@ def test_command(tmp_path, capsys):
     main(["identify", "matte-near", "--json", *small])
     found = json.loads(capsys.readouterr().out)
     assert (found["setup"], found["modes_above_1e-2"]) == ("matte-near", 3)
-    assert "memory" in found["verdict"]
+    assert "training data" in found["verdict"]
     main(["identify", "matte-near", "hard-far", "--out", str(tmp_path / "o"), *small])
     shown = capsys.readouterr().out
     assert "| matte-near | 3 |" in shown and "hard-far: With this wall" in shown

@@ -319,12 +319,12 @@ def log_change(events: Events, edges_us: ArrayLike, pixel: EventPixel) -> torch.
 
 
 def local_changes(images: torch.Tensor) -> torch.Tensor:
-    """Return what small errors of brightness, place and blur change in images [..., h, w]: [..., h, w, 5].
+    """Return what small errors of brightness, place and blur change in images [N, h, w]: [N, h, w, 5].
 
     The image itself, its differences along x and y, and its second differences along both, per pixel.
 
     Example:
-        >>> local_changes(torch.arange(9.0).reshape(3, 3))[1, 1].tolist()
+        >>> local_changes(torch.arange(9.0).reshape(1, 3, 3))[0, 1, 1].tolist()
         [4.0, 1.0, 3.0, 0.0, 0.0]
     """
     wide, high = (pad(images, size, mode="replicate") for size in ((1, 1, 0, 0), (0, 0, 1, 1)))
