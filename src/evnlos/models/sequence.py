@@ -485,11 +485,6 @@ class SequenceReconstructor(Reconstructor):
         """Take what frames are solved through from the samples' setup, or correct it by captures."""
         assert self.frames is not None
         self._corrects = False
-        if is_new and not self.sampling.setup:
-            raise ConfigError(
-                "Sampling.setup is empty, and network.frames is 'likelihood', which undoes the light path of a "
-                "setup: make the samples with --sampling.setup FOLDER of `evnlos calibrate`"
-            )
         device, places = self.frames.basis.device, torch.from_numpy(samples.position_m)
         known = samples.inputs[:, self._frame].cpu(), samples.truth.cpu(), places, samples.names
         if is_new:
