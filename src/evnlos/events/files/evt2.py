@@ -214,7 +214,7 @@ _count_below: Any = intrinsic(_zeros_below)  # (mask)
 
 
 @njit(cache=True)
-def bound_evt21(words: NDArray[np.int64]) -> int:
+def bound_evt21(words: NDArray[np.int64]) -> Any:
     """Return how many events `words` can hold at most."""
     count = np.int64(0)
     for index in range(len(words)):
@@ -223,7 +223,7 @@ def bound_evt21(words: NDArray[np.int64]) -> int:
 
 
 @njit(cache=True)
-def bound_evt21_swapped(words: NDArray[np.int64]) -> int:
+def bound_evt21_swapped(words: NDArray[np.int64]) -> Any:
     """Return how many events `words` can hold at most when the fields lie in their low halves."""
     count = np.int64(0)
     for index in range(len(words)):
