@@ -97,12 +97,12 @@ class SequenceAnalysisSettings:
         Args:
             capture: Its motion and the number of its frames count; the default's where the motion is unknown.
         """
-        frames, motion, plain = len(capture.frame_times_us), capture.motion, cls()
+        travel_m, speed_m_s, positions = cls.travel_m, cls.speed_m_s, cls.positions
+        frames, motion = len(capture.frame_times_us), capture.motion
         if motion is not None and motion.speed_m_s > 0 and frames > 1:
             lasts_s = frames * float(np.median(np.diff(capture.frame_times_us))) * 1e-6
-            plain = cls(motion.speed_m_s * lasts_s, motion.speed_m_s, frames, (1, frames))
-        counts = (1, plain.positions)
-        return replace(plain, counts=counts, other_noises=(), other_models=False)
+            travel_m, speed_m_s, positions = motion.speed_m_s * lasts_s, motion.speed_m_s, frames
+        return cls(travel_m, speed_m_s, positions, (1, positions), other_noises=(), other_models=False)
 
     @property
     def duration_s(self) -> float:
@@ -209,8 +209,7 @@ def sequence_bounds(
     frames = [pixels * frame_information(light, z, setup, settings) for z in references]
     found = []
     typical = float(light(references[0]).mean()) * WHITE_DN
-    own = {str(getattr(setup.pixel, "kind", "")): setup.pixel}
-    for kind, pixel in (_models(setup.pixel) if settings.other_models else own).items():
+    for kind, pixel in _models(setup.pixel, others=settings.other_models).items():
         law = pixel.crossing_law(typical)
         if law is None:
             continue
@@ -384,11 +383,11 @@ def _decibel(prior: PatternPrior, information: list[np.ndarray]) -> tuple[float,
     )
 
 
-def _models(own: PixelSettings) -> dict[str, PixelSettings]:
-    """Return the setup's own event model, and the other kinds with its thresholds."""
+def _models(own: PixelSettings, *, others: bool) -> dict[str, PixelSettings]:
+    """Return the setup's own event model and, where asked for, the other kinds with its thresholds."""
     found = {str(getattr(own, "kind", "")): own}
     values = {item.name: getattr(own, item.name) for item in fields(own) if item.name != "kind"}  # type: ignore[arg-type]
-    for kind in EVENT_MODELS:
+    for kind in EVENT_MODELS if others else ():
         settings = EVENT_MODELS[kind]
         names = {item.name for item in fields(settings)}  # type: ignore[arg-type]
         if kind not in found and "threshold_on" in names & set(values):

@@ -203,7 +203,7 @@ class Model:
             recording: A capture folder, or one that was read; its target may be unknown.
             setup: The calibrated setup of this very recording; the images are then moved to where its wall
                 agrees with the frames, if these are as bright as the setup makes them. Without one, the
-                confidence asks the setup that pretrained weights were trained for, and the images stay.
+                confidence asks the `known_setup`, and the images stay.
             pattern: Fixed pattern of the frame camera, to be taken from the frames.
             track: Find the motion in the recording with the setup, also where it is stated.
 

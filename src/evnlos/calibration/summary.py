@@ -29,9 +29,7 @@ TRAINING_FILE, CALIBRATION_VALUES_FILE = "training.yaml", "calibration.json"
 TARGETS = "targets"
 """Folder, beside the setup's file, of the known targets' pictures."""
 
-_SOME_OF_COUNTS = (
-    1.1  # of what noise alone leaves of the counts held out, above which less is expected of events
-)
+_SOME_OF_COUNTS = 1.1  # times what noise leaves of counts held out: from there on less comes of events
 _MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25
 _GOOD, _FAIR, _POOR = 3.0, 6.0, 10.0  # per cent of the light beside the noise
 

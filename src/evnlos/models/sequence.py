@@ -245,8 +245,7 @@ class PooledFrames(nn.Module):
         left = code - gain[owner, None] * clean
         self.reach.copy_(torch.stack([position_m.amin(dim=0), position_m.amax(dim=0)]))
         terms = self._terms(position_m)
-        gram = (terms.T @ terms).double() + _RIDGE * len(terms) * torch.eye(_ALONG, dtype=torch.float64)
-        along = torch.linalg.solve(gram, (terms.T @ left).double()).float()
+        along = _polynomial(terms, left)
         left = left - terms @ along
         offset = mean_of(left)
         noise = (left - offset[owner]).double()
@@ -301,9 +300,7 @@ class PooledFrames(nn.Module):
         # of light that is a sum of `back`, the changes are the sum of those of `back`
         turn = (local_changes(back.unflatten(1, size)) * maps).sum(dim=-1).flatten(1) @ self.basis  # [r, r]
         moved = (torch.eye(len(turn)) + turn).T @ self.light.flatten(1)  # [r, cells]
-        left = code - gain * (truth.flatten(1) @ moved.T)
-        gram = (terms.T @ terms).double() + _RIDGE * len(terms) * torch.eye(_ALONG)
-        self.along += torch.linalg.solve(gram, (terms.T @ left).double()).float()
+        self.along += _polynomial(terms, code - gain * (truth.flatten(1) @ moved.T))
         self.light.copy_(moved.view_as(self.light))
         self._last = None
 
@@ -356,6 +353,12 @@ class PooledFrames(nn.Module):
         at = position_m.to(self.reach).clamp(low, high)
         x, y = ((at - (low + high) / 2) / ((high - low) / 2).clamp_min(1e-6)).unbind(dim=1)
         return torch.stack([torch.ones_like(x), x, x**2, x**3, y, x * y, y**2], dim=1)
+
+
+def _polynomial(terms: Tensor, values: Tensor) -> Tensor:
+    """Return the factors [7, r] of terms [N, 7] that come nearest to values [N, r]."""
+    gram = (terms.T @ terms).double() + _RIDGE * len(terms) * torch.eye(_ALONG, dtype=torch.float64)
+    return torch.linalg.solve(gram, (terms.T @ values).double()).float()
 
 
 class SequenceReconstructor(Reconstructor):

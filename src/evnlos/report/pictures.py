@@ -203,7 +203,7 @@ def reconstruct_capture(
         zoom: Size of a pixel in the pictures.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
         setup: The calibrated setup; the pictures are then moved to where the wall agrees with the frames, if
-            these are as bright as it makes them. Without one, the setup of published weights explains them.
+            these are as bright as it makes them. Without one, the setup of the weights explains them, if known.
         track: Find the motion in the recording with the setup, also where it is stated; the truth, where it is
             known, stays where the capture states it.
         progress: Called at each of three stages, and at the end.

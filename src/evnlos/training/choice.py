@@ -11,7 +11,6 @@ import math
 import shutil
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -304,10 +303,15 @@ def augmented(dataset: Dataset, modality: str, progress: Progress = silent) -> D
     return new
 
 
-@lru_cache(maxsize=8)
+_ASYMMETRIES: dict[Path, float] = {}
+"""Of the datasets that were looked at; several networks ask for one."""
+
+
 def _measured(folder: Path, progress: Progress) -> float:
-    """Return the asymmetry of a dataset's captures; several networks ask for it."""
-    return asymmetry(open_dataset(folder), progress)
+    """Return the asymmetry of a dataset's captures; it is looked for once, whoever is told of it."""
+    if folder not in _ASYMMETRIES:
+        _ASYMMETRIES[folder] = asymmetry(open_dataset(folder), progress)
+    return _ASYMMETRIES[folder]
 
 
 def _pairs(dataset: Dataset, objects: list[tuple[str, bool]]) -> dict[str, list[tuple[str, bool]]]:

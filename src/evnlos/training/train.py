@@ -112,8 +112,11 @@ def train(
             f"mirror is on, and a reconstructor of kind {network.kind!r} sees whole sequences, which are not "
             "mirrored; leave it off"
         )
+    samples = None
+    if not (isinstance(dataset, LiveDataset) or (out / "weights.safetensors").is_file()):
+        samples = NlosDataset(dataset, "train", network.modality)
+        network.check_samples(samples, is_new=start is None or settings.refit_embedding)
     with process_group() as processes, ExitStack() as stack:
-        steps = _source(dataset, network, settings, processes, is_new=start is None or settings.refit_embedding)
         about = about_run(dataset, settings, start, processes.device)
         if processes.rank == 0:
             stack.enter_context(directory_lock(out, check=lambda: check_run(out, about)))
@@ -123,14 +126,14 @@ def train(
                 save_yaml(about, out / "run.yaml")
         processes.wait()
         history = [*(start.history if start else []), about]
-        records = _epochs(network, dataset, steps, settings, out, history, processes, start, progress)
+        records = _epochs(network, dataset, samples, settings, out, history, processes, start, progress)
     return TrainingResult(out, records)
 
 
 def _epochs(
     network: Reconstructor,
     dataset: Dataset,
-    steps: BatchSource,
+    samples: NlosDataset | None,
     settings: Training,
     out: Path,
     history: list[dict[str, Any]],
@@ -152,6 +155,12 @@ def _epochs(
     optimiser = torch.optim.Adam(trained, lr=settings.learning_rate)
     loss_of, half = LOSSES[settings.loss], _half(settings, device)
     progress(Step(f"{what}: gather its samples", 0, 1, "sets"))  # a minute, where a network pools sequences
+    how = settings.batch_size, settings.seed, processes
+    if isinstance(dataset, LiveDataset):
+        steps: BatchSource = SimulatedSource(dataset, network.modality, *how)
+    else:
+        assert samples is not None  # of a training that has not ended
+        steps = DiskSource(samples, *how)
     held_out = held_out_samples(dataset, network.modality, device) if leads else None
 
     done, log = 0, list[dict[str, Any]]()
@@ -249,17 +258,6 @@ def _check_data(dataset: Dataset, network: Reconstructor) -> None:
             f"{dataset.folder} lacks {len(lost)} of its shards ({lost[0]} is the first); run the command that "
             "made the dataset again"
         )
-
-
-def _source(
-    dataset: Dataset, network: Reconstructor, settings: Training, processes: ProcessGroup, *, is_new: bool
-) -> BatchSource:
-    """Return where the samples of single time steps come from; what the network can't learn from is refused."""
-    if isinstance(dataset, LiveDataset):
-        return SimulatedSource(dataset, network.modality, settings.batch_size, settings.seed, processes)
-    samples = NlosDataset(dataset, "train", network.modality)
-    network.check_samples(samples, is_new=is_new)
-    return DiskSource(samples, settings.batch_size, settings.seed, processes)
 
 
 def _write_log(path: Path, log: list[dict[str, Any]]) -> None:
