@@ -1,10 +1,10 @@
-"""How long the page lets a person wait, in a real Chromium: for the first picture and for each control.
+"""How long the page lets a person wait, in a real Chromium: for the first image and for each control.
 
     python benchmarks/app.py
     python benchmarks/app.py --rounds 9 --write benchmarks/results/app.md
 
 The page is started once and opened in a new browser; a control is moved by a key, and the clock runs until the
-picture of the new sequence stands in the page. Needs chromium and chromedriver.
+image of the new sequence stands in the page. Needs chromium and chromedriver.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ LEFT, RIGHT = "\ue012", "\ue014"
 SEQUENCE = "document.querySelector('.ev-sheet').dataset.sequence"
 
 
-FIRST = "first pictures, from opening the address"
+FIRST = "first images, from opening the address"
 READY = "controls, from opening the address"
 
 
 def opened(home: str, browser: chromium.Chromium, rows: dict[str, list[float]]) -> None:
     start = time.perf_counter()
     browser.open(home)
-    for row, place in (FIRST, ".ev-picture"), (READY, "gradio-app input[type=range]"):
+    for row, place in (FIRST, ".ev-image"), (READY, "gradio-app input[type=range]"):
         browser.wait(f"const p = document.querySelector('{place}'); return p && p.offsetWidth")
         rows[row].append(time.perf_counter() - start)
 

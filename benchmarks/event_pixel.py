@@ -47,7 +47,7 @@ Results = dict[str, tuple[float, float, int]]
 
 
 class Wall:
-    """A picture of soft lights that slides over the sensor: rows are interpolated."""
+    """An image of soft lights that slides over the sensor: rows are interpolated."""
 
     def __init__(self, height: int, width: int, speed_px_s: float) -> None:
         self.shape, self.speed_px_s = (height, width), speed_px_s

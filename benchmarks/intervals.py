@@ -11,12 +11,12 @@ them set on the validation split of `--calibration`, which none of the networks 
     unsure         in proportion to sqrt(p (1 - p) + 0.003), p the network's level (normalised split conformal)
     ensemble       mean of the networks +- 1.645 standard deviations among them, as a Gaussian would have it
     ensemble, set  the same in proportion to that deviation (normalised split conformal)
-    quantiles      a small network that learns the 5 % and the 95 % point from the pictures around a pixel
+    quantiles      a small network that learns the 5 % and the 95 % point from the images around a pixel
                    (pinball loss), moved to cover (conformalised quantile regression: Romano et al., 2019)
 
 Coverage and mean length; then the interval score (Gneiting and Raftery, JASA 2007), the length plus 20 times
 what the truth is outside by, of which less is better. The ensemble's intervals stand around the mean of its
-pictures, all others around the first network's.
+images, all others around the first network's.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def by_levels(confidence: Confidence, new: Seen) -> Interval:
 
 
 class Quantiles(nn.Module):
-    """The 5 % and the 95 % point of a pixel's level, from the picture around it and that of the sequence."""
+    """The 5 % and the 95 % point of a pixel's level, from the image around it and that of the sequence."""
 
     def __init__(self, width: int = 24) -> None:
         super().__init__()
@@ -112,7 +112,7 @@ class Quantiles(nn.Module):
         )
 
     def forward(self, picture: Tensor, of_sequence: Tensor) -> Interval:
-        """Return both ends [N, 32, 32] for a picture and the mean picture of its sequence."""
+        """Return both ends [N, 32, 32] for an image and the mean image of its sequence."""
         away = self.layers(torch.stack([picture, of_sequence], dim=1))
         middle = torch.logit(picture.clamp(0.01, 0.99)) + away[:, 0]
         spread = nn.functional.softplus(away[:, 1])
@@ -120,7 +120,7 @@ class Quantiles(nn.Module):
 
 
 def of_sequences(seen: Seen) -> Tensor:
-    """Return the mean target of each picture's sequence, [N, 32, 32]."""
+    """Return the mean target of each image's sequence, [N, 32, 32]."""
     sequences = torch.stack([seen.drawn[0, seen.owner == k].mean(dim=0) for k in range(len(seen.halves))])
     return sequences[seen.owner]
 

@@ -1,4 +1,4 @@
-"""How long from an event to its picture, live, at 160 x 100 and a million events per second; where does it go?
+"""How long from an event to its image, live, at 160 x 100 and a million events per second; where does it go?
 
     python benchmarks/live.py                              # replay and UDP, event and fusion, two threads
     python benchmarks/live.py --threads 1 --sources replay --seconds 20
@@ -7,7 +7,7 @@
     python benchmarks/live.py --sources udp --modalities event --rate 3e6 --seconds 600  # each event counted?
 
 Random events, the worst case for the surface, in true time: from memory, an event being due at its own
-instant, or from another process by UDP in packets of 180 events. Latency is wall time to the picture as an
+instant, or from another process by UDP in packets of 180 events. Latency is wall time to the image as an
 array, from the instant of the first event that is new in it (the one that waited longest) and from that of the
 last one; the parts are those of the first. Compilation and the first runs of the network are left out.
 
@@ -45,7 +45,7 @@ PIECE_US = 20_000
 FRAME_US = 200_000
 _NUMBER_AT, _BASE_AT = 8, 16  # of a packet, see docs/live.md
 COLUMNS = (
-    "source", "modality", "pictures/s", "M events/s", "oldest p50, ms", "p90", "p99", "max", "newest p50, ms",
+    "source", "modality", "images/s", "M events/s", "oldest p50, ms", "p90", "p99", "max", "newest p50, ms",
     "p99", "surface p50, ms", "network p50, ms", "surface / network / rest, %", "events dropped / lost",
     "cores used",
 )  # fmt: skip
@@ -125,7 +125,7 @@ def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
     else:
         source = replay(rate_hz, seconds, weights.modality.needs_frames)
         engine.begin()
-    run = Run(source, engine, RateOptions(rate=arguments.pictures_hz))
+    run = Run(source, engine, RateOptions(rate=arguments.images_hz))
     before = time.process_time()
     done = run.go().summary()
     cpu = (time.process_time() - before) / max(done["seconds"], 1e-9)
@@ -146,10 +146,10 @@ def row(name: str, weights: Weights, arguments: argparse.Namespace) -> str:
     spread = done["latency_ms"]
     oldest, newest = spread["oldest_event"], spread["newest_event"]
     if oldest is None:
-        return f"| {name} | {weights.modality.name} | no picture with an event |"
+        return f"| {name} | {weights.modality.name} | no image with an event |"
     parts = [spread[part]["mean"] for part in ("surface", "network", "wait")]
     shares = " / ".join(f"{100 * part / sum(parts):.0f}" for part in parts)
-    cells = [name, weights.modality.name, f"{done['pictures_hz']:.0f}", f"{done['events_hz'] / 1e6:.2f}"]
+    cells = [name, weights.modality.name, f"{done['images_hz']:.0f}", f"{done['events_hz'] / 1e6:.2f}"]
     cells += [f"{oldest[q]:.1f}" for q in ("p50", "p90", "p99", "max")]
     cells += [f"{newest[q]:.1f}" for q in ("p50", "p99")]
     cells += [f"{spread['surface']['p50']:.1f}", f"{spread['network']['p50']:.1f}", shares]
@@ -169,7 +169,7 @@ def main() -> None:
     parser.add_argument("--sources", nargs="+", choices=("replay", "udp"), default=["replay", "udp"])
     parser.add_argument("--modalities", nargs="+", choices=STANDARD_MODALITIES, default=["event", "fusion"])
     parser.add_argument("--rate-hz", "--rate", type=float, default=1e6, help="events per second")
-    parser.add_argument("--pictures-hz", type=float, default=RateOptions.rate, help="most pictures per second")
+    parser.add_argument("--pictures-hz", type=float, default=RateOptions.rate, help="most images per second")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--threads", type=int, default=2, help="threads of the network")
     parser.add_argument("--weights", help="weights or run, of the modality asked for")
@@ -185,7 +185,7 @@ def main() -> None:
         "# Live latency",
         "",
         f"{WIDTH} x {HEIGHT} pixels, {arguments.rate_hz:,.0f} events per second for {arguments.seconds:.0f} s; "
-        f"at most {arguments.pictures_hz:.0f} pictures per second of {Sampling.width} x {Sampling.height}; "
+        f"at most {arguments.images_hz:.0f} images per second of {Sampling.width} x {Sampling.height}; "
         f"{arguments.threads} threads; niceness {nice()}, load before: {load:.1f}.",
         "",
         machine(),

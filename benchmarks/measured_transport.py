@@ -1,10 +1,10 @@
-"""What does the noise of a scan cost the picture behind a real photograph, and what does denoising give back?
+"""What does the noise of a scan cost the image behind a real photograph, and what does denoising give back?
 
     python benchmarks/measured_transport.py mushroom_chair.npz
 
 The photograph is that of Saunders et al. (Nature 2019). Nobody scanned the room: its modelled matrix is scanned
 by our simulator with a camera of stated read noise (white levels), imported, and inverts the real photograph. r
-is Pearson's correlation with the picture on the screen, for the smooth inversion of docs/inversion.md.
+is Pearson's correlation with the image on the screen, for the smooth inversion of docs/inversion.md.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""How long does one reconstruction take, from events and frame to picture, beside the network alone?
+"""How long does one reconstruction take, from events and frame to image, beside the network alone?
 
     python benchmarks/reconstruct.py                 # default network, two threads
     python benchmarks/reconstruct.py --threads 1 --weights RUN

@@ -168,7 +168,7 @@ if __name__ == "__main__":
     parser.add_argument("--repeat", type=int, default=7, help="runs of each size")
     parser.add_argument("--node-cores", type=int, default=64, help="cores of a node in the estimate")
     parser.add_argument("--write", type=Path, help="file for the tables")
-    parser.add_argument("--figure", type=Path, help="picture of the sweeps")
+    parser.add_argument("--figure", type=Path, help="image of the sweeps")
     arguments = parser.parse_args()
     one_thread()
     simulate_object(BASE, BASE.glyphs.objects()[0])  # compiles

@@ -15,7 +15,7 @@ from evnlos import EventCamera, EventPixel, FrameCamera, Scene, Target, psnr, ti
 from evnlos.data import Sampling, object_light
 from evnlos.inverse import SequenceOperator, SequenceProblem
 from evnlos.inverse.sequence_problem import strip_gram_of
-from evnlos.plot.figures import Column, film, signed_pictures, slice_pictures
+from evnlos.plot.figures import Column, film, signed_images, slice_images
 from evnlos.report.pictures import grey, save_animation
 from evnlos.scene import FontGlyphs
 from evnlos.setups import load_setup
@@ -50,8 +50,8 @@ if len(sys.argv) > 1:
     columns = [
         Column("hidden object", "24 cm around the corner", grey(truth)),
         Column("wall", "what the frame camera sees", grey(frames, low, high)),
-        Column("events", "orange brighter, blue darker", slice_pictures(events, edges_us)),
-        Column("time surface", "fades in 0.2 s", signed_pictures(surface, 1.0, faintest=0.0)),
+        Column("events", "orange brighter, blue darker", slice_images(events, edges_us)),
+        Column("time surface", "fades in 0.2 s", signed_images(surface, 1.0, faintest=0.0)),
         Column("found", "all frames so far, inverted", grey(found)),
     ]
     save_animation(sys.argv[1], film(columns, 190, "dark"), 10)

@@ -2,7 +2,7 @@
 
     python examples/02_diffuse_kernel.py docs/figures/diffuse_kernel.png
 
-The paper shows curves and pictures for several mean free paths <l> and calls the curve very similar to
+The paper shows curves and images for several mean free paths <l> and calls the curve very similar to
 Lambert's cosine law. Each term of the tPSF is such a law, for a point source at the depth <l> + k t; the
 nearest one, k = -1, lies at t - <l>. So the likeness is exact for one term; what do the others add?
 """

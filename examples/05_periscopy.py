@@ -3,7 +3,7 @@
     python examples/05_periscopy.py mushroom_chair.npz docs/figures/periscopy_rules.png
 
 A small chair between screen and wall casts shadows that differ from cell to cell; with the chair in the model
-the wall turns into a picture. No choice looks at the truth; "best regularization" does, to say what the choices
+the wall turns into an image. No choice looks at the truth; "best regularization" does, to say what the choices
 cost.
 """
 

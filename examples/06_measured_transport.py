@@ -40,8 +40,7 @@ for pattern in ("raster", "hadamard"):
     errors[pattern] = row
     print(f"{pattern:28}" + "".join(f"{1e4 * value:9.2f}" for value in row), better.denoising)
     print(
-        f"{'':28}brightest entry {1e4 * truth.max():.0f}, {planned.scan_frames} pictures, "
-        f"{planned.seconds:.0f} s"
+        f"{'':28}brightest entry {1e4 * truth.max():.0f}, {planned.scan_frames} images, {planned.seconds:.0f} s"
     )
 
 ratio = errors["raster"][2] / errors["hadamard"][2]

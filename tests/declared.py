@@ -51,7 +51,7 @@ cite tuned
 capture init begun --camera davis346
 capture check captures/lab_icon_000
 import captures/lab_icon_000 captures/lab_icon_001 --out recorded --test lab_icon_001 {{sampling}}
-reconstruct captures/lab_icon_000 --weights fused --out pictures
+reconstruct captures/lab_icon_000 --weights fused --out images
 live captures/lab_icon_000 --weights fused --headless --out watched --speed 8
 track captures/lab_icon_000 --json
 invert captures/lab_icon_000 --setup small.yaml --solver tikhonov --columns 24 --cells 8 --out solved.png

@@ -1,4 +1,4 @@
-"""Hostile inputs of many kinds: settings, YAML, captures, pictures, NPZ, HDF5, weights, packets, uploads.
+"""Hostile inputs of many kinds: settings, YAML, captures, images, NPZ, HDF5, weights, packets, uploads.
 
     python tests/fuzz_inputs.py --count 2400 --seed 1
     python tests/fuzz_inputs.py --guided 300 --seed 1     # seconds; keeps what reaches new branches
@@ -403,7 +403,7 @@ def datagrams_of(content: bytes) -> list[bytes]:
 
 @cache
 def listener() -> Engine:
-    """Return what makes pictures of packets; one for all inputs, for each tracing of a network keeps memory."""
+    """Return what makes images of packets; one for all inputs, for each tracing of a network keeps memory."""
     network = UNetConfig(width=4, depth=1, shuffle=1, rank=0).build("event", Sampling(8, 8, 0.01, 8))
     return Engine(Weights(network))
 

@@ -43,7 +43,7 @@ from evnlos.cli import main
 from evnlos.data import Sampling
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
 from evnlos.models import load_weights
-from evnlos.plot.figures import CloudSize, cloud_pictures, signed_pictures, smaller, time_slices
+from evnlos.plot.figures import CloudSize, cloud_images, signed_images, smaller, time_slices
 
 SMALL = Controls(columns=24)
 
@@ -91,7 +91,7 @@ def test_a_drawing_is_a_target() -> None:
     assert picked(CHARACTERS[0]).mask.any()
 
 
-def test_classical_pictures_beat_black_and_the_whole_sequence_beats_one_frame(app_sequence) -> None:
+def test_classical_images_beat_black_and_the_whole_sequence_beats_one_frame(app_sequence) -> None:
     whole, single = from_whole_sequence(app_sequence), from_each_frame(app_sequence)
     middle = slice(10, 30)
     assert whole.psnr_db[middle].mean() > single.psnr_db[middle].mean() + 0.5
@@ -126,14 +126,14 @@ def test_networks_of_the_package_see_more_than_least_squares(app_sequence) -> No
         assert "all frames" in found[name].note and "agree on" in found[name].note
 
 
-def test_pictures_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames() -> None:
+def test_images_of_a_wall_that_networks_do_not_know_are_refused_by_its_frames() -> None:
     networks, noted = Networks(), {}
     for name, setup in (("own", SMALL), ("rough", replace(SMALL, roughness=0.2))):
         recorded = simulate_sequence(setup, picked("R"))
         wall = networks.wall_of(recorded)
         network = networks.of(recorded)["network, frames"]
         noted[name] = from_weights(recorded, "frames", network, wall).note
-        assert "agree on" in from_weights(recorded, "frames", network).note  # the pictures alone do not tell
+        assert "agree on" in from_weights(recorded, "frames", network).note  # the images alone do not tell
     assert "agree on" in noted["own"] and "nothing measured" in noted["rough"]
 
 
@@ -205,12 +205,12 @@ def test_a_message_is_text() -> None:
 
 def test_the_cloud_shows_each_event_once_as_present() -> None:
     events = Events([5, 15, 25], [0, 3, 1], [0, 1, 1], [1, 0, 1], width=4, height=2)
-    pictures, colours = cloud_pictures(events, np.array([0, 10, 20, 30]), CloudSize(160, 96))
+    pictures, colours = cloud_images(events, np.array([0, 10, 20, 30]), CloudSize(160, 96))
     for k, now in enumerate((6, 7, 6)):
         assert (pictures[k] == now).any() and not (pictures[k] == 13 - now).any()
     assert not (pictures[2] == 3).any() and (pictures[0] == 3).any()
     assert colours.shape == (8, 4)
-    blank, _ = cloud_pictures(Events.empty(4, 2), np.array([0, 10]))
+    blank, _ = cloud_images(Events.empty(4, 2), np.array([0, 10]))
     assert not (blank >= 3).any()
     with pytest.raises(DataError, match="64"):
         CloudSize(10, 10)
@@ -223,7 +223,7 @@ def test_slices_count_the_events_of_the_middle() -> None:
     assert over_y.sum() == 2 and over_y[0, 8, 1] == 1 and over_y[0, 0, 5] == 1
     with pytest.raises(DataError, match="bins"):
         time_slices(events, np.array([0, 10]), bins=0)
-    assert not signed_pictures(np.zeros((2, 3, 3))).any()
+    assert not signed_images(np.zeros((2, 3, 3))).any()
 
 
 def test_a_large_sensor_is_made_small_without_losing_events() -> None:
@@ -503,8 +503,8 @@ def test_the_page_in_a_real_browser(tmp_path) -> None:
             " return box ? getComputedStyle(box).backgroundColor : document.querySelector('.dark') && 'gone'"
         ) in ("rgb(10, 15, 30)", "gone")
         browser.open(home)
-        # The pictures are there before Gradio is, and give way to its own.
-        width = browser.wait("const p = document.querySelector('.ev-picture'); return p && p.offsetWidth")
+        # The images are there before Gradio is, and give way to its own.
+        width = browser.wait("const p = document.querySelector('.ev-image'); return p && p.offsetWidth")
         assert width > 100
         marks = "performance.getEntriesByName('evnlos-sheet').map(mark => mark.startTime)"
         first, then = browser.wait(f"const m = {marks}; return m.length > 1 && m.slice(0, 2)")
@@ -560,8 +560,8 @@ def test_the_page_on_a_phone_and_opened_by_a_link(tmp_path) -> None:
         )
         numbers = "[...document.querySelectorAll('.ev-controls input[type=number]')].map(box => box.value)"
         assert browser.run(f"return {numbers}")[:2] == ["0.02", "40"]
-        # Pictures come first, none is wider than the screen, and they stay while one scrolls to a slider.
-        top = "document.querySelector('.ev-picture').getBoundingClientRect().top"
+        # Images come first, none is wider than the screen, and they stay while one scrolls to a slider.
+        top = "document.querySelector('.ev-image').getBoundingClientRect().top"
         assert browser.run(f"return {top}") < 500
         assert browser.run("return document.documentElement.scrollWidth") <= 390
         slider = "document.querySelector('input[type=range][aria-label*=\"Ambient light\"]')"
@@ -572,7 +572,7 @@ def test_the_page_on_a_phone_and_opened_by_a_link(tmp_path) -> None:
             f"const b = {slider}.getBoundingClientRect(); return [b.left + 20, b.top + b.height / 2]"
         )
         assert browser.run(f"return document.elementFromPoint({x}, {y}) === {slider}")
-        # What is downloaded is a picture.
+        # What is downloaded is an image.
         assert browser.run("return evnlosSave(document.querySelector('button[onclick*=Save]'))") > 10_000
         unnamed = (
             "[...document.querySelectorAll('input, button, canvas, a.ev-button')]"

@@ -649,7 +649,7 @@ def test_no_camera_and_no_package_are_one_line_each(monkeypatch, capsys) -> None
         assert stop.value.code == 2 and len(lines) == 1 and text in lines[0]
 
 
-def test_live_pictures_a_camera_that_comes_back_and_accounts_for_its_events(
+def test_live_images_a_camera_that_comes_back_and_accounts_for_its_events(
     monkeypatch, tmp_path: Path, capsys
 ) -> None:
     drivers = pytest.importorskip("neuromorphic_drivers")

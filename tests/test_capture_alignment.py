@@ -160,7 +160,7 @@ def test_warping_keeps_pixels_and_averages_finer_ones():
         warp_frames(frames, np.zeros((3, 3)), (20, 30))
 
 
-def dots_picture(matrix, shape, rows=4, columns=6, step=30.0, spread=3.0):
+def dots_image(matrix, shape, rows=4, columns=6, step=30.0, spread=3.0):
     """A grid of soft dots under a homography, and their true centres."""
     grid = np.array([(60 + step * c, 40 + step * r) for r in range(rows) for c in range(columns)], float)
     centres = project(matrix, grid)
@@ -170,7 +170,7 @@ def dots_picture(matrix, shape, rows=4, columns=6, step=30.0, spread=3.0):
 
 
 def test_dots_are_found_in_their_order_under_perspective():
-    picture, truth = dots_picture(TILTED, (200, 300))
+    picture, truth = dots_image(TILTED, (200, 300))
     noisy = 20 + 150 * picture + np.random.default_rng(2).normal(0, 3, picture.shape)
     found = find_dots(noisy, 4, 6)
     assert np.abs(found - truth).max() < 0.25

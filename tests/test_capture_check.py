@@ -77,7 +77,7 @@ def test_a_motion_that_is_not_that_of_the_light_is_named(capture) -> None:
     assert halted["motion"] != "good"
 
 
-def test_light_that_leaves_the_picture_is_named(capture) -> None:
+def test_light_that_leaves_the_image_is_named(capture) -> None:
     """All movement at the left border of a wall that is dark elsewhere."""
     frames = np.full((12, 48, 72), 100, np.uint8)
     frames += np.random.default_rng(0).integers(0, 3, frames.shape).astype(np.uint8)

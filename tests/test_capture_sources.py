@@ -12,7 +12,7 @@ from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
 from evnlos.cli import main
-from evnlos.data import Capture, FixedPattern, Sampling, check_picture, read_shard
+from evnlos.data import Capture, FixedPattern, Sampling, check_image, read_shard
 from evnlos.data.frames import homography_from_points
 from evnlos.events import FrameStack, write_aedat4, write_celex_frames, write_events
 from evnlos.types import Events
@@ -47,7 +47,7 @@ def folder_of(tmp_path: Path, name: str = "shot_A", **settings) -> Path:
 
 
 def test_a_celex_pair(tmp_path):
-    """EI events and F pictures: one pixel grid; the pictures carry no time, the offset ties the clocks."""
+    """EI events and F images: one pixel grid; the images carry no time, the offset ties the clocks."""
     folder = folder_of(
         tmp_path,
         camera={"width": 1280, "height": 800, "frame_rate_hz": 10.0},
@@ -153,7 +153,7 @@ def test_the_memory_of_an_import_does_not_grow_with_the_frames(tmp_path, little_
     for count in (60, 600):
         path = long_bag(tmp_path / f"of{count}.bag", count)
         tracemalloc.start()
-        import_captures([path], tmp_path / f"d{count}", look=check_picture)
+        import_captures([path], tmp_path / f"d{count}", look=check_image)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     held = 540 * 96 * 128  # of the frames that are more, as bytes
@@ -246,13 +246,13 @@ def test_frames_beside_evt3_come_on_the_clock_of_the_sensor(tmp_path):
 def test_a_raw_beside_a_folder_an_animation_or_an_array(tmp_path):
     frames = pictures()
 
-    def save_pictures(path: Path) -> None:
+    def save_images(path: Path) -> None:
         path.mkdir()
         for k, frame in enumerate(frames):
             Image.fromarray(frame).save(path / f"{k}.png")
 
     write = {
-        "pictures": save_pictures,
+        "pictures": save_images,
         "video.gif": lambda path: Image.fromarray(frames[0]).save(
             path, save_all=True, append_images=[Image.fromarray(f) for f in frames[1:]], duration=200
         ),
@@ -302,13 +302,13 @@ def test_frame_times_from_a_trigger(tmp_path):
 
 def test_a_camera_of_its_own_with_a_grid_of_dots(tmp_path):
     """Frames of 150 x 120 through a homography; both cameras saw 3 x 4 dots; a dark frame is taken away."""
-    from test_capture_alignment import dots_picture, project
+    from test_capture_alignment import dots_image, project
 
     to_frame = np.array([[2.0, 0.1, 8.0], [-0.08, 2.1, 6.0], [1e-4, 2e-4, 1.0]])  # event pixels to frame pixels
     dark = np.random.default_rng(3).integers(5, 15, (120, 150)).astype(np.uint8)
-    events_grid = np.array([[0.5, 0, -10], [0, 0.5, -8], [0, 0, 1]])  # of `dots_picture` to event pixels
-    on_events, _ = dots_picture(events_grid, (HEIGHT, WIDTH), 3, 4, 24.0, 1.2)
-    on_frame, _ = dots_picture(to_frame @ events_grid, (120, 150), 3, 4, 24.0, 2.5)
+    events_grid = np.array([[0.5, 0, -10], [0, 0.5, -8], [0, 0, 1]])  # of `dots_image` to event pixels
+    on_events, _ = dots_image(events_grid, (HEIGHT, WIDTH), 3, 4, 24.0, 1.2)
+    on_frame, _ = dots_image(to_frame @ events_grid, (120, 150), 3, 4, 24.0, 2.5)
     folder = folder_of(
         tmp_path,
         frames="frames.npy",
@@ -384,11 +384,11 @@ def test_turned_frames_and_unknown_polarity(tmp_path):
     assert len(recording.events) == 4_000 and any("no polarity" in note for note in recording.notes)
 
 
-def test_the_check_picture_shows_frame_events_and_curves(tmp_path):
+def test_the_check_image_shows_frame_events_and_curves(tmp_path):
     folder = folder_of(tmp_path, frames="frames.npy")
     np.save(folder / "frames.npy", pictures())
     write_events(folder / "events.raw", stream())
-    sheet = np.asarray(check_picture(read_capture(folder)))
+    sheet = np.asarray(check_image(read_capture(folder)))
     high = round(HEIGHT * 320 / WIDTH)
     panels = [sheet[48 : 48 + high, 12 + k * 332 : 332 + k * 332] for k in range(3)]
     assert (panels[0][..., 0] == panels[0][..., 1]).all()  # grey

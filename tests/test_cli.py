@@ -209,7 +209,7 @@ def test_evaluate_refuses_objects_that_training_saw(runs, tmp_path, tiny_capture
     assert "lab_A" in fails(capsys, "evaluate", "--weights", runs["e2e-frame"], "--data", tmp_path / "d")
 
 
-def test_reconstruct_writes_pictures_strip_and_animation(runs, tiny_captures, tmp_path, capsys) -> None:
+def test_reconstruct_writes_images_strip_and_animation(runs, tiny_captures, tmp_path, capsys) -> None:
     capsys.readouterr()
     call("reconstruct", tiny_captures[3], "--weights", runs["epnp-frame"], "--out", tmp_path / "r", "--json")
     found = json.loads(capsys.readouterr().out)
@@ -248,7 +248,7 @@ def test_report_is_one_page_without_requests(runs, recorded, tmp_path, capsys) -
     page = (tmp_path / "report.html").read_text()
     assert not re.findall(r"(?:src|href)=['\"](?!data:|#)", page)
     assert not re.findall(r"https?:", page.replace("http://www.w3.org/2000/svg", ""))
-    # One position, a strip of truth and runs, an animation, the worst pictures of each run.
+    # One position, a strip of truth and runs, an animation, the worst images of each run.
     assert page.count("<img") == (3 + len(runs)) + (1 + len(runs)) + 1 + 6 * len(runs)
     rows = (tmp_path / "report.csv").read_text().splitlines()
     assert rows[0].split(",")[3:6] == ["all-black", "mean image", "mean target at its place"]
@@ -274,14 +274,14 @@ def test_captures_that_are_not_there_match_nothing(tmp_path, capsys) -> None:
     assert "nope/* matches nothing; give capture folders" in said and not (tmp_path / "none").exists()
 
 
-def test_one_picture_of_a_whole_recording_is_shown_once(tiny_captures, tmp_path, capsys) -> None:
+def test_one_image_of_a_whole_recording_is_shown_once(tiny_captures, tmp_path, capsys) -> None:
     sampling = Sampling(height=24, width=36, scored_rows=18)
     network = SequenceConfig(width=4, depth=1, rank=4).build("frame", sampling).eval()
     save_weights(tmp_path / "w.safetensors", Weights(network))
     call("reconstruct", tiny_captures[0], "--weights", tmp_path / "w.safetensors", "--out", tmp_path / "r")
-    assert "all positions show one picture" in capsys.readouterr().out
+    assert "all positions show one image" in capsys.readouterr().out
     told = json.loads((tmp_path / "r" / "summary.json").read_text())
-    assert told["one_picture"] and any("one picture" in line for line in told["in_words"])
+    assert told["one_picture"] and any("one image" in line for line in told["in_words"])
     assert "confidence" in told or told["no_confidence"] in told["in_words"]
     with Image.open(tmp_path / "r" / "result.png") as sheet:
         assert sheet.width > 900 and sheet.height > 400

@@ -21,7 +21,7 @@ from test_video import write_animation, write_container
 
 
 def moving_bar(count: int = 12) -> list[np.ndarray]:
-    """Return grey pictures [24, 32, 3] of a bright bar that moves to the right."""
+    """Return grey images [24, 32, 3] of a bright bar that moves to the right."""
     pictures = []
     for number in range(count):
         picture = np.full((24, 32, 3), 60, np.uint8)
@@ -108,7 +108,7 @@ def test_events_of_an_animation_in_both_modes(tmp_path: Path, capsys, ending: st
     assert found["pixel"] == to_dict(pixel)
 
 
-def test_events_of_pictures_and_arrays(tmp_path: Path, capsys) -> None:
+def test_events_of_images_and_arrays(tmp_path: Path, capsys) -> None:
     folder = tmp_path / "frames"
     folder.mkdir()
     for number, picture in enumerate(moving_bar()):
@@ -427,7 +427,7 @@ def test_preview_takes_its_name_from_the_file(tmp_path: Path, capsys, monkeypatc
     monkeypatch.chdir(tmp_path)
     write_events("a.h5", random_events(500))
     call("preview", "a.h5", "--frames", 2)
-    assert "a.gif: 2 pictures" in capsys.readouterr().out
+    assert "a.gif: 2 images" in capsys.readouterr().out
     assert left_in(tmp_path) == {"a.h5", "a.gif"}
 
 
@@ -451,7 +451,7 @@ def test_wrong_previews_leave_nothing(tmp_path: Path, capsys, monkeypatch) -> No
 
 
 def test_a_window_shows_each_event_at_its_place_in_its_colour() -> None:
-    from evnlos.plot.preview import PreviewOptions, preview_pictures
+    from evnlos.plot.preview import PreviewOptions, preview_images
 
     # Two windows of 10 ms: ON at (0, 0) and OFF at (3, 1); then an event without a polarity at (2, 0).
     known = [True, True, False]
@@ -460,7 +460,7 @@ def test_a_window_shows_each_event_at_its_place_in_its_colour() -> None:
     for style in ("polarity", "surface"):
         look = PreviewOptions(style=style, frames=2, window_ms=10, side_px=64, background="light")
         first, second = (
-            picture[:32].reshape(2, 16, 4, 16, 3) for picture in preview_pictures([events], summary, look)
+            picture[:32].reshape(2, 16, 4, 16, 3) for picture in preview_images([events], summary, look)
         )
         for picture in (first, second):
             assert (picture == picture[:, :1, :, :1]).all()  # places of 16 x 16 pixels
@@ -475,8 +475,8 @@ def test_a_window_shows_each_event_at_its_place_in_its_colour() -> None:
 
 
 def test_large_sensors_are_added_up(tmp_path: Path) -> None:
-    from evnlos.plot.preview import PreviewOptions, preview_pictures
+    from evnlos.plot.preview import PreviewOptions, preview_images
 
     events = random_events(20_000, width=1280, height=720)
-    pictures = preview_pictures([events], summarise([events]), PreviewOptions(frames=3, side_px=320))
+    pictures = preview_images([events], summarise([events]), PreviewOptions(frames=3, side_px=320))
     assert {picture.shape for picture in pictures} == {(180 + 26, 320, 3)}

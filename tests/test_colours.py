@@ -12,8 +12,8 @@ import evnlos
 from evnlos import Events
 from evnlos.events.recording import summarise
 from evnlos.events.volume import OFF_RGB, ON_HEX, ON_RGB, WORDS
-from evnlos.plot.figures import signed_pictures
-from evnlos.plot.preview import PreviewOptions, preview_pictures
+from evnlos.plot.figures import signed_images
+from evnlos.plot.preview import PreviewOptions, preview_images
 from evnlos.report.pictures import polarity
 
 SOURCE = Path(evnlos.__file__).parent
@@ -49,16 +49,16 @@ def test_on_and_off_are_told_apart_in_grey_and_by_the_colour_blind() -> None:
         assert min(contrast(ON_RGB, ground), contrast(OFF_RGB, ground)) >= 2.95, ground
 
 
-def test_pictures_of_events_keep_the_grey_difference() -> None:
+def test_images_of_events_keep_the_grey_difference() -> None:
     maps = np.array([[[1.0, 0.0]], [[0.0, 1.0]]])  # an ON pixel beside an OFF pixel
     on, off = polarity(maps)[0]
     assert grey(on) - grey(off) >= 50
-    on, off = signed_pictures(maps)[0, :, :3]
+    on, off = signed_images(maps)[0, :, :3]
     assert grey(on) - grey(off) >= 50
     events = Events([0, 0], [0, 1], [0, 0], [1, 0], 2, 1)
     for background in ("dark", "light"):
         look = PreviewOptions(frames=1, side_px=64, background=background)
-        (picture,) = preview_pictures([events], summarise([events]), look)
+        (picture,) = preview_images([events], summarise([events]), look)
         assert grey(picture[0, 0]) - grey(picture[0, -1]) >= 50
 
 

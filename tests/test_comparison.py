@@ -258,9 +258,9 @@ def test_interval_over_seeds_covers_what_other_seeds_would_give() -> None:
     assert plain / 200 < 0.8
 
 
-def test_interval_draws_objects_not_pictures() -> None:
+def test_interval_draws_objects_not_images() -> None:
     objects = np.repeat([0, 1], 50)
     wide = paired_difference(np.repeat([1.0, 3.0], 50), np.zeros(100), objects)
     assert (wide.mean, wide.low, wide.high) == (2.0, 1.0, 3.0)
-    with pytest.raises(EvnlosError, match="one object a picture"):
+    with pytest.raises(EvnlosError, match="one object an image"):
         paired_difference([1.0, 2.0], [0.0, 0.0], [0])

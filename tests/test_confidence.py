@@ -1,4 +1,4 @@
-"""What pictures are worth: support, intervals, and the verdict where nothing was measured."""
+"""What images are worth: support, intervals, and the verdict where nothing was measured."""
 
 import copy
 import json
@@ -41,7 +41,7 @@ SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
 
 
 class Given(UNetReconstructor):
-    """A network whose picture is its input: what is measured can be chosen."""
+    """A network whose image is its input: what is measured can be chosen."""
 
     def __init__(self) -> None:
         sampling = Sampling(height=48, width=96, scored_rows=48)
@@ -140,11 +140,11 @@ def test_a_pattern_that_does_not_move_with_the_object_is_no_support() -> None:
     samples = sequences(0.0)
     confidence = fit_confidence(Given(), samples, CANVAS)
     still = sequences(0.0, count=1, seed=7)
-    still.inputs = still.inputs[:1].expand(10, -1, -1, -1)  # the same picture, wherever the object is
+    still.inputs = still.inputs[:1].expand(10, -1, -1, -1)  # the same image, wherever the object is
     assert not judged(confidence, still, "o0").measured
 
 
-def test_pictures_that_do_not_explain_the_frames_are_not_measured() -> None:
+def test_images_that_do_not_explain_the_frames_are_not_measured() -> None:
     samples = sequences(0.2)
     confidence = fit_confidence(Given(), samples, CANVAS)
     inputs, at = samples.inputs[:10], samples.position_m[:10]
@@ -243,7 +243,7 @@ def test_light_pattern_and_noise_need_not_be_known() -> None:
     assert explained(true, frames, *known) == pytest.approx(1, abs=0.02)
     assert explained(blank, frames, *known) == pytest.approx(0, abs=0.02)
     assert light_gain(true, frames, operator) == pytest.approx(2.3, rel=1e-3)
-    # What shows no object explains none, whatever the picture.
+    # What shows no object explains none, whatever the image.
     assert explained(true, pattern + noise, *known) == 0.0
     assert explained(true, pattern.expand_as(frames), *known) == 0.0
 
@@ -285,7 +285,7 @@ def test_published_weights_refuse_a_wall_that_is_not_theirs() -> None:
     assert other is not None and not other.measured and other.explained < 0.3
 
 
-def test_reconstruct_and_evaluate_say_what_the_pictures_are_worth(
+def test_reconstruct_and_evaluate_say_what_the_images_are_worth(
     tiny_dataset, tiny_captures, tmp_path, capsys
 ) -> None:
     torch.manual_seed(0)
@@ -374,7 +374,7 @@ def test_own_weights_know_the_setup_that_their_samples_name(tmp_path) -> None:
 
 def test_each_verdict_says_what_is_guessed() -> None:
     nothing, sure = (ConfidenceReport(a, 0.1, torch.zeros(1), torch.ones(1), 0.9) for a in (0.0, 0.8))
-    assert verdict_on(None, nothing).guessed == "the whole picture is the network's guess"
+    assert verdict_on(None, nothing).guessed == "the whole image is the network's guess"
     assert "intervals" in verdict_on(None, sure).guessed
     assert verdict_on(None, None, "no confidence: why").lines[0] == "no confidence: why"
     wrong = replace(sure, explained=0.3)

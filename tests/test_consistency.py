@@ -51,7 +51,7 @@ def test_the_operator_is_the_simulators_wall(operator) -> None:
     torch.testing.assert_close(made, seen, atol=2e-3, rtol=0)
 
 
-def test_the_refined_picture_solves_its_equation(operator) -> None:
+def test_the_refined_image_solves_its_equation(operator) -> None:
     draw = torch.Generator().manual_seed(0)
     prior = 0.2 + 0.6 * torch.rand(2, 16, 24, generator=draw)
     frames = operator(prior) + 0.3 * operator.sigma * torch.randn(2, 16, 24, generator=draw)

@@ -114,7 +114,7 @@ def a_penumbra(change: np.ndarray, variance: np.ndarray, step_s: float = 0.1) ->
 
 
 def test_the_estimate_is_the_posterior_of_a_dense_gaussian() -> None:
-    """All unknowns at once: the picture, the steady part of each bin, gain and slope of each step."""
+    """All unknowns at once: the image, the steady part of each bin, gain and slope of each step."""
     draw = np.random.default_rng(4)
     steps, bins = 7, 9
     variance = draw.uniform(0.5, 2.0, bins) * 1e-4
@@ -151,7 +151,7 @@ def test_the_estimate_is_the_posterior_of_a_dense_gaussian() -> None:
     assert found.evidence == pytest.approx(evidence(cov_y) - evidence(null), abs=1e-3)
 
 
-def test_intervals_of_the_picture_hold_for_pictures_of_the_prior_and_its_evidence_finds_it() -> None:
+def test_intervals_of_the_image_hold_for_images_of_the_prior_and_its_evidence_finds_it() -> None:
     draw = np.random.default_rng(5)
     steps, bins = 120, 30
     blank = a_penumbra(np.zeros((steps, bins)), np.full(bins, 4e-6))
@@ -327,7 +327,7 @@ def test_something_on_the_floor_itself_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("points", "told"),
     [
-        (((300.0, 10.0), (10.0, 100.0), (20.0, 20.0)), "outside the picture"),
+        (((300.0, 10.0), (10.0, 100.0), (20.0, 20.0)), "outside the image"),
         (((55.0, 55.0), (56.0, 55.0), (90.0, 20.0)), "give one 8 px off"),
         (((55.0, 55.0), (15.0, 105.0), (95.0, 5.0)), "10 to 179"),
     ],

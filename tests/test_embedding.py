@@ -56,7 +56,7 @@ def test_frame_and_events_are_undone_each_on_its_own() -> None:
     pictures = both(seen)
     assert pictures.shape == (60, 6, 6, 8)
     torch.testing.assert_close(pictures[:, :3], alone(seen[:, :1]))
-    # The frame's pictures know nothing of the events, and the other way round.
+    # The frame's images know nothing of the events, and the other way round.
     blind = seen.clone()
     blind[:, 1:] = 0
     torch.testing.assert_close(both(blind)[:, :3], pictures[:, :3])
@@ -99,7 +99,7 @@ def test_frames_lose_their_mean_and_events_keep_their_zero(modality: str, channe
         torch.testing.assert_close(found[k], torch.cat(expected))
 
 
-def test_scaled_by_itself_a_picture_tells_neither_gain_nor_ambient_light() -> None:
+def test_scaled_by_itself_an_image_tells_neither_gain_nor_ambient_light() -> None:
     layer = InputNormalization(as_modality("frame"), "picture")
     x = torch.rand(2, 1, 6, 8)
     torch.testing.assert_close(layer(0.5 * x + 0.2), layer(x), atol=1e-5, rtol=0)

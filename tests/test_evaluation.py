@@ -36,7 +36,7 @@ def test_the_box_holds_the_target_and_two_pixels_more() -> None:
     assert empty.psnr_box_db[0] == pytest.approx(20.0, abs=1e-4)
 
 
-def test_means_are_over_pictures_not_over_errors() -> None:
+def test_means_are_over_images_not_over_errors() -> None:
     truth = torch.zeros(2, 16, 16)
     image = torch.stack([torch.full((16, 16), 0.1), torch.full((16, 16), 0.01)])
     found = score(image, truth)
@@ -120,7 +120,7 @@ def test_curves_hold_every_point_and_name() -> None:
     assert curves_svg({}, "x", "y") == ""
 
 
-def test_a_reconstructor_gives_the_same_pictures_one_at_a_time() -> None:
+def test_a_reconstructor_gives_the_same_images_one_at_a_time() -> None:
     draw = np.random.default_rng(0)
     sampling = Sampling(height=22, width=34, scored_rows=16)
     frame, surface = draw.random((3, 22, 34), np.float32), draw.random((3, 2, 22, 34), np.float32)

@@ -1,4 +1,4 @@
-"""Batches and tensors of representations are those of the single streams, and pictures of intensities."""
+"""Batches and tensors of representations are those of the single streams, and images of intensities."""
 
 from itertools import pairwise
 

@@ -102,7 +102,7 @@ def test_celex_recordings_equal_their_truth(shared_data, name, divisor):
         last[int(x), int(y)] = adc
 
 
-def test_celex_pictures_equal_their_truth(shared_data, tmp_path):
+def test_celex_images_equal_their_truth(shared_data, tmp_path):
     path = shared_data / "celex" / "blob_F_100M.bin"
     truth = np.load(shared_data / "celex" / "blob_F_100M.npz")["frames"]
     np.testing.assert_array_equal(read_frames(path), truth)
@@ -121,8 +121,8 @@ def test_celex_pictures_equal_their_truth(shared_data, tmp_path):
         read_frames(shared_data / "celex" / "blob_EI_100M.bin")
 
 
-def test_celex_pictures_and_events_register(shared_data):
-    """The same blob, once in pictures and once in events, moves to the right in both: neither is turned."""
+def test_celex_images_and_events_register(shared_data):
+    """The same blob, once in images and once in events, moves to the right in both: neither is turned."""
     frames = read_frames(shared_data / "celex" / "blob_F_100M.bin").astype(float)
     columns = np.arange(1280)
     bright = [
@@ -181,7 +181,7 @@ def test_celex_format_0_by_hand(tmp_path):
 
 
 def celex_file(tmp_path, loop: bool = False, imu: int | None = None, packages: int | None = None):
-    """Return a path and its bytes: two packages of events, a picture between them in loop mode."""
+    """Return a path and its bytes: two packages of events, an image between them in loop mode."""
     write_events(tmp_path / "e_EI_100M.bin", celex_events(True))
     data = (tmp_path / "e_EI_100M.bin").read_bytes()
     package = data[12:]
@@ -220,7 +220,7 @@ def test_celex_after_a_crash(tmp_path):
         (lambda data: data + b"\1", "are left"),
         (lambda data: data[:8] + struct.pack("<I", 9) + data[12:], "announces 9"),
         (lambda data: data[:12] + struct.pack("<I", 2**31) + data[16:], "no known"),
-        (lambda data: data[:-1] + b"\0", "full picture of"),
+        (lambda data: data[:-1] + b"\0", "full image of"),
         (lambda data: data[:2000] + np.random.default_rng(0).bytes(3000) + data[5000:], "word|outside"),
     ],
 )
@@ -263,7 +263,7 @@ def test_celex_refusals(tmp_path):
         read_frames(path)
 
 
-def test_celex_pictures_round_trip(tmp_path):
+def test_celex_images_round_trip(tmp_path):
     frames = np.random.default_rng(0).integers(0, 256, (2, 800, 1280)).astype(np.uint8)
     write_celex_frames(tmp_path / "p_F_100M.bin", frames)
     np.testing.assert_array_equal(read_frames(tmp_path / "p_F_100M.bin"), frames)

@@ -229,8 +229,8 @@ def test_arms_begin_with_installed_layers(records, apart, tmp_path, monkeypatch)
     assert [len(load_weights(apart.out / "runs" / record.settings["run"]).history)] == [3]
 
 
-def test_an_ensemble_is_the_mean_of_its_pictures(records) -> None:
-    """Squared error is convex: the mean picture is at least as good as the mean error of its members."""
+def test_an_ensemble_is_the_mean_of_its_images(records) -> None:
+    """Squared error is convex: the mean image is at least as good as the mean error of its members."""
     by = {(r.arm, r.seed): np.array(r.positions["lab_4"]) for r in records}
     error = {key: 10 ** (-psnr / 10) for key, psnr in by.items()}
     for arm in ("E2E", "EPNP"):

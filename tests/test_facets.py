@@ -139,7 +139,7 @@ def test_a_table_of_one_lobe_reflects_like_ggx():
     assert ratio.mean() == pytest.approx(1 / 0.92, rel=0.02)  # aluminium's reflectance
 
 
-def test_carried_pictures_are_the_matrix_times_the_pictures():
+def test_carried_images_are_the_matrix_times_the_images():
     rng = np.random.default_rng(1)
     pictures = rng.uniform(0, 1, (5, 28)) * (rng.uniform(0, 1, (5, 28)) < 0.3)
     wall, place = table(), parts()

@@ -264,7 +264,7 @@ def test_a_full_disk_leaves_no_half_of_a_reconstruction(app_weights, tiny_captur
 
 
 def test_two_at_once_into_one_folder_are_one_result_and_one_line(app_weights, tiny_captures, tmp_path) -> None:
-    """Both used to end well, and the pictures of one capture were gone."""
+    """Both used to end well, and the images of one capture were gone."""
     words = ["--weights", str(app_weights["event"]), "--out"]
     alone = []
     for number, capture in enumerate(tiny_captures[:2]):
@@ -435,7 +435,7 @@ def dies_at(rename: int, arguments: list[str]) -> None:
 
 @pytest.mark.parametrize("rename", [1, 2, 4])
 def test_a_killed_import_ends_with_the_same_bytes(rename: int, tiny_captures, tmp_path) -> None:
-    """Renames: dataset.yaml, then check picture and shard of each capture."""
+    """Renames: dataset.yaml, then check image and shard of each capture."""
     arguments = ["import", *map(str, tiny_captures), "--sampling.height", "32", "--sampling.width", "48"]
     arguments += ["--sampling.scored-rows", "24", "--test", "4", "--out"]
     main([*arguments, str(tmp_path / "whole")])

@@ -162,7 +162,7 @@ def test_the_tone_curve_is_found_where_light_adds_up() -> None:
     np.testing.assert_allclose(back, light[7] / light[1].mean(), rtol=0.03)
 
 
-def test_gain_and_movement_of_each_picture_are_found() -> None:
+def test_gain_and_movement_of_each_image_are_found() -> None:
     rng = np.random.default_rng(0)
     show = PLAN.as_show()
     design = np.stack([np.r_[show.cells(p).ravel(), 1.0] for p in show.parts if p.kind == "pattern"])

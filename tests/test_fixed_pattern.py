@@ -78,7 +78,7 @@ def test_wrong_files_and_frames_are_named(pattern, tmp_path) -> None:
     with pytest.raises(DataError, match="no fixed pattern"):
         load_pattern(path)
     save_file({"sensitivity": np.ones((3, 4), np.float32), "offset": np.ones((4, 3), np.float32)}, path)
-    with pytest.raises(DataError, match="no pictures of one size"):
+    with pytest.raises(DataError, match="no images of one size"):
         load_pattern(path)
     save_file({"sensitivity": np.full((3, 4), np.nan), "offset": np.ones((3, 4))}, path)
     with pytest.raises(DataError, match="NaN or infinity"):

@@ -168,7 +168,7 @@ def test_fit_to_target_plane_cuts_scales_and_centres():
 # The user's own databases
 
 
-def character_picture(side):
+def character_image(side):
     """A thick L: neither transposing nor inverting it goes unseen."""
     mask = np.zeros((side, side), np.float32)
     mask[side // 4 : 3 * side // 4, side // 3 : side // 3 + side // 8] = 1
@@ -179,7 +179,7 @@ def character_picture(side):
 @pytest.fixture
 def sd19(tmp_path):
     """Three images of "A" and "l" in the official layout: 128 x 128 RGB, black on white."""
-    ink = np.repeat((255 * (1 - character_picture(128)))[..., None], 3, axis=2).astype(np.uint8)
+    ink = np.repeat((255 * (1 - character_image(128)))[..., None], 3, axis=2).astype(np.uint8)
     for code in ("41", "6c"):
         for partition in ("hsf_0", "hsf_4", f"train_{code}"):
             folder = tmp_path / "by_class" / code / partition
@@ -195,7 +195,7 @@ def test_sd19_is_read_upright_and_bright_on_dark(sd19):
     assert [(item.char, item.source) for item in found] == [
         (char, f"hsf_0_0000{number}") for char in "Al" for number in range(3)
     ]
-    np.testing.assert_array_equal(found[0].mask, character_picture(128))
+    np.testing.assert_array_equal(found[0].mask, character_image(128))
     assert [item.source for item in read_sd19(sd19 / "by_class", "A", "train", first=1, count=1)] == [
         "train_41_00001"
     ]
@@ -208,7 +208,7 @@ def test_sd19_says_what_is_missing(sd19):
         list(list_sd19(sd19, "A", count=4))
     with pytest.raises(DataError, match="hsf_0 to hsf_8"):
         list(list_sd19(sd19, "A", partition="hsf_9"))
-    (sd19 / "by_class/41/hsf_0/hsf_0_00000.png").write_bytes(b"no picture")
+    (sd19 / "by_class/41/hsf_0/hsf_0_00000.png").write_bytes(b"no image")
     with pytest.raises(DataError, match="no image"):
         list(read_sd19(sd19, "A"))
     Image.new("L", (2000, 10)).save(sd19 / "by_class/41/hsf_0/hsf_0_00000.png")
@@ -228,7 +228,7 @@ def test_sd19_objects_become_targets(sd19):
 
 def write_emnist(folder, labels=(10, 11, 10, 0), part="train", directory_lock=None):
     folder.mkdir(exist_ok=True)
-    stored = np.stack([character_picture(28).T * 255] * len(labels)).astype(np.uint8)
+    stored = np.stack([character_image(28).T * 255] * len(labels)).astype(np.uint8)
     stem = f"emnist-byclass-{part}"
     count = len(labels) if directory_lock is None else directory_lock
     with gzip.open(folder / f"{stem}-images-idx3-ubyte.gz", "wb") as file:
@@ -247,7 +247,7 @@ def test_emnist_is_turned_upright(tmp_path):
         ("B", "train_000001"),
         ("A", "train_000002"),
     ]
-    np.testing.assert_array_equal(found[0].mask, character_picture(28))
+    np.testing.assert_array_equal(found[0].mask, character_image(28))
     assert list_emnist(folder, "A", first=1, count=1) == [("A", 2)]
 
 

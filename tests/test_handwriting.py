@@ -197,7 +197,7 @@ def test_redrawn_targets_are_objects_of_the_set(tmp_path) -> None:
     assert target.mask.shape == (128, 128) and target.size_m == glyphs.target_plane.size_m
     with pytest.raises(ConfigError, match="redrawn is 2"):
         HandwritingGlyphs(redrawn=2)
-    (tmp_path / "lab_R.png").write_bytes(b"no picture")
+    (tmp_path / "lab_R.png").write_bytes(b"no image")
     other = tmp_path / "other"
     other.mkdir()
     for folder in (tmp_path / "none", other):

@@ -239,7 +239,7 @@ def test_a_garbled_log_of_a_training_is_one_line(line: str, tmp_path) -> None:
         _log_of(tmp_path)
 
 
-def test_small_pictures_are_scored_without_haarpsi() -> None:
+def test_small_images_are_scored_without_haarpsi() -> None:
     import torch
 
     from evnlos.analysis.scores import score
@@ -320,7 +320,7 @@ HOMOGRAPHY = {"homography": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
 
 @pytest.mark.parametrize("count", [1, 40])
 @pytest.mark.parametrize("side", [13_000, 5000])
-def test_huge_pictures_are_refused_before_they_are_decoded(
+def test_huge_images_are_refused_before_they_are_decoded(
     side: int, count: int, capture_folder, bounded_memory
 ) -> None:
     _image_of(capture_folder / "0.png", side, side)
@@ -335,11 +335,11 @@ def test_huge_pictures_are_refused_before_they_are_decoded(
         read_capture(capture_folder)
 
 
-def test_a_picture_named_many_times_is_refused(capture_folder, bounded_memory) -> None:
+def test_an_image_named_many_times_is_refused(capture_folder, bounded_memory) -> None:
     _image_of(capture_folder / "one.png", 72, 48)
     lines = [f"{number},one.png" for number in range(400_000)]
     (capture_folder / "frames.csv").write_text("\n".join(["t_us,file", *lines]))
-    with pytest.raises(EvnlosError, match="name every picture once"):
+    with pytest.raises(EvnlosError, match="name every image once"):
         read_capture(capture_folder)
 
 

@@ -217,8 +217,8 @@ def test_a_post_resolves_across_itself_only():
     assert "upright bars" in found.verdict
 
 
-def test_picard_and_picture():
-    """The coefficients of a noiseless picture, from the definition; the same seed draws the same picture."""
+def test_picard_and_image():
+    """The coefficients of a noiseless image, from the definition; the same seed draws the same image."""
     one, same, other = (identify(setup_preset("hard"), settings=SMALL, seed=seed) for seed in (0, 0, 1))
     setup = linearized(setup_preset("hard"), SMALL)
     targets = handwritten_targets(SMALL.target_plane, 1)

@@ -40,7 +40,7 @@ def test_its_prox_is_our_tikhonov(deepinv):
     """prox of |A x - y|^2 / 2 at 0 with step g is the Tikhonov solution with regularization = 1 / g."""
     example = EXAMPLES["rough metal"]()
     assert isinstance(example, MatrixTransport)
-    # Its conjugate gradients add an absolute 1e-8 to a denominator: norm 1 and bright pictures make that small.
+    # Its conjugate gradients add an absolute 1e-8 to a denominator: norm 1 and bright images make that small.
     matrix = example.matrix / torch.linalg.matrix_norm(example.matrix, 2)
     operator = MatrixTransport(matrix, example.source, example.shape)
     y = 1e6 * operator(torch.rand(1, 1, 7, 10, generator=torch.Generator().manual_seed(1)).double())

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-UNITS = "(?:second|pixel|position|step|image|picture|object|capture|shot|frame|sample|event|sequence|setup|row)"
+UNITS = "(?:second|pixel|position|step|image|object|capture|shot|frame|sample|event|sequence|setup|row)"
 RATES = "(?:events?|Hz|hertz|metres?|seconds?|s|ms|us|ns|kB|MB|GB|dB|bytes|steps|frames|samples|dots|shard)"
 BANNED = {
     "rightly": "correctly",

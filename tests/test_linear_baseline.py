@@ -10,7 +10,7 @@ from evnlos.models.reconstructor import _LAMBDAS, _left_out
 
 
 def world(noise: float, objects: int = 30, positions: int = 10, seed: int = 0):
-    """Pictures of 6 modes, measured by a random matrix: inputs, truth, names."""
+    """Images of 6 modes, measured by a random matrix: inputs, truth, names."""
     draw = torch.Generator().manual_seed(seed)
     modes = torch.randn(6, 8 * 12, generator=draw) / 40
     count = objects * positions
@@ -70,7 +70,7 @@ def test_same_seed_same_numbers_and_wrong_input_is_named() -> None:
     inputs, truth, names = world(0.1)
     one, other = (fit_linear(inputs, truth, names, rank=8, seed=3)(inputs[:3]) for _ in range(2))
     assert torch.equal(one, other)
-    with pytest.raises(DataError, match="2 pictures"):
+    with pytest.raises(DataError, match="2 images"):
         fit_linear(inputs, truth[:2], names)
     with pytest.raises(DataError, match="at least two"):
         fit_linear(inputs[:10], truth[:10], names[:10])

@@ -427,7 +427,7 @@ def test_a_sender_that_begins_anew_begins_a_new_stream(engine: Engine) -> None:
         UdpSource("203.0.113.1", 9)
 
 
-def test_udp_gives_up_when_nothing_comes_and_a_stream_of_nothing_is_no_picture(engine: Engine) -> None:
+def test_udp_gives_up_when_nothing_comes_and_a_stream_of_nothing_is_no_image(engine: Engine) -> None:
     source, turns = UdpSource(idle_s=0.06), iter(range(8))
     assert list(source.chunks(lambda: next(turns, None) is None)) == []
     assert next(turns, None) is None  # nobody sent yet: that is no stream which ended
@@ -480,7 +480,7 @@ def test_a_frame_outlives_its_dropped_chunk() -> None:
 
 
 @pytest.mark.parametrize("modality", STANDARD_MODALITIES)
-def test_at_a_frame_the_live_picture_is_the_one_of_reconstruct(modality: str, tiny_captures) -> None:
+def test_at_a_frame_the_live_image_is_the_one_of_reconstruct(modality: str, tiny_captures) -> None:
     loaded, capture = weights(modality), read_capture(tiny_captures[0])
     live = Engine(loaded)
     samples = capture_samples(capture, live.sampling)
@@ -526,7 +526,7 @@ def test_weights_that_do_not_fit_are_one_line(tmp_path: Path) -> None:
 
 
 class Kept:
-    """A sink that keeps all pictures."""
+    """A sink that keeps all images."""
 
     def __init__(self) -> None:
         self.pictures: list[Picture] = []
@@ -535,7 +535,7 @@ class Kept:
         self.pictures.append(picture)
 
 
-def test_a_run_makes_the_last_picture_of_all_events(engine: Engine) -> None:
+def test_a_run_makes_the_last_image_of_all_events(engine: Engine) -> None:
     events, kept = stream(2000, 15, span_us=200_000), Kept()
     run = Run(Replay([events], speed=2), engine, RateOptions(rate=200))
     summary = run.go([kept]).summary()
@@ -681,7 +681,7 @@ def test_without_weights_published_ones_of_single_positions_are_taken(
     for source, name in ((tiny_captures[0], "near-frame"), (tmp_path / "walk.raw", "near-event")):
         out = tmp_path / name
         main(["live", str(source), "--headless", "--out", str(out), "--speed", "20", "--seconds", "5"])
-        assert f"{name} makes the pictures" in capsys.readouterr().err
+        assert f"{name} makes the images" in capsys.readouterr().err
         table = json.loads((out / "latency.json").read_text())
         assert (
             table["weights"] == name and table["modality"] == name.partition("-")[2] and table["pictures"] > 0
@@ -732,7 +732,7 @@ def test_a_video_on_a_full_disk_is_one_line_and_nothing_is_left(
         assert list(place.iterdir()) == []
 
 
-def test_a_run_without_a_picture_leaves_no_folder(engine: Engine, tmp_path: Path) -> None:
+def test_a_run_without_an_image_leaves_no_folder(engine: Engine, tmp_path: Path) -> None:
     write_events(tmp_path / "e.npz", stream(5))
     with pytest.raises(EventFileError, match="followed"), record.Recorder(tmp_path / "new" / "out") as recorder:
         Run(open_live(str(tmp_path / "e.npz"), SourceOptions(follow=True)), engine).go([recorder])
@@ -850,7 +850,7 @@ def test_the_page_of_a_replay_on_a_phone(engine: Engine, tmp_path: Path) -> None
             "return [...document.images].every(one => one.alt && one.getBoundingClientRect().right <= 390)"
         )
         browser.wait("return document.querySelector('#verdict').textContent === 'nothing is certain'")
-        # By keys: hold the picture, and then from the beginning.
+        # By keys: hold the image, and then from the beginning.
         browser.press("\ue004 ")
         browser.wait("return document.querySelector('#hold').getAttribute('aria-pressed') === 'true'")
         browser.press("\ue004 ")
@@ -858,7 +858,7 @@ def test_the_page_of_a_replay_on_a_phone(engine: Engine, tmp_path: Path) -> None
         assert [one for one in browser.complaints() if "SEVERE" in one] == []
 
 
-def test_the_stream_brings_each_new_picture_and_the_end(page: Page, engine: Engine) -> None:
+def test_the_stream_brings_each_new_image_and_the_end(page: Page, engine: Engine) -> None:
     image = np.linspace(0, 1, 16 * 24, dtype=np.float32).reshape(16, 24)
     timing = Timing(0.0214, 0.01, 0.01, 0.001, 0.01)
     nan = Timing(*[float("nan")] * 5)
@@ -909,7 +909,7 @@ def test_a_ninth_viewer_is_told_and_silent_ones_are_let_go(engine: Engine, monke
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_run_with_a_page_shows_its_pictures(event_weights: Path, tmp_path: Path, capsys) -> None:
+def test_a_run_with_a_page_shows_its_images(event_weights: Path, tmp_path: Path, capsys) -> None:
     write_events(tmp_path / "walk.raw", stream(800, 19, span_us=100_000))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -929,10 +929,10 @@ def test_a_run_with_a_page_shows_its_pictures(event_weights: Path, tmp_path: Pat
     viewer.start()
     main(["live", str(tmp_path / "walk.raw"), "--weights", str(event_weights), "--port", str(port)])
     viewer.join(10)
-    assert sum(line.startswith(b"event: picture") for line in seen) >= 1
+    assert sum(line.startswith(b"event: image") for line in seen) >= 1
     assert b'"ended": true' in seen[-2]
     shown = capsys.readouterr()
-    assert f"http://127.0.0.1:{port}/" in shown.err and "oldest new event to picture" in shown.out
+    assert f"http://127.0.0.1:{port}/" in shown.err and "oldest new event to image" in shown.out
     state = json.loads(
         next(line for line in reversed(seen) if b'"ended": true' in line).removeprefix(b"data: ")
     )

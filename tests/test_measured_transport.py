@@ -49,7 +49,7 @@ SHAPE = (24, 40)
 PLANE = Plane(6, 12, 0.01)
 SETUP = RadiometricSetup(roughness=0.1, cell_m=0.01, strip_m=(0.12, 0.06), ambient=0.03)
 CAMERA = FrameCamera(bit_depth=16, black_level=1024, full_well_e=1e9, read_noise_e=0, prnu=0, dsnu_e=0)
-SCALE = (65535 - 1024) / 65535  # white levels of the picture to one of light
+SCALE = (65535 - 1024) / 65535  # white levels of the image to one of light
 
 
 def setup_matrix(level: float) -> np.ndarray:
@@ -65,7 +65,7 @@ def with_read_noise(sigma: float) -> FrameCamera:
 def record(
     folder: Path, plan: ScanPlan, matrix: np.ndarray, camera: FrameCamera, shape=SHAPE, change=None
 ) -> None:
-    """Write a plan and the pictures that `camera` takes of it; `change` may alter the light of a frame."""
+    """Write a plan and the images that `camera` takes of it; `change` may alter the light of a frame."""
     write_plan(plan, folder)
     save_yaml(replace(read_scan_info(folder), white_dn=65535), folder / "scan.yaml")
     rehearse_scan(folder, matrix, shape, camera, seed=7, change=change)
@@ -294,7 +294,7 @@ def spoiled(folder: Path, source: Path, how: str) -> None:
         Image.fromarray(image).save(file)
     elif how == "other size":
         Image.fromarray(np.zeros((5, 5), np.uint16)).save(file)
-    elif how == "no picture":
+    elif how == "no image":
         file.write_bytes(b"PNG?")
     elif how == "swapped":
         other = next(line for line in lines if line.startswith("66,1,"))
@@ -312,17 +312,17 @@ def spoiled(folder: Path, source: Path, how: str) -> None:
 @pytest.mark.parametrize(
     ("how", "match"),
     [
-        ("missing line", r"lists 143 pictures of patterns.*72 x 2 repeats = 144.*pattern 5 of repeat 1"),
+        ("missing line", r"lists 143 images of patterns.*72 x 2 repeats = 144.*pattern 5 of repeat 1"),
         ("missing file", r"does not exist; .*frames.csv names it"),
-        ("twice", "lists 1 pictures twice"),
+        ("twice", "lists 1 images twice"),
         ("outside", "lies outside"),
         ("link", "lies outside"),
         ("no dark", "no dark frame of repeat 1"),
         ("word", "'last'.*write a number"),
         ("too many", "pattern 72; the scan has patterns 0 to 71"),
         ("saturated", r"16\.7 % of the pixels are saturated \(65535 DN\).*shorten exposure_s"),
-        ("other size", "give pictures of one"),
-        ("no picture", "can't be read as a picture"),
+        ("other size", "give images of one"),
+        ("no image", "can't be read as an image"),
         ("swapped", r"pattern 5 differs between repeats 0 and 1 by \d+ %"),
         ("repeats", "pattern 0 of repeat 2"),
         ("unknown key", "perhaps you meant 'exposure_s'"),
@@ -485,7 +485,7 @@ def test_identify_tells_the_scan_s_own_noise(noisy, clean, tmp_path) -> None:
     assert any("surely measured" in warning for warning in rough.warnings)  # ... and the report says so
 
 
-def test_commands_from_plan_to_picture(tmp_path, capsys) -> None:
+def test_commands_from_plan_to_image(tmp_path, capsys) -> None:
     scan, out = tmp_path / "scan", tmp_path / "setup.safetensors"
     main(["scan", "plan", str(scan), "--plane", "0.12", "0.06", "--pattern", "hadamard", "--json"])
     planned = json.loads(capsys.readouterr().out)

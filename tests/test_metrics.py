@@ -45,7 +45,7 @@ def test_a_batch_is_its_single_images() -> None:
     assert together[1, 2].item() == pytest.approx(ssim(x[1, 2], y[1, 2]).item(), abs=1e-12)
 
 
-def test_an_all_black_picture_of_a_sparse_target_already_has_a_high_ssim() -> None:
+def test_an_all_black_image_of_a_sparse_target_already_has_a_high_ssim() -> None:
     truth = torch.zeros(48, 96)
     truth[20:28, 40:42] = 1.0
     assert ssim(torch.zeros_like(truth), truth).item() > 0.8
@@ -157,5 +157,5 @@ def test_metrics_know_the_same_and_the_worse_and_batches(metric, best: float) ->
         metric(torch.zeros(5, 20), torch.zeros(5, 20))
 
 
-def test_haarpsi_of_two_empty_pictures_is_one() -> None:
+def test_haarpsi_of_two_empty_images_is_one() -> None:
     assert haarpsi(torch.zeros(16, 16), torch.zeros(16, 16)).item() == 1.0

@@ -1,4 +1,4 @@
-"""The real photograph, and photographs of our own, from file to picture."""
+"""The real photograph, and photographs of our own, from file to image."""
 
 import json
 import sys
@@ -68,7 +68,7 @@ def test_own_photograph_needs_its_occluder(made):
         inversion.solve("tv", rule="gcv")
 
 
-def test_a_photograph_without_its_truth_gives_the_same_picture(made, tmp_path):
+def test_a_photograph_without_its_truth_gives_the_same_image(made, tmp_path):
     data = dict(np.load(made))
     del data["truth"]
     np.savez(tmp_path / "blind.npz", **data)

@@ -48,8 +48,8 @@ def test_the_readme_is_three_screens_with_three_doors() -> None:
     assert "docs/figures/setup_paper.svg" in TEXT
 
 
-def test_the_way_from_pip_to_a_picture_is_short() -> None:
-    """Three commands to events, five to a reconstructed picture, and neither make nor a compiler."""
+def test_the_way_from_pip_to_an_image_is_short() -> None:
+    """Three commands to events, five to a reconstructed image, and neither make nor a compiler."""
     text = TEXT[TEXT.index("## Install") : TEXT.index("## What it measures")]
     events, picture, *_ = re.findall(r"(?:^    .*\n)+", text, flags=re.MULTILINE)
     for commands, most in ((events, 3), (picture, 5)):

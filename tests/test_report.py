@@ -88,8 +88,8 @@ def test_the_page_shows_set_up_films_failures_and_origin(made, tmp_path) -> None
     assert page.count("data:image/webp") == 2  # an animation an object
     assert page.count("near_G: ") >= 3  # truth and both runs over positions
     # The run that answers the same fails everywhere, and the page says so.
-    assert "E2E frame: 100% of its pictures are worse than the mean picture" in page
-    assert "EPNP frame: 0% of its pictures are worse than the mean picture" in page
+    assert "E2E frame: 100% of its images are worse than the mean image" in page
+    assert "EPNP frame: 0% of its images are worse than the mean image" in page
     worst = runs[1].evaluation.scores.psnr_db.min()
     assert f"{worst:.1f} dB (" in page.split("Where it fails")[1]
     shown = page.split("How it was made")[1]
@@ -301,7 +301,7 @@ def _unmeasured(name: str) -> ConfidenceCheck:
     return ConfidenceCheck(name, 0.0, 0.01, None, False, -0.3, 0.99, 1.0)
 
 
-def test_the_worst_pictures_are_of_several_objects() -> None:
+def test_the_worst_images_are_of_several_objects() -> None:
     gain = np.array([-5.0, -4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0])
     names = np.array(["a", "a", "a", "b", "b", "b", "c", "c"])
     assert _worst(gain, names) == [0, 1, 3, 4, 6, 7]

@@ -65,7 +65,7 @@ def test_light_is_conserved_at_any_position(x, y, side, seed):
 
 @given(dx=st.integers(-10, 10), dy=st.integers(-5, 5), x=st.floats(-0.01, 0.01))
 @settings(max_examples=30, deadline=None)
-def test_a_shift_by_whole_samples_rolls_the_picture(dx, dy, x):
+def test_a_shift_by_whole_samples_rolls_the_image(dx, dy, x):
     target = random_target(size_m=0.08)
     still = target.rasterise(CANVAS, (x, 0.0))
     moved = target.rasterise(CANVAS, (x + dx * CANVAS.pitch_m, dy * CANVAS.pitch_m))

@@ -35,7 +35,7 @@ def network() -> SequenceReconstructor:
     return SequenceReconstructor(as_modality("frame"), NET, Sampling(height=64, width=96, pitch_m=PITCH_M))
 
 
-def test_pictures_of_a_moving_target_meet_on_the_target_and_come_back() -> None:
+def test_images_of_a_moving_target_meet_on_the_target_and_come_back() -> None:
     target = FontGlyphs(characters="F").target("comic_neue_bold_F")
     places = np.array([[-0.05, -0.01], [0.0, 0.0], [0.0313, 0.0117], [0.06, 0.02]])
     truth = torch.from_numpy(target.rasterise(Plane(64, 96, PITCH_M), places)).float()

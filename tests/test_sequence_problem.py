@@ -107,7 +107,7 @@ def test_gcv_finds_the_weight_where_the_noise_is_white(sight) -> None:
     assert chosen.noise_sigma == pytest.approx(0.3, rel=0.2)
 
 
-def test_total_variation_is_that_of_one_picture(sight) -> None:
+def test_total_variation_is_that_of_one_image(sight) -> None:
     one = SequenceOperator(sight.transport, TARGET_PLANE, POSITIONS[:1])
     images = one(random(4, 4, seed=8)) + 0.1 * random(1, *SHAPE, seed=9)
     operator = MatrixTransport(one(torch.eye(16).double().reshape(16, 4, 4)).flatten(1).mT, TARGET_PLANE, SHAPE)
@@ -125,7 +125,7 @@ def test_total_variation_is_that_of_one_picture(sight) -> None:
     assert float(found.residual) == pytest.approx(float((operator(found.image) - images[0]).norm()), rel=1e-6)
 
 
-def test_a_sequence_shows_more_than_a_picture() -> None:
+def test_a_sequence_shows_more_than_an_image() -> None:
     setup = RadiometricSetup(roughness=0.05, cell_m=0.01, gain=1.0)
     target_plane = Plane(10, 10, 0.008)
     positions = np.stack([np.linspace(-0.06, 0.06, 8), np.zeros(8)], axis=1)

@@ -206,7 +206,7 @@ def test_the_likeliest_acceleration_is_the_true_one() -> None:
 
 
 def test_events_tell_the_velocity(registered) -> None:
-    """Events of a picture that slides at a known, changing speed, between frames that know its places."""
+    """Events of an image that slides at a known, changing speed, between frames that know its places."""
     side = 48
     picture = torch.from_numpy(np.pad(blobs(np.array([(17.5, 11.5)]))[0], ((12, 12), (6, 6))))
     path = PathMotion((0.0, 4.0), ((-6e-3, 0.0), (6e-3, 0.0)))  # a pixel is a millimetre
@@ -489,9 +489,9 @@ def test_no_line_of_the_speed_lies_on_the_frame(tmp_path, monkeypatch) -> None:
 
 
 def test_reconstruct_finds_the_motion_that_nobody_stated(capture, tmp_path, capsys, monkeypatch) -> None:
-    """Motion found gives a picture near that of motion stated, and the confidence that goes with it."""
+    """Motion found gives an image near that of motion stated, and the confidence that goes with it."""
     folder, setup = capture
-    # The network is untrained, and its light anything: let the setup move its pictures all the same.
+    # The network is untrained, and its light anything: let the setup move its images all the same.
     monkeypatch.setattr("evnlos.analysis.model._SAME_LIGHT", (0.0, np.inf))
     sampling = Sampling(height=24, width=36, scored_rows=18)
     torch.manual_seed(0)

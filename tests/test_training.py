@@ -173,7 +173,7 @@ def test_any_part_can_be_frozen(part: str, tiny_dataset, trained, tmp_path) -> N
     assert np.isfinite(log[-1]["loss"])
 
 
-def test_half_of_a_mirrored_batch_is_upside_down_with_its_pictures() -> None:
+def test_half_of_a_mirrored_batch_is_upside_down_with_its_images() -> None:
     draw = torch.Generator().manual_seed(0)
     seen, truth = torch.rand(400, 2, 6, 5, generator=draw), torch.rand(400, 1, 6, 5, generator=draw)
     inputs, pictures = half_mirrored(seen, truth, seed=3)

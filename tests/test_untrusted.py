@@ -78,7 +78,7 @@ def described(folder: Path, **settings: Any) -> Path:
 
 
 @pytest.mark.parametrize("what", ["frame", "mask", "dark", "dots", "folder of frames", "animation", "sd19"])
-def test_a_program_named_as_a_picture_is_not_run(what: str, tiny_captures, tmp_path, ghostscript) -> None:
+def test_a_program_named_as_an_image_is_not_run(what: str, tiny_captures, tmp_path, ghostscript) -> None:
     folder = copied(tiny_captures[0], tmp_path / "capture_folder")
     trap = folder / "trap.png"
     trap.write_bytes(POSTSCRIPT)
@@ -111,7 +111,7 @@ def test_a_program_named_as_a_picture_is_not_run(what: str, tiny_captures, tmp_p
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg", "tif", "bmp", "gif", "webp", "ppm", "pgm"])
-def test_the_pictures_that_cameras_write_are_read(ending: str, tmp_path) -> None:
+def test_the_images_that_cameras_write_are_read(ending: str, tmp_path) -> None:
     picture = np.arange(48, dtype=np.uint8).reshape(6, 8)
     Image.fromarray(picture).save(tmp_path / f"a.{ending}")
     with open_image(tmp_path / f"a.{ending}") as image:
@@ -283,7 +283,7 @@ def write_with(path: Path, codec: str) -> None:
         container.mux(stream.encode())
 
 
-def test_a_folder_of_frames_holds_its_own_pictures(tiny_captures, tmp_path) -> None:
+def test_a_folder_of_frames_holds_its_own_images(tiny_captures, tmp_path) -> None:
     folder = copied(tiny_captures[0], tmp_path / "capture_folder")
     (folder / "many").mkdir()
     for number in range(3):

@@ -14,7 +14,7 @@ from evnlos.errors import ConfigError, DataError, MissingDependencyError
 
 
 def greys(values: list[int], shape: tuple[int, int] = (48, 64)) -> list[np.ndarray]:
-    """Return one even colour picture [H, W, 3] for each value."""
+    """Return one even colour image [H, W, 3] for each value."""
     return [np.full((*shape, 3), value, np.uint8) for value in values]
 
 
@@ -96,10 +96,10 @@ def test_an_animation_gives_the_sums_of_its_durations(tmp_path: Path, ending: st
     np.testing.assert_array_equal(light[:, 0, 0], values)
 
 
-def test_pictures_are_ordered_by_the_numbers_in_their_names(tmp_path: Path) -> None:
+def test_images_are_ordered_by_the_numbers_in_their_names(tmp_path: Path) -> None:
     for number in (1, 2, 10, 9):
         Image.fromarray(np.full((4, 6), number, np.uint8)).save(tmp_path / f"frame_{number}.png")
-    (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "notes.txt").write_text("no image")
     given = sorted(tmp_path.glob("*.png"))
     for path in (tmp_path, str(tmp_path / "*.png"), given):
         times_s, light = read(path, fps=4)
@@ -107,7 +107,7 @@ def test_pictures_are_ordered_by_the_numbers_in_their_names(tmp_path: Path) -> N
         np.testing.assert_array_equal(light[:, 0, 0], [1, 2, 9, 10])
 
 
-def test_deep_pictures_keep_their_fractions(tmp_path: Path) -> None:
+def test_deep_images_keep_their_fractions(tmp_path: Path) -> None:
     ramp = np.arange(24, dtype=np.uint16).reshape(4, 6) * 1000
     for number in range(2):
         Image.fromarray(ramp + number).save(tmp_path / f"{number}.png")
@@ -223,9 +223,9 @@ def test_what_is_no_video_is_refused_in_one_sentence(tmp_path: Path, monkeypatch
     refuses([tmp_path / "one.png", tmp_path / "two.png"], "two.png: no such file", fps=1)
     refuses([], "no video")
     (tmp_path / "empty").mkdir()
-    refuses(tmp_path / "empty", "without pictures")
-    (tmp_path / "text.gif").write_text("no picture")
-    refuses(tmp_path / "text.gif", "not a picture")
+    refuses(tmp_path / "empty", "without images")
+    (tmp_path / "text.gif").write_text("no image")
+    refuses(tmp_path / "text.gif", "not an image")
     (tmp_path / "text.npy").write_text("no array")
     refuses(tmp_path / "text.npy", "not a NumPy array", fps=1)
     Image.fromarray(np.zeros((5, 6), np.uint8)).save(tmp_path / "two.png")

@@ -100,7 +100,7 @@ def fitted(rendered):
 
 
 def test_the_operator_comes_back(rendered, fitted):
-    # Two lobes, a bent wall, vignetting: what the fit says of any picture is what the camera would see.
+    # Two lobes, a bent wall, vignetting: what the fit says of any image is what the camera would see.
     truth = rendered[2].reshape(-1, *WIDE.shape)[:, 12:44].reshape(SHAPE[0] * SHAPE[1], -1)
     setup = fitted.optics.setup
     assert setup.source() == Plane(32, 72, 0.0025)
@@ -259,7 +259,7 @@ def test_texture_and_operator_errors_are_told_from_noise(rendered):
     bright = precision > 10
     assert bright.sum() > 30
     np.testing.assert_allclose(ratio[bright], texture[bright], atol=0.03)
-    # An error of the operator that is linear in the picture is found, and predicts other pictures.
+    # An error of the operator that is linear in the image is found, and predicts other images.
     weights = np.sin(40 * np.add.outer(PLANE.y_m, PLANE.x_m)).ravel() * 1e-3
     pictures = [np.zeros((PLANE.height * PLANE.width, d.seen.shape[1])) for d in (data, data)]
     for n in range(data.seen.shape[1]):

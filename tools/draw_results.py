@@ -41,7 +41,7 @@ def scores(method: str, modality: str) -> np.ndarray:
 
 
 def draw_film() -> None:
-    """Draw hidden object, wall, linear and learned result of a simulated sequence, one position a picture."""
+    """Draw hidden object, wall, linear and learned result of a simulated sequence, one position an image."""
     from PIL import Image
 
     from evnlos.app.controls import Controls, picked, simulate_sequence

@@ -160,7 +160,7 @@ def degrade(pictures: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _bend(count: int, generator: torch.Generator) -> Tensor:
-    """Return a smooth displacement of each picture, as another hand would draw it, [N, 64, 64, 2]."""
+    """Return a smooth displacement of each image, as another hand would draw it, [N, 64, 64, 2]."""
     ticks = torch.linspace(0, torch.pi, _DRAWN)
     waves = torch.cos(torch.arange(_WAVES)[:, None] * ticks)  # [K, 64]
     amounts = 0.05 * torch.randn(count, 2, _WAVES, _WAVES, generator=generator)

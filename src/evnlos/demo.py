@@ -218,7 +218,7 @@ class Finding:
         warnings: What the calibration said against itself.
         expected: What the calibration says that EPNP will bring; empty where it said nothing.
         left: "frames" or "surfaces" (of events) -> (residual on held-out captures, what noise leaves), shares.
-        mean_image_db: Modality -> PSNR of the mean picture, dB.
+        mean_image_db: Modality -> PSNR of the mean image, dB.
         psnr_db: (arm, modality) -> PSNR of each seed, dB.
     """
 

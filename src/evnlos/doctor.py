@@ -225,7 +225,7 @@ def _reader() -> Part:
         size = sum(values.numel() for values in load_reader().parameters())
     except EvnlosError as error:
         return Part("reader", False, str(error), "reinstall evnlos: its weights are damaged", needed=True)
-    return Part("reader", True, f"{size:,} weights that tell whether a picture can be read")
+    return Part("reader", True, f"{size:,} weights that tell whether an image can be read")
 
 
 def _gpu() -> Part:

@@ -1,6 +1,6 @@
 """Opening files that may be a stranger's: plain files only, by lists of formats, and nothing beside the file.
 
-A picture named `.png` may be a program for Ghostscript, a video a playlist of films elsewhere, a column of an
+An image named `.png` may be a program for Ghostscript, a video a playlist of films elsewhere, a column of an
 HDF5 file the bytes of another file, and a name in a folder a pipe that never ends: all are opened here.
 Requests that a page from elsewhere sends to a server of this machine are refused here.
 """
@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # they are slow to import, and not every command needs them
     from PIL import Image
 
 RASTER_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "WEBP", "PPM")
-"""Formats of pictures that are decoded, as Pillow names them; never PostScript, which is a program."""
+"""Formats of images that are decoded, as Pillow names them; never PostScript, which is a program."""
 
 CONTAINER_FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2",
@@ -57,11 +57,11 @@ CONTAINER_FORMATS = (
     "mjpeg",
     "yuv4mpegpipe",
 )
-"""Video containers that are read, as FFmpeg names them; all hold their pictures themselves, no playlists."""
+"""Video containers that are read, as FFmpeg names them; all hold their images themselves, no playlists."""
 
 
 MOST_IMAGE_PIXELS = 1 << 26
-"""Pixels of a picture, at most: a small file can claim any number."""
+"""Pixels of an image, at most: a small file can claim any number."""
 MOST_SENSOR_PIXELS = 1 << 24
 """Pixels of a sensor whose pixels all get memory, at most; the largest event cameras have a quarter."""
 
@@ -117,13 +117,13 @@ def _without_waiting(path: str, flags: int) -> int:
 
 @contextmanager
 def open_image(path: str | os.PathLike[str] | BinaryIO) -> Iterator[Image.Image]:
-    """Yield an open picture of one of `RASTER_FORMATS`, told by its content.
+    """Yield an open image of one of `RASTER_FORMATS`, told by its content.
 
     Args:
         path: The file, or an open one.
 
     Raises:
-        OSError: It can't be opened, is no plain file, no picture of these formats, or has too many pixels.
+        OSError: It can't be opened, is no plain file, no image of these formats, or has too many pixels.
     """
     from PIL import Image
 

@@ -1,7 +1,7 @@
 """Whether images agree with what the frames show, and whether their confidence can be trusted.
 
-- Test-time data consistency: move a network's picture to where the calibrated wall agrees with the frame.
-- How much of what the frames show the pictures explain: the light path run forward again.
+- Test-time data consistency: move a network's image to where the calibrated wall agrees with the frame.
+- How much of what the frames show the images explain: the light path run forward again.
 - Is the confidence right? Support against skill, and coverage of the intervals, sequence by sequence.
 """
 
@@ -35,25 +35,25 @@ _TOLERANCE, _MOST_STEPS = 1e-3, 200
 def consistent(
     pictures: Tensor, frames: Tensor, operator: FrameOperator, trust: float = 1.0, floor: float = 0.003
 ) -> Tensor:
-    """Return the most probable pictures, given the network's answer as a prior and the frames as data.
+    """Return the most probable images, given the network's answer as a prior and the frames as data.
 
     x = argmin |A x + b - y|^2 / sigma^2 + sum (x - p)^2 / v, with the variance v = trust (p (1 - p) + floor): a
     network whose output p is the probability of a bright pixel is unsure where p is neither 0 nor 1, and there
     the frame may move it. Conjugate gradients in units of sqrt(v); clipped to 0..1.
 
     Args:
-        pictures: The network's pictures p, float32 [N, H, W], 0..1.
+        pictures: The network's images p, float32 [N, H, W], 0..1.
         frames: Frames of the samples y, float32 [N, h, w], white levels, without fixed pattern.
         operator: The setup.
-        trust: How much the frames may move the pictures, above 0; 0 returns the pictures.
+        trust: How much the frames may move the images, above 0; 0 returns the images.
         floor: Smallest variance of a pixel at trust 1.
 
     Raises:
-        DataError: Pictures and frames are not as many, or not of the operator's size.
+        DataError: Images and frames are not as many, or not of the operator's size.
     """
     if frames.shape[1:] != operator.size or len(frames) != len(pictures):
         raise DataError(
-            f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a setup of "
+            f"frames {tuple(frames.shape)} and images {tuple(pictures.shape)} do not fit a setup of "
             f"{operator.size[1]} x {operator.size[0]} samples"
         )
     if trust <= 0:
@@ -78,7 +78,7 @@ def consistent(
 
 
 _BEYOND_NOISE = 0.05
-"""What the average object must leave above the noise, as a share of it, for a picture to be told from it."""
+"""What the average object must leave above the noise, as a share of it, for an image to be told from it."""
 _MAD = 0.6745  # of a normal distribution, in standard deviations
 
 
@@ -90,29 +90,29 @@ def explained(
     operator: FrameOperator,
     canvas: Plane,
 ) -> float:
-    """Return the share of what the average object leaves unexplained in the frames that the pictures explain.
+    """Return the share of what the average object leaves unexplained in the frames that the images explain.
 
-    1 - (|m y - g m A x|^2 - n) / (|m y - g0 m A x0|^2 - n), with x the pictures, x0 the average target where
+    1 - (|m y - g m A x|^2 - n) / (|m y - g0 m A x0|^2 - n), with x the images, x0 the average target where
     the target is, and n the noise. m takes what stands still away, each pixel's mean over the sequence, and the
     gains g and g0 are the best ones: neither ambient light nor the camera's fixed pattern nor how bright the
-    object is has to be known, only what the wall does. 1 = the frames are as the pictures make them; 0 = they
+    object is has to be known, only what the wall does. 1 = the frames are as the images make them; 0 = they
     are as good as those of the average target, or the frames do not tell objects from it, as before a matte
-    wall; below 0 = they are worse: the pictures are not what was in front of the wall, or the wall is another.
+    wall; below 0 = they are worse: the images are not what was in front of the wall, or the wall is another.
 
     Args:
-        pictures: Pictures of the canvas, float32 [N, H, W], 0..1.
+        pictures: Images of the canvas, float32 [N, H, W], 0..1.
         frames: Frames of the samples y, float32 [N, h, w].
         position_m: The target's centre in each, (x, y) in metres, [N, 2].
         average: The average target, [P, P].
         operator: The setup.
-        canvas: Geometry of the pictures.
+        canvas: Geometry of the images.
 
     Raises:
-        DataError: Pictures and frames are not as many, or not of the operator's size.
+        DataError: Images and frames are not as many, or not of the operator's size.
     """
     if frames.shape != (len(pictures), *operator.size):
         raise DataError(
-            f"frames {tuple(frames.shape)} and pictures {tuple(pictures.shape)} do not fit a setup of "
+            f"frames {tuple(frames.shape)} and images {tuple(pictures.shape)} do not fit a setup of "
             f"{operator.size[1]} x {operator.size[0]} samples"
         )
     plain = on_canvas(average, canvas, position_m)
@@ -141,10 +141,10 @@ def share_explained(
 
 
 def light_gain(pictures: Tensor, frames: Tensor, operator: FrameOperator) -> float:
-    """Return how much brighter the moving light of frames is than the setup makes it from pictures.
+    """Return how much brighter the moving light of frames is than the setup makes it from images.
 
     Args:
-        pictures: Pictures of the canvas, float32 [N, H, W], 0..1.
+        pictures: Images of the canvas, float32 [N, H, W], 0..1.
         frames: Frames of the samples, float32 [N, h, w], white levels.
         operator: The setup.
     """
@@ -187,12 +187,12 @@ def _noise(frames: Tensor, operator: FrameOperator) -> Tensor:
 def confidence_of(
     weights: Weights, samples: Samples, images: Tensor, operator: FrameOperator | None = None
 ) -> ConfidenceReport | None:
-    """Return the confidence in the pictures of one sequence; None where the weights or the motion do not tell.
+    """Return the confidence in the images of one sequence; None where the weights or the motion do not tell.
 
     Args:
         weights: The network and its confidence.
         samples: The sequence.
-        images: The network's pictures, float32 [N, H, W].
+        images: The network's images, float32 [N, H, W].
         operator: The calibrated setup, where it is known.
     """
     if why_no_confidence(weights, samples) is not None:
@@ -252,11 +252,11 @@ class ConfidenceCheck:
 
     Args:
         name: Object of the sequence.
-        support: What it said, in one number: how much of the picture the measurement supports, 0..1.
+        support: What it said, in one number: how much of the image the measurement supports, 0..1.
         agreement: Share of what tells this object from others that both halves of the sequence agree on.
-        explained: Share of the frames that the pictures explain (see `explained`); None without a setup.
+        explained: Share of the frames that the images explain (see `explained`); None without a setup.
         measured: Whether it said that anything was.
-        skill: 1 - |x - t|^2 / |x0 - t|^2 over the targets, with x the pictures, t the truth, and x0 the average
+        skill: 1 - |x - t|^2 / |x0 - t|^2 over the targets, with x the images, t the truth, and x0 the average
             target: 1 is perfect, 0 is no better than the average object, below 0 is worse.
         coverage: Share of the target planes' pixels whose true level lies in its interval.
         width: Mean length of these intervals, 0..1.
@@ -281,13 +281,13 @@ def check_confidence(
     canvas: Plane,
     operator: FrameOperator | None = None,
 ) -> list[ConfidenceCheck]:
-    """Compare what the confidence says of pictures with their truth, for each sequence.
+    """Compare what the confidence says of images with their truth, for each sequence.
 
     Args:
         network: The network.
         confidence: Its confidence.
         samples: The sequences, all of known motion.
-        images: The network's pictures of all samples, float32 [N, H, W].
+        images: The network's images of all samples, float32 [N, H, W].
         canvas: Their geometry.
         operator: The setup that the network was trained for; the modality then has a group "frame".
 

@@ -168,28 +168,28 @@ BASELINES = {
 
 CHECKS = {
     "read": "characters that an independent reader names correctly",
-    "read_truth": "the same on the true pictures",
-    "nearer_to_truth": "pictures nearer to the truth than to any training picture",
+    "read_truth": "the same on the true images",
+    "nearer_to_truth": "images nearer to the truth than to any training image",
 }
 """Meaning of each check."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Scores and pictures of one network (or baseline) on one split.
+    """Scores and images of one network (or baseline) on one split.
 
     Args:
         images: Reconstructions on the scored canvas, float32 [N, H, W], 0..1.
-        truth: True pictures, the same shape.
-        names: Object of each picture, [N].
-        scores: Scores of each picture.
-        baselines: Scores of the all-black picture ("zero"), of the mean training picture ("mean"), of the mean
-            target of the training objects where the target is ("placed"), and of the true picture of the
+        truth: True images, the same shape.
+        names: Object of each image, [N].
+        scores: Scores of each image.
+        baselines: Scores of the all-black image ("zero"), of the mean training image ("mean"), of the mean
+            target of the training objects where the target is ("placed"), and of the true image of the
             training object whose measurement is most like this one ("nearest").
-        checks: Shares of the pictures: "read", whose character the independent reader names correctly;
-            "read_truth", the same of the true pictures, its ceiling; "nearer_to_truth", which are nearer to
-            the truth than to any training picture. Only what could be found out.
-        read_as: Object -> character -> how many of its pictures the reader takes for it; empty where nothing
+        checks: Shares of the images: "read", whose character the independent reader names correctly;
+            "read_truth", the same of the true images, its ceiling; "nearer_to_truth", which are nearer to
+            the truth than to any training image. Only what could be found out.
+        read_as: Object -> character -> how many of its images the reader takes for it; empty where nothing
             could be read.
         confidence_checks: What the network's confidence said of each sequence, beside what was true; empty
             where it has none, or a motion is unknown.
@@ -238,14 +238,14 @@ def evaluate(
 ) -> Evaluation:
     """Reconstruct a split of a dataset and score it.
 
-    The baseline "mean" is the mean of the true pictures that the network was trained on last.
+    The baseline "mean" is the mean of the true images that the network was trained on last.
 
     Args:
         weights: The network.
         dataset: Where the samples are.
         split: "train", "validation", "test" or "all".
         perceptual: LPIPS, where its weights are at hand.
-        setup: The calibrated setup that the confidence asks how much of the frames the pictures explain;
+        setup: The calibrated setup that the confidence asks how much of the frames the images explain;
             weights of events alone see no frames, and are not asked.
         progress: Called as each of three stages begins and as the last has ended.
 
@@ -278,7 +278,7 @@ def assess(
     mean_image: Tensor | None = None,
     perceptual: Perceptual | None = None,
 ) -> Evaluation:
-    """Score any pictures of a split, whoever made them, beside the same baselines.
+    """Score any images of a split, whoever made them, beside the same baselines.
 
     Args:
         images: Reconstructions on the whole canvas, float32 [N, H, W], 0..1, in the order of `samples`.
@@ -357,7 +357,7 @@ def reconstruct(
         position_m: The target's centre, (x, y) in metres, [N, 2], which weights of whole sequences need.
 
     Returns:
-        Pictures, float32 [N, H, W], 0..1.
+        Images, float32 [N, H, W], 0..1.
 
     Raises:
         DataError: The weights see whole sequences, and the positions are unknown.

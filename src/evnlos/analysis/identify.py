@@ -1,7 +1,7 @@
 """Identifiability and resolution of a setup: what any method can reconstruct from it, in numbers and in words.
 
 - What the figures of a setup mean, in words.
-- What a setup can show at all: singular values, patterns above the noise, finest stroke, best linear picture.
+- What a setup can show at all: singular values, patterns above the noise, finest stroke, best linear image.
 - Setups side by side, as a table in Markdown.
 """
 
@@ -99,17 +99,17 @@ KINK_LEVEL = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevelResult:
-    """What is left of a setup at one noise; figures are expectations over the noise of one picture of the wall.
+    """What is left of a setup at one noise; figures are expectations over the noise of one image of the wall.
 
     Args:
         noise: Root mean square noise of a pixel, white levels.
         patterns: Patterns in which handwritten targets differ by more than the noise.
-        psnr_db: Mean over unseen targets of the PSNR of the best linear picture, on the target plane.
+        psnr_db: Mean over unseen targets of the PSNR of the best linear image, on the target plane.
         stroke_m: Width of the finest bars that are resolved, upright and lying, metres; None where none are.
         spectrum: Singular values of the matrix in units of the noise, float64 [n], descending.
-        picard: Coefficient of the typical target's picture on each mode, in units of the noise, float64 [n].
+        picard: Coefficient of the typical target's image on each mode, in units of the noise, float64 [n].
         modes: The first modes as targets, float64 [8, h, w], unit norm.
-        picture: The best linear picture of the typical target with one draw of the noise, float64 [h, w].
+        picture: The best linear image of the typical target with one draw of the noise, float64 [h, w].
     """
 
     noise: float
@@ -138,7 +138,7 @@ class Identification:
         settings: How the question was put.
         singular: Singular values over the largest, float64 [n], descending.
         modes: How many of them lie above 1e-2.
-        zero_db: Mean PSNR of the all-black picture, on the target plane.
+        zero_db: Mean PSNR of the all-black image, on the target plane.
         mean_db: Mean PSNR of the mean training target, on the target plane.
         stroke_m: Typical stroke of the targets, metres.
         truth: The typical target, float64 [h, w].
@@ -202,18 +202,18 @@ def identify(
     name: str = "setup",
     seed: int = 0,
 ) -> Identification:
-    """Say what one picture of the wall can show of a target at a known place, whatever the method.
+    """Say what one image of the wall can show of a target at a known place, whatever the method.
 
     The linear map from the target plane's cells to the camera's pixels is taken apart by its singular values;
     the noise is the frame camera's at the light of the mean target, and a fixed share of the brightest pixel.
-    The best linear picture uses mean and covariance of handwriting and is tested on characters and writers that
+    The best linear image uses mean and covariance of handwriting and is tested on characters and writers that
     it never saw.
 
     Args:
         setup: The setup; its frame camera's noise is what counts.
         settings: Cells, pixels and noise; None is the default, that of the table in docs/identifiability.md.
         name: What to call the setup.
-        seed: Seed of the one picture that is drawn with noise.
+        seed: Seed of the one image that is drawn with noise.
 
     Raises:
         ConfigError: The setup is geometrically impossible, or the camera gets no light from the target.
@@ -301,9 +301,9 @@ def verdict_on(
     """
     wall = "" if setup is None or not setup.is_linear else identify(setup, QUICK).wall
     if report is None:
-        return Verdict(wall, no_confidence or "", "how much of the picture is guessed cannot be told")
+        return Verdict(wall, no_confidence or "", "how much of the image is guessed cannot be told")
     if not report.measured:
-        return Verdict(wall, report.verdict, "the whole picture is the network's guess")
+        return Verdict(wall, report.verdict, "the whole image is the network's guess")
     return Verdict(
         wall, report.verdict, "what the intervals leave open is the network's guess, from its training"
     )
@@ -318,7 +318,7 @@ def result_at_noise(
         seen: The linear map.
         variance: Variance of each pixel's noise, white levels squared, [H W], above 0.
         targets: Prior and test.
-        seed: Seed of the one picture that is drawn with noise.
+        seed: Seed of the one image that is drawn with noise.
     """
     cells, shape = seen.target_plane.width, seen.target_plane.shape
     whitened = seen.matrix / variance.sqrt()[:, None]
@@ -360,7 +360,7 @@ def counted(singular: torch.Tensor, level: float) -> int:
 
 
 def _psnr(error: torch.Tensor) -> float:
-    """Return the mean PSNR of pictures with these mean squared errors, dB, peak 1."""
+    """Return the mean PSNR of images with these mean squared errors, dB, peak 1."""
     return float((-10 * torch.log10(error)).mean())
 
 
@@ -370,7 +370,7 @@ def _rounded(length_m: float | None) -> float | None:
 
 _HEAD = (
     "| setup | modes > 1e-2 | patterns above noise: camera / 1 % | bars, upright x lying, mm: camera / 1 % "
-    "| best linear picture, dB: camera / 1 % |\n|---|---|---|---|---|"
+    "| best linear image, dB: camera / 1 % |\n|---|---|---|---|---|"
 )
 
 

@@ -1,7 +1,7 @@
 """A setup as a matrix with a noise, and the best linear estimate that it allows.
 
 - A setup as a matrix with a noise: what every question about its limits starts from.
-- The best linear estimate of a target from one picture of the wall, and how wrong it is on average.
+- The best linear estimate of a target from one image of the wall, and how wrong it is on average.
 - What a measured matrix can't say about a setup: its own noise and the size of its cells, in words.
 """
 
@@ -124,7 +124,7 @@ class LinearEstimator:
     is seen with a signal-to-noise ratio snr_k in power, and x^ = m + T (snr + 1)^-1 T^T A^T D^-1 (y - A m).
 
     Args:
-        gram: A^T D^-1 A, [n, n]: the information that the picture carries.
+        gram: A^T D^-1 A, [n, n]: the information that the image carries.
         mean: m, [n], 0..1.
         patterns: T, [n, n].
         snr: Signal-to-noise ratio of each pattern, [n], descending.
@@ -178,7 +178,7 @@ class LinearEstimator:
         return int((self.snr > 1).sum())
 
     def expected(self, targets: torch.Tensor) -> torch.Tensor:
-        """Return the estimate without its noise: its mean over many pictures of each target [..., n]."""
+        """Return the estimate without its noise: its mean over many images of each target [..., n]."""
         return self.mean + (targets - self.mean) @ self._kept.mT
 
     def expected_error(self, targets: torch.Tensor) -> torch.Tensor:
@@ -214,11 +214,11 @@ def bars(cells: int, width: float, phase: float, upright: bool = True) -> torch.
 
 
 def finest_bars(estimator: LinearEstimator, cells: int, upright: bool = True) -> float | None:
-    """Return the width of the finest bars that one picture resolves, in cells; None where none are.
+    """Return the width of the finest bars that one image resolves, in cells; None where none are.
 
     Bars of full contrast fill the target plane. They are resolved when the expected squared error of the
     estimate, averaged over their phase, is at most half of what an even grey of their mean would have (a
-    quarter of the all-black picture's), and so are all wider bars. Widths go from half of the target plane down
+    quarter of the all-black image's), and so are all wider bars. Widths go from half of the target plane down
     to one cell in steps of 9 %.
 
     Args:

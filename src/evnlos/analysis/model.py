@@ -296,7 +296,7 @@ class PositionsPoint:
     Args:
         positions: Positions that it saw.
         subsets: Choices of so many positions that the scores are a mean over, at most.
-        psnr_db: Mean PSNR over the pictures of all positions of the split, the scored canvas, dB.
+        psnr_db: Mean PSNR over the images of all positions of the split, the scored canvas, dB.
         objects: The same of each object, dB.
     """
 
@@ -314,10 +314,10 @@ def curve_over_positions(
     counts: tuple[int, ...] = (1, 2, 5, 10, 20, 40),
     progress: Progress = silent,
 ) -> list[PositionsPoint]:
-    """Reconstruct each sequence from some of its positions and score the picture at all of them.
+    """Reconstruct each sequence from some of its positions and score the image at all of them.
 
     The choices of n of N positions are equally spaced: begun at the first, the second and so on, up to 8
-    choices spread over the N // n that there are. What is scored is the same for every n: the picture drawn
+    choices spread over the N // n that there are. What is scored is the same for every n: the image drawn
     at all N positions, whose places are known.
 
     Args:

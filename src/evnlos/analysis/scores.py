@@ -1,6 +1,6 @@
 """Scores of images against the truth: metrics, intervals, a character classifier, LPIPS.
 
-- Scores of pictures against the truth: on the whole scored canvas and on the target's own box.
+- Scores of images against the truth: on the whole scored canvas and on the target's own box.
 - Intervals for differences between methods, by a paired bootstrap over objects.
 - An independent reader: a small network that names a character, trained on clean glyphs alone.
 - What images of single time steps make of a whole sequence: their mean along the motion.
@@ -64,11 +64,11 @@ class Scores:
 
 
 def score(images: Tensor, truth: Tensor, perceptual: Perceptual | None = None) -> Scores:
-    """Score pictures [N, H, W] in 0..1 against true ones, both already cut to the scored rows.
+    """Score images [N, H, W] in 0..1 against true ones, both already cut to the scored rows.
 
     Args:
         images: Reconstructions.
-        truth: True pictures.
+        truth: True images.
         perceptual: LPIPS of [N, 1, H, W] pairs, where its weights are at hand.
     """
     large = min(images.shape[-2:]) >= HAAR_LEAST_SIDE
@@ -86,7 +86,7 @@ def score(images: Tensor, truth: Tensor, perceptual: Perceptual | None = None) -
 
 
 def _box(truth: Tensor) -> tuple[slice, slice]:
-    """Return the rows and columns of the target; the whole picture where there is none."""
+    """Return the rows and columns of the target; the whole image where there is none."""
     rows, columns = (torch.nonzero(truth.amax(dim=axis) > 0).flatten() for axis in (1, 0))
     if not len(rows):
         return slice(None), slice(None)
@@ -99,7 +99,7 @@ class Interval:
     """A mean with its 95 % interval.
 
     Args:
-        mean: The mean over all pictures.
+        mean: The mean over all images.
         low: 2.5 % point of the bootstrap.
         high: 97.5 % point of the bootstrap.
     """
@@ -118,19 +118,19 @@ def paired_difference(
     """Return the mean of a - b with a 95 % percentile interval, objects and seeds drawn with replacement.
 
     The positions of one object are not independent, so whole objects are drawn, and both methods are always
-    compared on the same pictures. Of several seeds each draw takes as many, those of `a` and of `b` apart, so
+    compared on the same images. Of several seeds each draw takes as many, those of `a` and of `b` apart, so
     that the interval holds what another training would change. With few objects (4 characters) such an
     interval is coarse and, as a rule, too narrow; it speaks of other objects like these, not of other setups.
 
     Args:
         a: Scores of one method, [N], or [S, N] for S seeds, which are averaged.
-        b: Scores of the other, the same pictures in the same order.
-        objects: Object of each picture, [N].
+        b: Scores of the other, the same images in the same order.
+        objects: Object of each image, [N].
         draws: Number of bootstrap samples.
         seed: Seed of the draws.
 
     Raises:
-        DataError: The lengths disagree, or there is no picture.
+        DataError: The lengths disagree, or there is no image.
 
     Example:
         >>> str(paired_difference([3.0, 4.0, 6.0], [1.0, 2.0, 3.0], ["A", "A", "B"]))
@@ -140,7 +140,7 @@ def paired_difference(
     difference = both[0].mean(axis=0) - (both[1].mean(axis=0) if both[1].size else 0.0)
     if any(one.shape[1:] != labels.shape for one in both) or not len(labels):
         shapes = " and ".join(str(one.shape) for one in both)
-        raise DataError(f"scores {shapes} and {labels.shape} objects; give one object a picture")
+        raise DataError(f"scores {shapes} and {labels.shape} objects; give one object an image")
     _, group = np.unique(labels, return_inverse=True)
     counts, draw = np.bincount(group), np.random.default_rng(seed)
     chosen = draw.integers(0, len(counts), (draws, len(counts)))  # [D, G]
@@ -160,7 +160,7 @@ _FILE = Path(__file__).parent / "classifier.safetensors"
 
 
 class CharacterReader(nn.Module):
-    """Three strided convolutions and a mean: pictures of a target [N, 1, 32, 32] in 0..1 -> scores [N, 36]."""
+    """Three strided convolutions and a mean: images of a target [N, 1, 32, 32] in 0..1 -> scores [N, 36]."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -170,7 +170,7 @@ class CharacterReader(nn.Module):
         self.head = nn.Linear(widths[-1] * 16, len(CHARACTERS))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return unnormalised scores; each picture is first brought to mean 0 and deviation 1."""
+        """Return unnormalised scores; each image is first brought to mean 0 and deviation 1."""
         x = x - x.mean(dim=(1, 2, 3), keepdim=True)
         x = x / x.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(1e-3)
         for layer, norm in zip(self.layers, self.norms, strict=True):
@@ -224,7 +224,7 @@ _MEAN, _STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 def load_lpips(
     trunk: str | Path | None = None, heads: str | Path | None = None
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return the metric: pairs of pictures [N, 1, H, W] in 0..1 -> LPIPS [N], 0 = the same.
+    """Return the metric: pairs of images [N, 1, H, W] in 0..1 -> LPIPS [N], 0 = the same.
 
     Args:
         trunk: torchvision's `vgg16-397923af.pth`; by default the torch hub cache is looked in.

@@ -1,4 +1,4 @@
-// The first pictures at once: Gradio needs seconds for its controls, but what it will show is in the page already.
+// The first images at once: Gradio needs seconds for its controls, but what it will show is in the page already.
 (() => {
   const WAIT_MS = 30000;
   const parts = window.gradio_config?.components ?? [];

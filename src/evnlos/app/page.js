@@ -64,7 +64,7 @@
     });
     return false;
   };
-  // All pictures at the position that is looked at, with their titles, as one PNG.
+  // All images at the position that is looked at, with their titles, as one PNG.
   window.evnlosSave = async (button) => {
     const sheet = button.closest(".ev-sheet"), k = Number(sheet.style.getPropertyValue("--k"));
     const figures = [...sheet.querySelectorAll("figure:not(.ev-setup)")], WIDTH = 320, ROW = 260, COLUMNS = 4;

@@ -1,8 +1,8 @@
 """The page in Gradio: texts, controls, and what happens when a control moves.
 
 - The texts of the page that stand still: its head, and its words explained.
-- What happens when a control moves or a file arrives: pictures and words as HTML, piece by piece.
-- The page in Gradio: controls on the left, pictures on the right.
+- What happens when a control moves or a file arrives: images and words as HTML, piece by piece.
+- The page in Gradio: controls on the left, images on the right.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ _WORDS = {
     "wall roughness": "How far the wall throws light off the direction in which a mirror would. At 0.02 it is "
     "polished metal, at 0.1 it is dull; matte paint throws light everywhere alike.",
     "white level": "A light of 1 white level just fills a pixel of the frame camera.",
-    "event": "A pixel of an event camera sends no pictures. It reports when its light has changed by a "
+    "event": "A pixel of an event camera sends no images. It reports when its light has changed by a "
     "threshold, brighter or darker, at that instant.",
     "threshold": "How much the natural logarithm of a pixel's light has to change for an event: 0.15 is 16 %.",
-    "time surface": "A picture made from events: each pixel shows how recent its newest event is.",
-    "least squares": "The picture that explains one frame best, kept dark where the frame says nothing.",
-    "whole sequence": "The one picture that explains all frames of the sequence together.",
+    "time surface": "An image made from events: each pixel shows how recent its newest event is.",
+    "least squares": "The image that explains one frame best, kept dark where the frame says nothing.",
+    "whole sequence": "The one image that explains all frames of the sequence together.",
     "dB": "PSNR: ten decibels more are a tenth of the squared error. It means something only beside the value "
-    "of an all-black picture at the same instant.",
+    "of an all-black image at the same instant.",
     "verdict": "What wall and noise leave to be seen in one frame, whatever the method; a whole sequence shows "
     "more. Where they leave nothing, a network may still draw a letter: it remembers one.",
 }

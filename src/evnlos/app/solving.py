@@ -1,7 +1,7 @@
 """What is reconstructed from a sequence, by solvers and by networks.
 
 - Which networks look at a sequence: the user's own, or the pretrained ones that know its setup.
-- What can be made of a sequence: two classical pictures where the setup is known, and one of each network.
+- What can be made of a sequence: two classical images where the setup is known, and one of each network.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Networks:
         return found
 
     def wall_of(self, recorded: Recorded) -> Callable[[Sampling], FrameOperator] | None:
-        """Return the wall that has to turn the pictures into the frames: the sequence's own, or the networks'.
+        """Return the wall that has to turn the images into the frames: the sequence's own, or the networks'.
 
         None where there are no frames, or where the networks are the user's and so is the recording.
         """
@@ -93,7 +93,7 @@ def own_networks(paths: Iterable[Path]) -> Networks:
     return Networks(found)
 
 
-_DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far a picture may go from it
+_DIM, _TRUST = 0.02, 4.0  # a dark plane, and how far an image may go from it
 _CELLS = 16  # a side of the target plane of the whole sequence
 _SMOOTH = 3.0  # weight of the gradient in units of the noise's variance
 _STATIC = 1.0  # the camera's fixed pattern is about as strong as its noise
@@ -101,14 +101,14 @@ _STATIC = 1.0  # the camera's fixed pattern is about as strong as its noise
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """The pictures that one method made of a sequence.
+    """The images that one method made of a sequence.
 
     Args:
         name: The method.
         note: What it uses.
         images: The scored rows of the canvas, float32 [N, h, w], 0..1.
-        psnr_db: PSNR of each picture, [N]; None where the truth is unknown.
-        black_db: PSNR of an all-black picture, [N].
+        psnr_db: PSNR of each image, [N]; None where the truth is unknown.
+        black_db: PSNR of an all-black image, [N].
     """
 
     name: str
@@ -119,7 +119,7 @@ class Reconstruction:
 
 
 def from_each_frame(recorded: Recorded) -> Reconstruction:
-    """Return the regularised least squares picture of each frame alone, the setup and its noise being known.
+    """Return the regularised least squares image of each frame alone, the setup and its noise being known.
 
     Raises:
         DataError: The sequence has no frames, or its setup is unknown.
@@ -133,7 +133,7 @@ def from_each_frame(recorded: Recorded) -> Reconstruction:
 
 
 def from_whole_sequence(recorded: Recorded) -> Reconstruction:
-    """Return one picture from all frames at once, setup and motion being known, drawn where the object was.
+    """Return one image from all frames at once, setup and motion being known, drawn where the object was.
 
     Raises:
         DataError: The sequence has no frames, or its setup or its motion is unknown.
@@ -168,13 +168,13 @@ def from_weights(
     weights: Weights,
     wall: Callable[[Sampling], FrameOperator] | None = None,
 ) -> Reconstruction:
-    """Return the pictures of a network, and how far to believe them.
+    """Return the images of a network, and how far to believe them.
 
     Args:
         recorded: The sequence.
         name: What to call the network.
         weights: The network.
-        wall: What has to make the frames of these pictures, for a size of samples; None: the pictures alone
+        wall: What has to make the frames of these images, for a size of samples; None: the images alone
             are required.
 
     Raises:
@@ -201,7 +201,7 @@ def from_weights(
 def _known(recorded: Recorded) -> tuple[Setup, NDArray]:
     simulation, frames = recorded.simulation, recorded.frames
     if simulation is None or frames is None or simulation.setup.target_cells() is None:
-        raise DataError("the setup or the frames are unknown; a classical picture needs both")
+        raise DataError("the setup or the frames are unknown; a classical image needs both")
     return simulation.setup, frames
 
 

@@ -1,8 +1,8 @@
-"""Pictures and words of the page.
+"""Images and words of the page.
 
 - What the chosen setup can show at all, in plain words.
-- From a sequence and its reconstructions to the pictures that stand side by side on the page.
-- Views as one piece of HTML without requests: each a tall picture of all positions, of which one is shown.
+- From a sequence and its reconstructions to the images that stand side by side on the page.
+- Views as one piece of HTML without requests: each a tall image of all positions, of which one is shown.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from evnlos.events import time_surface
 from evnlos.events.volume import WORDS
 from evnlos.plot.figures import (
     CloudSize,
-    cloud_pictures,
-    signed_pictures,
-    slice_pictures,
+    cloud_images,
+    signed_images,
+    slice_images,
     smaller,
     time_slices,
 )
@@ -55,12 +55,12 @@ def limits_of(simulation: Simulation) -> Identification:
     return _identified(replace(simulation.setup, pixel=EventPixel()))
 
 
-_LONGEST_SIDE = 320  # of a picture of the wall or of events: a page shows no more
+_LONGEST_SIDE = 320  # of an image of the wall or of events: a page shows no more
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One place on the page: a picture for each position, or one with a cursor that runs through time.
+    """One place on the page: an image for each position, or one with a cursor that runs through time.
 
     Args:
         title: What it shows.
@@ -69,8 +69,8 @@ class View:
         captions: A line for each position; empty where there is none.
         colours: RGBA, uint8 [K, 4].
         group: "seen", "found" or "events": where on the page it stands.
-        cursor: Whether time runs to the right in the one picture.
-        marks: Words at places of the picture: (text, left, top), shares of its sides.
+        cursor: Whether time runs to the right in the one image.
+        marks: Words at places of the image: (text, left, top), shares of its sides.
     """
 
     title: str
@@ -98,7 +98,7 @@ def seen_views(recorded: Recorded) -> list[View]:
         View(
             "Events",
             f"{WORDS}, of the last {interval_ms:.3g} ms",
-            slice_pictures(events, edges),
+            slice_images(events, edges),
             tuple(f"{count:,} events" for count in counts),
         )
     )
@@ -108,14 +108,14 @@ def seen_views(recorded: Recorded) -> list[View]:
         View(
             "Time surface",
             f"each pixel's newest event; it fades in {interval_ms:.3g} ms",
-            signed_pictures(surface, 1.0, faintest=0.0),
+            signed_images(surface, 1.0, faintest=0.0),
         )
     )
     return views
 
 
 def found_views(found: Sequence[Reconstruction]) -> list[View]:
-    """Return a view of each reconstruction, with its PSNR beside that of an all-black picture."""
+    """Return a view of each reconstruction, with its PSNR beside that of an all-black image."""
     views = []
     for one in found:
         captions: tuple[str, ...] = ()
@@ -133,7 +133,7 @@ def event_views(recorded: Recorded) -> list[View]:
     """Return the space-time cloud and the slices through its middle."""
     events, edges = smaller(recorded.events, _LONGEST_SIDE), recorded.edges_us
     size = CloudSize()
-    pictures, colours = cloud_pictures(events, edges, size)
+    pictures, colours = cloud_images(events, edges, size)
     begin, along, across, down = size.axes() / [size.width, size.height]
     seconds = (int(edges[-1]) - int(edges[0])) / 1e6
     foot = begin + across + down
@@ -147,7 +147,7 @@ def event_views(recorded: Recorded) -> list[View]:
     views = [View("Space-time cloud", note, pictures, (), colours, "events", marks=marks)]
     for name, other, counts in zip("xy", ("rows", "columns"), time_slices(events, edges), strict=True):
         note = f"events of the middle {other}: {name} downwards, time to the right ({seconds:.3g} s)"
-        picture = signed_pictures(counts)[None]
+        picture = signed_images(counts)[None]
         views.append(View(f"Slice: {name} over time", note, picture, (), None, "events", cursor=True))
     return views
 
@@ -229,8 +229,8 @@ def sheet(
 def verdict_box(found: Identification) -> str:
     """Return what a setup can show as HTML."""
     figures = (
-        f"On handwriting, the best linear picture from one frame reaches {found.at_camera.psnr_db:.1f} dB; "
-        f"a mean character {found.mean_db:.1f} dB, an all-black picture {found.zero_db:.1f} dB."
+        f"On handwriting, the best linear image from one frame reaches {found.at_camera.psnr_db:.1f} dB; "
+        f"a mean character {found.mean_db:.1f} dB, an all-black image {found.zero_db:.1f} dB."
     )
     wall = html.escape(f"{found.wall[:1].upper()}{found.wall[1:]}.")
     reason = html.escape(found.verdict.partition(": ")[0])
@@ -256,7 +256,7 @@ def message_box(text: str, wrong: bool = True) -> str:
 
 
 def sprite(view: View) -> bytes:
-    """Return all pictures of a view below each other as one PNG."""
+    """Return all images of a view below each other as one PNG."""
     stack = view.pictures.reshape(-1, *view.pictures.shape[2:])  # [N h, w] or [N h, w, 4]
     image = Image.fromarray(np.ascontiguousarray(stack))
     options: dict[str, bytes] = {}
@@ -291,6 +291,6 @@ def _figure(view: View, start: int) -> str:
         caption = f'<span class="ev-value" data-texts="{texts}">{html.escape(view.captions[start])}</span>'
     kind = " ev-line" if view.colours is not None else ""
     return (
-        f'<figure><figcaption><b>{title}</b>{caption}</figcaption><div class="ev-picture{kind}" role="img" '
+        f'<figure><figcaption><b>{title}</b>{caption}</figcaption><div class="ev-image{kind}" role="img" '
         f'aria-label="{title}: {note}" style="{style}">{inner}</div><small>{note}</small></figure>'
     )

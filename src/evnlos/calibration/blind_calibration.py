@@ -191,7 +191,7 @@ class FrameResiduals:
 
 CELLS = 12
 """Cells a side of the unknown target."""
-_COLUMNS = 32  # of the working pictures: a rough wall shows no finer detail
+_COLUMNS = 32  # of the working images: a rough wall shows no finer detail
 _MOST_FRAMES = 12  # of a sequence
 _SCANS = tuple((wider, rougher) for wider in (1.0, 0.7, 1.4) for rougher in (0.25, 0.5, 1.0, 2.0))
 _SCALE = 20.0  # steps of a finite difference that a parameter may be off

@@ -2,7 +2,7 @@
 
 - Settings: which captures are fitted and which held out, and where the search begins.
 - The captures: one setup, one camera, known motions, some of them held out.
-- What the fit of a wall works on: some pixels of some frames, and the targets as sparse pictures.
+- What the fit of a wall works on: some pixels of some frames, and the targets as sparse images.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Calibration:
     events: bool = True
     """Fit the event pixel too."""
     columns: int = 64
-    """Columns of the pictures that the optics are fitted to, pixels; more cost time."""
+    """Columns of the images that the optics are fitted to, pixels; more cost time."""
     event_captures: int = 3
     """Captures whose events are simulated for the fit, and as many for the check."""
     start: Simulation = field(default_factory=_rough_metal)
@@ -266,7 +266,7 @@ _SATURATED = 0.995
 
 @dataclass(frozen=True, eq=False)
 class WallData:
-    """What the fit works on: some pixels of some frames, and the targets as sparse pictures.
+    """What the fit works on: some pixels of some frames, and the targets as sparse images.
 
     Args:
         shape: Size (H, W) of the camera image, pixels.
@@ -276,11 +276,11 @@ class WallData:
         capture: Capture of each frame [N].
         group: Place of the target of each frame [N]: light that all captures share there is left out.
         weight: Weight of each pixel's squares [P].
-        grid: Size (h, w) of the working pictures.
+        grid: Size (h, w) of the working images.
         pixel: Number of each pixel in them [P].
         places: Place (x, y) of the target in each frame [N, 2], metres.
-        plane: Cells of the targets' pictures.
-        starts: Where each picture's entries begin [N + 1].
+        plane: Cells of the targets' images.
+        starts: Where each image's entries begin [N + 1].
         index: Cell of each entry.
         light: Brightness of each entry.
     """
@@ -314,7 +314,7 @@ class WallData:
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     def image(self, values: Array, fill: float) -> Array:
-        """Return values of the pixels [P] as a working picture [h, w], `fill` where a pixel takes no part."""
+        """Return values of the pixels [P] as a working image [h, w], `fill` where a pixel takes no part."""
         out = np.full(self.grid[0] * self.grid[1], fill)
         out[self.pixel] = values
         return out.reshape(self.grid)
@@ -335,11 +335,11 @@ def wall_data(
     first: int | None = None,
     checkered: bool = False,
 ) -> WallData:
-    """Return the frames of captures at a working size, and their targets as pictures on a plane's cells.
+    """Return the frames of captures at a working size, and their targets as images on a plane's cells.
 
     Args:
         capture_set: The captures.
-        columns: Columns of the working pictures, at most the sensor's.
+        columns: Columns of the working images, at most the sensor's.
         plane: Cells, over the whole travel.
         every: Only every n-th frame of a capture takes part.
         first: The first of them; None is the middle of the first n.

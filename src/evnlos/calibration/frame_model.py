@@ -104,7 +104,7 @@ class FrameModel:
         """Return gain and ambient light that fit best, and the residual frame - model, float32 [N, h, w]."""
         ramp = self._ramp.double()
         lit = light * self.weight
-        # Normal equations: the ambient light is the same three pictures in every frame.
+        # Normal equations: the ambient light is the same three images in every frame.
         columns = torch.zeros(4, 4, dtype=torch.float64)
         columns[0, 0] = _inner(lit, light)
         columns[0, 1:] = columns[1:, 0] = (ramp * lit.sum(0)).sum((1, 2))

@@ -55,7 +55,7 @@ class KnownLight:
         speed_px_s: Speed of the edge, pixels per second.
         direction_deg: Where the edge moves: 0 = to the right, 90 = down.
         blur_px: Distance over which the edge passes, pixels.
-        frames: Video, folder of pictures or array with frames on the events' pixels and clock.
+        frames: Video, folder of images or array with frames on the events' pixels and clock.
         first_frame_s: Time of the first frame, seconds after the first event.
         fps: Frames per second, where the frames carry no times.
 
@@ -84,7 +84,7 @@ class KnownLight:
     blur_px: float = 1.0
     """Distance over which the edge passes, pixels."""
     frames: str = ""
-    """Video, folder of pictures or array with frames on the events' pixels and clock."""
+    """Video, folder of images or array with frames on the events' pixels and clock."""
     first_frame_s: float = 0.0
     """Time of the first frame, seconds after the first event."""
     fps: float | None = None

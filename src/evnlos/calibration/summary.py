@@ -27,7 +27,7 @@ from evnlos.setups import CALIBRATED_FILE, FittedSetup
 
 TRAINING_FILE, CALIBRATION_VALUES_FILE = "training.yaml", "calibration.json"
 TARGETS = "targets"
-"""Folder, beside the setup's file, of the known targets' pictures."""
+"""Folder, beside the setup's file, of the known targets' images."""
 
 _SOME_OF_COUNTS = 1.1  # times what noise leaves of counts held out: from there on less comes of events
 _MOST_OF_COUNTS, _LEAST_OF_COUNTS = 1.25, 0.25

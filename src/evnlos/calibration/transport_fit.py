@@ -245,13 +245,13 @@ def fit_transport(
 
     The residual at given parameters is that after the best gain and ambient light (variable projection, Golub
     and Pereyra 1973), so only the optics are searched: first a scan over blur and magnification, then
-    Levenberg-Marquardt on small pictures and coarse cells, then on larger ones.
+    Levenberg-Marquardt on small images and coarse cells, then on larger ones.
 
     Args:
         capture_set: The captures to fit.
         start: Where the search starts; its kind is the kind that is fitted.
         fixed: Names of settings that keep their values.
-        columns: Columns of the working pictures, pixels; half as many in the coarse stage.
+        columns: Columns of the working images, pixels; half as many in the coarse stage.
         iterations: Most steps per stage.
 
     Raises:

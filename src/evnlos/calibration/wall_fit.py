@@ -1,7 +1,7 @@
 """Fitting a wall of any kind: the facets' slopes, the camera's place and the wall's bend from known targets.
 
 The frames are y(p, n) = shared(p, place of n) + g(p) sum_q A(p, q; pose, slopes) x(q, n), with x the known
-pictures. What all captures share at a place is taken off both sides: ambient light, and anything else that
+images. What all captures share at a place is taken off both sides: ambient light, and anything else that
 moves along. The rest is least squares in the numbers of the pose, the logarithm of the slopes' density, a
 polynomial for the sensitivity g and a matte part, all at once (Gauss-Newton with damping; Marquardt 1963), with
 priors.
@@ -57,7 +57,7 @@ class Freedom:
         spread: Standard deviation of what is known before, in the unit, or relative where `log`.
         step: Step of the finite difference, likewise.
         log: Whether the search runs over its logarithm.
-        fine: Whether only the last stage of the search moves it; the small pictures hardly tell it.
+        fine: Whether only the last stage of the search moves it; the small images hardly tell it.
     """
 
     name: str

@@ -21,7 +21,7 @@ from evnlos.types import Plane
 
 Array = NDArray[np.float64]
 
-_COLUMNS = 160  # of the working pictures: finer texture is the fixed pattern's
+_COLUMNS = 160  # of the working images: finer texture is the fixed pattern's
 _COARSE = 64  # of those that the correction of the operator is estimated on
 _TEXTURE = 0.05  # standard deviation of a pixel's sensitivity about the smooth model
 _SMOOTH_PX = (2.0, 5.0)  # of the map of sensitivities, working pixels
@@ -58,7 +58,7 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
         fit: Captures to fit.
         held: Captures to judge on.
         state: Pose and slopes.
-        plane: Cells of the targets' pictures, over the whole travel.
+        plane: Cells of the targets' images, over the whole travel.
     """
     from scipy.ndimage import gaussian_filter  # scipy loads slowly
 
@@ -141,7 +141,7 @@ def _both(
 
 
 def _resized(pictures: Array, grid: tuple[int, int]) -> Array:
-    """Return pictures [..., h, w] at another size."""
+    """Return images [..., h, w] at another size."""
     before = pictures.shape[:-2]
     if pictures.shape[-2:] == grid or not pictures.size:
         return pictures.reshape(*before, *grid)
@@ -232,9 +232,9 @@ def _smoothed(data: WallData, ratio: Array, precision: Array, smooth: float) -> 
 def correction_of(data: WallData, light: Array, other: WallData, away: Array) -> tuple[Array, Array, Array]:
     """Return the correction of the operator that predicts held-out captures best; the squares it leaves [C].
 
-    The correction is pictures of the camera image [P, R] times weights over target cells [R, Q].
+    The correction is images of the camera image [P, R] times weights over target cells [R, Q].
 
-    A residual pixel is a linear function of the target's picture, with a Gaussian prior of smooth weights over
+    A residual pixel is a linear function of the target's image, with a Gaussian prior of smooth weights over
     the plane (Gaussian process regression); strength and smoothness are chosen on the captures held out,
     and the result is cut to its strongest singular vectors.
 
@@ -273,9 +273,9 @@ def correction_of(data: WallData, light: Array, other: WallData, away: Array) ->
 def companion_of(
     data: WallData, state: WallState, shared: Array, places: Array, plane: Plane, sensitivity: Array
 ) -> tuple[Array, Array]:
-    """Return the picture of what shines beside the target and moves along [h, w], and its light [P, S].
+    """Return the image of what shines beside the target and moves along [h, w], and its light [P, S].
 
-    The light that all captures share at each place is ambient light, the same everywhere, and what a picture
+    The light that all captures share at each place is ambient light, the same everywhere, and what an image
     without negative values makes, drawn to be dark and smooth (non-negative least squares).
 
     Args:
@@ -283,7 +283,7 @@ def companion_of(
         state: The wall.
         shared: Light that all captures share at each place [P, S].
         places: These places (x, y) [S, 2], metres.
-        plane: Cells of the picture, about the target's middle.
+        plane: Cells of the image, about the target's middle.
         sensitivity: Of each pixel [P].
     """
     from scipy.optimize import nnls  # scipy loads slowly
@@ -302,7 +302,7 @@ def companion_of(
 
 
 def _moving_matrix(data: WallData, state: WallState, places: Array, plane: Plane, sensitivity: Array) -> Array:
-    """Return what the pixels see of each cell of a picture at each place, [P, S, h w]."""
+    """Return what the pixels see of each cell of an image at each place, [P, S, h w]."""
     seen = seen_points(state.pose, data.shape, data.columns, data.rows)
     table, here = state.table, target_cells(state.pose, plane)
     out = np.empty((len(data.columns), len(places), plane.height * plane.width))
@@ -333,7 +333,7 @@ def _neighbours(plane: Plane) -> Array:
 
 
 def _dense(data: WallData) -> Array:
-    """Return the targets' pictures [Q, N]."""
+    """Return the targets' images [Q, N]."""
     out = np.zeros((data.plane.height * data.plane.width, len(data.starts) - 1))
     frame = np.repeat(np.arange(out.shape[1]), np.diff(data.starts))
     out[data.index, frame] = data.light

@@ -57,7 +57,7 @@ _VIEWS = (1.0, 0.67, 1.5)
 _DISTANCES = (1.0, 0.65, 1.5)
 _ROUGH = {f.name: 0.6 * f.spread for f in FREEDOMS}  # a spread below it is a measurement, and is not scanned
 _TRIED = 3  # of the scan's best are refined
-_COARSE = 25  # columns of the working pictures of the scan
+_COARSE = 25  # columns of the working images of the scan
 _CELLS_DOWN = 11  # of the target in the scan
 _COARSE_FRAMES, _FINE_FRAMES = 90, 160
 _MIRRORED, _LEAST = 0.6, 0.9
@@ -70,15 +70,15 @@ def search_wall(
     """Find the wall and the pose that explain the frames of captures with known targets.
 
     A scan over angles, views and distances with walls of GGX lobes gives the starts; each is refined on small
-    pictures, the best on larger ones. Light that all captures share at a place takes no part: the ambient
+    images, the best on larger ones. Light that all captures share at a place takes no part: the ambient
     light, and whatever else moves along.
 
     Args:
         capture_set: The captures.
         known: What is known of the pose.
         freedoms: The numbers that are searched, with how well they are known.
-        plane: Cells of the targets' pictures, over the whole travel.
-        columns: Columns of the working pictures of the last stage, pixels.
+        plane: Cells of the targets' images, over the whole travel.
+        columns: Columns of the working images of the last stage, pixels.
 
     Raises:
         DataError: No pose explains more than a twentieth of the frames, or mirrored ones are explained better.
@@ -203,7 +203,7 @@ def fit_wall(
         start: What is known of camera and target; its roughness is the start's.
         fit_distance: Whether the distance of target and wall is hardly known; else to 3 %.
         measured: Name of a freedom -> its value and standard deviation, as somebody has measured them.
-        columns: Columns of the working pictures of the search, pixels.
+        columns: Columns of the working images of the search, pixels.
     """
     known = Pose(
         camera_distance_m=start.camera_distance_m,

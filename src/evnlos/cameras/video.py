@@ -1,6 +1,6 @@
 """A video as light, frame by frame, from files, animations, folders and arrays; its events; its making.
 
-- A video on disk as light, frame by frame; a part of its pictures where only that is looked at.
+- A video on disk as light, frame by frame; a part of its images where only that is looked at.
 - The events that an event camera would send of it, in memory that does not grow with its length.
 - The video that a frame camera would make of light that is simulated.
 """
@@ -122,9 +122,9 @@ def open_video(
     """Return a video that is read frame by frame, as light with the instants of its frames.
 
     Args:
-        path: Video file (needs the extra `video`), animated GIF, PNG or WebP, folder, list or glob of pictures,
-            NumPy file [T, H, W] or [T, H, W, 3]. Pictures are ordered by the numbers in their names.
-        fps: Frames per second, 0.001 to 1e9; needed for pictures and arrays, else in place of the file's times.
+        path: Video file (needs the extra `video`), animated GIF, PNG or WebP, folder, list or glob of images,
+            NumPy file [T, H, W] or [T, H, W, 3]. Images are ordered by the numbers in their names.
+        fps: Frames per second, 0.001 to 1e9; needed for images and arrays, else in place of the file's times.
         slow_motion: How many times slower than life the video plays, 0.001 to 1e9; 8 for 240 Hz shown at 30 Hz.
         tone: "as-is" takes the numbers as light, as v2e does (luma of Rec. 601 for colour); "srgb" and "rec709"
             undo that curve first (luminance of Rec. 709); white stays white.
@@ -264,13 +264,13 @@ def _find(path: str | PathLike[str] | Sequence[str | PathLike[str]]) -> tuple[Pa
         if len(paths) == 1:
             return _find(paths[0])
         if not paths:
-            raise DataError("no video; give a file, a folder or pictures")
+            raise DataError("no video; give a file, a folder or images")
         return _named(paths)
     path = Path(path)
     if path.is_dir():
         inside = [one for one in path.iterdir() if one.suffix.lower() in _PICTURES]
         if not inside:
-            raise DataError(f"{path}: a folder without pictures; {', '.join(_PICTURES)} are read")
+            raise DataError(f"{path}: a folder without images; {', '.join(_PICTURES)} are read")
         return path, _named(inside)[1]
     if not path.exists() and glob.has_magic(str(path)):
         found = [Path(one) for one in glob.glob(str(path))]  # noqa: PTH207 - the pattern may be absolute
@@ -297,7 +297,7 @@ def _named(paths: list[Path]) -> tuple[Path, PictureSource]:
 
 
 def _white_of_floats(path: Path, source: PictureSource) -> float:
-    """Return 255 for floating-point pictures, unless the first looks as if 1 were white."""
+    """Return 255 for floating-point images, unless the first looks as if 1 were white."""
     _, picture = next(source.pictures())
     if 0 < float(np.max(picture)) <= 1.0:
         cure = "give white=1 (--white 1) if 1 is white, 255 if not"

@@ -1,8 +1,8 @@
-"""Files of moving pictures, frame by frame as light.
+"""Files of moving images, frame by frame as light.
 
-- Numbers of a picture as light: the tone curve undone, colours weighed.
-- The four kinds of moving pictures that are read: containers, animations, single pictures, arrays.
-- Light as numbers of a picture, and frames as a video file.
+- Numbers of an image as light: the tone curve undone, colours weighed.
+- The four kinds of moving images that are read: containers, animations, single images, arrays.
+- Light as numbers of an image, and frames as a video file.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from evnlos.untrusted import MOST_IMAGE_PIXELS, NUMPY_ERRORS, open_container, op
 Picture = NDArray
 """Grey [H, W] or colour [H, W, 3]: uint8, uint16 or floating point."""
 Tone = Literal["as-is", "srgb", "rec709"]
-"""What the numbers of a picture mean: light as they are, or codes of a tone curve to undo."""
+"""What the numbers of an image mean: light as they are, or codes of a tone curve to undo."""
 
 _LUMA_601 = 299, 587, 114  # thousandths: of a grey pixel the sum is exactly its value
 _LUMINANCE_709 = 0.2126, 0.7152, 0.0722
 
 
 def to_light(picture: Picture, tone: Tone = "as-is", white: float = 255.0) -> NDArray[np.float32]:
-    """Return a picture as light in DN: 255 = white.
+    """Return an image as light in DN: 255 = white.
 
-    With the value v = picture / white, "as-is" gives 255 v; "srgb" gives 255 times v / 12.92 up to 0.04045 and
+    With the value v = image / white, "as-is" gives 255 v; "srgb" gives 255 times v / 12.92 up to 0.04045 and
     ((v + 0.055) / 1.055)^2.4 above (IEC 61966-2-1); "rec709" v / 4.5 up to 0.081 and
     ((v + 0.099) / 1.099)^(1 / 0.45) above (ITU-R BT.709).
 
@@ -168,7 +168,7 @@ def write_video(
 
 
 class PictureSource(Protocol):
-    """Moving pictures on disk."""
+    """Moving images on disk."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -177,26 +177,26 @@ class PictureSource(Protocol):
 
     @property
     def frames(self) -> int | None:
-        """Number of pictures, None where the file does not say."""
+        """Number of images, None where the file does not say."""
         ...
 
     @property
     def white(self) -> float | None:
-        """Value of white where the type of the pictures says it; None for floating point."""
+        """Value of white where the type of the images says it; None for floating point."""
         ...
 
     @property
     def timed(self) -> bool:
-        """Whether the file states the times of its pictures."""
+        """Whether the file states the times of its images."""
         ...
 
     def pictures(self) -> Iterator[tuple[float | None, Picture]]:
-        """Yield the time in seconds, None where it is not stated, and the picture."""
+        """Yield the time in seconds, None where it is not stated, and the image."""
         ...
 
 
 class ContainerSource:
-    """A video file, through PyAV (FFmpeg); pictures are turned as the file's rotation says."""
+    """A video file, through PyAV (FFmpeg); images are turned as the file's rotation says."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.timed = path, True
@@ -226,14 +226,14 @@ class ContainerSource:
             except (av.error.FFmpegError, OSError, ValueError) as error:
                 raise DataError(
                     f"{self.path}: not a video that FFmpeg reads ({_reason(error)}); give MP4, MKV, AVI or "
-                    "another container that holds its pictures itself"
+                    "another container that holds its images itself"
                 ) from None
             if not container.streams.video:
                 raise DataError(f"{self.path}: a media file without a video stream; give another file")
             yield container
 
     def pictures(self) -> Generator[tuple[float | None, Picture], None, None]:
-        """Yield the presentation time and the picture, 16 bits deep where the video has more than 8."""
+        """Yield the presentation time and the image, 16 bits deep where the video has more than 8."""
         av = _pyav()
         count = 0
         with self._opened() as container:
@@ -257,7 +257,7 @@ def _pyav() -> Any:
         import av
     except ImportError:
         raise MissingDependencyError(
-            'reading video files needs PyAV: pip install "evnlos[video]" (GIF, pictures and .npy go without)'
+            'reading video files needs PyAV: pip install "evnlos[video]" (GIF, images and .npy go without)'
         ) from None
     av.logging.set_level(None)  # pyright: ignore[reportPrivateImportUsage]  # FFmpeg's own remarks are no use to a reader of one line
     return av
@@ -279,7 +279,7 @@ class AnimationSource:
             self.size = image.size
 
     def pictures(self) -> Iterator[tuple[float | None, Picture]]:
-        """Yield the sum of the durations before a picture, and the picture."""
+        """Yield the sum of the durations before an image, and the image."""
         shown_ms = 0.0
         with _image(self.path) as image:
             for number in range(self.frames):
@@ -289,7 +289,7 @@ class AnimationSource:
 
 
 class PicturesSource:
-    """Single pictures in the order of their names; they carry no times."""
+    """Single images in the order of their names; they carry no times."""
 
     timed = False
 
@@ -302,16 +302,16 @@ class PicturesSource:
         self._dtype, self.white = first.dtype, _white(first)
 
     def pictures(self) -> Iterator[tuple[float | None, Picture]]:
-        """Yield the pictures without times."""
+        """Yield the images without times."""
         for path in self.paths:
             with _image(path) as image:
                 if image.size != self.size:
                     found, first = "{} x {}".format(*image.size), "{} x {}".format(*self.size)
-                    raise DataError(f"{path} is {found}, {self.paths[0]} is {first}; give pictures of one size")
+                    raise DataError(f"{path} is {found}, {self.paths[0]} is {first}; give images of one size")
                 picture = _array(image, path)
             if picture.dtype != self._dtype:
                 kinds = f"{path} holds {picture.dtype}, {self.paths[0]} {self._dtype}"
-                raise DataError(f"{kinds}; give pictures of one depth")
+                raise DataError(f"{kinds}; give images of one depth")
             yield None, picture
 
 
@@ -340,7 +340,7 @@ class ArraySource:
         self.white = _white(self._array)
 
     def pictures(self) -> Iterator[tuple[float | None, Picture]]:
-        """Yield the pictures without times."""
+        """Yield the images without times."""
         for picture in self._array:
             yield None, np.asarray(picture)
 
@@ -355,7 +355,7 @@ def _image(path: Path) -> Iterator[Image.Image]:
         with open_image(path) as image:
             yield image
     except UnidentifiedImageError:
-        raise DataError(f"{path}: not a picture that is read; give PNG, TIFF, JPEG, GIF or WebP") from None
+        raise DataError(f"{path}: not an image that is read; give PNG, TIFF, JPEG, GIF or WebP") from None
     except (OSError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: cannot be read ({error})") from None
 
@@ -364,20 +364,20 @@ def _seek(image: Image.Image, number: int, path: Path) -> Picture:
     try:
         image.seek(number)
     except (OSError, EOFError, SyntaxError) as error:
-        raise DataError(f"{path}: picture {number} cannot be read ({error}); copy the file again") from None
+        raise DataError(f"{path}: image {number} cannot be read ({error}); copy the file again") from None
     return _array(image, path)
 
 
 def _array(image: Image.Image, path: Path) -> Picture:
-    """Return the current picture: uint8, uint16 for 16-bit files, float32 for floating-point files."""
+    """Return the current image: uint8, uint16 for 16-bit files, float32 for floating-point files."""
     try:
         if image.mode.startswith("I"):
             numbers = np.asarray(image)
             if numbers.min() < 0 or numbers.max() > 65_535:
-                raise DataError(f"{path}: a picture of more than 16 bits; save it as 16 bits or floating point")
+                raise DataError(f"{path}: an image of more than 16 bits; save it as 16 bits or floating point")
             return numbers.astype(np.uint16)
         if image.mode in ("L", "RGB"):
             return np.asarray(image)
         return np.asarray(image if image.mode == "F" else image.convert("RGB"))
     except (OSError, SyntaxError, ValueError) as error:
-        raise DataError(f"{path}: the picture cannot be decoded ({error}); copy the file again") from None
+        raise DataError(f"{path}: the image cannot be decoded ({error}); copy the file again") from None

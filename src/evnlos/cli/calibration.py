@@ -119,13 +119,13 @@ class ScanCommand:
     """Measure a setup's own light transport with a display or an LED: plan a scan, import what was seen."""
 
     action: Annotated[Literal["plan", "import", "rehearse"], tyro.conf.Positional]
-    """plan writes scan.yaml, the table of pictures and what to show; import makes a transport of them, or of a
+    """plan writes scan.yaml, the table of images and what to show; import makes a transport of them, or of a
     film; rehearse films a planned show with a pretended phone: FOLDER/film.mp4."""
     folder: Annotated[Path, tyro.conf.Positional]
     """The folder of the scan."""
     out: Path | None = None
     """import: the transport, a .safetensors file; by default transport.safetensors in the folder. A check
-    picture goes to the same name with .png."""
+    image goes to the same name with .png."""
     film: Path | None = None
     """import: a video of the wall while the show of `plan --show page` or `video` ran; characters that it moved
     become captures, FOLDER/captures/*, with simulated events beside the filmed frames."""
@@ -136,9 +136,9 @@ class ScanCommand:
     plan: Flat[ScanPlan] = field(default_factory=ScanPlan)
     """plan: what to scan, and with what."""
     settings: Flat[ScanImport] = field(default_factory=ScanImport)
-    """import: how the pictures become a matrix."""
+    """import: how the images become a matrix."""
     reading: Flat[FilmReading] = field(default_factory=FilmReading)
-    """import --film: how the video becomes pictures."""
+    """import --film: how the video becomes images."""
     phone: Phone = field(default_factory=Phone)
     """rehearse: the phone, with a phone's faults."""
 
@@ -160,7 +160,7 @@ class ScanCommand:
             f"{self.folder}: {info.pattern}, {plane.height} x {plane.width} cells of {1e3 * plane.pitch_m:g} mm"
         )
         print(
-            f"{found.scan_frames} pictures in frames.csv, about {minutes:.1f} min at this exposure and overhead"
+            f"{found.scan_frames} images in frames.csv, about {minutes:.1f} min at this exposure and overhead"
         )
         print(
             f"expected noise of an entry, brightest pixel: {100 * found.noise:.2g} % of the brightest one "
@@ -169,7 +169,7 @@ class ScanCommand:
         for note in found.notes:
             say(f"note: {note}")
         if self.plan.show == "pictures":
-            print(f"record the pictures as frames.csv names them, then: evnlos scan import {self.folder}")
+            print(f"record the images as frames.csv names them, then: evnlos scan import {self.folder}")
             return
         length, name = self.plan.as_show().duration_s, "html" if self.plan.show == "page" else "mp4"
         print(f"show {self.folder / 'show'}.{name} on the whole display and film the wall: {length:.0f} s")
@@ -186,7 +186,7 @@ class ScanCommand:
             print(f"then: evnlos scan import {self.folder} --film {path}")
 
     def _filmed(self) -> FilmResult | None:
-        """Make the scan's pictures of the film, and return what was found in it."""
+        """Make the scan's images of the film, and return what was found in it."""
         from evnlos.calibration.scan import import_film
 
         if self.film is None:

@@ -18,7 +18,7 @@ from evnlos.cli.parsing import check_files, drawn, say
 from evnlos.cli.recordings import Flat, refuse_existing, result
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
-from evnlos.inverse import CornerPicture, FloorSector, Penumbra
+from evnlos.inverse import CornerImage, FloorSector, Penumbra
 from evnlos.machine import ProgressBars, counted
 from evnlos.tracking import UNSURE_NOISE, BearingTracking, BearingTracks
 from evnlos.untrusted import open_regular
@@ -86,7 +86,7 @@ class CornerCommand:
     """
 
     video: Annotated[Path, tyro.conf.Positional]
-    """Video file, GIF, folder of pictures or .npy; with --simulate the file to write (.mp4, .mkv, .gif or a
+    """Video file, GIF, folder of images or .npy; with --simulate the file to write (.mp4, .mkv, .gif or a
     folder)."""
     edge: tuple[float, float] | None = None
     """Foot of the wall's edge: column and row, pixels."""
@@ -98,7 +98,7 @@ class CornerCommand:
     end says how far from the edge the floor is used."""
     floor: tuple[float, float, float, float, float, float, float, float] | None = None
     """Corners of a rectangle that lies on the floor (a tile), one after the other: column and row of each,
-    pixels. Without it bearings are those of the picture, right at the wall's line and off elsewhere."""
+    pixels. Without it bearings are those of the image, right at the wall's line and off elsewhere."""
     floor_size: tuple[float, float] = (1.0, 1.0)
     """Sides of that rectangle, first to second corner and second to third, any unit: their ratio counts."""
     out: Path = Path("corner")
@@ -108,7 +108,7 @@ class CornerCommand:
     stop: float | None = None
     """End, seconds; by default the video's."""
     fps: float | None = None
-    """Frames per second; needed for pictures and arrays, otherwise in place of the times in the file."""
+    """Frames per second; needed for images and arrays, otherwise in place of the times in the file."""
     tone: Tone = "srgb"
     """Curve of the video's numbers that is undone: srgb, rec709, or as-is where they are light already."""
     step: float = 0.1
@@ -221,7 +221,7 @@ class CornerCommand:
             )
             raise ConfigError(
                 f"no {lacks}; give the pixels of the foot of the edge, of another point of the wall's foot, "
-                "and of the floor's far side, as a viewer of pictures shows them"
+                "and of the floor's far side, as a viewer of images shows them"
             )
         ground = None
         if self.floor is not None:
@@ -236,9 +236,7 @@ class CornerCommand:
         return FloorSector(self.edge, self.wall, self.end, ground)
 
 
-def in_words(
-    tracks: BearingTracks, picture: CornerPicture, penumbra: Penumbra, sector: FloorSector
-) -> list[str]:
+def in_words(tracks: BearingTracks, picture: CornerImage, penumbra: Penumbra, sector: FloorSector) -> list[str]:
     """Return what is seen, first in one sentence, then what it rests on."""
     rate = f"{100 * tracks.false_alarms:g} %"
     if tracks.tracks:
@@ -272,7 +270,7 @@ def in_words(
     if tracks.noise_factor > UNSURE_NOISE:
         first = f"Doubtful, as the video's noise is that of compression or unsteady light: {first}"
     if sector.to_ground is None:
-        rest.append("Bearings are those of the picture, not of the floor: --floor makes them true.")
+        rest.append("Bearings are those of the image, not of the floor: --floor makes them true.")
     return [first, *rest]
 
 
@@ -287,7 +285,7 @@ def warnings_of(penumbra: Penumbra, tracks: BearingTracks) -> list[str]:
     shake = np.sqrt(np.nanmean(np.nanvar(penumbra.shift_px, axis=0))) if penumbra.shift_known else 0.0
     if shake > _SHAKE_PX:
         found.append(
-            f"the picture shakes by {shake:.2f} px rms; it is corrected roughly: put the camera on a tripod"
+            f"the image shakes by {shake:.2f} px rms; it is corrected roughly: put the camera on a tripod"
         )
     if tracks.noise_factor > _NOISE:
         found.append(
@@ -300,7 +298,7 @@ def warnings_of(penumbra: Penumbra, tracks: BearingTracks) -> list[str]:
 
 
 def _values(
-    command: CornerCommand, penumbra: Penumbra, picture: CornerPicture, tracks: BearingTracks
+    command: CornerCommand, penumbra: Penumbra, picture: CornerImage, tracks: BearingTracks
 ) -> dict[str, Any]:
     return {
         "video": str(command.video),
@@ -322,7 +320,7 @@ def _values(
     }
 
 
-def _arrays(penumbra: Penumbra, picture: CornerPicture, tracks: BearingTracks) -> bytes:
+def _arrays(penumbra: Penumbra, picture: CornerImage, tracks: BearingTracks) -> bytes:
     """Return the numbers behind the figure as an NPZ file."""
     buffer = io.BytesIO()
     columns = {"bearing_deg": [], "deviation_deg": [], "presence": [], "brightness": []}
@@ -338,7 +336,7 @@ def _arrays(penumbra: Penumbra, picture: CornerPicture, tracks: BearingTracks) -
         gain=penumbra.gain,
         shift_px=penumbra.shift_px,
         picture=picture.mean,
-        picture_deviation=picture.deviation,
+        image_deviation=picture.deviation,
         resolution_deg=picture.resolution_deg,
         **{f"track_{name}": np.array(rows).reshape(shape) for name, rows in columns.items()},
     )

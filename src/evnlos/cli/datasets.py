@@ -26,7 +26,7 @@ from evnlos.data import (
     Capture,
     Sampling,
     Simulation,
-    check_picture,
+    check_image,
     import_captures,
     load_pattern,
     randomized,
@@ -344,8 +344,8 @@ class ImportCommand:
     """Captures or characters that are held out for validation."""
     pattern: Path | None = None
     """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
-    check_pictures: bool = True
-    """Draw one picture per capture (frame, events, both, curves over time) into the folder checks of the
+    check_images: bool = True
+    """Draw one image per capture (frame, events, both, curves over time) into the folder checks of the
     dataset."""
     json: bool = False
     """Print one JSON object."""
@@ -374,15 +374,15 @@ class ImportCommand:
         counts = ", ".join(f"{len(names)} {split}" for split, names in dataset.split.items())
         text = f"{self.out}: {len(dataset.objects())} captures ({counts})"
         result(self.json, {"out": str(self.out), "split": dataset.split}, text)
-        if self.check_pictures and not self.json:
-            print(f"check pictures: {self.out / 'checks'}")
+        if self.check_images and not self.json:
+            print(f"check images: {self.out / 'checks'}")
 
     def _look(self, capture: Capture) -> None:
         """Tell what was done to a capture, and draw it."""
         tqdm.write(f"{capture.name}: {'; '.join(capture.notes)}", file=sys.stderr)  # above the bar
-        if self.check_pictures:
+        if self.check_images:
             folder = self.out / "checks"
             folder.mkdir(exist_ok=True)
             drawn = io.BytesIO()
-            check_picture(capture).save(drawn, "PNG")
+            check_image(capture).save(drawn, "PNG")
             write_atomically(folder / f"{capture.name}.png", drawn.getvalue())

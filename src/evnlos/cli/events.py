@@ -104,10 +104,10 @@ _VIDEO_ENDINGS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".gif
 
 @dataclass(frozen=True)
 class EventsCommand:
-    """Turn any video into the events that an event camera would send: files, animations, pictures, arrays."""
+    """Turn any video into the events that an event camera would send: files, animations, images, arrays."""
 
     video: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
-    """Video file (mp4, avi, mkv, ...), GIF, APNG, WebP, pictures or a folder of them, .npy [T, H, W(, 3)]; or a
+    """Video file (mp4, avi, mkv, ...), GIF, APNG, WebP, images or a folder of them, .npy [T, H, W(, 3)]; or a
     folder of videos."""
     out: Path
     """The event file; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv. Of a folder of
@@ -122,7 +122,7 @@ class EventsCommand:
     seed: int = 0
     """Seed of mismatch and noise: same seed, same bytes."""
     fps: float | None = None
-    """Frames per second; needed for pictures and arrays, otherwise in place of the times in the file."""
+    """Frames per second; needed for images and arrays, otherwise in place of the times in the file."""
     start: float = 0.0
     """First frame to take, seconds in the video; the events keep the video's times."""
     stop: float | None = None
@@ -138,7 +138,7 @@ class EventsCommand:
     format: str | None = None
     """Format to write where the ending does not say, e.g. EVT2 for .raw."""
     preview: Path | None = None
-    """Also show the events: an animation (.gif) or a sheet of pictures (.png)."""
+    """Also show the events: an animation (.gif) or a sheet of images (.png)."""
     force: bool = False
     """Replace the file where it exists, and begin although the machine's memory will hardly do."""
     json: bool = False

@@ -3,7 +3,7 @@
 - `evnlos demo`: the main job, small.
 - `evnlos experiment`: a named comparison in, records and tables out.
 - `evnlos app`: a page to play with.
-- `evnlos live`: events as they come in, pictures out.
+- `evnlos live`: events as they come in, images out.
 """
 
 from __future__ import annotations
@@ -287,7 +287,7 @@ class AppCommand:
         """Run the page until it is interrupted."""
         say("starting: the first images are computed before the page opens, about 20 s")
         serve(self.server, self.weights, lambda address: print(f"{address}  (Ctrl+C stops it)", flush=True))
-        # A visitor's picture may be in the making still, in compiled code on a thread of its own, which the
+        # A visitor's image may be in the making still, in compiled code on a thread of its own, which the
         # interpreter would tear apart at its end; nothing of it is wanted any more.
         say("stopped")
         sys.stdout.flush()
@@ -331,7 +331,7 @@ class LiveCommand:
         check_source(self.source, self.listening.follow)
 
     def run(self) -> None:
-        """Show or record pictures until the source ends, and print how quick they were."""
+        """Show or record images until the source ends, and print how quick they were."""
         import torch
 
         from evnlos.analysis.identify import verdict_on
@@ -359,7 +359,7 @@ class LiveCommand:
                     modality = "frame" if source.has_frames else "event"
                     name = published_for(None, modality, is_motion_known=False)
                     model = load_model(name)
-                    say(f"{name} makes the pictures: weights of the package, for its own setup; see --weights")
+                    say(f"{name} makes the images: weights of the package, for its own setup; see --weights")
                 engine = Engine(model.weights)
                 verdict = verdict_on(model.known_setup(), None, _LIVE_CONFIDENCE)
                 run = Run(source, engine, self.pace)
@@ -371,7 +371,7 @@ class LiveCommand:
                     )
                     stack.enter_context(page)
                     sinks.append(page)
-                    say(f"{page.url} shows the pictures; Ctrl-C ends")
+                    say(f"{page.url} shows the images; Ctrl-C ends")
                     if source.waits:
                         page.wait_for_viewer(lambda: False)
                 if out is not None:
@@ -394,5 +394,5 @@ class LiveCommand:
             return
         print("\n".join([*verdict.lines, latency_table(summary)]))
         if recorder is not None:
-            video = f"{recorder.path.name} ({recorder.recorded} pictures) and " if recorder.recorded else ""
+            video = f"{recorder.path.name} ({recorder.recorded} images) and " if recorder.recorded else ""
             print(f"{out}: {video}latency.json")

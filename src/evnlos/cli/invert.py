@@ -1,4 +1,4 @@
-"""`evnlos invert`: a photograph, captures or pictures of a known setup in; what is hidden out."""
+"""`evnlos invert`: a photograph, captures or images of a known setup in; what is hidden out."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class InvertCommand:
     """Invert a photograph of a matte wall, or whole sequences of captures, by the operator alone."""
 
     files: Folders
-    """One NPZ file with a wall's picture and geometry (docs/inversion.md), or capture folders with --setup, or
-    pictures of the wall with a measured --setup."""
+    """One NPZ file with a wall's image and geometry (docs/inversion.md), or capture folders with --setup, or
+    images of the wall with a measured --setup."""
     setup: Path | None = None
     """The setup of the captures: a name, a settings file, the folder that `evnlos calibrate` wrote, or the file
     of `evnlos scan import`."""
     dark: Path | None = None
-    """Pictures: one taken without the hidden object; by default the scan's own dark frames."""
+    """Images: one taken without the hidden object; by default the scan's own dark frames."""
     positions: tuple[int, ...] = ()
     """Captures: how many of the frames 1, 2, ... to use, equally spaced; none = all, several = a curve."""
     pattern: Path | None = None
@@ -74,16 +74,16 @@ class InvertCommand:
     emission_exponent: tuple[float, float] | None = None
     """Exponents of the screen's falloff, horizontal and vertical; by default the file's."""
     out: Path = Path("inversion.png")
-    """The picture; the numbers go to the same name with .npz."""
+    """The image; the numbers go to the same name with .npz."""
     json: bool = False
     """Print one JSON object."""
 
     def check_names(self) -> None:
-        """Refuse captures and pictures that are not there."""
+        """Refuse captures and images that are not there."""
         check_files(*self.files)
 
     def run(self) -> None:
-        """Invert, print the figures, write the picture."""
+        """Invert, print the figures, write the image."""
         if self.setup is not None:
             still = all(path.is_file() for path in self.files)
             (self._invert_stills if still else self._invert_captures)(self.setup)
@@ -162,7 +162,7 @@ class InvertCommand:
         options = StillOptions(
             self.dark, solvers, regularization, rule, self.noise_sigma, self.background_degree, self.bin
         )
-        with ProgressBars() as progress, progress.stage("invert", f"{len(self.files)} pictures"):
+        with ProgressBars() as progress, progress.stage("invert", f"{len(self.files)} images"):
             found, pictures = invert_stills(self.files, setup, options)
         panels = [
             (f"{file.stem}, {name}", image[None])
@@ -291,7 +291,7 @@ class InvertCommand:
 
 
 def _save_arrays(picture: Path, arrays: dict[str, Any]) -> None:
-    """Write arrays as NPZ beside the picture that shows them."""
+    """Write arrays as NPZ beside the image that shows them."""
     content = io.BytesIO()
     np.savez(content, **arrays)
     write_atomically(picture.with_suffix(".npz"), content.getvalue())

@@ -1,7 +1,7 @@
-"""What `evnlos invert` does with captures and with still pictures.
+"""What `evnlos invert` does with captures and with still images.
 
-- `evnlos invert CAPTURE... --setup SETUP`: one picture of each object from its whole sequence.
-- `evnlos invert PICTURE... --setup transport.safetensors`: still pictures of the wall, a measured setup.
+- `evnlos invert CAPTURE... --setup SETUP`: one image of each object from its whole sequence.
+- `evnlos invert PICTURE... --setup transport.safetensors`: still images of the wall, a measured setup.
 - `evnlos invert CAPTURE... --setup SETUP --from events|frames|both`: one likelihood of a whole sequence.
 """
 
@@ -172,7 +172,7 @@ def _target_size_m(capture: Capture, tracked: bool) -> float:
 
 
 def score(capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]) -> float | None:
-    """Return the PSNR of a picture [cells, cells] on the standard sample, dB; None where the truth is unknown.
+    """Return the PSNR of an image [cells, cells] on the standard sample, dB; None where the truth is unknown.
 
     Args:
         capture: The capture.
@@ -196,7 +196,7 @@ _FINEST = 48  # pixels a side that a rough wall's light needs
 
 @dataclass(frozen=True)
 class StillOptions:
-    """What `evnlos invert` was told about still pictures."""
+    """What `evnlos invert` was told about still images."""
 
     dark: Path | None
     solvers: tuple[Literal["tikhonov", "tv"], ...]
@@ -210,24 +210,24 @@ class StillOptions:
 def invert_stills(
     files: Sequence[Path], setup: Setup, options: StillOptions
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Return the figures, and the pictures [files, h, w] on the scanned cells by solver.
+    """Return the figures, and the images [files, h, w] on the scanned cells by solver.
 
     The dark frame (the scan's own where none is given) is taken off, unusable pixels are filled in alike in
-    the pictures and in the matrix, both are reduced, and the operator is brought to norm 1.
+    the images and in the matrix, both are reduced, and the operator is brought to norm 1.
 
     Raises:
-        ConfigError: A picture does not have the scan's size or is one that the scan was not.
-        DataError: A picture can't be read.
+        ConfigError: An image does not have the scan's size or is one that the scan was not.
+        DataError: An image can't be read.
     """
     clock = time.perf_counter()
     measured = setup.measurement()
     pictures = [read_image(path, measured.shape) for path in files]
     peaks = {float(np.iinfo(picture.dtype).max) for picture in pictures}
     if len(peaks) > 1:
-        raise ConfigError("the pictures have 8 and 16 bits; give pictures of one camera")
+        raise ConfigError("the images have 8 and 16 bits; give images of one camera")
     white = float(measured.about.white_dn or peaks.pop())
     if (brightest := max(int(picture.max()) for picture in pictures)) > white:
-        raise ConfigError(f"a picture reaches {brightest} DN, the scan's white is {white:g}; save both alike")
+        raise ConfigError(f"an image reaches {brightest} DN, the scan's white is {white:g}; save both alike")
     light = torch.from_numpy(np.stack(pictures).astype(np.float32)) / white
     if options.dark is None:
         light = light - setup.ambient_light(measured.shape)
@@ -271,7 +271,7 @@ def figures_of(name: str, solution: Solution) -> dict[str, Any]:
 
 
 def reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:
-    """Return the size (h, w) that pictures are reduced to: pixels binned, by default at most 48 a side."""
+    """Return the size (h, w) that images are reduced to: pixels binned, by default at most 48 a side."""
     most = max(shape)
     factor = most / min(most, _FINEST) if bin is None else bin
     if not 1 <= factor <= min(shape):

@@ -177,7 +177,7 @@ class EvaluateCommand:
     """The linear heads vgg.pth of LPIPS v0.1; by default those of an installed `lpips`."""
     setup: Path | None = None
     """The calibrated setup (the folder that `calibrate` wrote): the confidence then asks how much of the frames
-    the pictures explain. Without it weights take the setup that they were trained for, where it is known."""
+    the images explain. Without it weights take the setup that they were trained for, where it is known."""
     positions: tuple[int, ...] = ()
     """Numbers of positions, e.g. 1 2 5 10 20 40: also how the image of a sequence network grows with them."""
     json: bool = False
@@ -222,7 +222,7 @@ class EvaluateCommand:
 def _print_summary(about: dict[str, str], found: dict[str, Any]) -> None:
     print(
         f"{about['weights']} ({about['modality']}) on {about['data']}, split {about['split']}: "
-        f"{found['images']} pictures"
+        f"{found['images']} images"
     )
     names = list(found["overall"])
     rows = [["", *names]]

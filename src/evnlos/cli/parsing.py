@@ -72,7 +72,7 @@ def say(text: str) -> None:
 
 
 def drawn(path: Path, draw: Callable[[], object]) -> str | None:
-    """Draw the picture of a result, and return its path; None and a note where matplotlib is not installed."""
+    """Draw the image of a result, and return its path; None and a note where matplotlib is not installed."""
     try:
         return str(draw() or path)
     except MissingDependencyError as error:

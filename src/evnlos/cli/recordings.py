@@ -4,7 +4,7 @@
 - What the commands on event files share: how a file is read, what is taken of it, numbers in words.
 - `evnlos convert`: an event file in, an event file of another format out.
 - `evnlos info`: what an event file holds, and what is wrong with it.
-- `evnlos preview`: an event file in, an animation or a sheet of pictures out.
+- `evnlos preview`: an event file in, an animation or a sheet of images out.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from evnlos.events import CelexOptions, EventWriter, ReadReport
 from evnlos.events.files.columns import OnError
 from evnlos.events.recording import WINDOW_US, Box, CropOptions, Recording, Summary, summarise
 from evnlos.machine import ProgressBars, Step
-from evnlos.plot.preview import Background, PreviewOptions, Style, preview_pictures
+from evnlos.plot.preview import Background, PreviewOptions, Style, preview_images
 from evnlos.types import Events, matching_paths
 
 T = TypeVar("T")
@@ -249,7 +249,7 @@ def to_text(name: str, found: dict[str, Any]) -> str:
     if found["triggers"]:
         rows.append(("triggers", f"{found['triggers']:,} edges"))
     if found["frames"]:
-        rows.append(("frames", f"{found['frames']:,} pictures"))
+        rows.append(("frames", f"{found['frames']:,} images"))
     if found["skipped"]:
         rows.append(("skipped", f"{found['skipped']:,} events before the first row or time: no fault"))
     rows.append(("memory", f"{amount(found['memory_bytes'], 'B')} as arrays"))
@@ -313,19 +313,19 @@ def _polarity(found: dict[str, Any]) -> str:
     return part if known == 1 else f"{part} of the {100 * known:.1f} % of events whose polarity is known"
 
 
-_RATE_HZ = 12.5  # pictures a second of an animation
+_RATE_HZ = 12.5  # images a second of an animation
 _FRAMES = {".gif": 40, ".png": 8}
 _COLUMNS = 4
 
 
 @dataclass(frozen=True)
 class PreviewCommand:
-    """Show an event file as an animation (.gif) or as a sheet of pictures (.png)."""
+    """Show an event file as an animation (.gif) or as a sheet of images (.png)."""
 
     file: EventFile
     """Event file of any format that is read; it may be larger than memory. Damage is left out."""
     out: Path | None = None
-    """The picture, .gif or .png; by default the file's name with .gif, in the current folder."""
+    """The image, .gif or .png; by default the file's name with .gif, in the current folder."""
     style: Style = "polarity"
     """polarity: the events of each window by sign; surface: each pixel's newest event, fading."""
     frames: int | None = None
@@ -335,17 +335,17 @@ class PreviewCommand:
     background: Background = "dark"
     """dark or light."""
     side: int = 480
-    """About the longest side of a picture, pixels; larger sensors are added up, smaller ones magnified."""
+    """About the longest side of an image, pixels; larger sensors are added up, smaller ones magnified."""
     reading: Flat[ReadOptions] = field(default_factory=ReadOptions)
     taking: Flat[SelectionOptions] = field(default_factory=SelectionOptions)
 
     def run(self) -> None:
-        """Read the file twice, to see how much it holds and to draw it, and write the picture."""
+        """Read the file twice, to see how much it holds and to draw it, and write the image."""
         out = self.out or Path(self.file.name).with_suffix(".gif")
         look = look_of(out, self.style, self.background, self.frames, self.window_ms, self.side)
         recording = self.reading.open(self.file, "salvage")
         size = write_preview(recording, self.taking.cut(), out, look)
-        print(f"{out}: {look.frames} pictures, {amount(size, 'B')}")
+        print(f"{out}: {look.frames} images, {amount(size, 'B')}")
 
 
 def look_of(
@@ -374,7 +374,7 @@ def write_preview(recording: Recording, cut: CropOptions, out: Path, look: Previ
     if not summary.events:
         raise DataError(f"{recording.path}: no events to show; see evnlos info {recording.path}")
     pieces = counted(recording.pieces(cut), out.name, summary.events)
-    pictures = preview_pictures(pieces, summary, look)
+    pictures = preview_images(pieces, summary, look)
     if out.suffix.lower() == ".gif":
         save_animation(out, pictures, _RATE_HZ)
     else:

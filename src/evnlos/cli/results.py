@@ -1,6 +1,6 @@
 """Commands that show results: `reconstruct`, `track`, `identify`, `report`.
 
-- `evnlos reconstruct`: capture and weights in, pictures out.
+- `evnlos reconstruct`: capture and weights in, images out.
 - `evnlos track`: a capture in, the path and the speed of the hidden object out.
 - `evnlos identify`: a setup in, what it can show at all out.
 - `evnlos report`: runs in, one HTML page out.
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReconstructCommand:
-    """Reconstruct all positions of a capture: pictures, a film strip and an animation."""
+    """Reconstruct all positions of a capture: images, a film strip and an animation."""
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder; its target may be unknown."""
@@ -48,12 +48,12 @@ class ReconstructCommand:
     or found (--track).
     """
     out: Path = Path("reconstruction")
-    """Folder for the pictures; new or empty."""
+    """Folder for the images; new or empty."""
     pattern: Path | None = None
     """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
     setup: Path | None = None
     """The calibrated setup: the folder that `calibrate` wrote, or the settings file in it. Its fixed pattern is
-    taken from the frames, the pictures are moved to where its wall agrees with the frames, and it is printed
+    taken from the frames, the images are moved to where its wall agrees with the frames, and it is printed
     how much of the frames they explain. No name such as main-near: that needs the light and the camera of this
     very setup. Without it, the setup that the weights were trained for explains the frames, if known."""
     track: bool = False
@@ -69,7 +69,7 @@ class ReconstructCommand:
         check_there(read_capture, self.capture)
 
     def run(self) -> None:
-        """Reconstruct and print where the pictures are."""
+        """Reconstruct and print where the images are."""
         from evnlos.data import pattern_of
         from evnlos.report import reconstruct_capture
         from evnlos.setups import calibrated_folder, load_setup
@@ -142,7 +142,7 @@ class TrackCommand:
     """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup. By default that
     of a calibrated --setup."""
     out: Path = Path("track.png")
-    """The picture; the numbers go to the same name with .json."""
+    """The image; the numbers go to the same name with .json."""
     json: bool = False
     """Print one JSON object."""
     settings: Flat[Tracking] = field(default_factory=Tracking)
@@ -154,7 +154,7 @@ class TrackCommand:
         check_there(read_capture, self.capture)
 
     def run(self) -> None:
-        """Follow, print, write the picture."""
+        """Follow, print, write the image."""
         from evnlos.cli.invert_captures import linear_setup
         from evnlos.data import pattern_of, read_capture
         from evnlos.plot.results import draw_track
@@ -260,7 +260,7 @@ def to_text(found: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class IdentifyCommand:
-    """Say what a setup can show at all: modes above the noise, finest stroke, best linear picture, in words."""
+    """Say what a setup can show at all: modes above the noise, finest stroke, best linear image, in words."""
 
     setups: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Names (main-near, matte-far, ..., simulate-paper), settings files, folders of `calibrate`, files of
@@ -274,7 +274,7 @@ class IdentifyCommand:
     json: bool = False
     """Print one JSON object, or a list where several setups are requested."""
     seed: int = 0
-    """Seed of the one noisy picture of the figure."""
+    """Seed of the one noisy image of the figure."""
     settings: Flat[AnalysisSettings] = field(default_factory=AnalysisSettings)
     bounds: bool = False
     """Also print the expected PSNR of the best linear estimate of a moving target, from frames, from events and
@@ -371,7 +371,7 @@ class ReportCommand:
                 limits = None if setup is None else identify(setup.setup, name=setup.name)
                 if setup is None and dataset.origin == "simulation":
                     setup = named_setup(self.data / "dataset.yaml")
-            with progress.stage("report", "pictures, films and page", 1, 2):
+            with progress.stage("report", "images, films and page", 1, 2):
                 path = write_report(self.out, dataset, results, [], self.split, setup, limits)
         about: dict[str, Any] = {"report": str(path), "csv": str(path.with_suffix(".csv"))}
         about["runs"] = {r.name: r.evaluation.scores.mean() for r in results}

@@ -1,6 +1,6 @@
 """Is a capture worth a day of recordings? What was recorded, in plain words, and how to mend it.
 
-- One picture per capture, for the eye: do frames and events show the same thing at the same time?
+- One image per capture, for the eye: do frames and events show the same thing at the same time?
 """
 
 from __future__ import annotations
@@ -305,7 +305,7 @@ _INK, _PAPER, _LINE = (40, 42, 48), (255, 255, 255), (210, 212, 216)
 _BINS = 200
 
 
-def check_picture(capture: Capture) -> Image.Image:
+def check_image(capture: Capture) -> Image.Image:
     """Return the frame at the busiest moment, the events of its interval, both overlaid, and curves over time.
 
     The curves are the events per second and the mean change of the frames, each on its own scale: peaks of the

@@ -49,7 +49,7 @@ class TargetInfo:
     name: str
     """What it shows, e.g. a letter."""
     mask: str | None = None
-    """Picture of the target, a file in the folder; white shines."""
+    """Image of the target, a file in the folder; white shines."""
     size_m: float = 0.08
     """Side of the target plane, metres."""
 
@@ -98,7 +98,7 @@ class DotsInfo:
     columns: int
     """Dots per row."""
     frame: str
-    """Picture of the grid by the frame camera, a file in the folder."""
+    """Image of the grid by the frame camera, a file in the folder."""
     events: str
     """Recording of the blinking grid by the event camera, a file in the folder."""
 
@@ -188,7 +188,7 @@ class CaptureInfo:
     events: str | None = "events.raw"
     """The event file, as the camera wrote it; null for a frame camera alone."""
     frames: str | None = "frames.csv"
-    """Frames: a table t_us,file; a video; a folder of pictures; an AEDAT file or ROS bag, also the same file as
+    """Frames: a table t_us,file; a video; a folder of images; an AEDAT file or ROS bag, also the same file as
     `events`; a CeleX-V recording of mode F; null for an event camera alone, whose time steps are then at
     `camera.frame_rate_hz` (30 Hz by default)."""
     events_topic: str | None = None
@@ -288,9 +288,9 @@ camera:
 
 events: {events}           # as the camera wrote it; the format is found from its content; null for a frame
                              # camera alone, whose size is then above
-frames: {frames}               # a folder of pictures, a video, a table t_us,file, an AEDAT file or a ROS bag;
+frames: {frames}               # a folder of images, a video, a table t_us,file, an AEDAT file or a ROS bag;
                              # null for an event camera alone
-# frames_turned: true        # pictures that the CeleX-V program exported are turned by 180 degrees
+# frames_turned: true        # images that the CeleX-V program exported are turned by 180 degrees
 
 # Clocks. Leave out where both files share one; otherwise one of:
 # alignment: {{offset_us: 41000}}         # event time = frame time + offset
@@ -305,7 +305,7 @@ frames: {frames}               # a folder of pictures, a video, a table t_us,fil
 # roi: {{x: 0, y: 0, width: {width}, height: {height}}}
 # filters: {{hot_pixel_factor: 10, background_us: 20000}}
 
-# What was hidden: leave out when unknown. The mask is a picture of the target, white shines.
+# What was hidden: leave out when unknown. The mask is an image of the target, white shines.
 # target: {{name: R, mask: target.png, size_m: 0.08}}
 # How it moved: the centre is at start_m + speed_m_s (t - start_us), relative to the middle of the travel.
 # motion: {{start_m: -0.08, speed_m_s: 0.02, direction: [1, 0], start_us: 0}}

@@ -43,7 +43,7 @@ def correct_frames(
         flat: Mean of frames of an evenly lit surface, [H, W], digital numbers.
 
     Raises:
-        DataError: A picture of another size, or a flat field that is nowhere brighter than the dark frame.
+        DataError: An image of another size, or a flat field that is nowhere brighter than the dark frame.
     """
     ground = np.zeros(frames.shape[1:], np.float32) if dark is None else np.asarray(dark, np.float32)
     for name, picture in (("dark", ground), ("flat", flat)):
@@ -168,7 +168,7 @@ def load_pattern(path: str | Path) -> FixedPattern:
         raise DataError(f"{path} holds no fixed pattern: {' '.join(str(error).split())}") from None
     if sensitivity.ndim != 2 or sensitivity.shape != offset.shape:
         raise DataError(
-            f"{path}: sensitivity {sensitivity.shape} and offset {offset.shape} are no pictures of one size"
+            f"{path}: sensitivity {sensitivity.shape} and offset {offset.shape} are no images of one size"
         )
     return FixedPattern(sensitivity, offset)
 

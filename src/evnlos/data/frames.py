@@ -42,7 +42,7 @@ class FrameSeries:
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
-    """Read a grey picture as uint8 or uint16 [H, W]; `size` is (rows, columns)."""
+    """Read a grey image as uint8 or uint16 [H, W]; `size` is (rows, columns)."""
     try:
         with open_image(path) as image:
             if size is not None and image.size != (size[1], size[0]):
@@ -52,7 +52,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
                 raise DataError(f"{path} holds NaN or infinity; leave it out or mend it")
             array = np.asarray(image if image.mode.startswith("I;16") else image.convert("L"))
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise DataError(f"{path} can't be read as a picture: {error}") from None
+        raise DataError(f"{path} can't be read as an image: {error}") from None
     return array
 
 
@@ -108,7 +108,7 @@ def _at_rate(path: Path, count: int, info: CaptureInfo) -> NDArray[np.int64]:
 
 
 def _video_frames(folder: Path, path: Path, info: CaptureInfo, most: int | None) -> FrameReader:
-    """Return what reads a video, animation, array or folder of pictures as 16 bits."""
+    """Return what reads a video, animation, array or folder of images as 16 bits."""
     if path.is_dir():
         for one in path.iterdir():
             inside(folder, str(one.relative_to(folder.resolve())), f"{info.frames}")
@@ -143,7 +143,7 @@ def _from_table(folder: Path, path: Path, size: tuple[int, int] | None, most: in
     for k, row in enumerate(rows):
         before = named.setdefault(row["file"] or "", k)
         if before != k:
-            raise DataError(f"{path}: frames {before} and {k} are both {row['file']}; name every picture once")
+            raise DataError(f"{path}: frames {before} and {k} are both {row['file']}; name every image once")
     first = read_image(inside(folder, rows[0]["file"] or "", path.name), size)
     _check_size(path, len(rows) * first.nbytes, most)
     images = np.empty((len(rows), *first.shape), first.dtype)
@@ -175,7 +175,7 @@ _FLAT = 1e-6  # ratio of singular values below which points lie on a line
 
 
 def homography_from_points(source: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
-    """Return the matrix that maps points of one plane's picture to those of another, by the normalised DLT.
+    """Return the matrix that maps points of one plane's image to those of another, by the normalised DLT.
 
     (x', y', 1) ~ H (x, y, 1), least squares of the algebraic error after both sets of points are shifted to
     their mean and scaled to a mean distance of sqrt 2 (Hartley, "In defense of the eight-point algorithm",
@@ -183,7 +183,7 @@ def homography_from_points(source: ArrayLike, target: ArrayLike) -> NDArray[np.f
 
     Args:
         source: Points (x, y), [N, 2], N at least 4, pixels.
-        target: Where they are in the other picture, [N, 2], pixels.
+        target: Where they are in the other image, [N, 2], pixels.
 
     Returns:
         float64 [3, 3], the last entry 1.
@@ -212,9 +212,7 @@ def homography_from_points(source: ArrayLike, target: ArrayLike) -> NDArray[np.f
     )  # [2 N, 9]
     _, values, vectors = np.linalg.svd(rows)
     if values[7] < _FLAT * values[0]:
-        raise DataError(
-            "the points of the registration lie on a line or coincide; spread them over the picture"
-        )
+        raise DataError("the points of the registration lie on a line or coincide; spread them over the image")
     found = np.linalg.inv(b) @ vectors[8].reshape(3, 3) @ a
     if abs(found[2, 2]) < 1e-12 or abs(np.linalg.det(found / found[2, 2])) < 1e-12:
         raise DataError("the points of the registration give no invertible homography; check their order")
@@ -225,7 +223,7 @@ def _normaliser(points: NDArray[np.float64]) -> NDArray[np.float64]:
     middle = points.mean(axis=0)
     distance = np.sqrt(((points - middle) ** 2).sum(axis=1)).mean()
     if distance == 0:
-        raise DataError("the points of the registration coincide; spread them over the picture")
+        raise DataError("the points of the registration coincide; spread them over the image")
     scale = np.sqrt(2) / distance
     return np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1]])
 

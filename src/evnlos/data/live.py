@@ -205,7 +205,7 @@ class LiveDataset(Dataset):
             yield from simulate_objects_on(config, names[first : first + together], device)
 
     def truth(self, name: str) -> NDArray[np.float32]:
-        """Return the true pictures of an object in the first epoch, float32 [N, H, W], 0..1."""
+        """Return the true images of an object in the first epoch, float32 [N, H, W], 0..1."""
         config = self.simulation
         scene = scene_of(config, drawn_for(config, name), name)
         return scene.truth(config.sampling.canvas, scene.position_times_s(config.positions))

@@ -192,11 +192,11 @@ def modality_order(name: str) -> int:
 
 
 class InMemoryDataset(torch.utils.data.Dataset):
-    """Samples in memory: item i is (input [C, h, w], picture [1, h, w]), float32.
+    """Samples in memory: item i is (input [C, h, w], image [1, h, w]), float32.
 
     Args:
         inputs: What the network sees, float16 [N, C, h, w].
-        truth: True pictures, float16 [N, h, w].
+        truth: True images, float16 [N, h, w].
         names: The object of each sample, [N].
     """
 

@@ -231,7 +231,7 @@ def iter_samples(
 def reduce_by_area(images: NDArray, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Resample images [..., H, W] to [..., *shape] by exact area averaging, also at fractional ratios.
 
-    Each output pixel is the mean of the input over its cell; the mean of the picture is kept.
+    Each output pixel is the mean of the input over its cell; the mean of the image is kept.
 
     Example:
         >>> reduce_by_area(np.arange(6.0).reshape(1, 6), (1, 4)).round(2)

@@ -168,7 +168,7 @@ class Simulation:
         check_made(self)
 
     def optics(self) -> dict[str, float]:
-        """Return what diffraction and the wall do to the picture: Fresnel number, blurs, sampling limit.
+        """Return what diffraction and the wall do to the image: Fresnel number, blurs, sampling limit.
 
         Empty for a radiometric wall, whose blur `evnlos identify` measures.
 

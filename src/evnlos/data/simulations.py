@@ -33,7 +33,7 @@ def default() -> Simulation:
 
     Blur, light, noise and thresholds are drawn for each object from wide ranges, the magnification from a
     narrow one around a target 0.3 m from the wall and a camera 0.6 m from it; the camera aims at the middle
-    of the travel. A view that varied more would make the place of the target unknowable from one picture.
+    of the travel. A view that varied more would make the place of the target unknowable from one image.
     """
     return Simulation(
         glyphs=HandwritingGlyphs(characters="ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789", writers=8),

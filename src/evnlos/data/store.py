@@ -222,7 +222,7 @@ class Dataset:
         split: Split name -> names of its objects; an object is in exactly one split.
         config: The settings that made the samples (resolved, complete).
         config_hash: Hash of these settings.
-        optics: What diffraction and the wall do to the picture, by name; empty where nobody knows.
+        optics: What diffraction and the wall do to the image, by name; empty where nobody knows.
         version: Version of the package that made it.
     """
 

@@ -1,6 +1,6 @@
 """Time surfaces of events, and the compiled loops that fill them; `surface_reference` is the slow reference.
 
-- Time surfaces: pictures of how recently, and in what company, each pixel saw its events.
+- Time surfaces: images of how recently, and in what company, each pixel saw its events.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Maps of events: counts in histograms, frames and voxel grids, and intensities that a camera sends along.
 
 - Asking the processor for memory before it is needed, which numba has no name for.
-- The intensities that some cameras send with their events, as a picture.
+- The intensities that some cameras send with their events, as an image.
 - Counts of events: histograms, frames, voxel grids, and the threshold-ordinal surface.
 """
 
@@ -160,7 +160,7 @@ def intensity_map(
     carry: bool = True,
     empty: float = 0.0,
 ) -> NDArray[np.float32]:
-    """Return the last intensity of each pixel: the picture that a CeleX-V in EI mode sends along with its
+    """Return the last intensity of each pixel: the image that a CeleX-V in EI mode sends along with its
     events.
 
     Args:

@@ -68,7 +68,7 @@ class Finding:
         value: Its value.
         unit: Its unit.
         psnr_db: str -> mean PSNR of the linear estimate on the test writer, dB.
-        mean_db: PSNR of the mean picture, dB.
+        mean_db: PSNR of the mean image, dB.
         gain_db: PSNR of events minus that of frames: mean, low and high end of the 95 % interval over objects.
         events_per_pixel: Events per pixel and sequence.
         event_bytes_s: Data of the events, bytes per second.
@@ -237,7 +237,7 @@ def measure(condition: Condition, workers: int = 0, rank: int = 192, force: bool
 def conditions_table(findings: list[Finding]) -> str:
     """Return Markdown: a row a condition."""
     lines = [
-        "| condition | frame dB | event dB | fusion dB | mean picture dB | event - frame dB, 95 % interval | "
+        "| condition | frame dB | event dB | fusion dB | mean image dB | event - frame dB, 95 % interval | "
         "events per pixel | events kB/s | frames kB/s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]

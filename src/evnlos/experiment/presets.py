@@ -164,7 +164,7 @@ def width(setup: str) -> Study:
 def embedding(setup: str) -> Study:
     """Return the ablation of what the network knows before its first step: scale and linear embedding."""
     kinds = {
-        "plain, each picture scaled": _PLAIN,
+        "plain, each image scaled": _PLAIN,
         "plain": UNetConfig(rank=0),
         "one ridge": UNetConfig(ridge_multipliers=(1.0,)),
         "three ridges": UNetConfig(),
@@ -277,9 +277,9 @@ class GeneralizationResult:
 
     Args:
         name: What the set is.
-        psnr_db: Mean PSNR of the network's pictures on the scored canvas, dB.
+        psnr_db: Mean PSNR of the network's images on the scored canvas, dB.
         average_db: The same of the average target, drawn where the target is, dB.
-        consistent_db: The same of the network's pictures after data consistency with the set's own wall, dB;
+        consistent_db: The same of the network's images after data consistency with the set's own wall, dB;
             None for events alone.
         confidence_checks: What the confidence said of each sequence, and what was true.
     """

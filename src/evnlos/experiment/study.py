@@ -154,7 +154,7 @@ class Study:
     robust: bool = False
     """Draw sensors and walls of the simulations from wide ranges (`evnlos.data.randomized`)."""
     refine: bool = True
-    """Also score pictures after data consistency, where there are a frame and a calibrated setup."""
+    """Also score images after data consistency, where there are a frame and a calibrated setup."""
     average: bool = False
     """Also score the images of networks of single positions after they are aligned along the known motion and
     averaged over the sequence."""
@@ -219,9 +219,9 @@ class Record:
         scores: Metric -> object -> mean over its positions.
         positions: PSNR in dB, object -> one value per position.
         baselines: Baseline -> metric -> object -> mean.
-        checks: Shares of pictures (see `evnlos.analysis.CHECKS`).
+        checks: Shares of images (see `evnlos.analysis.CHECKS`).
         settings: Everything that decided the weights.
-        read_as: Object -> character -> how many of its pictures the reader takes for it.
+        read_as: Object -> character -> how many of its images the reader takes for it.
     """
 
     study: str

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 
 TRUST = 1.0
-"""How far the frames may move the pictures of `+ consistency`: the variance that a probability itself has."""
+"""How far the frames may move the images of `+ consistency`: the variance that a probability itself has."""
 
 ENSEMBLE = -1
 """Seed of a record that belongs to all seeds together."""
@@ -137,7 +137,7 @@ def _without_network(
     recorded: Dataset,
     place: Place,
 ) -> Iterator[tuple[str, Callable[[], Tensor]]]:
-    """Yield the baselines that belong to an arm, each with what makes its pictures."""
+    """Yield the baselines that belong to an arm, each with what makes its images."""
     if study.name == "captures" and arm.pretraining is None:
         yield "linear, captures", lambda: _linear(recorded, modality, samples)
     if arm.finetuning is not None or made is None:
@@ -212,7 +212,7 @@ def _middle_target(made: Dataset, name: str, size_m: float) -> Tensor:
 
 
 def _consistent(study: Study, arm: Arm, recorded: Dataset, place: Place, images: Tensor) -> Tensor:
-    """Return pictures of the scored split after data consistency with the calibrated setup."""
+    """Return images of the scored split after data consistency with the calibrated setup."""
     operator = _operator(place.out / "setups" / study.setup, arm.sampling)
     names = recorded.objects(study.split)
     frames = torch.cat([torch.from_numpy(read_shard(recorded.shard(name))[0].frame) for name in names])
@@ -318,13 +318,13 @@ def gain_table(records: list[Record], arm: str = "EPNP", other: str = "E2E") -> 
 
 
 def checks_table(records: list[Record]) -> str:
-    """Return Markdown: shares of pictures that are recognized and that are no memory, and the confusion."""
+    """Return Markdown: shares of images that are recognized and that are no memory, and the confusion."""
     found: dict[tuple[str, str], list[Record]] = defaultdict(list)
     for record in records:
         name = record.arm if record.seed >= 0 else f"{record.arm}, ensemble"
         found[name, record.modality].append(record)
     lines = [
-        "| | recognized | of the true pictures | nearer to the truth than to any capture | taken for another |",
+        "| | recognized | of the true images | nearer to the truth than to any capture | taken for another |",
         "|---|---|---|---|---|",
     ]
     for (arm, modality), own in found.items():

@@ -5,7 +5,7 @@ from .changing import FilmPrior as FilmPrior
 from .changing import ModeSeries as ModeSeries
 from .changing import estimate_film as estimate_film
 from .changing import smooth_modes as smooth_modes
-from .corner import CornerPicture as CornerPicture
+from .corner import CornerImage as CornerImage
 from .corner import FloorSector as FloorSector
 from .corner import Penumbra as Penumbra
 from .corner import Prior as Prior

@@ -1,8 +1,8 @@
-"""A corner as a camera, the other way: from a video of the floor to a picture over bearing and time.
+"""A corner as a camera, the other way: from a video of the floor to an image over bearing and time.
 
 - The sector of the floor that is looked at, and the bearing of each of its pixels about the edge.
 - The floor's relative change per bin of bearing and step of time, read from a video frame by frame.
-- The most probable picture of the hidden side, with its uncertainty and its evidence.
+- The most probable image of the hidden side, with its uncertainty and its evidence.
 
 The floor's texture multiplies its light, so each pixel is divided by its own mean: what is left is the relative
 change dE / E, the same for a dark tile and a bright one. The model of a bin b at step t is
@@ -13,7 +13,7 @@ with A of `evnlos.optics.EdgeOperator`, m the unknown steady part, N constants a
 of the camera, lamps of this side; both unknown at each step) and x a Gaussian process with covariance s^2
 exp(-|dphi| / l) exp(-|dt| / tau): the prior on first differences over the bearing of Bouman et al. (ICCV 2017),
 with a weak pull to nothing and a memory in time. m and c have flat priors and are integrated out; s, l and tau
-are those of largest evidence. Everything is exact: in the modes of prior and noise, the picture falls into
+are those of largest evidence. Everything is exact: in the modes of prior and noise, the image falls into
 independent series, each solved by a Kalman filter and a smoother (Rauch, Tung and Striebel 1965).
 """
 
@@ -43,7 +43,7 @@ _NORMAL_MEDIAN = 0.4549  # of a squared standard normal number
 
 @dataclass(frozen=True)
 class FloorSector:
-    """The part of a picture of the floor that looks past the edge, and its bearings.
+    """The part of an image of the floor that looks past the edge, and its bearings.
 
     Args:
         edge: Foot of the wall's edge (column, row), pixels.
@@ -51,7 +51,7 @@ class FloorSector:
         end: A point of the floor; the sector runs from the wall's line to the ray through it, by less than 180
             degrees. The farther of `wall` and `end` says how far from the edge pixels are taken.
         to_ground: Homography [3, 3] from pixels to any plane that is similar to the floor; None takes bearings
-            as they are in the picture, which is right at the wall's line alone.
+            as they are in the image, which is right at the wall's line alone.
 
     Raises:
         ConfigError: Points that coincide or are not finite.
@@ -99,19 +99,19 @@ class FloorSector:
         """Return the box (left, top, right, bottom) around the sector, its pixels in it, and their bearings.
 
         Args:
-            shape: Size (H, W) of the picture, pixels.
+            shape: Size (H, W) of the image, pixels.
 
         Returns:
             Box; flat indices within the box [P]; bearings [P], degrees.
 
         Raises:
-            ConfigError: The edge lies outside the picture, too little of the sector inside, or it is too narrow
+            ConfigError: The edge lies outside the image, too little of the sector inside, or it is too narrow
                 or too wide.
         """
         height, width = shape
         if not (0 <= self.edge[0] < width and 0 <= self.edge[1] < height):
             raise ConfigError(
-                f"the edge {self.edge} lies outside the picture of {width} x {height} pixels; give "
+                f"the edge {self.edge} lies outside the image of {width} x {height} pixels; give "
                 "the column and the row of its foot"
             )
         if not 10 < self.span_deg < 179.9:
@@ -131,7 +131,7 @@ class FloorSector:
         index = np.flatnonzero(inside)
         if len(index) < _LEAST_PIXELS:
             raise ConfigError(
-                f"the sector has {len(index)} pixels inside the picture; give wall and end so that it has "
+                f"the sector has {len(index)} pixels inside the image; give wall and end so that it has "
                 f"{_LEAST_PIXELS} or more"
             )
         return (left, top, right, bottom), index, bearing[index]
@@ -147,7 +147,7 @@ class Penumbra:
         change: dE / E less its mean over time, [T, B]; NaN where a step is lost.
         variance: Variance of the noise of a bin in one step, [B].
         gain: Common factor of the floor's light, [T].
-        shift_px: The picture's shift (columns, rows), [T, 2]; NaN where the floor has no texture to tell.
+        shift_px: The image's shift (columns, rows), [T, 2]; NaN where the floor has no texture to tell.
         disturbed: Fraction of the frames in which something moves on the floor itself.
         noise_factor: Noise over that of independent pixels: what the codec and unsteady light add.
         level: Mean light of the floor, fraction of white.
@@ -172,7 +172,7 @@ class Penumbra:
 
     @property
     def shift_known(self) -> bool:
-        """Whether the floor has texture enough to tell the picture's shift."""
+        """Whether the floor has texture enough to tell the image's shift."""
         return not bool(np.isnan(self.shift_px).all())
 
     @cached_property
@@ -312,7 +312,7 @@ class _Reducer:
         """Return relative changes [T, B], gains [T] and shifts [T, 2] of sums [T, B + 2]."""
         bins, likeness = sums[:, :-2], sums[:, -2:]
         against = likeness - (bins * self.variance) @ self._cross.T
-        moved: Array = against @ np.linalg.inv(self._schur)  # picture = mean - slope * shift
+        moved: Array = against @ np.linalg.inv(self._schur)  # image = mean - slope * shift
         change = (bins - moved @ self._cross) * self.variance
         known = np.linalg.eigvalsh(self._schur)[0] > 400  # a twentieth of a pixel
         gain = 1 + (change * self.precision).sum(axis=1) / self.precision.sum()
@@ -395,7 +395,7 @@ def noise_of(change: Array, predicted: Array) -> tuple[Array, float]:
 
 
 class Prior(NamedTuple):
-    """The prior of the hidden picture."""
+    """The prior of the hidden image."""
 
     deviation: float
     """Standard deviation s, relative change of the floor per degree."""
@@ -406,7 +406,7 @@ class Prior(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class CornerPicture:
+class CornerImage:
     """The hidden side over bearing and time.
 
     Args:
@@ -504,8 +504,8 @@ class _Modes:
         return _smooth(self.data, self.lost, deviation * self.gain, keep, none, none)
 
 
-def estimate_corner(penumbra: Penumbra, prior: Prior | None = None) -> CornerPicture:
-    """Return the most probable picture of the hidden side, its deviation and its evidence.
+def estimate_corner(penumbra: Penumbra, prior: Prior | None = None) -> CornerImage:
+    """Return the most probable image of the hidden side, its deviation and its evidence.
 
     Args:
         penumbra: What the floor shows.
@@ -523,7 +523,7 @@ def estimate_corner(penumbra: Penumbra, prior: Prior | None = None) -> CornerPic
     steps = max(1.0, prior.memory_s / step)
     gain2 = steps * (prior.deviation * modes.gain) ** 2
     spread = (modes.basis * (gain2 / (1 + gain2))) @ np.linalg.inv(modes.basis)
-    return CornerPicture(
+    return CornerImage(
         modes.middle,
         penumbra.times_s,
         (basis @ mean).T,

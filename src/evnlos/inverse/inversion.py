@@ -1,7 +1,7 @@
-"""From a photograph of a relay wall to a picture of the hidden screen.
+"""From a photograph of a relay wall to an image of the hidden screen.
 
 - A photograph of a relay wall with its geometry: an NPZ file, light, screen and occluders.
-- From a wall photograph to a picture of the hidden screen, every choice made without the truth.
+- From a wall photograph to an image of the hidden screen, every choice made without the truth.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Photograph:
         return Plane(height, width, pitch_m, (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2))
 
     def at_cells(self, images: torch.Tensor, plane: Plane) -> torch.Tensor:
-        """Return pictures of a plane [..., H, W] at the samples nearest to the screen's cells, [..., h, w]."""
+        """Return images of a plane [..., H, W] at the samples nearest to the screen's cells, [..., h, w]."""
         x, y = np.asarray(self.screen.x_m), np.asarray(self.screen.y_m)
         rows = np.abs(y[:, None] - plane.y_m).argmin(axis=1)
         columns = np.abs(x[:, None] - plane.x_m).argmin(axis=1)
@@ -111,7 +111,7 @@ class Photograph:
 def read_photograph(path: str | Path, emission_exponent: tuple[float, float] | None = None) -> Photograph:
     """Read a wall photograph and its geometry from an NPZ file.
 
-    The axes are the room's: x to the right in the picture, z up, y from the hidden screen (y = 0) to the wall
+    The axes are the room's: x to the right in the image, z up, y from the hidden screen (y = 0) to the wall
     (y = distance_m). Keys, lengths in metres: `wall` [H, W] or `wall_rgb` [H, W, 3], linear; `wall_x_m` [W],
     `wall_z_m` [H], equally spaced; `cell_x_m` [w], `cell_z_m` [h] and `cell_size_m` (width, height) of the
     screen's cells; `distance_m`. May be left out: `occluder_polygons_m` [N, K, 3], convex, corners (x, y, z)
@@ -245,7 +245,7 @@ class Inversion:
         rule: Rule = "cv",
         noise_sigma: float | None = None,
     ) -> Solution:
-        """Return the screen's picture, [channels, h, w], in units of the wall's largest value over the norm.
+        """Return the screen's image, [channels, h, w], in units of the wall's largest value over the norm.
 
         Args:
             solver: "tikhonov" with the gradient towards a dark border as prior, or "tv", total variation with

@@ -1,4 +1,4 @@
-"""One target seen at many positions: the operator from its cells to all pictures, and its Gram matrix.
+"""One target seen at many positions: the operator from its cells to all images, and its Gram matrix.
 
 - One object from its whole sequence: Tikhonov and total variation on the normal equations of all positions.
 """
@@ -59,7 +59,7 @@ class SequenceOperator:
         return len(self.positions_m)
 
     def __call__(self, target: torch.Tensor, /) -> torch.Tensor:
-        """Return the pictures [..., N, H, W] of a target [..., n, n]."""
+        """Return the images [..., N, H, W] of a target [..., n, n]."""
         return self.transport(self.drawn(target))
 
     def adjoint(self, images: torch.Tensor, /) -> torch.Tensor:
@@ -195,9 +195,9 @@ _KEPT = 1e-12  # of the largest eigenvalue; what lies below is rounding
 
 
 class SequenceProblem:
-    """Find the target x behind N pictures y_k = A S_k x + b + noise, b unknown and the same in all of them.
+    """Find the target x behind N images y_k = A S_k x + b + noise, b unknown and the same in all of them.
 
-    With R = A^T C^-1 A accumulated over the positions (`SequenceOperator.gram`) the pictures are looked at
+    With R = A^T C^-1 A accumulated over the positions (`SequenceOperator.gram`) the images are looked at
     once, and every regularization costs a product of the target's size. C holds independent noise and, of
     standard deviation `static` times the noise, a constant offset of each pixel: the camera's fixed pattern and
     ambient light.
@@ -242,11 +242,11 @@ class SequenceProblem:
             images: y without known ambient light, [..., N, H, W]; leading axes are a batch, which shares
                 regularization.
             regularization: Weight of the prior, squared white levels; None: by generalised cross-validation,
-                which takes the errors of all pictures' samples to be independent.
+                which takes the errors of all images' samples to be independent.
 
         Raises:
             ConfigError: regularization is not 0 or more.
-            DataError: The pictures are not those of the sequence.
+            DataError: The images are not those of the sequence.
         """
         if regularization is not None and not (math.isfinite(regularization) and regularization >= 0):
             raise ConfigError(
@@ -290,7 +290,7 @@ class SequenceProblem:
 
         Raises:
             ConfigError: regularization is not positive, or the box is empty.
-            DataError: The pictures are not those of the sequence.
+            DataError: The images are not those of the sequence.
         """
         back, energy = self._seen(images)
         target_plane, (values, vectors) = self.sight.target_plane, self._eigen
@@ -325,9 +325,9 @@ class SequenceProblem:
         """Return A^T C^-1 y [B, C] and y^T C^-1 y [B]."""
         wanted = (len(self.sight), *self.sight.transport.shape)
         if tuple(images.shape[-3:]) != wanted or not images.is_floating_point():
-            raise DataError(f"the pictures are {images.dtype} {tuple(images.shape)}; give real [..., {wanted}]")
+            raise DataError(f"the images are {images.dtype} {tuple(images.shape)}; give real [..., {wanted}]")
         if not bool(torch.isfinite(images).all()):
-            raise DataError("the pictures hold NaN or infinity")
+            raise DataError("the images hold NaN or infinity")
         flat = images.double().reshape(-1, *wanted)
         whitened = flat - (1 - self._kept) * flat.mean(dim=1, keepdim=True)
         return self.sight.adjoint(whitened).flatten(1), (whitened * flat).sum(dim=(1, 2, 3))

@@ -1,4 +1,4 @@
-"""Streaming reconstruction: events arrive, pictures leave, and every picture knows how long it took."""
+"""Streaming reconstruction: events arrive, images leave, and every image knows how long it took."""
 
 import lazy_loader
 

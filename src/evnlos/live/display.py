@@ -1,8 +1,8 @@
 """The images of a live run: as a page of this machine, and as a video.
 
-- A picture and what it was made of, side by side.
-- The pictures of a live run as a page of this machine: one file, a stream of server-sent events, no more.
-- The pictures of a live run as a video: mp4 where PyAV is installed, else an animated PNG.
+- An image and what it was made of, side by side.
+- The images of a live run as a page of this machine: one file, a stream of server-sent events, no more.
+- The images of a live run as a video: mp4 where PyAV is installed, else an animated PNG.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def panels(picture: Picture) -> dict[str, NDArray[np.uint8]]:
 
 
 def side_by_side(picture: Picture, height_px: int = 256) -> NDArray[np.uint8]:
-    """Return the panels as one colour picture [H, W, 3] of even sides, magnified to about a height, pixels."""
+    """Return the panels as one colour image [H, W, 3] of even sides, magnified to about a height, pixels."""
     zoom = max(1, round(height_px / picture.image.shape[0]))
     row: list[NDArray[np.uint8]] = []
     for panel in panels(picture).values():
@@ -54,7 +54,7 @@ def side_by_side(picture: Picture, height_px: int = 256) -> NDArray[np.uint8]:
 
 _HOST = "127.0.0.1"
 _MOST_VIEWERS = 8
-_LEAST_S = 0.033  # between two pictures of a page: faster than eyes follow would cost the network's time
+_LEAST_S = 0.033  # between two images of a page: faster than eyes follow would cost the network's time
 _SILENT_S = 10.0  # in which a request must be whole, and a viewer take what is sent
 _BEAT_S = 1.0  # longest time without a message, by which a viewer that left is noticed
 _POLICY = (
@@ -64,13 +64,13 @@ _POLICY = (
 
 
 class Page:
-    """A sink that shows the newest picture to browsers on this machine; a context that ends with the server.
+    """A sink that shows the newest image to browsers on this machine; a context that ends with the server.
 
-    A picture is encoded when a viewer asks for it, in the server's threads; a viewer that is slow misses
-    pictures and holds nobody up.
+    An image is encoded when a viewer asks for it, in the server's threads; a viewer that is slow misses
+    images and holds nobody up.
 
     Args:
-        status: Returns what is shown beside the picture, as plain values.
+        status: Returns what is shown beside the image, as plain values.
         port: Port on 127.0.0.1; 0 takes a free one.
         title: What is shown, for the head of the page.
         again: Set when a viewer wishes the replay to begin again; None where that can't be.
@@ -122,7 +122,7 @@ class Page:
         self._thread.join()
 
     def show(self, picture: Picture) -> None:
-        """Take a picture without waiting."""
+        """Take an image without waiting."""
         with self._changed:
             self._picture = picture
             self._changed.notify_all()
@@ -137,11 +137,11 @@ class Page:
         return files("evnlos.live").joinpath("page.html").read_bytes()
 
     def state(self) -> dict[str, Any]:
-        """Return what is shown beside the picture."""
+        """Return what is shown beside the image."""
         return {"title": self._title, "ended": self._ended, "again": self.again is not None, **self._status()}
 
     def stream(self, write: Callable[[bytes], object]) -> None:
-        """Write messages until the run ends or the viewer leaves: each picture, or a sign of life."""
+        """Write messages until the run ends or the viewer leaves: each image, or a sign of life."""
         shown, ended, beat_s = -1, False, 0.0  # the first message comes at once
         while not ended:
             began_s = time.monotonic()
@@ -149,7 +149,7 @@ class Page:
                 self._changed.wait_for(lambda shown=shown: self._ended or self._number() > shown, beat_s)
                 picture, ended = self._picture, self._ended
             if picture is not None and picture.number > shown:
-                write(b"event: picture\ndata: " + self._encoded(picture) + b"\n\n")
+                write(b"event: image\ndata: " + self._encoded(picture) + b"\n\n")
                 shown = picture.number
             write(b"event: state\ndata: " + json.dumps(self.state()).encode() + b"\n\n")
             self.seen.set()
@@ -160,7 +160,7 @@ class Page:
         return -1 if self._picture is None else self._picture.number
 
     def _encoded(self, picture: Picture) -> bytes:
-        """Return a picture as one line of JSON; encoded once for all viewers."""
+        """Return an image as one line of JSON; encoded once for all viewers."""
         with self._encoding:
             if self._message[0] != picture.number:
                 latency = picture.timing.oldest_s
@@ -242,10 +242,10 @@ def _handler(page: Page) -> type[BaseHTTPRequestHandler]:
     return Handler
 
 
-_WAITING = 64  # pictures that may wait for the encoder
-_RECORD_LEAST_S = 0.039  # between two pictures of the video, 25 a second: the cores are for the network
-_MOST_ANIMATED = 3000  # pictures of an animated PNG, which is held in memory until it is written
-_LAST_MS = 100  # how long the last picture of an animation stays
+_WAITING = 64  # images that may wait for the encoder
+_RECORD_LEAST_S = 0.039  # between two images of the video, 25 a second: the cores are for the network
+_MOST_ANIMATED = 3000  # images of an animated PNG, which is held in memory until it is written
+_LAST_MS = 100  # how long the last image of an animation stays
 
 
 class _Encoder(Protocol):
@@ -257,16 +257,16 @@ class _Encoder(Protocol):
 class Recorder:
     """A sink that writes a video beside the run, in a thread of its own; a context that ends with the file.
 
-    The video holds at most 25 pictures per second, at the times at which they were made. Where the encoder
-    can't follow, pictures are left out and counted.
+    The video holds at most 25 images per second, at the times at which they were made. Where the encoder
+    can't follow, images are left out and counted.
 
     Args:
         folder: Where to write `video.mp4`, or `video.png` without PyAV; new or empty.
 
     Attributes:
         path: The video.
-        recorded: Pictures in it.
-        left_out: Pictures that should be in it and are not.
+        recorded: Images in it.
+        left_out: Images that should be in it and are not.
 
     Raises:
         DataError: The folder holds files already, or another process is at work in it.
@@ -302,7 +302,7 @@ class Recorder:
             raise DataError(f"{self.path}: the video could not be written ({self._error}); check the disk")
 
     def show(self, picture: Picture) -> None:
-        """Take a picture without waiting."""
+        """Take an image without waiting."""
         if picture.made_s - self._last_s < _RECORD_LEAST_S:
             return
         self._last_s = picture.made_s
@@ -338,7 +338,7 @@ def _pyav() -> Any:
 
 
 class _Movie:
-    """An mp4 file with a time stamp of its own for each picture."""
+    """An mp4 file with a time stamp of its own for each image."""
 
     def __init__(self, path: Path, av: Any) -> None:
         self._av, self._file = av, new_file(path)
@@ -375,7 +375,7 @@ class _Movie:
 
 
 class _Animation:
-    """An animated PNG, whose pictures are held until the end."""
+    """An animated PNG, whose images are held until the end."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -1,8 +1,8 @@
 """From chunks to images: the running surface, its reduction, the network.
 
-- Area averaging with what does not change worked out beforehand, for one picture after the other.
+- Area averaging with what does not change worked out beforehand, for one image after the other.
 - The time surface as a state that events change, in place of a map computed from all events anew.
-- From chunks to pictures: the running surface, its reduction, the network, and how long each took.
+- From chunks to images: the running surface, its reduction, the network, and how long each took.
 """
 
 from __future__ import annotations
@@ -166,13 +166,13 @@ _WARM = 8  # the graph is optimised in its first calls
 
 @dataclass(frozen=True)
 class Timing:
-    """How long a picture took, seconds; NaN for both latencies where no event is new in it.
+    """How long an image took, seconds; NaN for both latencies where no event is new in it.
 
     Args:
-        oldest_s: From the first event that is new in it to the picture: the longest that an event waited.
-        newest_s: From its last event to the picture.
-        wait_s: The part of `oldest_s` before work on the picture began: in the source, in the queue, for the
-            picture before.
+        oldest_s: From the first event that is new in it to the image: the longest that an event waited.
+        newest_s: From its last event to the image.
+        wait_s: The part of `oldest_s` before work on the image began: in the source, in the queue, for the
+            image before.
         surface_s: Taking the events and making the maps that the network sees.
         network_s: The network.
     """
@@ -210,7 +210,7 @@ class Picture:
 
 
 class Engine:
-    """Turns chunks into pictures, with weights of any modality.
+    """Turns chunks into images, with weights of any modality.
 
     A network that sees events gets the surface at the instant that the stream has reached, and beside it the
     newest frame, where it sees frames too; one that sees frames alone makes one image per frame.
@@ -229,7 +229,7 @@ class Engine:
         >>> network = UNetConfig(width=4, depth=1, rank=0).build("event", sampling)
         >>> engine = Engine(Weights(network))
         >>> events = Events([3, 9], [1, 30], [2, 20], [True, False], width=48, height=32)
-        >>> picture = engine.see([Chunk(events, 9, 0.0, 0.0)])
+        >>> image = engine.see([Chunk(events, 9, 0.0, 0.0)])
         >>> picture.image.shape, picture.t_us, picture.events
         ((16, 24), 9, 2)
     """
@@ -260,7 +260,7 @@ class Engine:
         self._events = 0
 
     def begin(self) -> None:
-        """Forget what came before, and compile now what would make the first picture late."""
+        """Forget what came before, and compile now what would make the first image late."""
         self._forget()
         surface, reduce = RunningSurface(*self._shape, 1.0), AreaReduction(self._shape, self._shape)
         place = np.zeros(1, np.uint16)
@@ -269,7 +269,7 @@ class Engine:
             self._see(self._dark, reduce(surface.at(1)))
 
     def see(self, chunks: Sequence[Chunk]) -> Picture | None:
-        """Take chunks in their order and return the picture behind them; None where there is none to be made.
+        """Take chunks in their order and return the image behind them; None where there is none to be made.
 
         Raises:
             DataError: The chunks do not follow each other, or change the sensor.

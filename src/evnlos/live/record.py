@@ -286,7 +286,7 @@ class _Recording(threading.Thread):
             self._keep(chunk.frame, frame_us + self._shift_us)
 
     def _keep(self, frame: NDArray[np.float32], t_us: int) -> None:
-        """Write a frame as a picture of 16 bits; one that is not later than the frame before is left out."""
+        """Write a frame as an image of 16 bits; one that is not later than the frame before is left out."""
         if self._frame_us is not None and t_us <= self._frame_us:
             return
         self._frame_us = t_us

@@ -1,7 +1,7 @@
 """A live run, and its statistics.
 
-- What a live run did: pictures, latencies, drops, rates; as numbers and as a table.
-- A live run: the source fills a queue in its own thread, the network empties it, sinks get the pictures.
+- What a live run did: images, latencies, drops, rates; as numbers and as a table.
+- A live run: the source fills a queue in its own thread, the network empties it, sinks get the images.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.live.engine import Engine, Picture
 from evnlos.live.packet import ChunkQueue, Clock, EventSource, SystemClock
 
-_KEPT = 100_000  # pictures whose times are kept: half an hour at 50 a second, 6 MB
+_KEPT = 100_000  # images whose times are kept: half an hour at 50 a second, 6 MB
 _RECENT = 100
 _PERCENTILES = (50, 90, 99)
 
 ROWS = {
-    "oldest_event": "oldest new event to picture",
-    "newest_event": "newest event to picture",
+    "oldest_event": "oldest new event to image",
+    "newest_event": "newest event to image",
     "wait": "of the oldest: waiting",
     "surface": "of both: surface and maps",
     "network": "of both: network",
 }
-"""What is measured of each picture, in words."""
+"""What is measured of each image, in words."""
 
 
 class RunStatistics:
@@ -45,11 +45,11 @@ class RunStatistics:
         self._times: deque[tuple[float, ...]] = deque(maxlen=_KEPT)
         self._recent: deque[tuple[float, int, float]] = deque(maxlen=_RECENT)
         self.pictures = self.events = 0
-        self._first: tuple[float, int] | None = None  # instant and events of the first picture
+        self._first: tuple[float, int] | None = None  # instant and events of the first image
         self._last_s = 0.0
 
     def add(self, picture: Picture) -> None:
-        """Count a picture."""
+        """Count an image."""
         t = picture.timing
         self._times.append((t.oldest_s, t.newest_s, t.wait_s, t.surface_s, t.network_s))
         self._recent.append((picture.made_s, picture.events, t.oldest_s))
@@ -59,13 +59,13 @@ class RunStatistics:
         self._last_s = picture.made_s
 
     def now(self) -> dict[str, Any]:
-        """Return how it goes: rates of the last 100 pictures, their median latency, drops."""
+        """Return how it goes: rates of the last 100 images, their median latency, drops."""
         recent = list(self._recent)
         span = recent[-1][0] - recent[0][0] if len(recent) > 1 else 0.0
         times = np.array([oldest_s * 1e3 for _, _, oldest_s in recent if np.isfinite(oldest_s)])
         return {
             "pictures": self.pictures,
-            "pictures_hz": round((len(recent) - 1) / span, 1) if span else 0.0,
+            "images_hz": round((len(recent) - 1) / span, 1) if span else 0.0,
             "events_hz": round(sum(n for _, n, _ in recent[1:]) / span) if span else 0,
             "latency_ms": [round(float(v), 1) for v in np.percentile(times, [50, 99])] if len(times) else [],
             **self._losses(),
@@ -77,18 +77,18 @@ class RunStatistics:
         return {"dropped": dropped, "faults": self._source.faults()}
 
     def summary(self) -> dict[str, Any]:
-        """Return everything: counts, rates, percentiles of the last 100,000 pictures in milliseconds.
+        """Return everything: counts, rates, percentiles of the last 100,000 images in milliseconds.
 
-        Seconds and rates are from the first picture to the last.
+        Seconds and rates are from the first image to the last.
         """
         begun_s, first_events = self._first or (self._last_s, 0)
         seconds = self._last_s - begun_s
-        times = np.array(self._times).reshape(-1, len(ROWS)) * 1e3  # [pictures, rows]
+        times = np.array(self._times).reshape(-1, len(ROWS)) * 1e3  # [images, rows]
         return {
             "source": self._source.name,
             "seconds": round(seconds, 3),
             "pictures": self.pictures,
-            "pictures_hz": round((self.pictures - 1) / seconds, 2) if seconds else 0.0,
+            "images_hz": round((self.pictures - 1) / seconds, 2) if seconds else 0.0,
             "events": self.events,
             "events_hz": round((self.events - first_events) / seconds) if seconds else 0,
             **self._losses(),
@@ -114,7 +114,7 @@ def latency_table(summary: dict[str, Any]) -> str:
         spread = summary["latency_ms"][row]
         cells = (f"{spread[name]:9.1f}" if spread else f"{'-':>9}" for name in names)
         lines.append(f"{title:<32}{''.join(cells)}")
-    pictures = f"{summary['pictures']:,} pictures ({summary['pictures_hz']:.1f} a second)"
+    pictures = f"{summary['pictures']:,} images ({summary['images_hz']:.1f} a second)"
     events = f"{summary['events']:,} events ({summary['events_hz']:,} a second)"
     lines.append(f"{pictures} of {events} in {summary['seconds']:.1f} s")
     dropped, faults = summary["dropped"], _listed(summary["faults"].items())
@@ -131,10 +131,10 @@ _NAP_S = 0.05
 
 @dataclass(frozen=True)
 class RateOptions:
-    """How often there is a picture, and how much may wait for one."""
+    """How often there is an image, and how much may wait for one."""
 
     rate: float = 100.0
-    """Most pictures per second; one is made only when something came, and events wait for it."""
+    """Most images per second; one is made only when something came, and events wait for it."""
     queue_events: int = 200_000
     """Most events that wait between source and network; beyond that the oldest are dropped and counted."""
     seconds: float | None = None
@@ -142,7 +142,7 @@ class RateOptions:
 
     def __post_init__(self) -> None:
         if not 0.1 <= self.rate <= 1000:
-            raise ConfigError(f"rate is {self.rate}; give 0.1 to 1000 pictures per second")
+            raise ConfigError(f"rate is {self.rate}; give 0.1 to 1000 images per second")
         if self.queue_events < 1:
             raise ConfigError(f"queue_events is {self.queue_events}; give at least 1")
         if self.seconds is not None and not self.seconds > 0:
@@ -150,10 +150,10 @@ class RateOptions:
 
 
 class Sink(Protocol):
-    """Something that takes pictures without making the run wait."""
+    """Something that takes images without making the run wait."""
 
     def show(self, picture: Picture) -> None:
-        """Take a picture."""
+        """Take an image."""
         ...
 
 
@@ -162,7 +162,7 @@ class Run:
 
     Args:
         source: Where the events come from.
-        engine: What makes pictures of them.
+        engine: What makes images of them.
         pace: How often, and how much may wait.
         clock: The clock that it goes by.
 

@@ -1,6 +1,6 @@
 """Confidence: how much of a reconstruction the measurement supports, pixel by pixel and as a whole.
 
-- The confidence in a picture: how much of it the measurement supports, and where each pixel's level lies.
+- The confidence in an image: how much of it the measurement supports, and where each pixel's level lies.
 - How it is learned from sequences that the network was not trained on.
 """
 
@@ -20,16 +20,16 @@ from evnlos.models.reconstructor import Reconstructor
 from evnlos.types import Plane, derive_seed
 
 SIDE = 32
-"""Side of a target plane's picture, pixels."""
+"""Side of a target plane's image, pixels."""
 
 
 def on_target_plane(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
-    """Return the part of each picture that shows the target, resampled to 32 x 32.
+    """Return the part of each image that shows the target, resampled to 32 x 32.
 
     Args:
-        images: Pictures of the canvas, float [N, H, W].
+        images: Images of the canvas, float [N, H, W].
         canvas: Their geometry.
-        position_m: Centre (x, y) of the target in each picture, [N, 2], metres.
+        position_m: Centre (x, y) of the target in each image, [N, 2], metres.
         size_m: Side of the target plane, metres.
 
     Returns:
@@ -45,13 +45,13 @@ def on_target_plane(images: Tensor, canvas: Plane, position_m: ArrayLike, size_m
 
 
 def on_canvas(target: Tensor, canvas: Plane, position_m: ArrayLike, size_m: float = 0.08) -> Tensor:
-    """Return pictures of the canvas that show one target at each position; `on_target_plane` takes it out
+    """Return images of the canvas that show one target at each position; `on_target_plane` takes it out
     again.
 
     Args:
-        target: Picture of the target, float [P, P].
-        canvas: Geometry of the pictures.
-        position_m: Centre (x, y) of the target in each picture, [N, 2], metres.
+        target: Image of the target, float [P, P].
+        canvas: Geometry of the images.
+        position_m: Centre (x, y) of the target in each image, [N, 2], metres.
         size_m: Side of the target plane, metres.
 
     Returns:
@@ -67,7 +67,7 @@ def on_canvas(target: Tensor, canvas: Plane, position_m: ArrayLike, size_m: floa
 COVERAGE = 0.9
 """Share of a target plane's pixels whose true level the intervals are to hold."""
 CONFIRMED = 0.7
-"""Share of the frames that pictures have to explain where the setup is known (see
+"""Share of the frames that images have to explain where the setup is known (see
 `ConfidenceReport.explained`).
 """
 LEVELS = 16
@@ -78,7 +78,7 @@ GROUPS = 3
 
 @dataclass(frozen=True)
 class ConfidenceReport:
-    """How much of one sequence's pictures to believe.
+    """How much of one sequence's images to believe.
 
     Args:
         agreement: Share of what tells this object from the average one that both halves of the sequence agree
@@ -87,7 +87,7 @@ class ConfidenceReport:
             nothing of any one object was measured.
         low: Lower end of each pixel's interval, float32 [N, H, W], 0..1.
         high: Upper end.
-        explained: Share of what the average object leaves unexplained in the frames that the pictures explain,
+        explained: Share of what the average object leaves unexplained in the frames that the images explain,
             where the setup is known; 0 or less is no better than the average object, and `CONFIRMED` is the
             least that is believed.
     """
@@ -100,7 +100,7 @@ class ConfidenceReport:
 
     @property
     def support(self) -> float:
-        """How much of this picture the measurement supports, 0..1: the smaller of agreement and explained."""
+        """How much of this image the measurement supports, 0..1: the smaller of agreement and explained."""
         known = self.agreement if self.explained is None else min(self.agreement, self.explained)
         return min(max(known, 0.0), 1.0) if self.measured else 0.0
 
@@ -125,9 +125,9 @@ class ConfidenceReport:
                 f"disagree, they share {100 * max(self.agreement, 0):.0f} % of what distinguishes objects, "
                 f"where sequences without any object share up to {100 * self.threshold:.0f} %"
             )
-        frames = f", and the pictures explain {explained:.0f} % of its frames"
+        frames = f", and the images explain {explained:.0f} % of its frames"
         if self.explained is None:
-            frames = "; whether the pictures explain its frames is not known, which takes the calibrated setup"
+            frames = "; whether the images explain its frames is not known, which takes the calibrated setup"
         agreed = f"{100 * min(max(self.agreement, 0), 1):.0f} %"
         return f"both halves of the sequence agree on {agreed} of what distinguishes this object{frames}"
 
@@ -156,12 +156,12 @@ class Confidence:
     high: Tensor
 
     def judge(self, pictures: Tensor, halves: Tensor, explained: float | None = None) -> ConfidenceReport:
-        """Return the confidence in the pictures of a sequence.
+        """Return the confidence in the images of a sequence.
 
         Args:
-            pictures: Pictures of all positions, float [N, H, W], 0..1.
+            pictures: Images of all positions, float [N, H, W], 0..1.
             halves: What the two halves of the sequence show of the target, [2, 32, 32]: see `halves_of`.
-            explained: How much of the frames the pictures explain, where the setup is known.
+            explained: How much of the frames the images explain, where the setup is known.
         """
         agreement, threshold = float(self.agreement(halves)), float(self.threshold)
         blank = ConfidenceReport(
@@ -227,7 +227,7 @@ def halves_of(network: Reconstructor, inputs: Tensor, position_m: NDArray, canva
         network: The network.
         inputs: What was measured, [N, C, H, W], in the order of time, N at least 2.
         position_m: The target's centre at each, (x, y) in metres, [N, 2].
-        canvas: Geometry of the pictures.
+        canvas: Geometry of the images.
 
     Raises:
         DataError: The motion is unknown, or there are fewer than two positions.
@@ -261,7 +261,7 @@ _MIXED = 60  # sequences without an object
 
 @torch.inference_mode()
 def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) -> Confidence:
-    """Learn the confidence in a network's pictures from sequences that it was not trained on.
+    """Learn the confidence in a network's images from sequences that it was not trained on.
 
     Agreement. With d what tells a target from the network's empty answer (`Confidence.telling`), the agreement
     is <d1, d2> / E|t|^2: d1 and d2 from the two halves of a sequence, t the same of true targets. For a network
@@ -277,7 +277,7 @@ def fit_confidence(network: Reconstructor, samples: NlosDataset, canvas: Plane) 
     Args:
         network: The network.
         samples: The sequences, each object's positions in the order of time.
-        canvas: Geometry of the pictures.
+        canvas: Geometry of the images.
 
     Raises:
         DataError: There are fewer than 8 sequences, or a motion is unknown.

@@ -292,7 +292,7 @@ class LinearEmbeddings(nn.Module):
 
 
 class FrameOperator:
-    """What a calibrated setup makes of a picture on the canvas: frame = A x + ambient, at the samples' size.
+    """What a calibrated setup makes of an image on the canvas: frame = A x + ambient, at the samples' size.
 
     Args:
         setup: The calibrated setup (`load_setup` of the calibrated folder).
@@ -319,7 +319,7 @@ class FrameOperator:
         self.sigma = float(self.variance(self.ambient.mean() + 0.1 * setup.gain).sqrt())
 
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return the frames [N, h, w] that the setup makes of pictures [N, H, W]."""
+        """Return the frames [N, h, w] that the setup makes of images [N, H, W]."""
         light = pictures[:, self.rows].flatten(1) @ self.matrix.T + self.ambient  # [N, h w]
         return light.unflatten(1, self.size)
 

@@ -245,8 +245,8 @@ class LinearEstimate:
         mean_in: Mean input, [D], D = C H W.
         basis: Main directions of the inputs, [D, R], orthogonal, their coefficients uncorrelated.
         powers: Power of each coefficient, summed over the samples, [R].
-        weights: From the coefficients to the picture, [R, H W].
-        mean_out: Mean picture, [H, W].
+        weights: From the coefficients to the image, [R, H W].
+        mean_out: Mean image, [H, W].
         regularization: Weight of the ridge that was chosen, in units of the mean power of a component.
     """
 
@@ -267,7 +267,7 @@ class LinearEstimate:
         return (self.powers + ridge) / (self.powers + strength * ridge)
 
     def __call__(self, inputs: Tensor) -> Tensor:
-        """Return pictures [N, H, W], 0..1, for inputs [N, C, H, W]."""
+        """Return images [N, H, W], 0..1, for inputs [N, C, H, W]."""
         code = (inputs.float().flatten(1) - self.mean_in) @ self.basis  # [N, R]
         return (self.mean_out + (code @ self.weights).unflatten(1, tuple(self.mean_out.shape))).clamp(0, 1)
 
@@ -288,7 +288,7 @@ def fit_linear(
 
     Args:
         inputs: What the network would see, [N, C, H, W].
-        truth: True pictures, [N, H, W], 0..1.
+        truth: True images, [N, H, W], 0..1.
         objects: Object of each sample, [N].
         rank: Most components of the input.
         seed: Seed of the random probe and of the folds.
@@ -299,7 +299,7 @@ def fit_linear(
     """
     names = np.unique(objects)
     if not len(inputs) == len(truth) == len(objects):
-        raise DataError(f"{len(inputs)} inputs, {len(truth)} pictures and {len(objects)} names; give as many")
+        raise DataError(f"{len(inputs)} inputs, {len(truth)} images and {len(objects)} names; give as many")
     if len(names) < 2:
         raise DataError(f"{len(names)} object(s); a ridge is chosen on objects left out: give at least two")
     order = np.random.default_rng(derive_seed(seed, "folds")).permutation(len(names))

@@ -2,7 +2,7 @@
 
 - An empty matplotlib figure, or one line that says what to install.
 - Films of a sequence: one column per stage of the light path, one image per position; NumPy and Pillow.
-- Events as pictures on any background: a space-time cloud, and slices through it; NumPy and Pillow.
+- Events as images on any background: a space-time cloud, and slices through it; NumPy and Pillow.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def save_figure(figure: Any, path: str | Path, *, dpi: int) -> Path:
     known = figure.canvas.get_supported_filetypes()
     kind = path.suffix.lower().removeprefix(".") or "png"
     if kind not in known:
-        raise DataError(f"{path} is no picture of a known format; end its name in .png, .svg or .pdf")
+        raise DataError(f"{path} is no image of a known format; end its name in .png, .svg or .pdf")
     figure.savefig(drawn, dpi=dpi, format=kind)
     write_atomically(path, drawn.getvalue())
     return path
@@ -92,26 +92,26 @@ class Column:
 def film(
     columns: Sequence[Column], width_px: int = 180, theme: Theme = "light", captions: Sequence[str] = ()
 ) -> list[NDArray[np.uint8]]:
-    """Return the pictures of a film, RGB [H, W, 3] each: columns side by side under their titles.
+    """Return the images of a film, RGB [H, W, 3] each: columns side by side under their titles.
 
     Args:
-        columns: What stands side by side, from left to right; as many pictures in each.
-        width_px: Width of a column, pixels; heights follow from the pictures' own sides.
+        columns: What stands side by side, from left to right; as many images in each.
+        width_px: Width of a column, pixels; heights follow from the images' own sides.
         theme: "dark" or "light" ground.
-        captions: A line below each picture of the film; none where empty.
+        captions: A line below each image of the film; none where empty.
 
     Raises:
         DataError: No columns, or columns of unequal length.
 
     Example:
         >>> hidden, wall = np.zeros((3, 12, 24), np.uint8), np.zeros((3, 10, 16, 4), np.uint8)
-        >>> pictures = film([Column("hidden", "24 cm wide", hidden), Column("wall", "16 px", wall)], 96)
-        >>> len(pictures), pictures[0].shape
+        >>> images = film([Column("hidden", "24 cm wide", hidden), Column("wall", "16 px", wall)], 96)
+        >>> len(images), images[0].shape
         (3, (109, 216, 3))
     """
     lengths = sorted({len(column.pictures) for column in columns} | ({len(captions)} if captions else set()))
     if len(lengths) != 1:
-        raise DataError(f"columns and captions have {lengths} pictures; give all of them the same number")
+        raise DataError(f"columns and captions have {lengths} images; give all of them the same number")
     rows = [round(width_px * c.pictures.shape[1] / c.pictures.shape[2]) for c in columns]
     top, deepest = _TITLE_PX + 12, max(rows)
     line = _NOTE_PX + 10
@@ -135,7 +135,7 @@ def film(
 
 
 def _on_ground(picture: NDArray[np.uint8], theme: Theme) -> Image.Image:
-    """Return a picture as RGB; where it is transparent the ground shows."""
+    """Return an image as RGB; where it is transparent the ground shows."""
     if picture.ndim == 2:
         return Image.fromarray(picture).convert("RGB")
     ground = Image.new("RGBA", picture.shape[1::-1], _GROUND[theme])
@@ -156,8 +156,8 @@ class CloudSize:
     """How large a cloud is drawn, pixels.
 
     Args:
-        width: Columns of the picture.
-        height: Rows of the picture.
+        width: Columns of the image.
+        height: Rows of the image.
         most: Events that are drawn, evenly taken from all.
 
     Raises:
@@ -180,7 +180,7 @@ class CloudSize:
         )
 
 
-def cloud_pictures(
+def cloud_images(
     events: Events, edges_us: NDArray[np.int64], size: CloudSize | None = None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the events as points in time, x and y, once for each position: what was, what is, what comes.
@@ -191,14 +191,14 @@ def cloud_pictures(
     Args:
         events: The events.
         edges_us: N + 1 ascending instants, microseconds; position k has the events in (edge k, edge k + 1].
-        size: Size of the pictures.
+        size: Size of the images.
 
     Returns:
         Numbers of colours, uint8 [N, H, W], and the colours, uint8 [8, 4], RGBA; 0 is transparent.
 
     Example:
         >>> events = Events([5, 15], [0, 3], [1, 1], [True, False], width=4, height=2)
-        >>> pictures, colours = cloud_pictures(events, np.array([0, 10, 20]))
+        >>> images, colours = cloud_images(events, np.array([0, 10, 20]))
         >>> pictures.shape, colours.shape, colours[0].tolist()
         ((2, 264, 480), (8, 4), [0, 0, 0, 0])
     """
@@ -237,8 +237,8 @@ def cloud_pictures(
     return pictures, np.array(colours, np.uint8)
 
 
-def signed_pictures(maps: NDArray, top: float | None = None, faintest: float = _FAINTEST) -> NDArray[np.uint8]:
-    """Return maps of ON and OFF as RGBA pictures, transparent where there is nothing.
+def signed_images(maps: NDArray, top: float | None = None, faintest: float = _FAINTEST) -> NDArray[np.uint8]:
+    """Return maps of ON and OFF as RGBA images, transparent where there is nothing.
 
     Args:
         maps: [..., 2, H, W], ON first, 0 or more.
@@ -249,7 +249,7 @@ def signed_pictures(maps: NDArray, top: float | None = None, faintest: float = _
         uint8 [..., H, W, 4].
 
     Example:
-        >>> signed_pictures(np.array([[[1.0, 0.0]], [[0.0, 0.0]]])).tolist()
+        >>> signed_images(np.array([[[1.0, 0.0]], [[0.0, 0.0]]])).tolist()
         [[[226, 120, 0, 255], [0, 0, 0, 0]]]
     """
     maps = np.asarray(maps, np.float32)
@@ -314,13 +314,13 @@ def smaller(events: Events, side_px: int) -> Events:
     return Events(events.t_us, x, y, events.p, width, height)
 
 
-def slice_pictures(events: Events, edges_us: NDArray[np.int64]) -> NDArray[np.uint8]:
+def slice_images(events: Events, edges_us: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Return the events of each position where they happened, RGBA, uint8 [N, H, W, 4]."""
-    return signed_pictures(event_histogram(events, edges_us))
+    return signed_images(event_histogram(events, edges_us))
 
 
 def _dot(picture: NDArray[np.uint8], row: NDArray, column: NDArray, colour: NDArray[np.uint8]) -> None:
-    """Paint dots two pixels wide; those beyond the picture are cut."""
+    """Paint dots two pixels wide; those beyond the image are cut."""
     for side in (0, 1):
         r, c = np.clip(row, 0, picture.shape[0] - 1), np.clip(column + side, 0, picture.shape[1] - 1)
         picture[r, c] = colour

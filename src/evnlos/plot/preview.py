@@ -1,4 +1,4 @@
-"""Pictures of an event stream, window by window, in memory that does not grow with it; Pillow alone."""
+"""Images of an event stream, window by window, in memory that does not grow with it; Pillow alone."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PreviewOptions:
         frames: Number of windows, spread evenly over the recording, 1 to 500.
         window_ms: Length of a window, milliseconds; None = as long as it takes to show something, at most up to
             the next window.
-        side_px: About the longest side of a picture, pixels: larger sensors are added up, smaller magnified.
+        side_px: About the longest side of an image, pixels: larger sensors are added up, smaller magnified.
 
     Raises:
         ConfigError: A value outside its range.
@@ -66,10 +66,10 @@ class PreviewOptions:
             raise ConfigError(f"side_px is {self.side_px}; give 64 to 2048 pixels")
 
 
-def preview_pictures(
+def preview_images(
     pieces: Iterable[Events], summary: Summary, look: PreviewOptions | None = None
 ) -> list[NDArray[np.uint8]]:
-    """Return pictures [H, W, 3] of a recording with a line of text below: time, events, length of the window.
+    """Return images [H, W, 3] of a recording with a line of text below: time, events, length of the window.
 
     Args:
         pieces: The events in the order of time, as `iter_events` yields them.
@@ -79,8 +79,8 @@ def preview_pictures(
     Example:
         >>> from evnlos.events.recording import summarise
         >>> events = Events([0, 900], [0, 3], [1, 1], [1, 0], width=4, height=2)
-        >>> pictures = preview_pictures([events], summarise([events]), PreviewOptions(frames=2))
-        >>> len(pictures), pictures[0].shape, pictures[0][-30, 0].tolist()
+        >>> images = preview_images([events], summarise([events]), PreviewOptions(frames=2))
+        >>> len(images), images[0].shape, images[0][-30, 0].tolist()
         (2, (266, 480, 3), [226, 120, 0])
     """
     look = look or PreviewOptions()
@@ -221,7 +221,7 @@ def _full_scale(maps: Iterable[NDArray[np.uint8]]) -> float:
 
 
 def _coloured(strength: NDArray[np.float64], background: Background) -> NDArray[np.uint8]:
-    """Return strengths from 0 to 1 [3, H, W] as a picture [H, W, 3]."""
+    """Return strengths from 0 to 1 [3, H, W] as an image [H, W, 3]."""
     ground, ink, _ = _GROUNDS[background]
     share = strength / np.maximum(strength.sum(axis=0), 1e-9)
     colour = np.tensordot(share, np.array([ON_RGB, OFF_RGB, ink], np.float64), axes=(0, 0))  # [H, W, 3]

@@ -1,12 +1,12 @@
 """Figures of results, one for each command.
 
-- The check picture of a calibration: held-out captures beside the fit.
+- The check image of a calibration: held-out captures beside the fit.
 - Reconstructions of a hidden screen side by side; needs matplotlib.
-- The check picture of an imported scan; needs matplotlib.
+- The check image of an imported scan; needs matplotlib.
 - The path of a hidden object and its speed; needs matplotlib.
 - Can the confidence be trusted? What is left when the least supported sequences go, and support against skill.
 - A fitted event pixel: what was recorded beside what its model makes.
-- What a setup can show, drawn: singular values, Picard plot, modes, and the best linear picture.
+- What a setup can show, drawn: singular values, Picard plot, modes, and the best linear image.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def draw_calibration(fit: SetupFit, path: str | Path) -> None:
             axis.imshow(picture, cmap=colours, vmin=low, vmax=high)
             axis.set_title(f"{example.name}: {title}" if title == "frame" else title, fontsize=8)
     figure.supxlabel("differences and events: light orange above 0, grey at 0, dark blue below", fontsize=8)
-    # Noise hardly compresses: fewer colours keep the picture small.
+    # Noise hardly compresses: fewer colours keep the image small.
     drawn = BytesIO()
     figure.savefig(drawn, dpi=60, format="png")
     with open_image(drawn) as picture:
@@ -107,12 +107,12 @@ def draw_pixel_fit(fit: KnownLightFit, path: str | Path) -> None:
 
 
 def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]]) -> Path:
-    """Draw pictures [channels, h, w] in a row under their titles.
+    """Draw images [channels, h, w] in a row under their titles.
 
     Each is drawn from 0 to its own 99.5th percentile: how bright the screen was is not known.
 
     Args:
-        path: The picture, PNG or SVG.
+        path: The image, PNG or SVG.
         panels: Titles and images, one or three channels.
 
     Returns:
@@ -123,13 +123,13 @@ def draw_inversion(path: str | Path, panels: Sequence[tuple[str, torch.Tensor]])
     """
     figure = new_figure((3.1 * len(panels), 3.0))
     for axes, (title, image) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        axes.imshow(as_picture(image), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes.imshow(as_image(image), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
     return save_figure(figure, path, dpi=100)
 
 
-def as_picture(image: torch.Tensor) -> NDArray[np.float64]:
+def as_image(image: torch.Tensor) -> NDArray[np.float64]:
     """Return an image [channels, h, w] as [h, w] or [h, w, 3] in 0..1, 1 its 99.5th percentile."""
     picture = image.detach().double().clamp(min=0).numpy()
     picture = np.clip(picture / max(float(np.quantile(picture, 0.995)), 1e-12), 0, 1)
@@ -140,7 +140,7 @@ def draw_scan(path: str | Path, measurement: Measurement, raw: torch.Tensor | No
     """Draw four columns of the matrix, the light of all cells, the noise, and the singular values.
 
     Args:
-        path: The picture, PNG or SVG.
+        path: The image, PNG or SVG.
         measurement: What was measured.
         raw: The matrix before denoising, [H W, n], for its singular values beside the others.
 
@@ -200,7 +200,7 @@ def draw_track(
 
     Args:
         track: The track.
-        path: The picture, PNG or SVG.
+        path: The image, PNG or SVG.
         truth: The true position (x, y) at the track's instants, [T, 2], in its unit, where it is known.
         title: Heading of the figure.
 
@@ -244,7 +244,7 @@ def draw_track(
     speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, _HEADROOM * top or None))
     if track.distance is None:
         size.errorbar(track.frame_time_s, track.size, 2 * track.size_sigma, fmt=".", color="C3")
-        size.set(xlabel="time, s", ylabel="size over its mean", title="size of the picture")
+        size.set(xlabel="time, s", ylabel="size over its mean", title="size of the image")
     else:
         away = track.distance
         middle, band = scale * away.distance_m, 2 * scale * away.distance_sigma
@@ -262,7 +262,7 @@ def draw_confidence(found: Mapping[str, Sequence[ConfidenceCheck]], path: str | 
 
     Args:
         found: The sequences by the name of their set.
-        path: The picture, PNG or SVG.
+        path: The image, PNG or SVG.
 
     Returns:
         The path.
@@ -307,11 +307,11 @@ _FLOOR = 1e-7
 
 
 def draw_identification(found: Identification, path: str | Path) -> Path:
-    """Draw singular values, the Picard plot of a typical target, the first modes, truth and linear picture.
+    """Draw singular values, the Picard plot of a typical target, the first modes, truth and linear image.
 
     Args:
         found: What `identify` returned.
-        path: The picture, PNG or SVG.
+        path: The image, PNG or SVG.
 
     Returns:
         The path.
@@ -351,7 +351,7 @@ def draw_setups(found: Sequence[Identification], path: str | Path) -> Path:
 
     Args:
         found: The setups.
-        path: The picture, PNG or SVG.
+        path: The image, PNG or SVG.
 
     Raises:
         MissingDependencyError: Matplotlib is not installed.

@@ -27,7 +27,7 @@ from evnlos.setups import Setup
 from evnlos.types import Events, Plane
 
 if TYPE_CHECKING:
-    from evnlos.inverse import CornerPicture, FloorSector
+    from evnlos.inverse import CornerImage, FloorSector
     from evnlos.tracking import BearingTracks
 
 _WIDTH, _HEIGHT, _MARGIN = 620, 400, 46
@@ -39,7 +39,7 @@ _STEPS_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Drawing:
-    """An SVG drawing; a notebook shows it as a picture.
+    """An SVG drawing; a notebook shows it as an image.
 
     Args:
         svg: The drawing.
@@ -195,7 +195,7 @@ def _text(x: float, y: float, words: str, anchor: str = "middle") -> str:
 CURVES = (0.2, 0.4, 0.6, 0.8, 0.9)
 """Mean free paths of the curves, in units of t."""
 PICTURES = (0.4, 0.8, 1.2, 1.6)
-"""Mean free paths of the pictures, at t = 2."""
+"""Mean free paths of the images, at t = 2."""
 
 
 def cosine_law(rho: NDArray, height: float, power: int = 3) -> NDArray:
@@ -232,7 +232,7 @@ def draw_kernel(path: str | Path, letter: str = "R") -> Path:
     """Draw the kernel's curves and a letter behind each of several walls; needs matplotlib.
 
     Args:
-        path: The picture, PNG or SVG.
+        path: The image, PNG or SVG.
         letter: What is hidden.
 
     Returns:
@@ -285,7 +285,7 @@ def draw_time_stamps(
     """Draw column against time of the events of some rows, one panel a stream; needs matplotlib.
 
     Args:
-        path: The picture, PNG or SVG.
+        path: The image, PNG or SVG.
         streams: Events of the same scene by title.
         times_s: Times of the frames that they were made from, [T], seconds: thin lines.
         rows: First row, and the row after the last.
@@ -321,7 +321,7 @@ _TRACKS = ("#d95f02", "#1b9e77", "#7570b3", "#e7298a")  # apart in hue, and draw
 
 def draw_corner(
     path: str | Path,
-    picture: CornerPicture,
+    picture: CornerImage,
     found: BearingTracks,
     floor: NDArray,
     sector: FloorSector,
@@ -331,7 +331,7 @@ def draw_corner(
     """Draw what a corner shows: the floor that was used, the hidden side over time, its certainty, the tracks.
 
     Args:
-        path: The picture, PNG, SVG or PDF.
+        path: The image, PNG, SVG or PDF.
         picture: The hidden side over bearing and time.
         found: Who moves there.
         floor: A frame of the video, [H, W], any unit of light.

@@ -1,4 +1,4 @@
-"""Results for people: one HTML page with its numbers as CSV, and reconstructions as pictures."""
+"""Results for people: one HTML page with its numbers as CSV, and reconstructions as images."""
 
 from evnlos.report.page import write_report
 from evnlos.report.pictures import reconstruct_capture, result_sheet

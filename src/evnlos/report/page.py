@@ -49,7 +49,7 @@ GLOSSARY = {
     ),
     "e2e": ("E2E", "end to end: trained on the real captures alone, from random weights."),
     "simulation": ("simulation only", "trained on simulation, and never shown a real capture."),
-    "frame": ("frame", "the network sees pictures of the wall, as an ordinary camera takes them."),
+    "frame": ("frame", "the network sees images of the wall, as an ordinary camera takes them."),
     "event": (
         "event",
         "the network sees what an event camera sends: each of its pixels reports when its light has grown or "
@@ -65,7 +65,7 @@ GLOSSARY = {
     "psnr_db": (
         "PSNR",
         "peak signal-to-noise ratio, in dB: how small the mean squared error is beside full white. 10 dB more "
-        "are a tenth of the error. Mostly black pictures score high even where nothing is seen.",
+        "are a tenth of the error. Mostly black images score high even where nothing is seen.",
     ),
     "psnr_box_db": (
         "PSNR in the box",
@@ -89,7 +89,7 @@ GLOSSARY = {
     ),
     "lpips": (
         "LPIPS",
-        "how far apart a network for photographs finds the two pictures. Lower is better; 0 is the same.",
+        "how far apart a network for photographs finds the two images. Lower is better; 0 is the same.",
     ),
 }
 
@@ -204,13 +204,13 @@ def _head(dataset: Dataset, results: list[RunResult], notes: list[str], split: s
         if results[0].evaluation.scores.lpips is not None
         else " LPIPS: not available (no VGG trunk was given)."
     )
-    seen = f"{len(first.images)} pictures of {len(first.characters())} objects ({html.escape(objects)})"
+    seen = f"{len(first.images)} images of {len(first.characters())} objects ({html.escape(objects)})"
     return (
         "<h1>Around the corner: reconstructions of hidden moving objects</h1>"
         f"<p class=dim>evnlos {__version__} · {seen}, split “{html.escape(split)}”</p>{lines}"
         f"<p>Scored on a canvas of {canvas} at {sampling.pitch_m * 1e3:g} mm a pixel; {psnr} is the mean over "
-        "the pictures of each picture's PSNR with peak 1. The first columns are what one scores without "
-        "looking: an all-black picture, and the mean of the training pictures, then what pure memory scores. A "
+        "the images of each image's PSNR with peak 1. The first columns are what one scores without "
+        "looking: an all-black image, and the mean of the training images, then what pure memory scores. A "
         f"method that does not exceed them has learned nothing.{no_lpips}</p>"
         f"<p><b>{words.link('e2e')}</b>: trained on the captures alone. <b>{words.link('epnp')}</b>: "
         "pre-trained on simulation, then fine-tuned on the captures. <span class=best>Best</span> and "
@@ -244,7 +244,7 @@ def _table(results: list[RunResult], metric: str, title: str, unit: str, decimal
 
 
 def _checks(results: list[RunResult]) -> str:
-    """Show what stands beside the metrics: can the pictures be read, and are they more than memory?"""
+    """Show what stands beside the metrics: can the images be read, and are they more than memory?"""
     rows = []
     for name, meaning in CHECKS.items():
         values = [r.evaluation.checks.get(name) for r in results]
@@ -280,7 +280,7 @@ def _pictures(dataset: Dataset, results: list[RunResult]) -> str:
         ]
     grid = f"grid-template-columns:4.5rem repeat({len(heads) - 1},minmax(56px,100px))"
     return (
-        "<h2>Pictures</h2><p class=dim>The middle position of each object. Wall frame stretched in contrast; "
+        "<h2>Images</h2><p class=dim>The middle position of each object. Wall frame stretched in contrast; "
         f"events as time surface ({WORDS}); reconstructions and truth from 0 to 1.</p>"
         f"<div class=tiles style='{grid}'>{''.join(f'<div>{c}</div>' for c in cells)}</div>"
     )
@@ -303,7 +303,7 @@ def _curves(results: list[RunResult]) -> str:
 
 
 def _optics(dataset: Dataset, results: list[RunResult]) -> str:
-    """Show what the optics of each simulated dataset does to the picture."""
+    """Show what the optics of each simulated dataset does to the image."""
     found = {dataset.folder.resolve().name: dataset.optics}
     for step in (step for r in results for step in r.history):
         found[step["data"]["name"]] = step["data"].get("optics", {})

@@ -1,8 +1,8 @@
-"""Arrays as pictures and curves, and the reconstructions of a capture as files.
+"""Arrays as images and curves, and the reconstructions of a capture as files.
 
 - Curves as inline SVG: small, printable, with no requests.
-- Arrays as pictures: grey and signed maps, film strips, animations; Pillow alone.
-- The reconstructions of one capture as files: a picture per position, a film strip, an animation.
+- Arrays as images: grey and signed maps, film strips, animations; Pillow alone.
+- The reconstructions of one capture as files: an image per position, a film strip, an animation.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def polarity(surface: ArrayLike) -> NDArray[np.uint8]:
 
 
 def strip(pictures: Sequence[NDArray[np.uint8]], columns: int = 8, gap: int = 2) -> NDArray[np.uint8]:
-    """Return pictures [H, W] or [H, W, 3] of one size side by side, `columns` a row, as one picture."""
+    """Return images [H, W] or [H, W, 3] of one size side by side, `columns` a row, as one image."""
     rgb = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=-1) for p in pictures]
     height, width = rgb[0].shape[:2]
     columns = min(columns, len(rgb))
@@ -127,19 +127,19 @@ def strip(pictures: Sequence[NDArray[np.uint8]], columns: int = 8, gap: int = 2)
 
 
 def png(picture: NDArray[np.uint8], zoom: int = 1) -> bytes:
-    """Return a picture as PNG bytes, each pixel `zoom` pixels wide."""
+    """Return an image as PNG bytes, each pixel `zoom` pixels wide."""
     return _encoded([picture], "PNG", zoom)
 
 
 def save_png(path: str | Path, picture: NDArray[np.uint8], zoom: int = 1) -> None:
-    """Write a picture as a PNG file, atomically."""
+    """Write an image as a PNG file, atomically."""
     write_atomically(path, png(picture, zoom))
 
 
 def save_animation(
     path: str | Path, pictures: Sequence[NDArray[np.uint8]], rate_hz: float, zoom: int = 1
 ) -> None:
-    """Write pictures as an animation that repeats, at most 50 pictures per second, atomically.
+    """Write images as an animation that repeats, at most 50 images per second, atomically.
 
     A file that ends in .webp is a WebP, a few times smaller and not exact; any other a GIF.
     """
@@ -149,7 +149,7 @@ def save_animation(
 def animation(
     pictures: Sequence[NDArray[np.uint8]], rate_hz: float, zoom: int = 1, webp: bool = False
 ) -> bytes:
-    """Return pictures as the bytes of an animated GIF or WebP that repeats."""
+    """Return images as the bytes of an animated GIF or WebP that repeats."""
     pause_ms = max(round(1000 / rate_hz), 20)
     if webp:
         return _encoded(pictures, "WEBP", zoom, duration=pause_ms, loop=0, quality=70, method=4)
@@ -187,7 +187,7 @@ def reconstruct_capture(
     track: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Reconstruct all positions of a capture and write them as pictures.
+    """Reconstruct all positions of a capture and write them as images.
 
     Writes `position_00.png` and on, `strip.png`, `animation.gif` (frame, surface, image, truth if known) and
     `reconstruction.npy` (float32 [N, H, W], 0..1). Where the weights hold a confidence and the motion is known,
@@ -199,22 +199,22 @@ def reconstruct_capture(
         weights: A weights file, a run's folder or a name of `published`; None: the published weights for frames
             (for events where there are no frames) of the setup whose distance is nearest, of whole sequences
             where the motion is known or found.
-        out: The folder for the pictures, new or empty; it is there with all of them, or not at all.
-        zoom: Size of a pixel in the pictures.
+        out: The folder for the images, new or empty; it is there with all of them, or not at all.
+        zoom: Size of a pixel in the images.
         pattern: Fixed pattern of the frame camera, to be taken from the frames.
-        setup: The calibrated setup; the pictures are then moved to where the wall agrees with the frames, if
+        setup: The calibrated setup; the images are then moved to where the wall agrees with the frames, if
             these are as bright as it makes them. Without one, the setup of the weights explains them, if known.
         track: Find the motion in the recording with the setup, also where it is stated; the truth, where it is
             known, stays where the capture states it.
         progress: Called at each of three stages, and at the end.
 
     Returns:
-        Capture, weights, modality, number of positions, and whether all of them show one picture, which was
+        Capture, weights, modality, number of positions, and whether all of them show one image, which was
         made from the whole recording and is drawn where the motion was stated or found; where the truth is
         known, the mean scores; where it can be told, the confidence: support, threshold, measured, verdict and,
         where a setup is known, explained; else no_confidence, which says why. Where the frames were brought to
         the light that the weights know, brought_from. With a setup also `light`, the capture's brightness in
-        that of the setup, and whether the pictures were moved; with `track` the warnings of the track.
+        that of the setup, and whether the images were moved; with `track` the warnings of the track.
 
     Raises:
         ConfigError: `track` without a setup.
@@ -286,17 +286,17 @@ def reconstruct_capture(
 
 
 def _in_words(found: dict[str, Any], verdict: Verdict, tracked: bool) -> list[str]:
-    """Return in sentences what the pictures of `reconstruct_capture` are and what of them to believe."""
+    """Return in sentences what the images of `reconstruct_capture` are and what of them to believe."""
     lines = []
     if found["one_picture"]:
         lines.append(
-            f"all positions show one picture, made from the whole recording and drawn where the motion was "
+            f"all positions show one image, made from the whole recording and drawn where the motion was "
             f"{'found' if tracked else 'stated'}"
         )
     if not found.get("moved_by_the_setup", True):
         lines.append(
             f"the light is {found['light']:.2f} x that of the setup: its gain is not this capture's, the "
-            "pictures stay as the network draws them; calibrate at this exposure, on known targets"
+            "images stay as the network draws them; calibrate at this exposure, on known targets"
         )
     if "brought_from" in found:
         lines.append(f"frames of {found['brought_from']:.2g} x the light that the weights know, brought to it")
@@ -316,7 +316,7 @@ def result_sheet(
     confidence: ConfidenceReport | None,
     lines: Sequence[str],
 ) -> NDArray[np.uint8]:
-    """Return one labelled picture, uint8 [H', W', 3], of a reconstruction at the position in the middle.
+    """Return one labelled image, uint8 [H', W', 3], of a reconstruction at the position in the middle.
 
     Args:
         title: First line.

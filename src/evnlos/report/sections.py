@@ -2,8 +2,8 @@
 
 - The setup of a report: its drawing to scale, and what it can show at all.
 - The figure that a report leads with: what pre-training gains, beside what one scores without looking.
-- How far to believe the pictures: what each run said of its own sequences, beside what was true.
-- Pictures of a report over positions: a strip of each object, animations, and the worst on purpose.
+- How far to believe the images: what each run said of its own sequences, beside what was true.
+- Images of a report over positions: a strip of each object, animations, and the worst on purpose.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def setup_section(name: str, setup: Setup | None, travel_m: float = 0.16, target
 
 
 def limits_section(found: Identification | None) -> str:
-    """Return the section that says what any method can make of one picture; nothing without a setup."""
+    """Return the section that says what any method can make of one image; nothing without a setup."""
     if found is None:
         return ""
     at = found.at_camera
@@ -62,14 +62,14 @@ def limits_section(found: Identification | None) -> str:
     pictures = "".join(
         f"<figure><img class=large alt='{words}' src='{data_uri(png(grey(image.numpy())))}'>"
         f"<figcaption>{words}</figcaption></figure>"
-        for image, words in ((found.truth, "a typical target"), (at.picture, "best linear picture"))
+        for image, words in ((found.truth, "a typical target"), (at.picture, "best linear image"))
     )
     warned = "".join(f"<p>{html.escape(words)}</p>" for words in found.warnings)
     return (
         "<h2>What this setup can show at all</h2>"
-        f"<p><b>{html.escape(found.verdict)}</b></p>{warned}<p class=dim>One picture of the wall, the object "
+        f"<p><b>{html.escape(found.verdict)}</b></p>{warned}<p class=dim>One image of the wall, the object "
         "at a known place, the setup known exactly; patterns whose value lies above 0 stand above the noise. "
-        f"On the target plane itself: best linear picture {at.psnr_db:.1f} dB, mean target "
+        f"On the target plane itself: best linear image {at.psnr_db:.1f} dB, mean target "
         f"{found.mean_db:.1f} dB, "
         f"all-black {found.zero_db:.1f} dB. What a network draws beyond that it knows from its training.</p>"
         f"<div class=pair>{pictures}</div>{curves_svg(series, 'pattern', 'log10 of value over noise')}"
@@ -230,7 +230,7 @@ _RATE_HZ = 8.0
 
 
 def strips_section(results: list[RunResult]) -> str:
-    """Return strips: for each object truth and every run's picture at up to ten positions, evenly spread."""
+    """Return strips: for each object truth and every run's image at up to ten positions, evenly spread."""
     first = results[0].evaluation
     rows = []
     for name in first.characters()[:MOST_OBJECTS]:
@@ -249,7 +249,7 @@ def strips_section(results: list[RunResult]) -> str:
 
 
 def animations_section(dataset: Dataset, results: list[RunResult]) -> str:
-    """Return animations: wall frame, events, truth and the picture of the best run, for a few objects."""
+    """Return animations: wall frame, events, truth and the image of the best run, for a few objects."""
     best = max(results, key=lambda r: float(r.evaluation.scores.psnr_db.mean()))
     found = best.evaluation
     cells = []
@@ -262,21 +262,21 @@ def animations_section(dataset: Dataset, results: list[RunResult]) -> str:
             four = [picture[scored] for picture in four] + [grey(found.truth[at]), grey(found.images[at])]
             pictures.append(strip(four, 4))
         moving = data_uri(animation(pictures, _RATE_HZ, webp=True), "image/webp")
-        words = f"wall, events, truth and picture of {name}, moving"
+        words = f"wall, events, truth and image of {name}, moving"
         cells.append(
             f"<figure><img class=moving alt='{html.escape(words)}' src='{moving}'>"
             f"<figcaption>{html.escape(name)}</figcaption></figure>"
         )
     return (
         f"<h2>Moving</h2><p class=dim>Wall frame, events as time surface ({WORDS}), truth, and the "
-        f"picture of {html.escape(label(best))}, the run with the highest mean PSNR. Print shows the first "
+        f"image of {html.escape(label(best))}, the run with the highest mean PSNR. Print shows the first "
         "position.</p>"
         f"<div class=movies>{''.join(cells)}</div>"
     )
 
 
 def failures_section(results: list[RunResult]) -> str:
-    """Return the worst pictures of each run: those that gain least over the mean picture, or lose most."""
+    """Return the worst images of each run: those that gain least over the mean image, or lose most."""
     blocks = []
     for r in results:
         found = r.evaluation
@@ -289,18 +289,18 @@ def failures_section(results: list[RunResult]) -> str:
             pair = data_uri(png(strip([grey(found.truth[k]), grey(found.images[k])], 1)))
             words = f"{name}, position {position}: {found.scores.psnr_db[k]:.1f} dB ({gain[k]:+.1f})"
             cells.append(
-                f"<figure><img class=worst alt='truth above, picture below: {html.escape(words)}' src='{pair}'>"
+                f"<figure><img class=worst alt='truth above, image below: {html.escape(words)}' src='{pair}'>"
                 f"<figcaption>{html.escape(words)}</figcaption></figure>"
             )
         lost = float(np.mean(gain < 0))
         blocks.append(
-            f"<h3>{html.escape(label(r))}: {lost:.0%} of its pictures are worse than the mean picture</h3>"
+            f"<h3>{html.escape(label(r))}: {lost:.0%} of its images are worse than the mean image</h3>"
             f"<div class=movies>{''.join(cells)}</div>"
         )
     return (
-        "<h2>Where it fails</h2><p class=dim>The worst pictures of each run, by number, no more than two of an "
-        "object where there are enough: truth above, picture below, PSNR and in brackets the difference to the "
-        "mean training picture, dB.</p>" + "".join(blocks)
+        "<h2>Where it fails</h2><p class=dim>The worst images of each run, by number, no more than two of an "
+        "object where there are enough: truth above, image below, PSNR and in brackets the difference to the "
+        "mean training image, dB.</p>" + "".join(blocks)
     )
 
 

@@ -37,7 +37,7 @@ class RunResult:
         modality: Name of what it sees.
         sees_sequence: Whether it sees whole sequences.
         method: "simulation only" (pre-trained, no capture seen), "E2E" (captures alone) or "EPNP" (both).
-        evaluation: Pictures and scores on the split.
+        evaluation: Images and scores on the split.
         log: One record per epoch.
         history: The trainings behind the weights, oldest first.
         is_published: Whether the weights are pretrained ones of this name.
@@ -205,7 +205,7 @@ def columns_of(results: list[RunResult]) -> list[str]:
 
 
 def baselines_of(results: list[RunResult]) -> dict[str, Scores]:
-    """Return the baselines of the last run: its mean picture is that of captures, where any run saw some."""
+    """Return the baselines of the last run: its mean image is that of captures, where any run saw some."""
     return results[-1].evaluation.baselines
 
 

@@ -75,7 +75,7 @@ class Font:
 
     def load(self, size_px: float) -> ImageFont.FreeTypeFont:
         """Return the face ready to draw at `size_px` pixels an em."""
-        # The basic layout engine is in every build of Pillow: the same picture everywhere.
+        # The basic layout engine is in every build of Pillow: the same image everywhere.
         loaded = ImageFont.truetype(
             str(self.path), size_px, index=self.index, layout_engine=ImageFont.Layout.BASIC
         )
@@ -325,7 +325,7 @@ def render_glyph(char: str, font: Font, size_px: int = 256, fraction: float = 1.
 
 
 def fit_to_target_plane(picture: NDArray, size_px: int = 256, fraction: float = 1.0) -> NDArray[np.float32]:
-    """Cut a picture of a character to its ink, scale the ink as `render_glyph` does and centre it.
+    """Cut an image of a character to its ink, scale the ink as `render_glyph` does and centre it.
 
     Args:
         picture: Bright ink on dark ground, [h, w], 0..1.
@@ -336,17 +336,17 @@ def fit_to_target_plane(picture: NDArray, size_px: int = 256, fraction: float = 
         float32 [size_px, size_px], 0..1.
 
     Raises:
-        DataError: The picture is not [h, w] or holds no ink.
+        DataError: The image is not [h, w] or holds no ink.
     """
     check_size(size_px, fraction)
     image = np.asarray(picture, dtype=np.float32)
     if image.ndim != 2 or not np.isfinite(image).all():
-        raise DataError(f"a character's picture has shape {image.shape}; give finite values [h, w]")
+        raise DataError(f"a character's image has shape {image.shape}; give finite values [h, w]")
     rows, columns = np.flatnonzero((image > 0.5).any(1)), np.flatnonzero((image > 0.5).any(0))
     if not len(rows):
-        raise DataError("a character's picture holds no ink (nothing above 0.5); leave it out")
+        raise DataError("a character's image holds no ink (nothing above 0.5); leave it out")
     top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
-    # The square that becomes the target plane, in the picture's pixels; a margin of zeros lets it reach
+    # The square that becomes the target plane, in the image's pixels; a margin of zeros lets it reach
     # outside.
     side = max(bottom - top, right - left) / fraction
     margin = int(np.ceil(side)) + 2

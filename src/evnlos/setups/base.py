@@ -315,7 +315,7 @@ class Setup(Kinded, ABC):
             ConfigError: It was not measured.
         """
         raise ConfigError(
-            f"the setup is of kind {self.kind!r}; pictures need a measured one (evnlos scan), captures are "
+            f"the setup is of kind {self.kind!r}; images need a measured one (evnlos scan), captures are "
             "folders"
         )
 

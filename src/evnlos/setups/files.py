@@ -40,7 +40,7 @@ class About:
     noise_cells: bool = True
     """Whether cells have independent noise: not after denoising, nor for a point-spread function."""
     white_dn: int | None = None
-    """Digital number of white in the scan's pictures; none = the largest of their type."""
+    """Digital number of white in the scan's images; none = the largest of their type."""
     notes: dict[str, Any] = field(default_factory=dict)
     """Figures of the import: denoising, checks, date."""
 
@@ -138,7 +138,7 @@ class AboutWall:
     matte: float
     """Albedo of the matte part."""
     companion: Plane
-    """Cells of the picture of what shines beside the target and moves along, about the target's middle."""
+    """Cells of the image of what shines beside the target and moves along, about the target's middle."""
     corrected: Plane
     """Cells of the correction of the operator, in the coordinates of the target's motion."""
     notes: dict[str, Any] = field(default_factory=dict)
@@ -159,9 +159,9 @@ class FittedWall:
     Args:
         log_density: Table of the facets' slopes, float64 [K, K], see `SlopeTable`; white levels included.
         sensitivity: Sensitivity of the pixels (texture, vignetting), float32 [H, W].
-        ambient: Light without the target over its mean, float32 [h, w], a picture of any size.
+        ambient: Light without the target over its mean, float32 [h, w], an image of any size.
         companion: Brightness of what moves along, float32 [h, w]; the target's is 1.
-        left: Correction of the operator, float32 [R, h, w]: R pictures of the camera image, any size.
+        left: Correction of the operator, float32 [R, h, w]: R images of the camera image, any size.
         right: Their weights over the cells of `about.corrected`, float32 [R, h w].
         about: Geometry of the arrays, and notes.
 
@@ -191,7 +191,7 @@ class FittedWall:
         if self.sensitivity.ndim != 2 or self.ambient.ndim != 2 or not 5 <= nodes <= _LARGEST or nodes % 2 == 0:
             raise DataError(
                 f"sensitivity is {self.sensitivity.shape}, ambient {self.ambient.shape}, log_density "
-                f"{self.log_density.shape}; give two pictures and "
+                f"{self.log_density.shape}; give two images and "
                 "an odd number of nodes from 5"
             )
         for name in _ARRAYS:

@@ -291,7 +291,7 @@ class FittedSetup(Setup):
         return _magnification_px_m(self.pose(), shape)
 
     def _along(self, shape: tuple[int, int], device: torch.device) -> tuple[MatrixTransport, Target] | None:
-        """Return matrix and picture of what moves along; None where nothing shines beside the target."""
+        """Return matrix and image of what moves along; None where nothing shines beside the target."""
         picture = self.fitted().companion * self.companion
         if not picture.any():
             return None

@@ -30,7 +30,7 @@ _LEAST_SHARE = 0.1
 def temporal_noise(frames: NDArray) -> float:
     """Return the standard deviation of the noise that changes from frame to frame, in the frames' unit.
 
-    Median absolute value of second differences, in time and then over neighbours: a smooth picture that moves
+    Median absolute value of second differences, in time and then over neighbours: a smooth image that moves
     leaves next to nothing there.
 
     Args:

@@ -32,7 +32,7 @@ _BASIS = np.linalg.inv(np.vander(np.arange(-1.0, _NEAR - 1.0), increasing=True))
 class Depths:
     """Matrices from the target's plane at any distance, by Lagrange's cubics in its logarithm.
 
-    Nothing else of the setup moves. What is further away is smaller in the picture, more blurred, dimmer and
+    Nothing else of the setup moves. What is further away is smaller in the image, more blurred, dimmer and
     seen elsewhere: all four tell the distance.
 
     Args:
@@ -59,7 +59,7 @@ class Depths:
         return MatrixTransport(self._sum(weights, self._nodes[first : first + _NEAR]), self._strip, self._shape)
 
     def slope(self, log_distance: float, light: torch.Tensor) -> torch.Tensor:
-        """Return the derivative by the distance's logarithm, [H W], of the picture of shining cells, [h, w]."""
+        """Return the derivative by the distance's logarithm, [H W], of the image of shining cells, [h, w]."""
         first, along = _place(log_distance)
         powers = np.arange(1, _NEAR)
         weights = np.concatenate([[0.0], powers * np.power(along, powers - 1)]) @ _BASIS / _STEP
@@ -165,7 +165,7 @@ def fit_motion(
 
 
 def _middle(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far the middle of a picture's light is from the picture's, (x, y), pixels."""
+    """Return how far the middle of an image's light is from the image's, (x, y), pixels."""
     bright = np.where(image > 0.1 * image.max(), image, 0.0)
     return np.array(middle_of_light(bright)) - (np.array(image.shape[::-1]) - 1) / 2
 

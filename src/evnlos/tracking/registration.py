@@ -1,6 +1,6 @@
-"""Where the object's picture lies in each frame: the likeliest shift against a template made of them all.
+"""Where the object's image lies in each frame: the likeliest shift against a template made of them all.
 
-- How fast the picture of the object slides, from the events between its frames.
+- How fast the image of the object slides, from the events between its frames.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from evnlos.types import Events
 
 _EDGE = 0.02  # of the template's peak; weaker light is left to the background
 _LEAST_SIGNAL = 6.0  # standard deviations of the noise that the object's peak must have
-_LEAST_EXPLAINED = 0.5  # share of what changes between the frames that one shifted picture must explain
+_LEAST_EXPLAINED = 0.5  # share of what changes between the frames that one shifted image must explain
 _STEP = np.array([2.0, 2.0, 0.2, 0.2])  # largest step of (x, y, ln size, ln brightness), pixels and shares
 _FIT_STEPS = 2
 _ROUNDS = 8
@@ -27,13 +27,13 @@ _ROUNDS = 8
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The object's picture and its place in every frame.
+    """The object's image and its place in every frame.
 
     Args:
         place_px: Middle of the object's light (x, y), float64 [N, 2], pixels of these frames.
-        size: Size of the picture over the template's, [N].
+        size: Size of the image over the template's, [N].
         covariance: Of (x, y, log size, log brightness) of each frame, [N, 4, 4].
-        template: The picture with its middle in the array's middle, float64 [h, w].
+        template: The image with its middle in the array's middle, float64 [h, w].
         light: Brightness of each frame over the template's, [N].
         background: What rests, [H, W].
     """
@@ -57,7 +57,7 @@ def register(frames: NDArray, background: NDArray, noise: float) -> Registration
 
     T is the mean of the frames' light, each moved back to the middle; then each frame's (m, ln s, ln g) is
     fitted to T by Gauss-Newton (Lucas and Kanade 1981), and the background takes up what no frame's light
-    explains. Where the picture does not keep its shape, T is the mean shape and the misfit enters the
+    explains. Where the image does not keep its shape, T is the mean shape and the misfit enters the
     covariance.
 
     Args:
@@ -67,7 +67,7 @@ def register(frames: NDArray, background: NDArray, noise: float) -> Registration
 
     Raises:
         DataError: A frame shows no light that stands out from the noise, or its light does not shift as one
-            picture does.
+            image does.
     """
     light = torch.from_numpy(np.asarray(frames, np.float64) - background)  # [N, H, W]
     shape = (int(light.shape[1]), int(light.shape[2]))
@@ -84,7 +84,7 @@ def register(frames: NDArray, background: NDArray, noise: float) -> Registration
         for k in range(len(frames)):
             try:
                 values[k], covariance[k] = _fit(coefficients, light[k] - rest, values[k], noise)
-            except RuntimeError:  # a singular matrix: the picture is nowhere in the frame
+            except RuntimeError:  # a singular matrix: the image is nowhere in the frame
                 raise DataError(_unfollowed(f"no place fits frame {k}")) from None
             if not (np.isfinite(values[k]).all() and np.isfinite(covariance[k]).all()):
                 raise DataError(_unfollowed(f"no place fits frame {k}"))
@@ -105,7 +105,7 @@ def register(frames: NDArray, background: NDArray, noise: float) -> Registration
 
 
 def middle_of_light(light: NDArray) -> NDArray[np.float64]:
-    """Return the first moments (x, y) of pictures [..., H, W], pixels, [..., 2]."""
+    """Return the first moments (x, y) of images [..., H, W], pixels, [..., 2]."""
     total = light.sum(axis=(-2, -1))
     x = (light.sum(axis=-2) * np.arange(light.shape[-1])).sum(axis=-1) / total
     y = (light.sum(axis=-1) * np.arange(light.shape[-2])).sum(axis=-1) / total
@@ -142,11 +142,11 @@ def _check(place_px: NDArray[np.float64], light: torch.Tensor, drawn: torch.Tens
     Args:
         place_px: Places (x, y), [N, 2].
         light: Frames, [N, H, W].
-        drawn: The picture in each of them, [N, H, W].
+        drawn: The image in each of them, [N, H, W].
         noise: Standard deviation of a sample's noise.
 
     Raises:
-        DataError: A place lies outside the frames, or the picture's shifts explain little of what changes.
+        DataError: A place lies outside the frames, or the image's shifts explain little of what changes.
     """
     height, width = (int(side) for side in light.shape[1:])
     outside = np.flatnonzero(((place_px < -0.5) | (place_px > np.array([width, height]) - 0.5)).any(axis=1))
@@ -159,7 +159,7 @@ def _check(place_px: NDArray[np.float64], light: torch.Tensor, drawn: torch.Tens
     if share < _LEAST_EXPLAINED:
         raise DataError(
             _unfollowed(
-                f"one picture that shifts explains {100 * share:.0f} % of what changes between the frames, "
+                f"one image that shifts explains {100 * share:.0f} % of what changes between the frames, "
                 f"{100 * _LEAST_EXPLAINED:.0f} % is the least"
             )
         )
@@ -254,7 +254,7 @@ def _fit(
 def _newton(
     coefficients: torch.Tensor, light: torch.Tensor, values: NDArray[np.float64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.float64], torch.Tensor, torch.Tensor]:
-    """Return the Gauss-Newton step [4], the normal matrix [4, 4] and the picture drawn."""
+    """Return the Gauss-Newton step [4], the normal matrix [4, 4] and the image drawn."""
     picture, slopes = _draw(coefficients, values, shape)
     flat = slopes.flatten(1)  # [4, P]
     normal = flat @ flat.mT
@@ -269,7 +269,7 @@ _WINDOWS_AT_A_TIME = 64
 
 @dataclass(frozen=True, eq=False)
 class EventVelocity:
-    """Velocities of the picture.
+    """Velocities of the image.
 
     Args:
         time_s: Middle of each window, [M], seconds.
@@ -287,7 +287,7 @@ def event_velocity(
 ) -> EventVelocity | None:
     """Return the velocity in windows between the first and the last frame, None where events say nothing.
 
-    A sliding picture changes a pixel's log light L by -grad L . d for a small displacement d, and the pixel
+    A sliding image changes a pixel's log light L by -grad L . d for a small displacement d, and the pixel
     sends an ON event for each rise by its threshold, an OFF event for each fall. Thresholds and noise rates are
     not known: they are found as the two lines (rate of events over expected change) that fit the frames' own
     displacements. Then ON / a - OFF / b in each window is a linear function of d, solved by least squares with
@@ -329,7 +329,7 @@ def event_velocity(
     left = signed + np.einsum("maP,ma->mP", slopes, moved)
     spread = float(
         (np.square(left) * weight).sum() / np.count_nonzero(weight)
-    )  # above 1 where the picture is not what was thought
+    )  # above 1 where the image is not what was thought
     variance = np.diagonal(inverse, axis1=1, axis2=2) * max(spread, 1.0) / window_s**2
     return EventVelocity(middle, moved / window_s, variance)
 

@@ -1,6 +1,6 @@
 """Tracks: geometry from image to target, a smoother over positions and velocities, and its result.
 
-- From the picture's motion to the target's: where a camera sees light from a place behind the corner.
+- From the image's motion to the target's: where a camera sees light from a place behind the corner.
 - A Kalman smoother that fuses positions and velocities, and finds by itself how much the motion may change.
 - A track: where the hidden object was at any time of a recording, how fast it went, and how sure that is.
 """
@@ -20,7 +20,7 @@ from evnlos.types import Plane
 
 _REACH_M = (0.40, 0.28)  # region of the target's plane that the map is fitted on, (x, y)
 _CELL_M = 0.02
-_SEEN = 0.2  # of the brightest cell's light; darker cells lie partly outside the picture
+_SEEN = 0.2  # of the brightest cell's light; darker cells lie partly outside the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class PlaneMap:
 
     Args:
         coefficients: Of 1, u, v, u^2, u v, v^2 for x and y, [6, 2], metres; u, v in half widths.
-        shape: Size (H, W) of the picture, pixels.
+        shape: Size (H, W) of the image, pixels.
         error_m: Root mean square misfit of the map over the region, metres.
     """
 
@@ -55,11 +55,11 @@ class PlaneMap:
 
 
 def plane_map(setup: Setup, shape: tuple[int, int]) -> PlaneMap:
-    """Fit the map to the pictures of small cells all over the target's plane.
+    """Fit the map to the images of small cells all over the target's plane.
 
     Args:
         setup: The setup.
-        shape: Size (H, W) of the picture, pixels.
+        shape: Size (H, W) of the image, pixels.
 
     Raises:
         DataError: The middle of the light hardly moves with the cell: a matte wall shows no place that way.
@@ -72,7 +72,7 @@ def plane_map(setup: Setup, shape: tuple[int, int]) -> PlaneMap:
     used = (light > _SEEN * light.max()) & whole
     if used.sum() < 12:
         raise DataError(
-            f"{int(used.sum())} of {len(used)} places of the target's plane make a bounded picture, 12 are the "
+            f"{int(used.sum())} of {len(used)} places of the target's plane make a bounded image, 12 are the "
             "least: this wall does not show where its light comes from; track without the setup"
         )
     place = np.stack(np.meshgrid(cells.x_m, cells.y_m), axis=-1).reshape(-1, 2)[used]
@@ -224,7 +224,7 @@ class Track:
     """Position and velocity over time, from a smoother, with their standard deviations.
 
     The position is that of the middle of the object's light; which point of the target that is, only the
-    object's shape could tell. In pixels the origin is its mean over the frames, as a picture has no other.
+    object's shape could tell. In pixels the origin is its mean over the frames, as an image has no other.
 
     Args:
         time_s: Instants, float64 [T], seconds, ascending.
@@ -236,7 +236,7 @@ class Track:
         frame_time_s: Instants of the frames, [N], seconds.
         frame_position: What the frames alone say, [N, 2], in `unit`.
         frame_sigma: Its standard deviation, [N, 2].
-        size: Size of the object's picture in each frame over its mean size, [N]; it falls as the object moves
+        size: Size of the object's image in each frame over its mean size, [N]; it falls as the object moves
             away from the wall.
         size_sigma: Standard deviation of the size, [N].
         event_windows: Number of velocities that came from events.

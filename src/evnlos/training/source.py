@@ -92,7 +92,7 @@ class Batch(NamedTuple):
     seen: Tensor
     """Input, float32 [b, C, H, W]."""
     truth: Tensor
-    """True pictures, float32 [b, 1, H, W]."""
+    """True images, float32 [b, 1, H, W]."""
     share: float
     """The part of the batch that these are, 0..1."""
     weight: float
@@ -113,11 +113,11 @@ class BatchSource(Protocol):
         ...
 
     def mean_image(self) -> Tensor:
-        """Return the mean of the true pictures, float32 [H, W]."""
+        """Return the mean of the true images, float32 [H, W]."""
         ...
 
     def subset(self, count: int) -> Samples:
-        """Return about `count` samples at most, the same in every process: inputs [n, C, H, W], pictures
+        """Return about `count` samples at most, the same in every process: inputs [n, C, H, W], images
         [n, H, W] and the object of each.
         """
         ...
@@ -188,7 +188,7 @@ class DiskSource:
         )
 
     def mean_image(self) -> Tensor:
-        """Return the mean of the true pictures, float32 [H, W]."""
+        """Return the mean of the true images, float32 [H, W]."""
         if self._reads:
             every = torch.arange(len(self.samples)).split(self._batch_size)
             total = sum(truth[:, 0].sum(dim=0, dtype=torch.float64) for _, truth in self._taken(list(every)))
@@ -278,7 +278,7 @@ class SimulatedSource:
             held = [(inputs[shuffled[full:]], truth[shuffled[full:]])]
 
     def mean_image(self) -> Tensor:
-        """Return the mean of the true pictures of the first epoch, float32 [H, W]; it takes no simulation."""
+        """Return the mean of the true images of the first epoch, float32 [H, W]; it takes no simulation."""
         total = sum(self._dataset.truth(name).mean(axis=0, dtype=np.float64) for name in self._names)
         return torch.from_numpy(total / len(self._names)).float()
 
@@ -300,7 +300,7 @@ def half_mirrored(seen: Tensor, truth: Tensor, seed: int) -> tuple[Tensor, Tenso
 
     Args:
         seen: Input, [b, C, H, W].
-        truth: True pictures, [b, 1, h, w].
+        truth: True images, [b, 1, h, w].
         seed: Seed of the draw.
     """
     draw = torch.rand(len(seen), generator=torch.Generator().manual_seed(seed)) < 0.5

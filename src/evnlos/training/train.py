@@ -366,7 +366,7 @@ def validate(
     device: torch.device,
     half: bool,
 ) -> dict[str, Any]:
-    """Return psnr_db, zero_db (an all-black picture's) and collapsed of the samples that are held out."""
+    """Return psnr_db, zero_db (an all-black image's) and collapsed of the samples that are held out."""
     if isinstance(held_out, NlosDataset):
         inputs, truth = held_out.inputs, held_out.truth.float().cpu()
         places, names = held_out.position_m, held_out.names
@@ -385,7 +385,7 @@ def validate(
 def confidence_of(
     network: Reconstructor, held_out: HeldOut | None, dataset: Dataset, start: Weights | None
 ) -> Confidence | None:
-    """Return the confidence in the pictures: of the validation, or of the weights that this began with."""
+    """Return the confidence in the images: of the validation, or of the weights that this began with."""
     if isinstance(held_out, NlosDataset):
         is_known = not np.isnan(held_out.position_m).any()
         if is_known and len(dataset.objects("validation")) >= FEWEST:

@@ -1,6 +1,6 @@
-"""From a phone's film of a show to the pictures of a scan, and to captures of the characters that moved.
+"""From a phone's film of a show to the images of a scan, and to captures of the characters that moved.
 
-The film is read once, at a small size. Its flashes tell where in the show each frame lies, pictures that
+The film is read once, at a small size. Its flashes tell where in the show each frame lies, images that
 complete one another tell the tone curve, and what the patterns say twice tells exposure and shake.
 """
 
@@ -53,12 +53,12 @@ _CALM_S, _JITTER = 0.6, 1e-3  # seconds over which exposure and place stay alike
 
 @dataclass(frozen=True)
 class FilmReading:
-    """How a film becomes the pictures of a scan."""
+    """How a film becomes the images of a scan."""
 
     tone: Tone = "srgb"
     """Tone curve of the film's numbers; what it leaves is found from the show's own check."""
     fit_tone: bool = True
-    """Correct what is left of the tone curve, by pictures whose light adds up."""
+    """Correct what is left of the tone curve, by images whose light adds up."""
     steady: bool = True
     """Take out changes of the exposure and movement of the phone."""
     fps: float | None = None
@@ -96,10 +96,10 @@ class FilmResult:
 
     Args:
         clock: Where the show lies.
-        shape: Size (H, W) of the pictures, pixels.
+        shape: Size (H, W) of the images, pixels.
         tone: Exponent g and steepness a of the correction l^g exp(a (l - 1)) of light l; (1, 0) is none.
         misfit: By how much the light of halves differs from that of the whole before the correction, and after.
-        exposure_locked: Whether a picture is as bright after the brightest one as before.
+        exposure_locked: Whether an image is as bright after the brightest one as before.
         gain_rms: Root mean square of the exposure's changes.
         shift_px: Root mean square of the movement, pixels.
         corrected: Whether both were taken out.
@@ -153,7 +153,7 @@ def read_film(
         progress: Called now and then.
 
     Raises:
-        DataError: The film is too long, or larger pictures are asked for than it has.
+        DataError: The film is too long, or larger images are asked for than it has.
     """
     if shape[0] > video.height or shape[1] > video.width:
         raise DataError(
@@ -229,7 +229,7 @@ def find_show(film: Film, show: Show) -> Clock:
         raise DataError(
             f"the flashes at the show's begin and end are not in the film (they agree to {worst:.2f}, at least "
             f"{_AGREES:g} is needed): film from before the first to after the last, the lit wall in the "
-            "picture, with the exposure locked"
+            "image, with the exposure locked"
         )
     rate = (found[1][0] - found[0][0]) / apart
     if not abs(rate - 1) < _MOST_RATE:
@@ -242,12 +242,12 @@ def find_show(film: Film, show: Show) -> Clock:
 def fit_tone(pictures: list[NDArray[np.float32]]) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return (g, a) of the curve l^g exp(a (l - 1)) that makes light add up, and the misfit before and after.
 
-    The light of two pictures that complete one another, less the dark, is that of all cells: with f the curve,
+    The light of two images that complete one another, less the dark, is that of all cells: with f the curve,
     f(A) + f(B) = f(all) + f(none) at every pixel. The misfit is the root mean square of what is left of this
     over that of f(all) - f(none).
 
     Args:
-        pictures: The check's pictures in the order of `CHECKS`, [H, W] each.
+        pictures: The check's images in the order of `CHECKS`, [H, W] each.
     """
     from scipy.optimize import minimize  # loads slowly
 
@@ -280,10 +280,10 @@ def straightened(light: NDArray, curve: tuple[float, float] | NDArray[np.float64
 
 @dataclass(frozen=True, eq=False)
 class Steadiness:
-    """How exposure and place changed from picture to picture.
+    """How exposure and place changed from image to image.
 
     Args:
-        gain: Exposure of each picture over the mean one, float64 [K].
+        gain: Exposure of each image over the mean one, float64 [K].
         shift_px: Movement (down, right) of each, pixels, float64 [K, 2].
     """
 
@@ -307,11 +307,11 @@ def find_steadiness(
     spacing_s: float,
     progress: Progress = silent,
 ) -> Steadiness:
-    """Find exposure and movement of each picture of a scan from what the patterns say twice.
+    """Find exposure and movement of each image of a scan from what the patterns say twice.
 
-    Without them picture k is P_k = D + M p_k, D the dark, M the light of the cells, p_k the pattern, so that K
-    pictures lie in the span of the n + 1 columns of the design. With them, to first order, F_k = P_k + B_k t_k,
-    B_k the picture and its slopes, t_k = (gain, down, right). With Q the projection off the design's span,
+    Without them image k is P_k = D + M p_k, D the dark, M the light of the cells, p_k the pattern, so that K
+    images lie in the span of the n + 1 columns of the design. With them, to first order, F_k = P_k + B_k t_k,
+    B_k the image and its slopes, t_k = (gain, down, right). With Q the projection off the design's span,
     Q F = Q (B t) holds whatever D and M are (variable projection, Golub and Pereyra 1973): least squares for
     all t at once. Their prior is a smooth Gaussian process of the size that the data have (expectation
     maximisation), so that what never moved stays where it is.
@@ -319,7 +319,7 @@ def find_steadiness(
     Args:
         pictures: Light, float32 [K, H, W].
         design: Which cells each lights, and a column of ones for the dark, float64 [K, n + 1].
-        spacing_s: Time from one picture to the next, seconds.
+        spacing_s: Time from one image to the next, seconds.
         progress: Called after each round.
     """
     count = len(pictures)
@@ -361,12 +361,12 @@ def find_steadiness(
 def _steadied(
     pictures: NDArray[np.float32], gain: NDArray[np.float64], moved: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Return pictures [K, H, W] at the mean exposure and moved back."""
+    """Return images [K, H, W] at the mean exposure and moved back."""
     return np.stack([_undone(*one) for one in zip(pictures, gain, moved, strict=True)])
 
 
 def _undone(picture: NDArray[np.float32], gain: float, moved: NDArray) -> NDArray[np.float32]:
-    """Return a picture [H, W] divided by a gain and moved back by (down, right) pixels."""
+    """Return an image [H, W] divided by a gain and moved back by (down, right) pixels."""
     from scipy.ndimage import shift
 
     still = np.abs(moved).max() < 1e-3
@@ -381,13 +381,13 @@ def import_film(
     shape: tuple[int, int] | None = None,
     progress: Progress = silent,
 ) -> FilmResult:
-    """Make the pictures of a scan of a film of its show: the files that frames.csv names.
+    """Make the images of a scan of a film of its show: the files that frames.csv names.
 
     Args:
         folder: A scan's folder with show.yaml.
         path: The film: a video file.
         reading: How it is read; None is the default.
-        shape: Size (H, W) of the pictures, pixels; None is 160 columns, or the film's.
+        shape: Size (H, W) of the images, pixels; None is 160 columns, or the film's.
         progress: Called as the work goes on.
 
     Raises:
@@ -398,7 +398,7 @@ def import_film(
     show = read_show(folder)
     white, hold_s = show.info.white_dn, show.show.hold_s
     if white is not None:
-        raise ConfigError(f"{folder}: scan.yaml states white_dn {white}; a film's pictures have 16 bits")
+        raise ConfigError(f"{folder}: scan.yaml states white_dn {white}; a film's images have 16 bits")
     video = open_video(path, tone=reading.tone, fps=reading.fps)
     if shape is None:
         columns = min(_WIDTH, video.width)
@@ -444,7 +444,7 @@ def import_film(
     warnings = []
     if not locked:
         warnings.append(
-            f"after the brightest picture the others are {100 * brighter:+.0f} % brighter than before: the "
+            f"after the brightest image the others are {100 * brighter:+.0f} % brighter than before: the "
             "exposure is not locked, so that the tone curve could not be checked; lock it and film again"
         )
     elif reading.fit_tone and misfit[1] > 0.05:
@@ -499,7 +499,7 @@ class _Reference:
         return cls(np.stack([dark.ravel(), *slopes, *modes[:_MODES]]))
 
     def steadied(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return a picture at the scan's exposure and place."""
+        """Return an image at the scan's exposure and place."""
         found = np.linalg.lstsq(self.basis.T, picture.ravel().astype(np.float64), rcond=1e-6)[0]
         gain = float(np.clip(found[0], 0.5, 2.0))
         return _undone(picture, gain, -np.clip(found[1:3] / gain, -5, 5))  # F = D + u dD/dy: D moved by -u
@@ -581,7 +581,7 @@ def add_events(folder: str | Path, capture: Path, transport: str | Path, seed: i
 
 
 def _save(path: Path, light: NDArray[np.float32], over: NDArray[np.bool_]) -> None:
-    """Write a picture of 16 bits, saturated where the film was."""
+    """Write an image of 16 bits, saturated where the film was."""
     numbers = np.clip(np.rint(light * 65_535), 0, _CODED).astype(np.uint16)
     numbers[over] = 65_535
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ Multiplexing lights about half of the cells at a time (Harwit and Sloane, Hadama
 Under noise that does not depend on the light, q patterns make the noise of a cell (q + 1) / (2 sqrt q) times
 smaller; under shot noise alone they bring nothing.
 
-- A scan's folder: `scan.yaml` says what was shown, `frames.csv` which picture shows what.
+- A scan's folder: `scan.yaml` says what was shown, `frames.csv` which image shows what.
 """
 
 from __future__ import annotations
@@ -153,9 +153,9 @@ class ScanInfo:
     exposure_s: float = 0.05
     """Exposure of a frame, seconds, where frames.csv states none."""
     white_dn: int | None = None
-    """Digital number at which the camera saturates, e.g. 4095; none = the largest of the picture's type."""
+    """Digital number at which the camera saturates, e.g. 4095; none = the largest of the image's type."""
     frames: str = "frames.csv"
-    """Table pattern,repeat,exposure_s,file: one line per picture."""
+    """Table pattern,repeat,exposure_s,file: one line per image."""
     image_px_per_m: tuple[tuple[float, float], tuple[float, float]] | None = None
     """points: how far the image moves, pixels, when the light moves a metre: ((column by x, column by y),
     (row by x, row by y)); found from the points where three or more do not lie on a line."""
@@ -191,13 +191,13 @@ class ScanInfo:
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """One picture of a scan.
+    """One image of a scan.
 
     Args:
         pattern: Number of the pattern, or None for a dark frame.
         repeat: Number of the pass, from 0.
         exposure_s: Exposure, seconds.
-        file: Name of the picture in the folder.
+        file: Name of the image in the folder.
     """
 
     pattern: int | None
@@ -230,7 +230,7 @@ def cell_edges(plane: Plane, display: tuple[int, int], display_pitch: float) -> 
 def displayed(
     cells: NDArray, plane: Plane, display: tuple[int, int], display_pitch: float
 ) -> NDArray[np.uint8]:
-    """Return the picture of a display [rows, columns] that shows cells [h, w], of brightness 0 to 1."""
+    """Return the image of a display [rows, columns] that shows cells [h, w], of brightness 0 to 1."""
     width, height = display
     y, x = cell_edges(plane, display, display_pitch)
     shown = np.repeat(np.repeat(cells, np.diff(y), axis=0), np.diff(x), axis=1)
@@ -256,7 +256,7 @@ def read_scan_info(folder: str | Path) -> ScanInfo:
 
 
 def write_scan_frames(path: Path, scan_frames: list[ScanFrame]) -> None:
-    """Write the table of pictures."""
+    """Write the table of images."""
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(_HEADER)
@@ -266,7 +266,7 @@ def write_scan_frames(path: Path, scan_frames: list[ScanFrame]) -> None:
 
 
 def read_scan_frames(folder: str | Path, info: ScanInfo) -> list[ScanFrame]:
-    """Read and check the table of pictures: every pattern in every repeat, once, and dark frames.
+    """Read and check the table of images: every pattern in every repeat, once, and dark frames.
 
     Raises:
         DataError: The table is missing or garbled, or a pattern or the dark frames are missing.
@@ -279,30 +279,30 @@ def read_scan_frames(folder: str | Path, info: ScanInfo) -> list[ScanFrame]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path} can't be read as a table: {error}") from None
     if not rows or not {"pattern", "file"} <= rows[0].keys():
-        raise DataError(f"{path} holds no pictures; give a header {','.join(_HEADER)} and one line per picture")
+        raise DataError(f"{path} holds no images; give a header {','.join(_HEADER)} and one line per image")
     scan_frames = [_scan_frame(path, number, row, info) for number, row in enumerate(rows, start=2)]
     _check_complete(path, scan_frames, info)
     return scan_frames
 
 
 def is_main(scan_frame: ScanFrame, info: ScanInfo) -> bool:
-    """Return whether a picture has the scan's own exposure; the others serve the check of linearity."""
+    """Return whether an image has the scan's own exposure; the others serve the check of linearity."""
     return abs(scan_frame.exposure_s - info.exposure_s) <= 1e-6 * info.exposure_s
 
 
 Reader = Callable[[ScanFrame], NDArray]
-"""From a frame to its picture, digital numbers [H, W]."""
+"""From a frame to its image, digital numbers [H, W]."""
 
 
 def frame_reader(folder: str | Path, table: str = "frames.csv") -> Reader:
-    """Return what reads the pictures of a folder, all of one size and type.
+    """Return what reads the images of a folder, all of one size and type.
 
     Args:
         folder: The scan's folder.
-        table: Table that names the pictures, for messages.
+        table: Table that names the images, for messages.
 
     Raises (when it reads):
-        DataError: A picture is missing, unreadable, outside the folder, or unlike the first one.
+        DataError: An image is missing, unreadable, outside the folder, or unlike the first one.
     """
     folder, first = Path(folder), {}
 
@@ -312,7 +312,7 @@ def frame_reader(folder: str | Path, table: str = "frames.csv") -> Reader:
         shape, kind = first.setdefault("like", (image.shape, image.dtype))
         if image.shape != shape or image.dtype != kind:
             raise DataError(
-                f"{path} is {image.dtype} {image.shape}, the first picture {kind} {shape}; give pictures of "
+                f"{path} is {image.dtype} {image.shape}, the first image {kind} {shape}; give images of "
                 "one "
                 "camera and one format"
             )
@@ -358,12 +358,12 @@ def _check_complete(path: Path, scan_frames: list[ScanFrame], info: ScanInfo) ->
     count = info.patterns.count
     wanted = count * info.repeats
     if lit != len(found):
-        raise DataError(f"{path} lists {lit - len(found)} pictures twice; one line a pattern and repeat")
+        raise DataError(f"{path} lists {lit - len(found)} images twice; one line a pattern and repeat")
     if len(found) != wanted:
         every = ((k, r) for r in range(info.repeats) for k in range(count))
         pattern, repeat = next(pair for pair in every if pair not in found)
         raise DataError(
-            f"{path} lists {len(found)} pictures of patterns, {info.pattern} on {info.plane.height} x "
+            f"{path} lists {len(found)} images of patterns, {info.pattern} on {info.plane.height} x "
             f"{info.plane.width} cells needs {count} x {info.repeats} repeats = {wanted}; the first missing is "
             f"pattern {pattern} of repeat {repeat}: record it, or correct scan.yaml"
         )

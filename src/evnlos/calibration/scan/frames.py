@@ -1,6 +1,6 @@
-"""The pictures of a scan: as light, compared between repeats, and rehearsed by the simulator.
+"""The images of a scan: as light, compared between repeats, and rehearsed by the simulator.
 
-- The pictures of a scan as light: dark frames taken off, saturation and linearity checked.
+- The images of a scan as light: dark frames taken off, saturation and linearity checked.
 - Whether the repeats of a scan agree: a camera that moved, a light that faded, a frame that differs.
 - A planned scan recorded by the simulator instead of a camera: to try plan, exposure and import beforehand.
 """
@@ -63,11 +63,11 @@ class ScanLight:
 def read_light(
     info: ScanInfo, scan_frames: list[ScanFrame], read: Reader, shape: tuple[int, int] | None = None
 ) -> ScanLight:
-    """Read all pictures, one at a time.
+    """Read all images, one at a time.
 
     Args:
         info: What was shown.
-        scan_frames: The pictures.
+        scan_frames: The images.
         read: What reads one.
         shape: Size (H, W) to reduce them to by area averaging; None keeps the camera's.
 
@@ -78,9 +78,7 @@ def read_light(
     full = (int(first.shape[0]), int(first.shape[1]))
     shape = shape or full
     if shape[0] > full[0] or shape[1] > full[1] or min(shape) < 1:
-        raise DataError(
-            f"{shape[0]} x {shape[1]} pixels are requested, the pictures have {full[0]} x {full[1]}"
-        )
+        raise DataError(f"{shape[0]} x {shape[1]} pixels are requested, the images have {full[0]} x {full[1]}")
     white = info.white_dn or int(np.iinfo(first.dtype).max)
     count, pixels = info.patterns.count, shape[0] * shape[1]
     room = 4 * info.repeats * count * pixels
@@ -130,7 +128,7 @@ def read_light(
 
 
 def _levels(image: NDArray, white: int, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return a picture as white levels, reduced, flat."""
+    """Return an image as white levels, reduced, flat."""
     return reduce_by_area(image[None].astype(np.float32) / np.float32(white), shape)[0].ravel()
 
 
@@ -139,7 +137,7 @@ def _linearity(
 ) -> float | None:
     """Return the light at another exposure over what a linear camera would have seen; refuse if far from 1.
 
-    None where there is no such picture, or where noise leaves the ratio open.
+    None where there is no such image, or where noise leaves the ratio open.
     """
     others = [
         scan_frame
@@ -171,7 +169,7 @@ def _linearity(
         # Expected from the same repeat: between repeats the light may have changed, which is another fault.
         dark = main[None, scan_frame.repeat]
         full = np.mean(main[scan_frame.pattern, scan_frame.repeat], axis=0)
-        # Weighted by pictures with noise of their own: weighted by itself, the slope would come out too low.
+        # Weighted by images with noise of their own: weighted by itself, the slope would come out too low.
         other = (scan_frame.repeat + 1) % info.repeats
         if other != scan_frame.repeat:
             weights.append(
@@ -192,7 +190,7 @@ def _linearity(
     if not abs(ratio - 1) <= _LINEAR_WITHIN + 3 * error:
         raise DataError(
             f"at another exposure the camera shows {ratio:.2f} of the light that a linear one would, beyond "
-            f"1 +- {_LINEAR_WITHIN:g}; save raw pictures without gamma, auto exposure or tone curve"
+            f"1 +- {_LINEAR_WITHIN:g}; save raw images without gamma, auto exposure or tone curve"
         )
     return ratio
 
@@ -310,7 +308,7 @@ def _refuse(shift: float, gain: float, difference: float, pattern: int, repeat: 
             f"pattern {pattern} differs between repeats 0 and {repeat} by {100 * difference:.0f} % of the "
             "brightest "
             f"pattern's light beyond noise, at most {100 * _MOST_DIFFERENCE:g} % may be: a wrong or late "
-            "picture, or "
+            "image, or "
             "another light; record it again"
         )
 
@@ -342,13 +340,13 @@ def rehearse_scan(
     seed: int = 0,
     change: Change | None = None,
 ) -> int:
-    """Take the pictures of a planned scan with a known setup, and return their number.
+    """Take the images of a planned scan with a known setup, and return their number.
 
     Args:
         folder: A folder that `write_plan` wrote.
         matrix: White levels per cell at the scan's exposure, [H W, cells of the plane].
         shape: Size (H, W) of the camera image, pixels.
-        camera: Its frame camera; a picture at another exposure has light in proportion.
+        camera: Its frame camera; an image at another exposure has light in proportion.
         ambient: Light that is always there, white levels.
         seed: Seed of the noise.
         change: Alters the light [H, W] of a frame before the exposure: a fault to rehearse.

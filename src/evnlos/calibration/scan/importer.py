@@ -29,9 +29,9 @@ class ScanImport:
     """How a scan becomes a matrix."""
 
     height: int | None = None
-    """Rows to which the pictures are reduced, pixels; none = the camera's."""
+    """Rows to which the images are reduced, pixels; none = the camera's."""
     width: int | None = None
-    """Columns to which the pictures are reduced, pixels; none = the camera's."""
+    """Columns to which the images are reduced, pixels; none = the camera's."""
     denoise: bool = True
     """Denoise where held-out repeats show that it helps; off keeps the plain mean."""
     psf: bool = False
@@ -82,12 +82,12 @@ def import_scan(folder: str | Path, settings: ScanImport | None = None) -> ScanR
     from the repeats, and the matrix denoised where that helps (`choose_denoising`).
 
     Args:
-        folder: A folder with `scan.yaml` and its pictures.
+        folder: A folder with `scan.yaml` and its images.
         settings: What to do; None is the default.
 
     Raises:
         ConfigError: `scan.yaml` is garbled.
-        DataError: Pictures are missing, saturated, not linear, or the repeats disagree; or the wall is not
+        DataError: Images are missing, saturated, not linear, or the repeats disagree; or the wall is not
             shift-invariant where that is supposed.
     """
     settings = settings or ScanImport()
@@ -269,7 +269,7 @@ def _first_warnings(info: ScanInfo, light: ScanLight) -> list[str]:
         found.append("one repeat: the noise is that of the dark frames alone, and nothing can be denoised")
     if light.linearity is None:
         found.append(
-            "that the camera is linear was not checked: no picture at another exposure, or too much noise in it"
+            "that the camera is linear was not checked: no image at another exposure, or too much noise in it"
         )
     step = 1 / light.white_dn
     brightest = float(light.lit.mean(axis=0).max())

@@ -259,7 +259,7 @@ def matrix_from_psf(
 
 
 def moved(kernel: torch.Tensor, shift_px: NDArray[np.float64]) -> torch.Tensor:
-    """Return a picture [H, W] moved by (columns, rows) [n, 2], pixels: [n, H, W]; borders go on outside."""
+    """Return an image [H, W] moved by (columns, rows) [n, 2], pixels: [n, H, W]; borders go on outside."""
     height, width = kernel.shape
     shift = torch.from_numpy(np.ascontiguousarray(shift_px, dtype=np.float64))
     u = torch.arange(width, dtype=torch.float64) - shift[:, :1]  # [n, W]

@@ -1,6 +1,6 @@
 """How long a scan takes, and how noisy its matrix will be, before a display is mounted.
 
-- A scan planned: `scan.yaml`, the table of pictures to take, and what to show for each of them.
+- A scan planned: `scan.yaml`, the table of images to take, and what to show for each of them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from evnlos.calibration.scan.folder import (
     measured_cells,
     write_scan_frames,
 )
-from evnlos.calibration.scan.show import SHOW_FILE, Show, ShowInfo, show_page, show_pictures
+from evnlos.calibration.scan.show import SHOW_FILE, Show, ShowInfo, show_images, show_page
 from evnlos.cameras.video_files import write_video
 from evnlos.config import save_yaml
 from evnlos.errors import ConfigError
@@ -68,7 +68,7 @@ class ScanEstimate:
     """What a scan will cost and give.
 
     Args:
-        scan_frames: Pictures, dark frames and linearity check included.
+        scan_frames: Images, dark frames and linearity check included.
         seconds: Time for them.
         cell_level: White levels of the brightest entry of the matrix.
         noise: Standard deviation of an entry of the brightest pixel over the brightest entry; others have less.
@@ -106,9 +106,9 @@ def estimate_scan(
         camera: Light and noise.
         pitch_m: Side of a cell, metres.
         repeats: How often.
-        scan_frames: Number of pictures.
+        scan_frames: Number of images.
         darks: Number of dark frames among them.
-        seconds_per_frame: Exposure and what passes between two pictures, seconds.
+        seconds_per_frame: Exposure and what passes between two images, seconds.
 
     Example:
         >>> camera = ScanCamera(full_level=0.8, full_well_e=1e9, read_noise_e=1e6, bit_depth=16)
@@ -184,7 +184,7 @@ class ScanPlan:
     points: int = 5
     """points: number of cells, the middle one first, then outwards."""
     display: tuple[int, int] | None = None
-    """Width and height of the display, pixels; none = a moving LED (places.csv) or one picture pixel per cell.
+    """Width and height of the display, pixels; none = a moving LED (places.csv) or one image pixel per cell.
     """
     display_pitch: float = 0.00027
     """Side of a display pixel, metres."""
@@ -193,12 +193,12 @@ class ScanPlan:
     exposure_s: float = 0.05
     """Exposure of a frame, seconds."""
     overhead_s: float = 0.1
-    """Time between two pictures besides the exposure, seconds (an LED on a stage: how long a move takes)."""
+    """Time between two images besides the exposure, seconds (an LED on a stage: how long a move takes)."""
     dark_every: int | None = None
-    """A dark frame before every so many pictures, and one at the end of each repeat; none = 64 for hadamard, 4
+    """A dark frame before every so many images, and one at the end of each repeat; none = 64 for hadamard, 4
     else: all cells of a raster share the error of the dark frame, and it adds up where many of them shine."""
     show: Literal["pictures", "page", "video"] = "pictures"
-    """pictures: one file a pattern, for a camera that takes pictures. page or video: the whole scan as one show
+    """images: one file a pattern, for a camera that takes images. page or video: the whole scan as one show
     on the display, to be filmed (`import --film`)."""
     hold_s: float = 0.5
     """page, video: how long a pattern stands, seconds."""
@@ -256,7 +256,7 @@ class ScanPlan:
         return ScanInfo(plane, self.pattern, listed, self.repeats, self.exposure_s)
 
     def scan_frames(self) -> list[ScanFrame]:
-        """Return the pictures in the order in which to take them."""
+        """Return the images in the order in which to take them."""
         count, found = self.info().patterns.count, []
         every = self.dark_every or (64 if self.pattern == "hadamard" else 4)
         for repeat in range(self.repeats):
@@ -383,7 +383,7 @@ def _write_show(path: Path, show: Show, progress: Progress) -> None:
     total = math.ceil(show.duration_s * _SHOWN_HZ)
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
-        for number, picture in enumerate(show_pictures(show, _SHOWN_HZ)):
+        for number, picture in enumerate(show_images(show, _SHOWN_HZ)):
             if number % 20 == 0:
                 progress(Step("draw show", number, total, "frames"))
             yield picture

@@ -1,7 +1,7 @@
 """A scan as a show: one page or video on a monitor, to be filmed by a phone; its flashes tell the time.
 
 The show begins and ends with the same code of flashes; between them it holds every pattern of the scan for the
-same time, then pictures that tell the film's tone curve, and then moves characters over the plane. It can be
+same time, then images that tell the film's tone curve, and then moves characters over the plane. It can be
 rehearsed: filmed by a pretended phone in front of a known wall.
 """
 
@@ -45,7 +45,7 @@ SHOW_FILE = "show.yaml"
 CODE = (1, 0, 0, 0, 1, 0, 0, 1, 1, 0, 1, 0, 1, 1, 1)
 """The flashes: a sequence of x^4 + x + 1 (Golomb, 1967), which looks like itself at one place only."""
 _LEAD_S, _REST_S = 2.0, 1.0
-_TARGET_PX = 128  # side of a character's picture
+_TARGET_PX = 128  # side of a character's image
 _SPEED_M_S = (0.001, 1.0)
 
 
@@ -89,10 +89,10 @@ class Part:
     """A stretch of the show.
 
     Args:
-        kind: "code" and "rest", "pattern" (a picture of frames.csv), "check" (the tone curve's), or "target".
+        kind: "code" and "rest", "pattern" (an image of frames.csv), "check" (the tone curve's), or "target".
         start_s: When it begins, seconds from the show's begin.
         stop_s: When it ends.
-        number: Which flash, picture, check or target.
+        number: Which flash, image, check or target.
     """
 
     kind: Kind
@@ -107,7 +107,7 @@ class Show:
 
     Args:
         info: The scan.
-        scan_frames: Its pictures, in order.
+        scan_frames: Its images, in order.
         show: Time and display.
 
     Raises:
@@ -157,7 +157,7 @@ class Show:
 
     @cached_property
     def checks(self) -> tuple[NDArray[np.bool_], ...]:
-        """What the pictures for the tone curve light, [h, w] each: see `CHECKS`."""
+        """What the images for the tone curve light, [h, w] each: see `CHECKS`."""
         height, width = self.info.plane.shape
         draw = np.random.default_rng(derive_seed(0, "checks"))
         cells = height * width
@@ -204,7 +204,7 @@ class Show:
 
 
 CHECKS = ("none", "left", "right", "half", "rest", "quarter", "three", "all", "left", "right", "none")
-"""The pictures that tell the tone curve: what each lights. Light adds up, so that those of a pair have to give
+"""The images that tell the tone curve: what each lights. Light adds up, so that those of a pair have to give
 what all cells give; the first pair comes once more after the brightest, by which a changing exposure shows."""
 PAIRS = ((1, 2), (3, 4), (5, 6), (8, 9))
 """Numbers of the checks that complete one another."""
@@ -223,7 +223,7 @@ def read_show(folder: str | Path) -> Show:
     return Show(info, tuple(read_scan_frames(folder, info)), load_yaml(ShowInfo, folder / SHOW_FILE))
 
 
-def shown_picture(show: Show, part: Part, t_s: float) -> NDArray[np.uint8]:
+def shown_image(show: Show, part: Part, t_s: float) -> NDArray[np.uint8]:
     """Return what the display shows at an instant, uint8 [rows, columns]."""
     display, pitch = show.show.display, show.show.display_pitch
     assert display is not None  # refused before
@@ -233,19 +233,19 @@ def shown_picture(show: Show, part: Part, t_s: float) -> NDArray[np.uint8]:
     x, y = scene.motion.position_m(t_s - part.start_s) - np.asarray(show.info.plane.center_m)
     canvas = Image.new("L", display)
     place = (round(x / pitch + (display[0] - side) / 2), round(y / pitch + (display[1] - side) / 2))
-    canvas.paste(_target_picture(scene.target).resize((side, side), Image.Resampling.BOX), place)
+    canvas.paste(_target_image(scene.target).resize((side, side), Image.Resampling.BOX), place)
     return np.asarray(canvas)
 
 
-def show_pictures(show: Show, fps: float) -> Iterator[NDArray[np.uint8]]:
-    """Yield what the display shows, a picture a frame at `fps`; the same array while nothing changes."""
+def show_images(show: Show, fps: float) -> Iterator[NDArray[np.uint8]]:
+    """Yield what the display shows, an image a frame at `fps`; the same array while nothing changes."""
     before: Part | None = None
     picture = np.zeros((1, 1), np.uint8)
     for number in range(math.ceil(show.duration_s * fps)):
         t_s = (number + 0.5) / fps
         part = show.part_at(t_s)
         if part is not before or part.kind == "target":
-            picture, before = shown_picture(show, part, t_s), part
+            picture, before = shown_image(show, part, t_s), part
         yield picture
 
 
@@ -275,13 +275,13 @@ def show_page(show: Show) -> str:
         "duration_s": show.duration_s,
         "side": show.show.target_m / show.show.display_pitch,
         "bar_px": 0.1 / show.show.display_pitch,
-        "targets": [_as_url(_target_picture(scene.target)) for scene in show.scenes],
+        "targets": [_as_url(_target_image(scene.target)) for scene in show.scenes],
     }
     page = (Path(__file__).parent / "show.html").read_text(encoding="utf-8")
     return page.replace('"{show}"', json.dumps(data))
 
 
-def _target_picture(target: Target) -> Image.Image:
+def _target_image(target: Target) -> Image.Image:
     image = Image.fromarray(np.round(255 * target.mask).astype(np.uint8))
     return image.resize((_TARGET_PX, _TARGET_PX), Image.Resampling.LANCZOS)
 

@@ -176,7 +176,7 @@ class Aedat2Source:
             out, many = allocate(len(pairs) // 2), len(pairs) // 2
             places, edges = np.empty(many, np.int64), np.empty(many, np.int64)
             columns = out["t_us"], out["x"], out["y"], out["p"]
-            if self._is_davis:  # bit 31 and 1 in bits 10 and 11: a pixel's signal; each picture has one of each
+            if self._is_davis:  # bit 31 and 1 in bits 10 and 11: a pixel's signal; each image has one of each
                 self._signals += int(np.count_nonzero(pairs[::2] & _SIGNAL_MASK == _SIGNAL))
                 self.report.frames = self._signals // (self.report.width * self.report.height)
             count, inputs = _decode(pairs, state, self._is_davis, *columns, places, edges)
@@ -235,7 +235,7 @@ def _sample(pairs, start, state, samples, seen):
 def aedat2_frames(
     path: Path, report: ReadReport, topic: str | None
 ) -> Iterator[tuple[int, NDArray[np.uint16]]]:
-    """Yield the time [us] and the picture, uint16 [H, W], of each complete frame of a DAVIS.
+    """Yield the time [us] and the image, uint16 [H, W], of each complete frame of a DAVIS.
 
     A pixel is its level after reset minus that after the exposure: 10 bits, in the upper ones of 16. A frame's
     time is that of its first sample after the exposure. Frames that are not complete are left out.

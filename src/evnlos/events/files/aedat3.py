@@ -163,7 +163,7 @@ class Aedat3Source:
             yield times, np.zeros(len(times), np.uint8), rising
 
     def frames(self) -> Iterator[tuple[int, NDArray[np.uint16]]]:
-        """Yield the middle of the exposure [us] and the grey picture, uint16 [H, W], of each valid frame."""
+        """Yield the middle of the exposure [us] and the grey image, uint16 [H, W], of each valid frame."""
         for packet in self._packets((_FRAME,)):
             for index in range(packet.events):
                 data = packet.data[index * packet.size : (index + 1) * packet.size]
@@ -178,7 +178,7 @@ class Aedat3Source:
 
 
 def _frame(data: bytes, turns: int) -> tuple[int, NDArray[np.uint16]] | None:
-    """Return time and picture of a frame event; None where it is not valid."""
+    """Return time and image of a frame event; None where it is not valid."""
     if len(data) < _FRAME_HEAD:
         raise ValueError(f"a frame of {len(data)} bytes")
     info, _, _, begin, end, width, height, _, _ = struct.unpack_from("<Iiiiiiiii", data)
@@ -197,5 +197,5 @@ def _frame(data: bytes, turns: int) -> tuple[int, NDArray[np.uint16]] | None:
 def aedat3_frames(
     path: Path, report: ReadReport, topic: str | None
 ) -> Iterator[tuple[int, NDArray[np.uint16]]]:
-    """Yield the middle of the exposure [us] and the picture, uint16 [H, W], of each frame."""
+    """Yield the middle of the exposure [us] and the image, uint16 [H, W], of each frame."""
     return Aedat3Source(path, report, None, None, topic, "frames").frames()

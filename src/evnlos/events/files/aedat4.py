@@ -245,7 +245,7 @@ class Aedat4Source:
 
 
 def aedat4_frames(path: Path, report: ReadReport, topic: str | None) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Yield the time [us] and the grey picture [H, W] of each frame of a stream.
+    """Yield the time [us] and the grey image [H, W] of each frame of a stream.
 
     Raises:
         EventFileError: The file is damaged or has no frames.
@@ -348,7 +348,7 @@ class Aedat4Sink(FileSink):
             self._packet(_EVENTS, _event_packet(events[start : start + _PACKET]))
 
     def append_frame(self, frame: NDArray[np.uint8], t_us: int) -> None:
-        """Write one grey picture [H, W] of 8 bits."""
+        """Write one grey image [H, W] of 8 bits."""
         self._packet(_FRAMES, _frame_packet(frame, t_us))
 
     def finish(self) -> None:
@@ -363,7 +363,7 @@ def write_aedat4(
     Args:
         path: The file to write; an existing one is replaced.
         events: The events.
-        frames: Grey pictures, uint8 [T, H, W].
+        frames: Grey images, uint8 [T, H, W].
         times_us: Time of each frame, [T], microseconds, ascending, on the events' clock.
 
     Raises:

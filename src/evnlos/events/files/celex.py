@@ -1,8 +1,8 @@
-"""CeleX-V recordings (`.bin`): events and full pictures.
+"""CeleX-V recordings (`.bin`): events and full images.
 
 - What a CeleX-V recording does not say about itself, or says wrongly after a crash.
-- CeleX-V recordings (`.bin`): a header of 12 bytes, then packages of events or full pictures.
-- Full pictures of CeleX-V recordings (mode F).
+- CeleX-V recordings (`.bin`): a header of 12 bytes, then packages of events or full images.
+- Full images of CeleX-V recordings (mode F).
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ def clock_from_name(path: Path) -> int | None:
 
 
 HEADER_BYTES = 12
-PICTURE_BYTES = WIDTH * HEIGHT * 3 // 2
-_MAX_PAYLOAD = PICTURE_BYTES + 1  # the longest that the camera sends; the last byte is the kind
-_FULL_PICTURE = 3  # a mode
+IMAGE_BYTES = WIDTH * HEIGHT * 3 // 2
+_MAX_PAYLOAD = IMAGE_BYTES + 1  # the longest that the camera sends; the last byte is the kind
+_FULL_IMAGE = 3  # a mode
 _IMU_BYTES = 32
 
 
@@ -106,7 +106,7 @@ class Package:
 
     offset: int
     length: int
-    is_picture: bool
+    is_image: bool
     host_time: int | None
 
 
@@ -156,7 +156,7 @@ def walk_packages(file: FileIO, header: CelexHeader, report: ReadReport) -> Iter
             report.fault("truncated", at, found, f"copy the file again or {SALVAGE}", lost_bytes=size - at)
             return
         file.seek(after - 1)
-        is_picture = file.read(1) == b"\0"
+        is_image = file.read(1) == b"\0"
         host_time = None
         if header.has_imu:
             tail = file.read(12)
@@ -166,11 +166,11 @@ def walk_packages(file: FileIO, header: CelexHeader, report: ReadReport) -> Iter
                 found = f"{samples} IMU samples behind a package"
                 report.fault("truncated", at, found, f"copy the file again or {SALVAGE}", lost_bytes=size - at)
                 return
-        if is_picture and length != _MAX_PAYLOAD:
-            found = f"a full picture of {length - 1} bytes"
-            report.fault("unknown", at, found, f"{PICTURE_BYTES} are one: {SALVAGE}", lost_bytes=length)
+        if is_image and length != _MAX_PAYLOAD:
+            found = f"a full image of {length - 1} bytes"
+            report.fault("unknown", at, found, f"{IMAGE_BYTES} are one: {SALVAGE}", lost_bytes=length)
         else:
-            yield Package(at + 4, length - 1, is_picture, host_time)
+            yield Package(at + 4, length - 1, is_image, host_time)
         at, count = after, count + 1
     if header.packages and count != header.packages:
         kind = "truncated" if count < header.packages else "count"
@@ -194,8 +194,8 @@ class CelexSource:
         options = options or CelexOptions()
         self._header = parse_header(path, options)
         report.format = "CELEX"
-        if not self._header.loop and self._header.modes[0] == _FULL_PICTURE and options.event_format is None:
-            raise unreadable(path, 1, "a recording of full pictures", "read it with evnlos.read_frames(path)")
+        if not self._header.loop and self._header.modes[0] == _FULL_IMAGE and options.event_format is None:
+            raise unreadable(path, 1, "a recording of full images", "read it with evnlos.read_frames(path)")
         if width is not None and (width, height) != (WIDTH, HEIGHT):
             raise unreadable(
                 path, 0, f"a sensor of {width} x {height}", "CeleX-V has 1280 x 800: leave the size out"
@@ -266,7 +266,7 @@ class CelexSource:
         self.report.skipped = int(state[slots.SKIPPED])
         if not events and pictures:
             raise unreadable(
-                self.path, 0, "a recording of full pictures", "read it with evnlos.read_frames(path)"
+                self.path, 0, "a recording of full images", "read it with evnlos.read_frames(path)"
             )
 
     def blocks(self) -> Iterator[Columns]:
@@ -275,7 +275,7 @@ class CelexSource:
         events = pictures = 0
         with self.path.open("rb", buffering=0) as file:
             for package in walk_packages(file, self._header, self.report):
-                if package.is_picture:
+                if package.is_image:
                     pictures += 1
                     continue
                 out = allocate(self._bound(package), self._names())
@@ -289,7 +289,7 @@ class CelexSource:
         state, last = self._new_state()
         with self.path.open("rb", buffering=0) as file:
             packages = list(walk_packages(file, self._header, self.report))
-            held = [package for package in packages if not package.is_picture]
+            held = [package for package in packages if not package.is_image]
             columns = allocate(sum(map(self._bound, held)), self._names())
             count = 0
             for package in held:
@@ -319,8 +319,8 @@ def _fixed_pattern(fpn: NDArray | str | PathLike[str] | None) -> NDArray | None:
     return values.reshape(HEIGHT, WIDTH)
 
 
-def _decode_picture(data: NDArray[np.uint8], bits: int) -> NDArray:
-    """Return one picture [H, W]: three bytes are two pixels, inverted; the third holds their low bits."""
+def _decode_image(data: NDArray[np.uint8], bits: int) -> NDArray:
+    """Return one image [H, W]: three bytes are two pixels, inverted; the third holds their low bits."""
     groups = data.reshape(-1, 3)  # [H * W / 2, 3]
     first, second, low = groups[:, 0], groups[:, 1], groups[:, 2]
     if bits == 8:
@@ -338,20 +338,20 @@ def read_celex_frames(
     on_error: OnError,
     options: CelexOptions,
 ) -> NDArray:
-    """Return the full pictures [T, 800, 1280] of a CeleX-V recording; arguments as those of `read_frames`."""
+    """Return the full images [T, 800, 1280] of a CeleX-V recording; arguments as those of `read_frames`."""
     if bits not in (8, 12):
         raise DataError(f"bits is {bits}; give 8 or 12")
     fixed = _fixed_pattern(pattern)
     with path.open("rb", buffering=0) as file:
         report = ReadReport(path, strict=on_error == "strict")
         packages = walk_packages(file, parse_header(path, options), report)
-        pictures = [package for package in packages if package.is_picture]
+        pictures = [package for package in packages if package.is_image]
         if not pictures and report.clean:
-            raise unreadable(path, 0, "a recording without pictures", "read its events with read_events")
+            raise unreadable(path, 0, "a recording without images", "read its events with read_events")
         frames = np.empty((len(pictures), HEIGHT, WIDTH), np.uint8 if bits == 8 else np.uint16)
         for frame, package in zip(frames, pictures, strict=True):
             file.seek(package.offset)
-            picture = _decode_picture(np.frombuffer(file.read(package.length), np.uint8), bits)
+            picture = _decode_image(np.frombuffer(file.read(package.length), np.uint8), bits)
             if fixed is not None:
                 picture = np.clip(picture.astype(np.int64) - fixed, 0, 2**bits - 1)
             frame[:] = picture

@@ -126,7 +126,7 @@ class ReadReport:
             "assumed" (the format's usual sensor).
         events: Events returned.
         triggers: External trigger edges seen.
-        frames: Pictures seen among the events of AEDAT 2.0 and 3.1; other formats list them in `streams`.
+        frames: Images seen among the events of AEDAT 2.0 and 3.1; other formats list them in `streams`.
         skipped: Events before the first row or time of a recording that starts in the middle; no fault.
         faults: How many faults of each kind: "truncated", "left_over", "out_of_range", "backwards",
             "undated", "unknown", "header", "checksum", "count", "clock" (a jump that bit errors of the camera's
@@ -183,7 +183,7 @@ class ReadReport:
         frames = [stream.name for stream in self.streams if stream.kind == "frames"]
         found = [f"{self.triggers:,} trigger edges (read_triggers)"] if self.triggers else []
         if frames or self.frames:
-            held = ", ".join(frames[:_MOST_NAMES]) if frames else f"{self.frames:,} pictures"
+            held = ", ".join(frames[:_MOST_NAMES]) if frames else f"{self.frames:,} images"
             found.append(f"frames ({held}; evnlos import takes both)")
         return found
 

@@ -32,7 +32,7 @@ class Frames:
     """Frames and, where the file says, their times.
 
     Args:
-        images: Grey pictures [T, H, W], uint8, or uint16 where they have more bits; brighter is larger.
+        images: Grey images [T, H, W], uint8, or uint16 where they have more bits; brighter is larger.
         t_us: Their times, int64 [T], microseconds, on the events' clock; None where the file has none
             (CeleX-V). Those of a ROS bag are the stamps of its images.
     """
@@ -136,7 +136,7 @@ def iter_frames(
     celex: CelexOptions | None = None,
     topic: str | None = None,
 ) -> Iterator[tuple[int | None, NDArray]]:
-    """Yield time (microseconds, None where the file has none) and picture of each frame of a file.
+    """Yield time (microseconds, None where the file has none) and image of each frame of a file.
 
     Memory does not grow with the number of frames, but for CeleX-V. Arguments and errors as of `read_frames`.
     """
@@ -165,7 +165,7 @@ def iter_frames(
 
 
 FrameReader = Callable[[], Iterator[tuple[int | None, NDArray]]]
-"""Begins anew, and yields time (microseconds, or None) and picture of each frame."""
+"""Begins anew, and yields time (microseconds, or None) and image of each frame."""
 
 
 def gather_frames(
@@ -230,16 +230,16 @@ def read_frames(
 ) -> NDArray:
     """Return the frames of a CeleX-V recording (mode F), an AEDAT file, or an image topic of a ROS bag.
 
-    Pixels are in the order of the file, which is that of the events: row and column of a picture are y and x of
-    an event. The CeleX-V camera's own viewer turns pictures, not events, by 180 degrees; turn pictures that it
+    Pixels are in the order of the file, which is that of the events: row and column of an image are y and x of
+    an event. The CeleX-V camera's own viewer turns images, not events, by 180 degrees; turn images that it
     exported back before laying them over events.
 
     Args:
-        path: The recording; for CeleX-V mode F or a loop with pictures in it.
+        path: The recording; for CeleX-V mode F or a loop with images in it.
         bits: 8 or 12 bits per pixel, for CeleX-V; other formats have their own, and colours become grey.
         fpn: CeleX-V's fixed pattern to subtract: [800, 1280] or the text file of the camera's program; the
             result is clipped to the range of `bits`.
-        on_error: "strict" raises at the first fault, "salvage" returns the whole pictures (CeleX-V).
+        on_error: "strict" raises at the first fault, "salvage" returns the whole images (CeleX-V).
         celex: What a CeleX-V recording does not say about itself.
         topic: Name of the stream of frames, of a file that holds several.
 
@@ -247,7 +247,7 @@ def read_frames(
         [T, H, W], uint8 or, for 12 bits, uint16; brighter is larger.
 
     Raises:
-        EventFileError: The file is damaged or holds no pictures.
+        EventFileError: The file is damaged or holds no images.
         MissingDependencyError: AEDAT4 needs the optional package aedat.
         DataError: `bits` or the size of `fpn` is wrong.
     """

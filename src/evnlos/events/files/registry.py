@@ -66,7 +66,7 @@ class Format:
         open: Opens a file: (path, report, width, height, celex options, topic).
         create: Begins a file: (path, first piece of the events, the name that it will get); None where the
             format is only read.
-        frames: Yields time [us] and picture of its frames: (path, report, topic); None where it has none.
+        frames: Yields time [us] and image of its frames: (path, report, topic); None where it has none.
         has_streams: Whether a file may hold several streams, of which `topic` names one.
     """
 

@@ -276,7 +276,7 @@ class _Words:
 def ros_frames(
     container: Container, path: Path, report: ReadReport, topic: str | None
 ) -> Iterator[tuple[int, NDArray]]:
-    """Yield the stamp [us] and the picture, uint8 or uint16 [H, W], of each image of a topic.
+    """Yield the stamp [us] and the image, uint8 or uint16 [H, W], of each image of a topic.
 
     Raises:
         EventFileError: The file has no images, or images of several sizes, or is damaged.

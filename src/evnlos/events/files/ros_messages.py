@@ -26,7 +26,7 @@ IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
 ENCODINGS = ("evt3", "libcaer", "libcaer_cmp", "mono", "trigger")
 ZSTD = b"\x28\xb5\x2f\xfd"
 _MOST_SIDE = 1 << 14
-_PICTURE_BYTES = {
+_IMAGE_BYTES = {
     "mono8": (1, 1), "8UC1": (1, 1), "mono16": (2, 1), "16UC1": (2, 1), "rgb8": (1, 3), "bgr8": (1, 3),
     "8UC3": (1, 3), "rgba8": (1, 4), "bgra8": (1, 4), "8UC4": (1, 4), "bayer_rggb8": (1, 1),
     "bayer_bggr8": (1, 1), "bayer_gbrg8": (1, 1), "bayer_grbg8": (1, 1),
@@ -273,7 +273,7 @@ def _decode_array(data, start, is_cdr, is_big, t_us, x, y, p):
 
 
 def image_of(message: Message) -> tuple[int, NDArray]:
-    """Return the stamp of an image message, nanoseconds, and its picture, uint8 or uint16 [H, W], grey.
+    """Return the stamp of an image message, nanoseconds, and its image, uint8 or uint16 [H, W], grey.
 
     Raises:
         ValueError: The message is damaged, or of an encoding that is not read.
@@ -285,9 +285,9 @@ def image_of(message: Message) -> tuple[int, NDArray]:
         return stamp_ns, _unpacked(bytes(fields.sequence()))
     height, width, encoding = fields.number("I"), fields.number("I"), fields.text()
     is_big, step, data = fields.number("B"), fields.number("I"), fields.sequence()
-    if encoding not in _PICTURE_BYTES:
-        raise ValueError(f"an image coded as {encoding[:20]!r}; {', '.join(_PICTURE_BYTES)} are read")
-    size, samples = _PICTURE_BYTES[encoding]
+    if encoding not in _IMAGE_BYTES:
+        raise ValueError(f"an image coded as {encoding[:20]!r}; {', '.join(_IMAGE_BYTES)} are read")
+    size, samples = _IMAGE_BYTES[encoding]
     if not (0 < height <= _MOST_SIDE and 0 < width <= _MOST_SIDE and width * size * samples <= step):
         raise ValueError(f"an image of {width} x {height} pixels in rows of {step} bytes")
     if len(data) < step * height:

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from evnlos.errors import DataError, EventFileError
-from evnlos.events.files.celex import PICTURE_BYTES, clock_from_name, tick_divisor
+from evnlos.events.files.celex import IMAGE_BYTES, clock_from_name, tick_divisor
 from evnlos.events.files.celex_kernels import HEIGHT, WIDTH, pack_lanes
 from evnlos.events.files.columns import FileSink
 from evnlos.files import new_file
@@ -176,14 +176,14 @@ class CelexSink(FileSink):
 
 
 def write_celex_frames(path: Path, frames: NDArray[np.uint8 | np.uint16]) -> None:
-    """Write pictures [T, 800, 1280] as a recording of mode F, each with a time stamp of 0.
+    """Write images [T, 800, 1280] as a recording of mode F, each with a time stamp of 0.
 
     Args:
         path: The file.
-        frames: Pictures, brighter = greater: uint8, or uint16 of 12 bits.
+        frames: Images, brighter = greater: uint8, or uint16 of 12 bits.
 
     Raises:
-        DataError: Pictures of another size or type, or of more than 12 bits.
+        DataError: Images of another size or type, or of more than 12 bits.
     """
     if frames.ndim != 3 or frames.shape[1:] != (HEIGHT, WIDTH) or frames.dtype not in (np.uint8, np.uint16):
         raise DataError(
@@ -195,16 +195,14 @@ def write_celex_frames(path: Path, frames: NDArray[np.uint8 | np.uint16]) -> Non
     with new_file(path) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<8BI", 2, 3, 255, 255, 1, 0, 0, 0, len(frames)))
         for frame in frames:
-            groups = np.zeros((PICTURE_BYTES // 3, 3), np.uint8)
+            groups = np.zeros((IMAGE_BYTES // 3, 3), np.uint8)
             if frame.dtype == np.uint8:
                 groups[:, :2] = 255 - frame.reshape(-1, 2)
             else:
                 words = 4095 - frame.reshape(-1, 2)
                 groups[:, :2] = words >> 4
                 groups[:, 2] = (words[:, 0] & 0xF) | ((words[:, 1] & 0xF) << 4)
-            file.write(
-                struct.pack("<I", PICTURE_BYTES + 1) + groups.tobytes() + b"\0" + struct.pack("<qI", 0, 0)
-            )
+            file.write(struct.pack("<I", IMAGE_BYTES + 1) + groups.tobytes() + b"\0" + struct.pack("<qI", 0, 0))
 
 
 @njit(cache=True)
