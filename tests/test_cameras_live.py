@@ -170,7 +170,7 @@ def test_live_reads_standard_input_to_its_end(tmp_path: Path) -> None:
     ended = subprocess.run(call, input=header + words, capture_output=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
     table = json.loads(ended.stdout)
-    assert table["events"] + table["dropped"]["events"] == 30_000 and table["pictures"] > 0
+    assert table["events"] + table["dropped"]["events"] == 30_000 and table["images"] > 0
     assert table["source"] == "standard input" and not any(table["faults"].values())
 
 
@@ -670,7 +670,7 @@ def test_live_images_a_camera_that_comes_back_and_accounts_for_its_events(
     main(["live", "dvxplorer", "--headless", "--out", out, "--seconds", "4", "--idle", "0", "--json"])
     printed = capsys.readouterr()
     table = json.loads(printed.out.splitlines()[-1])
-    assert table["events"] + table["dropped"]["events"] == 20_000 and table["pictures"] > 0
+    assert table["events"] + table["dropped"]["events"] == 20_000 and table["images"] > 0
     assert table["faults"]["disconnections"] == 2 and table["faults"]["overflows"] == 1
     assert "is back" in printed.err and "too slow" in printed.err
 

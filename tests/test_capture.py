@@ -136,7 +136,7 @@ DAMAGE = {
     ),
     "outside": (_edit("capture.yaml", "mask: target.png", "mask: ../../secret.png"), "outside"),
     "missing frame": (lambda f: (f / "frames/0003.png").unlink(), "0003.png"),
-    "no image": (lambda f: (f / "frames/0003.png").write_text("hello"), "picture"),
+    "no image": (lambda f: (f / "frames/0003.png").write_text("hello"), "as an image"),
     "small frame": (lambda f: Image.new("L", (70, 48)).save(f / "frames/0003.png"), "70 x 48"),
     "times": (_edit("frames.csv", "3000000", "2000000"), "ascend"),
     "time text": (_edit("frames.csv", "3000000", "three"), "whole number"),

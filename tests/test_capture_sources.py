@@ -117,10 +117,10 @@ def test_one_file_of_events_and_frames_is_imported_by_one_command(name, tmp_path
     assert recording.name == "shot_A" and recording.events == stream()
     np.testing.assert_array_equal(recording.frames, pictures())
     assert recording.frame_times_us.tolist() == (np.arange(6) * 200_000 + 9).tolist()
-    main(["import", str(path), "--out", str(tmp_path / "d"), "--no-check-pictures"])
+    main(["import", str(path), "--out", str(tmp_path / "d"), "--no-check-images"])
     samples, _ = read_shard(open_dataset(tmp_path / "d").shard("shot_A"))
     assert samples.frame.shape == (5, 64, 96)
-    main(["import", str(path), "--out", str(tmp_path / "d"), "--no-check-pictures"])  # nothing is left to do
+    main(["import", str(path), "--out", str(tmp_path / "d"), "--no-check-images"])  # nothing is left to do
 
 
 def long_bag(path: Path, count: int, size=(96, 128)) -> Path:
@@ -455,5 +455,5 @@ def test_the_command_tells_what_it_did_and_draws_it(tmp_path, capsys):
     assert str(tmp_path / "d" / "checks") in said.out
     with Image.open(tmp_path / "d" / "checks" / "shot_A.png") as sheet:
         assert sheet.size[0] > 900
-    main(["import", str(folder), "--out", str(tmp_path / "e"), "--no-check-pictures"])
+    main(["import", str(folder), "--out", str(tmp_path / "e"), "--no-check-images"])
     assert not (tmp_path / "e" / "checks").exists()

@@ -149,7 +149,7 @@ def test_a_pattern_stands_for_the_captures_that_it_matches(tiny_captures, tmp_pa
     matching = captures_in([Path(pattern)])
     assert matching == sorted(path for path in tiny_captures if path.match(pattern))
     assert captures_in([above]) == captures_in([above / "*"]) == sorted(tiny_captures)
-    main(["import", pattern, "--out", str(tmp_path / "data"), "--no-check-pictures", "--json"])
+    main(["import", pattern, "--out", str(tmp_path / "data"), "--no-check-images", "--json"])
     split = json.loads(capsys.readouterr().out)["split"]
     assert sum(map(len, split.values())) == len(matching) > 1
     odd = tmp_path / "odd[1]"  # brackets are a pattern's, and this is a name

@@ -544,12 +544,12 @@ def test_a_run_makes_the_last_image_of_all_events(engine: Engine) -> None:
     surface.add(events)
     np.testing.assert_allclose(last.surface, reduce_by_area(surface.at(last.t_us), (16, 24)), atol=1e-6)
     assert summary["events"] == 2000 and summary["dropped"] == {"events": 0, "chunks": 0}
-    assert summary["pictures"] == len(kept.pictures) > 0
+    assert summary["images"] == len(kept.pictures) > 0
     spread = summary["latency_ms"]["oldest_event"]
     assert 0 < spread["p50"] <= spread["p90"] <= spread["p99"] <= spread["max"]
     text = latency_table(summary)
     assert "2,000 events" in text and f"{spread['p50']:9.1f}" in text
-    assert run.statistics.now()["pictures"] == summary["pictures"]
+    assert run.statistics.now()["images"] == summary["images"]
 
 
 def test_drops_and_the_error_of_a_source_reach_the_user(engine: Engine) -> None:
@@ -630,7 +630,7 @@ def test_headless_writes_video_and_table(event_weights: Path, tmp_path: Path, ca
     assert (
         table["verdict"]["wall"] == "" and "single time steps" in table["verdict"]["recording"]
     )  # no setup known
-    assert 0 < table["recorded"] + table["not_recorded"] <= table["pictures"]
+    assert 0 < table["recorded"] + table["not_recorded"] <= table["images"]
     assert table["latency_ms"]["network"]["p50"] > 0
     if video_kind() == "mp4":
         import av
@@ -670,7 +670,7 @@ def test_a_capture_is_replayed_with_its_frames(tiny_captures, tmp_path: Path, ca
     call = ["live", str(tiny_captures[0]), "--weights", str(tmp_path / "f.safetensors"), "--headless", "--json"]
     main([*call, "--out", str(out), "--speed", "20", "--rate", "30"])
     table = recorded(out, capsys)
-    assert table["modality"] == "fusion" and table["pictures"] > 0
+    assert table["modality"] == "fusion" and table["images"] > 0
     assert table["events"] <= len(read_capture(tiny_captures[0]).events)
 
 
@@ -683,9 +683,7 @@ def test_without_weights_published_ones_of_single_positions_are_taken(
         main(["live", str(source), "--headless", "--out", str(out), "--speed", "20", "--seconds", "5"])
         assert f"{name} makes the images" in capsys.readouterr().err
         table = json.loads((out / "latency.json").read_text())
-        assert (
-            table["weights"] == name and table["modality"] == name.partition("-")[2] and table["pictures"] > 0
-        )
+        assert table["weights"] == name and table["modality"] == name.partition("-")[2] and table["images"] > 0
         wall = verdict_on(load_setup(published_setup(name)), None).wall
         assert (
             wall and table["verdict"]["wall"] == wall
@@ -791,7 +789,7 @@ def test_the_page_asks_nobody_else(page: Page) -> None:
     assert not re.findall(r"https?:|//[a-z]|@import|<script src|<link rel=.style", text)
     with get(page.url + "state.json") as answer:
         state = json.load(answer)
-    assert state["title"] == "walk.raw, event" and state["pictures"] == 0 and not state["ended"]
+    assert state["title"] == "walk.raw, event" and state["images"] == 0 and not state["ended"]
     assert not page.seen.is_set()
     assert page.url.startswith("http://127.0.0.1:")
 
@@ -873,7 +871,7 @@ def test_the_stream_brings_each_new_image_and_the_end(page: Page, engine: Engine
         assert answer.headers["Content-Type"] == "text/event-stream"
         heard = messages(answer)
         kind, shown = next(heard)
-        assert (kind, shown["number"], shown["t_s"], shown["latency_ms"]) == ("picture", 3, 1.5, 21.4)
+        assert (kind, shown["number"], shown["t_s"], shown["latency_ms"]) == ("image", 3, 1.5, 21.4)
         assert list(shown["panels"]) == ["events", "reconstruction"]
         with urllib.request.urlopen(shown["panels"]["reconstruction"]) as data:
             picture = np.asarray(Image.open(io.BytesIO(data.read())))
@@ -882,7 +880,7 @@ def test_the_stream_brings_each_new_image_and_the_end(page: Page, engine: Engine
         page.wait_for_viewer(NEVER)
         page.show(Picture(4, 1_600_000, 0.0, image, np.zeros((2, 16, 24), np.float32), image, 0, nan))
         kind, shown = next(heard)
-        assert (kind, shown["number"], shown["latency_ms"]) == ("picture", 4, None)
+        assert (kind, shown["number"], shown["latency_ms"]) == ("image", 4, None)
         assert list(shown["panels"]) == ["wall", "events", "reconstruction"]
         threading.Thread(target=page.__exit__).start()
         while not (message := next(heard))[1].get("ended"):

@@ -230,7 +230,7 @@ class Engine:
         >>> engine = Engine(Weights(network))
         >>> events = Events([3, 9], [1, 30], [2, 20], [True, False], width=48, height=32)
         >>> image = engine.see([Chunk(events, 9, 0.0, 0.0)])
-        >>> picture.image.shape, picture.t_us, picture.events
+        >>> image.image.shape, image.t_us, image.events
         ((16, 24), 9, 2)
     """
 

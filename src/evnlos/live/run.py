@@ -44,7 +44,7 @@ class RunStatistics:
         self._source, self._queue = source, queue
         self._times: deque[tuple[float, ...]] = deque(maxlen=_KEPT)
         self._recent: deque[tuple[float, int, float]] = deque(maxlen=_RECENT)
-        self.pictures = self.events = 0
+        self.images = self.events = 0
         self._first: tuple[float, int] | None = None  # instant and events of the first image
         self._last_s = 0.0
 
@@ -53,7 +53,7 @@ class RunStatistics:
         t = picture.timing
         self._times.append((t.oldest_s, t.newest_s, t.wait_s, t.surface_s, t.network_s))
         self._recent.append((picture.made_s, picture.events, t.oldest_s))
-        self.pictures += 1
+        self.images += 1
         self.events += picture.events
         self._first = self._first or (picture.made_s, picture.events)
         self._last_s = picture.made_s
@@ -64,7 +64,7 @@ class RunStatistics:
         span = recent[-1][0] - recent[0][0] if len(recent) > 1 else 0.0
         times = np.array([oldest_s * 1e3 for _, _, oldest_s in recent if np.isfinite(oldest_s)])
         return {
-            "pictures": self.pictures,
+            "images": self.images,
             "images_hz": round((len(recent) - 1) / span, 1) if span else 0.0,
             "events_hz": round(sum(n for _, n, _ in recent[1:]) / span) if span else 0,
             "latency_ms": [round(float(v), 1) for v in np.percentile(times, [50, 99])] if len(times) else [],
@@ -87,8 +87,8 @@ class RunStatistics:
         return {
             "source": self._source.name,
             "seconds": round(seconds, 3),
-            "pictures": self.pictures,
-            "images_hz": round((self.pictures - 1) / seconds, 2) if seconds else 0.0,
+            "images": self.images,
+            "images_hz": round((self.images - 1) / seconds, 2) if seconds else 0.0,
             "events": self.events,
             "events_hz": round((self.events - first_events) / seconds) if seconds else 0,
             **self._losses(),
@@ -114,9 +114,9 @@ def latency_table(summary: dict[str, Any]) -> str:
         spread = summary["latency_ms"][row]
         cells = (f"{spread[name]:9.1f}" if spread else f"{'-':>9}" for name in names)
         lines.append(f"{title:<32}{''.join(cells)}")
-    pictures = f"{summary['pictures']:,} images ({summary['images_hz']:.1f} a second)"
+    images = f"{summary['pictures']:,} images ({summary['images_hz']:.1f} a second)"
     events = f"{summary['events']:,} events ({summary['events_hz']:,} a second)"
-    lines.append(f"{pictures} of {events} in {summary['seconds']:.1f} s")
+    lines.append(f"{images} of {events} in {summary['seconds']:.1f} s")
     dropped, faults = summary["dropped"], _listed(summary["faults"].items())
     lines.append(f"dropped by the queue: {dropped['events']:,} events in {dropped['chunks']:,} chunks")
     return "\n".join([*lines, *([f"left out by the source: {faults}"] if faults else [])])

@@ -199,7 +199,7 @@ def cloud_images(
     Example:
         >>> events = Events([5, 15], [0, 3], [1, 1], [True, False], width=4, height=2)
         >>> images, colours = cloud_images(events, np.array([0, 10, 20]))
-        >>> pictures.shape, colours.shape, colours[0].tolist()
+        >>> images.shape, colours.shape, colours[0].tolist()
         ((2, 264, 480), (8, 4), [0, 0, 0, 0])
     """
     size = size or CloudSize()
