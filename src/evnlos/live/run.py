@@ -114,7 +114,7 @@ def latency_table(summary: dict[str, Any]) -> str:
         spread = summary["latency_ms"][row]
         cells = (f"{spread[name]:9.1f}" if spread else f"{'-':>9}" for name in names)
         lines.append(f"{title:<32}{''.join(cells)}")
-    images = f"{summary['pictures']:,} images ({summary['images_hz']:.1f} a second)"
+    images = f"{summary['images']:,} images ({summary['images_hz']:.1f} a second)"
     events = f"{summary['events']:,} events ({summary['events_hz']:,} a second)"
     lines.append(f"{images} of {events} in {summary['seconds']:.1f} s")
     dropped, faults = summary["dropped"], _listed(summary["faults"].items())
