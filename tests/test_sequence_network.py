@@ -15,7 +15,7 @@ from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, as_modality, simulate
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import SequenceOperator, fit_local_changes, local_changes
+from evnlos.inverse import SequenceOperator, ridge_by_groups
 from evnlos.inverse.sequence_light import EVENT_PRIORS
 from evnlos.models import FrameOperator, SequenceConfig, SequenceReconstructor, UNetConfig, load_weights
 from evnlos.models.sequence import PooledFrames
@@ -242,20 +242,30 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
             torch.testing.assert_close(image.double(), expected, rtol=1e-3, atol=1e-3 * float(expected.std()))
 
 
-def test_local_changes_are_found_beside_what_all_targets_share() -> None:
-    """Against least squares with a prior of one pixel after the other."""
+def test_ridge_regression_leaves_out_group_after_group() -> None:
+    """Against the penalty and the weights that solving anew without each group gives."""
     torch.manual_seed(1)
-    light, common = torch.rand(30, 5, 7), torch.randn(30, 4)
-    rest = 0.1 * torch.randn(30, 5, 7) + torch.einsum("nc,chw->nhw", common, torch.randn(4, 5, 7))
-    found = fit_local_changes(light, rest, common, spread=0.5)
-    changes = local_changes(light).double()
-    free = torch.eye(30).double() - common.double() @ torch.linalg.pinv(common.double())
-    sizes = torch.stack([(free @ c.flatten(1)).square().mean().sqrt() for c in changes.unbind(-1)])
-    for row, column in ((0, 0), (2, 3), (4, 6)):
-        x, y = free @ changes[:, row, column] / sizes, free @ rest[:, row, column].double()
-        known = y.square().mean() / (0.25 * light.double().square().mean())
-        wanted = torch.linalg.inv(x.T @ x + known * torch.eye(5)) @ (x.T @ y) / sizes
-        torch.testing.assert_close(found[row, column].double(), wanted, rtol=1e-3, atol=1e-4)
+    known, group = torch.randn(30, 12), torch.arange(30) % 5
+    wanted = known @ torch.randn(12, 3) + 5.0 * torch.randn(30, 3)
+    penalties = (1e-3, 1e-2, 1e-1, 10.0)
+    x, y = known.double(), wanted.double()
+
+    def solved(kept: torch.Tensor, penalty: float) -> torch.Tensor:
+        own = penalty * float(x.square().sum()) * torch.eye(12)
+        return torch.linalg.solve(x[kept].T @ x[kept] + own, x[kept].T @ y[kept])
+
+    left = {
+        penalty: sum(
+            float((y[group == g] - x[group == g] @ solved(group != g, penalty)).square().sum())
+            for g in range(5)
+        )
+        for penalty in penalties
+    }
+    best = min(left, key=lambda penalty: left[penalty])
+    assert penalties[0] < best < penalties[-1] and left[best] < float(y.square().sum())
+    found = ridge_by_groups(known, wanted, group, penalties)
+    torch.testing.assert_close(found.double(), solved(group >= 0, best), rtol=1e-4, atol=1e-5)
+    assert ridge_by_groups(known, torch.randn(30, 3), group, (1e-3, 1e-2)) is None
 
 
 @pytest.fixture(scope="module")
@@ -346,7 +356,7 @@ def test_captures_correct_the_light_path_that_frames_are_solved_through(solved, 
     plain = operator(truth)
     wave = torch.sin(torch.arange(sampling.width) / 3.0)
     draw = torch.Generator().manual_seed(3)
-    wrong = plain * (1 + 0.05 * wave) + 0.3 * wave * local_changes(plain)[..., 1]
+    wrong = plain * (1 + 0.05 * wave) + 0.15 * wave * (plain.roll(-1, 2) - plain.roll(1, 2))
     seen = wrong + operator.sigma * torch.randn(wrong.shape, generator=draw)
     fitted = PooledFrames(sampling, (1.0,), 200)
     fitted.fit(setup, samples.inputs[:, 0].float(), truth, places, samples.names)

@@ -566,7 +566,7 @@ def test_a_folder_without_a_setup_is_no_photograph(capture, capsys) -> None:
 
 @pytest.mark.parametrize("name", ["near_G", pytest.param("far_G", marks=pytest.mark.thorough)])
 def test_the_page_on_motion_says_what_the_command_prints(name, shared_data, tmp_path, capsys) -> None:
-    """A last digit may differ between machines, and the offset, which the frames hardly tell, by half a millimetre."""
+    """A last digit differs between machines, and the offset, which frames hardly tell, by half a millimetre."""
     page = (Path(__file__).parents[1] / "docs" / "motion.md").read_text()
     row = next(line for line in page.splitlines() if line.startswith(f"| {name} |"))
     error, strokes, deviation, x, y, speed = (float(value) for value in re.findall(r"-?[0-9.]+", row))

@@ -28,10 +28,9 @@ from .operators import Gradient as Gradient
 from .operators import LinearOperator as LinearOperator
 from .operators import LogChange as LogChange
 from .operators import Solution as Solution
-from .operators import fit_local_changes as fit_local_changes
-from .operators import local_changes as local_changes
 from .operators import log_change as log_change
 from .operators import operator_norm as operator_norm
+from .operators import ridge_by_groups as ridge_by_groups
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
 from .problem import block_folds as block_folds

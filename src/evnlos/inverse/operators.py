@@ -3,12 +3,12 @@
 - Conjugate gradients for a batch of symmetric systems.
 - What every solver hands back.
 - The event form of the inverse problem: changes of log light as a linear function of the hidden scene.
-- Small local errors of an operator: brightness, place and blur of its images, pixel by pixel.
+- Errors of an operator, from samples of what it misses: ridge regression, groups left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, Protocol
@@ -16,7 +16,6 @@ from typing import Literal, Protocol
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from torch.nn.functional import pad
 
 from evnlos.cameras.pixel import EventPixel
 from evnlos.errors import ConfigError, DataError
@@ -318,45 +317,39 @@ def log_change(events: Events, edges_us: ArrayLike, pixel: EventPixel) -> torch.
     return pixel.threshold_on * counts[:, 0] - pixel.threshold_off * counts[:, 1]
 
 
-def local_changes(images: torch.Tensor) -> torch.Tensor:
-    """Return what small errors of brightness, place and blur change in images [N, h, w]: [N, h, w, 5].
+def ridge_by_groups(
+    known: torch.Tensor,
+    wanted: torch.Tensor,
+    group: torch.Tensor,
+    penalties: Sequence[float] = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1),
+) -> torch.Tensor | None:
+    """Return weights W [P, R] of ridge regression, wanted ~ known W, with the penalty that groups left out want.
 
-    The image itself, its differences along x and y, and its second differences along both, per pixel.
-
-    Example:
-        >>> local_changes(torch.arange(9.0).reshape(1, 3, 3))[0, 1, 1].tolist()
-        [4.0, 1.0, 3.0, 0.0, 0.0]
-    """
-    wide, high = (pad(images, size, mode="replicate") for size in ((1, 1, 0, 0), (0, 0, 1, 1)))
-    left, right, up, down = wide[..., :-2], wide[..., 2:], high[..., :-2, :], high[..., 2:, :]
-    changes = (right - left) / 2, (down - up) / 2, left + right - 2 * images, up + down - 2 * images
-    return torch.stack([images, *changes], dim=-1)
-
-
-def fit_local_changes(
-    light: torch.Tensor, rest: torch.Tensor, common: torch.Tensor, spread: float = 0.02
-) -> torch.Tensor:
-    """Return how much of each of the `local_changes` of light each pixel sees beside it, [h, w, 5].
-
-    At pixel u and time step k: rest(u, k) = sum_j m_j(u) change_j(light)(u, k) + common(k) c(u) + noise. Least
-    squares with a Gaussian prior on m: no change is much larger than a share `spread` of the light.
+    In the dual form W = X^T (X X^T + penalty mean |x|^2 N)^-1 Y, each group is left out in closed form: with H
+    the inverse, what it misses of its own rows g is (H_gg)^-1 (H Y)_g (leave-out residuals of Gaussian
+    process regression; Rasmussen and Williams 2006, section 5.4.2).
 
     Args:
-        light: What the operator predicts, [N, h, w].
-        rest: What was seen beside it, [N, h, w].
-        common: What is the same whatever the target, a column each, [N, c]; it is given away.
-        spread: Typical size of a change, in that of the light.
+        known: X, a row for each sample, [N, P].
+        wanted: Y, [N, R].
+        group: Number of each sample's group, int64 [N].
+        penalties: Penalties, in units of N times the rows' mean square norm; each above 0.
+
+    Returns:
+        The weights, float32, or None: every penalty misses more of the groups left out than W = 0 does.
     """
-    basis = torch.linalg.qr(common).Q
-
-    def left(images: torch.Tensor) -> torch.Tensor:
-        flat = images.flatten(1)
-        return (flat - basis @ (basis.T @ flat)).view_as(images)
-
-    rest, free = left(rest), torch.stack([left(change) for change in local_changes(light).unbind(-1)])
-    sizes = free.square().mean(dim=(1, 2, 3)).sqrt().clamp_min(1e-12)
-    free = free / sizes[:, None, None, None]
-    gram, seen = torch.einsum("inhw,jnhw->hwij", free, free), torch.einsum("inhw,nhw->hwi", free, rest)
-    known = rest.square().mean(dim=0) / (spread**2 * light.square().mean().clamp_min(1e-12))
-    own = gram + known[..., None, None] * torch.eye(5)
-    return torch.cholesky_solve(seen[..., None], torch.linalg.cholesky(own))[..., 0] / sizes
+    target = wanted.double()
+    values, axes = torch.linalg.eigh((known @ known.T).double())
+    values = values.clamp_min(0)
+    turned, size = axes.T @ target, values.sum().clamp_min(1e-30)  # N times the mean square norm
+    least, best = float(target.square().sum()), None
+    for penalty in penalties:
+        inverse = 1 / (values + penalty * size)
+        dual, left = axes @ (inverse[:, None] * turned), 0.0
+        for number in group.unique():
+            own = axes[group == number]
+            root = torch.linalg.cholesky((own * inverse) @ own.T)
+            left += float(torch.cholesky_solve(dual[group == number], root).square().sum())
+        if left < least:
+            least, best = left, dual
+    return None if best is None else known.T @ best.to(known)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.operators import fit_local_changes, local_changes
+from evnlos.inverse.operators import ridge_by_groups
 from evnlos.inverse.sequence_light import EVENT_PRIORS, handwritten_prior
 from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.models.confidence import on_canvas
@@ -139,7 +139,7 @@ class TargetGrid:
 
 _COEFFICIENTS, _CELLS_ACROSS = 150, 32  # of prior, target
 _FEWEST = 8  # objects to tell gain, offset and noise from
-_FEWEST_CAPTURES, _MOST_FRAMES, _WAVES = 4, 2048, 12  # that correct the light path; waves over the travel
+_FEWEST_CAPTURES, _MOST_FRAMES = 4, 2048  # that correct the light path
 _ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
 _RIDGE, _AT_ONCE = 1e-6, 1024  # frames
 
@@ -268,10 +268,11 @@ class PooledFrames(nn.Module):
         self._last = None
 
     def correct(self, frames: Tensor, truth: Tensor, position_m: Tensor, names: NDArray[np.str_]) -> None:
-        """Take from captures with known targets what the setup's light path gets wrong at each pixel.
+        """Take from captures with known targets what the setup's light path gets wrong.
 
-        Brightness, place and blur of the light (`fit_local_changes`), then what moves along; waves over the
-        travel take what is the same for all targets at a place. Fewer than 4 captures change nothing.
+        What the components hold beside the predicted light is linear in the image on the canvas: ridge
+        regression (`ridge_by_groups`), each capture left out in turn, beside an offset of each capture and what
+        moves along. Fewer than 4 captures change nothing, nor do those that predict nothing of each other.
 
         Args:
             frames: White levels, [N, H, W].
@@ -280,28 +281,28 @@ class PooledFrames(nn.Module):
             names: Capture of each, [N].
         """
         found, owner = np.unique(names, return_inverse=True)
-        if (count := len(found)) < _FEWEST_CAPTURES:
+        if len(found) < _FEWEST_CAPTURES:
             return
-        some = torch.from_numpy(np.flatnonzero(owner * len(owner) < _MOST_FRAMES * count))
-        frames, truth, position_m = frames[some].float(), truth[some].float(), position_m[some]
-        steady = F.normalize(F.one_hot(torch.from_numpy(owner)[some]).float(), dim=0)  # a column a capture
-        terms, size = self._terms(position_m), self.ambient.shape
-        clean = truth.flatten(1) @ self.light.flatten(1).T
-        code = (frames - self.ambient).flatten(1) @ self.basis - terms @ self.along
-        moving, seen = (values - steady @ (steady.T @ values) for values in (clean, code))
-        gain = (moving * seen).sum() / moving.square().sum().clamp_min(1e-12)
-        gram = (self.basis.T @ self.basis).double()
-        gram += _RIDGE**2 * gram.diagonal().amax() * torch.eye(len(gram))
-        back = torch.cholesky_solve(self.basis.T.double(), torch.linalg.cholesky(gram)).float()  # [r, H W]
-        light = (clean @ back).unflatten(1, size)
-        waves = torch.cos(math.pi / 2 * (terms[:, 1:2] + 1) * torch.arange(1, _WAVES + 1))
-        common = torch.cat([steady, terms[:, 1:], waves], dim=1)
-        maps = fit_local_changes(light, frames - self.ambient - gain * light, common)
-        # of light that is a sum of `back`, the changes are the sum of those of `back`
-        turn = (local_changes(back.unflatten(1, size)) * maps).sum(dim=-1).flatten(1) @ self.basis  # [r, r]
-        moved = (torch.eye(len(turn)) + turn).T @ self.light.flatten(1)  # [r, cells]
-        self.along += _polynomial(terms, code - gain * (truth.flatten(1) @ moved.T))
-        self.light.copy_(moved.view_as(self.light))
+        some = torch.arange(0, len(owner), math.ceil(len(owner) / _MOST_FRAMES))
+        group, terms = torch.from_numpy(owner)[some], self._terms(position_m[some])
+        seen, code = (
+            truth[some].float().flatten(1),
+            (frames[some].float() - self.ambient).flatten(1) @ self.basis,
+        )
+        steady = F.normalize(F.one_hot(group).float(), dim=0)  # a column a capture
+        basis = torch.linalg.qr(torch.cat([steady, terms[:, 1:]], dim=1)).Q
+
+        def beside(values: Tensor) -> Tensor:
+            return values - basis @ (basis.T @ values)
+
+        moving, own = beside(seen), beside(code)
+        light = moving @ self.light.flatten(1).T
+        gain = (light * own).sum() / light.square().sum().clamp_min(1e-12)
+        errors = ridge_by_groups(moving, own - gain * light, group)
+        if errors is None:
+            return
+        self.light += (errors.T / gain).view_as(self.light)
+        self.along.copy_(_polynomial(terms, code - gain * (seen @ self.light.flatten(1).T)))
         self._last = None
 
     def forward(self, frames: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
