@@ -112,6 +112,7 @@ WHOLE_CHAPTERS = {
     "optics/corner.py",
     "optics/facets.py",
     "optics/radiometric.py",
+    "scene/moving.py",
 }
 """Settings, equations and loops of one model or measurement: cut in two, a reader would need both halves."""
 

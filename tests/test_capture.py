@@ -3,13 +3,15 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
-from evnlos.data import capture_samples, character_of, read_shard, reduce_by_area
+from evnlos.config import from_dict
+from evnlos.data import Capture, CaptureInfo, capture_samples, character_of, read_shard, reduce_by_area
 from evnlos.data.sampling import Sampling
 from evnlos.errors import DataError
 from watching import Watch, stopped
@@ -166,3 +168,12 @@ def test_a_capture_without_events_is_refused(capture, tmp_path) -> None:
 
 def test_characters_of_names() -> None:
     assert [character_of(n) for n in ("near_R", "writer03_A", "plain")] == ["R", "A", "plain"]
+
+
+def test_a_capture_states_a_motion_in_space() -> None:
+    motion = {"start_m": -0.05, "speed_m_s": 0.02, "retreat_m_s": 0.01, "spin_deg_s": 5.0, "start_us": 500_000}
+    info = from_dict(
+        CaptureInfo, {"camera": {"width": 8, "height": 4}, "motion": motion, "setup": {"distance_m": 0.3}}
+    )
+    pose = Capture.motion.fget(SimpleNamespace(info=info, distance_m=0.3)).pose(1.5)
+    assert float(pose.z_m) == pytest.approx(0.31) and float(pose.rotation_rad) == pytest.approx(np.radians(5))

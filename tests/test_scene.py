@@ -249,3 +249,47 @@ def test_bad_motion_is_refused(build):
 def test_the_standard_sample_is_forty_positions_a_fifth_of_a_second_apart():
     times = Scene(random_target()).position_times_s()
     np.testing.assert_allclose(times, 0.2 * np.arange(1, 41), atol=1e-12)
+
+
+def test_a_turned_target_is_its_mask_turned():
+    """Against points of the turned plane, looked up in a smooth mask; light is kept, a quarter is exact."""
+    at = (np.arange(80) + 0.5) / 80 - 0.5
+    smooth = lambda x, y: np.exp(-((x - 0.1) ** 2 / 0.02 + (y + 0.15) ** 2 / 0.01))  # noqa: E731
+    target = Target("blob", smooth(at, at[:, None]).astype(np.float32), 0.08)
+    plane = Plane(120, 150, 0.001, (0.004, 0.0))
+    x, y = (plane.x_m - 0.01) / 0.08, (plane.y_m[:, None] + 0.005) / 0.08
+    for angle in (0.4, -2.0):
+        drawn = target.rasterise(plane, (0.01, -0.005), angle)
+        # What is at (x, y) was at R^T (x, y) of the upright target; clockwise as rows and columns run.
+        cos, sin = np.cos(angle), np.sin(angle)
+        expected = smooth(cos * x + sin * y, cos * y - sin * x)
+        assert np.abs(drawn - expected).max() < 0.02
+        assert drawn.sum() == pytest.approx(target.rasterise(plane, (0.01, -0.005)).sum(), rel=2e-3)
+    quarter = Target("blob", np.rot90(target.mask, -1), 0.08)
+    own = Plane(80, 80, 0.001)
+    np.testing.assert_allclose(target.rasterise(own, (0, 0), np.pi / 2), quarter.rasterise(own), atol=0.02)
+    scene = Scene(target, LineMotion((0.0, 0.0), 0.0, spin_deg_s=90.0), 1.0)
+    np.testing.assert_allclose(scene.truth(own, [0.0, 1.0])[1], quarter.mask, atol=0.02)
+
+
+def test_motions_in_space_say_where_they_are():
+    line = LineMotion(z_m=0.3, retreat_m_s=0.01, spin_deg_s=10.0, start_s=1.0)
+    pose = line.pose([1.0, 3.0])
+    np.testing.assert_allclose(pose.z_m, [0.3, 0.32])
+    np.testing.assert_allclose(np.degrees(pose.rotation_rad), [0.0, 20.0], atol=1e-12)
+    path = PathMotion((0.0, 1.0, 2.0), ((0, 0), (0.1, 0), (0.2, 0)), (0.3, 0.4, 0.35), (0.0, 30.0, -10.0))
+    pose = path.pose([0.0, 1.0, 2.0, 5.0])
+    np.testing.assert_allclose(pose.z_m, [0.3, 0.4, 0.35, 0.35])
+    np.testing.assert_allclose(np.degrees(pose.rotation_rad), [0.0, 30.0, -10.0, -10.0])
+    target = Target("square", np.ones((4, 4)))
+    assert Scene(target, path, 2.0).moves_in_space and not Scene(target, LineMotion(z_m=0.3)).moves_in_space
+    for wrong in (
+        {"retreat_m_s": 0.1},
+        {"retreat_m_s": float("nan"), "z_m": 0.3},
+        {"spin_deg_s": float("inf")},
+    ):
+        with pytest.raises(DataError):
+            LineMotion(**wrong)
+    for wrong in ({"z_m": (0.3,)}, {"z_m": (0.3, -0.1)}, {"rotation_deg": (0.0, float("nan"))}):
+        with pytest.raises(DataError):
+            PathMotion((0.0, 1.0), ((0, 0), (0.1, 0)), **wrong)

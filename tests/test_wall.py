@@ -8,6 +8,7 @@ import torch
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.optics import (
+    DepthTransport,
     DiffuseReflection,
     Irradiance,
     MatrixTransport,
@@ -278,6 +279,68 @@ def test_matrix_wall_equals_the_matrix_times_the_drawing():
     torch.testing.assert_close(wall.irradiance(0.77), expected.float())
     assert isinstance(wall, Irradiance)
     assert wall.speed_px_s == pytest.approx(2.5)
+
+
+WINDING = PathMotion(
+    (0.0, 1.0, 2.0, 3.0),
+    ((-0.04, 0.0), (-0.01, 0.02), (0.02, -0.02), (0.05, 0.0)),
+    (0.28, 0.33, 0.31, 0.36),
+    (0.0, 40.0, 90.0, 20.0),
+)
+SMALL = RadiometricSetup(roughness=0.08, cell_m=0.008, gain=0.7, ambient=0.05).resized((10, 16))
+
+
+def test_light_of_any_distance_is_off_by_less_than_is_stated():
+    """Interpolated over distances in a basis of images, against matrices made at distances that no node has."""
+    cells = Plane(8, 16, 0.01)
+    exact = lambda z_m: SMALL.at_distance(z_m).matrix((10, 16), cells)  # noqa: E731
+    found = DepthTransport(exact, 0.25, 0.4, cells, (10, 16))
+    assert found.error < 1e-3 and found.basis.shape[1] < 128
+    away = np.random.default_rng(0).uniform(0.25, 0.4, 8)
+    errors = [float((found.at(z_m).matrix - exact(z_m)).norm() / exact(z_m).norm()) for z_m in away]
+    assert max(errors) < 2 * found.error
+    assert max(errors) > 0.05 * found.error  # what is stated is not a guess from above
+    a, b = (found.coefficients(0.3 * math.exp(way)) for way in (5e-4, -5e-4))
+    torch.testing.assert_close(found.slope(0.3), (a - b) / 1e-3, rtol=2e-2, atol=2e-2 * float(a.abs().max()))
+    with pytest.raises(DataError, match="not between"):
+        found.coefficients(0.5)
+    with pytest.raises(ConfigError, match="rougher wall"):
+        DepthTransport(
+            lambda z: torch.sin(torch.arange(128.0) * 99 * z).expand(160, -1), 0.2, 0.4, cells, (10, 16)
+        )
+
+
+def test_a_target_that_turns_and_retreats_is_seen_as_by_exact_matrices():
+    scene = Scene(letter(), WINDING, 3.0)
+    wall = SMALL.observe(scene)
+    assert isinstance(wall, Irradiance)
+    cells = wall.transport.source
+    own = SMALL.operator(SMALL.source()).dense().sum() / SMALL.matrix(SMALL.shape, SMALL.source()).sum()
+    for time in np.random.default_rng(3).uniform(0, 3, 5):
+        pose = scene.pose(time)
+        drawn = scene.target.rasterise(cells, (pose.x_m, pose.y_m), float(pose.rotation_rad))
+        light = (
+            own
+            * SMALL.at_distance(float(pose.z_m)).matrix(SMALL.shape, cells)
+            @ torch.from_numpy(drawn).double().flatten()
+        )
+        off = wall.irradiance(time) - (SMALL.ambient_light() + light.unflatten(0, SMALL.shape))
+        assert float(off.norm() / light.norm()) < 1e-3
+    some = np.array([0.3, 2.9])
+    torch.testing.assert_close(wall.irradiance(some)[1], wall.irradiance(2.9))
+    assert wall.irradiance([]).shape == (0, *SMALL.shape)
+
+
+def test_nothing_in_a_turning_image_outruns_its_bound():
+    """A spinning, resting target: the motion's own speed is nought, its corners' is not."""
+    scene = Scene(letter(), LineMotion(speed_m_s=0.0, start_m=(0.0, 0.0), spin_deg_s=45.0), 2.0)
+    wall = SMALL.observe(scene)
+    corner = math.radians(45) * 0.08 / math.sqrt(2) * SMALL.view(SMALL.shape).magnification()
+    assert wall.speed_px_s == pytest.approx(corner, rel=0.03)
+    still = SMALL.observe(Scene(letter(), LineMotion(speed_m_s=0.0, start_m=(0.0, 0.0)), 2.0))
+    light = wall.irradiance(0.0)
+    assert float((light - still.irradiance(0.0)).norm() / light.norm()) < 2e-3
+    assert float((light - wall.irradiance(1.0)).norm() / light.norm()) > 2e-2
 
 
 def test_matrix_wall_is_dark_when_the_target_has_left():

@@ -239,7 +239,7 @@ def _motion(capture: Capture) -> LineMotion:
             f"{capture.name} has no known motion; add `motion` to its capture.yaml (`evnlos track` finds it), "
             "or leave the capture out"
         )
-    return capture.motion
+    return capture.motion.in_its_plane()
 
 
 def _check_same_setup(first: Capture, other: Capture) -> None:

@@ -156,7 +156,7 @@ def _by_motion(
             motion = found.at(capture.frame_times_us[1:] * 1e-6)
         else:
             assert capture.motion is not None  # else it would be tracked
-            motion = capture.motion.position_m(capture.frame_times_us[1:] * 1e-6)
+            motion = capture.motion.in_its_plane().position_m(capture.frame_times_us[1:] * 1e-6)
         groups.setdefault(motion.tobytes(), (motion, []))[1].append(k)
     return list(groups.values())
 
@@ -314,7 +314,7 @@ def estimate_captures(
         motion = capture.motion
         if motion is None:
             raise ConfigError(f"{folder}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
-        size = capture.info.target_size_m
+        motion, size = motion.in_its_plane(), capture.info.target_size_m
         prior = handwritten_prior(Plane(_CELLS, _CELLS, size / _CELLS), _COEFFICIENTS)
         span = (float(capture.frame_times_us[0]) * 1e-6, float(capture.frame_times_us[-1]) * 1e-6)
         shape = (capture.events.height, capture.events.width)

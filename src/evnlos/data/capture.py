@@ -97,12 +97,13 @@ class Capture:
         motion = self.info.motion
         if motion is None:
             return None
-        direction = np.asarray(motion.direction, dtype=float)
-        start = motion.start_m
+        direction, start = np.asarray(motion.direction, dtype=float), motion.start_m
         if not isinstance(start, tuple):
             along = start * direction / np.hypot(*direction)
             start = (float(along[0]), float(along[1]))
-        return LineMotion(start, motion.speed_m_s, motion.direction, motion.start_us * 1e-6)
+        line = LineMotion(start, motion.speed_m_s, motion.direction, motion.start_us * 1e-6)
+        away_m = self.distance_m if motion.retreat_m_s else None
+        return replace(line, z_m=away_m, retreat_m_s=motion.retreat_m_s, spin_deg_s=motion.spin_deg_s)
 
     @property
     def scene(self) -> Scene | None:

@@ -1,7 +1,4 @@
-"""What `capture.yaml` says about a capture; a user writes it, everything but the camera's size has a default.
-
-- The commented `capture.yaml` that a new capture folder begins with.
-"""
+"""What `capture.yaml` says about a capture, and the commented one that a new capture folder begins with."""
 
 from __future__ import annotations
 
@@ -34,12 +31,11 @@ class CameraInfo:
     """Clock of a CeleX-V sensor, MHz, where the file's name does not say it."""
 
     def __post_init__(self) -> None:
+        sides = f"camera is {self.width} x {self.height} pixels"
         if not (1 <= self.width <= 65_536 and 1 <= self.height <= 65_536):
-            raise ConfigError(f"camera is {self.width} x {self.height} pixels; give sides of 1 to 65536")
+            raise ConfigError(f"{sides}; give sides of 1 to 65536")
         if self.width * self.height > MOST_SENSOR_PIXELS:
-            raise ConfigError(
-                f"camera is {self.width} x {self.height} pixels; at most {MOST_SENSOR_PIXELS:,} are read"
-            )
+            raise ConfigError(f"{sides}; at most {MOST_SENSOR_PIXELS:,} are read")
 
 
 @dataclass(frozen=True)
@@ -65,8 +61,11 @@ class MotionInfo:
     direction: tuple[float, float] = (1.0, 0.0)
     """Direction (x to the right, y downwards)."""
     start_us: int = 0
-    """Instant of the start on the events' clock, microseconds: the time stamp that ties the truth to the
-    capture."""
+    """Instant of the start on the events' clock, microseconds: it ties the truth to the capture."""
+    retreat_m_s: float = 0.0
+    """Speed away from the wall, metres per second; at the start it is `setup.distance_m` away."""
+    spin_deg_s: float = 0.0
+    """Turn in its plane from upright at the start, clockwise, degrees per second."""
 
 
 @dataclass(frozen=True)

@@ -383,6 +383,7 @@ def _description(lab: Lab, name: str, size_m: float) -> dict[str, Any]:
             "speed_m_s": lab.motion.speed_m_s,
             "direction": list(lab.motion.direction),
             "start_us": round(lab.motion.start_s * 1e6),
+            **{n: getattr(lab.motion, n) for n in ("retreat_m_s", "spin_deg_s") if getattr(lab.motion, n)},
         },
         "setup": {
             **({} if distance_m is None else {"distance_m": distance_m}),

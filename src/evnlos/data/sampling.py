@@ -28,7 +28,7 @@ from evnlos.events import (
     read_events,
     time_surface,
 )
-from evnlos.scene import Motion, Target
+from evnlos.scene import Motion, Scene, Target
 from evnlos.types import Events, Plane
 
 _BLOCK_BYTES = 1 << 26  # of frames and surfaces at the sensor's resolution
@@ -221,8 +221,8 @@ def iter_samples(
         time_s = np.asarray(edges_us[1:][part], dtype=np.float64) * 1e-6
         position = None if motion is None else motion.position_m(time_s)
         truth = None
-        if target is not None and position is not None:
-            truth = target.rasterise(sampling.canvas, position)
+        if target is not None and motion is not None:
+            truth = Scene(target, motion).truth(sampling.canvas, time_s)
         light = reduce_by_area(block / np.float32(peak), shape)
         maps = surface if mode == "likelihood" else reduce_by_area(surface, shape)
         yield Samples(light, maps, truth, time_s, position, counts[part])

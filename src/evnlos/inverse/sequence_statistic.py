@@ -369,7 +369,7 @@ def event_images(
     edges_us = np.asarray(edges_us, np.int64)
     if isinstance(motion, LineMotion):  # on the motion's own clock the recordings of a setup share a light path
         began_us = round(1e6 * motion.start_s)
-        motion, edges_us = replace(motion, start_s=0.0), edges_us - began_us
+        motion, edges_us = replace(motion.in_its_plane(), start_s=0.0), edges_us - began_us
         events = replace(events, t_us=events.t_us - began_us)
     span = (int(edges_us[0]) // _SPAN_US * _SPAN_US * 1e-6, -(-int(edges_us[-1]) // _SPAN_US) * _SPAN_US * 1e-6)
     solver, prior = _solver(setup, motion, span, (events.height, events.width))

@@ -1,12 +1,13 @@
 """The wall under a shift-variant transport: a strip of cells on which the target is drawn, and a matrix.
 
-- A target that moves as a whole.
+- A target that moves as a whole, in its plane, or in space: away from the wall, and turning.
 - A hidden plane that changes in place: a film.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -14,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.optics.interpolation import spline_coefficients, spline_weights
-from evnlos.optics.operator import LinearTransport, MatrixTransport
+from evnlos.optics.operator import DEPTH_STEP, DepthTransport, LinearTransport, MatrixTransport
 from evnlos.optics.wall import ambient_map, check_gain, checked_times
-from evnlos.scene import Film, LineMotion, Motion, Target
+from evnlos.scene import Film, LineMotion, Motion, Pose, Scene, Target
 from evnlos.types import Plane
 
 _CHUNK = 64  # positions drawn and carried over at a time
@@ -195,6 +196,110 @@ def coarsest_keyframe_step_m(transport: MatrixTransport, size_m: float) -> float
         if float((wall._between_keys(places) - direct).std()) <= _KEYFRAME_ERROR * float(direct.std()):
             return step
     return strip.pitch_m / 2
+
+
+_TAPS = [math.sqrt(3) * (math.sqrt(3) - 2) ** abs(k) for k in range(-_TAIL, _TAIL + 1)]  # a spline's prefilter
+_INSTANTS = 4096  # at which a motion's speed is looked at
+_FASTER = 1.02  # what may happen between them
+
+
+class SpaceWall:
+    """What a wall makes of a target that moves in space: sideways, away from the wall, and turning.
+
+    irradiance(t) = U c(t) + ambient, c(t) = C(d(t)) s(t), with s(t) the turned target drawn on the cells. c is
+    made at instants between which no point of the target moves more than half a cell, and a cubic spline runs
+    between them.
+
+    Args:
+        at_distances: The light of cells at any distance from the first to the second, white levels.
+        scene: Target and motion.
+        pitch_m: Side of the cells, metres.
+        distance_m: Distance from target to wall where the motion states none, metres.
+        magnification_px_m: Upper bound of the image motion, pixels per metre of target motion.
+        ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
+    """
+
+    def __init__(
+        self,
+        at_distances: Callable[[float, float, Plane], DepthTransport],
+        scene: Scene,
+        pitch_m: float,
+        distance_m: float,
+        magnification_px_m: float,
+        ambient: float | ArrayLike | torch.Tensor = 0.0,
+    ) -> None:
+        self.scene, self._distance_m = scene, distance_m
+        # The fastest point of the target; between the instants it may be a little faster.
+        x, y, z, turn = self._pose(np.linspace(0.0, scene.duration_s, _INSTANTS))
+        reach_m = scene.target.size_m / (math.sqrt(2) if turn.any() else 2)
+        moved = np.linalg.norm(np.diff([x, y, z]), axis=0) + reach_m * np.abs(np.diff(turn))
+        speed_m_s = _FASTER * float(moved.max()) * (_INSTANTS - 1) / scene.duration_s
+        self.speed_px_s = speed_m_s * magnification_px_m
+        """Upper bound of the speed of the image on the sensor, pixels per second."""
+        self._key_s = min(0.5 * pitch_m / max(speed_m_s, 1e-12), scene.duration_s / 4)
+        self._keys: dict[int, torch.Tensor] = {}
+        self._samples: dict[int, torch.Tensor] = {}
+        beyond_s = (_TAIL + 4) * self._key_s  # of the scene, where its spline's tail lies
+        x, y, z, turn = self._pose(np.linspace(-beyond_s, scene.duration_s + beyond_s, _INSTANTS))
+        sides = [
+            (math.floor((one.min() - reach_m) / pitch_m) - 1, math.ceil((one.max() + reach_m) / pitch_m) + 1)
+            for one in (x, y)
+        ]
+        (left, right), (top, bottom) = sides
+        middle = ((left + right) / 2 * pitch_m, (top + bottom) / 2 * pitch_m)
+        # Whole steps of the distance: scenes alike share their matrices.
+        low, high = (f(math.log(d) / DEPTH_STEP) for f, d in ((math.floor, z.min()), (math.ceil, z.max())))
+        self.transport = at_distances(
+            math.exp(low * DEPTH_STEP),
+            math.exp(max(high, low + 1) * DEPTH_STEP),
+            Plane(bottom - top, right - left, pitch_m, middle),
+        )
+        self.ambient = ambient_map(ambient, self.transport.shape)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the camera image, pixels."""
+        return self.transport.shape
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return white levels at times `t_s`, seconds, [] or [T]: float32 [H, W] or [T, H, W].
+
+        Raises:
+            DataError: The times have more than one axis.
+        """
+        times = checked_times(t_s)
+        at = times.reshape(-1) / self._key_s
+        whole = np.floor(at).astype(np.int64)
+        weights = spline_weights(torch.as_tensor(at - whole)).float()  # [4, T]
+        found = self.ambient.new_zeros(len(at), self.transport.basis.shape[1])
+        for k in range(4):
+            if len(at):
+                found += weights[k][:, None] * torch.stack([self._key(int(one) - 1 + k) for one in whole])
+        light = (found @ self.transport.basis.mT).unflatten(-1, self.shape)
+        image = self.ambient + light.clamp(min=0)
+        return image[0] if times.ndim == 0 else image
+
+    def light(self, t_s: float) -> torch.Tensor:
+        """Return c, [r], at a time, seconds: the direct product."""
+        x, y, z, turn = self._pose(t_s)
+        drawn = self.scene.target.rasterise(self.transport.source, (float(x), float(y)), float(turn))
+        return self.transport.coefficients(float(z)) @ torch.from_numpy(drawn).flatten()
+
+    def _pose(self, t_s: ArrayLike) -> Pose:
+        pose = self.scene.pose(t_s)
+        return pose._replace(z_m=np.where(np.isnan(pose.z_m), self._distance_m, pose.z_m))
+
+    def _key(self, k: int) -> torch.Tensor:
+        """Return coefficient k of the spline in time, [r]."""
+        if k not in self._keys:
+            around = [self._sample(k + j) for j in range(-_TAIL, _TAIL + 1)]
+            self._keys[k] = torch.stack([w * one for w, one in zip(_TAPS, around, strict=True)]).sum(dim=0)
+        return self._keys[k]
+
+    def _sample(self, k: int) -> torch.Tensor:
+        if k not in self._samples:
+            self._samples[k] = self.light(k * self._key_s)
+        return self._samples[k]
 
 
 class FilmWall:

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from torch.nn.functional import pad
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Plane
@@ -247,6 +249,123 @@ class MatrixTransport(LinearTransport):
     def _adjoint(self, image: torch.Tensor) -> torch.Tensor:
         scene = image.flatten(-2) @ self.matrix.to(image)  # [..., h w]
         return scene.unflatten(-1, self.source.shape)
+
+
+_NEAR = 4  # matrices that one in between is made of
+# Coefficients of Lagrange's cubics over the steps -1, 0, 1, 2, [power, matrix]
+_LAGRANGE = np.linalg.inv(np.vander(np.arange(-1.0, _NEAR - 1.0), increasing=True))
+DEPTH_STEP = 0.05
+"""Of the distance's logarithm between two matrices, to begin with: less than most walls' blur."""
+_DEPTH_ERROR = 1e-3  # of the light, root mean square
+_MOST_HALVINGS = 3
+_SKETCH = 64  # images that a basis grows by
+
+
+class DepthTransport:
+    """Matrices from a plane of cells at any distance from the wall: A(d) = U C(d).
+
+    U [P, r] are orthonormal camera images, the same at all distances; C(d) [r, cells] is interpolated in ln d
+    by Lagrange's cubics. What is further away is smaller in the image, more blurred, dimmer and seen elsewhere.
+    `error` is that of A(d), relative and root mean square: the largest of those amid three steps.
+
+    Args:
+        matrix: Exact matrix [P, cells] at a distance, metres.
+        low_m: Smallest distance, metres.
+        high_m: Largest distance, metres.
+        source: The cells.
+        shape: Size (H, W) of the images, pixels.
+        tolerance: Largest `error`: steps of the distance are halved, and images added, until it is met.
+
+    Raises:
+        ConfigError: Steps 8 times as fine do not suffice.
+    """
+
+    def __init__(
+        self,
+        matrix: Callable[[float], torch.Tensor],
+        low_m: float,
+        high_m: float,
+        source: Plane,
+        shape: tuple[int, int],
+        tolerance: float = _DEPTH_ERROR,
+    ) -> None:
+        self.source, self.shape = source, shape
+        self.basis = torch.zeros(shape[0] * shape[1], 0)
+        self.low_m, self.high_m = low_m, high_m
+        low, high = math.log(low_m), math.log(high_m)
+        steps = max(_NEAR - 1, math.ceil((high - low) / DEPTH_STEP))
+        made: dict[int, torch.Tensor] = {}  # C at places of the finest grid
+        finest = steps * 2**_MOST_HALVINGS
+        for halving in range(_MOST_HALVINGS + 1):
+            self._low, self._step = low, (high - low) / (steps * 2**halving)
+            for k in sorted({*range(0, finest + 1, 2 ** (_MOST_HALVINGS - halving))} - made.keys()):
+                there_m = math.exp(low + k * (high - low) / finest)
+                made[k] = self._added(matrix(there_m), tolerance / 4)
+            rank = self.basis.shape[1]
+            self.nodes = torch.stack([pad(one, (0, 0, 0, rank - len(one))) for _, one in sorted(made.items())])
+            values, ways = torch.linalg.eigh(torch.einsum("grc,gsc->rs", self.nodes, self.nodes).double())
+            ways = ways[:, values.cumsum(0) > (tolerance / 4) ** 2 * values.sum()].float()  # what carries light
+            basis, self.basis, self.nodes = self.basis, self.basis @ ways, ways.mT @ self.nodes
+            self.error = self._worst(matrix)
+            if self.error <= tolerance:
+                return
+            self.basis = basis
+        raise ConfigError(
+            f"matrices interpolated over the distance are off by {self.error:.2g} of the light, {tolerance:g} "
+            "is the most; give a rougher wall, or a path with less depth"
+        )
+
+    def coefficients(self, distance_m: float) -> torch.Tensor:
+        """Return C(d), [r, cells], at a distance in metres."""
+        first, along = self._place(distance_m)
+        return self._sum(np.power(along, np.arange(_NEAR)) @ _LAGRANGE, first)
+
+    def slope(self, distance_m: float) -> torch.Tensor:
+        """Return the derivative of C by ln d, [r, cells], at a distance in metres."""
+        first, along = self._place(distance_m)
+        powers = np.arange(1, _NEAR)
+        return self._sum(powers * np.power(along, powers - 1) @ _LAGRANGE[1:] / self._step, first)
+
+    def at(self, distance_m: float) -> MatrixTransport:
+        """Return the matrix at a distance in metres."""
+        return MatrixTransport(self.basis @ self.coefficients(distance_m), self.source, self.shape)
+
+    def _sum(self, weights: NDArray[np.floating], first: int) -> torch.Tensor:
+        near = self.nodes[first : first + _NEAR]
+        return torch.einsum("g,grc->rc", torch.from_numpy(weights).to(near), near)
+
+    def _place(self, distance_m: float) -> tuple[int, float]:
+        """Return the first matrix around a distance, and the place between the middle two, in steps."""
+        if not self.low_m * (1 - 1e-9) <= distance_m <= self.high_m * (1 + 1e-9):
+            raise DataError(
+                f"{distance_m:g} m is not between {self.low_m:g} and {self.high_m:g} m; ask for that"
+            )
+        steps = (math.log(distance_m) - self._low) / self._step
+        first = min(max(int(steps) - 1, 0), len(self.nodes) - _NEAR)
+        return first, steps - first - 1
+
+    def _added(self, matrix: torch.Tensor, tolerance: float) -> torch.Tensor:
+        """Return U^T A of a matrix [P, cells], with images added to U until the rest is below the tolerance."""
+        matrix = matrix.float()
+        draw, limit = torch.Generator().manual_seed(0), tolerance * float(matrix.norm())
+        rest = matrix - self.basis @ (self.basis.mT @ matrix)
+        while float(rest.norm()) > limit:
+            probes = torch.randn(matrix.shape[1], _SKETCH, generator=draw)
+            images = torch.linalg.qr(rest @ (rest.mT @ (rest @ probes)))[0]
+            turn, light, _ = torch.linalg.svd(images.mT @ rest, full_matrices=False)
+            images = images @ turn[:, light > 0.05 * limit]  # the others are rounding
+            images = torch.linalg.qr(images - self.basis @ (self.basis.mT @ images))[0]
+            self.basis = torch.cat([self.basis, images], dim=1)
+            rest = rest - images @ (images.mT @ rest)
+        return self.basis.mT @ matrix
+
+    def _worst(self, matrix: Callable[[float], torch.Tensor]) -> float:
+        last, worst = len(self.nodes) - 2, 0.0
+        for k in {0, last // 2, last}:
+            far_m = math.exp(self._low + (k + 0.5) * self._step)
+            exact = matrix(far_m).float()
+            worst = max(worst, float((self.at(far_m).matrix - exact).norm() / exact.norm()))
+        return worst
 
 
 def dense_matrix(operator: Callable[[torch.Tensor], torch.Tensor], like: torch.Tensor) -> torch.Tensor:

@@ -78,17 +78,22 @@ class LineMotion:
     """Constant speed along a straight line, for all times.
 
     position(t) = start + speed * direction / |direction| * (t - start time); the defaults are the paper's:
-    2 cm/s from left to right, 8 s for 16 cm.
+    2 cm/s from left to right, 8 s for 16 cm. It may retreat from the wall and turn in its plane on the way,
+    both steadily.
 
     Args:
         start_m: Centre (x, y) at `start_s`, metres, x to the right and y downwards.
         speed_m_s: Speed, metres per second, 0 or more.
         direction: Direction (x, y) of any length above 0.
         start_s: Time at which the centre is at `start_m`, seconds.
-        z_m: Distance from target to wall, metres, above 0; None is the setup's own.
+        z_m: Distance from target to wall at `start_s`, metres, above 0; None is the setup's own.
+        retreat_m_s: Speed away from the wall, metres per second; below 0 it approaches.
+        spin_deg_s: Turn about the wall's normal from upright at `start_s`, clockwise as the camera's rows and
+            columns run, degrees per second.
 
     Raises:
-        DataError: A value is not finite, the speed is negative or the direction has no length.
+        DataError: A value is not finite, the speed is negative, the direction has no length, or the target
+            retreats from no stated distance.
 
     Example:
         >>> LineMotion().position_m(4.0)
@@ -100,6 +105,8 @@ class LineMotion:
     direction: tuple[float, float] = (1.0, 0.0)
     start_s: float = 0.0
     z_m: float | None = None
+    retreat_m_s: float = 0.0
+    spin_deg_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name, pair in {"start_m": self.start_m, "direction": self.direction}.items():
@@ -110,14 +117,35 @@ class LineMotion:
             raise DataError(f"LineMotion.speed_m_s is {self.speed_m_s}; give 0 or more metres per second")
         if not math.hypot(*self.direction) > 0:
             raise DataError("LineMotion.direction is (0, 0); give a direction with a length")
-        if not math.isfinite(self.start_s):
-            raise DataError(f"LineMotion.start_s is {self.start_s}; give finite seconds")
+        for name in ("start_s", "retreat_m_s", "spin_deg_s"):
+            if not math.isfinite(getattr(self, name)):
+                raise DataError(f"LineMotion.{name} is {getattr(self, name)}; give a finite number")
         _check_distance("LineMotion", self.z_m)
+        if self.retreat_m_s and self.z_m is None:
+            raise DataError(
+                f"LineMotion.retreat_m_s is {self.retreat_m_s} from no stated distance; give z_m, the metres "
+                "to the wall at start_s"
+            )
         check_made(self)
 
+    def in_its_plane(self) -> LineMotion:
+        """Return the motion for a use that knows one target plane, upright.
+
+        Raises:
+            DataError: The target turns, approaches or retreats.
+        """
+        if self.retreat_m_s or self.spin_deg_s:
+            raise DataError(
+                f"the motion retreats at {self.retreat_m_s:g} m/s and turns at {self.spin_deg_s:g} degrees/s, "
+                "and this knows one plane and an upright target; follow it (`evnlos track --depth --turning`)"
+            )
+        return self
+
     def pose(self, t_s: ArrayLike) -> Pose:
-        """Return the pose at times `t_s` (seconds, any shape [...]): constant distance, no rotation."""
-        return _upright(self.position_m(t_s), self.z_m)
+        """Return the pose at times `t_s` (seconds, any shape [...])."""
+        upright, passed = _upright(self.position_m(t_s), self.z_m), _times(t_s) - self.start_s
+        z_m, turned = self.retreat_m_s * passed, math.radians(self.spin_deg_s) * passed
+        return upright._replace(z_m=upright.z_m + z_m, rotation_rad=turned)
 
     def position_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """Return the centre (x, y) at times `t_s` (seconds, any shape [...]), metres, float64 [..., 2]."""
@@ -140,7 +168,9 @@ class PathMotion:
     Args:
         times_s: Times of the points, seconds, strictly increasing, two or more.
         points_m: Centres (x, y) at these times, metres, one pair a time.
-        z_m: Distance from target to wall, metres, above 0; None is the setup's own.
+        z_m: Distance from target to wall, metres, above 0: one, or one a time; None is the setup's own.
+        rotation_deg: Turn about the wall's normal, clockwise as the camera's rows and columns run, degrees:
+            one, or one a time.
 
     Raises:
         DataError: Fewer than two points, unequal lengths, times that do not increase, or values not finite.
@@ -154,7 +184,8 @@ class PathMotion:
 
     times_s: tuple[float, ...]
     points_m: tuple[tuple[float, float], ...]
-    z_m: float | None = None
+    z_m: float | tuple[float, ...] | None = None
+    rotation_deg: float | tuple[float, ...] = 0.0
 
     def __post_init__(self) -> None:
         times = np.asarray(self.times_s, dtype=np.float64)
@@ -171,15 +202,29 @@ class PathMotion:
             raise DataError("PathMotion.times_s does not increase; give each time once, in order")
         object.__setattr__(self, "times_s", tuple(times.tolist()))
         object.__setattr__(self, "points_m", tuple((x, y) for x, y in points.tolist()))
-        _check_distance("PathMotion", self.z_m)
+        for name in ("z_m", "rotation_deg"):
+            value = getattr(self, name)
+            if isinstance(value, tuple | list):
+                if len(value) != len(times):
+                    raise DataError(f"PathMotion.{name} has {len(value)} values; give one, or {len(times)}")
+                object.__setattr__(self, name, tuple(float(one) for one in value))
+        for one in () if self.z_m is None else np.atleast_1d(self.z_m).tolist():
+            _check_distance("PathMotion", one)
+        if not np.isfinite(self.rotation_deg).all():
+            raise DataError(f"PathMotion.rotation_deg is {self.rotation_deg}; give finite degrees")
         check_made(self)
 
     def pose(self, t_s: ArrayLike) -> Pose:
-        """Return the pose at times `t_s` (seconds, any shape [...]): constant distance, no rotation."""
-        return _upright(self.position_m(t_s), self.z_m)
+        """Return the pose at times `t_s` (seconds, any shape [...])."""
+        x, y, z, turned = np.moveaxis(self._at(t_s), -1, 0)
+        return Pose(x, y, z, np.radians(turned))
 
     def position_m(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """Return the centre (x, y) at times `t_s` (seconds, any shape [...]), metres, float64 [..., 2]."""
+        return self._at(t_s)[..., :2]
+
+    def _at(self, t_s: ArrayLike) -> NDArray[np.float64]:
+        """Return x, y, z (metres) and rotation (degrees), [..., 4]."""
         knots, points, slopes = self._curve()
         times = np.clip(_times(t_s), knots[0], knots[-1])
         left = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
@@ -191,12 +236,13 @@ class PathMotion:
         return points[left] + rise * u**2 * (3 - 2 * u) + bend
 
     def speed_bound_m_s(self, start_s: float, stop_s: float) -> float:
-        """Return an upper bound of the speed between two times (seconds), metres per second.
+        """Return an upper bound of the speed in the plane between two times (seconds), metres per second.
 
         The velocity of a cubic piece is a parabola, bounded by its Bezier coefficients: both end slopes and
         3 rise / step - slope - slope.
         """
         knots, points, slopes = self._curve()
+        points, slopes = points[:, :2], slopes[:, :2]
         step = np.diff(knots)[:, None]
         middle = 3 * np.diff(points, axis=0) / step - slopes[:-1] - slopes[1:]
         hull = np.stack([slopes[:-1], middle, slopes[1:]])  # [3, pieces, 2]
@@ -205,8 +251,11 @@ class PathMotion:
         return float(bound[touched].max(initial=0.0))
 
     def _curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return knots [K], points [K, 2] and slopes [K, 2]."""
-        knots, points = np.asarray(self.times_s), np.asarray(self.points_m)
+        """Return knots [K], points (x, y, z, rotation) [K, 4] and their slopes [K, 4]."""
+        knots = np.asarray(self.times_s)
+        others = (np.nan if self.z_m is None else self.z_m, self.rotation_deg)
+        columns = [np.broadcast_to(np.asarray(one, np.float64), len(knots)) for one in others]
+        points = np.column_stack([self.points_m, *columns])
         step = np.diff(knots)[:, None]
         secant = np.diff(points, axis=0) / step
         slopes = np.zeros_like(points)
@@ -221,6 +270,7 @@ class PathMotion:
         return knots, points, slopes
 
 
+_PROBES = 65  # instants at which a scene's pose is looked at
 _MAX_SIDE = 4096  # pixels; a drawing of 20 um a pixel on an 8 cm target
 
 
@@ -274,7 +324,33 @@ class Target:
         same = (self.name, self.size_m) == (other.name, other.size_m)
         return same and np.array_equal(self.mask, other.mask)
 
-    def rasterise(self, plane: Plane, position_m: ArrayLike = (0.0, 0.0)) -> NDArray[np.float32]:
+    def turned(self, rotation_rad: float) -> Target:
+        """Return the target turned about its centre, on a larger plane of half the pixels' side.
+
+        Bilinear between the mask's pixels: what a pixel's width of blur hides.
+
+        Args:
+            rotation_rad: Angle, clockwise as rows and columns run, radians.
+        """
+        side = len(self.mask)
+        fine = 2 * math.ceil(side * math.sqrt(2))  # twice as fine, and room for the corners
+        along = (np.arange(fine) - (fine - 1) / 2) / 2
+        cos, sin = math.cos(rotation_rad), math.sin(rotation_rad)
+        row = cos * along[:, None] - sin * along + (side - 1) / 2
+        column = cos * along + sin * along[:, None] + (side - 1) / 2
+        top, left = np.floor(row).astype(np.intp), np.floor(column).astype(np.intp)
+        down, right = row - top, column - left
+        padded = np.pad(self.mask, 1)
+        found = np.zeros((fine, fine))
+        for j, wy in ((0, 1 - down), (1, down)):
+            r = np.clip(top + j + 1, 0, side + 1)
+            for i, wx in ((0, 1 - right), (1, right)):
+                found += wy * wx * padded[r, np.clip(left + i + 1, 0, side + 1)]
+        return Target(self.name, np.clip(found, 0, 1).astype(np.float32), self.size_m * fine / (2 * side))
+
+    def rasterise(
+        self, plane: Plane, position_m: ArrayLike = (0.0, 0.0), rotation_rad: float = 0.0
+    ) -> NDArray[np.float32]:
         """Draw the target on a sampled plane, exactly: each sample is the mean of the mask over its cell.
 
         With O_y [H, S] and O_x [W, S] the fractions of each cell that each mask pixel covers along one axis,
@@ -284,6 +360,7 @@ class Target:
         Args:
             plane: The plane to draw on.
             position_m: Target's centre (x, y) in the plane's coordinates, metres, [2], or [N, 2] for N places.
+            rotation_rad: Turn about the centre, radians; a turned target is drawn as `turned` says.
 
         Returns:
             float32 [H, W], or [N, H, W] for N places, 0..1; zero outside the target plane.
@@ -297,6 +374,8 @@ class Target:
                    [0., 1., 1., 1.],
                    [0., 1., 1., 1.]], dtype=float32)
         """
+        if rotation_rad:
+            return self.turned(rotation_rad).rasterise(plane, position_m)
         position = np.asarray(position_m, dtype=np.float64)
         if position.ndim not in (1, 2) or position.shape[-1] != 2:
             raise DataError(f"position_m has shape {position.shape}; give (x, y) or [N, 2] metres")
@@ -395,6 +474,21 @@ class Scene:
         """Return x, y, z and rotation of the target at times `t_s` (seconds, any shape [...])."""
         return pose_of(self.motion, t_s)
 
+    @property
+    def moves_in_space(self) -> bool:
+        """Whether the target turns, or its distance from the wall changes, while it is watched."""
+        pose = self.pose(np.linspace(0.0, self.duration_s, _PROBES))
+        return bool(pose.rotation_rad.any() or np.ptp(pose.z_m) > 0)  # NaN is the setup's own distance
+
     def truth(self, plane: Plane, t_s: ArrayLike) -> NDArray[np.float32]:
         """Return the target at times `t_s` (seconds, [] or [N]) on a plane, float32 [H, W] or [N, H, W]."""
-        return self.target.rasterise(plane, self.motion.position_m(t_s))
+        pose = self.pose(t_s)
+        places = np.stack([pose.x_m, pose.y_m], axis=-1)
+        turns = np.asarray(pose.rotation_rad)
+        if not turns.any():
+            return self.target.rasterise(plane, places)
+        drawn = [
+            self.target.rasterise(plane, place, float(turn))
+            for place, turn in zip(places.reshape(-1, 2), turns.reshape(-1), strict=True)
+        ]
+        return np.stack(drawn).reshape(*turns.shape, *plane.shape)

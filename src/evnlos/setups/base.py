@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -13,11 +14,11 @@ from numpy.typing import ArrayLike
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
 from evnlos.errors import ConfigError
-from evnlos.optics import Irradiance, LinearTransport
+from evnlos.optics import DepthTransport, Irradiance, LinearTransport
 from evnlos.optics.wall import ambient_plane
 from evnlos.registry import Kinded, Registry
 from evnlos.scene import Scene
-from evnlos.setups.files import Measurement
+from evnlos.setups.files import Measurement, OperatorNoise
 from evnlos.types import Plane
 
 S = TypeVar("S", bound="Setup")
@@ -94,25 +95,13 @@ class Layout(NamedTuple):
     """A torch that lights the target (x, z)."""
 
 
-class OperatorNoise(NamedTuple):
-    """How well an operator that was measured is known."""
-
-    matrix: torch.Tensor
-    """One draw of its noise, float64 [H W, h w], in white levels per unit of a cell."""
-    is_independent: bool
-    """Whether cells have independent noise: not after denoising, nor for a point-spread function."""
-    pitch_m: float
-    """Side of the cells that were measured, metres."""
-
-
 @dataclass(frozen=True)
 class Setup(Kinded, ABC):
     """Wall, geometry, ambient light and cameras: all that lies between a hidden scene and its recording.
 
     Derive a kind from it as a frozen dataclass with a literal field `kind`, give it `observe`, and
-    `Setup.registry.register` it (or name it in a package's entry points, group `evnlos.setups`): the simulator,
-    training, evaluation, reports and the command line then take it by its kind. `operator` makes the solvers,
-    data consistency and identifiability work with it, `parameters` the calibration.
+    `Setup.registry.register` it (or name it in a package's entry points, group `evnlos.setups`): all commands
+    take it by its kind. `operator` makes solvers and identifiability work with it, `parameters` calibration.
 
     The distance of the target and its pose belong to the scene (`Motion.pose`). Where a scene states no
     distance, the setup's own, `default_distance_m`, holds.
@@ -283,6 +272,21 @@ class Setup(Kinded, ABC):
             "leave the distance of the motion out, or give a setup of kind radiometric"
         )
 
+    def at_distances(
+        self, low_m: float, high_m: float, plane: Plane, shape: tuple[int, int] | None = None
+    ) -> DepthTransport:
+        """Return `operator` of the plane at any distance in a range, with the exposure of the setup's own.
+
+        Args:
+            low_m: Smallest distance, metres.
+            high_m: Largest distance, metres.
+            plane: Cells of the target plane, in the coordinates of the target's motion.
+            shape: Size (H, W) of the images, pixels; None is the sensor's.
+        """
+        if self.default_distance_m is None:
+            raise ConfigError(f"the setup {self.kind!r} states no distance; follow without depth")
+        return _at_distances(self, low_m, high_m, plane, self.shape if shape is None else shape)
+
     def covering(self: S, size_m: tuple[float, float]) -> S:
         """Return the setup with room for a target that moves within a region (width, height), metres."""
         return self
@@ -358,7 +362,7 @@ def stated_distance_m(setup: Setup, scene: Scene) -> float | None:
         most = float(np.degrees(np.abs(pose.rotation_rad).max()))
         raise ConfigError(
             f"the motion turns the target by {most:.3g} degrees, which the setup {setup.kind!r} can't show; "
-            "give a motion without rotation"
+            "give one without rotation, or a setup of kind radiometric"
         )
     stated = pose.z_m[~np.isnan(pose.z_m)]
     if not len(stated):
@@ -366,10 +370,20 @@ def stated_distance_m(setup: Setup, scene: Scene) -> float | None:
     low, high = float(stated.min()), float(stated.max())
     if low != high or len(stated) != len(pose.z_m):
         raise ConfigError(
-            f"the motion takes the target from {low:g} to {high:g} m from the wall, and the setup "
-            f"{setup.kind!r} shows one target plane; give a motion of constant z_m"
+            f"the motion takes the target from {low:g} to {high:g} m from the wall, the setup {setup.kind!r} "
+            "shows one target plane; give a constant z_m, or a setup of kind radiometric"
         )
     return low
+
+
+@lru_cache(maxsize=4)
+def _at_distances(
+    setup: Setup, low_m: float, high_m: float, plane: Plane, shape: tuple[int, int]
+) -> DepthTransport:
+    cell, own = Plane(1, 1, plane.pitch_m, plane.center_m), setup.at_distance(setup.default_distance_m or 1.0)
+    scale = own.operator(cell, shape).dense().sum() / own.matrix(shape, cell).sum()
+    light = lambda z_m: scale * setup.at_distance(z_m).matrix(shape, plane)  # noqa: E731
+    return DepthTransport(light, low_m, high_m, plane, shape)
 
 
 def _replaced(node: Any, keys: list[str], value: float, name: str) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,17 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.optics.facets import SlopeTable
 from evnlos.tensor_file import TensorFile, check_floats
 from evnlos.types import Plane
+
+
+class OperatorNoise(NamedTuple):
+    """How well an operator that was measured is known."""
+
+    matrix: torch.Tensor
+    """One draw of its noise, float64 [H W, h w], in white levels per unit of a cell."""
+    is_independent: bool
+    """Whether cells have independent noise: not after denoising, nor for a point-spread function."""
+    pitch_m: float
+    """Side of the cells that were measured, metres."""
 
 
 @dataclass(frozen=True)

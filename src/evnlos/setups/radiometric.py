@@ -19,6 +19,7 @@ from evnlos.optics import (
     MatrixTransport,
     MatrixWall,
     Occluder,
+    SpaceWall,
     View,
     lamp_radiance,
     light_transport_matrix,
@@ -137,13 +138,8 @@ class RadiometricSetup(Setup):
         """
         if self.lamp_m is None:
             return None
-        return lamp_radiance(
-            source,
-            self.distance_m,
-            self.lamp_m,
-            offset_m=self.offset_m(),
-            half_angle_deg=self.lamp_half_angle_deg,
-        )
+        offset_m, half = self.offset_m(), self.lamp_half_angle_deg
+        return lamp_radiance(source, self.distance_m, self.lamp_m, offset_m=offset_m, half_angle_deg=half)
 
     def transport(
         self, shape: tuple[int, int] | None = None, device: torch.device | str = "cpu"
@@ -232,34 +228,35 @@ class RadiometricSetup(Setup):
         columns = (torch.arange(strip.width) - (strip.width - 1) / 2).abs() <= strip.height / 2
         return Plane(strip.height, int(columns.sum()), strip.pitch_m)
 
-    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> MatrixWall:
+    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> MatrixWall | SpaceWall:
         """Return the irradiance on the sensor while the scene's target moves.
 
-        A scene that states another distance than the setup's own is seen with the same exposure: what is
-        further away is darker, while `gain` stays what it means at the setup's own distance.
+        At any distance the exposure is that of the setup's own: what is further away is darker.
 
         Args:
-            scene: The target and its motion, at a constant distance.
-            device: Where the matrix is made and the irradiance is then rendered.
+            scene: The target and its motion; one in space, with depth or turning, may leave the strip.
+            device: Where the matrix is made and the irradiance rendered; in space it is the CPU.
 
         Raises:
-            ConfigError: The target leaves the strip, needs finer cells, turns, approaches or retreats, or a
-                setting is out of range.
+            ConfigError: The target leaves the strip, needs finer cells, or a setting is out of range.
         """
+        seen_px_m = self.view(self.shape).magnification()
+        self.source()  # refuses cells or a strip without size
+        self._check_cells(scene.target.size_m)
+        if scene.moves_in_space:
+            where = self.cell_m, self.distance_m, seen_px_m
+            return SpaceWall(self.at_distances, scene, *where, self.ambient_light())
         distance_m = stated_distance_m(self, scene)
         if distance_m is not None and distance_m != self.distance_m:
             there = self.at_distance(distance_m)
             brighter = _full_light(there.optics(), self.shape)[0] / _full_light(self.optics(), self.shape)[0]
             return replace(there, gain=self.gain * brighter).observe(scene, device)
-        self.source()  # refuses cells or a strip without size
         self._check_travel(scene)
-        self._check_cells(scene.target.size_m)
         return MatrixWall(
             self.transport(self.shape, device),
             scene.target,
             scene.motion,
-            # No point of the image outruns the target: the reflection moves at most as fast as the target.
-            magnification_px_m=self.view(self.shape).magnification(),
+            magnification_px_m=seen_px_m,  # no point of the image outruns the target
             gain=self.gain,
             ambient=self.ambient_light(),
         )
@@ -294,8 +291,7 @@ class RadiometricSetup(Setup):
         """Return wall, occluders and torch in words."""
         parts = ["matte" if self.wall_material == "lambert" else f"aluminium, GGX roughness {self.roughness:g}"]
         parts += [f"{len(self.occluders())} occluder(s)"] if self.occluders() else []
-        parts += ["torch-lit target"] if self.lamp_m is not None else []
-        return ", ".join(parts)
+        return ", ".join([*parts, "torch-lit target"] if self.lamp_m is not None else parts)
 
     def layout(self) -> Layout:
         """Return where target, camera, occluders and torch are."""
