@@ -19,31 +19,32 @@ from evnlos.data import FixedPattern, Sampling, read_capture, save_pattern
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import SequenceOperator
 from evnlos.inverse.operators import Gradient, normal_matrix
-from evnlos.inverse.sequence_problem import matrix_of, strip_of
 from evnlos.models import SequenceConfig, Weights, published_setup, save_weights
 from evnlos.optics import SlidingWall, View
 from evnlos.plot.results import draw_track
 from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
 from evnlos.setups import RadiometricSetup
 from evnlos.tracking import (
+    Distance,
     Measurements,
     Track,
     Tracking,
+    Turn,
     event_velocity,
     fit_motion,
     most_likely_acceleration,
     plane_map,
     register,
     smooth,
+    smooth_together,
     static_light,
     temporal_noise,
     track_capture,
     track_frames,
     track_warnings,
 )
-from evnlos.tracking.motion_fit import Depths, Fit
+from evnlos.tracking.motion_fit import Fit, Lights
 from evnlos.tracking.registration import explained_change
 from evnlos.types import Events, Plane
 
@@ -285,10 +286,11 @@ def test_approach_and_retreat_are_found(change) -> None:
     light = retreating(away, positions)
     noisy = light + 2e-3 * torch.from_numpy(np.random.default_rng(3).standard_normal(light.shape))
     found = fit_motion(noisy, SETUP, positions + 0.002, 2e-3, 0.1, cells=10, depth=True)
-    assert found.log_distance is not None and found.log_distance_sigma is not None
+    assert found.log_distance is not None
+    sigma = np.sqrt(found.covariance[:, 2, :, 2].diagonal())
     error = found.log_distance - (away - away.mean())
     assert np.abs(error).max() < 0.02
-    assert np.sqrt(np.mean(error**2)) < 5 * found.log_distance_sigma.mean() < 0.05
+    assert np.sqrt(np.mean(error**2)) < 5 * sigma.mean() < 0.08
     place = found.position_m - positions
     assert np.abs(place - place.mean(axis=0)).max() < 3e-3
     # Without depth the path takes the blame.
@@ -297,47 +299,116 @@ def test_approach_and_retreat_are_found(change) -> None:
         assert np.abs(plain - plain.mean(axis=0)).max() > 1.5 * np.abs(place - place.mean(axis=0)).max()
 
 
-@pytest.mark.parametrize("depth", [False, True])
-def test_the_step_is_that_of_target_and_places_together(depth) -> None:
-    """Slow reference: one least squares problem of all unknowns, with the target's own shift forbidden."""
+KINDS = [[0, 1], [0, 1, 2], [0, 1, 3], [0, 1, 2, 3]]
+
+
+@pytest.fixture(scope="module")
+def lights() -> Lights:
+    return Lights(SETUP, Plane(30, 36, 0.012), SHAPE, depth=True)
+
+
+@pytest.mark.parametrize("kinds", KINDS)
+def test_the_step_is_that_of_target_and_poses_together(kinds, lights) -> None:
+    """Slow reference: one least squares problem of all unknowns; what is the target's own is forbidden."""
     rng = np.random.default_rng(7)
-    target_plane = Plane(6, 6, 0.016)
-    state = rng.uniform(-0.03, 0.03, (4, 3 if depth else 2))
-    transport = matrix_of(SETUP.resized(SHAPE).operator(strip_of(state[:, :2] + 0.0, target_plane), SHAPE))
-    fit = Fit(target_plane, transport, Depths(SETUP, transport) if depth else None, state, SETUP.distance_m)
-    light = torch.from_numpy(rng.standard_normal((4, *SHAPE)))
-    prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(target_plane.shape, dtype=torch.float64))
-    image, step, _, _ = fit.step(light, prior, 1.0)
-    maps = torch.stack(
-        [
-            SequenceOperator(
-                Depths(SETUP, transport).at(s[2] / SETUP.distance_m) if depth else transport,
-                target_plane,
-                s[None, :2],
-            )
-            .matrix()[0]
-            .double()
-            for s in state
-        ]
-    )
-    moving = (
-        torch.eye(4, dtype=torch.float64) - 0.8 / 4
-    )  # one offset per pixel, as large as the noise: 1 - 1 / 5
-    slope = fit._slopes(image)
-    frames, kinds, pixels = slope.shape
-    apart = torch.block_diag(*slope).reshape(frames * kinds, frames, pixels)
-    columns = torch.cat([maps.permute(2, 0, 1), apart])  # [unknowns, N, P]
+    plane = Plane(6, 6, 0.016)
+    poses = rng.uniform(-1, 1, (4, 4)) * np.array([0.03, 0.03, 0.1, 0.5])
+    scale = np.array([1.0, 1.0, 0.3, 0.02])
+    fit = Fit(plane, lights, poses, kinds, scale)
+    seen = lights.seen(torch.from_numpy(rng.standard_normal((4, *SHAPE))))
+    prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape, dtype=torch.float64))
+    image, step, covariance, _ = fit.step(seen, prior)
+    moving = torch.eye(4, dtype=torch.float64) - 0.8 / 4  # one offset a pixel, as large as the noise
+    slope = fit.slopes(image.flatten())
+    frames, many, parts = slope.shape
+    apart = torch.block_diag(*slope).reshape(frames * many, frames, parts)
+    columns = torch.cat([fit.maps.permute(2, 0, 1), apart])  # [unknowns, N, P]
     weighted = torch.einsum("kl,ulp->ukp", moving, columns).flatten(1)
-    left = light.flatten(1) - maps @ image.flatten()
-    square = weighted @ columns.flatten(1).mT
+    left = seen - fit.maps @ image.flatten()
+    square, pull = weighted @ columns.flatten(1).mT, weighted @ left.flatten()
     square[:36, :36] += prior
-    pull = weighted @ left.flatten()
     pull[:36] -= prior @ image.flatten()
-    alike = (slope @ slope.mT).flatten(0, 1)  # [N K, K]
-    bound = torch.cat([torch.zeros(36, kinds, dtype=torch.float64), alike])
-    whole = torch.cat([torch.cat([square, bound], 1), torch.cat([bound.mT, torch.zeros(kinds, kinds)], 1)])
-    reference = torch.linalg.solve(whole, torch.cat([pull, torch.zeros(kinds, dtype=torch.float64)]))
-    np.testing.assert_allclose(step.ravel(), reference[36 : 36 + frames * kinds].numpy(), rtol=2e-3, atol=1e-7)
+    x, y = np.meshgrid(plane.x_m, plane.y_m)
+    bound = [torch.cat([torch.from_numpy(one.ravel()), torch.zeros(frames * many)]) for one in (x, y)]
+    for k, kind in enumerate(kinds):
+        if kind > 1:  # in the metric in which each frame alone knows its pose equally well
+            alike = torch.zeros(frames, many, dtype=torch.float64)
+            alike[:, k] = 1.0
+            metric = torch.einsum("nab,nb->na", slope @ slope.mT, alike).flatten()
+            bound.append(torch.cat([torch.zeros(36, dtype=torch.float64), metric]))
+    wall = torch.stack(bound).double()
+    whole = torch.cat(
+        [torch.cat([square, wall.mT], 1), torch.cat([wall, torch.zeros(len(wall), len(wall))], 1)]
+    )
+    right = torch.cat([pull, torch.zeros(len(wall), dtype=torch.float64)])
+    reference = torch.linalg.solve(whole, right)[36 : 36 + frames * many]
+    np.testing.assert_allclose(step.ravel(), reference.numpy(), rtol=1e-3, atol=1e-5 * np.abs(step).max())
+    inverse = torch.linalg.inv(whole)[36 : 36 + frames * many, 36 : 36 + frames * many].numpy()
+    found = covariance.reshape(frames * many, -1)
+    np.testing.assert_allclose(found, inverse, rtol=1e-3, atol=1e-4 * np.abs(inverse).max())
+
+
+def test_slopes_are_those_of_the_maps(lights) -> None:
+    plane, rng = Plane(6, 6, 0.016), np.random.default_rng(2)
+    image = torch.from_numpy(rng.uniform(0, 1, 36))
+    pose = np.array([[0.01, -0.004, 0.03, 0.4]])
+    scale = np.ones(4)
+    slopes = Fit(plane, lights, pose, [0, 1, 2, 3], scale).slopes(image)[0]
+    for kind in range(4):
+        ahead, behind = (
+            Fit(plane, lights, pose + way * np.eye(4)[kind], [0], scale).maps[0] @ image
+            for way in (1e-4, -1e-4)
+        )
+        numeric = (ahead - behind) / 2e-4
+        torch.testing.assert_close(slopes[kind], numeric, rtol=5e-3, atol=5e-3 * float(numeric.abs().max()))
+
+
+def test_a_turn_is_found_within_what_is_stated() -> None:
+    """Frames of a letter that turns on its way, drawn and carried over in another way than the fit's."""
+    turn = np.radians([0.0, 8.0, 15.0, 25.0, 20.0, 10.0, -5.0])
+    positions = np.stack([np.linspace(-0.05, 0.05, 7), 0.01 * np.sin(np.arange(7.0))], axis=1)
+    source = Plane(32, 48, 0.005)
+    drawn = [letter().rasterise(source, place, float(one)) for place, one in zip(positions, turn, strict=True)]
+    light = SETUP.operator(source, SHAPE)(torch.from_numpy(np.stack(drawn)).double())
+    noise = 2e-3
+    light = light + noise * torch.from_numpy(np.random.default_rng(4).standard_normal(light.shape))
+    found = fit_motion(light, SETUP, positions + 0.002, noise, 0.1, cells=14, turning=True)
+    assert found.rotation_rad is not None
+    error = np.degrees(found.rotation_rad - (turn - turn.mean()))
+    sigma = np.degrees(np.sqrt(found.covariance[:, 2, :, 2].diagonal()))
+    assert np.abs(error).max() < 5
+    assert np.sqrt(np.mean(error**2)) < 2.5 * sigma.mean()
+    assert found.misfit < 1.1
+    # The path alone does not explain a target that turns.
+    assert fit_motion(light, SETUP, positions + 0.002, noise, 0.1, cells=14).misfit > 1.1 * found.misfit
+
+
+def test_poses_are_smoothed_with_the_errors_that_they_share() -> None:
+    """Independent errors: the Kalman smoother, kind by kind. Shared ones: what lasts stays unknown."""
+    times = np.array([0.0, 0.3, 0.5, 1.1, 1.4])
+    rng = np.random.default_rng(1)
+    values = np.stack([times, -2 * times], axis=1) + 0.01 * rng.standard_normal((5, 2))
+    covariance = np.zeros((5, 2, 5, 2))
+    for k in range(5):
+        covariance[k, :, k, :] = 1e-4 * np.eye(2)
+    told = (np.array([0.4, 0.9]), np.array([1.1, 0.8]), np.array([0.05, 0.04]))
+    at = np.unique(np.concatenate([times, told[0]]))
+    mean, sigma = smooth_together(times, values, covariance, [told, None], [0.5, 0.2], at)
+    nan = np.full(len(at), np.nan)
+    for k, (rates, speed) in enumerate(((told, 0.5), (None, 0.2))):
+        columns = [nan.copy() for _ in range(4)]
+        where = np.searchsorted(at, times)
+        columns[0][where], columns[1][where] = values[:, k], 1e-4
+        if rates is not None:
+            columns[2][np.searchsorted(at, rates[0])], columns[3][np.searchsorted(at, rates[0])] = rates[1:]
+        one = smooth(Measurements(at, *columns), speed)
+        np.testing.assert_allclose(mean[:, :, k], one.mean, atol=2e-3)
+        deviation = np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2))
+        np.testing.assert_allclose(sigma[:, :, k], deviation, rtol=2e-2)
+    shared = covariance + 0.05**2 * np.einsum("kl,ab->kalb", np.ones((5, 5)), np.eye(2))
+    wide = smooth_together(times, values, shared, [told, None], [0.5, 0.2], at)[1]
+    assert (wide[:, 0] > 0.9 * 0.05).all() and (wide[:, 0] > 1.5 * sigma[:, 0]).all()
+    np.testing.assert_allclose(wide[:, 1], sigma[:, 1], rtol=0.1)  # how fast it goes they leave alone
 
 
 def test_a_track_in_pixels_needs_no_setup(registered) -> None:
@@ -579,3 +650,16 @@ def test_the_page_on_motion_says_what_the_command_prints(name, shared_data, tmp_
     assert 1e3 * found["position_sigma"] == pytest.approx(deviation, abs=0.002)
     assert [1e3 * value for value in found["position_offset"]] == pytest.approx([x, y], abs=0.7)
     assert found["speed_error_percent"] == pytest.approx(speed, abs=0.03)
+
+
+def test_what_the_recording_does_not_tell_is_not_identified() -> None:
+    times, blank = np.linspace(0, 1, 5), np.zeros(5)
+    for sigma, told in ((2.0, True), (20.0, False)):  # a round target turns unseen
+        assert Turn(times, np.linspace(-20, 20, 5), np.full(5, sigma), blank, blank).is_identified is told
+    for change, sigma, told in ((0.02, 0.002, True), (0.001, 0.002, False), (0.1, 0.02, False)):
+        away = 0.3 + change * np.linspace(-1, 1, 5)
+        assert Distance(times, away, np.full(5, sigma), blank, blank).is_identified is told
+    frames = np.zeros((5, 24, 36), np.float32)
+    for settings in (Tracking(turning=True), Tracking(depth=True)):
+        with pytest.raises(ConfigError, match="needs a setup"):
+            track_frames(frames, times, settings=settings)

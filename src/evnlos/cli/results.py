@@ -186,8 +186,10 @@ def true_path(capture: Capture, t_s: NDArray[np.float64]) -> NDArray[np.float64]
         return None
     mask = scene.target.mask.astype(np.float64)
     along = ((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * scene.target.size_m
-    middle = np.array([mask.sum(axis=0) @ along, mask.sum(axis=1) @ along]) / mask.sum()
-    return scene.motion.position_m(t_s) + middle
+    x, y = np.array([mask.sum(axis=0) @ along, mask.sum(axis=1) @ along]) / mask.sum()
+    pose = scene.pose(t_s)
+    cos, sin = np.cos(pose.rotation_rad), np.sin(pose.rotation_rad)
+    return np.stack([pose.x_m + cos * x - sin * y, pose.y_m + sin * x + cos * y], axis=-1)
 
 
 def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | None) -> dict[str, Any]:
@@ -213,6 +215,11 @@ def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | No
         found["distance_sigma"] = float(away.distance_sigma.mean())
         found["retreat"] = float((away.distance_m[-1] - away.distance_m[0]) / np.ptp(away.time_s))
         found["distance_spread"] = float(away.distance_m.std())
+        found["distance_identified"] = away.is_identified
+    if track.turn is not None:
+        found["turn_deg"] = float(track.turn.rotation_deg[-1] - track.turn.rotation_deg[0])
+        found["turn_sigma_deg"] = float(track.turn.rotation_sigma.mean())
+        found["turn_identified"] = track.turn.is_identified
     if truth is not None:
         error = track.position - truth
         rate = np.gradient(truth, track.time_s, axis=0)
@@ -248,6 +255,12 @@ def to_text(found: dict[str, Any]) -> str:
             f"distance    {first:8.2f} {unit} at the start, {last:.2f} {unit} at the end, "
             f"+- {scale * found['distance_sigma']:.2f} {unit}; "
             f"{scale * found['distance_spread']:.2f} {unit} rms about its mean, which is the setup's"
+            + ("" if found["distance_identified"] else "; not identified: its changes drown in its error")
+        )
+    if "turn_deg" in found:
+        lines.append(
+            f"turn        {found['turn_deg']:8.2f} deg from start to end, +- {found['turn_sigma_deg']:.2f} deg"
+            + ("" if found["turn_identified"] else "; not identified: this target shows no turn")
         )
     if "position_error" in found:
         x, y = (scale * v for v in found["position_offset"])

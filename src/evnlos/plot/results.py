@@ -242,7 +242,12 @@ def draw_track(
         speed.plot(track.time_s, true, "--", color="k", linewidth=1)
     # An upper end of None would stay where it stood before and cut a band that has just been drawn.
     speed.set(xlabel="time, s", ylabel=f"speed, {unit}/s", title="speed", ylim=(0, _HEADROOM * top or None))
-    if track.distance is None:
+    if track.distance is None and track.turn is not None:
+        middle, band = track.turn.rotation_deg, 2 * track.turn.rotation_sigma
+        size.plot(track.turn.time_s, middle, color="C3")
+        size.fill_between(track.turn.time_s, middle - band, middle + band, color="C3", alpha=0.3)
+        size.set(xlabel="time, s", ylabel="turn, degrees", title="turn about its mean")
+    elif track.distance is None:
         size.errorbar(track.frame_time_s, track.size, 2 * track.size_sigma, fmt=".", color="C3")
         size.set(xlabel="time, s", ylabel="size over its mean", title="size of the image")
     else:

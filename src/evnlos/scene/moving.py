@@ -271,6 +271,7 @@ class PathMotion:
 
 
 _PROBES = 65  # instants at which a scene's pose is looked at
+_FINE_SIDE = 128  # pixels a side from which a mask is fine enough to be turned as it is
 _MAX_SIDE = 4096  # pixels; a drawing of 20 um a pixel on an 8 cm target
 
 
@@ -325,7 +326,7 @@ class Target:
         return same and np.array_equal(self.mask, other.mask)
 
     def turned(self, rotation_rad: float) -> Target:
-        """Return the target turned about its centre, on a larger plane of half the pixels' side.
+        """Return the target turned about its centre, on a larger plane; a coarse mask gets half the pixel.
 
         Bilinear between the mask's pixels: what a pixel's width of blur hides.
 
@@ -333,8 +334,9 @@ class Target:
             rotation_rad: Angle, clockwise as rows and columns run, radians.
         """
         side = len(self.mask)
-        fine = 2 * math.ceil(side * math.sqrt(2))  # twice as fine, and room for the corners
-        along = (np.arange(fine) - (fine - 1) / 2) / 2
+        finer = 2 if side < _FINE_SIDE else 1
+        fine = finer * math.ceil(side * math.sqrt(2))  # room for the corners
+        along = (np.arange(fine) - (fine - 1) / 2) / finer
         cos, sin = math.cos(rotation_rad), math.sin(rotation_rad)
         row = cos * along[:, None] - sin * along + (side - 1) / 2
         column = cos * along + sin * along[:, None] + (side - 1) / 2
@@ -346,7 +348,7 @@ class Target:
             r = np.clip(top + j + 1, 0, side + 1)
             for i, wx in ((0, 1 - right), (1, right)):
                 found += wy * wx * padded[r, np.clip(left + i + 1, 0, side + 1)]
-        return Target(self.name, np.clip(found, 0, 1).astype(np.float32), self.size_m * fine / (2 * side))
+        return Target(self.name, np.clip(found, 0, 1).astype(np.float32), self.size_m * fine / (finer * side))
 
     def rasterise(
         self, plane: Plane, position_m: ArrayLike = (0.0, 0.0), rotation_rad: float = 0.0

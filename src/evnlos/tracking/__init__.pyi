@@ -13,6 +13,7 @@ from .follow import track_frames as track_frames
 from .follow import track_warnings as track_warnings
 from .motion_fit import MotionFit as MotionFit
 from .motion_fit import fit_motion as fit_motion
+from .motion_fit import smooth_together as smooth_together
 from .registration import EventVelocity as EventVelocity
 from .registration import Registration as Registration
 from .registration import event_velocity as event_velocity
@@ -22,6 +23,7 @@ from .track import Measurements as Measurements
 from .track import PlaneMap as PlaneMap
 from .track import Smoothed as Smoothed
 from .track import Track as Track
+from .track import Turn as Turn
 from .track import most_likely_acceleration as most_likely_acceleration
 from .track import plane_map as plane_map
 from .track import smooth as smooth

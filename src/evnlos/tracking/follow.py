@@ -17,9 +17,17 @@ from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import BackgroundModel
 from evnlos.setups import Setup
-from evnlos.tracking.motion_fit import fit_motion
+from evnlos.tracking.motion_fit import MotionFit, fit_motion, smooth_together
 from evnlos.tracking.registration import EventVelocity, Registration, event_velocity, register
-from evnlos.tracking.track import Distance, Measurements, Track, most_likely_acceleration, plane_map, smooth
+from evnlos.tracking.track import (
+    Distance,
+    Measurements,
+    Track,
+    Turn,
+    most_likely_acceleration,
+    plane_map,
+    smooth,
+)
 from evnlos.types import Events
 
 _ROUNDS = 20
@@ -102,6 +110,8 @@ class Tracking:
     """With a setup: cells per side of that square."""
     depth: bool = False
     """With a setup: also find how far the object is from the wall in each frame."""
+    turning: bool = False
+    """With a setup: also find how the object turns about the wall's normal."""
     degree: int = 2
     """Degree of the ambient light over the wall, as a polynomial."""
 
@@ -157,8 +167,9 @@ def track_frames(
         DataError: Too few frames, or the object does not stand out.
     """
     settings = settings or Tracking()
-    if settings.depth and setup is None:
-        raise ConfigError("Tracking.depth needs a setup: give its file (--setup), or leave depth out")
+    for name in ("depth", "turning"):
+        if getattr(settings, name) and setup is None:
+            raise ConfigError(f"Tracking.{name} needs a setup: give its file (--setup), or leave {name} out")
     if len(frames) < _LEAST_FRAMES:
         raise DataError(f"{len(frames)} frames; tracking needs {_LEAST_FRAMES} or more")
     sensor = (int(frames.shape[1]), int(frames.shape[2]))
@@ -223,9 +234,16 @@ def _in_metres(
     light = torch.from_numpy(small - found.background)
     start_m = to_plane(found.place_px)
     fitted = fit_motion(
-        light, setup, start_m, noise, settings.target_size_m, settings.cells, depth=settings.depth
+        light,
+        setup,
+        start_m,
+        noise,
+        settings.target_size_m,
+        settings.cells,
+        depth=settings.depth,
+        turning=settings.turning,
     )
-    sigma = np.sqrt(np.diagonal(fitted.covariance, axis1=1, axis2=2))
+    sigma = np.sqrt(np.einsum("nknk->nk", fitted.covariance))
     velocity = None
     if by_events is not None:
         where = np.stack(
@@ -236,25 +254,50 @@ def _in_metres(
             np.einsum("mab,mb->ma", slope, by_events.velocity),
             np.einsum("mab,mb->ma", slope**2, by_events.variance),
         )
-    track = _joined(fitted.position_m, sigma, velocity, by_events, times_s, "m", found)
-    track = replace(track, misfit=fitted.misfit)
-    if fitted.log_distance is None or fitted.log_distance_sigma is None:
-        return track
-    return replace(track, distance=_distance(fitted.log_distance, fitted.log_distance_sigma, times_s, setup))
+    track = _joined(fitted.position_m, sigma[:, :2], velocity, by_events, times_s, "m", found)
+    return replace(_together(track, fitted, velocity, by_events, setup), misfit=fitted.misfit)
 
 
-def _distance(
-    log_distance: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    times_s: NDArray[np.float64],
+def _together(
+    track: Track,
+    fitted: MotionFit,
+    velocity: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+    by_events: EventVelocity | None,
     setup: Setup,
-) -> Distance:
+) -> Track:
+    """Return the track with all poses smoothed together, and the errors that they share."""
+    times_s = track.frame_time_s
+    others = [one for one in (fitted.log_distance, fitted.rotation_rad) if one is not None]
+    values = np.column_stack([fitted.position_m, *others])
     blank = np.full(len(times_s), np.nan)
-    measured = Measurements(times_s, log_distance, sigma**2, blank, blank)
-    smoothed = smooth(measured, most_likely_acceleration([measured]))
-    near = (setup.default_distance_m or 1.0) * np.exp(smoothed.mean[:, 0])
-    spread = np.sqrt(np.diagonal(smoothed.covariance, axis1=1, axis2=2))  # [N, 2]
-    return Distance(times_s, near, near * spread[:, 0], near * smoothed.mean[:, 1], near * spread[:, 1])
+    axes = [
+        Measurements(times_s, values[:, k], fitted.covariance[:, k, :, k].diagonal(), blank, blank)
+        for k in range(values.shape[1])
+    ]
+    speeds = [most_likely_acceleration(axes[:2])] * 2 + [most_likely_acceleration([one]) for one in axes[2:]]
+    rates: list = [None] * values.shape[1]
+    if velocity is not None and by_events is not None:
+        rates[:2] = [(by_events.time_s, velocity[0][:, k], velocity[1][:, k]) for k in range(2)]
+    mean, sigma = smooth_together(times_s, values, fitted.covariance, rates, speeds, track.time_s)
+    track = replace(
+        track,
+        position=mean[:, 0, :2],
+        velocity=mean[:, 1, :2],
+        position_sigma=sigma[:, 0, :2],
+        velocity_sigma=sigma[:, 1, :2],
+    )
+    at = np.searchsorted(track.time_s, times_s)
+    curves = [
+        (mean[at, 0, k], sigma[at, 0, k], mean[at, 1, k], sigma[at, 1, k]) for k in range(values.shape[1])
+    ]
+    if fitted.log_distance is not None:
+        log, log_sigma, rate, rate_sigma = curves[2]
+        away = (setup.default_distance_m or 1.0) * np.exp(log)
+        distance = Distance(times_s, away, away * log_sigma, away * rate, away * rate_sigma)
+        track = replace(track, distance=distance)
+    if fitted.rotation_rad is not None:
+        track = replace(track, turn=Turn(times_s, *(np.degrees(one) for one in curves[-1])))
+    return track
 
 
 def _joined(

@@ -198,11 +198,15 @@ def most_likely_acceleration(axes: list[Measurements]) -> float:
     return float(unit * _LIKELY[int(np.argmax(scores))])
 
 
+_KNOWN_DISTANCE, _KNOWN_TURN_DEG = 0.03, 5.0  # standard deviations up to which a pose counts as known
+
+
 @dataclass(frozen=True, eq=False)
 class Distance:
     """How far the object was from the wall, smoothed.
 
     Its mean is the setup's, which no sequence tells: a target that is nearer and one that is larger look alike.
+    Deviations are those of the distance over its mean.
 
     Args:
         time_s: Instants of the frames, [N], seconds.
@@ -217,6 +221,36 @@ class Distance:
     distance_sigma: NDArray[np.float64]
     retreat_m_s: NDArray[np.float64]
     retreat_sigma: NDArray[np.float64]
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether the distance is known within 3 %, and changes by more than its error."""
+        known = float((self.distance_sigma / self.distance_m).mean()) < _KNOWN_DISTANCE
+        return known and float(self.distance_m.std()) > float(self.distance_sigma.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """How the object turned about the wall's normal, smoothed; its mean is 0, as nobody knows which way is up.
+
+    Args:
+        time_s: Instants of the frames, [N], seconds.
+        rotation_deg: Turn, clockwise as the camera's rows and columns run, [N], degrees.
+        rotation_sigma: Its standard deviation, [N], degrees.
+        spin_deg_s: Rate, [N], degrees per second.
+        spin_sigma: Its standard deviation, [N].
+    """
+
+    time_s: NDArray[np.float64]
+    rotation_deg: NDArray[np.float64]
+    rotation_sigma: NDArray[np.float64]
+    spin_deg_s: NDArray[np.float64]
+    spin_sigma: NDArray[np.float64]
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether the turn is known within 5 degrees: that of a round target never is."""
+        return float(self.rotation_sigma.mean()) < _KNOWN_TURN_DEG
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,6 +275,7 @@ class Track:
         size_sigma: Standard deviation of the size, [N].
         event_windows: Number of velocities that came from events.
         distance: Distance from the wall, where it was looked for.
+        turn: Turn about the wall's normal, where it was looked for.
         misfit: With a setup: what it leaves of the frames' changes, over their noise, root mean square. The
             stated deviations hold it like noise.
     """
@@ -258,6 +293,7 @@ class Track:
     size_sigma: NDArray[np.float64]
     event_windows: int
     distance: Distance | None = None
+    turn: Turn | None = None
     misfit: float | None = None
 
     def __len__(self) -> int:
@@ -324,7 +360,7 @@ class Track:
         found = {"unit": self.unit, "event_windows": self.event_windows, **arrays}
         if self.misfit is not None:
             found["misfit"] = round(self.misfit, 3)
-        if self.distance is not None:
-            depth = {name: np.round(values, 7).tolist() for name, values in vars(self.distance).items()}
-            found["distance"] = depth
+        for name, part in {"distance": self.distance, "turn": self.turn}.items():
+            if part is not None:
+                found[name] = {key: np.round(values, 7).tolist() for key, values in vars(part).items()}
         return found
