@@ -219,12 +219,18 @@ class Model:
         capture = recording
         capture.info.check_cameras(capture.name, frames=track or eyes.needs_frames, events=eyes.needs_events)
         samples = capture_samples(capture, self.weights.sampling, pattern)
-        warnings: list[str] = []
+        stated, warnings = capture.info.motion, list[str]()
+        if stated is not None and (stated.retreat_m_s or stated.spin_deg_s):
+            warnings.append(
+                f"capture.yaml states a retreat of {stated.retreat_m_s:g} m/s and a spin of "
+                f"{stated.spin_deg_s:g} deg/s; networks know upright targets at one distance, and take x "
+                "and y of the motion alone"
+            )
         if tracked is not None:
             from evnlos.tracking import track_capture, track_warnings
 
             path = track_capture(capture, tracked, pattern=pattern)
-            warnings = track_warnings(capture, tracked, path)
+            warnings += track_warnings(capture, tracked, path)
             samples = replace(samples, position_m=path.at(samples.time_s))
         images = reconstruct(self.weights, samples.frame, samples.surface, samples.position_m)
         unjudged = why_no_confidence(self.weights, samples)

@@ -323,7 +323,7 @@ def ridge_by_groups(
     group: torch.Tensor,
     penalties: Sequence[float] = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1),
 ) -> torch.Tensor | None:
-    """Return weights W [P, R] of ridge regression, wanted = known W, with the penalty that groups left out want.
+    """Return weights W [P, R] of ridge regression, wanted = known W; groups left out choose the penalty.
 
     In the dual form W = X^T (X X^T + penalty mean |x|^2 N)^-1 Y, each group is left out in closed form: with H
     the inverse, what it misses of its own rows g is (H_gg)^-1 (H Y)_g (leave-out residuals of Gaussian

@@ -139,7 +139,7 @@ class TargetGrid:
 
 _COEFFICIENTS, _CELLS_ACROSS = 150, 32  # of prior, target
 _FEWEST = 8  # objects to tell gain, offset and noise from
-_FEWEST_CAPTURES, _MOST_FRAMES = 4, 2048  # that correct the light path
+_FEWEST_CAPTURES, _MOST_FRAMES, _PARTS = 4, 2048, 4  # that correct the light path; parts left out in turn
 _ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
 _RIDGE, _AT_ONCE = 1e-6, 1024  # frames
 
@@ -291,11 +291,7 @@ class PooledFrames(nn.Module):
         )
         steady = F.normalize(F.one_hot(group).float(), dim=0)  # a column a capture
         basis = torch.linalg.qr(torch.cat([steady, terms[:, 1:]], dim=1)).Q
-
-        def beside(values: Tensor) -> Tensor:
-            return values - basis @ (basis.T @ values)
-
-        moving, own = beside(seen), beside(code)
+        moving, own = (values - basis @ (basis.T @ values) for values in (seen, code))
         light = moving @ self.light.flatten(1).T
         gain = (light * own).sum() / light.square().sum().clamp_min(1e-12)
         errors = ridge_by_groups(moving, own - gain * light, group)
@@ -448,8 +444,8 @@ class SequenceReconstructor(Reconstructor):
         """
         inputs, truth, names = [], [], []
         self.check_samples(samples, is_new=is_new)
-        if self.frames is not None and (is_new or self._corrects):
-            self._fit_frames(samples, is_new=is_new)
+        begins = self.frames is not None and (is_new or self._corrects)
+        own, whole = self._fit_frames(samples, is_new=is_new) if begins else {}, self.frames
         draw = np.random.default_rng(derive_seed(seed, "views"))
         device = next(self.parameters()).device
         for name in dict.fromkeys(samples.names.tolist()):
@@ -460,9 +456,11 @@ class SequenceReconstructor(Reconstructor):
             for number in range(augmentations):
                 kept[number, _subset(number, len(mine), draw)] = 1
             seen = samples.inputs[torch.from_numpy(mine)].to(device)
+            self.frames = own.get(name, whole)
             inputs.append(self.pooled_subsets(seen, places, kept).half().cpu())
             truth += augmentations * [plane]
             names += augmentations * [name]
+        self.frames = whole
         found = InMemoryDataset(torch.cat(inputs), torch.stack(truth), np.array(names))
         if is_new:
             self.scale.fit(found.inputs)
@@ -485,17 +483,23 @@ class SequenceReconstructor(Reconstructor):
             )
         load_setup(self.sampling.setup)  # which refuses one that is not there
 
-    def _fit_frames(self, samples: NlosDataset, *, is_new: bool) -> None:
-        """Take what frames are solved through from the samples' setup, or correct it by captures."""
+    def _fit_frames(self, samples: NlosDataset, *, is_new: bool) -> dict[str, PooledFrames]:
+        """Take the setup's light path, or correct it: each capture by others, as new targets are."""
         assert self.frames is not None
-        self._corrects = False
         device, places = self.frames.basis.device, torch.from_numpy(samples.position_m)
         known = samples.inputs[:, self._frame].cpu(), samples.truth.cpu(), places, samples.names
+        own, names = dict[str, PooledFrames](), np.unique(samples.names)
+        for part in () if is_new else (names[k::_PARTS] for k in range(_PARTS)):
+            one, others = deepcopy(self.frames).cpu(), ~np.isin(samples.names, part)
+            one.correct(*(values[others] for values in known))
+            own |= dict.fromkeys(part.tolist(), one.to(device))
+        self.frames.cpu()
         if is_new:
-            self.frames.cpu().fit(load_setup(self.sampling.setup), *known)
+            self.frames.fit(load_setup(self.sampling.setup), *known)
         else:
-            self.frames.cpu().correct(*known)
+            self.frames.correct(*known)
         self.frames.to(device)
+        return own
 
     def draw(self, inputs: Tensor, position_m: Tensor, at_m: Tensor) -> Tensor:
         """Return images of one object at positions `at_m`, [M, H, W], from its sequence."""
@@ -538,12 +542,7 @@ class SequenceReconstructor(Reconstructor):
     def pooled(self, inputs: Tensor, position_m: Tensor) -> Tensor:
         """Return the mean of the embedded time steps as the target plane sees them, [S, P, P].
 
-        Args:
-            inputs: What was recorded at N time steps, [N, C, H, W].
-            position_m: The plane's centre on the canvas, (x, y) in metres, [N, 2].
-
-        Raises:
-            DataError: The plane is off the canvas at all time steps.
+        Arguments as in `pooled_subsets`.
         """
         return self.pooled_subsets(inputs, position_m, torch.ones(1, len(inputs)))[0]
 

@@ -167,15 +167,18 @@ def _epochs(
     is_new = start is None or settings.refit_embedding  # of this light path nothing is known yet
     # The hash is that of the settings as they were written, maybe by an older version.
     key = config_hash(read_yaml(out / "run.yaml", LONG_YAML)["settings"])
-    if checkpoint.is_file():
-        done, log = load_checkpoint(checkpoint, network, optimiser, key)
-        if leads:
-            _write_log(metrics, log)
-    else:
+    goes_on = checkpoint.is_file()
+    if not (goes_on and is_new):  # else what is fitted stands in the checkpoint
         keep, seed = settings.keep_normalization, settings.seed
         subset = with_mirrored(steps.subset) if settings.mirror else steps.subset
         network.fit(subset, seed, is_new=is_new, keep_normalization=keep)
+    if goes_on and is_new:
+        done, log = load_checkpoint(checkpoint, network, optimiser, key)
     source = steps.for_network(network, settings.sequence_augmentations, is_new=is_new and not done)
+    if goes_on and not is_new:  # its samples were those of the weights that it began with
+        done, log = load_checkpoint(checkpoint, network, optimiser, key)
+    if goes_on and leads:
+        _write_log(metrics, log)
     progress(Step(what, done, settings.epochs, "epochs"))
     processes.wait()  # nobody writes before all have read
     joined = processes.joined(network)
