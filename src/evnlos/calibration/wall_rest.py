@@ -28,7 +28,7 @@ _SMOOTH_PX = (2.0, 5.0)  # of the map of sensitivities, working pixels
 _AMBIENT_PX = 3.0
 _LENGTHS_M = (0.01, 0.025)
 _LEVELS = (1e-2, 3e-2, 1e-1, 3e-1)
-_RANK = 200
+_RANK = 32
 _COMPANION = Plane(16, 16, 0.01)
 _BRIGHTEST = 1.0
 
@@ -77,7 +77,7 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
             texture, best, kept = trial[:, 0], after, [name]
     sensitivity = texture * np.exp(data.monomials() @ state.sensitivity)
 
-    coarse, behind = _both(fit, held, _COARSE, plane, 1)
+    coarse, behind = _both(fit, held, _COARSE, plane, 2)
     factor = _resized(data.image(texture, 1.0), coarse.grid).ravel()
     light, away = (state.light(d) * factor[d.pixel, None] for d in (coarse, behind))
     error, floor = _remaining_error(coarse, behind, light, away), _noise(behind, away)
