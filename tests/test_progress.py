@@ -1,17 +1,21 @@
 """How far a piece of work is: bars, lines and JSON that move while nothing is told, and time that is left."""
 
+import importlib
 import json
 import re
 import time
 
 import numpy as np
 import pytest
+import torch
 
-from evnlos.analysis import evaluate
+from evnlos.analysis import AnalysisSettings, evaluate, identify
+from evnlos.calibration.transport_fit import levenberg_marquardt
 from evnlos.cli import main
 from evnlos.errors import ConfigError
-from evnlos.machine import ProgressBars, Step, show_progress
+from evnlos.machine import ProgressBars, Step, _duration, note, show_progress
 from evnlos.models import UNetConfig, Weights
+from evnlos.setups import load_setup
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +86,55 @@ def test_a_stage_that_says_nothing_itself_moves(capsys) -> None:
     with ProgressBars() as progress, progress.stage("track", "follow the target", 2, 3):
         time.sleep(0.3)
     assert "track: 2 of 3 stages (follow the target), 0 s" in capsys.readouterr().err
+
+
+def test_what_computes_notes_what_is_at_work(capsys) -> None:
+    show_progress("lines")
+    with ProgressBars() as progress, progress.stage("identify", "main-near", 0, 2):
+        note("light path")
+        time.sleep(0.2)
+        progress(Step("identify", 1, 2, "stages", within="main-far"))
+        time.sleep(0.2)
+    told = capsys.readouterr().err
+    assert "identify: 0 of 2 stages (main-near; light path), 0 s" in told
+    assert "(main-far)" in told and "(main-far; light path)" not in told
+
+
+def test_a_piece_that_is_done_is_told_once(capsys) -> None:
+    show_progress("lines")
+    with ProgressBars() as outer:
+        outer(Step("render", 18, 19, "captures"))
+        time.sleep(0.2)
+        outer(Step("render", 19, 19, "captures"))
+        with ProgressBars() as inner:
+            inner(Step("simulate", 5, 5, "objects"))  # of a run before this one
+            inner(Step("train", 1, 3, "networks"))
+            time.sleep(0.3)
+    told = capsys.readouterr().err
+    assert told.count("render: 19 of 19") == 1 and told.count("train: 1 of 3") > 2 and "simulate" not in told
+
+
+def test_a_time_is_told_as_people_say_it() -> None:
+    assert [_duration(one) for one in (8.4, 95, 7300)] == ["8 s", "1 min 35 s", "2 h 1 min"]
+
+
+def test_a_fit_says_which_trial_it_makes(monkeypatch) -> None:
+    told = list[str]()
+    monkeypatch.setattr("evnlos.calibration.transport_fit.note", told.append)
+    t = torch.linspace(0, 1, 20, dtype=torch.float64)
+    truth = torch.exp(-3 * t)
+    found = levenberg_marquardt(lambda p: torch.exp(-p[0] * t) - truth, [1.0], [1e-4], [(0.1, 10.0)])
+    assert told[:2] == ["round 1, slope 1 of 1", "round 1, trial 2"] and len(told) == found.evaluations - 1
+
+
+def test_identify_says_what_it_works_on(monkeypatch) -> None:
+    """One stage of ten seconds and more, within which something new is told every second or so."""
+    told = list[str]()
+    for room in ("analysis.identify", "analysis.linearized", "inverse.problem"):
+        monkeypatch.setattr(importlib.import_module(f"evnlos.{room}"), "note", told.append)
+    identify(load_setup("matte-near"), AnalysisSettings(cells=8, height=12, width=20, writers=1))
+    parts = ("light path", "handwritten target 2 of", "singular values", "modes at a noise", "bars of")
+    assert not [part for part in parts if not any(one.startswith(part) for one in told)]
 
 
 def test_compiling_is_told_apart_from_standing_still(capsys, monkeypatch) -> None:

@@ -1,7 +1,6 @@
 """What a process may use of its machine, how far its work is, and where others reach it.
 
-- How many threads there are, and how they wait for each other.
-- Ctrl-C and the wish to end, held back while something runs that must not break off in its middle.
+- How many threads there are, and how they wait; Ctrl-C, held back from what must not break off in its middle.
 - How far a piece of work is: one small protocol for all that takes long, and progress bars that speak it.
 - Which addresses of this machine can be listened on.
 """
@@ -18,7 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -33,11 +32,8 @@ T = TypeVar("T")
 def sleep_while_waiting() -> None:
     """Let threads of parallel loops sleep while they wait, unless the user has chosen.
 
-    By default a thread that is done spins until the slowest one is. On cores that other programs use this takes
-    the time away from it, and small loops take several times as long: `docs/performance.md` has the figures.
-    PyTorch and numba read the variable once, at their import, so this comes before; processes that are started
-    later inherit it. The program `evnlos` calls it; a library must not decide it for
-    the program that imports it.
+    By default a thread that is done spins until the slowest one is: `docs/performance.md` has the figures.
+    PyTorch and numba read the variable at their import; the program `evnlos` calls this, no library does.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
@@ -50,8 +46,7 @@ def cores() -> int:
 def one_thread() -> None:
     """Give this process one thread in every library: where there are several, processes are the parallelism.
 
-    The linear algebra of NumPy counts its threads apart from those of PyTorch, and more of them than cores make
-    small products many times slower. What is loaded is told, what is loaded later reads the environment.
+    NumPy counts its threads apart from PyTorch's, and more than cores make small products many times slower.
     """
     import torch
     from threadpoolctl import threadpool_limits
@@ -66,8 +61,7 @@ def one_thread() -> None:
 def undisturbed() -> Iterator[None]:
     """Hold back Ctrl-C and SIGTERM from a short piece of work; they come when it is done.
 
-    For libraries that call Python from C and lose their state where that call raises, as HDF5 does on a file
-    object. In another thread than the main one, where no signal is handled, this does nothing.
+    For libraries that lose their state where a call from C raises, as HDF5 does. Nothing in another thread.
     """
     numbers, held = (signal.SIGINT, signal.SIGTERM), list[int]()
     handlers = {number: signal.getsignal(number) for number in numbers}
@@ -89,7 +83,7 @@ def undisturbed() -> Iterator[None]:
 def children_undisturbed() -> Iterator[None]:
     """Hold back signals as `undisturbed` does, and Ctrl-C for ever from processes that are started meanwhile.
 
-    A started process takes over which signals are blocked; one whose start breaks off tells it at length.
+    A started process takes over which signals are blocked.
     """
     has_masks = hasattr(signal, "pthread_sigmask")  # not on Windows
     with undisturbed():  # another thread may hear a signal that is blocked here, and then it is handled here
@@ -112,8 +106,8 @@ class Step:
         unit: What is counted, e.g. "epochs".
         result: What the last unit brought (an object's name, an epoch's record, a score); None for the first
             step of a piece, which only says where it begins.
-        within: What is at work now, where a unit takes long: a text, or a function that looks it up and
-            returns, before the text, how many units the unfinished ones amount to.
+        within: What is at work now: a text, or a function that looks it up and returns, before the text, how
+            many units the unfinished ones amount to.
     """
 
     what: str
@@ -125,8 +119,7 @@ class Step:
 
 
 Progress: TypeAlias = Callable[[Step], None]
-"""Called by a verb when a piece of work begins and after each unit of it. What it raises stops the verb, which
-keeps what is finished; run it again to go on."""
+"""Called by a verb when a piece of work begins and after each unit of it; what it raises stops the verb."""
 
 
 def silent(step: Step) -> None:
@@ -151,6 +144,19 @@ def counted(
         progress(Step(what, done, total, unit))
 
 
+_noted = ""
+
+
+def note(text: str) -> None:
+    """Say what is at work within the unit that progress shows, until its next step.
+
+    Args:
+        text: E.g. the trial of a fit; what computes need not know who watches.
+    """
+    global _noted
+    _noted = text
+
+
 PROGRESS = "EVNLOS_PROGRESS"
 """Environment variable: how progress is shown, one of `SHOWN`."""
 SHOWN = ("auto", "bar", "lines", "json", "none")
@@ -163,8 +169,7 @@ _BEAT_S = 0.5
 class ProgressBars:
     """Shows on stderr how far each piece of work is, one after the other; use it as a context manager.
 
-    What is shown moves by itself: time passes, and what is at work within a unit is looked up. On a terminal
-    it is a bar, elsewhere a line now and then, after `--json` a line of JSON.
+    What is shown moves by itself: time passes, and what is at work within a unit is looked up, or noted.
 
     Args:
         quiet: Show nothing.
@@ -184,8 +189,10 @@ class ProgressBars:
 
     def __call__(self, step: Step) -> None:
         """Show a step; a new piece of work begins where its name is another one."""
-        if self._how == "none":
-            return
+        note("")
+        is_done = 0 < step.total <= step.done
+        if self._how == "none" or (is_done and (self._step is None or step.what != self._step.what)):
+            return  # nothing of it is left to do
         with self._lock:
             if self._step is None or step.what != self._step.what:
                 self._finish()
@@ -193,6 +200,9 @@ class ProgressBars:
                 self._first = step.done
             self._step = step
             self._show()
+            if is_done:  # what comes next, progress within this one's too, is no part of it
+                self._finish()
+                self._step = None
         if self._beats is None:
             self._beats = threading.Thread(target=self._beat, name="progress", daemon=True)
             self._beats.start()
@@ -218,17 +228,15 @@ class ProgressBars:
 
     def _show(self) -> None:
         step, now = self._step, time.monotonic()
-        if step is None:
+        if step is None or (self._how != "bar" and now - self._said < LINE_S):
             return
         if self._how != "bar":
-            if now - self._said >= LINE_S:
-                self._said = now
-                self._say(*self._state(step, now))
+            self._said = now
+            self._say(*self._state(step, now))
             return
         if self._bar is None:
-            from tqdm import tqdm
+            from tqdm import tqdm  # `disable=False` would overrule TQDM_DISABLE
 
-            # `disable=False` would overrule TQDM_DISABLE; None would leave it out where there is no terminal.
             self._bar = tqdm(total=step.total or None, initial=step.done, desc=step.what, unit=f" {step.unit}")
         done, text = self._state(step, now)
         self._bar.n = round(done, 2) if done != step.done else step.done
@@ -240,9 +248,9 @@ class ProgressBars:
     def _state(self, step: Step, now: float) -> tuple[float, str]:
         """Return how many units are done, unfinished ones by their part, and what is at work."""
         part, text = (0.0, step.within) if isinstance(step.within, str) else step.within()
-        compiling = _compiling_since()
-        if compiling is not None and now - compiling > 1:
-            text = f"{text}; " * bool(text) + "compiling, once per installation"
+        since = _compiling_since()
+        compiling = "compiling, once per installation" if since is not None and now - since > 1 else ""
+        text = "; ".join(one for one in (text, _noted, compiling) if one)
         return min(step.done + part, step.total) if step.total else step.done, text
 
     def _say(self, done: float, text: str) -> None:
@@ -271,18 +279,15 @@ class ProgressBars:
             self._said = time.monotonic()
             self._say(self._step.done, "")
 
-    def close(self) -> None:
+    def __enter__(self) -> ProgressBars:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """Show how the last piece ended, and nothing further."""
         self._end.set()
         with self._lock:
             self._finish()
             self._step = None
-
-    def __enter__(self) -> ProgressBars:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 _chosen: str | None = None
@@ -311,12 +316,7 @@ def _progress_shown() -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Return a time as people say it.
-
-    Example:
-        >>> _duration(8.4), _duration(95), _duration(7300)
-        ('8 s', '1 min 35 s', '2 h 1 min')
-    """
+    """Return a time as people say it: 8 s, 1 min 35 s, 2 h 1 min."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
@@ -349,6 +349,7 @@ def _compiling_since() -> float | None:
     return next(iter(_compilations), None)
 
 
+_GIVE_HOST = "give 127.0.0.1, or 0.0.0.0 to let the network in"
 _PATIENCE_S = 2.0  # for the name of a machine; a resolver that nobody answers takes half a minute to say so
 
 
@@ -370,9 +371,7 @@ def listening_address(host: str, port: int) -> str:
             probe.bind((address, port))
     except OSError as error:
         if error.errno == errno.EADDRNOTAVAIL:
-            raise ConfigError(
-                f"{host} is no address of this machine; give 127.0.0.1, or 0.0.0.0 to let the network in"
-            ) from None
+            raise ConfigError(f"{host} is no address of this machine; {_GIVE_HOST}") from None
         wrong = "is in use" if error.errno == errno.EADDRINUSE else f"can't be had ({error.strerror})"
         raise ConfigError(f"port {port} {wrong}; give another --port, or 0 for a free one") from None
     return address
@@ -390,10 +389,9 @@ def _resolved(host: str) -> tuple[socket.AddressFamily, str]:
             found.put(None)
 
     threading.Thread(target=ask, name="resolver", daemon=True).start()
-    try:
+    answer = None
+    with suppress(queue.Empty):
         answer = found.get(timeout=_PATIENCE_S)
-    except queue.Empty:
-        answer = None
     if answer is None:
-        raise ConfigError(f"host {host!r} is not known; give 127.0.0.1, or 0.0.0.0 to let the network in")
+        raise ConfigError(f"host {host!r} is not known; {_GIVE_HOST}")
     return answer

@@ -35,6 +35,7 @@ from evnlos.inverse import (
 )
 from evnlos.inverse.problem import handwritten_targets
 from evnlos.inverse.sequence_problem import position_subsets
+from evnlos.machine import note
 from evnlos.scene import LineMotion
 from evnlos.setups import Setup
 from evnlos.types import Plane
@@ -204,6 +205,7 @@ def sequence_bounds(
     pixels = setup.shape[0] * setup.shape[1] / (grid[0] * grid[1])
     targets = handwritten_targets(target_plane, settings.writers)
     chosen = [next(k for k, at in enumerate(targets.names) if at.endswith(f"_{c}")) for c in _REFERENCES]
+    note("frames of the sequence")
     scaled = prior.patterns / np.square(prior.patterns).sum(axis=0)
     references = [(targets.test[k].numpy() - prior.mean) @ scaled for k in chosen]
     frames = [pixels * frame_information(light, z, setup, settings) for z in references]
@@ -213,6 +215,7 @@ def sequence_bounds(
         law = pixel.crossing_law(typical)
         if law is None:
             continue
+        note(f"events of {kind}")
         noises = (settings.crossing_noise, *(settings.other_noises if pixel is setup.pixel else ()))
         each = [event_information(light, z, law, settings, noises, seed) for z in references]
         count = float(np.mean([one[2] for one in each]))

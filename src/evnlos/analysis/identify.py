@@ -1,7 +1,6 @@
 """Identifiability and resolution of a setup: what any method can reconstruct from it, in numbers and in words.
 
-- What the figures of a setup mean, in words.
-- What a setup can show at all: singular values, patterns above the noise, finest stroke, best linear image.
+- What a setup can show: singular values, patterns above the noise, finest stroke, best linear image, in words.
 - Setups side by side, as a table in Markdown.
 """
 
@@ -21,13 +20,13 @@ from evnlos.analysis.linearized import (
     linearized,
     scan_notes,
 )
+from evnlos.machine import note
 from evnlos.setups import Setup
 from evnlos.types import derive_seed
 
 if TYPE_CHECKING:
     from evnlos.inverse.problem import TargetPrior
     from evnlos.models import ConfidenceReport
-
 
 _SHAPE = 4  # bars of a quarter of the target plane tell where a letter is filled and where it is open
 _EXTRA_MODES = 1.1
@@ -304,9 +303,8 @@ def verdict_on(
         return Verdict(wall, no_confidence or "", "how much of the image is guessed cannot be told")
     if not report.measured:
         return Verdict(wall, report.verdict, "the whole image is the network's guess")
-    return Verdict(
-        wall, report.verdict, "what the intervals leave open is the network's guess, from its training"
-    )
+    guessed = "what the intervals leave open is the network's guess, from its training"
+    return Verdict(wall, report.verdict, guessed)
 
 
 def result_at_noise(
@@ -321,6 +319,7 @@ def result_at_noise(
         seed: Seed of the one image that is drawn with noise.
     """
     cells, shape = seen.target_plane.width, seen.target_plane.shape
+    note(f"modes at a noise of {float(variance.mean().sqrt()):.2g}")
     whitened = seen.matrix / variance.sqrt()[:, None]
     gram = whitened.mT @ whitened
     power, axes = torch.linalg.eigh(gram)
@@ -349,6 +348,7 @@ def result_at_noise(
 
 def singular_values(matrix: torch.Tensor) -> torch.Tensor:
     """Return the singular values of a tall matrix over the largest one, float64 [n], descending."""
+    note("singular values")
     # The triangle of a QR decomposition has the same ones; a product A^T A would lose those below 1e-8.
     values = torch.linalg.svdvals(torch.linalg.qr(matrix.double(), mode="r").R)
     return values / values[0]

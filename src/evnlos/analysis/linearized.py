@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.machine import note
 from evnlos.setups import OperatorNoise, Setup
 from evnlos.types import Plane
 
@@ -104,6 +105,7 @@ def linearized(setup: Setup, settings: AnalysisSettings = AnalysisSettings()) ->
         (torch.Size([240, 64]), True)
     """
     setup = setup.resized(settings.shape)
+    note("light path")
     matrix = setup.linear_part(settings.target_plane).dense()
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera gets no light from the target; move the target or the camera")
@@ -231,6 +233,7 @@ def finest_bars(estimator: LinearEstimator, cells: int, upright: bool = True) ->
     found = None
     for step in range(steps + 1):
         width = cells / 2 * 2 ** (-octaves * step / steps)
+        note(f"bars of {width:.1f} cells, {'upright' if upright else 'lying'}")
         targets = torch.stack(
             [bars(cells, width, 2 * width * k / _PHASES, upright).flatten() for k in range(_PHASES)]
         ).to(estimator.mean)

@@ -7,6 +7,7 @@ handwriting.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import SequenceOperator
 from evnlos.inverse.problem import handwritten_targets
 from evnlos.inverse.sequence_problem import strip_gram_of, strip_of
+from evnlos.machine import note
 from evnlos.optics import MatrixTransport
 from evnlos.scene import Target
 from evnlos.setups import Parameter, Setup
@@ -282,7 +284,10 @@ def _search(light: FrameResiduals, start: Setup, parameters: tuple[Parameter, ..
     middle = np.array([encoded(p, here[p.name]) for p in parameters])
     scale = np.array([_SCALE * p.step for p in parameters])
 
+    tried = itertools.count(1)
+
     def cost(at: NDArray[np.float64]) -> float:
+        note(f"trial {next(tried)}")
         return _cost(light, moved(start, parameters, middle + at * scale))
 
     def slope(at: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

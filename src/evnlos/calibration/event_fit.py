@@ -23,6 +23,7 @@ from evnlos.calibration.event_statistics import (
 )
 from evnlos.calibration.transport_fit import forward_jacobian, levenberg_marquardt
 from evnlos.cameras import EventPixel, PixelSettings
+from evnlos.machine import note
 from evnlos.types import Events
 
 _LOG_NAMES = ("threshold_on", "threshold_off", "threshold_sigma", "shot_noise_rate_hz")
@@ -220,6 +221,7 @@ def _scan_cutoff(
     """
     misfit = []
     for cutoff in _CUTOFFS_HZ:
+        note(f"cutoff {cutoff:g} Hz")
         made = simulated(recordings, replace(pixel, cutoff_hz=cutoff), seed)
         parts = []
         for recording, events in zip(recordings, made, strict=True):

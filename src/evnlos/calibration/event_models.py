@@ -18,6 +18,7 @@ from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import EventPixel
 from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.errors import ConfigError
+from evnlos.machine import note
 from evnlos.types import Events, derive_seed
 
 Array = NDArray[np.float64]
@@ -191,7 +192,10 @@ def misfit(recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> 
         seed: Seed of the simulations.
     """
     parts = []
-    draws = [simulated(recordings, pixel, derive_seed(seed, "misfit", k)) for k in range(4)]
+    draws = []
+    for k in range(4):
+        note(f"judge {type(pixel).__name__}, draw {k + 1} of 4")
+        draws.append(simulated(recordings, pixel, derive_seed(seed, "misfit", k)))
     for k, recording in enumerate(recordings):
         seen = _volume(recording, recording.events)
         model = sum((_volume(recording, draw[k]) for draw in draws), np.zeros(())) / len(draws)

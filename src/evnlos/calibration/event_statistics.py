@@ -19,6 +19,7 @@ from evnlos.cameras import PixelSettings, simulate_events
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.data.sampling import Sampling, make_samples, reduce_by_area
 from evnlos.errors import DataError
+from evnlos.machine import note
 from evnlos.setups import Setup
 from evnlos.types import Events, derive_seed
 
@@ -73,7 +74,8 @@ def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[R
     height, width = capture_set.shape
     chosen = np.unique(np.linspace(0, len(capture_set.captures) - 1, count).round().astype(int))
     recordings, used = [], 0
-    for k in chosen:
+    for done, k in enumerate(chosen):
+        note(f"light of capture {done + 1} of {len(chosen)}")
         capture, scene = capture_set.captures[k], capture_set.scenes[k]
         wall = setup.resized(capture_set.shape).observe(scene)
         first, last = (float(t) * 1e-6 for t in capture.frame_times_us[[0, -1]])

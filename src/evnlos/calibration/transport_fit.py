@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from evnlos.calibration.captures import CaptureSet
 from evnlos.calibration.frame_model import FrameModel, fitting_strip, working_shape
 from evnlos.errors import ConfigError, DataError
+from evnlos.machine import note
 from evnlos.setups import Parameter, Setup
 
 
@@ -100,8 +101,8 @@ def levenberg_marquardt(
     now = residual(values).flatten()
     damping, count = 1e-3, 1
     jacobian = now.new_zeros((len(now), len(values)))
-    for _ in range(iterations):
-        jacobian = forward_jacobian(residual, values, now, step, high)
+    for round_ in range(1, iterations + 1):
+        jacobian = forward_jacobian(residual, values, now, step, high, f"round {round_}, ")
         count += len(values)
         normal, slope = (jacobian.T @ jacobian).double().numpy(), (jacobian.T @ now).double().numpy()
         # A parameter that rests on a bound and wants to leave is not part of this step.
@@ -115,6 +116,7 @@ def levenberg_marquardt(
             if most is not None:
                 move /= max(1.0, float(np.abs(move / most).max()))
             trial = np.clip(values + move, low, high)
+            note(f"round {round_}, trial {count}")
             after = residual(trial).flatten()
             count += 1
             if float(after.square().mean().sqrt()) < before:
@@ -134,6 +136,7 @@ def forward_jacobian(
     now: torch.Tensor,
     step: NDArray[np.float64],
     high: NDArray[np.float64],
+    what: str = "",
 ) -> torch.Tensor:
     """Return the derivatives of a residual by forward differences.
 
@@ -143,6 +146,7 @@ def forward_jacobian(
         now: The residual there, [N].
         step: Step of each parameter [P]; one that would cross the upper bound goes down instead.
         high: Upper bounds [P].
+        what: What progress shows before the number of the parameter.
 
     Returns:
         Derivatives [N, P].
@@ -152,6 +156,7 @@ def forward_jacobian(
         h = step[k] if values[k] + step[k] <= high[k] else -step[k]
         moved = values.copy()
         moved[k] += h
+        note(f"{what}slope {k + 1} of {len(values)}")
         columns.append((residual(moved).flatten() - now) / h)
     return torch.stack(columns, dim=1)
 
@@ -306,6 +311,7 @@ def _scanned(model: FrameModel, start: Setup) -> Setup:
     best, least, mirrored = start, math.inf, math.inf
     for wider in (1.0, 0.7, 1.4):
         for rougher in (0.25, 0.5, 1.0, 2.0):
+            note(f"start with {rougher:g} x the blur, {wider:g} x the magnification")
             trial = rescaled(start, blur=rougher, magnification=wider)
             picture = model.light(trial)
             light, residual = model.fit(picture)

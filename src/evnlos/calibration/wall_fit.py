@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from evnlos.calibration.captures import Array, WallData
 from evnlos.errors import ConfigError
+from evnlos.machine import note
 from evnlos.optics.facets import (
     MASKING,
     Pose,
@@ -277,7 +278,8 @@ def refine(
     unknowns = _Unknowns(freedoms, state, prior)
     power = float((data.shared_removed(data.seen) ** 2 * data.weight[:, None]).sum())
     now, damping, evaluations = state.residual(data), 1e-2, 0
-    for _ in range(iterations):
+    for round_ in range(1, iterations + 1):
+        note(f"wall, round {round_}")
         temper = EFFECTIVE / float((now**2).sum())
         away = unknowns.away(state)
         cost = EFFECTIVE + away @ unknowns.information @ away

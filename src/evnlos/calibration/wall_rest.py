@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from evnlos.calibration.captures import CaptureSet, WallData, wall_data
 from evnlos.calibration.wall_fit import WallState
 from evnlos.data.sampling import reduce_by_area
+from evnlos.machine import note
 from evnlos.optics.facets import MASKING, fill_facets, seen_points, target_cells
 from evnlos.optics.radiometric import torchs_threads
 from evnlos.setups.files import AboutWall, FittedWall
@@ -70,6 +71,7 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
     texture, error = np.ones(len(light)), _remaining_error(data, other, light, away)
     floor, best, rough = _noise(other, away), error, pixel_sensitivity(data, light)
     for smooth in _SMOOTH_PX:
+        note(f"texture smooth over {smooth:g} pixels")
         name, trial = f"texture smooth over {smooth:g} pixels", _smoothed(data, *rough, smooth)[:, None]
         after = _remaining_error(data, other, light * trial, away * trial)
         explained[name] = _share(error, after, floor)

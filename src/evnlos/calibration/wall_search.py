@@ -29,6 +29,7 @@ from evnlos.calibration.wall_fit import (
 )
 from evnlos.calibration.wall_rest import WallRest, rest_of
 from evnlos.errors import ConfigError, DataError
+from evnlos.machine import note
 from evnlos.optics.facets import Pose
 from evnlos.setups import FittedSetup, RadiometricSetup, SensorSize
 from evnlos.setups.files import AboutWall, FittedWall, write_fitted
@@ -122,6 +123,7 @@ def _scanned(data: WallData, known: Pose, freedoms: Sequence[Freedom]) -> list[W
     tried: list[tuple[float, WallState]] = []
     mirrored = math.inf
     for angle, view, away in itertools.product(angles, views, distances):
+        note(f"camera at {angle:g} degrees, {view:g} x the view, {away:g} x the distance")
         middle = -known.distance_m * math.tan(math.radians(angle))
         if "target_offset_m.0" in measured:
             middle = known.target_offset_m[0]

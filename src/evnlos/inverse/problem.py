@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import LinearOperator
+from evnlos.machine import note
 from evnlos.optics import dense_matrix
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Target
 from evnlos.types import Plane
@@ -307,9 +308,11 @@ def handwritten_targets(target_plane: Plane, writers: int = 6) -> TargetPrior:
         writers: Writers of the training targets.
     """
     training = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=writers)
-    drawn = np.stack([training.target(name).rasterise(target_plane) for name in training.objects()]).astype(
-        np.float64
-    )
+    masks, names = [], training.objects()
+    for k, name in enumerate(names, 1):
+        note(f"handwritten target {k} of {len(names)}")
+        masks.append(training.target(name).rasterise(target_plane))
+    drawn = np.stack(masks).astype(np.float64)
     moved = [np.roll(drawn, (dy, dx), axis=(1, 2)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     samples = torch.from_numpy(np.concatenate(moved)).flatten(1)  # [9 N, n]
     mean = samples.mean(dim=0)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from evnlos.inverse.operators import Gradient, normal_matrix
 from evnlos.inverse.sequence_problem import mean_weight, strip_of
+from evnlos.machine import note
 from evnlos.optics import DepthTransport
 from evnlos.optics.interpolation import spline_coefficients, spline_weights
 from evnlos.setups import Setup
@@ -105,7 +106,8 @@ def fit_motion(
     still = (1 - mean_weight(len(light), _STATIC)) / len(light)
     whole, part = (float((one - still * one.sum(dim=0)).square().sum()) for one in (light, seen))
     rest = whole - part  # what no target explains
-    for _ in range(_ROUNDS):
+    for number in range(1, _ROUNDS + 1):
+        note(f"places and image, round {number}")
         fit = Fit(target_plane, lights, pose, kinds, scale)
         image, step, covariance, left = fit.step(seen, prior)
         samples = light[0].numel() * (len(light) - 1)

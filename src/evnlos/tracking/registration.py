@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.events import event_histogram
+from evnlos.machine import note
 from evnlos.optics.interpolation import MARGIN, spline_coefficients
 from evnlos.types import Events
 
@@ -82,6 +83,7 @@ def register(frames: NDArray, background: NDArray, noise: float) -> Registration
         coefficients = spline_coefficients(template)
         drawn = []
         for k in range(len(frames)):
+            note(f"register, round {turn + 1}, frame {k + 1} of {len(frames)}")
             try:
                 values[k], covariance[k] = _fit(coefficients, light[k] - rest, values[k], noise)
             except RuntimeError:  # a singular matrix: the image is nowhere in the frame
