@@ -1,6 +1,7 @@
 """A whole sequence as one measurement: aligned by the motion, pooled, and better than its best position."""
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -390,3 +391,24 @@ def test_a_killed_fine_tuning_corrects_the_light_path_once(solved, tmp_path) -> 
     assert not torch.equal(before.frames.light, whole.frames.light)
     one, other = whole.state_dict(), again.state_dict()
     assert [name for name in one if not torch.equal(one[name], other[name])] == []
+
+
+def test_what_a_fine_tuning_learns_from_is_solved_through_what_other_captures_correct(solved) -> None:
+    """Its own errors are undone nowhere but in the light path that new targets are solved through."""
+    dataset, out = solved
+    net = load_weights(train(dataset, replace(PLAN, network=SOLVING), out).folder).network
+    samples, other = NlosDataset(dataset, "train", "frame"), deepcopy(net)
+    net.fit(lambda count: pytest.fail("nothing is fitted again"), 0, is_new=False, keep_normalization=True)
+    learned = net.training_samples(samples, 1, 0, is_new=False)
+    name = np.unique(samples.names)[1]
+    mine = torch.from_numpy(samples.names == name)
+    rest = ~torch.from_numpy(np.isin(samples.names, np.unique(samples.names)[1::4]))
+    places = torch.from_numpy(samples.position_m)
+    other.frames.correct(
+        samples.inputs[rest, 0], samples.truth[rest], places[rest], samples.names[rest.numpy()]
+    )
+    seen = samples.inputs[mine].float(), places[mine]
+    expected = other.pooled(*seen)
+    (row,) = np.flatnonzero(learned.names == name)
+    torch.testing.assert_close(learned.inputs[row].float(), expected, rtol=2e-3, atol=2e-3)
+    assert float((net.pooled(*seen) - expected).abs().max()) > 0.01
