@@ -74,7 +74,7 @@
     ink.fillStyle = "#fff";
     ink.fillRect(0, 0, canvas.width, canvas.height);
     for (const [i, figure] of figures.entries()) {
-      const picture = figure.querySelector(".ev-picture"), box = picture.getBoundingClientRect(), image = new Image();
+      const picture = figure.querySelector(".ev-image"), box = picture.getBoundingClientRect(), image = new Image();
       image.src = picture.style.backgroundImage.slice(5, -2);
       await image.decode();
       const many = picture.style.backgroundSize.includes("var"), count = many ? Number(sheet.style.getPropertyValue("--n")) : 1;
