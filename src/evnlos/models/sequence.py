@@ -272,7 +272,8 @@ class PooledFrames(nn.Module):
 
         What the components hold beside the predicted light is linear in the image on the canvas: ridge
         regression (`ridge_by_groups`), each capture left out in turn, beside an offset of each capture and what
-        moves along. Fewer than 4 captures change nothing, nor do those that predict nothing of each other.
+        moves along. Fewer than 4 captures change nothing, and those that predict nothing of each other only the
+        latter.
 
         Args:
             frames: White levels, [N, H, W].
@@ -285,19 +286,16 @@ class PooledFrames(nn.Module):
             return
         some = torch.arange(0, len(owner), math.ceil(len(owner) / _MOST_FRAMES))
         group, terms = torch.from_numpy(owner)[some], self._terms(position_m[some])
-        seen, code = (
-            truth[some].float().flatten(1),
-            (frames[some].float() - self.ambient).flatten(1) @ self.basis,
-        )
+        seen, light = truth[some].float().flatten(1), frames[some].float() - self.ambient
+        code = light.flatten(1) @ self.basis
         steady = F.normalize(F.one_hot(group).float(), dim=0)  # a column a capture
         basis = torch.linalg.qr(torch.cat([steady, terms[:, 1:]], dim=1)).Q
         moving, own = (values - basis @ (basis.T @ values) for values in (seen, code))
         light = moving @ self.light.flatten(1).T
         gain = (light * own).sum() / light.square().sum().clamp_min(1e-12)
         errors = ridge_by_groups(moving, own - gain * light, group)
-        if errors is None:
-            return
-        self.light += (errors.T / gain).view_as(self.light)
+        if errors is not None:
+            self.light += (errors.T / gain).view_as(self.light)
         self.along.copy_(_polynomial(terms, code - gain * (seen @ self.light.flatten(1).T)))
         self._last = None
 
