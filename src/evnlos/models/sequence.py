@@ -485,17 +485,18 @@ class SequenceReconstructor(Reconstructor):
         """Take the setup's light path, or correct it: each capture by others, as new targets are."""
         assert self.frames is not None
         device, places = self.frames.basis.device, torch.from_numpy(samples.position_m)
-        known = samples.inputs[:, self._frame].cpu(), samples.truth.cpu(), places, samples.names
+        frames, truth = samples.inputs[:, self._frame].cpu(), samples.truth.cpu()
         own, names = dict[str, PooledFrames](), np.unique(samples.names)
         for part in () if is_new else (names[k::_PARTS] for k in range(_PARTS)):
-            one, others = deepcopy(self.frames).cpu(), ~np.isin(samples.names, part)
-            one.correct(*(values[others] for values in known))
+            one, others = deepcopy(self.frames).cpu(), np.flatnonzero(~np.isin(samples.names, part))
+            rows = torch.from_numpy(others)
+            one.correct(frames[rows], truth[rows], places[rows], samples.names[others])
             own |= dict.fromkeys(part.tolist(), one.to(device))
         self.frames.cpu()
         if is_new:
-            self.frames.fit(load_setup(self.sampling.setup), *known)
+            self.frames.fit(load_setup(self.sampling.setup), frames, truth, places, samples.names)
         else:
-            self.frames.correct(*known)
+            self.frames.correct(frames, truth, places, samples.names)
         self.frames.to(device)
         return own
 
