@@ -18,7 +18,13 @@ from evnlos.optics import (
     coarsest_keyframe_step_m,
     tpsf_kernel,
 )
-from evnlos.optics.interpolation import spline_coefficients, spline_sample, spline_scattered, spline_weights
+from evnlos.optics.interpolation import (
+    spline_coefficients,
+    spline_sample,
+    spline_scattered,
+    spline_slopes,
+    spline_weights,
+)
 from evnlos.optics.wall import ambient_plane
 from evnlos.scene import LineMotion, PathMotion, Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup
@@ -379,6 +385,8 @@ def test_spline_interpolates_and_its_weights_add_up():
     )
     fraction = torch.linspace(0, 1, 7, dtype=torch.float64)
     torch.testing.assert_close(spline_weights(fraction).sum(0), torch.ones(7, dtype=torch.float64))
+    (slopes,) = torch.func.jvp(spline_weights, (fraction,), (torch.ones_like(fraction),))[1:]
+    torch.testing.assert_close(spline_slopes(fraction), slopes)
 
 
 @pytest.mark.parametrize(

@@ -71,8 +71,8 @@ def rest_of(fit: CaptureSet, held: CaptureSet, state: WallState, plane: Plane) -
     texture, error = np.ones(len(light)), _remaining_error(data, other, light, away)
     floor, best, rough = _noise(other, away), error, pixel_sensitivity(data, light)
     for smooth in _SMOOTH_PX:
-        note(f"texture smooth over {smooth:g} pixels")
-        name, trial = f"texture smooth over {smooth:g} pixels", _smoothed(data, *rough, smooth)[:, None]
+        note(name := f"texture smooth over {smooth:g} pixels")
+        trial = _smoothed(data, *rough, smooth)[:, None]
         after = _remaining_error(data, other, light * trial, away * trial)
         explained[name] = _share(error, after, floor)
         if _better(best, after):

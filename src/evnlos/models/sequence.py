@@ -286,17 +286,17 @@ class PooledFrames(nn.Module):
             return
         some = torch.arange(0, len(owner), math.ceil(len(owner) / _MOST_FRAMES))
         group, terms = torch.from_numpy(owner)[some], self._terms(position_m[some])
-        seen, light = truth[some].float().flatten(1), frames[some].float() - self.ambient
-        code = light.flatten(1) @ self.basis
+        shown = truth[some].float().flatten(1)
+        code = (frames[some].float() - self.ambient).flatten(1) @ self.basis
         steady = F.normalize(F.one_hot(group).float(), dim=0)  # a column a capture
-        basis = torch.linalg.qr(torch.cat([steady, terms[:, 1:]], dim=1)).Q
-        moving, own = (values - basis @ (basis.T @ values) for values in (seen, code))
+        common = torch.linalg.qr(torch.cat([steady, terms[:, 1:]], dim=1)).Q
+        moving, own = (values - common @ (common.T @ values) for values in (shown, code))
         light = moving @ self.light.flatten(1).T
         gain = (light * own).sum() / light.square().sum().clamp_min(1e-12)
         errors = ridge_by_groups(moving, own - gain * light, group)
         if errors is not None:
             self.light += (errors.T / gain).view_as(self.light)
-        self.along.copy_(_polynomial(terms, code - gain * (seen @ self.light.flatten(1).T)))
+        self.along.copy_(_polynomial(terms, code - gain * (shown @ self.light.flatten(1).T)))
         self._last = None
 
     def forward(self, frames: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
@@ -443,7 +443,7 @@ class SequenceReconstructor(Reconstructor):
         inputs, truth, names = [], [], []
         self.check_samples(samples, is_new=is_new)
         begins = self.frames is not None and (is_new or self._corrects)
-        own, whole = self._fit_frames(samples, is_new=is_new) if begins else {}, self.frames
+        own = self._fit_frames(samples, is_new=is_new) if begins else {}
         draw = np.random.default_rng(derive_seed(seed, "views"))
         device = next(self.parameters()).device
         for name in dict.fromkeys(samples.names.tolist()):
@@ -454,11 +454,9 @@ class SequenceReconstructor(Reconstructor):
             for number in range(augmentations):
                 kept[number, _subset(number, len(mine), draw)] = 1
             seen = samples.inputs[torch.from_numpy(mine)].to(device)
-            self.frames = own.get(name, whole)
-            inputs.append(self.pooled_subsets(seen, places, kept).half().cpu())
+            inputs.append(self.pooled_subsets(seen, places, kept, own.get(name)).half().cpu())
             truth += augmentations * [plane]
             names += augmentations * [name]
-        self.frames = whole
         found = InMemoryDataset(torch.cat(inputs), torch.stack(truth), np.array(names))
         if is_new:
             self.scale.fit(found.inputs)
@@ -546,13 +544,16 @@ class SequenceReconstructor(Reconstructor):
         return self.pooled_subsets(inputs, position_m, torch.ones(1, len(inputs)))[0]
 
     @torch.no_grad()
-    def pooled_subsets(self, inputs: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
+    def pooled_subsets(
+        self, inputs: Tensor, position_m: Tensor, kept: Tensor, frames: PooledFrames | None = None
+    ) -> Tensor:
         """Return `pooled` of subsets of the time steps, [K, S, P, P]; each step is embedded once for all.
 
         Args:
             inputs: What was recorded at N time steps, [N, C, H, W].
             position_m: The plane's centre on the canvas, (x, y) in metres, [N, 2].
             kept: 1 where a subset has a time step, else 0, float32 [K, N].
+            frames: What frames are solved through; by default the network's own.
 
         Raises:
             DataError: The plane is off the canvas at all time steps of a subset.
@@ -573,10 +574,10 @@ class SequenceReconstructor(Reconstructor):
                 "the target plane is off the canvas at every time step; give positions within the travel"
             )
         maps = [total / seen[:, None].clamp_min(1)] if self.embedding.images else []
-        if self.frames is not None:
+        if (solver := frames or self.frames) is not None:
             with torch.autocast(inputs.device.type, enabled=False):
-                solved = self.frames(inputs[:, self._frame], position_m, kept.to(inputs.device))
-            maps.insert(0, self.grid.of_target(solved, self.frames.target_plane.extent_m[0]))
+                solved = solver(inputs[:, self._frame], position_m, kept.to(inputs.device))
+            maps.insert(0, self.grid.of_target(solved, solver.target_plane.extent_m[0]))
         return torch.cat(maps, dim=1)
 
     @classmethod

@@ -67,6 +67,13 @@ def spline_weights(fraction: torch.Tensor) -> torch.Tensor:
     return torch.stack([g**3 / 6, near_left, near_right, f**3 / 6])
 
 
+def spline_slopes(fraction: torch.Tensor) -> torch.Tensor:
+    """Return the derivatives [4, ...] of the `spline_weights` by the fraction [...]; their sum is 0."""
+    f = fraction
+    g = 1 - f
+    return torch.stack([-g * g / 2, 1.5 * f * f - 2 * f, 2 * g - 1.5 * g * g, f * f / 2])
+
+
 def spline_sample(coefficients: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
     """Evaluate a two-dimensional cubic B-spline at any points; zero outside the array.
 

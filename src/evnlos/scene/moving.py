@@ -333,6 +333,8 @@ class Target:
         Args:
             rotation_rad: Angle, clockwise as rows and columns run, radians.
         """
+        from scipy.ndimage import map_coordinates  # scipy loads slowly
+
         side = len(self.mask)
         finer = 2 if side < _FINE_SIDE else 1
         fine = finer * math.ceil(side * math.sqrt(2))  # room for the corners
@@ -340,14 +342,7 @@ class Target:
         cos, sin = math.cos(rotation_rad), math.sin(rotation_rad)
         row = cos * along[:, None] - sin * along + (side - 1) / 2
         column = cos * along + sin * along[:, None] + (side - 1) / 2
-        top, left = np.floor(row).astype(np.intp), np.floor(column).astype(np.intp)
-        down, right = row - top, column - left
-        padded = np.pad(self.mask, 1)
-        found = np.zeros((fine, fine))
-        for j, wy in ((0, 1 - down), (1, down)):
-            r = np.clip(top + j + 1, 0, side + 1)
-            for i, wx in ((0, 1 - right), (1, right)):
-                found += wy * wx * padded[r, np.clip(left + i + 1, 0, side + 1)]
+        found = map_coordinates(self.mask.astype(np.float64), [row, column], order=1, mode="grid-constant")
         return Target(self.name, np.clip(found, 0, 1).astype(np.float32), self.size_m * fine / (finer * side))
 
     def rasterise(

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import BackgroundModel
 from evnlos.setups import Setup
-from evnlos.tracking.motion_fit import MotionFit, fit_motion, smooth_together
+from evnlos.tracking.motion_fit import fit_motion, smooth_together
 from evnlos.tracking.registration import EventVelocity, Registration, event_velocity, register
 from evnlos.tracking.track import (
     Distance,
@@ -211,15 +212,6 @@ def track_warnings(capture: Capture, setup: Setup | None, track: Track) -> list[
     return warnings
 
 
-def _in_pixels(
-    found: Registration, by_events: EventVelocity | None, times_s: NDArray[np.float64], pixel: float
-) -> Track:
-    place = (found.place_px - found.place_px.mean(axis=0)) * pixel
-    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :2]) * pixel
-    velocity = None if by_events is None else (by_events.velocity * pixel, by_events.variance * pixel**2)
-    return _joined(place, sigma, velocity, by_events, times_s, "px", found)
-
-
 def _in_metres(
     found: Registration,
     by_events: EventVelocity | None,
@@ -243,98 +235,87 @@ def _in_metres(
         depth=settings.depth,
         turning=settings.turning,
     )
-    sigma = np.sqrt(np.einsum("nknk->nk", fitted.covariance))
-    velocity = None
+    variance = np.einsum("nknk->nk", fitted.covariance)
+    values = np.column_stack(
+        [fitted.position_m, *(one for one in (fitted.log_distance, fitted.rotation_rad) if one is not None)]
+    )
+    rates: list = [None] * values.shape[1]
     if by_events is not None:
         where = np.stack(
             [np.interp(by_events.time_s, times_s, found.place_px[:, k]) for k in range(2)], axis=-1
         )
         slope = to_plane.slope(where)  # [M, 2, 2]
-        velocity = (
-            np.einsum("mab,mb->ma", slope, by_events.velocity),
-            np.einsum("mab,mb->ma", slope**2, by_events.variance),
-        )
-    track = _joined(fitted.position_m, sigma[:, :2], velocity, by_events, times_s, "m", found)
-    return replace(_together(track, fitted, velocity, by_events, setup), misfit=fitted.misfit)
-
-
-def _together(
-    track: Track,
-    fitted: MotionFit,
-    velocity: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
-    by_events: EventVelocity | None,
-    setup: Setup,
-) -> Track:
-    """Return the track with all poses smoothed together, and the errors that they share."""
-    times_s = track.frame_time_s
-    others = [one for one in (fitted.log_distance, fitted.rotation_rad) if one is not None]
-    values = np.column_stack([fitted.position_m, *others])
+        velocity = np.einsum("mab,mb->ma", slope, by_events.velocity)
+        rough = np.einsum("mab,mb->ma", slope**2, by_events.variance)
+        rates[:2] = [(by_events.time_s, velocity[:, k], rough[:, k]) for k in range(2)]
     blank = np.full(len(times_s), np.nan)
-    axes = [
-        Measurements(times_s, values[:, k], fitted.covariance[:, k, :, k].diagonal(), blank, blank)
-        for k in range(values.shape[1])
-    ]
+    axes = [Measurements(times_s, *one, blank, blank) for one in zip(values.T, variance.T, strict=True)]
     speeds = [most_likely_acceleration(axes[:2])] * 2 + [most_likely_acceleration([one]) for one in axes[2:]]
-    rates: list = [None] * values.shape[1]
-    if velocity is not None and by_events is not None:
-        rates[:2] = [(by_events.time_s, velocity[0][:, k], velocity[1][:, k]) for k in range(2)]
-    mean, sigma = smooth_together(times_s, values, fitted.covariance, rates, speeds, track.time_s)
-    track = replace(
-        track,
-        position=mean[:, 0, :2],
-        velocity=mean[:, 1, :2],
-        position_sigma=sigma[:, 0, :2],
-        velocity_sigma=sigma[:, 1, :2],
-    )
-    at = np.searchsorted(track.time_s, times_s)
-    curves = [
-        (mean[at, 0, k], sigma[at, 0, k], mean[at, 1, k], sigma[at, 1, k]) for k in range(values.shape[1])
-    ]
+    instants = _instants(times_s, by_events)
+    by_frames = fitted.position_m, np.sqrt(variance[:, :2])
+    mean, spread = smooth_together(times_s, values, fitted.covariance, rates, speeds, instants)
+    track = _track(instants, mean, spread, "m", times_s, by_frames, found, by_events)
+    at = np.searchsorted(instants, times_s)
+    curves = [(mean[at, 0, k], spread[at, 0, k], mean[at, 1, k], spread[at, 1, k]) for k in range(len(axes))]
+    distance = turn = None
     if fitted.log_distance is not None:
         log, log_sigma, rate, rate_sigma = curves[2]
         away = (setup.default_distance_m or 1.0) * np.exp(log)
         distance = Distance(times_s, away, away * log_sigma, away * rate, away * rate_sigma)
-        track = replace(track, distance=distance)
     if fitted.rotation_rad is not None:
-        track = replace(track, turn=Turn(times_s, *(np.degrees(one) for one in curves[-1])))
-    return track
+        turn = Turn(times_s, *(np.degrees(one) for one in curves[-1]))
+    return replace(track, distance=distance, turn=turn, misfit=fitted.misfit)
 
 
-def _joined(
-    place: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    velocity: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
-    by_events: EventVelocity | None,
-    times_s: NDArray[np.float64],
-    unit: str,
-    found: Registration,
+def _instants(times_s: NDArray[np.float64], by_events: EventVelocity | None) -> NDArray[np.float64]:
+    """Return the instants of frames and windows, in order."""
+    return np.unique(np.concatenate([times_s, [] if by_events is None else by_events.time_s]))
+
+
+def _in_pixels(
+    found: Registration, by_events: EventVelocity | None, times_s: NDArray[np.float64], pixel: float
 ) -> Track:
     """Return the smoothed track over the instants of frames and windows."""
-    windows = np.zeros(0) if by_events is None else by_events.time_s
-    instants = np.unique(np.concatenate([times_s, windows]))
-    at_frames, at_windows = np.searchsorted(instants, times_s), np.searchsorted(instants, windows)
-    axes = []
+    place = (found.place_px - found.place_px.mean(axis=0)) * pixel
+    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :2]) * pixel
+    instants, axes = _instants(times_s, by_events), []
+    at_frames = np.searchsorted(instants, times_s)
     for axis in range(2):
         columns = np.full((4, len(instants)), np.nan)
         columns[0, at_frames], columns[1, at_frames] = place[:, axis], sigma[:, axis] ** 2
-        if velocity is not None:
-            columns[2, at_windows], columns[3, at_windows] = velocity[0][:, axis], velocity[1][:, axis]
+        if by_events is not None:
+            at_windows = np.searchsorted(instants, by_events.time_s)
+            columns[2, at_windows] = by_events.velocity[:, axis] * pixel
+            columns[3, at_windows] = by_events.variance[:, axis] * pixel**2
         axes.append(Measurements(instants, *columns))
     acceleration = most_likely_acceleration(axes)
     smoothed = [smooth(one, acceleration) for one in axes]
     mean = np.stack([one.mean for one in smoothed], axis=-1)  # [T, 2 (value, rate), 2 (x, y)]
     spread = np.stack([np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2)) for one in smoothed], axis=-1)
+    return _track(instants, mean, spread, "px", times_s, (place, sigma), found, by_events)
+
+
+def _track(
+    instants: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    spread: NDArray[np.float64],
+    unit: Literal["m", "px"],
+    times_s: NDArray[np.float64],
+    by_frames: tuple[NDArray[np.float64], NDArray[np.float64]],
+    found: Registration,
+    by_events: EventVelocity | None,
+) -> Track:
+    """Return the track of smoothed values and rates [T, 2, K] of x and y, beside what frames alone say."""
     return Track(
         instants,
-        mean[:, 0],
-        mean[:, 1],
-        spread[:, 0],
-        spread[:, 1],
-        "m" if unit == "m" else "px",
+        mean[:, 0, :2],
+        mean[:, 1, :2],
+        spread[:, 0, :2],
+        spread[:, 1, :2],
+        unit,
         times_s,
-        place,
-        sigma,
+        *by_frames,
         found.size,
         found.size * np.sqrt(found.covariance[:, 2, 2]),
-        len(windows),
+        0 if by_events is None else len(by_events.time_s),
     )

@@ -18,7 +18,7 @@ from evnlos.inverse.operators import Gradient, normal_matrix
 from evnlos.inverse.sequence_problem import mean_weight, strip_of
 from evnlos.machine import note
 from evnlos.optics import DepthTransport
-from evnlos.optics.interpolation import spline_coefficients, spline_weights
+from evnlos.optics.interpolation import spline_coefficients, spline_slopes, spline_weights
 from evnlos.setups import Setup
 from evnlos.types import Plane
 
@@ -198,10 +198,8 @@ class Lights:
 def _spline_taps(at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the four knots around points [n], their weights, and the weights' derivatives, each [4, n]."""
     whole = at.floor()
-    f = at - whole
-    g = 1 - f
-    slopes = torch.stack([-g * g / 2, 1.5 * f * f - 2 * f, 2 * g - 1.5 * g * g, f * f / 2])
-    return whole.long() + torch.arange(-1, 3)[:, None], spline_weights(f), slopes
+    knots = whole.long() + torch.arange(-1, 3)[:, None]
+    return knots, spline_weights(at - whole), spline_slopes(at - whole)
 
 
 class Fit:
