@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch.nn.functional import pad
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.machine import note
 from evnlos.types import Plane
 
 _COLUMNS = 256  # unit images carried over at a time
@@ -257,8 +258,7 @@ _LAGRANGE = np.linalg.inv(np.vander(np.arange(-1.0, _NEAR - 1.0), increasing=Tru
 DEPTH_STEP = 0.05
 """Of the distance's logarithm between two matrices, to begin with: less than most walls' blur."""
 _DEPTH_ERROR = 1e-3  # of the light, root mean square
-_MOST_HALVINGS = 3
-_SKETCH = 64  # images that a basis grows by
+_MOST_HALVINGS, _SKETCH = 3, 64  # of the step; images that a basis grows by
 
 
 class DepthTransport:
@@ -289,9 +289,8 @@ class DepthTransport:
         shape: tuple[int, int],
         tolerance: float = _DEPTH_ERROR,
     ) -> None:
-        self.source, self.shape = source, shape
+        self.source, self.shape, self.low_m, self.high_m = source, shape, low_m, high_m
         self.basis = torch.zeros(shape[0] * shape[1], 0)
-        self.low_m, self.high_m = low_m, high_m
         low, high = math.log(low_m), math.log(high_m)
         steps = max(_NEAR - 1, math.ceil((high - low) / DEPTH_STEP))
         made: dict[int, torch.Tensor] = {}  # C at places of the finest grid
@@ -300,6 +299,7 @@ class DepthTransport:
             self._low, self._step = low, (high - low) / (steps * 2**halving)
             for k in sorted({*range(0, finest + 1, 2 ** (_MOST_HALVINGS - halving))} - made.keys()):
                 there_m = math.exp(low + k * (high - low) / finest)
+                note(f"light path at {there_m:.3f} m")
                 made[k] = self._added(matrix(there_m), tolerance / 4)
             rank = self.basis.shape[1]
             self.nodes = torch.stack([pad(one, (0, 0, 0, rank - len(one))) for _, one in sorted(made.items())])
