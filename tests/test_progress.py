@@ -168,6 +168,18 @@ def test_compiling_is_told_apart_from_standing_still(capsys, monkeypatch) -> Non
     assert "events: 0 of 2 frames (compiling, once per installation)" in capsys.readouterr().err
 
 
+def test_compilations_are_listened_for_before_the_first_line(monkeypatch) -> None:
+    import numba  # noqa: F401  as whoever is about to compile
+
+    monkeypatch.setattr("evnlos.machine.LINE_S", 60.0)
+    monkeypatch.setattr("evnlos.machine._is_listening", False)
+    show_progress("lines")
+    with ProgressBars() as progress:
+        progress(Step("reconstruct", 0, 3, "stages"))
+        time.sleep(0.2)
+        assert importlib.import_module("evnlos.machine")._is_listening
+
+
 def test_the_flags_stand_anywhere(tmp_path, capsys, monkeypatch) -> None:
     shown = list[str]()
     monkeypatch.setattr("evnlos.machine.ProgressBars._show", lambda self: shown.append(self._how))

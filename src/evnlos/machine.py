@@ -223,6 +223,7 @@ class ProgressBars:
 
     def _beat(self) -> None:
         while not self._end.wait(_BEAT_S):
+            _compiling_since()  # also where nothing is shown yet: a compilation tells only who listens when it begins
             with self._lock:
                 self._show()
 

@@ -27,7 +27,7 @@ from evnlos.analysis.confidence import (
 from evnlos.analysis.evaluate import check_sampling, reconstruct
 from evnlos.data import Capture, Dataset, FixedPattern, NlosDataset, Samples, capture_samples, read_capture
 from evnlos.errors import ConfigError, DataError
-from evnlos.machine import Progress, counted, silent
+from evnlos.machine import Progress, counted, note, silent
 from evnlos.metrics import psnr
 from evnlos.models import ConfidenceReport, Weights, load_weights, published_setup, published_single
 from evnlos.setups import Setup, load_setup
@@ -159,6 +159,7 @@ def _in_known_light(
     still = (frames - light_gain(images, frames, operator) * (operator(images) - ambient)).mean(dim=0)
     best = max(_FINE, own + _BETTER), samples, images, None
     for level in _LEVELS:
+        note(f"light {level:g} x the known")
         seen = replace(samples, frame=(ambient + (frames - still) / level).float().numpy())
         drawn = reconstruct(weights, seen.frame, seen.surface, at)
         share = share_explained(drawn, frames, at, mean, operator, canvas)
@@ -232,12 +233,15 @@ class Model:
             path = track_capture(capture, tracked, pattern=pattern)
             warnings += track_warnings(capture, tracked, path)
             samples = replace(samples, position_m=path.at(samples.time_s))
+        note("network")
         images = reconstruct(self.weights, samples.frame, samples.surface, samples.position_m)
         unjudged = why_no_confidence(self.weights, samples)
         judge = setup
         if judge is None and unjudged is None:  # an operator takes a second to make
             judge = self.known_setup()
+        note("light path")
         operator = None if judge is None else FrameOperator(judge, self.weights.sampling)
+        note("confidence")
         seen, level = samples, None
         if operator is not None and unjudged is None and "frame" in self.weights.modality.slices:
             seen, images, level = _in_known_light(self.weights, samples, images, operator)

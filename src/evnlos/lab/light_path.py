@@ -153,7 +153,7 @@ def slope_density(u: float, v: float, table: Array) -> float:
     return total
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, error_model="numpy", fastmath=True)
 def add_density(total: Array, factor: Array, u: Array, v: Array, lobe: Array) -> None:
     """Add factor P(u, v) of one lobe, a row of `Reflection.table`, to `total`: all four are [C]."""
     kind, scale = lobe[0], lobe[1]
@@ -327,7 +327,7 @@ def _meet(origin: Array, ray: Array, curvature: tuple[float, float]) -> Array:
         return origin + t[..., None] * ray
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, error_model="numpy", fastmath=True)
 def _add_ray(
     total: Array,
     facet: Array,

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Ends = NDArray[np.int64]
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=True, inline="always", error_model="numpy")
 def _fresnel(cosine: float, n: float, k: float) -> float:
     c2 = cosine * cosine
     s2 = 1.0 - c2
@@ -37,7 +37,7 @@ def _fresnel(cosine: float, n: float, k: float) -> float:
     return 0.5 * (across + along)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _metal_row(value: Array, dx: Array, dy: float, z: float, eye: Array, metal: Array) -> None:
     """Set f cos cos / r^2 of a rough metal for one wall point and one row of target points."""
     ax, ay, n, k = metal[0], metal[1], metal[2], metal[3]
@@ -57,7 +57,7 @@ def _metal_row(value: Array, dx: Array, dy: float, z: float, eye: Array, metal: 
         value[c] = scale * distribution * masking * _fresnel(0.5 * math.sqrt(squared), n, k) * iz / r2
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _matte_row(value: Array, dx: Array, dy: float, z: float, albedo: float) -> None:
     """Set f cos cos / r^2 of a matte wall for one wall point and one row of target points."""
     scale = albedo / math.pi * z * z
