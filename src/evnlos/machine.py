@@ -223,7 +223,7 @@ class ProgressBars:
 
     def _beat(self) -> None:
         while not self._end.wait(_BEAT_S):
-            _compiling_since()  # also where nothing is shown yet: a compilation tells only who listens when it begins
+            _compiling_since()  # tells only who listens when it begins, before the first line too
             with self._lock:
                 self._show()
 
