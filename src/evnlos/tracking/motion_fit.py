@@ -266,7 +266,8 @@ class Fit:
         own = torch.zeros(frames, kinds, kinds, dtype=flat.dtype)
         for k, kind in enumerate(self._kinds):
             own[:, k, k] = float(kind > 1)
-        alike = (lower.mT @ own).flatten(0, 1)[:, [k for k, kind in enumerate(self._kinds) if kind > 1]]
+        alike = torch.linalg.solve_triangular(lower, own, upper=False).flatten(0, 1)
+        alike = alike[:, [k for k, kind in enumerate(self._kinds) if kind > 1]]
         alike = torch.linalg.qr(alike)[0] if alike.shape[1] else alike
         apart = one - alike @ alike.mT
         values, ways = torch.linalg.eigh(apart @ told @ apart)
