@@ -202,6 +202,7 @@ def test_wrong_videos_and_settings_leave_nothing(tmp_path: Path, capsys, monkeyp
     refuses("text.mp4: not a video", "text.mp4", "--out", "e.h5")
     refuses("1 frame", "one.npy", "--fps", 30, "--out", "e.h5")
     refuses("give fps (--fps)", "clip.npy", "--out", "e.h5")
+    refuses("--start 100 leaves 0 of the frames of a video that ends at", *good, "--start", 100)
     refuses("davis346", *good, "--pixel", "davis364")
     refuses("does not exist", *good, "--pixel", "absent.yaml")
     refuses("threshold_on", *good, "--pixel.threshold-on", 0)

@@ -150,7 +150,9 @@ def open_video(
             raise ConfigError(f"{name} is {value}; give {_LEAST:g} to {_MOST:g}")
     shown, source = _find(path)
     if source.frames is not None and source.frames < 2:
-        raise DataError(f"{shown}: {source.frames} frame; events need a video of at least two")
+        raise DataError(
+            f"{shown}: {source.frames} frame{'s' * (source.frames != 1)}; events need a video of at least two"
+        )
     if fps is None and not source.timed:
         raise DataError(f"{shown}: its frames carry no times; give fps (--fps)")
     chosen = white or source.white or _white_of_floats(shown, source)
@@ -199,7 +201,7 @@ def video_events(
         held = merged[sure:]
         yield merged[:sure]
     if count < 2:
-        raise DataError(f"a video of {count} frame; events need at least two")
+        raise DataError(f"a video of {count} frame{'s' * (count != 1)}; events need at least two")
     assert held is not None
     yield held
 

@@ -27,6 +27,7 @@ Picture = NDArray
 Tone = Literal["as-is", "srgb", "rec709"]
 """What the numbers of an image mean: light as they are, or codes of a tone curve to undo."""
 
+_OF_EVENTS = (".raw", ".h5", ".npz", ".aedat", ".aedat4", ".bag", ".db3", ".mcap", ".bin", ".csv", ".dat")
 _LUMA_601 = 299, 587, 114  # thousandths: of a grey pixel the sum is exactly its value
 _LUMINANCE_709 = 0.2126, 0.7152, 0.0722
 
@@ -224,10 +225,11 @@ class ContainerSource:
             try:
                 container = stack.enter_context(open_container(self.path))
             except (av.error.FFmpegError, OSError, ValueError) as error:
-                raise DataError(
-                    f"{self.path}: not a video that FFmpeg reads ({_reason(error)}); give MP4, MKV, AVI or "
-                    "another container that holds its images itself"
-                ) from None
+                cure = "give MP4, MKV, AVI or another container that holds its images itself"
+                if self.path.suffix.lower() in _OF_EVENTS:
+                    cure += "; `evnlos info` tells what an event file holds"
+                found = f"{self.path}: not a video that FFmpeg reads ({_reason(error)})"
+                raise DataError(f"{found}; {cure}") from None
             if not container.streams.video:
                 raise DataError(f"{self.path}: a media file without a video stream; give another file")
             yield container
@@ -326,9 +328,8 @@ class ArraySource:
                 self._array = np.load(path, mmap_mode="r", allow_pickle=False)
             if not isinstance(self._array, np.ndarray):
                 raise ValueError("an archive of arrays")
-        except NUMPY_ERRORS as error:
-            reason = " ".join(str(error).split())[:120]
-            raise DataError(f"{path}: not a NumPy array ({reason}); save one with numpy.save") from None
+        except NUMPY_ERRORS:
+            raise DataError(f"{path}: not a NumPy array of numbers; save one with numpy.save") from None
         shape, dtype = self._array.shape, self._array.dtype
         if len(shape) not in (3, 4) or (len(shape) == 4 and shape[3] != 3) or 0 in shape[1:]:
             raise DataError(f"{path}: an array of shape {shape}; give [T, H, W] or [T, H, W, 3]")

@@ -207,6 +207,7 @@ class _Clock:
         self.frames, self.first_s, self.last_s = 0, 0.0, 0.0
 
     def watched(self, video: Video, name: str) -> Iterator[tuple[float, NDArray]]:
+        time_s = 0.0
         with ProgressBars() as progress:
             for time_s, light in frames_counted(video, progress, name, video.frames or 0):
                 if time_s > self.stop_s:
@@ -215,6 +216,9 @@ class _Clock:
                     self.first_s = self.first_s if self.frames else time_s
                     self.frames, self.last_s = self.frames + 1, time_s
                     yield time_s, light
+            if self.frames < 2 and self.start_s > 0:
+                found = f"--start {self.start_s:g} leaves {self.frames} of the frames of a video that ends at"
+                raise ConfigError(f"{found} {time_s:.6g} s; give an earlier one")
 
 
 def _videos_in(paths: tuple[Path, ...]) -> list[Path]:
