@@ -17,6 +17,7 @@ from evnlos import open_dataset
 from evnlos.cli import VERBS, main
 from evnlos.config import save_yaml
 from evnlos.data import Samples, Sampling
+from evnlos.machine import ProgressBars
 from evnlos.models import ConfidenceReport, Weights, published_for, save_weights
 from evnlos.models.sequence import SequenceConfig
 from evnlos.report import result_sheet
@@ -306,7 +307,9 @@ def test_the_result_is_drawn_with_and_without_what_may_be_unknown() -> None:
 def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     assert "unknown command 'zzz'; give one of demo, simulate" in fails(capsys, "zzz")
-    assert "--port: invalid literal" in fails(capsys, "app", "--port", "abc")
+    assert "--port is 'abc'; give a whole number; see" in fails(capsys, "app", "--port", "abc")
+    assert "--fps is 'x'; give NUMBER; see" in fails(capsys, "events", "v.mp4", "--fps", "x", "--out", "e.h5")
+    assert "--changing is '1'; give NUMBER NUMBER; see" in fails(capsys, "invert", "c", "--changing", "1")
     assert "Unrecognized options: --prot, 3; Perhaps you meant: --port INT" in fails(
         capsys, "app", "--prot", "3"
     )
@@ -331,6 +334,35 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
     )
     assert "pitch_m" in fails(capsys, "import", *tiny_captures, "--out", out, "--sampling.pitch-m", "nan")
     assert not out.exists()
+
+
+def test_what_is_wrong_is_told_before_the_work(tiny_captures, tmp_path, capsys, monkeypatch) -> None:
+    """Each of these was told after minutes of work, in the system's words, or in a way that led elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    one, file = tiny_captures[0], tmp_path / "notes.txt"
+    file.write_text("hello")
+    for name in ("capture.yaml", "events.raw"):
+        assert f"{name} is one file of a capture; give its folder" in fails(capsys, "reconstruct", one / name)
+    monkeypatch.setattr(ProgressBars, "__enter__", lambda _: pytest.fail("the work began"))
+    for words in (["identify", "main-near"], ["demo"], ["pixel", "fit", one], ["calibrate", one], ["simulate"]):
+        assert "notes.txt is a file; give the name of a folder" in fails(capsys, *words, "--out", file)
+    for words in (["track", one], ["invert", one, "--setup", "main-near"]):
+        assert "no such folder absent" in fails(capsys, *words, "--out", "absent/a.png")
+        assert "end its name in .png" in fails(capsys, *words, "--out", "a.xyz")
+        assert "is a folder; give the name of a file" in fails(capsys, *words, "--out", tmp_path)
+    assert "Demo.writers is -1; give 1 or more" in fails(capsys, "demo", "--writers", -1)
+    assert "Demo.test names no character" in fails(capsys, "demo", "--test")
+    assert "--captures holds 2, of which 1 are not to test on" in fails(
+        capsys, "demo", "--captures", *tiny_captures[:2]
+    )
+    (tmp_path / "empty").mkdir()
+    assert "empty holds no capture.yaml" in fails(capsys, "calibrate", *tiny_captures, "empty", "--out", "out")
+    wrong = ("--cells", -3), ("--regularization", "-1"), ("--regularization", "few")
+    for flag, value in wrong:
+        told = fails(capsys, "invert", one, "--setup", "main-near", flag, value)
+        assert f"{flag} is" in told and str(value) in told
+    assert "is a folder, without --setup" in fails(capsys, "invert", one)
+    assert "check has 0 folders; give one or more" in fails(capsys, "capture", "check")
 
 
 def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkeypatch) -> None:

@@ -19,7 +19,7 @@ from evnlos.data.capture_info import character_of
 from evnlos.data.lab import Lab, lab_of, render_captures
 from evnlos.data.sampling import Sampling
 from evnlos.data.simulations import default
-from evnlos.errors import CalibrationError, UnknownNameError
+from evnlos.errors import CalibrationError, ConfigError, UnknownNameError
 from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
 from evnlos.machine import Progress, ProgressBars, silent
 from evnlos.models import GENERIC, SequenceConfig, UNetConfig, layers_of, published
@@ -27,6 +27,7 @@ from evnlos.report import collect_results, to_text, write_report
 from evnlos.scene import FontGlyphs
 from evnlos.setups import ROOMS, named_setup
 from evnlos.training import Training
+from evnlos.types import OutFolder
 
 LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
 """What the rendered captures show."""
@@ -42,7 +43,7 @@ _TEST = ("G", "K", "4", "9")
 class Demo:
     """Settings of the demo; a larger one is the same thing with other numbers."""
 
-    out: Path = Path("demo")
+    out: OutFolder = Path("demo")
     """Folder for everything that the demo makes; run it again to go on after an interruption."""
     captures: tuple[Path, ...] = ()
     """Capture folders, or the folder above them; without any, pseudo-real ones are rendered."""
@@ -74,6 +75,13 @@ class Demo:
     """Fit the simulator to the setup of the captures first; without it, pre-train on the default simulation."""
     seed: int = 0
     """Seed of every draw."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if type(value) is int and value < (least := int(name not in ("workers", "redrawn", "seed"))):
+                raise ConfigError(f"Demo.{name} is {value}; give {least} or more")
+        if not self.test:
+            raise ConfigError("Demo.test names no character; give some of the captures', e.g. G K 4 9")
 
     @property
     def lab(self) -> Lab:
@@ -107,7 +115,7 @@ def run_demo(settings: Demo) -> Path:
             )
     settings, lacking = _with_layers(settings)
     notes += lacking
-    study = _study(settings, _held_out(folders, settings.test))
+    study = _study(settings, held_out(folders, settings.test))
     place = replace(place, captures=tuple(sorted(folders)))
     try:
         with ProgressBars() as progress:
@@ -198,7 +206,7 @@ def _study(settings: Demo, test: list[str]) -> Study:
     )
 
 
-def _held_out(folders: list[Path], wanted: tuple[str, ...]) -> list[str]:
+def held_out(folders: list[Path], wanted: tuple[str, ...]) -> list[str]:
     """Return the characters to test on; every seventh where the captures have none of the wanted ones."""
     there = [character_of(folder.resolve().name) for folder in folders]
     return [c for c in wanted if c in there] or there[::7]

@@ -16,6 +16,13 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from evnlos.errors import DataError
 
+OutFolder = Path
+"""Type of a command's `out`: a folder that it makes, with the folders above it, or goes on with."""
+OutFile = Path
+"""The same: a file in a folder that is there."""
+OutImage = Path
+"""The same: a file whose ending names a format of images."""
+
 _MAX_SIDE = 65_536  # x and y are uint16
 
 

@@ -28,6 +28,7 @@ from evnlos.errors import ConfigError
 from evnlos.lab import Phone
 from evnlos.machine import ProgressBars
 from evnlos.setups import load_setup
+from evnlos.types import OutFile, OutFolder
 
 if TYPE_CHECKING:
     from evnlos.calibration.scan.film import FilmResult
@@ -42,7 +43,7 @@ class CalibrateCommand:
 
     captures: Folders
     """Capture folders of one setup and one camera."""
-    out: Path
+    out: OutFolder
     """Folder for setup.yaml, training.yaml, pattern.safetensors, calibration.json and check.png."""
     preset: str = "default"
     """Kind of wall: `default` is rough metal (GGX roughness, camera), `paper` the tPSF and an affine view."""
@@ -90,9 +91,12 @@ class CalibrateCommand:
             write_setup,
         )
         from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
+        from evnlos.data import captures_in
         from evnlos.plot.results import draw_calibration
 
         check_out(self.out, self.force)
+        if any(path.is_dir() for path in self.captures):
+            captures_in(self.captures)  # a folder that is no capture is named, not counted
         with ProgressBars() as progress:
             fit = fit_setup(self.captures, self.settings, progress)
         rows = rows_of(fit, self.settings.start.pixel, self.settings.start.frame_camera)
@@ -123,7 +127,7 @@ class ScanCommand:
     film; rehearse films a planned show with a pretended phone: FOLDER/film.mp4."""
     folder: Annotated[Path, tyro.conf.Positional]
     """The folder of the scan."""
-    out: Path | None = None
+    out: OutFile | None = None
     """import: the transport, a .safetensors file; by default transport.safetensors in the folder. A check
     image goes to the same name with .png."""
     film: Path | None = None
@@ -315,7 +319,7 @@ class PixelCommand:
     recording: Annotated[Path, tyro.conf.Positional]
     """Event file, capture folder with registered frames, or a YAML manifest of several recordings
     (`recordings: [{file: led.raw, light: {kind: sine, frequency_hz: 10, contrast: 0.5}}, ...]`)."""
-    out: Path
+    out: OutFolder
     """Folder for pixel.yaml, pixel_fit.json, pixel_maps.npz and pixel_fit.png."""
     light: tuple[str, ...] = ()
     """Light of the recording: static LEVEL, sine HZ CONTRAST [LEVEL], square HZ CONTRAST [LEVEL], edge RATIO

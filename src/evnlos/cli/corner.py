@@ -21,6 +21,7 @@ from evnlos.files import write_atomically
 from evnlos.inverse import CornerImage, FloorSector, Penumbra
 from evnlos.machine import ProgressBars, counted
 from evnlos.tracking import UNSURE_NOISE, BearingTracking, BearingTracks
+from evnlos.types import OutFolder
 from evnlos.untrusted import open_regular
 
 _DISTURBED, _SHAKE_PX, _NOISE, _GAIN = 0.02, 0.3, 3.0, 0.01  # beyond these a warning is due
@@ -101,7 +102,7 @@ class CornerCommand:
     pixels. Without it bearings are those of the image, right at the wall's line and off elsewhere."""
     floor_size: tuple[float, float] = (1.0, 1.0)
     """Sides of that rectangle, first to second corner and second to third, any unit: their ratio counts."""
-    out: Path = Path("corner")
+    out: OutFolder = Path("corner")
     """Folder for result.png, summary.json and corner.npz; files of these names are replaced."""
     start: float = 0.0
     """Begin, seconds."""

@@ -44,6 +44,7 @@ from evnlos.machine import ProgressBars, counted
 from evnlos.setups import load_setup
 from evnlos.setups.base import is_camera
 from evnlos.setups.load import is_name
+from evnlos.types import OutFolder
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class SimulateCommand:
 
     PRESETS: ClassVar[Presets[Simulation]] = PRESETS
 
-    out: Path
+    out: OutFolder
     """Folder of the dataset; new, or begun with the same settings."""
     preset: str = "default"
     """`default`; `paper` for the paper's training set; `paper-nist-test`, `paper-comic-letters` or
@@ -106,16 +107,15 @@ class SimulateCommand:
 
     def run(self) -> None:
         """Simulate, with a progress bar over the objects."""
-        config = randomized(self.settings) if self.robust else self.settings
+        config, share = randomized(self.settings) if self.robust else self.settings, _share(self.shard)
+        if self.scheduler and self.engine != "dask":
+            raise ConfigError(f"--scheduler {self.scheduler} needs --engine dask")
         for note in config.glyphs.notes():
             say(note)
         for line in config.setup.warnings():
             say(f"warning: {line}")
         for name, value in config.optics().items():
             say(f"{name} {value:.3g}")
-        share = _share(self.shard)
-        if self.scheduler and self.engine != "dask":
-            raise ConfigError(f"--scheduler {self.scheduler} needs --engine dask")
         total = len(config.glyphs.objects())
         if self.dry_run:
             print("\n".join(estimate(config, self.workers, share).lines(self.out)))
@@ -142,7 +142,7 @@ class LabCommand:
 
     PRESETS: ClassVar[Presets[Lab]] = {"default": Lab}
 
-    out: Path
+    out: OutFolder
     """Folder for the capture folders; a capture that is there is done."""
     setup: str | None = None
     """The setup: a name (mirror, easy, main, hard, matte or aperture, with -near or -far), a room (two-lobes,
@@ -214,7 +214,8 @@ class CaptureCommand:
     def run(self) -> None:
         """Write the file, record, or print the findings; exit code 1 where one of them is bad."""
         if not self.folders or (self.action != "check" and len(self.folders) > 1):
-            raise ConfigError(f"{len(self.folders)} folders; {self.action} takes one, check one or more")
+            several = " or more" if self.action == "check" else ""
+            raise ConfigError(f"{self.action} has {len(self.folders)} folders; give one{several}")
         {"init": self._init, "record": self._record, "check": self._check}[self.action]()
 
     def check_names(self) -> None:
@@ -332,7 +333,7 @@ class ImportCommand:
 
     captures: Folders
     """Capture folders; or recordings that hold events and frames of one camera (ROS bag, AEDAT)."""
-    out: Path
+    out: OutFolder
     """Folder of the dataset."""
     topic: str | None = None
     """Stream of the events, of a recording with several; `evnlos info` lists them."""

@@ -20,15 +20,17 @@ import tyro
 
 from evnlos import experiment
 from evnlos.app.serve import Server, serve
-from evnlos.cli.parsing import drawn, say
+from evnlos.calibration.captures import FEWEST
+from evnlos.cli.parsing import UnfitWordsError, drawn, say
 from evnlos.cli.recordings import Flat
 from evnlos.data import STANDARD_MODALITIES, captures_in
-from evnlos.demo import Demo, mismatch_setups, mismatch_table, run_demo, run_mismatch
+from evnlos.demo import Demo, held_out, mismatch_setups, mismatch_table, run_demo, run_mismatch
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import SourceOptions, check_source, open_live
 from evnlos.machine import ProgressBars
+from evnlos.types import OutFolder
 
 if TYPE_CHECKING:
     from evnlos.experiment import Arm, Study
@@ -41,14 +43,19 @@ class DemoCommand:
     settings: Flat[Demo] = field(default_factory=Demo)
 
     def check_names(self) -> None:
-        """Refuse captures that are not there."""
-        captures_in(self.settings.captures)
+        """Refuse captures that are not there, or too few."""
+        one, found = self.settings, captures_in(self.settings.captures)
+        left = len(found) - len(held_out(found, one.test))
+        if found and one.calibrate and left < FEWEST:
+            given = f"--captures holds {len(found)}, of which {left} are not to test on"
+            raise UnfitWordsError(f"{given}; give {FEWEST} or more of these, best 20, or --no-calibrate")
 
     def run(self) -> None:
         """Show a first reconstruction, run the demo, and print the table and the path of the report."""
         from evnlos.cli.results import show_first
 
         one = self.settings
+        self.check_names()
         show_first(one.out, one.captures, one.lab, one.force)
         run_demo(one)
 
@@ -74,7 +81,7 @@ class ExperimentCommand:
     weights: Path | None = None
     """Weights for generalization, which were trained for the setup OUT/setups/NAME, NAME as for --captures-of.
     """
-    out: Path = Path("experiments")
+    out: OutFolder = Path("experiments")
     """Folder for setups, datasets, runs, records and tables; experiments in one folder share what they can."""
     captures_of: str = "near"
     """Which captures: those whose names begin with this and an underscore."""
@@ -244,13 +251,8 @@ class ExperimentCommand:
 
     def _mismatch(self) -> None:
         base = Demo(out=self.out, test=self.test, workers=self.workers, force=self.force, robust=self.robust)
-        base = replace(
-            base,
-            writers=self.writers or base.writers,
-            pretrain_epochs=self.pretrain_epochs or base.pretrain_epochs,
-            finetune_epochs=self.finetune_epochs or base.finetune_epochs,
-            e2e_epochs=self.e2e_epochs or base.e2e_epochs,
-        )
+        names = ("writers", "pretrain_epochs", "finetune_epochs", "e2e_epochs")
+        base = replace(base, **{name: value for name in names if (value := getattr(self, name))})
         with ProgressBars() as progress:
             found = run_mismatch(base, self.setups, self.captures, self.seeds, progress)
         text, captures = mismatch_table(found), self.captures or self.out / "captures"
@@ -313,7 +315,7 @@ class LiveCommand:
     where SOURCE has no frames. None takes published ones: near-frame for a capture, else near-event."""
     headless: bool = False
     """Show no page; write the video and the latency table to --out."""
-    out: Path | None = None
+    out: OutFolder | None = None
     """Folder for video and latency.json, new or empty; by default live-out where --headless, else none."""
     port: int = 8765
     """Port of the page on 127.0.0.1; 0 = any that is free."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from evnlos.cli.recordings import Folders
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
+from evnlos.types import OutImage
 
 REGULARIZATION_TIKHONOV = 4.0  # best on eight characters of one setup, docs/inversion.md
 REGULARIZATION_TV = 0.3  # likewise
@@ -73,7 +75,7 @@ class InvertCommand:
     """Wall pixels per side to average; by default at most 48 a side are left."""
     emission_exponent: tuple[float, float] | None = None
     """Exponents of the screen's falloff, horizontal and vertical; by default the file's."""
-    out: Path = Path("inversion.png")
+    out: OutImage = Path("inversion.png")
     """The image; the numbers go to the same name with .npz."""
     json: bool = False
     """Print one JSON object."""
@@ -84,14 +86,25 @@ class InvertCommand:
 
     def run(self) -> None:
         """Invert, print the figures, write the image."""
+        for flag, value, least in (
+            ("cells", self.cells, 2),
+            ("columns", self.columns, 2),
+            ("subsets", self.subsets, 1),
+        ):
+            if value < least:
+                raise ConfigError(f"--{flag} is {value}; give {least} or more")
         if self.setup is not None:
             still = all(path.is_file() for path in self.files)
             (self._invert_stills if still else self._invert_captures)(self.setup)
             return
         if len(self.files) != 1 or self.files[0].is_dir():
-            raise ConfigError(
-                f"{len(self.files)} paths without --setup; give one NPZ file, or capture folders and --setup"
+            given = (
+                f"{self.files[0]} is a folder"
+                if len(self.files) == 1
+                else f"{len(self.files)} files or folders"
             )
+            cure = "give one NPZ file, or capture folders and their --setup, e.g. main-near"
+            raise ConfigError(f"{given}, without --setup; {cure}")
         from evnlos.cli.invert_captures import figures_of
         from evnlos.inverse import prepare_inversion, read_photograph
         from evnlos.plot.results import draw_inversion
@@ -335,10 +348,10 @@ def film_text(found: dict[str, Any]) -> str:
 def _weight(text: str) -> tuple[float | None, Literal["cv", "gcv", "discrepancy"]]:
     if text in ("cv", "gcv", "discrepancy"):
         return None, text
-    try:
-        return float(text), "cv"
-    except ValueError:
-        raise ConfigError(f"--regularization is {text!r}; give cv, gcv, discrepancy or a number") from None
+    number = float(text) if re.fullmatch(r"[+]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?", text, re.I) else None
+    if number is None:
+        raise ConfigError(f"--regularization is {text!r}; give cv, gcv, discrepancy or a number from 0 on")
+    return number, "cv"
 
 
 def sequence_table(rows: list[dict[str, Any]]) -> str:

@@ -46,6 +46,7 @@ from evnlos.training import (
     read_choice,
     train,
 )
+from evnlos.types import OutFolder
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class TrainCommand:
 
     PRESETS: ClassVar[Presets[Training]] = {"default": Training, "paper": paper_pretraining}
 
-    out: Path
+    out: OutFolder
     """Folder of the run; new, or begun with the same settings."""
     data: Path | None = None
     """Folder of the dataset."""
@@ -133,7 +134,7 @@ class FinetuneCommand:
     """Weights file, or the run to start from."""
     data: Path
     """Folder of the dataset of captures."""
-    out: Path
+    out: OutFolder
     """Folder of the run; new, or begun with the same settings."""
     preset: str = "default"
     """`default`, or `paper` for the paper's 100 epochs at 1e-5 with its loss."""

@@ -32,7 +32,7 @@ from evnlos.cli.parsing import (
     PlainOutput,
     UnfitWordsError,
     check_names,
-    check_writable,
+    check_out,
     flag_value,
     listen,
     parse,
@@ -303,7 +303,7 @@ def _command(verb: str, rest: list[str]) -> Any:
     made = parse(command, rest, verb, _defaults(command, rest))
     for one in (made, getattr(made, "settings", None)):
         if isinstance(out := getattr(one, "out", None), Path) and not getattr(made, "dry_run", False):
-            check_writable(out)
+            check_out(out, type(one).__annotations__.get("out", ""))
     return made
 
 

@@ -207,7 +207,7 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
     except SystemExit as end:
         if not end.code:
             raise
-        raise UnfitWordsError(f"{in_one_line(said.getvalue())}; see evnlos {verb} --help") from None
+        raise UnfitWordsError(f"{_plain(in_one_line(said.getvalue()))}; see evnlos {verb} --help") from None
     except (ArithmeticError, MemoryError, ValueError) as error:  # of a setting that only fits together
         raise ConfigError(f"the settings do not fit together ({error}); see evnlos {verb} --help") from None
     from evnlos.config import check_numbers  # needs packages that may be missing
@@ -251,6 +251,24 @@ def in_one_line(box: str) -> str:
             sections[-1].append(line.strip())
     kept = [part for part in sections if part and not part[0].startswith(("For full", "Argument helptext"))]
     return "; ".join(f"{part[0]} {', '.join(part[1:])}".strip() for part in kept).rstrip(".")
+
+
+_UNFIT = (  # what tyro says of a value that is no number, and how people say it
+    (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 is \2; give a number"),
+    (r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)", r"\1 is \2; give a whole number"),
+    (
+        r"Error parsing (\S+): no type matching (?:\{None\}\|)?\{?([^}]*?)\}? could be .* from \[(.*?)\]\.;.*",
+        r"\1 is \3; give \2",
+    ),
+    (r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]", r"\1 can't be \2"),
+)
+
+
+def _plain(text: str) -> str:
+    """Return a message of the parser's in words that say what to give."""
+    for pattern, words in _UNFIT:
+        text = re.sub(pattern, words, text)
+    return re.sub(r"\bFLOAT\b", "NUMBER", text)
 
 
 _RESOLVERS = {  # flag -> module and function of what its word stands for
@@ -310,15 +328,31 @@ def flag_value(words: list[str], flag: str) -> str | None:
     return None
 
 
-def check_writable(path: Path) -> None:
+_IMAGES = {".png", ".svg", ".pdf", ".eps", ".ps", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ""}
+
+
+def check_out(path: Path, kind: str) -> None:
     """Raise where a result could not be written, before it is worked for; nothing is made or changed.
 
     Args:
-        path: File or folder that the command will write, or will make along with the folders above it.
+        path: File or folder that the command will write.
+        kind: How the command calls it: OutFolder, OutFile or OutImage of `evnlos.types`; Path tells nothing.
 
     Raises:
-        ConfigError: It, or the nearest folder above it that exists, cannot be written.
+        ConfigError: It, or the nearest folder above it that exists, cannot be written, or is of another kind.
     """
+    if kind.startswith("OutFolder") and path.exists() and not path.is_dir():
+        raise ConfigError(f"{path} is a file; give the name of a folder")
+    _check_writable(path)
+    if kind.startswith(("OutFile", "OutImage")) and not path.parent.is_dir():
+        raise ConfigError(f"{path}: no such folder {path.parent}; create it first")
+    if kind.startswith(("OutFile", "OutImage")) and path.is_dir():
+        raise ConfigError(f"{path} is a folder; give the name of a file")
+    if kind.startswith("OutImage") and path.suffix.lower() not in _IMAGES:
+        raise ConfigError(f"{path} is no image of a known format; end its name in .png, .svg or .pdf")
+
+
+def _check_writable(path: Path) -> None:
     place = path.absolute()
     while not place.exists() and place != place.parent:
         place = place.parent

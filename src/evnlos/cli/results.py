@@ -26,6 +26,7 @@ from evnlos.errors import ConfigError, EvnlosError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
 from evnlos.tracking import Tracking
+from evnlos.types import OutFile, OutFolder, OutImage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +48,7 @@ class ReconstructCommand:
     published ones for frames of the setup with the nearest distance, of whole sequences if the motion is known
     or found (--track).
     """
-    out: Path = Path("reconstruction")
+    out: OutFolder = Path("reconstruction")
     """Folder for the images; new or empty."""
     pattern: Path | None = None
     """Fixed pattern to take from the frames: the file that `calibrate` wrote, or its folder."""
@@ -141,7 +142,7 @@ class TrackCommand:
     pattern: Path | None = None
     """The camera's fixed pattern, to be removed; a file, or the folder of its calibrated setup. By default that
     of a calibrated --setup."""
-    out: Path = Path("track.png")
+    out: OutImage = Path("track.png")
     """The image; the numbers go to the same name with .json."""
     json: bool = False
     """Print one JSON object."""
@@ -282,7 +283,7 @@ class IdentifyCommand:
     """The same, as in the other commands."""
     all: bool = False
     """All named walls, as a table."""
-    out: Path | None = None
+    out: OutFolder | None = None
     """Folder for a figure of each setup and identify.json with all curves."""
     json: bool = False
     """Print one JSON object, or a list where several setups are requested."""
@@ -365,7 +366,7 @@ class ReportCommand:
     setup: str | None = None
     """The setup: a name, a settings file, or the folder that `calibrate` wrote, as `identify` takes it: it is
     drawn, and what it can show stands beside the results. The setup of a simulated dataset is known."""
-    out: Path = Path("report.html")
+    out: OutFile = Path("report.html")
     """The page."""
     json: bool = False
     """Print one JSON object: mean scores of each run and baseline."""

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from evnlos.config import from_dict, read_yaml
 from evnlos.errors import ConfigError, DataError
+from evnlos.events.files.registry import find_format
 from evnlos.events.recording import Recording
 from evnlos.files import write_atomically
 from evnlos.untrusted import MOST_SENSOR_PIXELS
@@ -263,14 +264,14 @@ def read_capture_info(
 
 def _info_of_recording(path: Path, events_topic: str | None, frames_topic: str | None) -> CaptureInfo:
     """Describe a recording that holds events and frames of the same pixels and on the same clock."""
+    if (path.parent / "capture.yaml").is_file() and (path.suffix == ".yaml" or not find_format(path).frames):
+        raise ConfigError(f"{path} is one file of a capture; give its folder, {path.parent}")
     recording = Recording(path, topic=events_topic)
     if not recording.report.geometry_from:  # of some formats known with their first events
         next(recording.pieces(), None)
     height, width = recording.shape
-    camera = CameraInfo(width, height, name=recording.report.format)
-    return CaptureInfo(
-        camera, events=path.name, frames=path.name, events_topic=events_topic, frames_topic=frames_topic
-    )
+    camera, name = CameraInfo(width, height, name=recording.report.format), path.name
+    return CaptureInfo(camera, name, name, events_topic=events_topic, frames_topic=frames_topic)
 
 
 _TEMPLATE = """\
@@ -359,8 +360,8 @@ def begin_capture(
     if width < 1 or height < 1:
         raise DataError(f"the sensor is {width} x {height} pixels; give its width and height")
     folder.mkdir(parents=True, exist_ok=True)
-    name = name.replace("\n", " ").replace(":", " ")
-    text = _TEMPLATE.format(name=name, width=width, height=height, events=events, frames=frames)
+    one_line = " ".join(name.replace(":", " ").split())
+    text = _TEMPLATE.format(name=one_line, width=width, height=height, events=events, frames=frames)
     write_atomically(path, text.encode())
     return path
 
