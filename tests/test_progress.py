@@ -248,3 +248,15 @@ def test_evaluate_tells_its_stages(tiny_dataset) -> None:
     evaluate(Weights(network), tiny_dataset, "all", progress=steps.append)
     assert [one.done for one in steps] == [0, 1, 2, 3] and {one.total for one in steps} == {3}
     assert [one.within for one in steps][1:3] == ["scores and baselines", "confidence"]
+
+
+def test_a_short_video_is_worked_on_after_its_last_frame(tmp_path, monkeypatch, capsys) -> None:
+    """All its frames are read before the first of their events: what compiles then is told, not silent."""
+    import evnlos.cameras.video as video
+
+    slow = video.EventStream.push
+    monkeypatch.setattr(video.EventStream, "push", lambda *given: (time.sleep(0.2), slow(*given)))
+    np.save(tmp_path / "clip.npy", np.full((5, 4, 6), 100, np.uint8))
+    words = [str(tmp_path / "clip.npy"), "--fps", "30", "--out", str(tmp_path / "e.h5")]
+    main(["events", *words, "--progress", "lines"])
+    assert "e.h5: 5 frames (their events" in capsys.readouterr().err

@@ -40,7 +40,7 @@ from evnlos.errors import ConfigError
 from evnlos.events import Cleaner, CleanOptions, EventWriter
 from evnlos.events.files.columns import OnError
 from evnlos.events.recording import CropOptions, Recording
-from evnlos.machine import ProgressBars
+from evnlos.machine import Progress, ProgressBars, Step
 from evnlos.machine import counted as frames_counted
 from evnlos.types import Events
 
@@ -180,9 +180,10 @@ class EventsCommand:
         on = instants = 0
         last_us = -1
         clock = _Clock(self.start, self.stop)
-        with writer:
+        with writer, ProgressBars() as progress:
             writer.write(Events.empty(video.width, video.height))
-            for piece in video_events(clock.watched(video, self.out.name), pixel, self.mode, self.seed):
+            watched = clock.watched(video, self.out.name, progress)
+            for piece in video_events(watched, pixel, self.mode, self.seed):
                 writer.write(piece)
                 on += int(piece.p.sum())
                 if len(piece):
@@ -198,7 +199,7 @@ class EventsCommand:
 
 
 class _Clock:
-    """Takes the frames of a time, counts them and keeps first and last time, under a progress bar."""
+    """Takes the frames of a time, counts them and keeps first and last time."""
 
     def __init__(self, start_s: float, stop_s: float | None) -> None:
         if not 0 <= start_s < (math.inf if stop_s is None else stop_s):
@@ -206,19 +207,19 @@ class _Clock:
         self.start_s, self.stop_s = start_s, math.inf if stop_s is None else stop_s
         self.frames, self.first_s, self.last_s = 0, 0.0, 0.0
 
-    def watched(self, video: Video, name: str) -> Iterator[tuple[float, NDArray]]:
+    def watched(self, video: Video, name: str, progress: Progress) -> Iterator[tuple[float, NDArray]]:
         time_s = 0.0
-        with ProgressBars() as progress:
-            for time_s, light in frames_counted(video, progress, name, video.frames or 0):
-                if time_s > self.stop_s:
-                    return
-                if time_s >= self.start_s:
-                    self.first_s = self.first_s if self.frames else time_s
-                    self.frames, self.last_s = self.frames + 1, time_s
-                    yield time_s, light
-            if self.frames < 2 and self.start_s > 0:
-                found = f"--start {self.start_s:g} leaves {self.frames} of the frames of a video that ends at"
-                raise ConfigError(f"{found} {time_s:.6g} s; give an earlier one")
+        for time_s, light in frames_counted(video, progress, name, video.frames or 0):
+            if time_s > self.stop_s:
+                break
+            if time_s >= self.start_s:
+                self.first_s = self.first_s if self.frames else time_s
+                self.frames, self.last_s = self.frames + 1, time_s
+                yield time_s, light
+        progress(Step(name, self.frames, 0, "frames", within="their events"))
+        if self.frames < 2 and self.start_s > 0:
+            found = f"--start {self.start_s:g} leaves {self.frames} of the frames of a video that ends at"
+            raise ConfigError(f"{found} {time_s:.6g} s; give an earlier one")
 
 
 def _videos_in(paths: tuple[Path, ...]) -> list[Path]:
