@@ -13,7 +13,7 @@ from PIL import Image
 
 from evnlos.cli import main
 from evnlos.config import from_dict, load_yaml, read_yaml, save_yaml
-from evnlos.data import SensorSize, read_capture
+from evnlos.data import Sampling, SensorSize, capture_samples, read_capture
 from evnlos.data.lab import (
     PUBLISHED,
     SENSOR_SPREAD,
@@ -28,7 +28,7 @@ from evnlos.data.simulations import default
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.optics.angular_spectrum import Diffraction
-from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, Scene
+from evnlos.scene import FontGlyphs, HandwritingGlyphs, LineMotion, OtherTarget, Scene, SeveralTargets
 from evnlos.setups import PaperSetup, RadiometricSetup, setup_names, setup_preset
 from evnlos.types import Plane
 from watching import stopped
@@ -403,3 +403,40 @@ def test_published_sets_are_listed_whole_and_state_all_settings(tmp_path) -> Non
     with pytest.raises(ConfigError, match="near, far"):
         published_lab("middle")
     assert set(listed) == {"near", "far"}
+
+
+@pytest.mark.parametrize("cover", [False, True])
+def test_a_capture_of_several_targets_states_each_path_and_image(tmp_path, cover) -> None:
+    back = LineMotion((0.07, 0.02), 0.018, (-1.0, -0.2))
+    other = OtherTarget(FontGlyphs(family="kalam", characters="S"), back)
+    lab = small(glyphs=FontGlyphs(family="kalam", characters="L"), others=(other,), cover=cover, spread={})
+    lab = replace(lab, setup=replace(lab.setup, strip_m=(0.24, 0.14)))
+    assert from_dict(Lab, read_yaml_of(lab, tmp_path)) == lab
+    (folder,) = render_captures(lab, tmp_path / "lab")
+    capture = read_capture(folder)
+    several = capture.several
+    assert several is not None and several.cover == cover
+    first, second = several.scenes
+    assert [one.target.name for one in (first, second)] == ["L", "S"]
+    assert second.motion == back and first.motion == lab.motion
+    exact = SeveralTargets(
+        (
+            Scene(lab.glyphs.target(lab.glyphs.objects()[0]), lab.motion),
+            Scene(other.glyphs.target(other.glyphs.objects()[0]), back),
+        ),
+        cover,
+    )
+    light = lab.setup.observe_all(exact).irradiance(capture.frame_times_us * 1e-6).numpy()
+    noise = capture.frames / 255 - light
+    assert np.abs(noise.mean(axis=0)).mean() < 0.01 and noise.std() < 0.03
+    alone = lab.setup.observe(first).irradiance(capture.frame_times_us * 1e-6).numpy()
+    assert (capture.frames / 255 - alone).std() > 2 * noise.std()  # the other one is there
+    sampling = Sampling()
+    truth = capture_samples(capture, sampling).truth
+    np.testing.assert_array_equal(truth, several.truth(sampling.canvas, capture.frame_times_us[1:] * 1e-6))
+
+
+def read_yaml_of(lab: Lab, folder: Path) -> dict:
+    """Return the settings of a lab as they stand in a file."""
+    save_yaml(dataclasses.asdict(lab), folder / "lab.yaml")
+    return read_yaml(folder / "lab.yaml")

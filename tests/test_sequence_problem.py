@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import Gradient, SequenceOperator, SequenceProblem, total_variation
+from evnlos.inverse import Gradient, SequenceOperator, SequenceProblem, SeveralSequences, total_variation
 from evnlos.inverse.operators import normal_matrix
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
 from evnlos.optics import MatrixTransport
@@ -187,3 +187,36 @@ def test_the_dense_map_of_a_sequence_is_the_sequence(sight) -> None:
     dense = sight.matrix()
     assert dense.shape == (len(sight), SHAPE[0] * SHAPE[1], TARGET_PLANE.height * TARGET_PLANE.width)
     torch.testing.assert_close((dense @ target.flatten()).unflatten(1, SHAPE), sight(target))
+
+
+@pytest.mark.parametrize("static", [0.0, 0.7, np.inf])
+def test_several_targets_are_solved_for_as_the_stacked_problem_is(sight, static) -> None:
+    other = SequenceOperator(
+        sight.transport, TARGET_PLANE, np.array([(0.01, 0.004), (0.0, 0.0), (-0.02, -0.004)])
+    )
+    both = SeveralSequences((sight, other))
+    whole = torch.cat([stacked(sight), stacked(other)], dim=1)
+    x, images = random(2, 2, 4, 4, seed=5), random(2, 3, *SHAPE, seed=6)
+    torch.testing.assert_close(both(x).flatten(1), x.flatten(1) @ whole.mT, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close((both(x) * images).sum(), (x * both.adjoint(images)).sum(), rtol=1e-12, atol=0)
+    weight = torch.kron(precision(static).contiguous(), torch.eye(35, dtype=torch.float64))
+    problem = SequenceProblem(both, static)
+    torch.testing.assert_close(problem.gram, whole.mT @ weight @ whole, rtol=1e-10, atol=1e-10)
+    smooth = normal_matrix(Gradient("dark"), torch.zeros(4, 4, dtype=torch.float64))
+    normal = problem.gram + 0.3 * torch.block_diag(smooth, smooth)
+    expected = torch.linalg.solve(normal, whole.mT @ weight @ images.flatten(1).mT)  # [K n n, B]
+    found = problem.tikhonov(images, 0.3)
+    torch.testing.assert_close(found.image, expected.mT.reshape(2, 2, 4, 4), rtol=1e-7, atol=1e-9)
+    left = images.flatten(1).mT - whole @ expected
+    torch.testing.assert_close(
+        found.residual.square(), (left * (weight @ left)).sum(dim=0), rtol=1e-6, atol=1e-9
+    )
+    assert problem.tikhonov(images).regularization > 0  # by generalised cross-validation
+
+
+def test_several_targets_that_do_not_fit_together_are_refused(sight) -> None:
+    short = SequenceOperator(sight.transport, TARGET_PLANE, POSITIONS[:2])
+    with pytest.raises(DataError, match="2 targets differ"):
+        SeveralSequences((sight, short))
+    with pytest.raises(ConfigError, match="2 targets; total variation takes one"):
+        SequenceProblem(SeveralSequences((sight, sight))).total_variation(random(3, *SHAPE), 0.1)

@@ -1,6 +1,7 @@
 """Walls in continuous time: the fast paths against slow, obvious ones."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from evnlos.optics.interpolation import (
     spline_weights,
 )
 from evnlos.optics.wall import ambient_plane
-from evnlos.scene import LineMotion, PathMotion, Scene, Target
+from evnlos.scene import LineMotion, PathMotion, Scene, SeveralTargets, Target
 from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.types import Plane
 
@@ -427,3 +428,35 @@ def test_a_grid_of_points_is_sampled_as_points_in_any_order_are() -> None:
         rtol=0,
         atol=0,
     )
+
+
+@pytest.mark.parametrize("cover", [False, True])
+def test_the_light_of_several_targets_is_the_matrix_times_their_drawing(cover) -> None:
+    setup = RadiometricSetup(cell_m=0.01, strip_m=(0.24, 0.16), ambient=0.05).resized((10, 16))
+    times = np.linspace(0, 8, 5)
+    targets = [Target(name, np.random.default_rng(k).random((6, 6)), 0.08) for k, name in enumerate("ab")]
+    motions = LineMotion((-0.08, 0.0)), LineMotion((0.07, 0.02), 0.018, (-1.0, -0.2))
+    scene = SeveralTargets(tuple(Scene(a, m) for a, m in zip(targets, motions, strict=True)), cover)
+    wall = setup.observe_all(scene)
+    first, second = (
+        a.rasterise(setup.source(), m.position_m(times)) for a, m in zip(targets, motions, strict=True)
+    )
+    drawn = first * (1 - second) + second if cover else first + second
+    exact = setup.operator(setup.source())(torch.from_numpy(drawn).double()) + setup.ambient_light()
+    torch.testing.assert_close(wall.irradiance(times).double(), exact, rtol=0, atol=3e-4)
+    assert float((first * second).max()) > 0.1  # they do meet
+    assert wall.speed_px_s == max(setup.observe(one).speed_px_s for one in scene.scenes)
+    alone = scene.scenes[0]
+    assert torch.equal(setup.observe_all(alone).irradiance(times), setup.observe(alone).irradiance(times))
+
+
+def test_whoever_takes_one_target_refuses_several() -> None:
+    one = Scene(Target("a", np.ones((4, 4)), 0.08))
+    with pytest.raises(DataError, match="holds 2 targets, and this takes one"):
+        RadiometricSetup().observe(SeveralTargets((one, one)))
+    with pytest.raises(DataError, match=r"2 scenes last \[4.0, 8.0\] s"):
+        SeveralTargets((one, replace(one, duration_s=4.0)))
+    with pytest.raises(DataError, match="leave z_m and turns out, or let the light add"):
+        SeveralTargets((one, replace(one, motion=LineMotion(z_m=0.3))), cover=True)
+    with pytest.raises(ConfigError, match="draws no targets on cells, so none covers another"):
+        PaperSetup().resized((5, 8)).observe_all(SeveralTargets((one, one), cover=True))

@@ -15,9 +15,8 @@ import numpy as np
 from evnlos.calibration import CALIBRATION_VALUES_FILE, Calibration
 from evnlos.config import write_atomically
 from evnlos.data import STANDARD_MODALITIES, captures_in
-from evnlos.data.capture_info import character_of
 from evnlos.data.lab import Lab, lab_of, render_captures
-from evnlos.data.sampling import Sampling
+from evnlos.data.sampling import Sampling, character_of
 from evnlos.data.simulations import default
 from evnlos.errors import CalibrationError, ConfigError, UnknownNameError
 from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study

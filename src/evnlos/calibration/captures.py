@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.data.capture import Capture, read_capture
-from evnlos.data.capture_info import character_of
-from evnlos.data.sampling import reduce_by_area
+from evnlos.data.sampling import character_of, reduce_by_area
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import HandwritingGlyphs, LineMotion, Scene

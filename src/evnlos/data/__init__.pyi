@@ -7,7 +7,6 @@ from .capture import import_captures as import_captures
 from .capture import read_capture as read_capture
 from .capture_check import check_image as check_image
 from .capture_info import CaptureInfo as CaptureInfo
-from .capture_info import character_of as character_of
 from .fixed_pattern import PATTERN_FILE as PATTERN_FILE
 from .fixed_pattern import FixedPattern as FixedPattern
 from .fixed_pattern import correct_frames as correct_frames
@@ -27,6 +26,7 @@ from .loader import as_modality as as_modality
 from .loader import modality_order as modality_order
 from .sampling import Samples as Samples
 from .sampling import Sampling as Sampling
+from .sampling import character_of as character_of
 from .sampling import make_samples as make_samples
 from .sampling import reduce_by_area as reduce_by_area
 from .simulate import SensorSize as SensorSize

@@ -18,15 +18,24 @@ from evnlos.config import config_hash, to_dict
 from evnlos.data.capture_info import (
     CaptureInfo,
     FilterInfo,
-    TargetInfo,
-    character_of,
     inside,
     read_capture_info,
 )
 from evnlos.data.clocks import find_offset
 from evnlos.data.fixed_pattern import FixedPattern, mapped, prepare_frames
-from evnlos.data.frames import read_frame_series, read_image
-from evnlos.data.sampling import Samples, Sampling, iter_samples, join_samples, time_steps
+from evnlos.data.frames import read_frame_series
+from evnlos.data.sampling import (
+    Samples,
+    Sampling,
+    character_of,
+    iter_samples,
+    join_samples,
+    line_of,
+    noted_distance_m,
+    read_others,
+    read_target,
+    time_steps,
+)
 from evnlos.data.store import Dataset, claim_dataset, write_shard
 from evnlos.errors import DataError, UnknownNameError, printable
 from evnlos.events import (
@@ -38,7 +47,7 @@ from evnlos.events import (
     read_triggers,
 )
 from evnlos.machine import Progress, Step, silent
-from evnlos.scene import LineMotion, Scene, Target
+from evnlos.scene import LineMotion, Scene, SeveralTargets, Target
 from evnlos.types import Events, matching_paths
 from evnlos.untrusted import no_file
 
@@ -58,6 +67,7 @@ class Capture:
         frame_times_us: Time of each frame, int64 [N], microseconds, on the events' clock.
         target: The hidden target, or None where it is unknown.
         notes: What reading did to the recordings, a line each.
+        others: Other targets that were there too, with their motions, where they are known.
     """
 
     name: str
@@ -67,6 +77,7 @@ class Capture:
     frame_times_us: NDArray[np.int64]
     target: Target | None
     notes: tuple[str, ...] = field(default=())
+    others: tuple[Scene, ...] = ()
 
     @property
     def has_frames(self) -> bool:
@@ -86,24 +97,12 @@ class Capture:
     @property
     def distance_m(self) -> float | None:
         """From hidden object to wall, metres, as noted in `setup`; None where it is not, or is no length."""
-        noted = self.info.setup.get("distance_m")
-        if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not 0 < noted < float("inf"):
-            return None
-        return float(noted)
+        return noted_distance_m(self.info)
 
     @property
     def motion(self) -> LineMotion | None:
         """The target's motion on the events' clock; None where it is unknown."""
-        motion = self.info.motion
-        if motion is None:
-            return None
-        direction, start = np.asarray(motion.direction, dtype=float), motion.start_m
-        if not isinstance(start, tuple):
-            along = start * direction / np.hypot(*direction)
-            start = (float(along[0]), float(along[1]))
-        line = LineMotion(start, motion.speed_m_s, motion.direction, motion.start_us * 1e-6)
-        away_m = self.distance_m if motion.retreat_m_s else None
-        return replace(line, z_m=away_m, retreat_m_s=motion.retreat_m_s, spin_deg_s=motion.spin_deg_s)
+        return line_of(self.info.motion, self.distance_m)
 
     @property
     def scene(self) -> Scene | None:
@@ -112,6 +111,13 @@ class Capture:
         if self.target is None or motion is None:
             return None
         return Scene(self.target, motion, duration_s=max(float(self.frame_times_us[-1]) * 1e-6, 1e-6))
+
+    @property
+    def several(self) -> SeveralTargets | None:
+        """All targets with their motions, where there is more than one and they are known; else None."""
+        if (first := self.scene) is None or not self.others:
+            return None
+        return SeveralTargets((first, *self.others), self.info.cover)
 
 
 def captures_in(given: Iterable[Path]) -> list[Path]:
@@ -189,9 +195,10 @@ def read_capture(
         notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
     if info.events is not None and not len(events):
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
-    target = _read_target(folder, info.target)
+    target = read_target(folder, info.target)
     held = cast(Any, frames) if is_alone or isinstance(frames, FrameStack) else np.ascontiguousarray(frames)
-    return Capture(name, info, events, held, times_us, target, tuple(map(printable, notes)))
+    others = read_others(folder, info, times_us)
+    return Capture(name, info, events, held, times_us, target, tuple(map(printable, notes)), others)
 
 
 def _name_of(path: Path) -> str:
@@ -265,13 +272,6 @@ def _place_in_time(
     ]
 
 
-def _read_target(folder: Path, info: TargetInfo | None) -> Target | None:
-    if info is None or info.mask is None:
-        return None
-    mask = read_image(inside(folder, info.mask))
-    return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.size_m)
-
-
 def capture_samples(capture: Capture, sampling: Sampling, pattern: FixedPattern | None = None) -> Samples:
     """Return one sample for each frame but the first: the frame, and the events since the frame before.
 
@@ -296,7 +296,7 @@ def _samples_of(capture: Capture, sampling: Sampling, pattern: FixedPattern | No
         frames, peak = mapped(frames, partial(pattern.correct, peak=peak)), 1.0
     if not capture.has_events:  # nothing is in its maps, of whatever kind they are
         sampling = replace(sampling, surface="sae")
-    known = {"motion": capture.motion, "target": capture.target}
+    known: Any = {"motion": capture.motion, "target": capture.target, "several": capture.several}
     yield from iter_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
 
 

@@ -70,6 +70,14 @@ class MotionInfo:
 
 
 @dataclass(frozen=True)
+class OtherInfo(TargetInfo):
+    """Another target that was there at the same time, with its motion."""
+
+    motion: MotionInfo | None = None
+    """Its motion, where it is known."""
+
+
+@dataclass(frozen=True)
 class AlignmentInfo:
     """How the frames' clock becomes the events': event time = frame time + offset."""
 
@@ -201,6 +209,10 @@ class CaptureInfo:
     """The target, where it is known."""
     motion: MotionInfo | None = None
     """Its motion, where it is known."""
+    others: tuple[OtherInfo, ...] = ()
+    """Other targets that were there too, where they are known."""
+    cover: bool = False
+    """Whether a later target hides those before it where it shines; else their light adds."""
     alignment: AlignmentInfo = field(default_factory=AlignmentInfo)
     """Clock of the frames."""
     registration: RegistrationInfo | None = None
@@ -254,8 +266,7 @@ def read_capture_info(
     """
     if folder.is_file():
         return _info_of_recording(folder, events_topic, frames_topic)
-    path = folder / "capture.yaml"
-    if not path.is_file():
+    if not (path := folder / "capture.yaml").is_file():
         inside = sorted(one.parent.name for one in folder.glob("*/capture.yaml"))
         held = f" (it holds {len(inside)} captures, such as {inside[0]})" if inside else ""
         raise ConfigError(f"{folder} holds no capture.yaml; give the folder of one capture{held}")
@@ -388,13 +399,3 @@ def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
         how = f"{folder / by} names it, or leaves its name to the default; null where there is no such camera"
         raise DataError(f"{path} does not exist; {how}")
     return path
-
-
-def character_of(name: str) -> str:
-    """Return what an object shows, from its name: the part behind the last underscore.
-
-    Example:
-        >>> character_of("near_R"), character_of("writer03_A")
-        ('R', 'A')
-    """
-    return name.rsplit("_", 1)[-1]

@@ -20,13 +20,15 @@ from evnlos.cameras import EventPixel, FrameCamera, V2ePixel
 from evnlos.config import check_made, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data.capture import Capture, read_capture
 from evnlos.data.pool import processes, run_tasks
+from evnlos.data.sampling import mask_file, stated_targets
 from evnlos.data.simulate import check_ranges, check_sequences, sequence_bytes, varied
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
 from evnlos.files import new_folder
 from evnlos.machine import Progress, Step, silent
 from evnlos.registry import __version__
-from evnlos.scene import FontGlyphs, Glyphs, LineMotion, Scene, find_font
+from evnlos.scene import FontGlyphs, Glyphs, LineMotion, OtherTarget, Scene, SeveralTargets, with_others
+from evnlos.scene.fonts import find_font
 from evnlos.setups import RadiometricSetup, Setup, named_setup, setup_preset
 from evnlos.setups.load import is_name
 from evnlos.types import derive_seed
@@ -94,6 +96,10 @@ class Lab:
     """What is hidden."""
     motion: LineMotion = field(default_factory=LineMotion)
     """How it moves."""
+    others: tuple[OtherTarget, ...] = ()
+    """Targets that are there beside each object; in a settings file alone."""
+    cover: bool = False
+    """Whether a later target hides those before it as far as it shines itself; else their light adds."""
     duration_s: float = 8.0
     """Length of a sequence, seconds."""
     frame_rate_hz: float = 5.0
@@ -304,7 +310,7 @@ def render_captures(
             raise DataError(f"{folder} is there without a capture.yaml; move it away, it is no capture")
     # A wrong setup is an error before anything is written; a few pixels are enough to find it.
     if names:
-        drawn.setup.resized(_SKETCH).observe(_scene(drawn, names[0]))
+        drawn.setup.resized(_SKETCH).observe_all(_scene(drawn, names[0]))
     out.mkdir(parents=True, exist_ok=True)
     _record(lab, drawn, out / record)
     missing = [(drawn, name, folder) for name, folder in folders.items() if not folder.is_dir()]
@@ -338,15 +344,16 @@ def _folder_name(lab: Lab, name: str) -> str:
     return f"{lab.name}_{name.rsplit('_', 1)[-1] if isinstance(lab.glyphs, FontGlyphs) else name}"
 
 
-def _scene(lab: Lab, name: str) -> Scene:
-    return Scene(lab.glyphs.target(name, lab.seed), lab.motion, lab.duration_s)
+def _scene(lab: Lab, name: str) -> Scene | SeveralTargets:
+    scene = Scene(lab.glyphs.target(name, lab.seed), lab.motion, lab.duration_s)
+    return with_others(scene, lab.others, lab.cover, lab.seed)
 
 
 def _render(task: tuple[Lab, str, Path]) -> Path:
     """Render a capture into a folder that is there whole or not at all."""
     lab, name, folder = task
     scene = _scene(lab, name)
-    wall = lab.setup.observe(scene)
+    wall = lab.setup.observe_all(scene)
     times_s = np.arange(round(lab.duration_s * lab.frame_rate_hz) + 1) / lab.frame_rate_hz
     seed = derive_seed(lab.seed, name)
     events = lab.setup.event_camera.record(wall, 0.0, lab.duration_s, seed=derive_seed(seed, "events"))
@@ -359,12 +366,13 @@ def _render(task: tuple[Lab, str, Path]) -> Path:
             Image.fromarray(frame).save(draft / f"frames/{k:04d}.png")
             rows.append(f"{round(time_s * 1e6)},frames/{k:04d}.png")
         (draft / "frames.csv").write_text("\n".join(rows) + "\n")
-        Image.fromarray(np.round(scene.target.mask * 255).astype(np.uint8)).save(draft / "target.png")
-        save_yaml(_description(lab, folder.name, scene.target.size_m), draft / "capture.yaml")
+        for k, one in enumerate(scene.scenes):
+            Image.fromarray(np.round(one.target.mask * 255).astype(np.uint8)).save(draft / mask_file(k))
+        save_yaml(_description(lab, folder.name, scene), draft / "capture.yaml")
     return folder
 
 
-def _description(lab: Lab, name: str, size_m: float) -> dict[str, Any]:
+def _description(lab: Lab, name: str, scene: Scene | SeveralTargets) -> dict[str, Any]:
     setup = lab.setup
     distance_m = setup.default_distance_m if lab.motion.z_m is None else lab.motion.z_m
     return {
@@ -377,14 +385,7 @@ def _description(lab: Lab, name: str, size_m: float) -> dict[str, Any]:
         },
         "events": "events.raw",
         "frames": "frames.csv",
-        "target": {"name": name.rsplit("_", 1)[-1], "mask": "target.png", "size_m": size_m},
-        "motion": {
-            "start_m": list(lab.motion.start_m),
-            "speed_m_s": lab.motion.speed_m_s,
-            "direction": list(lab.motion.direction),
-            "start_us": round(lab.motion.start_s * 1e6),
-            **{n: getattr(lab.motion, n) for n in ("retreat_m_s", "spin_deg_s") if getattr(lab.motion, n)},
-        },
+        **stated_targets(name, scene.scenes, lab.cover),
         "setup": {
             **({} if distance_m is None else {"distance_m": distance_m}),
             "wall": f"rendered: {setup.wall_description()}",

@@ -7,8 +7,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.config import check_made
-from evnlos.data.capture_info import CaptureInfo, RegistrationInfo, inside
+from evnlos.data.capture_info import CaptureInfo, MotionInfo, RegistrationInfo, TargetInfo, inside
 from evnlos.data.frames import find_dots, homography_from_points, read_image, registration_error
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import (
@@ -28,7 +28,7 @@ from evnlos.events import (
     read_events,
     time_surface,
 )
-from evnlos.scene import Motion, Scene, Target
+from evnlos.scene import LineMotion, Motion, Scene, SeveralTargets, Target
 from evnlos.types import Events, Plane
 
 _BLOCK_BYTES = 1 << 26  # of frames and surfaces at the sensor's resolution
@@ -161,6 +161,7 @@ def make_samples(
     *,
     motion: Motion | None = None,
     target: Target | None = None,
+    several: SeveralTargets | None = None,
 ) -> Samples:
     """Turn one recording into samples: surfaces at sensor resolution, then all reduced by area averaging.
 
@@ -172,11 +173,13 @@ def make_samples(
         sampling: Resolution and representation.
         motion: The target's motion on the events' clock; None where it is unknown.
         target: The target; there is a truth only where motion and target are known.
+        several: All targets where there are others too: the truth then shows all of them.
 
     Raises:
         DataError: The number of frames and of edges disagree.
     """
-    return join_samples(iter_samples(frames, peak, events, edges_us, sampling, motion=motion, target=target))
+    known: dict[str, Any] = {"motion": motion, "target": target, "several": several}
+    return join_samples(iter_samples(frames, peak, events, edges_us, sampling, **known))
 
 
 def join_samples(blocks: Iterable[Samples]) -> Samples:
@@ -196,6 +199,7 @@ def iter_samples(
     *,
     motion: Motion | None = None,
     target: Target | None = None,
+    several: SeveralTargets | None = None,
 ) -> Iterator[Samples]:
     """Yield what `make_samples` returns in blocks, at least one, whose memory does not grow with the positions.
 
@@ -222,7 +226,7 @@ def iter_samples(
         position = None if motion is None else motion.position_m(time_s)
         truth = None
         if target is not None and motion is not None:
-            truth = Scene(target, motion).truth(sampling.canvas, time_s)
+            truth = (several or Scene(target, motion)).truth(sampling.canvas, time_s)
         light = reduce_by_area(block / np.float32(peak), shape)
         maps = surface if mode == "likelihood" else reduce_by_area(surface, shape)
         yield Samples(light, maps, truth, time_s, position, counts[part])
@@ -272,3 +276,79 @@ def time_steps(folder: Path, info: CaptureInfo, events: Events) -> tuple[NDArray
         raise DataError(f"{folder}: events over {(last - first) / 1e6:.0f} s; cut them, or lower frame_rate_hz")
     times_us = first + np.round(np.arange(int((last - first) / step_us) + 1) * step_us).astype(np.int64)
     return np.broadcast_to(np.uint8(0), (len(times_us), *events.shape)), times_us
+
+
+def character_of(name: str) -> str:
+    """Return what an object shows, from its name: the part behind the last underscore.
+
+    Example:
+        >>> character_of("near_R"), character_of("writer03_A")
+        ('R', 'A')
+    """
+    return name.rsplit("_", 1)[-1]
+
+
+def line_of(motion: MotionInfo | None, distance_m: float | None) -> LineMotion | None:
+    """Return the motion that a `capture.yaml` states, on the events' clock; None where it states none.
+
+    Args:
+        motion: What it states.
+        distance_m: Distance from target to wall that it notes, metres; None where it notes none.
+    """
+    if motion is None:
+        return None
+    direction, start = np.asarray(motion.direction, dtype=float), motion.start_m
+    if not isinstance(start, tuple):
+        along = start * direction / np.hypot(*direction)
+        start = (float(along[0]), float(along[1]))
+    line = LineMotion(start, motion.speed_m_s, motion.direction, motion.start_us * 1e-6)
+    away_m = distance_m if motion.retreat_m_s else None
+    return replace(line, z_m=away_m, retreat_m_s=motion.retreat_m_s, spin_deg_s=motion.spin_deg_s)
+
+
+def stated_targets(name: str, scenes: Sequence[Scene], cover: bool) -> dict[str, Any]:
+    """Return what a `capture.yaml` states of its targets and their motions; `line_of` reads the motions.
+
+    Args:
+        name: Name of the capture.
+        scenes: Each target and its motion.
+        cover: Whether later targets hide earlier ones.
+    """
+    told = []
+    for k, scene in enumerate(scenes):
+        motion: Any = scene.motion
+        pose = {n: getattr(motion, n) for n in ("retreat_m_s", "spin_deg_s") if getattr(motion, n)}
+        start, line = list(motion.start_m), {"speed_m_s": motion.speed_m_s, "direction": list(motion.direction)}
+        line = {"start_m": start, **line, "start_us": round(motion.start_s * 1e6), **pose}
+        shown = character_of(scene.target.name if k else name)
+        told.append({"name": shown, "mask": mask_file(k), "size_m": scene.target.size_m, "motion": line})
+    first = {"target": told[0], "motion": told[0].pop("motion")}
+    return {**first, "others": told[1:], "cover": cover} if told[1:] else first
+
+
+def mask_file(number: int) -> str:
+    """Return the name of the mask of target 0, 1, ... in a capture's folder."""
+    return f"other{number}.png" if number else "target.png"
+
+
+def read_target(folder: Path, info: TargetInfo | None) -> Target | None:
+    """Return the target of a capture with its mask; None where there is none."""
+    if info is None or info.mask is None:
+        return None
+    mask = read_image(inside(folder, info.mask))
+    return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.size_m)
+
+
+def read_others(folder: Path, info: CaptureInfo, times_us: NDArray[np.int64]) -> tuple[Scene, ...]:
+    """Return the other targets of a capture with their motions, as far as both are known."""
+    seconds = max(float(times_us[-1]) * 1e-6, 1e-6)
+    found = [(read_target(folder, one), line_of(one.motion, noted_distance_m(info))) for one in info.others]
+    return tuple(Scene(one, line, seconds) for one, line in found if one is not None and line is not None)
+
+
+def noted_distance_m(info: CaptureInfo) -> float | None:
+    """Return the distance from hidden object to wall that a capture notes, metres; None without one."""
+    noted = info.setup.get("distance_m")
+    if isinstance(noted, bool) or not isinstance(noted, (int, float)) or not 0 < noted < float("inf"):
+        return None
+    return float(noted)

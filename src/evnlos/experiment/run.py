@@ -20,8 +20,8 @@ import torch
 from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, as_modality, import_captures, load_pattern, simulate
-from evnlos.data.capture_info import character_of
 from evnlos.data.pool import processes, run_tasks
+from evnlos.data.sampling import character_of
 from evnlos.data.simulations import default, randomized
 from evnlos.errors import CalibrationError, ConfigError, DataError, MissingDependencyError
 from evnlos.experiment.study import Arm, Place, Record, Study, slug

@@ -33,6 +33,7 @@ from .operators import operator_norm as operator_norm
 from .operators import ridge_by_groups as ridge_by_groups
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
+from .problem import SeveralSequences as SeveralSequences
 from .problem import block_folds as block_folds
 from .sequence_light import FrameTerm as FrameTerm
 from .sequence_light import NormalEquations as NormalEquations

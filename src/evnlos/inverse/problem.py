@@ -2,6 +2,7 @@
 
 - What hidden targets look like: a Gaussian prior from some characters, and others to test it on.
 - The weight of a prior by leaving out blocks of the wall: no truth, and no belief in independent errors.
+- Several targets at once.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,9 +19,12 @@ from numpy.typing import NDArray
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import LinearOperator
 from evnlos.machine import note
-from evnlos.optics import dense_matrix
+from evnlos.optics import MatrixTransport, dense_matrix
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Target
 from evnlos.types import Plane
+
+if TYPE_CHECKING:
+    from evnlos.inverse.sequence_problem import SequenceOperator
 
 _MAX_DEGREE = 12
 
@@ -346,3 +351,49 @@ def stroke_width_m(target: Target) -> float:
 def _slopes(mask: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return forward differences along y and x, [S, S]."""
     return np.diff(mask, axis=0, append=mask[-1:]), np.diff(mask, axis=1, append=mask[:, -1:])
+
+
+@dataclass(frozen=True, eq=False)
+class SeveralSequences:
+    """The linear map of several targets, each in its own frame: (x, y, ...) -> A x + B y + ...
+
+    Args:
+        parts: The map of each target, over one strip and of as many positions.
+
+    Raises:
+        DataError: There is none, or they differ in strip or positions.
+    """
+
+    parts: tuple[SequenceOperator, ...]
+
+    def __post_init__(self) -> None:
+        if len({(id(one.transport), len(one), one.target_plane.shape) for one in self.parts}) != 1:
+            raise DataError(f"{len(self.parts)} targets differ in strip, positions or cells; give them alike")
+
+    def __len__(self) -> int:
+        return len(self.parts[0])
+
+    def __call__(self, targets: torch.Tensor, /) -> torch.Tensor:
+        """Return the images [..., N, H, W] of targets [..., K, n, n]."""
+        lights = [one(targets[..., k, :, :]) for k, one in enumerate(self.parts)]
+        return torch.stack(lights).sum(dim=0)
+
+    def adjoint(self, images: torch.Tensor, /) -> torch.Tensor:
+        """Return the transpose, [..., N, H, W] -> [..., K, n, n]."""
+        return torch.stack([one.adjoint(images) for one in self.parts], dim=-3)
+
+    def gram(self, strip_gram: torch.Tensor, static: float = 0.0) -> torch.Tensor:
+        """Return A^T C^-1 A, float64 [K n n, K n n]: a block for each pair; see `SequenceOperator.gram`."""
+        rows = [[one.cross_gram(other, strip_gram, static) for other in self.parts] for one in self.parts]
+        total = torch.cat([torch.cat(row, dim=1) for row in rows])
+        return (total + total.mT) / 2
+
+    @property
+    def transport(self) -> MatrixTransport:
+        """The map from the strip to the camera."""
+        return self.parts[0].transport
+
+    @property
+    def canvas(self) -> tuple[int, ...]:
+        """Size (K, n, n) of what is looked for."""
+        return len(self.parts), *self.parts[0].canvas

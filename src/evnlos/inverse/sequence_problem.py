@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import Gradient, Solution, normal_matrix
+from evnlos.inverse.problem import SeveralSequences
 from evnlos.inverse.tikhonov import smallest
 from evnlos.inverse.total_variation import total_variation
 from evnlos.optics import LinearTransport, MatrixTransport
@@ -99,16 +100,28 @@ class SequenceOperator:
         Returns:
             float64 [n n, n n].
         """
-        cells = self.target_plane.height * self.target_plane.width
-        strip, total = self.transport.source.shape, torch.zeros(cells, cells, dtype=torch.float64)
-        for y, x in self._shares:
-            total += _sandwich(strip_gram, strip, y, x)
-        kept = mean_weight(len(self), static)
-        if kept < 1:
-            mean = sum(torch.kron(y, x) for y, x in self._shares) / len(self)  # [strip cells, target cells]
-            assert isinstance(mean, torch.Tensor)
-            total -= (1 - kept) * len(self) * (mean.mT @ (strip_gram.double() @ mean))
+        total = self.cross_gram(self, strip_gram, static)
         return (total + total.mT) / 2
+
+    def cross_gram(
+        self, other: SequenceOperator, strip_gram: torch.Tensor, static: float = 0.0
+    ) -> torch.Tensor:
+        """Return A^T C^-1 B, [n n, m m], with B the map of another target over the same strip; see `gram`."""
+        strip, pairs = self.transport.source.shape, zip(self._shares, other._shares, strict=True)
+        total = reduce(torch.add, (_sandwich(strip_gram, strip, one, beside) for one, beside in pairs))
+        if (kept := mean_weight(len(self), static)) < 1:
+            total -= (1 - kept) * len(self) * (self._mean.mT @ (strip_gram.double() @ other._mean))
+        return total
+
+    @property
+    def canvas(self) -> tuple[int, ...]:
+        """Size (n, n) of what is looked for."""
+        return self.target_plane.shape
+
+    @cached_property
+    def _mean(self) -> torch.Tensor:
+        """Return the mean of S_k, [strip cells, target cells]."""
+        return reduce(torch.add, (torch.kron(y, x) for y, x in self._shares)) / len(self)
 
     @cached_property
     def _shares(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
@@ -178,12 +191,20 @@ def _share(
     return torch.from_numpy(np.maximum(high - low, 0.0) / strip_pitch)
 
 
-def _sandwich(gram: torch.Tensor, shape: tuple[int, int], y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """Return (y kron x)^T G (y kron x) for a symmetric G; only cells that the target touches are looked at."""
-    rows, columns = torch.nonzero(y.any(dim=1)).flatten(), torch.nonzero(x.any(dim=1)).flatten()
-    index = (rows[:, None] * shape[1] + columns).flatten()
-    product = gram[index][:, index].double()  # [r c, r c]
-    for _ in range(2):
+def _sandwich(
+    gram: torch.Tensor,
+    shape: tuple[int, int],
+    left: tuple[torch.Tensor, torch.Tensor],
+    right: tuple[torch.Tensor, torch.Tensor],
+) -> torch.Tensor:
+    """Return (y kron x)^T G (v kron u); only cells that the targets touch are looked at."""
+    sides = [
+        (y, x, torch.nonzero(y.any(dim=1)).flatten(), torch.nonzero(x.any(dim=1)).flatten())
+        for y, x in (left, right)
+    ]
+    index = [(rows[:, None] * shape[1] + columns).flatten() for _, _, rows, columns in sides]
+    product = gram[index[0]][:, index[1]].double()  # [r c, m]
+    for y, x, rows, columns in sides:
         parts = product.unflatten(0, (len(rows), len(columns)))  # [r, c, m]
         product = torch.einsum("rcm,rj->jcm", parts, y[rows])
         product = torch.einsum("jcm,ci->jim", product, x[columns]).flatten(0, 1).mT  # [m, n n]
@@ -203,7 +224,7 @@ class SequenceProblem:
     ambient light.
 
     Args:
-        sight: The sequence.
+        sight: The sequence of one target, or of several at once: they are solved for together.
         static: Standard deviation of the offsets over that of the noise, 0 or more; infinity: whatever does not
             move says nothing about the target.
         strip_gram: A^T A, where it is at hand; sequences over one strip share it.
@@ -214,7 +235,10 @@ class SequenceProblem:
     """
 
     def __init__(
-        self, sight: SequenceOperator, static: float = 0.0, strip_gram: torch.Tensor | None = None
+        self,
+        sight: SequenceOperator | SeveralSequences,
+        static: float = 0.0,
+        strip_gram: torch.Tensor | None = None,
     ) -> None:
         self.sight, self.static = sight, static
         strip_gram = strip_gram_of(sight.transport) if strip_gram is None else strip_gram
@@ -269,7 +293,7 @@ class SequenceProblem:
         image = (seen / (values + regularization)) @ basis.mT
         left = residual(regularization)
         sigma = float((left.mean() / freedom(regularization)).sqrt())
-        image = image.reshape(*images.shape[:-3], *self.sight.target_plane.shape)
+        image = image.reshape(*images.shape[:-3], *self.sight.canvas)
         left = left.sqrt().reshape(images.shape[:-3])
         return Solution(image, regularization, 0, True, left, sigma, self.samples - freedom(regularization))
 
@@ -289,9 +313,11 @@ class SequenceProblem:
             tolerance: Relative primal-dual gap at which to stop.
 
         Raises:
-            ConfigError: regularization is not positive, or the box is empty.
+            ConfigError: regularization is not positive, the box is empty, or there are several targets.
             DataError: The images are not those of the sequence.
         """
+        if isinstance(self.sight, SeveralSequences):
+            raise ConfigError(f"{self.sight.canvas[0]} targets; total variation takes one: give tikhonov")
         back, energy = self._seen(images)
         target_plane, (values, vectors) = self.sight.target_plane, self._eigen
         root = values.sqrt()
@@ -330,7 +356,7 @@ class SequenceProblem:
             raise DataError("the images hold NaN or infinity")
         flat = images.double().reshape(-1, *wanted)
         whitened = flat - (1 - self._kept) * flat.mean(dim=1, keepdim=True)
-        return self.sight.adjoint(whitened).flatten(1), (whitened * flat).sum(dim=(1, 2, 3))
+        return self.sight.adjoint(whitened).reshape(len(flat), -1), (whitened * flat).sum(dim=(1, 2, 3))
 
     @cached_property
     def _eigen(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -340,8 +366,9 @@ class SequenceProblem:
     @cached_property
     def _spectrum(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return s^2 and B with B^T R B = diag(s^2), B^T L^T L B = 1."""
-        blank = torch.zeros(self.sight.target_plane.shape, dtype=torch.float64)
+        blank = torch.zeros(self.sight.canvas[-2:], dtype=torch.float64)
         lower = torch.linalg.cholesky(normal_matrix(Gradient("dark"), blank))
+        lower = torch.block_diag(*[lower] * math.prod(self.sight.canvas[:-2]))
         half = torch.linalg.solve_triangular(lower, self.gram, upper=False)
         values, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(lower, half.mT, upper=False))
         basis = torch.linalg.solve_triangular(lower.mT, vectors, upper=True)

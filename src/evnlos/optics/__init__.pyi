@@ -16,6 +16,7 @@ from .corner import floor_bearing as floor_bearing
 from .corner import strip_response as strip_response
 from .matrix_wall import FilmWall as FilmWall
 from .matrix_wall import MatrixWall as MatrixWall
+from .matrix_wall import SeveralWall as SeveralWall
 from .matrix_wall import SpaceWall as SpaceWall
 from .matrix_wall import coarsest_keyframe_step_m as coarsest_keyframe_step_m
 from .operator import DepthTransport as DepthTransport

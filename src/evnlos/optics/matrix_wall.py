@@ -2,12 +2,13 @@
 
 - A target that moves as a whole, in its plane, or in space: away from the wall, and turning.
 - A hidden plane that changes in place: a film.
+- Several targets at once.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -16,8 +17,8 @@ from numpy.typing import ArrayLike
 from evnlos.errors import ConfigError, DataError
 from evnlos.optics.interpolation import spline_coefficients, spline_weights
 from evnlos.optics.operator import DEPTH_STEP, DepthTransport, LinearTransport, MatrixTransport
-from evnlos.optics.wall import ambient_map, check_gain, checked_times
-from evnlos.scene import Film, LineMotion, Motion, Pose, Scene, Target
+from evnlos.optics.wall import Irradiance, ambient_map, check_gain, checked_times
+from evnlos.scene import Film, LineMotion, Motion, Pose, Scene, SeveralTargets, Target
 from evnlos.types import Plane
 
 _CHUNK = 64  # positions drawn and carried over at a time
@@ -353,3 +354,36 @@ class FilmWall:
         times = checked_times(t_s)
         light = self.operator(torch.from_numpy(self.film.at(times).astype(np.float64)))
         return (self.ambient + light.clamp(min=0)).to(torch.float32)
+
+
+class SeveralWall:
+    """The light of several targets on the wall, at any instant: the sum of theirs, less what is hidden.
+
+    Args:
+        walls: The light of each target alone, with the ambient light.
+        scene: The targets.
+        ambient: Light that is always there, white levels: a number or an array [H, W], 0 or more.
+        operator: Where targets cover each other: from cells of their plane to white levels.
+    """
+
+    def __init__(
+        self,
+        walls: Sequence[Irradiance],
+        scene: SeveralTargets,
+        ambient: float | ArrayLike | torch.Tensor = 0.0,
+        operator: LinearTransport | None = None,
+    ) -> None:
+        self.walls, self.scene, self.shape, self._operator = walls, scene, walls[0].shape, operator
+        self.ambient = ambient_map(ambient, self.shape)
+        self.speed_px_s = max(one.speed_px_s for one in walls)
+        """Upper bound of the speed of the image on the sensor, pixels per second."""
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return white levels at times `t_s`, seconds, [] or [T]: float32 [H, W] or [T, H, W]."""
+        times = checked_times(t_s)
+        light = torch.stack([one.irradiance(times) - self.ambient for one in self.walls]).sum(dim=0)
+        if self._operator is not None:
+            assert isinstance(self._operator.source, Plane)  # whoever made it says so
+            hidden = torch.from_numpy(self.scene.hidden(self._operator.source, times))
+            light = light - self._operator(hidden).to(light)
+        return self.ambient + light.clamp(min=0)

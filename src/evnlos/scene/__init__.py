@@ -20,7 +20,9 @@ from evnlos.scene.glyph_sets import (
     HandwritingGlyphs,
     NistGlyphs,
     ObjectId,
+    OtherTarget,
     TargetPlane,
+    with_others,
 )
 from evnlos.scene.handwriting import (
     TRAIN_WRITERS,
@@ -32,7 +34,7 @@ from evnlos.scene.handwriting import (
     pen_width,
     redrawn,
 )
-from evnlos.scene.moving import LineMotion, Motion, PathMotion, Pose, Scene, Target
+from evnlos.scene.moving import LineMotion, Motion, PathMotion, Pose, Scene, SeveralTargets, Target
 
 __all__ = [
     "DIGITS",
@@ -52,9 +54,11 @@ __all__ = [
     "Motion",
     "NistGlyphs",
     "ObjectId",
+    "OtherTarget",
     "PathMotion",
     "Pose",
     "Scene",
+    "SeveralTargets",
     "Strokes",
     "Target",
     "TargetPlane",
@@ -73,4 +77,5 @@ __all__ = [
     "read_sd19",
     "redrawn",
     "render_glyph",
+    "with_others",
 ]

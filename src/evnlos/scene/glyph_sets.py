@@ -30,7 +30,7 @@ from evnlos.scene.fonts import (
     render_glyph,
 )
 from evnlos.scene.handwriting import Strokes, nist_like, redrawn
-from evnlos.scene.moving import Target
+from evnlos.scene.moving import LineMotion, Scene, SeveralTargets, Target
 from evnlos.untrusted import open_image
 
 ObjectId: TypeAlias = str
@@ -377,3 +377,22 @@ class DrawingGlyphs:
 
 Glyphs: TypeAlias = HandwritingGlyphs | FontGlyphs | NistGlyphs | EmnistGlyphs | DrawingGlyphs
 """All kinds of sets, distinguished by `kind` in a settings file."""
+
+
+@dataclass(frozen=True)
+class OtherTarget:
+    """A target beside the object of a recording: the first object of a set, on a path of its own."""
+
+    glyphs: Glyphs = field(default_factory=FontGlyphs)
+    """What it is: the first object of this set."""
+    motion: LineMotion = field(default_factory=LineMotion)
+    """How it moves."""
+
+
+def with_others(
+    scene: Scene, others: tuple[OtherTarget, ...], cover: bool, seed: int
+) -> Scene | SeveralTargets:
+    """Return a scene with other targets beside its own, or itself where there are none."""
+    drawn = [(one.glyphs.target(one.glyphs.objects()[0], seed), one.motion) for one in others]
+    scenes = (scene, *(Scene(target, motion, scene.duration_s) for target, motion in drawn))
+    return SeveralTargets(scenes, cover) if others else scene

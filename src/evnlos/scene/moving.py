@@ -467,6 +467,11 @@ class Scene:
             raise DataError(f"n is {n}; ask for 1 position or more")
         return np.arange(1, n + 1) * self.duration_s / n
 
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """This scene alone, as a scene of several targets holds more (`SeveralTargets`)."""
+        return (self,)
+
     def pose(self, t_s: ArrayLike) -> Pose:
         """Return x, y, z and rotation of the target at times `t_s` (seconds, any shape [...])."""
         return pose_of(self.motion, t_s)
@@ -489,3 +494,65 @@ class Scene:
             for place, turn in zip(places.reshape(-1, 2), turns.reshape(-1), strict=True)
         ]
         return np.stack(drawn).reshape(*turns.shape, *plane.shape)
+
+
+@dataclass(frozen=True)
+class SeveralTargets:
+    """Several targets at once, each on a path of its own: `Setup.observe_all` shows them.
+
+    Their light adds. With `cover`, a later target hides those before it as far as it shines itself:
+    drawn = earlier (1 - mask) + mask.
+
+    Args:
+        scenes: Each target with its motion, of one duration, in the order in which they are drawn.
+        cover: Whether a later target hides earlier ones. All of them are then at the setup's own distance.
+
+    Raises:
+        DataError: There is no target, durations differ, or targets that cover each other state a distance or
+            turn.
+    """
+
+    scenes: tuple[Scene, ...]
+    cover: bool = False
+
+    def __post_init__(self) -> None:
+        durations = {one.duration_s for one in self.scenes}
+        if len(durations) != 1:
+            raise DataError(
+                f"{len(self.scenes)} scenes last {sorted(durations)} s; give one or more of one length"
+            )
+        for one in self.scenes if self.cover else ():
+            if one.moves_in_space or np.isfinite(one.pose(0.0).z_m):
+                raise DataError(
+                    f"{one.target.name} states a distance or turns, and targets that cover each other share "
+                    "one plane; leave z_m and turns out, or let the light add (cover: false)"
+                )
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the recording, seconds."""
+        return self.scenes[0].duration_s
+
+    @property
+    def target(self) -> Target:
+        """None: whoever takes one target gets an error instead of one of several."""
+        raise DataError(
+            f"the scene holds {len(self.scenes)} targets, and this takes one; give one scene, or ask "
+            "Setup.observe_all for the light of all"
+        )
+
+    def truth(self, plane: Plane, t_s: ArrayLike) -> NDArray[np.float32]:
+        """Return all targets at times `t_s` (seconds, [] or [N]) on a plane, float32 [H, W] or [N, H, W]."""
+        return self._layers(plane, t_s)[0]
+
+    def hidden(self, plane: Plane, t_s: ArrayLike) -> NDArray[np.float32]:
+        """Return how much of the sum of all targets is hidden at times `t_s`, as `truth`; 0 without `cover`."""
+        return self._layers(plane, t_s)[1]
+
+    def _layers(self, plane: Plane, t_s: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        drawn = hidden = np.zeros((*np.shape(t_s), *plane.shape), np.float32)
+        for one in self.scenes:
+            image = one.truth(plane, t_s)
+            behind = drawn * image if self.cover else np.zeros_like(drawn)
+            drawn, hidden = drawn + image - behind, hidden + behind
+        return drawn, hidden

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
 from evnlos.errors import ConfigError
-from evnlos.optics import DepthTransport, Irradiance, LinearTransport
+from evnlos.optics import DepthTransport, Irradiance, LinearTransport, SeveralWall
 from evnlos.optics.wall import ambient_plane
 from evnlos.registry import Kinded, Registry
-from evnlos.scene import Scene
-from evnlos.setups.files import Measurement, OperatorNoise
+from evnlos.scene import Scene, SeveralTargets
+from evnlos.setups.files import Layout, Measurement, OperatorNoise
 from evnlos.types import Plane
 
 S = TypeVar("S", bound="Setup")
@@ -76,25 +76,6 @@ class Parameter:
     role: Literal["", "blur", "magnification", "place"] = ""
 
 
-class Layout(NamedTuple):
-    """Where the parts of a setup are, seen from above: x along the wall, z away from it, metres."""
-
-    target: tuple[float, float]
-    """Middle of the target's path (x, z)."""
-    wall: str
-    """What the wall is, in words."""
-    camera: tuple[float, float] | None = None
-    """Pin-hole (x, z); None where the setup states none."""
-    camera_words: str = ""
-    """Distance and angle of the camera, in words."""
-    seen_m: tuple[float, float] | None = None
-    """Ends of the part of the wall that the camera sees (x)."""
-    occluders: tuple[tuple[tuple[float, float], ...], ...] = ()
-    """Corners (x, z) of each opaque polygon."""
-    lamp: tuple[float, float] | None = None
-    """A torch that lights the target (x, z)."""
-
-
 @dataclass(frozen=True)
 class Setup(Kinded, ABC):
     """Wall, geometry, ambient light and cameras: all that lies between a hidden scene and its recording.
@@ -148,6 +129,25 @@ class Setup(Kinded, ABC):
         Raises:
             ConfigError: The setup can't show this scene, or a setting is out of range.
         """
+
+    def observe_all(self, scene: Scene | SeveralTargets) -> Irradiance:
+        """Return `observe` of a scene of one or several targets.
+
+        Raises:
+            ConfigError: As for `observe`; or targets cover each other, and the setup draws none on cells.
+        """
+        walls, operator = [self.observe(one) for one in scene.scenes], None
+        if len(walls) == 1:
+            return walls[0]
+        assert isinstance(scene, SeveralTargets)
+        if scene.cover:
+            if (cells := self.target_cells()) is None:
+                raise ConfigError(
+                    f"the setup {self.kind!r} draws no targets on cells, so none covers another; let light "
+                    f"add (cover: false), or give a setup of kind {' or '.join(linear_kinds())}"
+                )
+            operator = self.operator(cells, dtype=torch.float32)
+        return SeveralWall(walls, scene, self.ambient_light(), operator)
 
     def operator(
         self, plane: Plane, shape: tuple[int, int] | None = None, dtype: torch.dtype = torch.float64

@@ -1,5 +1,6 @@
-"""Setups on disk: a measured matrix, a fitted wall, and the folder of a calibration.
+"""What setups hand over, and setups on disk: a measured matrix, a fitted wall, the folder of a calibration.
 
+- Where the parts of a setup are, and how well a measured operator is known.
 - A measured light-transport matrix on disk: safetensors with its geometry in the metadata.
 - A fitted wall on disk: its facets' slopes, maps of the image, light that moves along.
 """
@@ -17,6 +18,25 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.optics.facets import SlopeTable
 from evnlos.tensor_file import TensorFile, check_floats
 from evnlos.types import Plane
+
+
+class Layout(NamedTuple):
+    """Where the parts of a setup are, seen from above: x along the wall, z away from it, metres."""
+
+    target: tuple[float, float]
+    """Middle of the target's path (x, z)."""
+    wall: str
+    """What the wall is, in words."""
+    camera: tuple[float, float] | None = None
+    """Pin-hole (x, z); None where the setup states none."""
+    camera_words: str = ""
+    """Distance and angle of the camera, in words."""
+    seen_m: tuple[float, float] | None = None
+    """Ends of the part of the wall that the camera sees (x)."""
+    occluders: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Corners (x, z) of each opaque polygon."""
+    lamp: tuple[float, float] | None = None
+    """A torch that lights the target (x, z)."""
 
 
 class OperatorNoise(NamedTuple):
