@@ -113,6 +113,7 @@ WHOLE_CHAPTERS = {
     "optics/facets.py",
     "optics/radiometric.py",
     "scene/moving.py",
+    "tracking/motion_fit.py",
 }
 """Settings, equations and loops of one model or measurement: cut in two, a reader would need both halves."""
 

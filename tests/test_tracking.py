@@ -3,7 +3,7 @@
 import json
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,11 @@ import yaml
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.cli.invert_captures import linear_setup
+from evnlos.cli.results import true_path
 from evnlos.config import read_yaml, save_yaml
-from evnlos.data import FixedPattern, Sampling, read_capture, save_pattern
+from evnlos.data import CaptureInfo, FixedPattern, Sampling, read_capture, save_pattern
+from evnlos.data.capture import Capture
+from evnlos.data.capture_info import CameraInfo
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize, Simulation
 from evnlos.errors import ConfigError, DataError
@@ -23,16 +26,19 @@ from evnlos.inverse.operators import Gradient, normal_matrix
 from evnlos.models import SequenceConfig, Weights, published_setup, save_weights
 from evnlos.optics import SlidingWall, View
 from evnlos.plot.results import draw_track
-from evnlos.scene import FontGlyphs, LineMotion, PathMotion, Target
+from evnlos.scene import FontGlyphs, LineMotion, OtherTarget, PathMotion, Scene, SeveralTargets, Target
 from evnlos.setups import RadiometricSetup
 from evnlos.tracking import (
     Distance,
     Measurements,
+    MotionFit,
     Track,
     Tracking,
     Turn,
+    count_targets,
     event_velocity,
     fit_motion,
+    log_evidence,
     most_likely_acceleration,
     plane_map,
     register,
@@ -42,10 +48,12 @@ from evnlos.tracking import (
     temporal_noise,
     track_capture,
     track_frames,
+    track_several,
     track_warnings,
 )
 from evnlos.tracking.motion_fit import Fit, Lights
 from evnlos.tracking.registration import explained_change
+from evnlos.tracking.track import straightened
 from evnlos.types import Events, Plane
 
 SHAPE = (24, 36)
@@ -662,3 +670,161 @@ def test_what_the_recording_does_not_tell_is_not_identified() -> None:
     for settings in (Tracking(turning=True), Tracking(depth=True)):
         with pytest.raises(ConfigError, match="needs a setup"):
             track_frames(frames, times, settings=settings)
+
+
+def test_the_step_of_two_targets_is_that_of_all_unknowns_together() -> None:
+    """Slow reference: one least squares problem of both targets and all their places."""
+    rng, plane = np.random.default_rng(8), Plane(5, 5, 0.02)
+    flat = Lights(SETUP, Plane(20, 30, 0.012), SHAPE, depth=False)
+    poses = np.zeros((4, 2, 4))
+    poses[..., :2] = rng.uniform(-0.03, 0.03, (4, 2, 2))
+    fit = Fit(plane, flat, poses, [0, 1], np.array([1.0, 1.0, 0.3, 0.02]))
+    seen = flat.seen(torch.from_numpy(rng.standard_normal((4, *SHAPE))))
+    prior = 0.3 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape, dtype=torch.float64))
+    prior = torch.block_diag(prior, prior)
+    image, step, covariance, _ = fit.step(seen, prior)
+    assert image.shape == (2, 5, 5)
+    moving = torch.eye(4, dtype=torch.float64) - 0.8 / 4
+    slope = fit.slopes(image.flatten())  # [N, 4, P]
+    frames, many, parts = slope.shape
+    assert (frames, many) == (4, 4)
+    apart = torch.block_diag(*slope).reshape(frames * many, frames, parts)
+    columns = torch.cat([fit.maps.permute(2, 0, 1), apart])
+    weighted = torch.einsum("kl,ulp->ukp", moving, columns).flatten(1)
+    left = seen - fit.maps @ image.flatten()
+    square, pull = weighted @ columns.flatten(1).mT, weighted @ left.flatten()
+    square[:50, :50] += prior
+    pull[:50] -= prior @ image.flatten()
+    x, y = (torch.from_numpy(one.ravel()) for one in np.meshgrid(plane.x_m, plane.y_m))
+    nothing = torch.zeros(25 + frames * many, dtype=torch.float64)
+    for k in range(2):
+        for axis in (x, y):
+            bound = torch.cat([nothing[: 25 * k], axis, nothing[25 * k :]])  # no light aside of the middle
+            square += 1e9 * torch.outer(bound, bound)
+    inverse = torch.linalg.inv(square)
+    exact = (inverse @ pull)[50:].reshape(frames, many)
+    torch.testing.assert_close(torch.from_numpy(step), exact, rtol=2e-3, atol=2e-3 * float(exact.abs().max()))
+    expected = inverse[50:, 50:].reshape(covariance.shape)
+    scale = float(expected.abs().max())
+    torch.testing.assert_close(torch.from_numpy(covariance), expected, rtol=2e-3, atol=2e-3 * scale)
+    # The marginal likelihood of the targets: one Gaussian density of all frames against that of noise alone.
+    columns, flat_seen = fit.maps.flatten(0, 1), seen.flatten()
+    normal = torch.einsum("npc,npd->cd", fit.maps, torch.einsum("nm,mpd->npd", moving, fit.maps)) + prior
+    middle = torch.block_diag(*[torch.stack([x, y]) / plane.extent_m[0]] * 2)
+    bound_prior = prior + 1e6 * float(normal.diagonal().mean()) * middle.mT @ middle
+    noise = torch.kron(torch.linalg.inv(moving).contiguous(), torch.eye(parts, dtype=torch.float64))
+    whole = noise + columns @ torch.linalg.inv(bound_prior) @ columns.mT
+    density = -0.5 * (flat_seen @ torch.linalg.solve(whole, flat_seen) + torch.linalg.slogdet(whole)[1])
+    assert -0.5 * (fit.surprise + fit.volume) == pytest.approx(
+        float(density + 0.5 * torch.linalg.slogdet(noise)[1]), rel=1e-6
+    )
+
+
+def test_the_evidence_of_paths_is_the_integral_over_them() -> None:
+    rng, times = np.random.default_rng(3), np.array([0.0, 0.5, 1.2, 2.0, 3.0])
+    places = np.stack([np.linspace(-0.04, 0.05, 5), 0.01 * np.sin(times)], axis=-1)
+    root = rng.standard_normal((10, 10))
+    covariance = 1e-6 * (root @ root.T + 3 * np.eye(10))
+    fit = MotionFit(places, covariance.reshape(5, 2, 5, 2), torch.zeros(3, 3), misfit=0.9, noise=0.01)
+    variance = np.diag(covariance).reshape(5, 2)
+    blank = np.full(5, np.nan)
+    axes = [Measurements(times, places[:, j], variance[:, j], blank, blank) for j in range(2)]
+    rough = most_likely_acceleration(axes)
+    prior = np.zeros((5, 2, 5, 2))
+    for a, s in enumerate(times):
+        for b, r in enumerate(times):
+            steps = np.linspace(0, min(s, r), 4001)
+            walk = np.trapezoid((s - steps) * (r - steps), steps)  # of a twice integrated white noise
+            for j, side in enumerate((0.40, 0.28)):
+                line = 1 / 12 + (s - times.mean()) * (r - times.mean()) / 3.0**2
+                prior[a, j, b, j] = rough * walk + side**2 * line
+    whole = prior.reshape(10, 10) + covariance * (0.02 / 0.01) ** 2  # twice the noise
+    flat = places.ravel()
+    expected = -0.5 * flat @ np.linalg.solve(whole, flat) - 0.5 * np.linalg.slogdet(whole)[1]
+    expected += 0.5 * np.linalg.slogdet(covariance * 4)[1]
+    assert log_evidence(fit, times, 0.02) == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_straightened_step_is_that_of_a_penalty_on_bends() -> None:
+    rng = np.random.default_rng(4)
+    root, step, pose = rng.standard_normal((12, 12)), rng.standard_normal((6, 2)), rng.standard_normal((6, 2))
+    covariance = root @ root.T + np.eye(12)
+    bends = np.zeros((8, 12))
+    for t in range(4):
+        for k in range(2):
+            bends[2 * t + k, [2 * t + k, 2 * t + 2 + k, 2 * t + 4 + k]] = 1, -2, 1
+    told, penalty = np.linalg.inv(covariance), bends.T @ bends / 0.3**2
+    expected = np.linalg.solve(told + penalty, told @ step.ravel() - penalty @ pose.ravel())
+    found = straightened(step, covariance.reshape(6, 2, 6, 2), pose, 0.3)
+    np.testing.assert_allclose(found.ravel(), expected, rtol=1e-9)
+
+
+WIDE = RadiometricSetup(cell_m=0.01, strip_m=(0.28, 0.16), gain=1.2, ambient=0.05).resized((18, 28))
+LETTERS = [
+    (FontGlyphs(family="Nunito Black", characters="U"), LineMotion((-0.06, 0.012), 0.02)),
+    (FontGlyphs(family="Nunito Black", characters="7"), LineMotion((0.065, -0.016), 0.02, (-1.0, 0.1))),
+]
+
+
+def several_frames(count: int) -> tuple[np.ndarray, np.ndarray, list[Scene]]:
+    """Return frames [13, h, w] of the first letters, their times, and the scenes."""
+    times = np.linspace(0.2, 6.2, 13)
+    scenes = [Scene(glyphs.target(glyphs.objects()[0]), motion) for glyphs, motion in LETTERS[:count]]
+    light = WIDE.ambient_light().numpy()[None].repeat(len(times), axis=0)
+    if scenes:
+        light = WIDE.observe_all(SeveralTargets(tuple(scenes))).irradiance(times).numpy()
+    return light + 3e-3 * np.random.default_rng(count).standard_normal(light.shape), times, scenes
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_the_number_of_objects_is_found_with_their_paths(count) -> None:
+    frames, times, scenes = several_frames(count)
+    light = torch.from_numpy(frames - WIDE.ambient_light().numpy())
+    number = count_targets(light, WIDE, times, 3e-3, 0.1, cells=10)
+    assert number.found == count and len(number.gains) == count + 1
+    assert all(gain > 50 for gain in number.gains[:-1]) and number.gains[-1] < -10
+    if not scenes:
+        return
+    truth = np.stack([true_path(one, times) for one in scenes], axis=1)
+    found = number.fits[count - 1].position_m
+    order = [
+        int(np.linalg.norm(truth - found[:, k : k + 1], axis=-1).mean(axis=0).argmin()) for k in range(count)
+    ]
+    assert sorted(order) == list(range(count))
+    assert np.linalg.norm(found - truth[:, order], axis=-1).max() < 6e-3
+    if count == 2:  # they do cross
+        assert np.linalg.norm(truth[:, 0] - truth[:, 1], axis=-1).min() < 0.035
+
+
+def test_several_objects_of_a_capture_are_followed_and_drawn(tmp_path, capsys) -> None:
+    (first, way), (second, back) = LETTERS
+    setup = replace(WIDE, pixel=EventPixel(), frame_camera=FrameCamera(exposure_s=0.016))
+    lab = Lab("pair", first, way, (OtherTarget(second, back),), False, 6.0, 2.0, setup, {}, 0)
+    (folder,) = render_captures(lab, tmp_path)
+    save_yaml(asdict(setup), tmp_path / "setup.yaml")
+    words = ["track", str(folder), "--setup", str(tmp_path / "setup.yaml"), "--targets", "2", "--cells", "10"]
+    main([*words, "--out", str(tmp_path / "path.png"), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert {row["target"] for row in told["objects"]} == {"U", "7"} and told["targets"] == 2
+    assert all(row["position_error"] < 4e-3 for row in told["objects"])
+    written = json.loads((tmp_path / "path.json").read_text())
+    assert len(written["tracks"]) == 2 and "size" not in written["tracks"][0]
+    images = np.load(tmp_path / "path_images.npz")
+    assert images["object_1"].shape == (32, 32) and images["object_2"].max() > 0.3
+    for name in ("path_1.png", "path_2.png", "path_images.png"):
+        assert (tmp_path / name).is_file()
+    main([*words, "--out", str(tmp_path / "path.png")])
+    assert "U: error" in capsys.readouterr().out
+
+
+def test_what_several_objects_need_is_named() -> None:
+    frames, times, _ = several_frames(1)
+    with pytest.raises(ConfigError, match="targets is 9; give 1 to 5, or auto"):
+        Tracking(targets=9)
+    with pytest.raises(ConfigError, match="`track_several` follows several"):
+        track_frames(frames, times, None, WIDE, Tracking(targets=2))
+    capture = Capture("none", CaptureInfo(CameraInfo(28, 18), None), Events.empty(28, 18), frames, times, None)
+    with pytest.raises(ConfigError, match="needs a setup"):
+        track_several(capture, None, Tracking(targets="auto"))
+    with pytest.raises(ConfigError, match="depth and turning are found of one"):
+        track_several(capture, WIDE, Tracking(targets=2, depth=True))

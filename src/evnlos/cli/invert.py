@@ -7,8 +7,9 @@ import json
 import re
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -20,6 +21,10 @@ from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
 from evnlos.types import OutImage
+
+if TYPE_CHECKING:
+    from evnlos.data import Capture
+    from evnlos.tracking import Tracks
 
 REGULARIZATION_TIKHONOV = 4.0  # best on eight characters of one setup, docs/inversion.md
 REGULARIZATION_TV = 0.3  # likewise
@@ -213,18 +218,8 @@ class InvertCommand:
                 )
             regularization = dict.fromkeys(regularization, number)
         solvers = tuple(regularization) if self.solver == "all" else (self.solver,)
-        options = SequenceOptions(
-            setup,
-            self.positions,
-            self.pattern,
-            self.track,
-            solvers,
-            regularization,
-            self.cells,
-            self.columns,
-            self.static,
-            self.subsets,
-        )
+        used = (self.positions, self.pattern, self.track, solvers, regularization)
+        options = SequenceOptions(setup, *used, self.cells, self.columns, self.static, self.subsets)
         with ProgressBars() as progress:
             found, pictures = invert_captures(self.files, options, progress)
         most = max(row["positions"] for row in found["rows"])
@@ -366,3 +361,52 @@ def sequence_table(rows: list[dict[str, Any]]) -> str:
             values.append(f"{np.mean(db):9.2f} dB" if db else f"{'-':>12}")
         lines.append(f"{count:9d} " + "".join(values))
     return "\n".join(lines)
+
+
+def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool) -> None:
+    """Print paths of several objects, each with the nearest true one, and write each path and image.
+
+    Args:
+        capture: The recording.
+        found: Paths and images.
+        out: NAME.png: NAME_1.png, ... show the paths, NAME_images.png the objects.
+        as_json: Print one JSON object.
+    """
+    from evnlos.cli.results import track_values, true_path
+    from evnlos.plot.results import draw_inversion, draw_track
+
+    rows, pictures = [], []
+    for k, track in enumerate(found.tracks):
+        known = [] if capture.scene is None else [capture.scene, *capture.others]
+        truths = [(one.target.name, true_path(one, track.time_s)) for one in known]
+        nearest = min(truths, key=lambda one: float(np.square(one[1] - track.position).sum()), default=None)
+        rows.append(track_values(capture, track, None if nearest is None else nearest[1]))
+        rows[-1]["target"] = None if nearest is None else nearest[0]
+        path, title = out.with_stem(f"{out.stem}_{k + 1}"), f"{capture.name}, object {k + 1}"
+        pictures.append(drawn(path, partial(draw_track, track, path, nearest and nearest[1], title)))
+    if found.tracks:
+        panels = [(f"object {k + 1}", torch.from_numpy(one)[None]) for k, one in enumerate(found.images)]
+        path = out.with_stem(f"{out.stem}_images")
+        pictures.append(drawn(path, partial(draw_inversion, path, panels)))
+        _save_arrays(path, {f"object_{k + 1}": one for k, one in enumerate(found.images)})
+    told = {"capture": capture.name, "targets": len(rows), "evidence_gains": list(found.gains), "objects": rows}
+    told |= {"image_size_m": found.size_m, "pictures": [one for one in pictures if one]}
+    text = json.dumps({**told, "tracks": [track.summary() for track in found.tracks]})
+    write_atomically(out.with_suffix(".json"), text.encode())
+    print(json.dumps(told) if as_json else tracks_text(told))
+
+
+def tracks_text(told: dict[str, Any]) -> str:
+    """Return the figures of several objects as lines for people."""
+    lines = [f"{told['capture']}: {told['targets']} moving objects"]
+    for k, gain in enumerate(told["evidence_gains"]):
+        lines.append(f"evidence    ln {gain:+.0f} for {k + 1} over {k}")
+    for k, row in enumerate(told["objects"]):
+        travel, speed, sigma = (1e3 * row[name] for name in ("travel", "mean_speed", "position_sigma"))
+        lines.append(f"object {k + 1}    travel {travel:.1f} mm, {speed:.2f} mm/s, position +- {sigma:.2f} mm")
+        if row["target"] is not None:
+            x, y = (1e3 * one for one in row["position_offset"])
+            lines[-1] += (
+                f"; {row['target']}: error {1e3 * row['position_error']:.2f} mm rms about ({x:.2f}, {y:.2f})"
+            )
+    return "\n".join([*lines, *told["pictures"]])

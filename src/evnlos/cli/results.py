@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from evnlos.analysis import Identification
     from evnlos.data import Capture
     from evnlos.data.lab import Lab
+    from evnlos.scene import Scene
     from evnlos.tracking import Track
 
 
@@ -132,7 +133,7 @@ def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool) -> N
 
 @dataclass(frozen=True)
 class TrackCommand:
-    """Follow the hidden object of a capture: position, speed and direction over time, with errors."""
+    """Follow the hidden object of a capture, or several (--targets): position and speed over time."""
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Capture folder; what it says of the motion serves for comparison only."""
@@ -156,10 +157,11 @@ class TrackCommand:
 
     def run(self) -> None:
         """Follow, print, write the image."""
+        from evnlos.cli.invert import show_tracks
         from evnlos.cli.invert_captures import linear_setup
         from evnlos.data import pattern_of, read_capture
         from evnlos.plot.results import draw_track
-        from evnlos.tracking import track_capture, track_warnings
+        from evnlos.tracking import Tracks, track_capture, track_several, track_warnings
 
         with ProgressBars() as progress:
             with progress.stage("track", "read the capture", 0, 3):
@@ -168,8 +170,12 @@ class TrackCommand:
                 setup = None if self.setup is None else linear_setup(self.setup)
                 pattern = pattern_of(self.setup, self.pattern)
             with progress.stage("track", "follow the target", 2, 3):
-                track = track_capture(capture, setup, self.settings, pattern)
-        truth = true_path(capture, track.time_s) if track.unit == "m" else None
+                follow = track_capture if self.settings.targets == 1 else track_several
+                track = follow(capture, setup, self.settings, pattern)
+        if isinstance(track, Tracks):
+            show_tracks(capture, track, self.out, self.json)
+            return
+        truth = None if track.unit != "m" or capture.scene is None else true_path(capture.scene, track.time_s)
         found = track_values(capture, track, truth)
         found["warnings"] = track_warnings(capture, setup, track)
         found["picture"] = drawn(self.out, lambda: draw_track(track, self.out, truth, capture.name))
@@ -180,11 +186,8 @@ class TrackCommand:
             say(f"warning: {warning}")
 
 
-def true_path(capture: Capture, t_s: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the middle of the target's light, [T, 2], metres; None where target or motion is unknown."""
-    scene = capture.scene
-    if scene is None:
-        return None
+def true_path(scene: Scene, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the middle of the target's light, [T, 2], metres."""
     mask = scene.target.mask.astype(np.float64)
     along = ((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * scene.target.size_m
     x, y = np.array([mask.sum(axis=0) @ along, mask.sum(axis=1) @ along]) / mask.sum()
@@ -206,8 +209,9 @@ def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | No
         "mean_speed": float(track.speed.mean()),
         "position_sigma": float(track.position_sigma.mean()),
         "speed_sigma": float(track.speed_sigma.mean()),
-        "size_change": float(track.size[-1] / track.size[0]),
     }
+    if np.isfinite(track.size).all():
+        found["size_change"] = float(track.size[-1] / track.size[0])
     if track.misfit is not None:
         found["misfit"] = track.misfit
     if track.distance is not None:

@@ -1,10 +1,12 @@
 """From a recording to a track: the light that stands still taken off, then the object followed.
 
 - From a recording to a track: frames give places, events give velocities, a smoother joins them.
+- Several objects at once: their number, their paths, their images.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,40 +16,34 @@ from numpy.typing import NDArray
 
 from evnlos.data.capture import Capture
 from evnlos.data.fixed_pattern import FixedPattern
-from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse import BackgroundModel
+from evnlos.inverse import BackgroundModel, SequenceOperator, SequenceProblem, SeveralSequences
+from evnlos.inverse.sequence_problem import matrix_of, strip_of
 from evnlos.setups import Setup
-from evnlos.tracking.motion_fit import fit_motion, smooth_together
-from evnlos.tracking.registration import EventVelocity, Registration, event_velocity, register
+from evnlos.tracking.motion_fit import MOST_TARGETS, count_targets, first_paths, fit_motion, smooth_together
+from evnlos.tracking.registration import (
+    EventVelocity,
+    Registration,
+    event_velocity,
+    reduced,
+    register,
+    temporal_noise,
+)
 from evnlos.tracking.track import (
     Distance,
     Measurements,
     Track,
+    Tracks,
     Turn,
     most_likely_acceleration,
     plane_map,
     smooth,
 )
-from evnlos.types import Events
+from evnlos.types import Events, Plane
 
 _ROUNDS = 20
 _ABOVE = 2.5  # standard deviations over the background from which a pixel shows the object
 _LEAST_SHARE = 0.1
-
-
-def temporal_noise(frames: NDArray) -> float:
-    """Return the standard deviation of the noise that changes from frame to frame, in the frames' unit.
-
-    Median absolute value of second differences, in time and then over neighbours: a smooth image that moves
-    leaves next to nothing there.
-
-    Args:
-        frames: Real [N, H, W], three or more along each axis.
-    """
-    change = (frames[2:] - 2 * frames[1:-1] + frames[:-2]) / np.sqrt(6)
-    around = change[:, :-2, 1:-1] + change[:, 2:, 1:-1] + change[:, 1:-1, :-2] + change[:, 1:-1, 2:]
-    return float(1.4826 * np.median(np.abs(4 * change[:, 1:-1, 1:-1] - around)) / np.sqrt(20))
 
 
 def static_light(frames: NDArray, degree: int = 2) -> NDArray[np.float64]:
@@ -90,7 +86,8 @@ def static_light(frames: NDArray, degree: int = 2) -> NDArray[np.float64]:
     return fitted.reshape(shape)
 
 
-_LEAST_FRAMES = 4
+_IMAGE_CELLS = 32  # a side of an image of one of several objects
+_PRIOR, _STATIC = 4.0, 1.0  # weight of its prior, as `evnlos invert` takes it; a pixel's offset over its noise
 _SAME_DISTANCE = 0.03  # share by which a capture's stated distance may differ from its setup's
 _MOST_MISFIT = 1.2  # times the noise: calibrated setups leave 0.95 to 1.05 of captures of their own
 
@@ -113,15 +110,92 @@ class Tracking:
     """With a setup: also find how far the object is from the wall in each frame."""
     turning: bool = False
     """With a setup: also find how the object turns about the wall's normal."""
+    targets: int | Literal["auto"] = 1
+    """Number of objects on paths of their own, or auto: by evidence. Other than 1 needs a setup, and looks at
+    frames alone."""
     degree: int = 2
     """Degree of the ambient light over the wall, as a polynomial."""
 
     def __post_init__(self) -> None:
         if self.columns < 16:
             raise ConfigError(f"Tracking.columns is {self.columns}; give 16 pixels or more")
+        if self.targets != "auto" and not 1 <= self.targets <= MOST_TARGETS:
+            raise ConfigError(f"Tracking.targets is {self.targets}; give 1 to {MOST_TARGETS}, or auto")
         for name in ("window_s", "target_size_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"Tracking.{name} is {getattr(self, name)}; give a positive number")
+
+
+def track_several(
+    capture: Capture, setup: Setup | None, settings: Tracking, pattern: FixedPattern | None = None
+) -> Tracks:
+    """Return where several hidden objects were, what they look like, and how many they are.
+
+    Args:
+        capture: The recording.
+        setup: The calibrated setup.
+        settings: How to follow; `targets` says how many, or auto.
+        pattern: The frame camera's fixed pattern, to be taken off first.
+
+    Raises:
+        ConfigError: There is no setup, or depth or turning is asked for.
+        DataError: Too few frames.
+    """
+    if setup is None:
+        raise ConfigError(f"Tracking.targets is {settings.targets} and needs a setup: give its file (--setup)")
+    if settings.depth or settings.turning:
+        raise ConfigError(
+            f"Tracking.targets is {settings.targets}; depth and turning are found of one: leave them out"
+        )
+    times_s = capture.frame_times_us.astype(np.float64) * 1e-6
+    small = reduced(_levels(capture, pattern), settings.columns)
+    noise = temporal_noise(small)
+    light = torch.from_numpy(small - static_light(small, settings.degree))
+    size_m, gains = settings.target_size_m, list[float]()
+    if settings.targets == "auto":
+        number = count_targets(light, setup, times_s, noise, size_m, settings.cells)
+        if not number.found:
+            return Tracks((), np.zeros((0, _IMAGE_CELLS, _IMAGE_CELLS)), size_m, tuple(number.gains))
+        start_m, gains, bend_m = number.fits[number.found - 1].position_m, number.gains, 0.0
+    else:
+        start_m, bend_m = first_paths(light, setup, noise, size_m, settings.targets), size_m / 50
+    fit = fit_motion(light, setup, start_m, noise, size_m, settings.cells, bend_m=bend_m)
+    count, many = fit.covariance.shape[:2]
+    values, variance = fit.position_m.reshape(count, many), np.einsum("nknk->nk", fit.covariance)
+    blank = np.full(count, np.nan)
+    axes = [Measurements(times_s, *one, blank, blank) for one in zip(values.T, variance.T, strict=True)]
+    speeds = [most_likely_acceleration(axes[k - k % 2 :][:2]) for k in range(many)]
+    mean, spread = smooth_together(times_s, values, fit.covariance, [None] * many, speeds, times_s)
+    sigma, pairs = np.sqrt(variance), [slice(k, k + 2) for k in range(0, many, 2)]
+    told = [(mean[..., p], spread[..., p], (values[:, p], sigma[:, p])) for p in pairs]
+    tracks = tuple(_track(times_s, a, b, "m", times_s, by, misfit=fit.misfit) for a, b, by in told)
+    return Tracks(tracks, images_of_targets(light, setup, tracks, noise, size_m), size_m, tuple(gains))
+
+
+def images_of_targets(
+    light: torch.Tensor, setup: Setup, tracks: Sequence[Track], noise: float, size_m: float
+) -> NDArray[np.float64]:
+    """Return the images of targets on known paths, all at once, [K, n, n]: Tikhonov over the whole sequence.
+
+    Args:
+        light: Frames without ambient light, white levels, [N, h, w].
+        setup: The setup.
+        tracks: Their paths at the frames' instants.
+        noise: Standard deviation of a sample's noise, white levels.
+        size_m: Side of an image, metres.
+    """
+    plane, shape = Plane(_IMAGE_CELLS, _IMAGE_CELLS, size_m / _IMAGE_CELLS), (light.shape[1], light.shape[2])
+    strip = strip_of(np.concatenate([one.position for one in tracks]), plane)
+    transport = matrix_of(setup.resized(shape).operator(strip, shape))
+    parts = tuple(SequenceOperator(transport, plane, one.position) for one in tracks)
+    problem = SequenceProblem(SeveralSequences(parts), _STATIC)
+    return problem.tikhonov(light.double(), _PRIOR * noise**2).image.numpy()
+
+
+def _levels(capture: Capture, pattern: FixedPattern | None) -> NDArray:
+    if pattern is not None:
+        return pattern.correct(capture.frames, capture.peak)
+    return capture.frames / np.float32(capture.peak)
 
 
 def track_capture(
@@ -141,9 +215,7 @@ def track_capture(
     Raises:
         DataError: Too few frames, or the object does not stand out.
     """
-    frames = capture.frames / np.float32(capture.peak)
-    if pattern is not None:
-        frames = pattern.correct(capture.frames, capture.peak)
+    frames = _levels(capture, pattern)
     events = capture.events if capture.has_events else None
     return track_frames(frames, capture.frame_times_us.astype(np.float64) * 1e-6, events, setup, settings)
 
@@ -171,19 +243,16 @@ def track_frames(
     for name in ("depth", "turning"):
         if getattr(settings, name) and setup is None:
             raise ConfigError(f"Tracking.{name} needs a setup: give its file (--setup), or leave {name} out")
-    if len(frames) < _LEAST_FRAMES:
-        raise DataError(f"{len(frames)} frames; tracking needs {_LEAST_FRAMES} or more")
-    sensor = (int(frames.shape[1]), int(frames.shape[2]))
-    columns = min(settings.columns, sensor[1])
-    shape = (max(1, round(sensor[0] * columns / sensor[1])), columns)
-    small = reduce_by_area(frames, shape)
+    if settings.targets != 1:
+        raise ConfigError(f"Tracking.targets is {settings.targets}; `track_several` follows several, this one")
+    small = reduced(frames, settings.columns)
     noise = temporal_noise(small)
     found = register(small, static_light(small, settings.degree), noise)
     by_events = None
     if events is not None and settings.events:
         by_events = event_velocity(events, found, times_s, settings.window_s)
     if setup is None:
-        return _in_pixels(found, by_events, times_s, sensor[1] / columns)
+        return _in_pixels(found, by_events, times_s, frames.shape[2] / small.shape[2])
     return _in_metres(found, by_events, times_s, small, setup, noise, settings)
 
 
@@ -302,10 +371,12 @@ def _track(
     unit: Literal["m", "px"],
     times_s: NDArray[np.float64],
     by_frames: tuple[NDArray[np.float64], NDArray[np.float64]],
-    found: Registration,
-    by_events: EventVelocity | None,
+    found: Registration | None = None,
+    by_events: EventVelocity | None = None,
+    misfit: float | None = None,
 ) -> Track:
     """Return the track of smoothed values and rates [T, 2, K] of x and y, beside what frames alone say."""
+    unknown = np.full(len(times_s), np.nan)
     return Track(
         instants,
         mean[:, 0, :2],
@@ -315,7 +386,8 @@ def _track(
         unit,
         times_s,
         *by_frames,
-        found.size,
-        found.size * np.sqrt(found.covariance[:, 2, 2]),
+        unknown if found is None else found.size,
+        unknown if found is None else found.size * np.sqrt(found.covariance[:, 2, 2]),
         0 if by_events is None else len(by_events.time_s),
+        misfit=misfit,
     )

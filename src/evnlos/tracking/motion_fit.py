@@ -1,6 +1,7 @@
 """Fitting a motion: positions, and distances and turns where they change, by the calibrated operator.
 
-- Poses that make the frames of one target likeliest, by the calibrated operator.
+- Poses that make the frames of one target, or of several, likeliest, by the calibrated operator.
+- How many targets there are, by evidence, and first guesses of their paths.
 - A smoother of poses whose errors belong together.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,11 +22,21 @@ from evnlos.machine import note
 from evnlos.optics import DepthTransport
 from evnlos.optics.interpolation import spline_coefficients, spline_slopes, spline_weights
 from evnlos.setups import Setup
+from evnlos.tracking.track import Measurements, most_likely_acceleration, straightened
 from evnlos.types import Plane
 
 REACH = 0.3
 """Largest change of the distance's logarithm that is looked for: 0.74 to 1.35 of the setup's own distance."""
-_ROUNDS = 24
+REGION_M = (0.40, 0.28)
+"""Sides of the part of the target's plane in which several targets are looked for, (x, y), metres."""
+MOST_TARGETS = 5
+"""Largest number of targets that is looked for by evidence."""
+_ROUNDS, _TRIAL_ROUNDS, _STRAIGHT_ROUNDS = 24, 12, 5
+_FIRST_FRAMES = 24  # of which first guesses of paths are made
+_STRIDE, _BEND = (
+    3,
+    0.1,
+)  # cells between two of them at most; what a bend of one cell costs, of the brightest score
 _STATIC = 1.0  # a pixel's constant offset over its noise
 _PRIOR = 3.0  # weight of the target's smoothness, in units of the noise's variance
 _MARGIN_M = 0.03
@@ -50,6 +62,10 @@ class MotionFit:
             is. None where it was not looked for.
         misfit: What the target leaves of the frames' changes, over their noise, root mean square; 1 is a setup
             that explains all.
+        surprise: Smallest sum of squares of what is left and of the target's roughness, weighed by the prior.
+        volume: ln of how much the frames narrow down the target, a determinant over that of its prior.
+        inside: As `misfit`, of what the strip can show of the frames, where the light is.
+        noise: Standard deviation of a sample's noise that was taken for true, white levels.
     """
 
     position_m: NDArray[np.float64]
@@ -58,6 +74,10 @@ class MotionFit:
     log_distance: NDArray[np.float64] | None = None
     rotation_rad: NDArray[np.float64] | None = None
     misfit: float = 1.0
+    surprise: float = 0.0
+    volume: float = 0.0
+    inside: float = 1.0
+    noise: float = 1.0
 
 
 def fit_motion(
@@ -70,66 +90,249 @@ def fit_motion(
     *,
     depth: bool = False,
     turning: bool = False,
+    rounds: int = _ROUNDS,
+    bend_m: float = 0.0,
 ) -> MotionFit:
     """Find the poses of a target, and the target, that explain the frames best: Gauss and Newton's method.
 
     The target is eliminated (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973): a
     step of the poses knows that the target follows, as it does where a path is stretched or a target comes
     nearer on its way. A target and a path are only known together up to a shift; the target's middle of light
-    is the reference.
+    is the reference. Several targets are found together: each knows what the others explain.
 
     Args:
         light: Frames without ambient light, white levels, [N, h, w].
         setup: The setup.
-        start_m: First guess of the positions, [N, 2], metres.
+        start_m: First guess of the positions, [N, 2], of K targets [N, K, 2], metres.
         noise: Standard deviation of a sample's noise, white levels.
         target_size_m: Side of a target plane that surely holds the object, metres.
         cells: Cells a side of it.
         depth: Find the distance to the wall in each frame too.
         turning: Find the turn about the wall's normal in each frame too.
+        rounds: Most steps.
+        bend_m: Above 0: standard deviation of a path's second difference in the first rounds, metres, which
+            carries it through frames in which another target hides where it is.
     """
     target_plane = Plane(cells, cells, target_size_m / cells)
-    reach = np.concatenate([start_m + _MARGIN_M, start_m - _MARGIN_M])
+    places = start_m.reshape(-1, 2)
+    reach = np.concatenate([places + _MARGIN_M, places - _MARGIN_M])
     if turning:  # corners reach further
         reach = np.concatenate([reach + 0.21 * target_size_m, reach - 0.21 * target_size_m])
     # Whole steps: recordings alike share their matrices.
     reach = np.stack([np.floor(reach.min(axis=0) / _STRIP_M), np.ceil(reach.max(axis=0) / _STRIP_M)]) * _STRIP_M
     lights = Lights(setup, strip_of(reach, target_plane), (int(light.shape[1]), int(light.shape[2])), depth)
     seen = lights.seen(light)
+    count, targets = len(start_m), len(places) // len(start_m)
     prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(target_plane.shape).double())
-    pose = np.zeros((len(start_m), 4))  # x, y, ln(distance / own), turn
-    pose[:, :2] = start_m
+    prior = torch.block_diag(*[prior] * targets)
+    pose = np.zeros((count, targets, 4))  # x, y, ln(distance / own), turn
+    pose[..., :2] = places.reshape(count, targets, 2)
     kinds = [0, 1, *([2] if depth else []), *([3] if turning else [])]
     scale = np.array([1.0, 1.0, setup.default_distance_m or 1.0, target_size_m / 4])  # to metres
-    covariance = np.zeros((len(pose), len(kinds), len(pose), len(kinds)))
-    misfit, image = 1.0, torch.zeros(target_plane.shape)
+    many = targets * len(kinds)
+    covariance = np.zeros((count, many, count, many))
+    image, told = torch.zeros(target_plane.shape), (1.0, 0.0, 0.0, 1.0)
     still = (1 - mean_weight(len(light), _STATIC)) / len(light)
     whole, part = (float((one - still * one.sum(dim=0)).square().sum()) for one in (light, seen))
     rest = whole - part  # what no target explains
-    for number in range(1, _ROUNDS + 1):
+    beyond = moving_energy(light) - moving_energy(seen)
+    for number in range(1, rounds + 1):
         note(f"places and image, round {number}")
         fit = Fit(target_plane, lights, pose, kinds, scale)
         image, step, covariance, left = fit.step(seen, prior)
-        samples = light[0].numel() * (len(light) - 1)
-        misfit = math.sqrt((rest + left) / samples) / noise
-        step = step * min(1.0, _LONGEST_M / np.abs(step).max())
-        pose[:, kinds] += step / scale[kinds]
-        pose[:, 2:] -= pose[:, 2:].mean(axis=0)
-        pose[:, 2] = np.clip(pose[:, 2], -REACH, REACH)
-        sigma = noise * np.sqrt(np.einsum("nknk->nk", covariance))
-        if (np.abs(step) < _ENOUGH * sigma).all():
+        misfit = math.sqrt((rest + left) / (light[0].numel() * (count - 1))) / noise
+        inside = math.sqrt(left / (seen.shape[1] * (count - 1))) / noise
+        told = misfit, beyond + fit.surprise, fit.volume, inside
+        if straight := bend_m > 0 and number <= _STRAIGHT_ROUNDS:
+            step = straightened(step, covariance, pose[..., kinds].reshape(count, many), bend_m / noise)
+        step = step.reshape(count, targets, len(kinds))
+        step = step * np.minimum(1.0, _LONGEST_M / np.abs(step).max(axis=(0, 2), keepdims=True))
+        pose[..., kinds] += step / scale[kinds]
+        pose[..., 2:] -= pose[..., 2:].mean(axis=0)
+        pose[..., 2] = np.clip(pose[..., 2], -REACH, REACH)
+        pose[..., :2] = np.clip(pose[..., :2], reach[0], reach[1])
+        sigma = noise * np.sqrt(np.einsum("nknk->nk", covariance)).reshape(step.shape)
+        if not straight and (np.abs(step) < _ENOUGH * sigma).all():
             break
     # Pixels that no target reaches hold the noise alone: a setup that explains all leaves just that.
-    unit = scale[kinds]
-    covariance = (max(misfit, 1.0) * noise) ** 2 * covariance / unit[:, None, None] / unit
+    unit = np.tile(scale[kinds], targets)
+    covariance = (max(told[0], 1.0) * noise) ** 2 * covariance / unit[:, None, None] / unit
     return MotionFit(
-        pose[:, :2].copy(),
+        pose[..., :2].reshape(start_m.shape),
         covariance,
-        image,
-        pose[:, 2].copy() if depth else None,
-        pose[:, 3].copy() if turning else None,
-        misfit,
+        image if start_m.ndim > 2 else image[0],
+        pose[..., 2].reshape(start_m.shape[:-1]) if depth else None,
+        pose[..., 3].reshape(start_m.shape[:-1]) if turning else None,
+        *told,
+        noise,
     )
+
+
+def moving_energy(frames: torch.Tensor) -> float:
+    """Return the sum of squares of frames [N, ...], with as much of their mean as an unknown offset leaves."""
+    mean = frames.double().mean(dim=0)
+    kept = mean_weight(len(frames), _STATIC)
+    return float(frames.double().square().sum() - (1 - kept) * len(frames) * mean.square().sum())
+
+
+def log_evidence(fit: MotionFit, times_s: NDArray[np.float64], noise: float) -> float:
+    """Return ln of the probability density of the frames, up to what all numbers of targets share.
+
+    Targets are integrated out exactly, paths by Laplace's method: they may be anywhere in `REGION_M`, at any
+    velocity that crosses it, which walks at random by as much as makes the path likeliest (`smooth`).
+
+    Args:
+        fit: Paths and targets in their plane.
+        times_s: Instants of the frames, [N], seconds.
+        noise: Standard deviation of the noise, white levels: the same for all numbers of targets.
+    """
+    count, many, passed = len(times_s), fit.covariance.shape[1], times_s - times_s.mean()
+    variance, places = np.einsum("nknk->nk", fit.covariance), fit.position_m.reshape(count, many)
+    covered = np.zeros((count, many, count, many))
+    blank = np.full(count, np.nan)
+    for k in range(0, many, 2):
+        axes = [Measurements(times_s, places[:, k + j], variance[:, k + j], blank, blank) for j in range(2)]
+        walk = _walk(times_s - times_s[0], np.zeros(count, bool), most_likely_acceleration(axes))
+        for j, side_m in enumerate(REGION_M):
+            line = side_m**2 / 12 + np.outer(passed, passed) * (side_m / np.ptp(times_s)) ** 2
+            covered[:, k + j, :, k + j] = walk + line
+    size, scale = count * many, (max(fit.misfit, 1.0) * fit.noise / noise) ** 2
+    root = np.linalg.cholesky(covered.reshape(size, size) + 1e-12 * np.eye(size))
+    told = scale * np.linalg.pinv(fit.covariance.reshape(size, size), rcond=1e-10, hermitian=True)
+    d = places.ravel()  # from the middle of the region
+    within, b = np.eye(size) + root.T @ told @ root, root.T @ (told @ d)
+    path = -0.5 * d @ told @ d + 0.5 * b @ np.linalg.solve(within, b) - 0.5 * np.linalg.slogdet(within)[1]
+    return float(path - 0.5 * fit.surprise / noise**2 - 0.5 * fit.volume)
+
+
+class Number(NamedTuple):
+    """How many targets the frames show, and by how much."""
+
+    fits: list[MotionFit]
+    """The likeliest paths and targets of 1, 2, ... targets, one more than were found at most."""
+    gains: list[float]
+    """ln of the evidence of each number over that of one target less."""
+
+    @property
+    def found(self) -> int:
+        """The number up to which each further target raises the evidence."""
+        return next((k for k, gain in enumerate(self.gains) if gain <= 0), len(self.gains))
+
+
+def count_targets(
+    light: torch.Tensor,
+    setup: Setup,
+    times_s: NDArray[np.float64],
+    noise: float,
+    target_size_m: float,
+    cells: int = 20,
+    most: int = MOST_TARGETS,
+) -> Number:
+    """Fit no target, one, two, ..., until one more is less likely: each pays for its paths and cells.
+
+    Args:
+        light: Frames without ambient light, white levels, [N, h, w].
+        setup: The setup.
+        times_s: Instants of the frames, [N], seconds.
+        noise: Standard deviation of a sample's noise, white levels.
+        target_size_m: Side of a target plane that surely holds an object, metres.
+        cells: Cells a side of it.
+        most: Largest number that is tried.
+    """
+    found = Number([], [])
+    for number in range(1, most + 1):
+        start_m = first_paths(light, setup, noise, target_size_m, number)
+        fit = fit_motion(
+            light, setup, start_m, noise, target_size_m, cells, rounds=_TRIAL_ROUNDS, bend_m=target_size_m / 50
+        )
+        # The fit of more targets tells how much noise there is where the light is.
+        sigma = noise * max(1.0, fit.inside)
+        empty = -0.5 * moving_energy(light) / sigma**2
+        fewer = log_evidence(found.fits[-1], times_s, sigma) if found.fits else empty
+        found.fits.append(fit)
+        found.gains.append(log_evidence(fit, times_s, sigma) - fewer)
+        if found.gains[-1] <= 0:
+            break
+    return found
+
+
+def first_paths(
+    light: torch.Tensor, setup: Setup, noise: float, target_size_m: float, targets: int
+) -> NDArray[np.float64]:
+    """Return first guesses of the paths of targets, [N, K, 2], metres, the brightest first.
+
+    Each frame becomes an image of the target's plane (Tikhonov), blurred to a target's width. A path is the
+    brightest one through the frames that bends little (dynamic programming over places and steps); its
+    surroundings are then darkened for the next.
+
+    Args:
+        light: Frames without ambient light, white levels, [N, h, w].
+        setup: The setup.
+        noise: Standard deviation of a sample's noise, white levels.
+        target_size_m: Side of a target plane that surely holds an object, metres.
+        targets: How many, K.
+    """
+    from scipy.ndimage import gaussian_filter  # scipy loads slowly
+
+    cell_m = target_size_m / 10
+    plane = Plane(round(REGION_M[1] / cell_m), round(REGION_M[0] / cell_m), cell_m)
+    shape = (int(light.shape[1]), int(light.shape[2]))
+    matrix = setup.resized(shape).operator(plane, shape).dense()
+    prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape).double())
+    used = np.unique(np.linspace(0, len(light) - 1, min(len(light), _FIRST_FRAMES)).round().astype(int))
+    back = matrix.mT @ light[torch.from_numpy(used)].double().flatten(1).mT
+    shown = torch.linalg.solve(prior + matrix.mT @ matrix, back).mT.unflatten(1, plane.shape).numpy()
+    score = gaussian_filter(shown, (0, 2, 2))
+    score /= max(float(score.max()), 1e-12)
+    paths = []
+    for _ in range(targets):
+        row, column = _brightest_path(score)
+        path = np.stack([plane.x_m[column], plane.y_m[row]], axis=-1)
+        away = [axis - path[:, k, None] for k, axis in enumerate((plane.x_m, plane.y_m))]
+        near = (np.square(away[0])[:, None, :] + np.square(away[1])[:, :, None]) / (0.3 * target_size_m) ** 2
+        score = score * (1 - np.exp(-near / 2))
+        paths.append(np.stack([np.interp(np.arange(len(light)), used, axis) for axis in path.T], axis=-1))
+    return np.stack(paths, axis=1)
+
+
+def _brightest_path(score: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows and columns [T] of the path of the largest sum of scores [T, H, W] less its bends.
+
+    Viterbi's algorithm; a state is a cell and the step to it, of at most `_STRIDE` cells along each axis.
+    """
+    side, (height, width) = 2 * _STRIDE + 1, score.shape[1:]
+    best = np.broadcast_to(score[0], (side, side, height, width))
+    came = np.zeros((len(score), side, side, height, width), np.int8)
+    for t in range(1, len(score)):
+        around = np.pad(best, ((1, 1), (1, 1), (0, 0), (0, 0)), constant_values=-np.inf)
+        options = [
+            around[a : a + side, b : b + side] - _BEND * ((a - 1) ** 2 + (b - 1) ** 2)
+            for a in range(3)
+            for b in range(3)
+        ]
+        before = np.argmax(options, axis=0)
+        top = np.pad(
+            np.max(options, axis=0), ((0, 0), (0, 0), (_STRIDE,) * 2, (_STRIDE,) * 2), constant_values=-np.inf
+        )
+        before = np.pad(before, ((0, 0), (0, 0), (_STRIDE,) * 2, (_STRIDE,) * 2))
+        best = np.empty((side, side, height, width))
+        for i in range(side):
+            for j in range(side):
+                rows, columns = (
+                    slice(side - 1 - i, side - 1 - i + height),
+                    slice(side - 1 - j, side - 1 - j + width),
+                )
+                best[i, j] = top[i, j, rows, columns] + score[t]
+                came[t, i, j] = before[i, j, rows, columns]
+    i, j, row, column = (int(one) for one in np.unravel_index(int(np.argmax(best)), best.shape))
+    path = [(row, column)]
+    for t in range(len(score) - 1, 0, -1):
+        step = int(came[t, i, j, row, column])
+        row, column = row - (i - _STRIDE), column - (j - _STRIDE)
+        i, j = i + step // 3 - 1, j + step % 3 - 1
+        path.append((row, column))
+    rows, columns = np.array(path[::-1]).T
+    return rows, columns
 
 
 class Lights:
@@ -154,6 +357,7 @@ class Lights:
             own = setup.resized(shape).operator(strip, shape).dense()
             away = DepthTransport(lambda _: own, 0.99 * self._own_m, 1.01 * self._own_m, strip, shape)
         self._basis, self._away = away.basis.double(), copy(away)
+        self._known: dict[float, tuple[torch.Tensor, torch.Tensor]] = {}
         splines = spline_coefficients(away.nodes.double().unflatten(-1, strip.shape))
         self._away.nodes = splines.flatten(-2)
 
@@ -163,8 +367,11 @@ class Lights:
 
     def at(self, log_distance: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Return splines over the strip, [P, cells], and their derivative by ln(distance)."""
-        distance_m = self._own_m * math.exp(log_distance)
-        return self._away.coefficients(distance_m), self._away.slope(distance_m)
+        if log_distance not in self._known:
+            self._known.clear()  # poses in a plane ask for the same one again
+            distance_m = self._own_m * math.exp(log_distance)
+            self._known[log_distance] = self._away.coefficients(distance_m), self._away.slope(distance_m)
+        return self._known[log_distance]
 
     def taps(
         self, plane: Plane, pose: NDArray[np.float64]
@@ -208,7 +415,7 @@ class Fit:
     Args:
         target_plane: The target plane's cells.
         lights: The light of the strip's cells.
-        poses: x, y (metres), ln(distance), turn (radians) of each frame, [N, 4].
+        poses: x, y (metres), ln(distance), turn (radians) of each frame, [N, 4]; of K targets [N, K, 4].
         kinds: Which of them are looked for.
         scale: Metres a unit of each.
     """
@@ -221,13 +428,26 @@ class Fit:
         kinds: list[int],
         scale: NDArray[np.float64],
     ) -> None:
-        self.target_plane, self._kinds, self._scale = target_plane, kinds, scale
-        self._sights = [(*lights.at(float(pose[2])), *lights.taps(target_plane, pose)) for pose in poses]
+        self.target_plane, self._scale, self._found = (
+            target_plane,
+            scale,
+            (*poses.shape[1:-1], *target_plane.shape),
+        )
+        targets = math.prod(poses.shape[1:-1])
+        self._each, self._kinds = kinds, kinds * targets
+        self._sights = [
+            [(*lights.at(float(pose[2])), *lights.taps(target_plane, pose)) for pose in one]
+            for one in poses.reshape(len(poses), targets, -1)
+        ]
         self.maps = torch.stack(
-            [(own[:, at] * weights).sum(dim=1) for own, _, at, weights, _ in self._sights]
-        )  # [N, P, n n]
+            [
+                torch.cat([(own[:, at] * w).sum(dim=1) for own, _, at, w, _ in each], dim=1)
+                for each in self._sights
+            ]
+        )  # [N, P, K n n]
         self._total = self.maps.sum(dim=0)
         self._still = (1 - mean_weight(len(poses), _STATIC)) / len(poses)
+        self.surprise = self.volume = 0.0  # of the state of `step`, for `log_evidence`
 
     def step(
         self, seen: torch.Tensor, prior: torch.Tensor
@@ -239,18 +459,23 @@ class Fit:
 
         Args:
             seen: Frames, float64 [N, P].
-            prior: Matrix of the target's prior, [n n, n n].
+            prior: Matrix of the prior of all targets, [K n n, K n n].
         """
         normal = prior + torch.einsum("npc,npd->cd", self.maps, self.maps)
         normal -= self._still * self._total.mT @ self._total
         # The light's middle lies in the target's: only then is a place the light's middle.
         x, y = np.meshgrid(self.target_plane.x_m, self.target_plane.y_m)
         middle = torch.from_numpy(np.stack([x.ravel(), y.ravel()])) / self.target_plane.extent_m[0]
-        normal += _HELD * float(normal.diagonal().mean()) * middle.mT @ middle
+        middle = torch.block_diag(*[middle] * (len(normal) // middle.shape[1]))
+        held = _HELD * float(normal.diagonal().mean()) * middle.mT @ middle
+        normal += held
         root = torch.linalg.cholesky(normal)
         back = torch.einsum("npc,np->c", self.maps, self._moving(seen))
         image = torch.cholesky_solve(back[:, None], root)[:, 0]
         left = seen - self.maps @ image
+        self.surprise = float((left * self._moving(left)).sum() + image @ (prior @ image))
+        before = torch.linalg.cholesky(prior + held)
+        self.volume = 2 * float((root.diagonal().log() - before.diagonal().log()).sum())
         slope = self.slopes(image)  # [N, K, P]
         frames, kinds = slope.shape[:2]
         # Coordinates in which each frame alone would know its pose equally well in all directions.
@@ -275,19 +500,19 @@ class Fit:
         up = torch.block_diag(*torch.linalg.inv(lower).mT)
         step = (up @ inverse @ pull).reshape(frames, kinds).numpy()
         covariance = (up @ inverse @ up.mT).reshape(frames, kinds, frames, kinds).numpy()
-        found = image.reshape(self.target_plane.shape)
-        return found, step, covariance, float(self._moving(left).square().sum())
+        return image.reshape(self._found), step, covariance, float(self._moving(left).square().sum())
 
     def slopes(self, image: torch.Tensor) -> torch.Tensor:
-        """Return the frames' derivatives, [N, K, P], a metre, at a target [n n]."""
+        """Return the frames' derivatives, [N, K, P], a metre, by the poses of all targets, at these [K n n]."""
         rows = []
-        for own, away, at, weights, ways in self._sights:
+        for sights in self._sights:
             each = []
-            for kind in self._kinds:
-                cells = torch.zeros(own.shape[1], dtype=image.dtype)
-                used = weights if kind == 2 else ways[kind]
-                cells.index_add_(0, at.flatten(), (used * image).flatten())
-                each.append((away if kind == 2 else own) @ cells / self._scale[kind])
+            for (own, away, at, weights, ways), one in zip(sights, image.reshape(len(sights), -1), strict=True):
+                for kind in self._each:
+                    cells = torch.zeros(own.shape[1], dtype=image.dtype)
+                    used = weights if kind == 2 else ways[kind]
+                    cells.index_add_(0, at.flatten(), (used * one).flatten())
+                    each.append((away if kind == 2 else own) @ cells / self._scale[kind])
             rows.append(torch.stack(each))
         return torch.stack(rows)
 

@@ -18,12 +18,36 @@ from evnlos.machine import note
 from evnlos.optics.interpolation import MARGIN, spline_coefficients
 from evnlos.types import Events
 
+_LEAST_FRAMES = 4
 _EDGE = 0.02  # of the template's peak; weaker light is left to the background
 _LEAST_SIGNAL = 6.0  # standard deviations of the noise that the object's peak must have
 _LEAST_EXPLAINED = 0.5  # share of what changes between the frames that one shifted image must explain
 _STEP = np.array([2.0, 2.0, 0.2, 0.2])  # largest step of (x, y, ln size, ln brightness), pixels and shares
 _FIT_STEPS = 2
 _ROUNDS = 8
+
+
+def reduced(frames: NDArray, columns: int) -> NDArray:
+    """Return frames [N, H, W] of at most so many columns, by area averaging; refuse too few."""
+    if len(frames) < _LEAST_FRAMES:
+        raise DataError(f"{len(frames)} frames; tracking needs {_LEAST_FRAMES} or more")
+    height, width = int(frames.shape[1]), int(frames.shape[2])
+    columns = min(columns, width)
+    return reduce_by_area(frames, (max(1, round(height * columns / width)), columns))
+
+
+def temporal_noise(frames: NDArray) -> float:
+    """Return the standard deviation of the noise that changes from frame to frame, in the frames' unit.
+
+    Median absolute value of second differences, in time and then over neighbours: a smooth image that moves
+    leaves next to nothing there.
+
+    Args:
+        frames: Real [N, H, W], three or more along each axis.
+    """
+    change = (frames[2:] - 2 * frames[1:-1] + frames[:-2]) / np.sqrt(6)
+    around = change[:, :-2, 1:-1] + change[:, 2:, 1:-1] + change[:, 1:-1, :-2] + change[:, 1:-1, 2:]
+    return float(1.4826 * np.median(np.abs(4 * change[:, 1:-1, 1:-1] - around)) / np.sqrt(20))
 
 
 @dataclass(frozen=True, eq=False)

@@ -271,7 +271,7 @@ class Track:
         frame_position: What the frames alone say, [N, 2], in `unit`.
         frame_sigma: Its standard deviation, [N, 2].
         size: Size of the object's image in each frame over its mean size, [N]; it falls as the object moves
-            away from the wall.
+            away from the wall. NaN where several objects were followed.
         size_sigma: Standard deviation of the size, [N].
         event_windows: Number of velocities that came from events.
         distance: Distance from the wall, where it was looked for.
@@ -357,6 +357,8 @@ class Track:
                 "size_sigma",
             )
         }
+        if np.isnan(self.size).any():
+            arrays = {name: values for name, values in arrays.items() if not name.startswith("size")}
         found = {"unit": self.unit, "event_windows": self.event_windows, **arrays}
         if self.misfit is not None:
             found["misfit"] = round(self.misfit, 3)
@@ -364,3 +366,32 @@ class Track:
             if part is not None:
                 found[name] = {key: np.round(values, 7).tolist() for key, values in vars(part).items()}
         return found
+
+
+def straightened(
+    step: NDArray[np.float64], covariance: NDArray[np.float64], pose: NDArray[np.float64], bend: float
+) -> NDArray[np.float64]:
+    """Return the step [N, K] to poses whose second differences are small too: one update of a Kalman filter."""
+    count, kinds = step.shape
+    bends = np.kron(np.diff(np.eye(count), n=2, axis=0), np.eye(kinds))
+    flat = covariance.reshape(count * kinds, -1)
+    gain = flat @ bends.T @ np.linalg.inv(bends @ flat @ bends.T + bend**2 * np.eye(len(bends)))
+    return step - (gain @ (bends @ (pose + step).ravel())).reshape(step.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Paths and images of several hidden objects, followed at once.
+
+    Args:
+        tracks: The path of each.
+        images: Each one's brightness, its light's middle in the array's middle, float64 [K, n, n].
+        size_m: Side of an image, metres.
+        gains: Where the number was looked for: ln of the evidence of 1, 2, ... objects over that of one less;
+            the last is that of one more than were found, or of the most that are looked for.
+    """
+
+    tracks: tuple[Track, ...]
+    images: NDArray[np.float64]
+    size_m: float
+    gains: tuple[float, ...] = ()
