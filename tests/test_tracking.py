@@ -14,10 +14,8 @@ import yaml
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.cli.invert_captures import linear_setup
-from evnlos.cli.results import true_path
 from evnlos.config import read_yaml, save_yaml
-from evnlos.data import CaptureInfo, FixedPattern, Sampling, read_capture, save_pattern
-from evnlos.data.capture import Capture
+from evnlos.data import Capture, CaptureInfo, FixedPattern, Sampling, read_capture, save_pattern
 from evnlos.data.capture_info import CameraInfo
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize, Simulation
@@ -45,6 +43,7 @@ from evnlos.tracking import (
     smooth,
     smooth_together,
     static_light,
+    straightened,
     temporal_noise,
     track_capture,
     track_frames,
@@ -53,7 +52,6 @@ from evnlos.tracking import (
 )
 from evnlos.tracking.motion_fit import Fit, Lights
 from evnlos.tracking.registration import explained_change
-from evnlos.tracking.track import straightened
 from evnlos.types import Events, Plane
 
 SHAPE = (24, 36)
@@ -766,6 +764,13 @@ LETTERS = [
 ]
 
 
+def middle_of_light(scene: Scene, times: np.ndarray) -> np.ndarray:
+    """Return where the light of an upright target has its middle, [N, 2], metres."""
+    mask, size = scene.target.mask.astype(float), scene.target.size_m
+    at = ((np.arange(len(mask)) + 0.5) / len(mask) - 0.5) * size
+    return scene.motion.position_m(times) + np.array([mask.sum(0) @ at, mask.sum(1) @ at]) / mask.sum()
+
+
 def several_frames(count: int) -> tuple[np.ndarray, np.ndarray, list[Scene]]:
     """Return frames [13, h, w] of the first letters, their times, and the scenes."""
     times = np.linspace(0.2, 6.2, 13)
@@ -785,7 +790,7 @@ def test_the_number_of_objects_is_found_with_their_paths(count) -> None:
     assert all(gain > 50 for gain in number.gains[:-1]) and number.gains[-1] < -10
     if not scenes:
         return
-    truth = np.stack([true_path(one, times) for one in scenes], axis=1)
+    truth = np.stack([middle_of_light(one, times) for one in scenes], axis=1)
     found = number.fits[count - 1].position_m
     order = [
         int(np.linalg.norm(truth - found[:, k : k + 1], axis=-1).mean(axis=0).argmin()) for k in range(count)
@@ -813,8 +818,12 @@ def test_several_objects_of_a_capture_are_followed_and_drawn(tmp_path, capsys) -
     assert images["object_1"].shape == (32, 32) and images["object_2"].max() > 0.3
     for name in ("path_1.png", "path_2.png", "path_images.png"):
         assert (tmp_path / name).is_file()
+    assert told["warnings"] == []
+    wrong = yaml.safe_load((tmp_path / "setup.yaml").read_text())
+    (tmp_path / "setup.yaml").write_text(yaml.safe_dump({**wrong, "distance_m": 0.36}))
     main([*words, "--out", str(tmp_path / "path.png")])
-    assert "U: error" in capsys.readouterr().out
+    shown = capsys.readouterr()
+    assert "U: error" in shown.out and "capture.yaml states a distance" in shown.err
 
 
 def test_what_several_objects_need_is_named() -> None:
@@ -828,3 +837,5 @@ def test_what_several_objects_need_is_named() -> None:
         track_several(capture, None, Tracking(targets="auto"))
     with pytest.raises(ConfigError, match="depth and turning are found of one"):
         track_several(capture, WIDE, Tracking(targets=2, depth=True))
+    with pytest.raises(DataError, match="none: its frames show no noise"):
+        track_several(replace(capture, frames=np.zeros(frames.shape, np.uint8)), WIDE, Tracking(targets="auto"))

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import tyro
 
-from evnlos.cli.parsing import check_files, drawn, say
+from evnlos.cli.parsing import check_files, drawn, say, tracks_text
 from evnlos.cli.recordings import Folders
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
@@ -363,7 +363,7 @@ def sequence_table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool) -> None:
+def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool, warnings: list[str]) -> None:
     """Print paths of several objects, each with the nearest true one, and write each path and image.
 
     Args:
@@ -371,6 +371,7 @@ def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool) -> No
         found: Paths and images.
         out: NAME.png: NAME_1.png, ... show the paths, NAME_images.png the objects.
         as_json: Print one JSON object.
+        warnings: Why paths may be wrong by more than they state.
     """
     from evnlos.cli.results import track_values, true_path
     from evnlos.plot.results import draw_inversion, draw_track
@@ -390,23 +391,9 @@ def show_tracks(capture: Capture, found: Tracks, out: Path, as_json: bool) -> No
         pictures.append(drawn(path, partial(draw_inversion, path, panels)))
         _save_arrays(path, {f"object_{k + 1}": one for k, one in enumerate(found.images)})
     told = {"capture": capture.name, "targets": len(rows), "evidence_gains": list(found.gains), "objects": rows}
-    told |= {"image_size_m": found.size_m, "pictures": [one for one in pictures if one]}
+    told |= {"image_size_m": found.size_m, "pictures": [one for one in pictures if one], "warnings": warnings}
     text = json.dumps({**told, "tracks": [track.summary() for track in found.tracks]})
     write_atomically(out.with_suffix(".json"), text.encode())
     print(json.dumps(told) if as_json else tracks_text(told))
-
-
-def tracks_text(told: dict[str, Any]) -> str:
-    """Return the figures of several objects as lines for people."""
-    lines = [f"{told['capture']}: {told['targets']} moving objects"]
-    for k, gain in enumerate(told["evidence_gains"]):
-        lines.append(f"evidence    ln {gain:+.0f} for {k + 1} over {k}")
-    for k, row in enumerate(told["objects"]):
-        travel, speed, sigma = (1e3 * row[name] for name in ("travel", "mean_speed", "position_sigma"))
-        lines.append(f"object {k + 1}    travel {travel:.1f} mm, {speed:.2f} mm/s, position +- {sigma:.2f} mm")
-        if row["target"] is not None:
-            x, y = (1e3 * one for one in row["position_offset"])
-            lines[-1] += (
-                f"; {row['target']}: error {1e3 * row['position_error']:.2f} mm rms about ({x:.2f}, {y:.2f})"
-            )
-    return "\n".join([*lines, *told["pictures"]])
+    for warning in warnings:
+        say(f"warning: {warning}")

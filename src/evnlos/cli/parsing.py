@@ -3,6 +3,7 @@
 - Notes on stderr: how much a command says beside its result (`--log-level`, EVNLOS_LOG).
 - From the words after a verb to its command; what does not fit is one line, not the parser's box.
 - What names on a command line stand for, before the libraries of the work are there.
+- The figures of several objects as lines.
 """
 
 from __future__ import annotations
@@ -365,3 +366,19 @@ def _check_writable(path: Path) -> None:
 def _is_read_only(place: Path) -> bool:
     """Return whether a file system takes no file, which an administrator's rights hide."""
     return hasattr(os, "statvfs") and bool(os.statvfs(place).f_flag & os.ST_RDONLY)
+
+
+def tracks_text(told: dict[str, Any]) -> str:
+    """Return the figures of several objects as lines for people."""
+    lines = [f"{told['capture']}: {told['targets']} moving objects"]
+    for k, gain in enumerate(told["evidence_gains"]):
+        lines.append(f"evidence    ln {gain:+.0f} for {k + 1} over {k}")
+    for k, row in enumerate(told["objects"]):
+        travel, speed, sigma = (1e3 * row[name] for name in ("travel", "mean_speed", "position_sigma"))
+        lines.append(f"object {k + 1}    travel {travel:.1f} mm, {speed:.2f} mm/s, position +- {sigma:.2f} mm")
+        if row["target"] is not None:
+            x, y = (1e3 * one for one in row["position_offset"])
+            lines[-1] += (
+                f"; {row['target']}: error {1e3 * row['position_error']:.2f} mm rms about ({x:.2f}, {y:.2f})"
+            )
+    return "\n".join([*lines, *told["pictures"]])

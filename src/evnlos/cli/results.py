@@ -173,7 +173,8 @@ class TrackCommand:
                 follow = track_capture if self.settings.targets == 1 else track_several
                 track = follow(capture, setup, self.settings, pattern)
         if isinstance(track, Tracks):
-            show_tracks(capture, track, self.out, self.json)
+            odd = track_warnings(capture, setup, track.tracks[0]) if track.tracks else []
+            show_tracks(capture, track, self.out, self.json, odd)
             return
         truth = None if track.unit != "m" or capture.scene is None else true_path(capture.scene, track.time_s)
         found = track_values(capture, track, truth)

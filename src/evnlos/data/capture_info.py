@@ -389,8 +389,7 @@ def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
         DataError: It is no name, lies outside the folder, or does not exist.
     """
     try:
-        path = (folder / name).resolve()
-        there = path.exists()
+        there = (path := (folder / name).resolve()).exists()
     except (OSError, ValueError) as error:
         raise DataError(f"{folder}: {name[:80]!r} is no name of a file ({error})") from None
     if not path.is_relative_to(folder.resolve()):

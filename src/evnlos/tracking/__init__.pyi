@@ -34,3 +34,4 @@ from .track import Turn as Turn
 from .track import most_likely_acceleration as most_likely_acceleration
 from .track import plane_map as plane_map
 from .track import smooth as smooth
+from .track import straightened as straightened

@@ -147,9 +147,12 @@ def track_several(
         raise ConfigError(
             f"Tracking.targets is {settings.targets}; depth and turning are found of one: leave them out"
         )
-    times_s = capture.frame_times_us.astype(np.float64) * 1e-6
     small = reduced(_levels(capture, pattern), settings.columns)
-    noise = temporal_noise(small)
+    times_s, noise = capture.frame_times_us.astype(np.float64) * 1e-6, temporal_noise(small)
+    if not noise > 0:
+        raise DataError(
+            f"{capture.name}: its frames show no noise; give a recording with frames that are not clipped"
+        )
     light = torch.from_numpy(small - static_light(small, settings.degree))
     size_m, gains = settings.target_size_m, list[float]()
     if settings.targets == "auto":
