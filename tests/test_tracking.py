@@ -637,7 +637,7 @@ def test_the_command_inverts_a_sequence(capture, tmp_path, capsys) -> None:
 def test_a_folder_without_a_setup_is_no_photograph(capture, capsys) -> None:
     with pytest.raises(SystemExit):
         main(["invert", str(capture[0])])
-    assert "give one NPZ file, or capture folders and --setup" in capsys.readouterr().err
+    assert "give one NPZ file, or capture folders and their --setup" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["near_G", pytest.param("far_G", marks=pytest.mark.thorough)])
