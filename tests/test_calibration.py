@@ -246,7 +246,9 @@ def test_unfit_captures_are_named(copies, change, words) -> None:
     assert copies[1].name in str(error.value) and "\n" not in str(error.value)
 
 
-def test_too_few_captures_and_unknown_names(folders) -> None:
+def test_too_few_captures_and_unknown_names(folders, copies) -> None:
+    with pytest.raises(DataError, match="different names; rename those that share one"):
+        read_capture_set([*folders, copies[0]])
     with pytest.raises(DataError, match=r"2 capture\(s\) are left"):
         read_capture_set(folders[:2])
     with pytest.raises(DataError, match="no capture is named Z"):

@@ -172,7 +172,7 @@ def read_yaml(path: str | Path, most_bytes: int = _MOST_BYTES) -> dict[str, Any]
         raise ConfigError(f"{path} can't be read as a YAML file: {error}") from None
     except (yaml.YAMLError, RecursionError, ValueError, ArithmeticError, LookupError, TypeError) as error:
         # PyYAML hands on what Python says of impossible dates and of numbers without digits, or with thousands.
-        reason = " ".join(str(error).split())
+        reason = " ".join(str(error).replace(' in "<unicode string>",', " at").split())
         raise ConfigError(f"{path} is not valid YAML: {reason[:500]}") from None
     if not isinstance(values, dict):
         raise ConfigError(f"{path} holds {type(values).__name__}; give a mapping of setting names to values")

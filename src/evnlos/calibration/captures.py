@@ -178,25 +178,25 @@ def read_capture_set(
         DataError: Too few captures, two of one name, one without target or motion, or captures of different
             cameras, setups or targets.
     """
-    paths = {Path(folder).resolve().name: Path(folder).resolve() for folder in folders}
+    given = {Path(folder).resolve() for folder in folders}
+    paths = {path.name: path for path in given}
+    if len(paths) < len(given):
+        raise DataError(f"{len(given)} folders have {len(paths)} different names; rename those that share one")
     _refuse_strangers(paths, (*exclude, *holdout))
     chosen = [name for name in sorted(paths) if not _named(name, exclude)]
     if len(chosen) < FEWEST:
-        raise DataError(
-            f"{len(chosen)} capture(s) are left to calibrate on; give {FEWEST} or more, best 20, of one setup"
-        )
+        needed = f"give {FEWEST} or more, best 20, of one setup"
+        raise DataError(f"{len(chosen)} capture(s) are left to calibrate on; {needed}")
     captures = [read_capture(paths[name], needs_events=False) for name in chosen]
-    if target_size_m is not None:
-        captures = [replace(capture, target=None) for capture in captures]
+    captures = captures if target_size_m is None else [replace(one, target=None) for one in captures]
     for capture in captures:
         _motion(capture) if target_size_m is not None else _scene(capture)
         _check_same_setup(captures[0], capture)
     side = _scene(captures[0]).target.size_m if target_size_m is None else target_size_m
     held = {name for name in chosen if _named(name, holdout)} or _drawn(chosen, share, seed)
     if len(chosen) - len(held) < FEWEST - 1:
-        raise DataError(
-            f"{len(held)} of {len(chosen)} captures are held out; leave {FEWEST - 1} or more to fit"
-        )
+        least = f"leave {FEWEST - 1} or more to fit"
+        raise DataError(f"{len(held)} of {len(chosen)} captures are held out; {least}")
     return (
         CaptureSet(tuple(capture for capture in captures if capture.name not in held), side),
         CaptureSet(tuple(capture for capture in captures if capture.name in held), side),
