@@ -146,7 +146,7 @@ def test_a_new_folder_explains_itself_and_is_read_back(tmp_path, capsys) -> None
     )
     assert "evnlos capture check" in capsys.readouterr().out
     info = read_capture_info(tmp_path / "recording")
-    assert (info.camera.width, info.camera.height, info.camera.name) == (640, 480, "EVK  4")
+    assert (info.camera.width, info.camera.height, info.camera.name) == (640, 480, "EVK 4")
     text = (tmp_path / "recording" / "capture.yaml").read_text()
     # Every setting that is offered in a comment is one that the reader knows.
     offered = [line[2:] for line in text.splitlines() if line.startswith("# ") and ": {" in line]

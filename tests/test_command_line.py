@@ -90,7 +90,7 @@ def test_log_levels(recording, monkeypatch, capsys) -> None:
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
 def test_words_that_do_not_fit_are_one_line_whatever_the_terminal_shows(encoding: str) -> None:
     for words, said in (
-        (("--port", "abc"), "Error parsing --port: invalid literal for int() with base 10: 'abc'"),
+        (("--port", "abc"), "--port is 'abc'; give a whole number"),
         (("--prot", "3"), "Unrecognized options: --prot, 3; Perhaps you meant: --port INT"),
         (("--port",), "Missing value for argument '--port'. Expected 1 values"),
     ):

@@ -23,7 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from evnlos.analysis.scores import CHARACTERS, CharacterReader
-from evnlos.data.capture_info import character_of
+from evnlos.data import character_of
 from evnlos.files import write_atomically
 from evnlos.models.confidence import SIDE
 from evnlos.scene import FontGlyphs, HandwritingGlyphs, Target

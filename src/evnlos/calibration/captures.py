@@ -185,8 +185,9 @@ def read_capture_set(
     _refuse_strangers(paths, (*exclude, *holdout))
     chosen = [name for name in sorted(paths) if not _named(name, exclude)]
     if len(chosen) < FEWEST:
-        needed = f"give {FEWEST} or more, best 20, of one setup"
-        raise DataError(f"{len(chosen)} capture(s) are left to calibrate on; {needed}")
+        raise DataError(
+            f"{len(chosen)} capture(s) are left to calibrate on; give {FEWEST} or more, best 20, of one setup"
+        )
     captures = [read_capture(paths[name], needs_events=False) for name in chosen]
     captures = captures if target_size_m is None else [replace(one, target=None) for one in captures]
     for capture in captures:

@@ -180,7 +180,11 @@ def _end_anew(lost: Any) -> None:
         return
     again = threading.Timer(_AGAIN_S, signal.raise_signal, (signal.SIGTERM,))
     again.daemon = True
-    again.start()
+    try:
+        again.start()
+    except SystemExit:  # one more signal struck here
+        if not again.is_alive():
+            os._exit(128 + signal.SIGTERM)
 
 
 def _end_with(parent: int) -> None:
