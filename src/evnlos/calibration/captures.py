@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.data.capture import Capture, read_capture
+from evnlos.data.capture import Capture, by_name, read_capture
 from evnlos.data.sampling import character_of, reduce_by_area
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
@@ -178,10 +178,7 @@ def read_capture_set(
         DataError: Too few captures, two of one name, one without target or motion, or captures of different
             cameras, setups or targets.
     """
-    given = {Path(folder).resolve() for folder in folders}
-    paths = {path.name: path for path in given}
-    if len(paths) < len(given):
-        raise DataError(f"{len(given)} folders have {len(paths)} different names; rename those that share one")
+    paths = by_name({Path(folder).resolve() for folder in folders})
     _refuse_strangers(paths, (*exclude, *holdout))
     chosen = [name for name in sorted(paths) if not _named(name, exclude)]
     if len(chosen) < FEWEST:

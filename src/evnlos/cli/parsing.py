@@ -345,9 +345,11 @@ def check_out(path: Path, kind: str) -> None:
     if kind.startswith("OutFolder") and path.exists() and not path.is_dir():
         raise ConfigError(f"{path} is a file; give the name of a folder")
     _check_writable(path)
-    if kind.startswith(("OutFile", "OutImage")) and not path.parent.is_dir():
+    if not kind.startswith(("OutFile", "OutImage")):
+        return
+    if not path.parent.is_dir():
         raise ConfigError(f"{path}: no such folder {path.parent}; create it first")
-    if kind.startswith(("OutFile", "OutImage")) and path.is_dir():
+    if path.is_dir():
         raise ConfigError(f"{path} is a folder; give the name of a file")
     if kind.startswith("OutImage") and path.suffix.lower() not in _IMAGES:
         raise ConfigError(f"{path} is no image of a known format; end its name in .png, .svg or .pdf")

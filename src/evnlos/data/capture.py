@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -15,12 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evnlos.config import config_hash, to_dict
-from evnlos.data.capture_info import (
-    CaptureInfo,
-    FilterInfo,
-    inside,
-    read_capture_info,
-)
+from evnlos.data.capture_info import CaptureInfo, FilterInfo, inside, read_capture_info
 from evnlos.data.clocks import find_offset
 from evnlos.data.fixed_pattern import FixedPattern, mapped, prepare_frames
 from evnlos.data.frames import read_frame_series
@@ -201,6 +196,14 @@ def read_capture(
     return Capture(name, info, events, held, times_us, target, tuple(map(printable, notes)), others)
 
 
+def by_name(paths: Collection[Path]) -> dict[str, Path]:
+    """Return captures by name; refuse those that share one."""
+    named = {_name_of(path): path for path in paths}
+    if len(named) < len(paths):
+        raise DataError(f"{len(paths)} folders have {len(named)} different names; rename those that share one")
+    return named
+
+
 def _name_of(path: Path) -> str:
     """Return the name of a capture: that of its folder, or of its file without the ending."""
     return path.stem if path.is_file() else path.name
@@ -335,12 +338,9 @@ def import_captures(
     Raises:
         DataError: No folder, two captures of one name, or a held-out name that no capture has.
     """
-    given = [Path(folder).resolve() for folder in folders]
-    paths = {_name_of(path): path for path in given}
+    paths = by_name([Path(folder).resolve() for folder in folders])
     if not paths:
         raise DataError("no captures given; name at least one capture folder")
-    if len(paths) != len(given):
-        raise DataError(f"{len(given)} folders have {len(paths)} different names; rename those that share one")
     split = _split(list(paths), list(test), list(validation))
     # Read every description first: a wrong folder is an error before anything is written.
     for path in paths.values():

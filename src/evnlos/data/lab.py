@@ -20,7 +20,7 @@ from evnlos.cameras import EventPixel, FrameCamera, V2ePixel
 from evnlos.config import check_made, differing_keys, from_dict, read_yaml, save_yaml, to_dict
 from evnlos.data.capture import Capture, read_capture
 from evnlos.data.pool import processes, run_tasks
-from evnlos.data.sampling import mask_file, stated_targets
+from evnlos.data.sampling import character_of, mask_file, stated_targets
 from evnlos.data.simulate import check_ranges, check_sequences, sequence_bytes, varied
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import write_events
@@ -341,7 +341,7 @@ def _record(lab: Lab, drawn: Lab, path: Path) -> None:
 
 def _folder_name(lab: Lab, name: str) -> str:
     """Return NAME_A for a font, which shows each character once, and NAME_object for other glyphs."""
-    return f"{lab.name}_{name.rsplit('_', 1)[-1] if isinstance(lab.glyphs, FontGlyphs) else name}"
+    return f"{lab.name}_{character_of(name) if isinstance(lab.glyphs, FontGlyphs) else name}"
 
 
 def _scene(lab: Lab, name: str) -> Scene | SeveralTargets:

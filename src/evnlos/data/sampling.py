@@ -2,6 +2,7 @@
 
 - Where the pixels of the frame camera lie on those of the event camera.
 - Samples at a working resolution: a frame, a time surface and the truth of each position.
+- What a capture's description says of its targets and their motions.
 """
 
 from __future__ import annotations

@@ -33,10 +33,8 @@ MOST_TARGETS = 5
 """Largest number of targets that is looked for by evidence."""
 _ROUNDS, _TRIAL_ROUNDS, _STRAIGHT_ROUNDS = 24, 12, 5
 _FIRST_FRAMES = 24  # of which first guesses of paths are made
-_STRIDE, _BEND = (
-    3,
-    0.1,
-)  # cells between two of them at most; what a bend of one cell costs, of the brightest score
+_STRIDE = 3  # cells between two of them at most
+_BEND = 0.1  # what a bend of one cell costs, of the brightest score
 _STATIC = 1.0  # a pixel's constant offset over its noise
 _PRIOR = 3.0  # weight of the target's smoothness, in units of the noise's variance
 _MARGIN_M = 0.03
@@ -311,19 +309,15 @@ def _brightest_path(score: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDAr
             for b in range(3)
         ]
         before = np.argmax(options, axis=0)
-        top = np.pad(
-            np.max(options, axis=0), ((0, 0), (0, 0), (_STRIDE,) * 2, (_STRIDE,) * 2), constant_values=-np.inf
-        )
-        before = np.pad(before, ((0, 0), (0, 0), (_STRIDE,) * 2, (_STRIDE,) * 2))
+        margin = ((0, 0), (0, 0), (_STRIDE,) * 2, (_STRIDE,) * 2)
+        top = np.pad(np.max(options, axis=0), margin, constant_values=-np.inf)
+        before = np.pad(before, margin)
         best = np.empty((side, side, height, width))
         for i in range(side):
             for j in range(side):
-                rows, columns = (
-                    slice(side - 1 - i, side - 1 - i + height),
-                    slice(side - 1 - j, side - 1 - j + width),
-                )
-                best[i, j] = top[i, j, rows, columns] + score[t]
-                came[t, i, j] = before[i, j, rows, columns]
+                y, x = side - 1 - i, side - 1 - j
+                best[i, j] = top[i, j, y : y + height, x : x + width] + score[t]
+                came[t, i, j] = before[i, j, y : y + height, x : x + width]
     i, j, row, column = (int(one) for one in np.unravel_index(int(np.argmax(best)), best.shape))
     path = [(row, column)]
     for t in range(len(score) - 1, 0, -1):
@@ -428,11 +422,8 @@ class Fit:
         kinds: list[int],
         scale: NDArray[np.float64],
     ) -> None:
-        self.target_plane, self._scale, self._found = (
-            target_plane,
-            scale,
-            (*poses.shape[1:-1], *target_plane.shape),
-        )
+        self.target_plane, self._scale = target_plane, scale
+        self._found = (*poses.shape[1:-1], *target_plane.shape)
         targets = math.prod(poses.shape[1:-1])
         self._each, self._kinds = kinds, kinds * targets
         self._sights = [
