@@ -54,7 +54,7 @@ def test_a_calibrated_folder_may_be_moved(tmp_path) -> None:
         noise=SimpleNamespace(pattern=FixedPattern(ones, 0 * ones)),  # type: ignore[arg-type]
         pixel=None,
         residuals={
-            name: Residual(before=0.5, after=0.1, noise=0.1)
+            name: Residual(before=0.5, after=0.102, noise=0.1)
             for name in ("frames fit", "frames held out", "frames held out, without pattern")
         },
         example=(),
@@ -67,7 +67,8 @@ def test_a_calibrated_folder_may_be_moved(tmp_path) -> None:
         assert str(tmp_path) not in (folder / name).read_text()
     moved.parent.mkdir()
     folder.rename(moved)
-    assert load_setup(moved) == replace(setup, file=str(moved / "wall.safetensors"))
+    found = load_setup(moved)  # which says what it leaves of the light beside the noise
+    assert found == replace(setup, file=str(moved / "wall.safetensors"), unexplained=0.0201)
     main(
         [
             "simulate",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from scipy.ndimage import gaussian_filter
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera
 from evnlos.cli import main
@@ -799,6 +800,19 @@ def test_the_number_of_objects_is_found_with_their_paths(count) -> None:
     assert np.linalg.norm(found - truth[:, order], axis=-1).max() < 6e-3
     if count == 2:  # they do cross
         assert np.linalg.norm(truth[:, 0] - truth[:, 1], axis=-1).min() < 0.035
+
+
+@pytest.mark.parametrize(("least", "stated", "found"), [(0.01, 0.0, 1), (0.0, 0.0, 2), (0.0, 0.01, 1)])
+def test_an_error_of_the_setup_is_no_second_object(monkeypatch, least, stated, found) -> None:
+    """An unknown texture of 1 % makes up a second object, unless errors of that size are allowed."""
+    monkeypatch.setattr("evnlos.tracking.motion_fit.LEAST_ERROR", least)
+    monkeypatch.setattr(RadiometricSetup, "unexplained", stated)
+    _, times, scenes = several_frames(1)
+    light = WIDE.observe(scenes[0]).irradiance(times).numpy() - WIDE.ambient_light().numpy()
+    texture = gaussian_filter(np.random.default_rng(3).standard_normal(light.shape[1:]), 1.5)
+    light = light * (1 + 0.01 * texture / texture.std())
+    light += 3e-4 * np.random.default_rng(1).standard_normal(light.shape)
+    assert count_targets(torch.from_numpy(light), WIDE, times, 3e-4, 0.1, cells=10, most=2).found == found
 
 
 def test_several_objects_of_a_capture_are_followed_and_drawn(tmp_path, capsys) -> None:

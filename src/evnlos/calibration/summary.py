@@ -322,7 +322,8 @@ def _with_wall(fit: SetupFit, simulation: Simulation, out: Path) -> Simulation:
     path = (out / WALL_FILE).resolve()
     if Path(setup.file).resolve() != path:
         write_atomically(path, Path(setup.file).read_bytes())
-    return simulation.with_setup(file=str(path), misfit="; ".join(warnings_of(fit)))
+    left = round(fit.residuals["frames held out, without pattern"].unexplained, 4)
+    return simulation.with_setup(file=str(path), misfit="; ".join(warnings_of(fit)), unexplained=left)
 
 
 def _with_targets(fit: SetupFit, simulation: Simulation, folder: Path) -> Simulation:

@@ -372,9 +372,10 @@ def _is_read_only(place: Path) -> bool:
 
 def tracks_text(told: dict[str, Any]) -> str:
     """Return the figures of several objects as lines for people."""
-    lines = [f"{told['capture']}: {told['targets']} moving objects"]
+    lines = [f"{told['capture']}: {told['targets']} moving object{'s' * (told['targets'] != 1)}"]
     for k, gain in enumerate(told["evidence_gains"]):
-        lines.append(f"evidence    ln {gain:+.0f} for {k + 1} over {k}")
+        error = " and the setup's own error" if k else ""
+        lines.append(f"evidence    ln {gain:+.0f} for {k + 1} over {k}{error}")
     for k, row in enumerate(told["objects"]):
         travel, speed, sigma = (1e3 * row[name] for name in ("travel", "mean_speed", "position_sigma"))
         lines.append(f"object {k + 1}    travel {travel:.1f} mm, {speed:.2f} mm/s, position +- {sigma:.2f} mm")

@@ -96,6 +96,8 @@ class Setup(Kinded, ABC):
     """Whether a setup of this kind that is called by its name states light and cameras, too."""
     artifact: ClassVar[str] = ""
     """What the kind's model adds to a real wall, in words; see `without_artifacts`."""
+    unexplained: ClassVar[float] = 0.0
+    """Share of the light that the setup gets wrong; 0 = not known. A calibrated setup has it as a setting."""
 
     kind: str = ""
     """Kind of this setup."""
@@ -313,11 +315,7 @@ class Setup(Kinded, ABC):
         return 16 * self.shape[0] * self.shape[1]
 
     def measurement(self) -> Measurement:
-        """Return the scan that the setup was measured by.
-
-        Raises:
-            ConfigError: It was not measured.
-        """
+        """Return the scan that the setup was measured by; ConfigError where it was not."""
         raise ConfigError(
             f"the setup is of kind {self.kind!r}; images need a measured one (evnlos scan), captures are "
             "folders"

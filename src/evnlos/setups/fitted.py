@@ -79,6 +79,8 @@ class FittedSetup(Setup):
     """Width and height of the region in which the target moves, metres."""
     misfit: str = ""
     """What the calibration could not explain; empty = nothing worth a warning."""
+    unexplained: float = 0.0  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Share of the light of captures held out that the calibration left beside the noise; 0 = not known."""
 
     def fitted(self) -> FittedWall:
         """Return the fitted wall; the file is read once.
@@ -300,7 +302,7 @@ class FittedSetup(Setup):
         return _companion_transport(self._key(), shape, device), shown
 
     def _key(self) -> FittedSetup:
-        return replace(self.optics(), companion=1.0, misfit="")
+        return replace(self.optics(), companion=1.0, misfit="", unexplained=0.0)
 
     def _check_travel(self, scene: Scene) -> NDArray[np.float64]:
         """Return centres along the motion [65, 2], metres; refuse those off the strip."""

@@ -111,8 +111,8 @@ class Tracking:
     turning: bool = False
     """With a setup: also find how the object turns about the wall's normal."""
     targets: int | Literal["auto"] = 1
-    """Number of objects on paths of their own, or auto: by evidence, too many where the setup has errors of its
-    own. Other than 1 needs a setup, and looks at frames alone."""
+    """Number of objects on paths of their own, or auto: by evidence beyond what an error of the setup could
+    make. Other than 1 needs a setup, and looks at frames alone."""
     degree: int = 2
     """Degree of the ambient light over the wall, as a polynomial."""
 

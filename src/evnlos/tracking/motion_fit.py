@@ -31,6 +31,8 @@ REGION_M = (0.40, 0.28)
 """Sides of the part of the target's plane in which several targets are looked for, (x, y), metres."""
 MOST_TARGETS = 5
 """Largest number of targets that is looked for by evidence."""
+LEAST_ERROR = 0.01
+"""Share of the light that any setup is taken to get wrong; no target is told by less of it."""
 _ROUNDS, _TRIAL_ROUNDS, _STRAIGHT_ROUNDS = 24, 12, 5
 _FIRST_FRAMES = 24  # of which first guesses of paths are made
 _STRIDE = 3  # cells between two of them at most
@@ -41,6 +43,7 @@ _MARGIN_M = 0.03
 _STRIP_M = 0.04
 _LONGEST_M = 0.01  # step of one round
 _ENOUGH = 0.1  # of a place's standard deviation: a step below it changes nothing that is known
+_WORSE = 2.0  # of one recording's share that its setup gets wrong, over that of all captures held out
 _UNTOLD = 1e-7  # share of a direction's information that the target leaves, below which it is not told
 _HELD = 1e6  # weight of the light's middle in the target's middle, over that of the frames
 
@@ -209,7 +212,7 @@ class Number(NamedTuple):
     fits: list[MotionFit]
     """The likeliest paths and targets of 1, 2, ... targets, one more than were found at most."""
     gains: list[float]
-    """ln of the evidence of each number over that of one target less."""
+    """ln of the evidence of each number over that of one target less and the setup's own error."""
 
     @property
     def found(self) -> int:
@@ -228,16 +231,21 @@ def count_targets(
 ) -> Number:
     """Fit no target, one, two, ..., until one more is less likely: each pays for its paths and cells.
 
+    A setup is not exact: what its operator gets wrong moves along with the targets and looks like one more.
+    An error E of the operator with |E s| = e |s|, where s is the light of the targets found so far, raises ln
+    of the evidence by at most e^2 |s|^2 / (2 sigma^2): a further target has to raise it by more.
+
     Args:
         light: Frames without ambient light, white levels, [N, h, w].
-        setup: The setup.
+        setup: The setup; e is twice its `unexplained`, as recordings differ, and 1 % at least.
         times_s: Instants of the frames, [N], seconds.
         noise: Standard deviation of a sample's noise, white levels.
         target_size_m: Side of a target plane that surely holds an object, metres.
         cells: Cells a side of it.
         most: Largest number that is tried.
     """
-    found = Number([], [])
+    found, whole = Number([], []), moving_energy(light)
+    error = max(_WORSE * setup.unexplained, LEAST_ERROR)
     for number in range(1, most + 1):
         start_m = first_paths(light, setup, noise, target_size_m, number)
         fit = fit_motion(
@@ -245,8 +253,10 @@ def count_targets(
         )
         # The fit of more targets tells how much noise there is where the light is.
         sigma = noise * max(1.0, fit.inside)
-        empty = -0.5 * moving_energy(light) / sigma**2
-        fewer = log_evidence(found.fits[-1], times_s, sigma) if found.fits else empty
+        fewer = -0.5 * whole / sigma**2
+        if found.fits:
+            explained = max(whole - found.fits[-1].surprise, 0.0)
+            fewer = log_evidence(found.fits[-1], times_s, sigma) + 0.5 * error**2 * explained / sigma**2
         found.fits.append(fit)
         found.gains.append(log_evidence(fit, times_s, sigma) - fewer)
         if found.gains[-1] <= 0:

@@ -387,8 +387,8 @@ class Tracks:
         tracks: The path of each.
         images: Each one's brightness, its light's middle in the array's middle, float64 [K, n, n].
         size_m: Side of an image, metres.
-        gains: Where the number was looked for: ln of the evidence of 1, 2, ... objects over that of one less;
-            the last is that of one more than were found, or of the most that are looked for.
+        gains: Where the number was looked for: ln of the evidence of 1, 2, ... objects over that of one less
+            and the setup's own error; the last is that of one more than were found, or of the most.
     """
 
     tracks: tuple[Track, ...]
