@@ -251,8 +251,7 @@ def count_targets(
         fit = fit_motion(
             light, setup, start_m, noise, target_size_m, cells, rounds=_TRIAL_ROUNDS, bend_m=target_size_m / 50
         )
-        # The fit of more targets tells how much noise there is where the light is.
-        sigma = noise * max(1.0, fit.inside)
+        sigma = noise * max(1.0, fit.inside)  # the fit of more targets tells it where the light is
         fewer = -0.5 * whole / sigma**2
         if found.fits:
             explained = max(whole - found.fits[-1].surprise, 0.0)
