@@ -5,7 +5,7 @@
 The default simulation: 160 x 100 pixels, 8 s, 40 positions; the default network, one epoch. The stages are
 those of a GPU (`simulate_objects_on`, v2e's pixels in steps of 2 ms), also where the device is the CPU; a
 training on the CPU uses `simulate_object` instead, by default in one process. Wall time, after a group and an
-epoch to warm up.
+epoch to warm up. "By processes" is a process of `simulate_object` for each core, which feed the training.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import argparse
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -77,17 +77,17 @@ def stages(config: Simulation, names: list[str], device: torch.device, together:
     return {stage: seconds / count for stage, seconds in (*spent.items(), ("all", total))}
 
 
-def throughput(config: Simulation, together: int) -> dict[str, float]:
-    """Return samples a second of an epoch that reads shards, and of one that simulates, each after one more."""
+def throughput(config: Simulation, together: int) -> Iterator[tuple[str, float]]:
+    """Yield samples a second of an epoch that reads shards, and of one that simulates, each after one more."""
     samples = len(config.glyphs.objects()) * config.positions
-    found = {}
     with tempfile.TemporaryDirectory() as folder:
         simulate(config, Path(folder, "set"), workers=0)
         live = replace(live_dataset(config), together=together)
-        for kind, data in (("shards", open_dataset(Path(folder, "set"))), ("simulated", live)):
+        by_processes = live_dataset(config, workers=0, where="cpu")
+        sources = {"shards": open_dataset(Path(folder, "set")), "simulated": live, "by processes": by_processes}
+        for kind, data in sources.items():
             records = train(data, Training(epochs=2), Path(folder, kind)).records
-            found[kind] = samples / records[-1]["seconds"]
-    return found
+            yield kind, samples / records[-1]["seconds"]
 
 
 def main() -> None:
@@ -105,22 +105,28 @@ def main() -> None:
     glyphs = HandwritingGlyphs(writers=writers)
     config = Simulation(glyphs=glyphs, setup=PaperSetup(pixel=V2ePixel(), time_step_s=STEP_S), validation=0.0)
     names = config.glyphs.objects()[:count]
-    spent = stages(config, names, device, options.together)
     where = torch.cuda.get_device_name(device) if device.type == "cuda" else "no GPU"
-    lines = ["# Training on samples simulated meanwhile", "", *(__doc__ or "").split("\n\n")[2:]]
-    lines += [f"{machine('torch')}; {where}; {options.together} objects at a time", ""]
-    lines += ["| stage | ms per object | share |", "|---|---|---|"]
-    lines += [f"| {stage} | {1e3 * s:.1f} | {100 * s / spent['all']:.0f} % |" for stage, s in spent.items()]
+    lines = list[str]()
+
+    def tell(*more: str) -> None:
+        print(*more, sep="\n", flush=True)
+        lines.extend(more)
+
+    tell("# Training on samples simulated meanwhile", "", *(__doc__ or "").split("\n\n")[2:])
+    tell(f"{machine('torch')}; {where}; {options.together} objects at a time", "")
+    tell("| stage | ms per object | share |", "|---|---|---|")
+    spent = stages(config, names, device, options.together)
+    tell(*(f"| {stage} | {1e3 * s:.1f} | {100 * s / spent['all']:.0f} % |" for stage, s in spent.items()))
     few = names[: 1 + min(8, count - 1)]
     simulate_object(config, few[0])
     start = time.perf_counter()
     for name in few[1:]:
         simulate_object(config, name)
     alone = (time.perf_counter() - start) / max(1, len(few) - 1)
-    lines += [f"| `simulate_object`, one process | {1e3 * alone:.1f} | |", ""]
-    lines += ["| training, second epoch | samples/s |", "|---|---|"]
-    lines += [f"| {kind} | {speed:.0f} |" for kind, speed in throughput(config, options.together).items()]
-    print("\n".join(lines))
+    tell(f"| `simulate_object`, one process | {1e3 * alone:.1f} | |", "")
+    tell("| training, second epoch | samples/s |", "|---|---|")
+    for kind, speed in throughput(config, options.together):
+        tell(f"| {kind} | {speed:.0f} |")
     if options.results is not None:
         (options.results / "live_training.md").write_text("\n".join(lines) + "\n")
 

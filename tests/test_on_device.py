@@ -11,15 +11,17 @@ from evnlos.cameras.on_device import capture_tensors, record_tensors
 from evnlos.cameras.pixels.torch_noise import electrons
 from evnlos.cameras.random_numbers import fill_electrons
 from evnlos.cameras.streams import EventTensors
-from evnlos.data import Sampling, SensorSize, Simulation, live_dataset
+from evnlos.data import NlosDataset, Sampling, SensorSize, Simulation, live_dataset, simulate
 from evnlos.data.live import bytes_of_a_wall, simulate_objects_on, time_surface_tensors
 from evnlos.data.simulate import simulate_object
 from evnlos.errors import ConfigError, DataError
 from evnlos.events import time_surface
+from evnlos.models import UNetConfig, load_weights
 from evnlos.optics import SlidingWall, View
 from evnlos.optics.wall import slide
 from evnlos.scene import HandwritingGlyphs, LineMotion, PathMotion
 from evnlos.setups import PaperSetup, RadiometricSetup
+from evnlos.training import Training, train
 from evnlos.training.source import ProcessGroup, SimulatedSource
 from evnlos.types import Plane
 from pretend_device import PRETENDED, PretendedDevice
@@ -367,3 +369,76 @@ def test_a_gpu_may_be_fed_by_the_cpu(small) -> None:
         ((seen, truth),) = live_dataset(small, where="cpu").stream([name], 0, "fusion", PRETENDED)
         assert seen.device == truth.device == PRETENDED
         assert torch.equal(seen.cpu(), expected)
+
+
+# On a GPU, where there is one.
+
+
+@pytest.fixture(scope="module")
+def gpu() -> torch.device:
+    """The GPU, or a skip."""
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    return torch.device("cuda")
+
+
+@pytest.mark.parametrize(
+    ("kind", "surface"), [*((kind, "sae") for kind in WALLS), ("affine", "context"), ("affine", "hots")]
+)
+def test_cuda_simulates_what_the_cpu_simulates(gpu, small, kind, surface) -> None:
+    """Light differs in its last bits: single digital numbers of a frame, single events of a surface."""
+    config = replace(
+        small, setup=WALLS[kind].with_cameras_of(small.setup), sampling=replace(small.sampling, surface=surface)
+    )
+    names = config.glyphs.objects()
+    expected, made, again = (simulate_objects_on(config, names, where) for where in ("cpu", gpu, gpu))
+    for there, here, repeated in zip(made, expected, again, strict=True):
+        assert {part.device.type for part in there} == {"cuda"}
+        assert all(torch.equal(one, other) for one, other in zip(there, repeated, strict=True))
+        frame, seen, truth = (part.cpu() for part in there)
+        assert (frame - here.frame).abs().max() < 1.01 / 255
+        assert ((frame - here.frame).abs() > 1e-6).float().mean() < 0.01
+        assert here.surface.max() > 0.1
+        assert ((seen - here.surface).abs() > 1e-4).float().mean() < 0.01
+        torch.testing.assert_close(truth, here.truth, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", PIXELS)
+def test_cuda_pixels_send_the_events_of_the_cpu(gpu, name) -> None:
+    """Exponential and logarithm of a GPU differ in their last bit, which moves single events by a step."""
+    frames, times_s = _video(1, steps=40, height=6, width=50)
+    clips = torch.from_numpy(np.clip(frames, 0, 255).astype(np.float32))[None]
+    (expected,) = simulate_batch(clips, times_s, PIXELS[name], [5])
+    (made,) = simulate_batch(clips.to(gpu), times_s, PIXELS[name], [5])
+
+    def counts(events) -> np.ndarray:
+        return np.histogramdd((events.y, events.x, events.p), (range(7), range(51), range(3)))[0]
+
+    assert len(expected) > 50
+    assert np.abs(counts(made) - counts(expected)).sum() <= 0.01 * len(expected)
+
+
+@pytest.mark.parametrize("modality", ["frame", "event", "fusion"])
+def test_a_training_on_cuda_is_fed_there(gpu, small, modality) -> None:
+    source = SimulatedSource(live_dataset(small), modality, 3, 0, ProcessGroup(0, 1, gpu))
+    first, again = (list(source.batches(1)) for _ in range(2))
+    assert len(first) == source.steps == 3
+    for one, other in zip(first, again, strict=True):
+        assert one.seen.device.type == one.truth.device.type == "cuda"
+        assert torch.equal(one.seen, other.seen)
+
+
+def test_a_training_on_cuda_ends_where_that_of_the_cpu_does(gpu, small, tmp_path, monkeypatch) -> None:
+    config = replace(small, glyphs=replace(small.glyphs, characters="ABCDEFGH"), validation=0.25)
+    data = simulate(config, tmp_path / "set", workers=1)
+    settings = Training(epochs=2, batch_size=4, precision="float32", network=UNetConfig(width=8))
+    there = train(data, settings, tmp_path / "there")
+    with monkeypatch.context() as patched:
+        patched.setattr(torch.cuda, "is_available", lambda: False)
+        here = train(data, settings, tmp_path / "here")
+        samples = NlosDataset(data, "all", settings.modality)
+        images = load_weights(tmp_path / "there").network.infer(
+            samples.inputs, samples.position_m, samples.names
+        )
+    assert there.records[-1]["loss"] == pytest.approx(here.records[-1]["loss"], rel=1e-2)
+    assert images.device.type == "cpu" and images.isfinite().all()

@@ -449,7 +449,7 @@ class SequenceReconstructor(Reconstructor):
         for name in dict.fromkeys(samples.names.tolist()):
             mine = np.flatnonzero(samples.names == name)
             places = torch.from_numpy(samples.position_m[mine])
-            plane = self.grid.mean(samples.truth[torch.from_numpy(mine)], places).half()
+            plane = self.grid.mean(samples.truth[torch.from_numpy(mine)], places).half().cpu()
             kept = torch.zeros(augmentations, len(mine))
             for number in range(augmentations):
                 kept[number, _subset(number, len(mine), draw)] = 1
