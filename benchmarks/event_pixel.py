@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from evnlos.cameras import EventCamera, EventPixel, simulate_batch, simulate_events
+from evnlos.cameras import EventCamera, EventPixel, simulate_events
 from evnlos.cameras.simulation import Mode
 from evnlos.data.simulations import paper
 from evnlos.optics import Irradiance as CameraWall
@@ -202,16 +202,6 @@ def table(results: Results, unit: str, scale: Callable[[str], float]) -> list[st
     return lines
 
 
-def torch_run(gray: np.ndarray, times: np.ndarray, dtype: torch.dtype) -> Callable[[int], int]:
-    """Return a run of the batched path on PyTorch, on the CPU."""
-
-    def run(count: int) -> int:
-        clips = torch.from_numpy(gray[:count])[None]
-        return len(simulate_batch(clips, times[:count], PAPER, [0], dtype=dtype)[0])
-
-    return run
-
-
 def rival_runs(v2e: str | None, gray: np.ndarray, times: np.ndarray) -> dict[str, Callable[[int], int]]:
     """Return the runs of the other simulators that are present, on 8-bit frames."""
     runs = {}
@@ -329,8 +319,6 @@ def main() -> None:
         'evnlos, mode="v2e", 8-bit': ours(gray, "v2e"),
         'evnlos, mode="v2e", float': ours(light, "v2e"),
         'evnlos, mode="exact", float': ours(light, "exact"),
-        "evnlos, torch alone, 8-bit": torch_run(gray, times, torch.float64),
-        "evnlos, torch alone, float32, 8-bit": torch_run(gray, times, torch.float32),
     }
     results = interleaved({**runs, **rival_runs(args.v2e, gray, times)}, args.steps, args.rounds)
     pixel_steps = height * width * args.steps

@@ -105,7 +105,6 @@ WHOLE_CHAPTERS = {
     "cameras/pixels/brownian.py",
     "cameras/pixels/circuit.py",
     "cameras/pixels/readout.py",
-    "cameras/pixels/torch_v2e.py",
     "inverse/corner.py",
     "lab/light_path.py",
     "models/sequence.py",

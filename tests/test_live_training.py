@@ -8,19 +8,15 @@ import pytest
 import torch
 
 from evnlos import EvnlosError, train
-from evnlos.cameras import V2ePixel, simulate_batch
 from evnlos.cli import main
 from evnlos.config import save_yaml
 from evnlos.data import NlosDataset, live_dataset
-from evnlos.data.live import epoch_settings, simulate_objects_on
+from evnlos.data.live import epoch_settings
 from evnlos.data.pool import run_in_order
-from evnlos.data.sampling import edges_from, make_samples
-from evnlos.data.simulate import drawn_for, scene_of
 from evnlos.errors import ConfigError
 from evnlos.models import UNetConfig, load_weights
 from evnlos.training import Training
 from evnlos.training.source import ProcessGroup, SimulatedSource
-from evnlos.types import derive_seed
 from watching import stopped
 
 CPU = torch.device("cpu")
@@ -100,16 +96,7 @@ def test_training_without_a_dataset_goes_on_after_a_stop_with_the_same_bytes(few
 def test_the_command_simulates_as_it_trains(few, tmp_path, capsys) -> None:
     save_yaml(few, tmp_path / "setup.yaml")
     arguments = ["train", "--simulate", str(tmp_path / "setup.yaml"), "--epochs", "1", "--precision", "float32"]
-    arguments += [
-        "--simulation-device",
-        "cpu",
-        "--network.width",
-        "8",
-        "--network.depth",
-        "1",
-        "--network.shuffle",
-        "1",
-    ]
+    arguments += ["--network.width", "8", "--network.depth", "1", "--network.shuffle", "1"]
     main([*arguments, "--out", str(tmp_path / "run")])
     assert "1 epochs" in capsys.readouterr().out
     (line,) = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
@@ -129,28 +116,6 @@ def test_data_or_a_simulation_is_asked_for(given: list[str], tmp_path, capsys) -
 def test_nobody_to_train_on_is_refused(few) -> None:
     with pytest.raises(ConfigError, match="none to train on"):
         live_dataset(replace(few, glyphs=replace(few.glyphs, characters="A"), validation=0.9))
-
-
-@pytest.mark.parametrize("surface", ["sae", "context", "hots", "trace"])
-def test_samples_made_on_a_device_are_those_of_the_same_events(few, surface) -> None:
-    """Each stage is that of the CPU."""
-    sampling = replace(few.sampling, surface=surface, radius=2)
-    config = replace(few, sampling=sampling).with_setup(pixel=V2ePixel(threshold_sigma=0.02), time_step_s=0.002)
-    name = config.glyphs.objects()[1]
-    drawn = drawn_for(config, name)
-    scene = scene_of(config, drawn, name)
-    shape = config.sensor.height, config.sensor.width
-    wall, times_s = drawn.setup.resized(shape).observe(scene), scene.position_times_s(config.positions)
-    steps = np.linspace(0.0, drawn.duration_s, round(drawn.duration_s / 0.002) + 1)
-    light = 255.0 * wall.irradiance(steps)[None]
-    seed = derive_seed(config.seed, name, "events")
-    (events,) = simulate_batch(light, steps, drawn.pixel, [seed])
-    assert len(events) > 1000
-    frames = drawn.frame_camera.capture(wall, times_s, derive_seed(config.seed, name, "frames"))
-    expected = make_samples(frames, 255, events, edges_from(times_s), sampling)
-    samples = simulate_objects_on(config, [name], CPU)[0]
-    np.testing.assert_allclose(samples.frame.numpy(), expected.frame, atol=1e-6)
-    np.testing.assert_allclose(samples.surface.numpy(), expected.surface, atol=1e-5)
 
 
 def test_results_come_in_the_order_of_the_tasks() -> None:

@@ -37,7 +37,7 @@ class ToyWindow(Setup):
     frost_px: int = 3
     """Side of the square over which the glass blurs, pixels; odd."""
 
-    def observe(self, scene, device="cpu"):
+    def observe(self, scene):
         return FrostedImage(self, scene)
 
 

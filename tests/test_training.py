@@ -218,3 +218,15 @@ def test_a_run_that_an_older_version_began_is_taken_up(tmp_path) -> None:
     check_run(tmp_path, {"settings": to_dict(settings), "data": {"name": "near"}})
     with pytest.raises(DataError, match=r"settings.epochs: 3 -> 4"):
         check_run(tmp_path, {"settings": to_dict(replace(settings, epochs=4)), "data": {"name": "near"}})
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("kind", [UNetConfig, SequenceConfig])
+def test_a_training_on_cuda_ends_where_that_of_the_cpu_does(kind, tiny_dataset, tmp_path, monkeypatch) -> None:
+    settings = replace(QUICK, network=kind(width=8, depth=2, shuffle=1, rank=8), batch_size=4)
+    there = run(tiny_dataset, settings, tmp_path / "there")
+    with monkeypatch.context() as patched:
+        patched.setattr(torch.cuda, "is_available", lambda: False)
+        here = run(tiny_dataset, settings, tmp_path / "here")
+    assert there[-1]["loss"] == pytest.approx(here[-1]["loss"], rel=1e-2)
+    assert next(load_weights(tmp_path / "there").network.parameters()).device.type == "cpu"

@@ -8,7 +8,7 @@ from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.circuit import CircuitPixel
 from evnlos.cameras.pixels.readout import FlickeringWall, ReadoutPixel
 from evnlos.cameras.sensors import CelexCamera, CelexPixel, load_pixel, pixel_preset
-from evnlos.cameras.simulation import EventStream, simulate_batch, simulate_events
+from evnlos.cameras.simulation import EventStream, simulate_events
 
 __all__ = [
     "EVENT_MODELS",
@@ -28,6 +28,5 @@ __all__ = [
     "V2ePixel",
     "load_pixel",
     "pixel_preset",
-    "simulate_batch",
     "simulate_events",
 ]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
@@ -22,7 +21,7 @@ from evnlos.errors import ConfigError
 from evnlos.registry import Kinded, Registry
 
 if TYPE_CHECKING:
-    from evnlos.cameras.streams import Columns, EventTensors, Light
+    from evnlos.cameras.streams import Columns, Light
 
 Phase = Literal["random", "rest"]
 """State of the pixels before the first frame: anywhere between two events, or as if one had just been sent."""
@@ -207,14 +206,6 @@ class PixelSettings(Kinded):
         """Events that a pixel sends without cause, about, hertz: leak, shot noise and hot pixels."""
         hot = getattr(self, "hot_pixel_fraction", 0.0) * getattr(self, "hot_pixel_rate_hz", 0.0)
         return hot + sum(getattr(self, name, 0.0) for name in ("leak_rate_hz", "shot_noise_rate_hz"))
-
-    def can_run_together(self, others: Sequence[PixelSettings]) -> bool:
-        """Return whether the torch backend runs clips with such pixels, one settings each, in one batch."""
-        return False
-
-    def torch_backend(self) -> Callable[..., list[EventTensors]] | None:
-        """Return what runs this model on a torch device, called as `record_tensors` is; None = nothing does."""
-        return None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -24,7 +23,6 @@ from evnlos.errors import ConfigError
 
 if TYPE_CHECKING:
     from evnlos.cameras.pixels.continuous_math import Curve
-    from evnlos.cameras.streams import EventTensors
 
 MAX_JITTER = 9
 """Standard deviations that the normal random numbers can reach."""
@@ -193,7 +191,7 @@ class V2ePixel(_ContrastPixel):
     """The same pixel stepped from frame to frame exactly as v2e does, for comparisons with results of v2e.
 
     Its events depend on the time step: every event of a step carries one of a few times that the busiest pixel
-    sets. It starts at rest. It runs on the CPU and, with torch, on any device, with the same events.
+    sets. It starts at rest.
 
     Args:
         threshold_on: As in `EventPixel`, and so the six that follow.
@@ -254,18 +252,6 @@ class V2ePixel(_ContrastPixel):
         from evnlos.cameras.pixels.arrays import V2eArray
 
         return V2eArray(self, shape, seed, thresholds, 2048 if tile_px is None else tile_px, threads)
-
-    def can_run_together(self, others: Sequence[PixelSettings]) -> bool:
-        """Return whether all have a filter or none, and the same refractory period."""
-        stepped = [one for one in others if isinstance(one, V2ePixel)]
-        alike = {(one.cutoff_hz > 0, one.refractory_s) for one in stepped}
-        return len(stepped) == len(others) and len(alike) < 2
-
-    def torch_backend(self) -> Callable[..., list[EventTensors]]:
-        """Return `record_tensors`."""
-        from evnlos.cameras.on_device import record_tensors
-
-        return record_tensors
 
 
 def in_mode(pixel: PixelSettings, mode: str) -> PixelSettings:

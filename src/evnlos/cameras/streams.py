@@ -3,24 +3,20 @@
 - Checks of the light and the instants that come in from outside.
 - Light on its way to an array of pixels: whole frames, or strips that are rendered when they are needed.
 - Events in their one order: by time stamp, then row, then column, then OFF before ON.
-- Events that stay on the device on which they were simulated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from evnlos.cameras.event_model import MIN_THRESHOLD
 from evnlos.errors import ConfigError, DataError
-from evnlos.types import Events
 
 _LIGHT_DTYPES = (np.uint8, np.float32, np.float64)
 
@@ -370,31 +366,3 @@ def join(blocks: list[Columns]) -> Columns:
             last = int(np.searchsorted(time, time[edge], "right"))
             settle_ties(time[first:last], pixel[first:last], on[first:last])
     return time, pixel, on
-
-
-@dataclass(frozen=True, eq=False)
-class EventTensors:
-    """A stream of events as tensors on one device, ordered by time, then pixel, then OFF before ON.
-
-    Args:
-        t_us: Times, int64 [N], microseconds.
-        pixel: Flat pixels y width + x, int64 [N].
-        on: Polarities, bool [N], True = brighter.
-        height: Sensor height, pixels.
-        width: Sensor width, pixels.
-    """
-
-    t_us: Tensor
-    pixel: Tensor
-    on: Tensor
-    height: int
-    width: int
-
-    def __len__(self) -> int:
-        return len(self.t_us)
-
-    def to_events(self) -> Events:
-        """Return the same events in main memory."""
-        time_us, pixel, on = (column.cpu().numpy() for column in (self.t_us, self.pixel, self.on))
-        y, x = np.divmod(pixel, self.width)
-        return Events(time_us, x.astype(np.uint16), y.astype(np.uint16), on, self.width, self.height)

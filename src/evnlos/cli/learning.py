@@ -22,7 +22,6 @@ from evnlos.cli.parsing import check_there, say
 from evnlos.cli.recordings import Flat, Presets, result
 from evnlos.config import load_yaml, read_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
-from evnlos.data.live import Place
 from evnlos.errors import ConfigError, DataError, printable
 from evnlos.machine import ProgressBars
 from evnlos.models import (
@@ -63,10 +62,8 @@ class TrainCommand:
     """YAML file with the settings of a simulation, instead of --data: samples are made while the network
     trains, other ones in each epoch, and nothing is stored."""
     workers: int = 1
-    """Processes that simulate beside the training on the CPU, for --simulate; 0 = one for each core."""
-    simulation_device: Place = "device"
-    """Where --simulate works beside a GPU: `device` = on it, where the event model can (v2e, with a time step);
-    `cpu` = in --workers processes, of which it then wants several. The physics is the same."""
+    """Processes that simulate beside the training, for --simulate; 0 = one for each core.
+    A GPU wants several."""
     force: bool = False
     """Begin --simulate although the machine's memory will hardly do."""
     preset: str = "default"
@@ -91,10 +88,7 @@ class TrainCommand:
         else:
             assert self.simulate is not None
             settings = load_yaml(Simulation, self.simulate)
-            dataset = live_dataset(settings, self.workers, self.simulation_device, self.force)
-            if note := dataset.note(torch.device("cuda" if torch.cuda.is_available() else "cpu")):
-                say(f"note: {note}")
-            fit(dataset, self.settings, self.out, None, self.json)
+            fit(live_dataset(settings, self.workers, self.force), self.settings, self.out, None, self.json)
 
 
 def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, as_json: bool) -> None:

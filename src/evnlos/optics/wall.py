@@ -1,7 +1,6 @@
 """Light on the wall in continuous time: an image that slides, ambient light, strips of rows.
 
 - Ambient light on the wall: what is there without the hidden object.
-- A band of the wall that slides under the sensor: many frames in a few operations, on any device.
 - Light of a sliding wall for any of its pixels: no more of an image than is requested.
 - The wall that the camera sees, in continuous time: an image that slides under a shift-invariant transport.
 """
@@ -59,28 +58,6 @@ def ambient_plane(level: float, gradient: tuple[float, float], shape: tuple[int,
     return ambient_map(level * (1 + gradient[1] * y[:, None] + gradient[0] * x), shape)
 
 
-def slide(band: torch.Tensor, starts: torch.Tensor, taps: torch.Tensor, width: int) -> torch.Tensor:
-    """Return windows of a band at sub-sample places: sum over k of taps[t, k] band[:, starts[t] + k + column].
-
-    Args:
-        band: Spline coefficients at the sensor's rows, real [H, B]; zero beyond its ends.
-        starts: First column of each window, int64 [T]; it may lie outside the band.
-        taps: Weights of four neighbours, [T, 4].
-        width: Columns of a window.
-
-    Returns:
-        Frames [T, H, width].
-    """
-    # a window beyond the band is as dark wherever it is
-    place = starts.clamp(-width - 3, band.shape[1]) + width + 3
-    windows = pad(band, (width + 3, width + 3)).unfold(1, width, 1).transpose(0, 1)  # [place, H, width]
-    weights = taps[:, :, None, None]
-    frames = weights[:, 0] * windows[place]
-    for k in range(1, 4):
-        frames.add_(weights[:, k] * windows[place + k])
-    return frames
-
-
 @dataclass(frozen=True)
 class ImageStrips:
     """A sliding wall's light at some instants, of which any pixels can be had without the others.
@@ -124,7 +101,6 @@ class ImageStrips:
 
 _MAX_CANVAS = 8192  # pixels per side
 _SAME_ROWS_PX = 1e-9
-_TOGETHER_PX = 1 << 25  # pixels that a device renders in one operation
 
 
 @runtime_checkable
@@ -231,8 +207,6 @@ class SlidingWall:
         image = self.ambient.new_empty((len(positions), *self.shape))
         if self._compiled:
             self._write(positions, image)
-        elif self.view.is_affine and not self._canvas.requires_grad:
-            self._slide(positions, image)
         else:
             frame = self._shifted if self.view.is_affine else self._projected
             for k, (x, y) in enumerate(positions.tolist()):
@@ -304,23 +278,6 @@ class SlidingWall:
         else:
             for k in range(len(image)):
                 self._write(positions_m[k : k + 1], image[k : k + 1])
-
-    def _slide(self, positions_m: NDArray[np.float64], image: torch.Tensor) -> None:
-        """Write the frames with the target at positions [T, 2] to `image`; `_shifted` is the slow reference.
-
-        Frames on the same rows are rendered together: one by one, a GPU would mostly wait for its orders.
-        """
-        across, down = self._pixels(positions_m)
-        most = max(1, _TOGETHER_PX // (self.shape[0] * self.shape[1]))
-        if len(down) and float(np.ptp(down)) > _SAME_ROWS_PX:
-            most = 1
-        shifts = [_taps(-shift) for shift in across.tolist()]
-        starts = torch.tensor([whole - 1 - self._low[0] for whole, _ in shifts], device=image.device)
-        taps = torch.tensor([weights for _, weights in shifts], dtype=image.dtype, device=image.device)
-        for first in range(0, len(image), most):
-            some = slice(first, first + most)
-            light = slide(self._rows(float(down[first])), starts[some], taps[some], self.shape[1])
-            image[some] = light.clamp_(min=0).mul_(self.gain).add_(self.ambient)
 
     def _strips(self, positions_m: NDArray[np.float64]) -> ImageStrips | None:
         """Return the light with the target at positions [T, 2], unless they differ across the rows."""

@@ -118,12 +118,11 @@ class Setup(Kinded, ABC):
     None = the event camera chooses its steps from the motion."""
 
     @abstractmethod
-    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> Irradiance:
+    def observe(self, scene: Scene) -> Irradiance:
         """Return the irradiance on the cameras' pixels while the scene's target moves, at any instant.
 
         Args:
             scene: The target and its motion; its pose states the distance, or leaves it to the setup.
-            device: Where the irradiance is computed.
 
         Returns:
             An object with `irradiance(t_s)` -> white levels, float32 [T, H, W], `shape` and `speed_px_s`.

@@ -127,16 +127,13 @@ class FittedSetup(Setup):
         """Return the cells on which `observe` draws targets."""
         return self.source()
 
-    def transport(
-        self, shape: tuple[int, int] | None = None, device: torch.device | str = "cpu"
-    ) -> MatrixTransport:
+    def transport(self, shape: tuple[int, int] | None = None) -> MatrixTransport:
         """Return the matrix from the strip to a camera image, without `gain`; cached.
 
         Args:
             shape: Size (H, W) of the image, pixels; None is the sensor's.
-            device: Where the matrix lies.
         """
-        return _transport(self._key(), self.shape if shape is None else shape, torch.device(device))
+        return _transport(self._key(), self.shape if shape is None else shape)
 
     def operator(
         self, plane: Plane, shape: tuple[int, int] | None = None, dtype: torch.dtype = torch.float64
@@ -191,7 +188,7 @@ class FittedSetup(Setup):
 
         White levels, gain included, float32 [T, H, W]; None where nothing shines beside the target.
         """
-        along = self._along(self.shape, torch.device("cpu"))
+        along = self._along(self.shape)
         if along is None:
             return None
         carry, picture = along
@@ -199,28 +196,27 @@ class FittedSetup(Setup):
         drawn = picture.rasterise(carry.source, np.asarray(places_m, dtype=np.float64))
         return self.gain * carry(torch.from_numpy(drawn))
 
-    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> MatrixWall:
+    def observe(self, scene: Scene) -> MatrixWall:
         """Return the irradiance on the sensor while the scene's target moves.
 
         Args:
             scene: The target and its motion.
-            device: Where the matrix is made and the irradiance rendered.
 
         Raises:
             ConfigError: The target leaves the strip or turns, or a setting is out of range.
         """
         distance_m = stated_distance_m(self, scene)
         if distance_m is not None and distance_m != self.distance_m:
-            return self.at_distance(distance_m).observe(scene, device)
+            return self.at_distance(distance_m).observe(scene)
         x = self._check_travel(scene)[:, 0]
         return MatrixWall(
-            self.transport(self.shape, device),
+            self.transport(self.shape),
             scene.target,
             scene.motion,
             magnification_px_m=self.magnification_px_m(self.shape),
             gain=self.gain,
             ambient=self.ambient_light(),
-            along=self._along(self.shape, torch.device(device)),
+            along=self._along(self.shape),
             keyframe_step_m=_keyframe_step_m(self._key(), self.shape, scene.target.size_m),
             travel_m=(float(x.min()) - self.cell_m, float(x.max()) + self.cell_m),  # exposures end later
         )
@@ -292,14 +288,14 @@ class FittedSetup(Setup):
         """Return an upper bound of the image motion, pixels per metre of the target's."""
         return _magnification_px_m(self.pose(), shape)
 
-    def _along(self, shape: tuple[int, int], device: torch.device) -> tuple[MatrixTransport, Target] | None:
+    def _along(self, shape: tuple[int, int]) -> tuple[MatrixTransport, Target] | None:
         """Return matrix and image of what moves along; None where nothing shines beside the target."""
         picture = self.fitted().companion * self.companion
         if not picture.any():
             return None
         side = self.fitted().about.companion.pitch_m * len(picture)
         shown = Target("companion", np.clip(picture, 0, 1).astype(np.float32), side)
-        return _companion_transport(self._key(), shape, device), shown
+        return _companion_transport(self._key(), shape), shown
 
     def _key(self) -> FittedSetup:
         return replace(self.optics(), companion=1.0, misfit="", unexplained=0.0)
@@ -318,9 +314,9 @@ class FittedSetup(Setup):
 
 
 @lru_cache(maxsize=4)
-def _transport(setup: FittedSetup, shape: tuple[int, int], device: torch.device) -> MatrixTransport:
+def _transport(setup: FittedSetup, shape: tuple[int, int]) -> MatrixTransport:
     source = setup.source()
-    matrix = setup.matrix(shape, source, torch.float32).to(device)
+    matrix = setup.matrix(shape, source, torch.float32)
     if not float(matrix.max()) > 0:
         raise ConfigError("the camera receives no light from the target; calibrate again")
     return MatrixTransport(matrix, source, shape)
@@ -340,15 +336,15 @@ def _magnification_px_m(pose: Pose, shape: tuple[int, int]) -> float:
 
 @lru_cache(maxsize=8)
 def _keyframe_step_m(setup: FittedSetup, shape: tuple[int, int], size_m: float) -> float:
-    return coarsest_keyframe_step_m(_transport(setup, shape, torch.device("cpu")), size_m)
+    return coarsest_keyframe_step_m(_transport(setup, shape), size_m)
 
 
 @lru_cache(maxsize=4)
-def _companion_transport(setup: FittedSetup, shape: tuple[int, int], device: torch.device) -> MatrixTransport:
+def _companion_transport(setup: FittedSetup, shape: tuple[int, int]) -> MatrixTransport:
     """Return the matrix for light beside the target: larger cells over a larger region."""
     side = setup.fitted().about.companion.pitch_m * len(setup.fitted().companion)
     width, height = setup.strip_m[0] + side, setup.strip_m[1] + side
     rows, columns = (max(1, math.ceil(n / _COMPANION_CELL_M)) for n in (height, width))
     cells = Plane(rows, columns, _COMPANION_CELL_M)
     matrix = replace(setup, correction=0.0).matrix(shape, cells, torch.float32)
-    return MatrixTransport(matrix.to(device), cells, shape)
+    return MatrixTransport(matrix, cells, shape)

@@ -61,20 +61,17 @@ class MeasuredSetup(Setup):
         """Return the scanned cells, in the coordinates of the target's motion."""
         return self.measurement().about.plane
 
-    def transport(
-        self, shape: tuple[int, int] | None = None, device: torch.device | str = "cpu"
-    ) -> MatrixTransport:
+    def transport(self, shape: tuple[int, int] | None = None) -> MatrixTransport:
         """Return the matrix from the scanned cells to a camera image, without `gain`.
 
         Args:
             shape: Size (H, W) of the image, pixels; None is the sensor's.
-            device: Where the matrix lies.
 
         Raises:
             ConfigError: The scan has fewer pixels than that.
         """
         measured, shape = self.measurement(), self.shape if shape is None else shape
-        matrix = _matrix(measured, shape, torch.device(device))
+        matrix = _matrix(measured, shape)
         return MatrixTransport(matrix, measured.about.plane, shape)
 
     def matrix(self, shape: tuple[int, int], source: Plane, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -136,12 +133,11 @@ class MeasuredSetup(Setup):
         measured = self.measurement()
         return light + averaged(measured.dark.reshape(-1, 1), measured.shape, shape).reshape(shape).clamp(min=0)
 
-    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> MatrixWall:
+    def observe(self, scene: Scene) -> MatrixWall:
         """Return the irradiance on the sensor while the scene's target moves.
 
         Args:
             scene: The target and its motion; the scanned plane has one distance, so the motion states none.
-            device: Where the matrix lies and the irradiance is rendered.
 
         Raises:
             ConfigError: The target leaves the scanned plane, the motion states a distance or a rotation, or a
@@ -149,12 +145,12 @@ class MeasuredSetup(Setup):
         """
         distance_m = stated_distance_m(self, scene)
         if distance_m is not None:
-            return self.at_distance(distance_m).observe(scene, device)
+            return self.at_distance(distance_m).observe(scene)
         about = self.measurement().about
         self._check_travel(scene, about.plane)
         height, width = self.shape
         return MatrixWall(
-            self.transport(self.shape, device),
+            self.transport(self.shape),
             scene.target,
             scene.motion,
             magnification_px_m=about.magnification_px_m * max(height / about.height, width / about.width),
@@ -210,9 +206,9 @@ class MeasuredSetup(Setup):
 
 
 @lru_cache(maxsize=2)
-def _matrix(measured: Measurement, shape: tuple[int, int], device: torch.device) -> torch.Tensor:
-    """Return the matrix for a camera image of `shape` on a device: one for all objects."""
-    return averaged(measured.matrix, measured.shape, shape).to(device)
+def _matrix(measured: Measurement, shape: tuple[int, int]) -> torch.Tensor:
+    """Return the matrix for a camera image of `shape`: one for all objects."""
+    return averaged(measured.matrix, measured.shape, shape)
 
 
 def averaged(matrix: torch.Tensor, have: tuple[int, int], want: tuple[int, int]) -> torch.Tensor:

@@ -106,21 +106,20 @@ class PaperSetup(Setup):
         side += 2 * min(side, math.ceil(4 * fringes) + 1)
         return Plane(side, side, self.pitch_m)
 
-    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> SlidingWall:
+    def observe(self, scene: Scene) -> SlidingWall:
         """Return the irradiance on the sensor while the scene's target moves: a wall image that slides.
 
         Args:
             scene: The target and its motion, at a constant distance.
-            device: Where diffraction and reflection are computed and the irradiance is then rendered.
 
         Raises:
             ConfigError: A setting is outside its range, or the target turns, approaches or retreats.
         """
         distance_m = stated_distance_m(self, scene)
         if distance_m is not None and distance_m != self.distance_m:
-            return self.at_distance(distance_m).observe(scene, device)
+            return self.at_distance(distance_m).observe(scene)
         transport = self.transport(scene.target.size_m)
-        mask = torch.from_numpy(scene.target.rasterise(self.source(scene.target.size_m))).to(device)
+        mask = torch.from_numpy(scene.target.rasterise(self.source(scene.target.size_m)))
         plane = transport.output
         assert plane is not None  # both steps end on planes
         return SlidingWall(

@@ -32,7 +32,6 @@ from evnlos.types import Plane
 
 R = TypeVar("R", bound="RadiometricSetup")
 
-_MOST_KEPT_BYTES = 1 << 30  # a matrix on a GPU that is kept for the next object
 _LEAST_CELLS = 4  # a side of the target: fewer show no shape at all
 
 
@@ -141,28 +140,21 @@ class RadiometricSetup(Setup):
         offset_m, half = self.offset_m(), self.lamp_half_angle_deg
         return lamp_radiance(source, self.distance_m, self.lamp_m, offset_m=offset_m, half_angle_deg=half)
 
-    def transport(
-        self, shape: tuple[int, int] | None = None, device: torch.device | str = "cpu"
-    ) -> MatrixTransport:
+    def transport(self, shape: tuple[int, int] | None = None) -> MatrixTransport:
         """Return the matrix from the strip to the camera, scaled so that `gain` means what it says; cached.
 
         Args:
             shape: Size (H, W) of the camera image, pixels; None is the sensor's.
-            device: Where it is computed and stays.
         """
         shape = self.shape if shape is None else shape
         # Light that only adds up afterwards and the cameras do not belong to the matrix's key.
-        key, where, source = self.optics(), torch.device(device), self.source()
-        is_large = 4 * shape[0] * shape[1] * source.height * source.width > _MOST_KEPT_BYTES
-        make = _transport.__wrapped__ if is_large and where.type != "cpu" else _transport
-        return make(key, shape, where)
+        return _transport(self.optics(), shape)
 
     def matrix(
         self,
         shape: tuple[int, int],
         source: Plane,
         dtype: torch.dtype = torch.float64,
-        device: torch.device | str = "cpu",
     ) -> torch.Tensor:
         """Return the matrix from any cells of the target's plane to the camera, without `gain`, [H W, h w].
 
@@ -170,7 +162,6 @@ class RadiometricSetup(Setup):
             shape: Size (H, W) of the camera image, pixels.
             source: Cells, in the coordinates of the target's motion.
             dtype: Floating-point type of the result.
-            device: Where it is computed and stays.
 
         Raises:
             ConfigError: An occluder reaches the wall or the target's plane, or hides the wall from the camera.
@@ -188,7 +179,6 @@ class RadiometricSetup(Setup):
             occluders=occluders,
             emission=self.emission(source),
             dtype=dtype,
-            device=device,
         )
         seen = self.gain_map(shape)
         return matrix if seen is None else matrix * seen.to(matrix).reshape(-1, 1)
@@ -228,14 +218,13 @@ class RadiometricSetup(Setup):
         columns = (torch.arange(strip.width) - (strip.width - 1) / 2).abs() <= strip.height / 2
         return Plane(strip.height, int(columns.sum()), strip.pitch_m)
 
-    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> MatrixWall | SpaceWall:
+    def observe(self, scene: Scene) -> MatrixWall | SpaceWall:
         """Return the irradiance on the sensor while the scene's target moves.
 
         At any distance the exposure is that of the setup's own: what is further away is darker.
 
         Args:
             scene: The target and its motion; one in space, with depth or turning, may leave the strip.
-            device: Where the matrix is made and the irradiance rendered; in space it is the CPU.
 
         Raises:
             ConfigError: The target leaves the strip, needs finer cells, or a setting is out of range.
@@ -250,10 +239,10 @@ class RadiometricSetup(Setup):
         if distance_m is not None and distance_m != self.distance_m:
             there = self.at_distance(distance_m)
             brighter = _full_light(there.optics(), self.shape)[0] / _full_light(self.optics(), self.shape)[0]
-            return replace(there, gain=self.gain * brighter).observe(scene, device)
+            return replace(there, gain=self.gain * brighter).observe(scene)
         self._check_travel(scene)
         return MatrixWall(
-            self.transport(self.shape, device),
+            self.transport(self.shape),
             scene.target,
             scene.motion,
             magnification_px_m=seen_px_m,  # no point of the image outruns the target
@@ -373,9 +362,9 @@ class RadiometricSetup(Setup):
 
 
 @lru_cache(maxsize=8)
-def _transport(setup: RadiometricSetup, shape: tuple[int, int], device: torch.device) -> MatrixTransport:
+def _transport(setup: RadiometricSetup, shape: tuple[int, int]) -> MatrixTransport:
     source = setup.source()
-    matrix = setup.matrix(shape, source, torch.float32, device)
+    matrix = setup.matrix(shape, source, torch.float32)
     # A square of the strip's height is the target of the paper; it makes gains comparable between walls.
     lit = (torch.arange(source.width) - (source.width - 1) / 2).abs() <= source.height / 2
     brightest = (matrix @ lit.to(matrix).repeat(source.height)).max()

@@ -154,12 +154,11 @@ class RoomSetup(Setup):
         """
         return replace(self, distance_m=distance_m, target_offset_m=self.offset_m())
 
-    def observe(self, scene: Scene, device: torch.device | str = "cpu") -> RenderedWall:
+    def observe(self, scene: Scene) -> RenderedWall:
         """Return the irradiance on the cameras' pixels while the scene's target moves, at any instant.
 
         Args:
             scene: The target and its motion; its pose states the distance, or leaves it to the setup.
-            device: The light is rendered in main memory, whatever stands here.
 
         Raises:
             ConfigError: The target turns, approaches or retreats, or no light of it reaches the camera.
