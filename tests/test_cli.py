@@ -314,6 +314,13 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, recorded, tiny_captures, 
         capsys, "app", "--prot", "3"
     )
     assert "Missing from evnlos simulate: --out PATH; see" in fails(capsys, "simulate")
+    for flag, command in (("--start", ["calibrate", "c"]), ("--setup.pixel", ["simulate"])):  # groups of flags
+        told = fails(capsys, *command, "--out", out, flag, "nope")
+        assert f"Unrecognized options: {flag}, nope; Perhaps you meant: {flag}." in told and len(told) < 240
+        assert told.count("--") == 5 and " or others; see evnlos" in told  # that one, three, --help
+    assert "--targets is 'nope'; give INT or auto; see" in fails(capsys, "track", "c", "--targets", "nope")
+    told = fails(capsys, "lab", "--out", out, "--set", "nope")
+    assert "--set is 'nope'; give one of 'near', 'far'; see" in told or "'far', 'near'; see" in told
     assert "no modality of kind 'x'; give one of frame, event, fusion" in fails(
         capsys, "train", "--out", out, "--modality", "x"
     )
@@ -343,6 +350,9 @@ def test_what_is_wrong_is_told_before_the_work(tiny_captures, tmp_path, capsys, 
     file.write_text("hello")
     for name in ("capture.yaml", "events.raw"):
         assert f"{name} is one file of a capture; give its folder" in fails(capsys, "reconstruct", one / name)
+    assert "text that begins with 'hello', of no known event format; give a capture's folder or" in fails(
+        capsys, "reconstruct", file
+    )
     monkeypatch.setattr(ProgressBars, "__enter__", lambda _: pytest.fail("the work began"))
     for words in (["identify", "main-near"], ["demo"], ["pixel", "fit", one], ["calibrate", one], ["simulate"]):
         assert "notes.txt is a file; give the name of a folder" in fails(capsys, *words, "--out", file)

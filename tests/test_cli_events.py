@@ -283,7 +283,10 @@ def test_info_shows_damage_and_never_refuses_it(tmp_path: Path, capsys) -> None:
     call("info", tmp_path / "none.h5")
     assert "events    none" in capsys.readouterr().out
     (tmp_path / "text.h5").write_text("no recording")
-    assert "no known event format" in fails(capsys, "info", tmp_path / "text.h5")
+    told = fails(capsys, "info", tmp_path / "text.h5")
+    assert "text.h5 is text that begins with 'no recording', of no known event format; give a recording" in told
+    (tmp_path / "text.h5").write_bytes(bytes(range(40)))
+    assert "is binary data that begin with the bytes 00 01 02" in fails(capsys, "info", tmp_path / "text.h5")
     assert "no such file" in fails(capsys, "info", tmp_path / "absent.h5")
     assert f"{tmp_path} is a folder; give a file in it" in fails(capsys, "info", tmp_path)
     assert "is not a regular file but a device or a pipe" in fails(capsys, "info", "/dev/null")

@@ -194,3 +194,36 @@ def test_where_a_result_goes_is_looked_at_before_it_is_worked_for(
         main(words)
     said = capsys.readouterr().err
     assert end.value.code == 2 and said.count("\n") == 1 and "file is a file; give another place" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["simulate", "--out", "notes"], "notes is not empty and holds no dataset.yaml; give a new folder"),
+        (["simulate", "--out", "new", "--workers", "-1"], "workers is -1; give 0 (one for each core) or more"),
+        (["simulate", "--out", "new", "--workers", "-1", "--force"], "workers is -1; give 0"),
+        (["simulate", "--out", "new", "--workers", "-1", "--dry-run"], "workers is -1; give 0"),
+        (["lab", "--out", "new", "--workers", "-1"], "workers is -1; give 0"),
+        (["lab", "--out", "notes"], "lab_A is there without a capture.yaml; move it away"),
+        (
+            ["train", "--data", "DATA", "--out", "notes"],
+            "notes is not empty and holds no run; give a new folder",
+        ),
+        (["import", "CAPTURE", "--out", "notes"], "notes is not empty and holds no dataset.yaml"),
+    ],
+)
+def test_what_is_refused_is_told_alone_and_changes_nothing(
+    words, said, tiny_captures, tiny_dataset, tmp_path, monkeypatch, capsys
+) -> None:
+    """Not after notes on what will not be done."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes" / "lab_A").mkdir(parents=True)
+    data = shutil.copytree(tiny_dataset.folder, tmp_path / "data")
+    page = (data / "dataset.yaml").read_text()
+    (data / "dataset.yaml").write_text(page.replace("  setup:\n", "  setup:\n    misfit: by far\n", 1))
+    given = {"CAPTURE": str(tiny_captures[0]), "DATA": str(data)}
+    with pytest.raises(SystemExit) as end:
+        main([given.get(word, word) for word in words])
+    told = capsys.readouterr()
+    assert end.value.code == 2 and told.err.count("\n") == 1 and said in told.err and not told.out
+    assert {path.name for path in tmp_path.rglob("*") if data not in path.parents} == {"notes", "data", "lab_A"}

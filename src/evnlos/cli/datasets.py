@@ -20,7 +20,7 @@ import tyro
 from tqdm import tqdm
 
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import check_there, say
+from evnlos.cli.parsing import check_there, say, told_first
 from evnlos.cli.recordings import Flat, Folders, Presets, result
 from evnlos.data import (
     Capture,
@@ -110,18 +110,22 @@ class SimulateCommand:
         config, share = randomized(self.settings) if self.robust else self.settings, _share(self.shard)
         if self.scheduler and self.engine != "dask":
             raise ConfigError(f"--scheduler {self.scheduler} needs --engine dask")
-        for note in config.glyphs.notes():
-            say(note)
-        for line in config.setup.warnings():
-            say(f"warning: {line}")
-        for name, value in config.optics().items():
-            say(f"{name} {value:.3g}")
+
+        def notes() -> None:
+            warnings = [f"warning: {line}" for line in config.setup.warnings()]
+            optics = [f"{name} {value:.3g}" for name, value in config.optics().items()]
+            for line in [*config.glyphs.notes(), *warnings, *optics]:
+                say(line)
+
         total = len(config.glyphs.objects())
         if self.dry_run:
-            print("\n".join(estimate(config, self.workers, share).lines(self.out)))
+            estimated = estimate(config, self.workers, share)
+            notes()
+            print("\n".join(estimated.lines(self.out)))
             return
         engine = run_tasks if self.engine == "local" else partial(run_on_dask, scheduler=self.scheduler)
-        with ProgressBars() as progress:
+        with ProgressBars() as bars:
+            progress = told_first(notes, bars)
             missing = simulate(config, self.out, self.workers, share, engine, progress, self.force).missing()
         about = {"out": str(self.out), "objects": total, "samples": total * config.positions}
         text = f"{self.out}: {total} objects, {total * config.positions} samples, {len(missing)} missing"
@@ -170,9 +174,8 @@ class LabCommand:
         lab, record = self.settings, "lab.yaml"
         if self.set is not None:
             lab, record = published_lab(self.set, lab), f"{self.set}.lab.yaml"
-        for note in lab.glyphs.notes():
-            say(note)
-        with ProgressBars() as progress:
+        with ProgressBars() as bars:
+            progress = told_first(lambda: [say(note) for note in lab.glyphs.notes()], bars)
             rendered = render_captures(lab, self.out, None, self.workers, progress, self.force, record)
             differing = compare_published(self.set, rendered, progress) if self.set else {}
         print(f"{self.out}: {len(rendered)} captures; settings and the drawn sensor in {self.out / record}")

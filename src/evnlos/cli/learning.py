@@ -18,7 +18,7 @@ import torch
 import tyro
 
 from evnlos.analysis import BASELINES, CHECKS, confusion
-from evnlos.cli.parsing import check_there, say
+from evnlos.cli.parsing import check_there, say, told_first
 from evnlos.cli.recordings import Flat, Presets, result
 from evnlos.config import load_yaml, read_yaml, to_dict
 from evnlos.data import Dataset, Simulation, live_dataset, open_dataset
@@ -97,10 +97,13 @@ def fit(dataset: Dataset, settings: Training, out: Path, weights: Path | None, a
     Of several processes that `torchrun` started, only the first speaks.
     """
     quiet = int(os.environ.get("RANK", "0")) > 0
-    if not quiet and (misfit := dataset.config.get("setup", {}).get("misfit")):
-        say(f"warning: the simulation's setup does not fit its captures: {misfit}")
+
+    def warn() -> None:
+        if not quiet and (misfit := dataset.config.get("setup", {}).get("misfit")):
+            say(f"warning: the simulation's setup does not fit its captures: {misfit}")
+
     with ProgressBars(quiet) as progress:
-        trained = train(dataset, settings, out, weights, progress)
+        trained = train(dataset, settings, out, weights, told_first(warn, progress))
     if quiet:
         return
     record = trained.records[-1]

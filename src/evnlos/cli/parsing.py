@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from evnlos.errors import ConfigError, MissingDependencyError, UnknownNameError, printable
-from evnlos.machine import PROGRESS, SHOWN, show_progress
+from evnlos.machine import PROGRESS, SHOWN, Progress, Step, show_progress
 from evnlos.untrusted import no_file
 
 LEVELS = ("debug", "info", "warning", "error")
@@ -81,6 +81,23 @@ def drawn(path: Path, draw: Callable[[], object]) -> str | None:
         return None
 
 
+def told_first(notes: Callable[[], object], progress: Progress) -> Progress:
+    """Return a progress that tells notes before its first step: what is refused before the work is told alone.
+
+    Args:
+        notes: Says them.
+        progress: Takes the steps.
+    """
+    untold = [notes]
+
+    def tell(step: Step) -> None:
+        while untold:
+            untold.pop()()
+        progress(step)
+
+    return tell
+
+
 def listen(arguments: list[str]) -> list[str]:
     """Set what the arguments, else the environment, say of notes and progress; return the other arguments.
 
@@ -95,8 +112,7 @@ def listen(arguments: list[str]) -> list[str]:
         ['info', 'events.raw']
     """
     rest, level, source = [], os.environ.get(VARIABLE) or "info", VARIABLE
-    shown = None
-    words = iter(arguments)
+    shown, words = None, iter(arguments)
     for word in words:
         if word == "--":
             rest += [word, *words]
@@ -144,11 +160,7 @@ _RENAMED_IN = {  # the same, of one command
     ("experiment", "--joint"): ("--sequence",),
     ("experiment", "--no-joint"): ("--no-sequence",),
 }
-_EXPERIMENTS = {
-    "joint": "sequence",
-    "shots": "capture-count",
-    "carry-over": "generalization",
-}  # their names before -> today's
+_EXPERIMENTS = {"joint": "sequence", "shots": "capture-count", "carry-over": "generalization"}  # today's by old
 
 
 _MOVED = {  # beginning of the flags of a setting that moved, by command
@@ -222,14 +234,12 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
 def _unwrapped(words: list[str]) -> Iterator[None]:
     """Have messages in lines of any length; help keeps the width of the terminal."""
     before = os.environ.get("COLUMNS")
-    if {"-h", "--help"} & set(words):
-        yield
-        return
-    os.environ["COLUMNS"] = "100000"
+    if not {"-h", "--help"} & set(words):
+        os.environ["COLUMNS"] = "100000"
     try:
         yield
     finally:
-        os.environ.pop("COLUMNS")
+        os.environ.pop("COLUMNS", None)
         if before is not None:
             os.environ["COLUMNS"] = before
 
@@ -257,11 +267,14 @@ def in_one_line(box: str) -> str:
 _UNFIT = (  # what tyro says of a value that is no number, and how people say it
     (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 is \2; give a number"),
     (r"Error parsing (\S+): invalid literal for int\(\) with base 10: (.*)", r"\1 is \2; give a whole number"),
-    (
-        r"Error parsing (\S+): no type matching (?:\{None\}\|)?\{?([^}]*?)\}? could be .* from \[(.*?)\]\.;.*",
-        r"\1 is \3; give \2",
-    ),
+    (r"Error parsing (\S+): no type matching (.*?) could be .* from \[(.*?)\]\.;.*", r"\1 is \3; give \2"),
     (r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]", r"\1 can't be \2"),
+    (r"invalid choice ('.*?') for argument '(\S+)'\. Expected one of \((.*?),?\)", r"\2 is \1; give one of \3"),
+    (r"\{None\}\||, 'None'(?!,)|'None', ", ""),
+    (r"(Perhaps you meant: --.*?, --.*?, --.*?), --.*", r"\1 or others"),  # the rest of a group of flags
+    (r"\b(INT|STR)\|", r"\1 or "),
+    (r"\{([^,|}]*)\}", r"\1"),
+    (r"\bFLOAT\b", "NUMBER"),
 )
 
 
@@ -269,7 +282,7 @@ def _plain(text: str) -> str:
     """Return a message of the parser's in words that say what to give."""
     for pattern, words in _UNFIT:
         text = re.sub(pattern, words, text)
-    return re.sub(r"\bFLOAT\b", "NUMBER", text)
+    return text
 
 
 _RESOLVERS = {  # flag -> module and function of what its word stands for

@@ -126,7 +126,7 @@ class RegistrationInfo:
         given = [name for name in ("homography", "points", "dots") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ConfigError(
-                f"registration has {' and '.join(given) or 'nothing'}; give homography, points or dots"
+                f"registration: {' and '.join(given) or 'nothing'}; give homography, points or dots"
             )
 
 
@@ -240,9 +240,7 @@ class CaptureInfo:
         """Raise `DataError` where a capture has no frames, or no events, and they are needed."""
         for is_needed, key, other in ((frames, "frames", "events"), (events, "events", "frames")):
             if is_needed and getattr(self, key) is None:
-                raise DataError(
-                    f"{name} holds {other} alone ({key}: null in capture.yaml); this needs {key} too"
-                )
+                raise DataError(f"{name} holds {other} alone ({key}: null in capture.yaml); this needs {key}")
 
     @property
     def target_size_m(self) -> float:
@@ -275,14 +273,14 @@ def read_capture_info(
 
 def _info_of_recording(path: Path, events_topic: str | None, frames_topic: str | None) -> CaptureInfo:
     """Describe a recording that holds events and frames of the same pixels and on the same clock."""
-    if (path.parent / "capture.yaml").is_file() and (path.suffix == ".yaml" or not find_format(path).frames):
+    has_frames = path.suffix != ".yaml" and find_format(path, wanted="a capture's folder or a recording").frames
+    if not has_frames and (path.parent / "capture.yaml").is_file():
         raise ConfigError(f"{path} is one file of a capture; give its folder, {path.parent}")
     recording = Recording(path, topic=events_topic)
     if not recording.report.geometry_from:  # of some formats known with their first events
         next(recording.pieces(), None)
-    height, width = recording.shape
-    camera, name = CameraInfo(width, height, name=recording.report.format), path.name
-    return CaptureInfo(camera, name, name, events_topic=events_topic, frames_topic=frames_topic)
+    camera = CameraInfo(*recording.shape[::-1], name=recording.report.format)
+    return CaptureInfo(camera, path.name, path.name, events_topic=events_topic, frames_topic=frames_topic)
 
 
 _TEMPLATE = """\
@@ -362,8 +360,7 @@ def begin_capture(
     Raises:
         DataError: The folder has a capture.yaml already, or is a file; or the size is none.
     """
-    folder = Path(folder)
-    path = folder / "capture.yaml"
+    path = (folder := Path(folder)) / "capture.yaml"
     if folder.exists() and not folder.is_dir():
         raise DataError(f"{folder} is a file; give a folder for the capture")
     if path.exists():

@@ -364,8 +364,9 @@ def simulate(
     first, stride = share
     if not 1 <= first <= stride:
         raise ConfigError(f"share {first} of {stride} is none; give i/n with i from 1 to n")
+    at_once = processes(workers, len(config.glyphs.objects()) // stride + 1)
     if not force:
-        check_sequences(object_bytes(config), processes(workers, len(config.glyphs.objects()) // stride + 1))
+        check_sequences(object_bytes(config), at_once)
     values = to_dict(config)
     dataset = Dataset(
         Path(folder),
@@ -379,11 +380,8 @@ def simulate(
     with claim_dataset(dataset, f"{first}-of-{stride}" if stride > 1 else "", Simulation) as dataset:
         share_names = set(config.glyphs.objects()[first - 1 :: stride])
         missing = [name for name in dataset.missing() if name in share_names]
-        what, total, there = (
-            f"simulate {dataset.folder.name}",
-            len(share_names),
-            len(share_names) - len(missing),
-        )
+        what, total = f"simulate {dataset.folder.name}", len(share_names)
+        there = total - len(missing)
         progress(Step(what, there, total, "objects"))
         tasks = [(config, name, dataset.shard(name), dataset.config_hash) for name in missing]
         with closing(engine(_simulate_shard, tasks, workers)) as finished:

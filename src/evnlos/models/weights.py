@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import importlib
 import json
@@ -85,11 +86,12 @@ def no_weights(what: str) -> UnknownNameError:
     Args:
         what: What was looked for.
     """
-    known = ", ".join(published())
-    names = f"a name of installed ones ({known})" if known else "install evnlos-weights for pretrained ones"
+    names = "install evnlos-weights for pretrained ones"
+    if known := list(published()):
+        near = difflib.get_close_matches(what.partition(" ")[0], known, cutoff=0.5) or known[:3]
+        names = f"one of {len(known)} names that `evnlos weights` lists, such as {', '.join(near)}"
     return UnknownNameError(
-        f"{what}; give a weights file, a run whose training has ended, or {names}, or set {VARIABLE} to a "
-        "folder that holds them"
+        f"{what}; give a weights file, a run's folder, or {names}, or set {VARIABLE} to their folder"
     )
 
 

@@ -193,7 +193,7 @@ FORMATS = (
 )
 
 
-def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format:
+def find_format(path: Path, celex: CelexOptions | None = None, wanted: str = "a recording") -> Format:
     """Return the format of a file from its content; a stated CeleX event format overrides a damaged header.
 
     Raises:
@@ -205,7 +205,7 @@ def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format
         start = file.read(_SNIFFED_BYTES)
     if not start:
         raise unreadable(path, 0, "the file is empty", "record or copy it again")
-    if celex_options is not None and celex_options.event_format is not None:
+    if celex is not None and celex.event_format is not None:
         return next(format for format in FORMATS if format.name == "CELEX")
     for format in FORMATS:
         if format.sniff(start):
@@ -213,9 +213,17 @@ def find_format(path: Path, celex_options: CelexOptions | None = None) -> Format
     if start.startswith(ZSTD):
         raise unreadable(path, 0, "a file packed by zstd as a whole", "unpack it first: zstd -d FILE")
     known = ", ".join(format.name for format in FORMATS if format.suffixes)
-    raise unreadable(
-        path, 0, f"no known event format starts with {start[:8].hex(' ')}", f"these are read: {known}"
-    )
+    cure = f"give {wanted} ({known}; text in rows of t, x, y, p)"
+    raise EventFileError(f"{path} is {_looks(start)}, of no known event format; {cure}")
+
+
+def _looks(start: bytes) -> str:
+    """Return what a file that holds no events looks like, from its first bytes."""
+    text = start.decode("utf-8", "ignore")
+    if "\0" in text or len(text.encode()) < len(start) - 3:  # a character may be cut
+        return f"binary data that begin with the bytes {start[:8].hex(' ')}"
+    line = next((line.strip() for line in text.splitlines() if line.strip()), "")
+    return f"text that begins with {line[:30]!r}"
 
 
 def format_to_write(path: Path, name: str | None) -> Format:
