@@ -348,7 +348,7 @@ def test_what_a_capture_of_one_camera_lacks_is_named(one_camera, tmp_path, capsy
     said = capsys.readouterr().err
     assert end.value.code == 2 and f"{lacking}: null in capture.yaml" in said and said.count("\n") == 1
     assert not (tmp_path / "out").exists()
-    with pytest.raises(DataError, match=f"needs {lacking} too"):
+    with pytest.raises(DataError, match=f"this needs {lacking}"):
         read_capture(folder)
 
 
