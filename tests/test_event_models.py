@@ -129,6 +129,6 @@ def test_thinning_keeps_light_and_events_of_the_same_pixels() -> None:
 
 def test_a_model_must_be_better_by_more_than_chance() -> None:
     before = np.full(20, 10.0)
-    assert is_better(before, before - 2) and not is_better(before, before - 0.5)
+    assert is_better(before, before - 2) and not is_better(before, before - 0.4)
     assert not is_better(before, before - 2 + 8 * np.random.default_rng(0).normal(size=20))
     assert not is_better(before, before + 1) and math.isfinite(float(before.sum()))

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from evnlos.calibration import CALIBRATION_VALUES_FILE
-from evnlos.demo import Demo, finding, mismatch_table, run_demo, run_mismatch
+from evnlos.demo import Demo, run_demo
 from evnlos.errors import CalibrationError, ConfigError
 from evnlos.experiment import Record, Study
 from evnlos.experiment.study import write_record
+from evnlos.mismatch import finding, mismatch_table, run_mismatch
 from evnlos.models import layers_of
 
 LEFT = {
@@ -79,7 +80,7 @@ def test_each_setup_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
             raise CalibrationError("no setup fits")
         keep(settings.out, settings.seed, {("E2E", "frame"): 1.0, ("EPNP", "frame"): 2.0}, [])
 
-    monkeypatch.setattr("evnlos.demo.run_demo", demo)
+    monkeypatch.setattr("evnlos.mismatch.run_demo", demo)
     found = run_mismatch(Demo(out=tmp_path / "out"), (), tmp_path / "captures", seeds=(0, 3))
     assert ran == [
         ("flat-seed0", ["flat_A", "flat_G"], 0),
@@ -113,6 +114,20 @@ def test_the_pre_training_begins_with_layers_where_they_are_installed(tmp_path, 
     assert begins == {"simulation only": found, "EPNP": found, "E2E": "", "E2E, single positions": ""}
     plans = {arm.pretraining for arm in studies[0].arms if arm.pretraining}
     assert {(plan.refit_embedding, plan.epochs) for plan in plans} == {(bool(found), 4 if found else 8)}
+
+
+def test_the_demo_trains_what_was_asked_for(tmp_path, monkeypatch):
+    (tmp_path / "a_A").mkdir()
+    (tmp_path / "a_A" / "capture.yaml").write_text("x: 1")
+
+    def stop(study: Study, *_) -> None:
+        raise CalibrationError(" ".join(study.modalities))
+
+    monkeypatch.setattr("evnlos.demo.run_study", stop)
+    with pytest.raises(CalibrationError, match=r"^event;"):
+        run_demo(Demo(out=tmp_path / "out", captures=(tmp_path / "a_A",), modalities=("event",)))
+    with pytest.raises(ConfigError, match="modalities names none"):
+        Demo(modalities=())
 
 
 def test_unknown_setups_and_empty_folders_are_refused(tmp_path):

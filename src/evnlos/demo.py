@@ -1,7 +1,4 @@
-"""The main job on one page: calibrate, simulate the setup, pre-train, fine-tune, train end to end, report.
-
-- What a mismatch costs: the demo's comparison on setups that the simulator does not describe, in one table.
-"""
+"""The main job on one page: calibrate, simulate the setup, pre-train, fine-tune, train end to end, report."""
 
 from __future__ import annotations
 
@@ -10,21 +7,18 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from evnlos.calibration import CALIBRATION_VALUES_FILE, Calibration
-from evnlos.config import write_atomically
-from evnlos.data import STANDARD_MODALITIES, captures_in
-from evnlos.data.lab import Lab, lab_of, render_captures
+from evnlos.calibration import Calibration
+from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in
+from evnlos.data.lab import Lab, render_captures
 from evnlos.data.sampling import Sampling, character_of
 from evnlos.data.simulations import default
 from evnlos.errors import CalibrationError, ConfigError, UnknownNameError
-from evnlos.experiment import Arm, Place, Record, Study, gain_table, means_of, read_records, run_study
-from evnlos.machine import Progress, ProgressBars, silent
+from evnlos.experiment import Arm, Place, Study, gain_table, read_records, run_study
+from evnlos.machine import ProgressBars
 from evnlos.models import GENERIC, SequenceConfig, UNetConfig, layers_of, published
 from evnlos.report import collect_results, to_text, write_report
 from evnlos.scene import FontGlyphs
-from evnlos.setups import ROOMS, named_setup
+from evnlos.setups import named_setup
 from evnlos.training import Training
 from evnlos.types import OutFolder
 
@@ -48,6 +42,8 @@ class Demo:
     """Capture folders, or the folder above them; without any, pseudo-real ones are rendered."""
     test: tuple[str, ...] = _TEST
     """Characters of the captures that neither calibration nor training sees."""
+    modalities: tuple[str, ...] = STANDARD_MODALITIES
+    """What the networks see."""
     writers: int = 4
     """Writers of the simulated characters, 36 objects each."""
     redrawn: int = 7
@@ -81,6 +77,10 @@ class Demo:
                 raise ConfigError(f"Demo.{name} is {value}; give {least} or more")
         if not self.test:
             raise ConfigError("Demo.test names no character; give some of the captures', e.g. G K 4 9")
+        if not self.modalities:
+            raise ConfigError("Demo.modalities names none; give some of frame, event, fusion")
+        for one in self.modalities:
+            MODALITIES.check(one)
 
     @property
     def lab(self) -> Lab:
@@ -103,11 +103,11 @@ def run_demo(settings: Demo) -> Path:
     folders = captures
     if not folders:
         lab = settings.lab
-        notes.append(
+        notes += [
             "Synthetic captures: a rough aluminium wall and cameras were rendered. The simulator does not know "
-            "their parameters and has to estimate them by calibration."
-        )
-        notes += lab.glyphs.notes()
+            "their parameters and has to estimate them by calibration.",
+            *lab.glyphs.notes(),
+        ]
         with ProgressBars() as progress:
             folders = render_captures(
                 lab, out / "captures", workers=settings.workers, progress=progress, force=settings.force
@@ -191,6 +191,7 @@ def _study(settings: Demo, test: list[str]) -> Study:
             Arm("E2E, single positions", "none", None, single, sampling=alone_sees),
             Arm("E2E", "none", None, alone, sampling=alone_sees),
         ),
+        modalities=settings.modalities,
         seeds=(settings.seed,),
         test=tuple(test),
         writers=settings.writers,
@@ -206,194 +207,10 @@ def _study(settings: Demo, test: list[str]) -> Study:
 
 
 def held_out(folders: list[Path], wanted: tuple[str, ...]) -> list[str]:
-    """Return the characters to test on; every seventh where the captures have none of the wanted ones."""
+    """Return the characters to test on; every seventh where the captures have none of the usual ones."""
     there = [character_of(folder.resolve().name) for folder in folders]
-    return [c for c in wanted if c in there] or there[::7]
-
-
-_REFUSED = "refused.txt"
-_FRAMES, _EVENTS = "frames", "surfaces"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What came of the demo on one setup.
-
-    Args:
-        setup: Name of the setup.
-        refused: Why the calibration refused the captures; empty where it did not.
-        warnings: What the calibration said against itself.
-        expected: What the calibration says that EPNP will bring; empty where it said nothing.
-        left: "frames" or "surfaces" (of events) -> (residual on held-out captures, what noise leaves), shares.
-        mean_image_db: Modality -> PSNR of the mean image, dB.
-        psnr_db: (arm, modality) -> PSNR of each seed, dB.
-    """
-
-    setup: str
-    refused: str
-    warnings: tuple[str, ...]
-    expected: str
-    left: dict[str, tuple[float, float]]
-    mean_image_db: dict[str, float]
-    psnr_db: dict[tuple[str, str], list[float]]
-
-    def best_e2e(self, modality: str) -> float:
-        """Return the mean PSNR of the strongest end-to-end arm, dB; NaN where there is none."""
-        values = [np.mean(v) for (arm, p), v in self.psnr_db.items() if arm.startswith("E2E") and p == modality]
-        return float(max(values, default=np.nan))
-
-    def of(self, arm: str, modality: str) -> float:
-        """Return the mean PSNR of an arm over its seeds, dB; NaN where it was not run."""
-        return float(np.mean(self.psnr_db.get((arm, modality), [np.nan])))
-
-
-def run_mismatch(
-    base: Demo,
-    setups: tuple[str, ...] = (),
-    captures: Path | None = None,
-    seeds: tuple[int, ...] = (0,),
-    progress: Progress = silent,
-) -> list[Finding]:
-    """Run the demo on each setup, one after the other, and return what came of it; run it again to go on.
-
-    Args:
-        base: Settings of the demo; `out` holds a folder for each setup and seed.
-        setups: Names of setups: of the rooms of `evnlos lab`, or of folders in `captures`; all by default.
-        captures: Folder that holds a folder of captures for each setup; None renders the rooms.
-        seeds: Seeds of the demo.
-        progress: Called as the captures are rendered.
-
-    Raises:
-        UnknownNameError: A setup is unknown, or its folder holds no captures.
-    """
-    found = []
-    for name in mismatch_setups(setups, captures):
-        if captures is None:
-            lab = lab_of(name, Demo().lab)
-            folders = render_captures(
-                lab, base.out / "captures" / name, workers=base.workers, progress=progress, force=base.force
-            )
-        else:
-            folders = [file.parent for file in sorted((captures / name).glob("*/capture.yaml"))]
-        outs = []
-        for seed in seeds:
-            out = base.out / f"{name}-seed{seed}"
-            outs.append(out)
-            out.mkdir(parents=True, exist_ok=True)
-            try:
-                run_demo(replace(base, captures=tuple(folders), out=out, seed=seed))
-            except CalibrationError as error:
-                write_atomically(out / _REFUSED, str(error).encode())
-        found.append(finding(name, outs))
-        write_atomically(base.out / "mismatch.md", mismatch_table(found).encode())
-    return found
-
-
-def mismatch_setups(asked: tuple[str, ...] = (), captures: Path | None = None) -> tuple[str, ...]:
-    """Return the names of the setups that `run_mismatch` goes through.
-
-    Args:
-        asked: As its `setups`.
-        captures: As its `captures`.
-
-    Raises:
-        UnknownNameError: A setup is unknown, or there is no folder of captures.
-    """
-    folders = [] if captures is None else Path(captures).glob("*/*/capture.yaml")
-    known = tuple(ROOMS) if captures is None else sorted({file.parent.parent.name for file in folders})
-    if not known:
-        raise UnknownNameError(f"{captures} holds no folders of captures; give the folder above them")
-    for name in asked:
-        if name not in known:
-            raise UnknownNameError(f"setup {name!r} is unknown; give some of {', '.join(known)}")
-    return asked or tuple(known)
-
-
-def finding(setup: str, outs: list[Path]) -> Finding:
-    """Return what the demo left in its folders, one a seed.
-
-    Args:
-        setup: Name of the setup.
-        outs: The demo's folders.
-    """
-    refused = [out / _REFUSED for out in outs if (out / _REFUSED).is_file()]
-    figures = [
-        json.loads(f.read_text()) for out in outs for f in (out / "setups").glob(f"*/{CALIBRATION_VALUES_FILE}")
-    ]
-    records: list[Record] = []
-    for out in outs:
-        if any((out / "records").rglob("*.json")):
-            records += read_records(out / "records")
-    left = {}
-    for kind in (_FRAMES, _EVENTS):
-        pairs = [_left(one["residuals"], kind) for one in figures]
-        pairs = [pair for pair in pairs if pair is not None]
-        if pairs:
-            left[kind] = (float(np.mean([p[0] for p in pairs])), float(np.mean([p[1] for p in pairs])))
-    mean_image = {
-        r.modality: float(np.mean(list(r.baselines["mean"]["psnr_db"].values())))
-        for r in records
-        if "mean" in r.baselines
-    }
-    warnings = dict.fromkeys(line for one in figures for line in one["warnings"])
-    words = refused[0].read_text() if refused else ""
-    expected = next((str(one["expectation"]) for one in figures if one.get("expectation")), "")
-    return Finding(setup, words, tuple(warnings), expected, left, mean_image, means_of(records))
-
-
-def _left(residuals: dict[str, dict[str, float]], kind: str) -> tuple[float, float] | None:
-    """Return residual and noise of held-out captures, without the frames' pattern where that is there."""
-    names = [name for name in residuals if name.startswith(kind) and "held out" in name]
-    names = [name for name in names if "without pattern" in name] or names
-    return (residuals[names[-1]]["after"], residuals[names[-1]]["noise"]) if names else None
-
-
-def mismatch_table(found: list[Finding]) -> str:
-    """Return Markdown: a row for each setup and modality, and the margins that matter below it."""
-    head = ["setup", "sees", "left / noise, %", "mean image", "E2E", "simulation only", "EPNP", "EPNP - E2E"]
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    for one in found:
-        for modality in [p for p in STANDARD_MODALITIES if p in one.mean_image_db]:
-            kinds = {"frame": (_FRAMES,), "event": (_EVENTS,)}.get(modality, (_FRAMES, _EVENTS))
-            left = "; ".join(
-                f"{100 * a:.1f} / {100 * b:.1f}" for a, b in (one.left[k] for k in kinds if k in one.left)
-            )
-            e2e, epnp = one.best_e2e(modality), one.of("EPNP", modality)
-            numbers = (one.mean_image_db[modality], e2e, one.of("simulation only", modality), epnp)
-            cells = [one.setup, modality, left, *(f"{v:.2f}" for v in numbers), f"{epnp - e2e:+.2f}"]
-            lines.append(f"| {' | '.join(cells)} |")
-        if one.refused:
-            lines.append(f"| {one.setup} | refused: {one.refused} |" + " |" * (len(head) - 2))
-    return "\n".join([*lines, "", *_margins(found), "", *_said(found)]) + "\n"
-
-
-def _margins(found: list[Finding]) -> list[str]:
-    """Return a line for each modality: by how much EPNP leads, in the mean and where it leads least."""
-    lines = []
-    for modality in STANDARD_MODALITIES:
-        lead = {one.setup: one.of("EPNP", modality) - one.best_e2e(modality) for one in found}
-        above = {
-            one.setup: one.of("simulation only", modality) - one.mean_image_db[modality]
-            for one in found
-            if modality in one.mean_image_db
-        }
-        lead = {setup: value for setup, value in lead.items() if np.isfinite(value)}
-        if not lead:
-            continue
-        least, lowest = min(lead, key=lead.__getitem__), min(above, key=above.__getitem__)
-        lines.append(
-            f"- {modality}: EPNP - E2E {np.mean(list(lead.values())):+.2f} dB in the mean, "
-            f"{lead[least]:+.2f} at least ({least}); simulation only - mean image {above[lowest]:+.2f} dB at "
-            f"least ({lowest})."
+    if wanted != _TEST and (lacking := [c for c in wanted if c not in there]):
+        raise UnknownNameError(
+            f"test has {lacking[0]!r}, and no capture shows it; give some of {' '.join(there)}"
         )
-    return lines
-
-
-def _said(found: list[Finding]) -> list[str]:
-    """Return what the calibrations said against themselves, and what they expected of EPNP."""
-    lines = []
-    for one in found:
-        words = "; ".join(one.warnings) or one.refused or "nothing"
-        expected = f"; it expected: {one.expected}" if one.expected else ""
-        lines.append(f"- {one.setup}: the calibration warned of {words}{expected}.")
-    return lines
+    return [c for c in wanted if c in there] or there[::7]

@@ -103,7 +103,7 @@ def choose_pixel(
 ) -> PixelFit:
     """Return the fit of the event model whose events are nearest to those of captures held out.
 
-    Another model than v2e's must be better by a tenth, and by more than thrice the scatter of the difference.
+    Another model than v2e's must be better by a twentieth, and by over thrice the scatter of the difference.
 
     Args:
         known: The fit of v2e's continuous pixel.

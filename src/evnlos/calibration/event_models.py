@@ -28,8 +28,8 @@ _MOVING = (0.15, 0.6)  # swings of the log light between pixels at rest, moving,
 _FLOOR = 0.05  # relative error of a figure that no model is held to
 _FEWEST = 1e-3  # events per pixel per second that count as none
 _BIN_S, _BLOCK_PX = 0.4, 5
-_SHARED = ("threshold_on", "threshold_off", "leak_rate_hz")
-_MARGIN = 0.1
+_SHARED = ("threshold_on", "threshold_off", "threshold_sigma", "leak_rate_hz", "shot_noise_rate_hz")
+_MARGIN = 0.05
 _FURTHEST = 0.7  # of a step along a logarithm: a factor of two
 _EDGE = 0.02  # of a parameter's range
 
@@ -140,7 +140,7 @@ def fit_model(
     Args:
         recordings: Light and events.
         name: Name of the model.
-        near: A pixel of another model that was fitted: the search starts at its thresholds and leak.
+        near: A pixel of another model that was fitted: the search starts at its thresholds, leak and noise.
         seed: Seed of the simulations; all trials draw the same noise.
         iterations: Most steps.
     """
@@ -204,7 +204,7 @@ def misfit(recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> 
 
 
 def is_better(before: Array, after: Array) -> bool:
-    """Return whether a model's misfit is lower by a tenth, and by more than thrice the difference's scatter."""
+    """Return whether a model's misfit is lower by a twentieth, and by over thrice the difference's scatter."""
     gain = before - after
     return bool(gain.sum() > max(3 * math.sqrt(len(gain)) * gain.std(), _MARGIN * before.sum()))
 

@@ -23,13 +23,14 @@ from evnlos.app.serve import Server, serve
 from evnlos.calibration.captures import FEWEST
 from evnlos.cli.parsing import UnfitWordsError, drawn, say
 from evnlos.cli.recordings import Flat
-from evnlos.data import STANDARD_MODALITIES, captures_in
-from evnlos.demo import Demo, held_out, mismatch_setups, mismatch_table, run_demo, run_mismatch
+from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in, character_of
+from evnlos.demo import LAB_CHARACTERS, Demo, held_out, run_demo
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import SourceOptions, check_source, open_live
-from evnlos.machine import ProgressBars
+from evnlos.machine import ProgressBars, Step
+from evnlos.mismatch import mismatch_setups, mismatch_table, run_mismatch
 from evnlos.types import OutFolder
 
 if TYPE_CHECKING:
@@ -43,9 +44,9 @@ class DemoCommand:
     settings: Flat[Demo] = field(default_factory=Demo)
 
     def check_names(self) -> None:
-        """Refuse captures that are not there, or too few."""
+        """Refuse captures that are not there, or too few, and characters to test on that none shows."""
         one, found = self.settings, captures_in(self.settings.captures)
-        left = len(found) - len(held_out(found, one.test))
+        left = len(found) - len(held_out(found or [Path(f"lab_{c}") for c in LAB_CHARACTERS], one.test))
         if found and one.calibrate and left < FEWEST:
             given = f"--captures holds {len(found)}, of which {left} are not to test on"
             raise UnfitWordsError(f"{given}; give {FEWEST} or more of these, best 20, or --no-calibrate")
@@ -134,6 +135,11 @@ class ExperimentCommand:
             there = [arm.name for arm in experiment.STUDIES[self.name](self.captures_of).arms]
             if unknown := [arm for arm in self.arms if arm not in there]:
                 raise UnknownNameError(f"arm {unknown[0]!r} is unknown; {self.name} has {', '.join(there)}")
+        for flag in ("seeds", "modalities", *(() if self.validation or self.folds else ("test",))):
+            if not getattr(self, flag):
+                raise UnfitWordsError(f"--{flag} is empty; give one or more")
+        for one in self.modalities:
+            MODALITIES.check(one)
 
     def run(self) -> None:
         """Run what is left, with a line of progress, and print the tables."""
@@ -141,9 +147,6 @@ class ExperimentCommand:
         getattr(self, f"_{self.name}" if self.name in _WITHOUT_CAPTURES else "_on_captures")()
 
     def _on_captures(self) -> None:
-        from evnlos.data import character_of
-        from evnlos.machine import Step
-
         study = self._study()
         assert self.captures is not None
         folders = tuple(experiment.captures_of(self.captures, self.captures_of))
@@ -204,12 +207,9 @@ class ExperimentCommand:
         settings = experiment.Simulated(
             self.out, modalities=self.modalities, seeds=self.seeds, workers=self.workers, force=self.force
         )
-        epochs = {
-            "pretraining": self.pretrain_epochs,
-            "finetuning": self.finetune_epochs,
-            "end_to_end": self.e2e_epochs,
-        }
-        changed = {name: replace(getattr(settings, name), epochs=n) for name, n in epochs.items() if n}
+        parts, epochs = ("pretraining", "finetuning", "end_to_end"), ("pretrain", "finetune", "e2e")
+        numbers = [getattr(self, f"{name}_epochs") for name in epochs]
+        changed = {p: replace(getattr(settings, p), epochs=n) for p, n in zip(parts, numbers, strict=True) if n}
         settings = replace(settings, writers=self.writers or settings.writers, **changed)
         with ProgressBars() as progress:
             experiment.run_simulated(settings, progress)
@@ -250,9 +250,9 @@ class ExperimentCommand:
         drawn(shown, lambda: draw_confidence(checks, shown))
 
     def _mismatch(self) -> None:
-        base = Demo(out=self.out, test=self.test, workers=self.workers, force=self.force, robust=self.robust)
-        names = ("writers", "pretrain_epochs", "finetune_epochs", "e2e_epochs")
-        base = replace(base, **{name: value for name in names if (value := getattr(self, name))})
+        names = ("out", "test", "modalities", "workers", "force", "robust", "writers")
+        names += ("pretrain_epochs", "finetune_epochs", "e2e_epochs")
+        base = replace(Demo(), **{name: value for name in names if (value := getattr(self, name))})
         with ProgressBars() as progress:
             found = run_mismatch(base, self.setups, self.captures, self.seeds, progress)
         text, captures = mismatch_table(found), self.captures or self.out / "captures"
@@ -329,8 +329,10 @@ class LiveCommand:
     pace: Flat[RateOptions] = field(default_factory=RateOptions)
 
     def check_names(self) -> None:
-        """Refuse a source that is nothing."""
+        """Refuse a source that is nothing, and a port that is none."""
         check_source(self.source, self.listening.follow)
+        if not 0 <= self.port <= 65_535:
+            raise UnfitWordsError(f"--port is {self.port}; give 1 to 65535, or 0 for any that is free")
 
     def run(self) -> None:
         """Show or record images until the source ends, and print how quick they were."""
@@ -382,11 +384,8 @@ class LiveCommand:
                 run.go(sinks)
         finally:
             source.close()
-        summary = run.statistics.summary() | {
-            "weights": str(name),
-            "modality": engine.modality.name,
-            "verdict": asdict(verdict),
-        }
+        about = {"weights": str(name), "modality": engine.modality.name, "verdict": asdict(verdict)}
+        summary = run.statistics.summary() | about
         if out is not None and recorder is not None:
             summary |= {"recorded": recorder.recorded, "not_recorded": recorder.left_out}
             out.mkdir(parents=True, exist_ok=True)
