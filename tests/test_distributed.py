@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -118,9 +119,37 @@ def test_a_training_without_torchrun_is_a_team_of_one(monkeypatch) -> None:
         assert (processes.rank, processes.size) == (0, 1)
         value = torch.ones(2)
         assert processes.total(value) is value
-        network = torch.nn.Linear(1, 1)
-        assert processes.joined(network) is network
     assert not torch.distributed.is_initialized()
+
+
+GROUP = """
+import os, sys
+import torch
+from evnlos.training.source import process_group
+
+with process_group() as processes:
+    torch.manual_seed(processes.rank)
+    network = torch.nn.Conv2d(3, 2, 3).to(memory_format=torch.channels_last)
+    processes.share(network)
+    assert processes.total(network.weight.detach()).equal(2 * network.weight)
+    if processes.rank:
+        network.weight.grad = torch.ones_like(network.weight)
+    processes.average_gradients(network.parameters())
+    assert network.weight.grad.eq(0.5).all() and network.bias.grad.eq(0).all()
+    network(torch.ones(1, 3, 4, 4)).sum().backward()
+    processes.wait()
+threads = {open(f"/proc/self/task/{task}/comm").read().strip() for task in os.listdir("/proc/self/task")}
+print("threads", sorted(name for name in threads if "gloo" in name))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="no /proc to count threads in")
+def test_a_group_shares_weights_and_gradients_and_its_threads_end_with_it(tmp_path) -> None:
+    """A thread of the group that is left when the interpreter ends may abort the process."""
+    (tmp_path / "group.py").write_text(GROUP)
+    done = subprocess.run([*TORCHRUN, str(tmp_path / "group.py")], **QUIET)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("threads []") == 2
 
 
 def test_processes_simulate_other_objects_each(tiny) -> None:

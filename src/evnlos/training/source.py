@@ -52,12 +52,32 @@ class ProcessGroup:
             dist.all_reduce(value)
         return value
 
-    def joined(self, network: nn.Module) -> nn.Module:
-        """Return the network with its gradients averaged over the processes as they come."""
+    def share(self, network: nn.Module) -> None:
+        """Give every process the parameters and buffers of number 0, in place."""
+        if self.size > 1:
+            for value in network.state_dict().values():
+                whole = value.contiguous()  # a layout other than C order is not sent
+                dist.broadcast(whole, 0)
+                value.copy_(whole)
+
+    def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Replace each parameter's gradient by its mean over the processes; one that has none counts as 0.
+
+        Not by `DistributedDataParallel`, whose reducer outlives it and keeps the group's threads alive into the
+        interpreter's end, where now and then one of them aborts the process.
+        """
         if self.size == 1:
-            return network
-        ids = [self.device] if self.device.type == "cuda" else None
-        return nn.parallel.DistributedDataParallel(network, device_ids=ids)
+            return
+        gradients = []
+        for parameter in parameters:
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+            gradients.append(parameter.grad)
+        flat = torch.cat([gradient.flatten() for gradient in gradients])
+        dist.all_reduce(flat)
+        parts = (flat / self.size).split([gradient.numel() for gradient in gradients])
+        for gradient, part in zip(gradients, parts, strict=True):
+            gradient.copy_(part.view_as(gradient))
 
 
 @contextmanager

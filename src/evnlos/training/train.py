@@ -181,8 +181,8 @@ def _epochs(
         _write_log(metrics, log)
     progress(Step(what, done, settings.epochs, "epochs"))
     processes.wait()  # nobody writes before all have read
-    joined = processes.joined(network)
-    run = torch.compile(joined) if settings.compile else joined
+    processes.share(network)
+    run = torch.compile(network) if settings.compile else network
     saved = time.monotonic()
     for epoch in range(done, settings.epochs):
         began, rate, total = time.perf_counter(), 0.0, torch.zeros((), device=device)
@@ -201,6 +201,7 @@ def _epochs(
             loss = loss_of(image.float(), truth, light) * batch.share  # losses are in float32
             optimiser.zero_grad(set_to_none=True)
             (loss * processes.size).backward()  # the mean over the processes is then the whole batch's gradient
+            processes.average_gradients(trained)
             torch.nn.utils.clip_grad_norm_(trained, 1.0)
             optimiser.step()
             total += loss.detach() * batch.weight
