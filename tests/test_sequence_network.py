@@ -210,7 +210,7 @@ SOLVING = replace(NET, rank=200, frames="likelihood", prior_weights=(0.3, 3.0))
 
 
 def test_frames_are_solved_as_one_gaussian_posterior() -> None:
-    """Against all rows of all frames at once, with the offset in a dense covariance."""
+    """Against all rows of all frames at once, with offset and noise in a dense covariance."""
     torch.manual_seed(0)
     solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5, 4.0), 200)
     for name, buffer in solver.named_buffers():
@@ -219,7 +219,9 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
     solver.reach.copy_(torch.tensor([[-0.06, -0.01], [0.06, 0.01]]))
     places = torch.stack([torch.linspace(-0.05, 0.05, 5), 0.1 * torch.linspace(-0.05, 0.05, 5)], dim=1)
     frames, kept = torch.rand(5, 24, 36), torch.tensor([[1.0, 1, 1, 1, 1], [1, 0, 1, 0, 0]])
-    found = solver(frames, places, kept)
+    white = torch.eye(200, dtype=torch.float64) + 0.03 * torch.randn(200, 200, dtype=torch.float64)
+    other = deepcopy(solver)
+    other._whiten(white)  # the noise of one component is then no longer that of another
 
     light = solver.light.double()
     away = (frames - solver.ambient).flatten(1).double() @ solver.basis.double()
@@ -229,25 +231,31 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
     x, y = places[:, :1].double() / 0.06, places[:, 1:].double() / 0.01
     along = torch.cat([x**0, x, x**2, x**3, y, x * y, y**2], dim=1) @ solver.along.double()
     away = away - along - torch.einsum("thw,rhw->tr", drawn(solver.mean.double()), light)
-    for some, images in zip(kept.bool(), found, strict=True):
-        rows, data = seen[some].flatten(0, 1), away[some].flatten()
-        count = int(some.sum())
-        offset = torch.ones(count, count, dtype=torch.float64)
-        covariance = torch.eye(len(rows), dtype=torch.float64)
-        covariance += torch.kron(offset, torch.diag(solver.static.double()))
-        pushed = torch.linalg.solve(covariance, torch.cat([rows, data[:, None]], dim=1))
-        for weight, image in zip(solver.weights, images, strict=True):
-            normal = rows.T @ pushed[:, :-1] + weight * torch.eye(rows.shape[1], dtype=torch.float64)
-            z = torch.linalg.solve(normal, rows.T @ pushed[:, -1])
-            expected = solver.mean + torch.tensordot(z, solver.patterns.double(), dims=1)
-            torch.testing.assert_close(image.double(), expected, rtol=1e-3, atol=1e-3 * float(expected.std()))
+    for one, noise in (
+        (solver, torch.eye(200, dtype=torch.float64)),
+        (other, torch.inverse(white.T @ white).contiguous()),
+    ):
+        for some, images in zip(kept.bool(), one(frames, places, kept), strict=True):
+            rows, data = seen[some].flatten(0, 1), away[some].flatten()
+            count = int(some.sum())
+            offset = torch.ones(count, count, dtype=torch.float64)
+            covariance = torch.kron(torch.eye(count, dtype=torch.float64), noise)
+            covariance += torch.kron(offset, torch.diag(solver.static.double()))
+            pushed = torch.linalg.solve(covariance, torch.cat([rows, data[:, None]], dim=1))
+            for weight, image in zip(solver.weights, images, strict=True):
+                normal = rows.T @ pushed[:, :-1] + weight * torch.eye(rows.shape[1], dtype=torch.float64)
+                z = torch.linalg.solve(normal, rows.T @ pushed[:, -1])
+                expected = solver.mean + torch.tensordot(z, solver.patterns.double(), dims=1)
+                near = {"rtol": 1e-3, "atol": 1e-3 * float(expected.std())}
+                torch.testing.assert_close(image.double(), expected, **near)
 
 
 def test_ridge_regression_leaves_out_group_after_group() -> None:
-    """Against the penalty and the weights that solving anew without each group gives."""
+    """Against the penalty of each column, and what it misses, that solving anew without each group gives."""
     torch.manual_seed(1)
-    known, group = torch.randn(30, 12), torch.arange(30) % 5
-    wanted = known @ torch.randn(12, 3) + 5.0 * torch.randn(30, 3)
+    known, group = torch.randn(60, 12), torch.arange(60) % 5
+    wanted = known @ torch.randn(12, 4) + torch.tensor([0.5, 9.0, 9.0, 0.0]) * torch.randn(60, 4)
+    wanted[:, 3] *= torch.tensor([1.0, -1.0, 0.0, 0.0, 0.0])[group]  # what others predict has the wrong sign
     penalties = (1e-3, 1e-2, 1e-1, 10.0)
     x, y = known.double(), wanted.double()
 
@@ -255,18 +263,18 @@ def test_ridge_regression_leaves_out_group_after_group() -> None:
         own = penalty * float(x.square().sum()) * torch.eye(12)
         return torch.linalg.solve(x[kept].T @ x[kept] + own, x[kept].T @ y[kept])
 
-    left = {
-        penalty: sum(
-            float((y[group == g] - x[group == g] @ solved(group != g, penalty)).square().sum())
-            for g in range(5)
-        )
-        for penalty in penalties
-    }
-    best = min(left, key=lambda penalty: left[penalty])
-    assert penalties[0] < best < penalties[-1] and left[best] < float(y.square().sum())
-    found = ridge_by_groups(known, wanted, group, penalties)
-    torch.testing.assert_close(found.double(), solved(group >= 0, best), rtol=1e-4, atol=1e-5)
-    assert ridge_by_groups(known, torch.randn(30, 3), group, (1e-3, 1e-2)) is None
+    left = torch.empty(len(penalties) + 1, 60, 4, dtype=torch.float64)
+    left[-1] = y
+    for row, penalty in enumerate(penalties):
+        for g in range(5):
+            left[row, group == g] = y[group == g] - x[group == g] @ solved(group != g, penalty)
+    best = left.square().sum(dim=1).argmin(dim=0)
+    assert len(best.unique()) > 2 and best[-1] == len(penalties)
+    found, missed = ridge_by_groups(known, wanted, group, penalties)
+    for column, row in enumerate(best.tolist()):
+        torch.testing.assert_close(missed[:, column], left[row, :, column], rtol=1e-4, atol=1e-4)
+        own = solved(group >= 0, penalties[row])[:, column] if row < len(penalties) else torch.zeros(12)
+        torch.testing.assert_close(found[:, column].double(), own.double(), rtol=1e-4, atol=1e-5)
 
 
 @pytest.fixture(scope="module")

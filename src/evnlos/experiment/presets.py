@@ -74,7 +74,7 @@ def captures(setup: str) -> Study:
 
 
 def paper(setup: str) -> Study:
-    """Return the comparison with the paper's own settings: 200 epochs, 1e-4, L1 + 2/SSIM; a GPU's work."""
+    """Return the comparison with the paper's own settings: 200 epochs, 1e-4, L1 + 2/SSIM."""
     fine = paper_finetuning()
     return Study(
         "paper",

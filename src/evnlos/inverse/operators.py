@@ -322,12 +322,13 @@ def ridge_by_groups(
     wanted: torch.Tensor,
     group: torch.Tensor,
     penalties: Sequence[float] = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1),
-) -> torch.Tensor | None:
-    """Return weights W [P, R] of ridge regression, wanted = known W; groups left out choose the penalty.
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return weights W [P, R] of ridge regression, wanted = known W; groups left out choose the penalties.
 
     In the dual form W = X^T (X X^T + penalty mean |x|^2 N)^-1 Y, each group is left out in closed form: with H
     the inverse, what it misses of its own rows g is (H_gg)^-1 (H Y)_g (leave-out residuals of Gaussian
-    process regression; Rasmussen and Williams 2006, section 5.4.2).
+    process regression; Rasmussen and Williams 2006, section 5.4.2). Each column takes the penalty that misses
+    least of the groups left out, or W = 0 where that misses less.
 
     Args:
         known: X, a row for each sample, [N, P].
@@ -336,20 +337,20 @@ def ridge_by_groups(
         penalties: Penalties, in units of N times the rows' mean square norm; each above 0.
 
     Returns:
-        The weights, float32, or None: every penalty misses more of the groups left out than W = 0 does.
+        The weights, float32 [P, R], and what they miss of each group when it is left out, float64 [N, R].
     """
     target = wanted.double()
     values, axes = torch.linalg.eigh((known @ known.T).double())
     values = values.clamp_min(0)
     turned, size = axes.T @ target, values.sum().clamp_min(1e-30)  # N times the mean square norm
-    least, best = float(target.square().sum()), None
+    missed, best = target.clone(), torch.zeros_like(target)
     for penalty in penalties:
         inverse = 1 / (values + penalty * size)
-        dual, left = axes @ (inverse[:, None] * turned), 0.0
+        dual, left = axes @ (inverse[:, None] * turned), torch.empty_like(target)
         for number in group.unique():
             own = axes[group == number]
             root = torch.linalg.cholesky((own * inverse) @ own.T)
-            left += float(torch.cholesky_solve(dual[group == number], root).square().sum())
-        if left < least:
-            least, best = left, dual
-    return None if best is None else known.T @ best.to(known)
+            left[group == number] = torch.cholesky_solve(dual[group == number], root)
+        better = left.square().sum(dim=0) < missed.square().sum(dim=0)
+        best, missed = torch.where(better, dual, best), torch.where(better, left, missed)
+    return known.T @ best.to(known), missed

@@ -272,8 +272,8 @@ class PooledFrames(nn.Module):
 
         What the components hold beside the predicted light is linear in the image on the canvas: ridge
         regression (`ridge_by_groups`), each capture left out in turn, beside an offset of each capture and what
-        moves along. Fewer than 4 captures change nothing, and those that predict nothing of each other only the
-        latter.
+        moves along. What captures left out miss after it is noise to a new target; where its covariance is more
+        than that of the samples the components are taken in units of it. Fewer than 4 captures change nothing.
 
         Args:
             frames: White levels, [N, H, W].
@@ -293,11 +293,21 @@ class PooledFrames(nn.Module):
         moving, own = (values - common @ (common.T @ values) for values in (shown, code))
         light = moving @ self.light.flatten(1).T
         gain = (light * own).sum() / light.square().sum().clamp_min(1e-12)
-        errors = ridge_by_groups(moving, own - gain * light, group)
-        if errors is not None:
-            self.light += (errors.T / gain).view_as(self.light)
+        errors, missed = ridge_by_groups(moving, own - gain * light, group)
+        self.light += (errors.T / gain).view_as(self.light)
         self.along.copy_(_polynomial(terms, code - gain * (shown @ self.light.flatten(1).T)))
+        variance, turn = torch.linalg.eigh(missed.T @ missed / len(missed))
+        self._whiten((turn / variance.clamp_min(1.0).sqrt()) @ turn.T)
         self._last = None
+
+    def _whiten(self, white: Tensor) -> None:
+        """Take components W c [r] of those that there are, turned so that their offsets stay independent."""
+        static, turn = torch.linalg.eigh((white * self.static.double()) @ white.T)
+        white = (turn.T @ white).float()
+        self.basis.copy_(self.basis @ white.T)
+        self.light.copy_((white @ self.light.flatten(1)).unflatten(1, self.light.shape[1:]))
+        self.along.copy_(self.along @ white.T)
+        self.static.copy_(static.clamp_min(0).float())
 
     def forward(self, frames: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
         """Return the solutions of subsets of the time steps, targets [K, S, h, h].
