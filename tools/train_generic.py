@@ -7,8 +7,8 @@ distances; no capture, no font of the captures and no room of `evnlos lab` is am
 solved at once through the light path of each wall; light, roughness and view scatter about what the solution
 takes them for, as calibrations do: behind every other wall by little, behind the others by more.
 
-Each wall is simulated and solved once, in one process; the walls together make one training set. Networks of
-events and of fusion begin with the layers of frames.
+Each wall is simulated and solved once, in one process; the walls together make one training set. The network of
+fusion begins with the layers of that of frames.
 
     python tools/train_generic.py --out generic
     cp generic/generic-*.safetensors packages/evnlos-weights/src/evnlos_weights/
@@ -20,11 +20,9 @@ import argparse
 import math
 import os
 import shutil
-import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
-from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -33,7 +31,7 @@ import torch
 
 from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.config import save_yaml, to_dict
-from evnlos.data import STANDARD_MODALITIES, NlosDataset, Sampling, Simulation, as_modality, simulate
+from evnlos.data import NlosDataset, Sampling, Simulation, as_modality, simulate
 from evnlos.data.simulate import ranges_around
 from evnlos.demo import SEQUENCE_NETWORK
 from evnlos.machine import ProgressBars, Step
@@ -44,7 +42,7 @@ from evnlos.training import LOSSES, Training, learning_rate_at
 from evnlos.training.settings import light_of
 
 _NETWORK = replace(SEQUENCE_NETWORK, frames="likelihood")
-_FIRST = "frame"  # the others begin with its layers
+_EPOCHS = {"frame": 20, "event": 16, "fusion": 16}
 _WRITERS = {False: 2, True: 1}  # whether events are seen, which takes most of the time -> writers of each wall
 _VIEWS = 3  # of each sequence: all positions, every other one, some
 _SPLITS = ("train", "validation")
@@ -128,7 +126,7 @@ def solve(number: int, out: Path) -> Path:
         )
         plan = wall(number, glyphs, out / f"{name}.yaml", sees_events=sees_events)
         data = simulate(plan, out / name, 1)
-        for modality in STANDARD_MODALITIES if sees_events else (_FIRST,):
+        for modality in _EPOCHS if sees_events else ("frame",):
             network = _NETWORK.build(modality, data.sampling)
             for is_new, split in zip((True, False), _SPLITS, strict=True):
                 samples = NlosDataset(data, split, as_modality(modality))
@@ -199,28 +197,21 @@ def main() -> None:
     """Simulate the walls, and train one network per modality through all of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("generic"), help="folder (default: generic)")
-    parser.add_argument("--walls", type=int, default=36, help="walls (default: 36)")
-    parser.add_argument("--epochs", type=int, default=24, help="epochs over all walls (default: 24)")
+    parser.add_argument("--walls", type=int, default=42, help="walls (default: 42)")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes (default: the cores)")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="begin no wall later (default: inf)")
     options = parser.parse_args()
-    out, files, began = options.out.resolve(), [], time.monotonic()
+    out, files = options.out.resolve(), list[Path]()
     out.mkdir(parents=True, exist_ok=True)
-    work = partial(solve, out=out)
-    settings = Training(epochs=options.epochs, batch_size=32, learning_rate=2e-3, schedule="cosine")
     with ProgressBars() as progress:
         with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-            made = [pool.submit(work, number) for number in range(options.walls)]
-            for one in as_completed(made):
-                if not one.cancelled():
-                    files.append(one.result())
-                    progress(Step("walls", len(files), options.walls, "walls"))
-                if time.monotonic() - began > options.seconds:
-                    for waiting in made:
-                        waiting.cancel()
+            for one in as_completed([pool.submit(solve, number, out) for number in range(options.walls)]):
+                files.append(one.result())
+                progress(Step("walls", len(files), options.walls, "walls"))
         first: Weights | None = None
-        for modality in (_FIRST, *(name for name in STANDARD_MODALITIES if name != _FIRST)):
-            found = trained(modality, sorted(files), first, settings, progress)
+        for modality, epochs in _EPOCHS.items():
+            settings = Training(epochs=epochs, batch_size=32, learning_rate=2e-3, schedule="cosine")
+            begins = first if as_modality(modality).needs_frames else None
+            found = trained(modality, sorted(files), begins, settings, progress)
             # Whoever begins with these layers fits a closed-form part of his own.
             save_weights(out / f"{layers_of('generic', modality)[0]}.safetensors", with_rank(found, 8))
             first = first or found

@@ -78,20 +78,17 @@ class Arm:
     def layers(self, modality: str) -> str | None:
         """Return the name of the installed layers that a network begins with; None: there are none like it.
 
-        Where the layers of its modality saw other surfaces, those of frames do, for events only if they are
-        solved for the target as those frames were.
+        Layers are like it where they saw frames and events solved, or embedded, as the network does.
 
         Args:
             modality: What the network sees.
         """
         if not self.start or self.pretraining is None:
             return None
-        name, frames = layers_of(self.start, modality, "frame")
+        (name,) = layers_of(self.start, modality)
         network = load_weights(name).network
         if network.modality.needs_events and network.sampling.surface != self.sampling.surface:
-            if not network.modality.needs_frames and self.sampling.surface != "likelihood":
-                return None
-            name, network = frames, load_weights(frames).network
+            return None
         given, own = (getattr(one, "frames", "") for one in (network.settings, self.pretraining.network))
         return name if given == own else None
 

@@ -20,7 +20,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import LinearOperator
 from evnlos.machine import note
 from evnlos.optics import MatrixTransport, dense_matrix
-from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Target
+from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Strokes, Target
 from evnlos.types import Plane
 
 if TYPE_CHECKING:
@@ -275,6 +275,7 @@ TRAIN_CHARACTERS = "BCDEFHIJLMNOPQRTUVWXYZ0135678"
 TYPICAL = "G"
 """The character whose Picard plot is shown."""
 _TEST_WRITERS = 2
+_HAND = Strokes()
 _RIDGE = 1e-3  # white part of the prior, share of its mean variance: no shape is impossible
 
 
@@ -303,7 +304,7 @@ class TargetPrior:
 
 
 @lru_cache(maxsize=2)
-def handwritten_targets(target_plane: Plane, writers: int = 6) -> TargetPrior:
+def handwritten_targets(target_plane: Plane, writers: int = 6, strokes: Strokes = _HAND) -> TargetPrior:
     """Return NIST-like handwriting as prior and test.
 
     Training targets are also moved by a cell each way, so that the prior does not know the place to a cell.
@@ -311,8 +312,9 @@ def handwritten_targets(target_plane: Plane, writers: int = 6) -> TargetPrior:
     Args:
         target_plane: Cells of the target plane, square.
         writers: Writers of the training targets.
+        strokes: Theirs; those of the test are handwriting.
     """
-    training = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=writers)
+    training = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=writers, strokes=strokes)
     masks, names = [], training.objects()
     for k, name in enumerate(names, 1):
         note(f"handwritten target {k} of {len(names)}")

@@ -24,6 +24,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.problem import handwritten_targets
 from evnlos.inverse.sequence_problem import SequenceOperator, strip_of
 from evnlos.optics import MatrixTransport
+from evnlos.scene import Strokes
 from evnlos.setups import Setup
 from evnlos.types import Plane
 
@@ -33,6 +34,7 @@ EVENT_PRIORS = (0.3, 2.0)
 """Weights of the prior, over its own, at which the events of a sequence are solved for the target: one image
 each."""
 
+_WRITERS, _STROKES = 11, Strokes(faces="both")  # of the prior; as many writers as faces
 _COARSEST = (50, 80)
 _TAIL = 1e-4
 _EXTRA, _POWERS = 40, 4  # directions and power iterations of the range finder
@@ -78,15 +80,22 @@ class PatternPrior:
 
 
 @lru_cache(maxsize=2)
-def handwritten_prior(target_plane: Plane, coefficients: int = 150, writers: int = 6) -> PatternPrior:
-    """Return the Gaussian of handwritten targets by its largest patterns.
+def handwritten_prior(
+    target_plane: Plane,
+    coefficients: int = 150,
+    writers: int = _WRITERS,
+    strokes: Strokes = _STROKES,
+) -> PatternPrior:
+    """Return the Gaussian of written targets by its largest patterns.
 
-    The targets are those of `handwritten_targets`: NIST-like characters without A G K S 2 4 9.
+    The targets are those of `handwritten_targets`, without A G K S 2 4 9. Printed letters are among them, since
+    a prior of handwriting alone takes broad strokes for noise.
 
     Args:
         target_plane: Cells of the target, square.
         coefficients: Patterns that are kept.
         writers: Writers of the targets.
+        strokes: Theirs.
 
     Raises:
         ConfigError: More coefficients than cells, or none.
@@ -95,7 +104,7 @@ def handwritten_prior(target_plane: Plane, coefficients: int = 150, writers: int
         raise ConfigError(
             f"coefficients is {coefficients}; give 1 to {target_plane.height * target_plane.width}, its cells"
         )
-    targets = handwritten_targets(target_plane, writers)
+    targets = handwritten_targets(target_plane, writers, strokes)
     values, axes = torch.linalg.eigh(targets.root @ targets.root.mT)
     values, axes = values.flip(0).clamp(min=0), axes.flip(1)
     patterns = axes[:, :coefficients] * values[:coefficients].sqrt()

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import ridge_by_groups
-from evnlos.inverse.sequence_light import EVENT_PRIORS, handwritten_prior
+from evnlos.inverse.sequence_light import handwritten_prior
 from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.models.confidence import on_canvas
 from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmbeddings, fit_input
@@ -403,12 +403,6 @@ class SequenceReconstructor(Reconstructor):
             None if self._frame is None else PooledFrames(sampling, settings.prior_weights, settings.rank)
         )
         images = self.embedding.images + (0 if self.frames is None else self.frames.images)
-        priors = {
-            ("frame",): settings.prior_weights if left_out else (),
-            ("surface",): EVENT_PRIORS if solved else (),
-        }
-        found = [weight for group in modality.groups for weight in priors.get(group.maps, ())]  # type: ignore[arg-type]
-        self._priors = found if len(found) == images else []  # of the images, where all of them are solved
         self.scale = PooledScale(images)
         self.unet = ResidualUNet(images, settings)
         self._corrects = False
@@ -512,29 +506,6 @@ class SequenceReconstructor(Reconstructor):
         """Return images of one object at positions `at_m`, [M, H, W], from its sequence."""
         plane = self(self.pooled(inputs, position_m)[None])[0, 0]
         return self.grid.on_canvas(plane, at_m)
-
-    @torch.no_grad()
-    def take_layers(self, other: Reconstructor) -> None:
-        """Take what gradients trained from another reconstructor, and leave what is fitted in closed form.
-
-        Events that are solved for the target take the layers of frames that were: each image those of the image
-        whose prior is nearest.
-
-        Args:
-            other: One of the same kind and layers.
-
-        Raises:
-            ConfigError: Kind, modality or the size of a layer differ.
-        """
-        given = getattr(other, "_priors", [])
-        if given and self._priors and not self.modality.needs_frames and other.modality.needs_frames:
-            away = np.log(self._priors)[:, None] - np.log(given)
-            stem, cell = other.get_parameter("unet.stem.weight"), self.settings.shuffle**2
-            other = deepcopy(other)
-            other.modality = self.modality
-            chosen = stem.unflatten(1, (-1, cell))[:, np.abs(away).argmin(axis=1)]
-            other.get_submodule("unet.stem").weight = nn.Parameter(chosen.flatten(1, 2))
-        super().take_layers(other)
 
     def reduced(self, rank: int) -> Reconstructor:
         """Return a copy whose linear embedding has fewer components, the strongest."""
