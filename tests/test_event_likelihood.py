@@ -16,8 +16,11 @@ from evnlos.data import NlosDataset, Sampling, Simulation, simulate
 from evnlos.data.sampling import surface_of
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import (
+    AboutErrors,
+    EventErrors,
     EventRecord,
     EventSolver,
+    EventStatistic,
     FrameTerm,
     LikelihoodSettings,
     PatternPrior,
@@ -289,3 +292,45 @@ def test_the_surface_is_refused_without_setup_or_motion() -> None:
         event_images(events, edges, None, "near", canvas)
     with pytest.raises(ConfigError, match="whole recordings"):
         surface_of(events, edges, Sampling(surface="likelihood", setup="near"))
+
+
+def errors_of(draw: np.random.Generator, captures: int, drift: float) -> tuple[EventErrors, np.ndarray]:
+    """Return errors of captures about information A [12, 12]: noise, and along two axes what is no noise."""
+    root = draw.normal(size=(12, 12)) + 4 * np.eye(12)
+    scores = draw.normal(size=(captures, 12)) @ root.T
+    scores[:, 0] += 20 * drift
+    scores[:, 1] += 20 * drift * draw.normal(size=captures)
+    about = AboutErrors(tuple(f"c{k}" for k in range(captures)))
+    a = root @ root.T
+    return EventErrors(about, torch.tensor(scores).float(), torch.tensor(a).float()), a
+
+
+@pytest.mark.parametrize("drift", [0.0, 1.0])
+def test_what_captures_show_of_errors_helps_the_next(drift: float) -> None:
+    plain, corrected = [], []
+    for seed in range(40):
+        draw = np.random.default_rng(seed)
+        errors, a = errors_of(draw, 15, drift)
+        z = draw.normal(size=12)
+        score = a @ z + errors.scores[3].double().numpy()  # the fourth is the next: it does not count itself
+        statistic = EventStatistic(z, a, score)
+        without = EventErrors(
+            AboutErrors(errors.about.captures[:3] + errors.about.captures[4:]),
+            errors.scores[[k for k in range(15) if k != 3]],
+            errors.information,
+        )
+        found = errors.corrected(statistic, "c3")
+        np.testing.assert_allclose(found.score, without.corrected(statistic, "new").score, rtol=1e-6, atol=1e-9)
+        plain.append(np.square(statistic.solutions((1.0,))[0] - z).mean())
+        corrected.append(np.square(found.solutions((1.0,))[0] - z).mean())
+    gain = np.mean(corrected) / np.mean(plain)
+    assert gain < 0.7 if drift else gain < 1.05
+
+
+def test_few_captures_change_nothing_of_what_events_say() -> None:
+    errors, a = errors_of(np.random.default_rng(0), 4, 1.0)
+    statistic = EventStatistic(np.zeros(12), a, np.ones(12))
+    assert errors.corrected(statistic, "c2") is statistic
+    assert errors.corrected(statistic, "another") is not statistic
+    with pytest.raises(DataError, match="of 2 captures"):
+        EventErrors(AboutErrors(("a", "b")), errors.scores, errors.information)

@@ -318,7 +318,7 @@ def test_frames_solved_through_the_light_path_show_the_target(solved) -> None:
         return float((brighter - light).square().mean())
 
     known = change()
-    slim = network.reduced(80).pooled(inputs, places)[1]  # by the strong prior, which needs few components
+    slim = network.reduced(100).pooled(inputs, places)[1]  # by the strong prior, which needs few components
     assert (slim - pooled[1]).square().mean() < 0.02 * blind
     network.load_state_dict(network.state_dict() | {"frames.static": torch.zeros(len(network.frames.static))})
     assert known < 0.2 * change()

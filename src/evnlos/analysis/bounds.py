@@ -207,8 +207,7 @@ def sequence_bounds(
     targets = handwritten_targets(target_plane, settings.writers)
     chosen = [next(k for k, at in enumerate(targets.names) if at.endswith(f"_{c}")) for c in _REFERENCES]
     note("frames of the sequence")
-    scaled = prior.patterns / np.square(prior.patterns).sum(axis=0)
-    references = [(targets.test[k].numpy() - prior.mean) @ scaled for k in chosen]
+    references = [prior.coefficients(targets.test[k].numpy()) for k in chosen]
     frames = [pixels * frame_information(light, z, setup, settings) for z in references]
     found = []
     typical = float(light(references[0]).mean()) * WHITE_DN

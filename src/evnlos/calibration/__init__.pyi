@@ -3,6 +3,7 @@
 from .captures import Calibration as Calibration
 from .captures import CaptureSet as CaptureSet
 from .captures import read_capture_set as read_capture_set
+from .event_errors import write_event_errors as write_event_errors
 from .event_fit import PixelFit as PixelFit
 from .event_fit import fit_pixel as fit_pixel
 from .fit import Example as Example

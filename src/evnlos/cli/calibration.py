@@ -88,6 +88,7 @@ class CalibrateCommand:
             rows_of,
             table,
             warnings_of,
+            write_event_errors,
             write_setup,
         )
         from evnlos.calibration.summary import TRAINING_FILE, check_out, expectation
@@ -110,6 +111,10 @@ class CalibrateCommand:
         for line in warnings_of(fit):
             say(f"warning: {line}")
         path = write_setup(fit, rows, self.out, self.force)
+        if fit.pixel is not None and fit.known:
+            used = [one for one in self.captures if one.resolve().name in {*fit.fitted, *fit.held_out}]
+            with ProgressBars() as progress:
+                write_event_errors(self.out, used, progress)
         if not self.json:
             print(
                 f"\nto pre-train on:   evnlos simulate --config {path.with_name(TRAINING_FILE)} --out DATASET"

@@ -299,7 +299,7 @@ def _samples_of(capture: Capture, sampling: Sampling, pattern: FixedPattern | No
         frames, peak = mapped(frames, partial(pattern.correct, peak=peak)), 1.0
     if not capture.has_events:  # nothing is in its maps, of whatever kind they are
         sampling = replace(sampling, surface="sae")
-    known: Any = {"motion": capture.motion, "target": capture.target, "several": capture.several}
+    known: Any = {n: getattr(capture, n) for n in ("motion", "target", "several")} | {"capture": capture.name}
     yield from iter_samples(frames, peak, capture.events, capture.frame_times_us, sampling, **known)
 
 

@@ -201,10 +201,12 @@ def iter_samples(
     motion: Motion | None = None,
     target: Target | None = None,
     several: SeveralTargets | None = None,
+    capture: str | None = None,
 ) -> Iterator[Samples]:
     """Yield what `make_samples` returns in blocks, at least one, whose memory does not grow with the positions.
 
-    Of the surfaces `trace` and `likelihood` alone all are held at once.
+    Of the surfaces `trace` and `likelihood` alone all are held at once. `capture` is the name of a real
+    recording, see `event_images`.
     """
     if len(edges_us) != len(frames) + 1:
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
@@ -212,9 +214,10 @@ def iter_samples(
     steps = max(1, _BLOCK_BYTES // (4 * (2 * events.width * events.height + math.prod(frames.shape[1:]))))
     tau_us, mode = sampling.tau_s * 1e6, sampling.surface
     if mode == "likelihood":
-        from evnlos.inverse.sequence_statistic import event_images  # which compiles
+        from evnlos.inverse.event_images import event_images  # which compiles
 
-        surfaces = frame_blocks(event_images(events, edges_us, motion, sampling.setup, sampling.canvas), steps)
+        images = event_images(events, edges_us, motion, sampling.setup, sampling.canvas, capture)
+        surfaces = frame_blocks(images, steps)
     elif mode == "trace":
         surfaces = frame_blocks(event_trace(events, edges_us, tau_us), steps)
     else:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
+from evnlos.calibration import SetupFit, fit_setup, rows_of, write_event_errors, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, as_modality, import_captures, load_pattern, simulate
 from evnlos.data.pool import processes, run_tasks
@@ -91,6 +91,9 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
             fit = fit_setup(place.captures, settings, progress)
             write_setup(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), setup)
             _draw(fit, setup / "check.png")
+            if sees_events and any(arm.sampling.surface == "likelihood" for arm in arms):
+                used = {*fit.fitted, *fit.held_out}
+                write_event_errors(setup, [f for f in place.captures if f.resolve().name in used], progress)
         except DataError as error:
             raise CalibrationError(str(error)) from None
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))

@@ -12,6 +12,9 @@ from .corner import Prior as Prior
 from .corner import estimate_corner as estimate_corner
 from .corner import noise_of as noise_of
 from .corner import read_penumbra as read_penumbra
+from .event_images import AboutErrors as AboutErrors
+from .event_images import EventErrors as EventErrors
+from .event_images import event_images as event_images
 from .event_likelihood import LikelihoodSettings as LikelihoodSettings
 from .event_likelihood import SequenceEstimate as SequenceEstimate
 from .event_likelihood import estimate_sequence as estimate_sequence
@@ -45,7 +48,6 @@ from .sequence_problem import SequenceOperator as SequenceOperator
 from .sequence_problem import SequenceProblem as SequenceProblem
 from .sequence_statistic import EventSolver as EventSolver
 from .sequence_statistic import EventStatistic as EventStatistic
-from .sequence_statistic import event_images as event_images
 from .tikhonov import tikhonov as tikhonov
 from .tikhonov import tikhonov_cv_error as tikhonov_cv_error
 from .total_variation import total_variation as total_variation

@@ -64,6 +64,10 @@ class PatternPrior:
         """Number of coefficients."""
         return self.patterns.shape[1]
 
+    def coefficients(self, image: Array) -> Array:
+        """Return the coefficients of a target [h, w], [k]: the patterns are orthogonal."""
+        return (image.ravel() - self.mean) @ (self.patterns / np.square(self.patterns).sum(axis=0))
+
     def image(self, z: Array) -> Array:
         """Return the target of coefficients [k], [h, w]."""
         return (self.mean + self.patterns @ z).reshape(self.target_plane.shape)

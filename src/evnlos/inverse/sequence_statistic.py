@@ -1,10 +1,9 @@
-"""All events of a sequence as two images of the target: what a network of whole sequences sees of them.
+"""What all events of a sequence say of the target, in a second.
 
-The estimate of `event_likelihood`, in single precision and in a second: from every fourth row and column
-first, which need a sixteenth of the work, then from all pixels. Mean thresholds are those of the setup, and the
-filter counts as a delay 1 / w. What the last iteration leaves, information A and score b about the coefficients
-z of the prior, is all that the events say of the target there; its solutions z = (A + m)^-1 b at a weak and at
-a strong prior m are the images, put where the target was at each instant.
+The estimate of `event_likelihood`, in single precision: from every fourth row and column first, which need a
+sixteenth of the work, then from all pixels. Mean thresholds are those of the setup, and the filter counts as a
+delay 1 / w. What the last iteration leaves, information A and score b about the coefficients z of the prior, is
+all that the events say of the target there.
 
 | symbol | meaning | unit |
 |---|---|---|
@@ -17,37 +16,23 @@ a strong prior m are the images, put where the target was at each instant.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from evnlos.cameras import CrossingLaw
 from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE
 from evnlos.cameras.streams import WHITE_DN
-from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.event_likelihood import LikelihoodSettings, upward
 from evnlos.inverse.event_record import EventRecord, record_of
-from evnlos.inverse.sequence_light import (
-    EVENT_PRIORS,
-    Array,
-    PatternPrior,
-    SequenceLight,
-    handwritten_prior,
-    sequence_light,
-)
-from evnlos.scene import LineMotion, Motion, Target, TargetPlane
-from evnlos.setups import load_setup
-from evnlos.types import Events, Plane
+from evnlos.inverse.sequence_light import Array, SequenceLight
+from evnlos.types import Events
 
 Single = NDArray[np.float32]
 
-CELLS, COEFFICIENTS, RANK = 32, 120, 120
-"""Cells along a side of the target, patterns of its prior, factors of the light path."""
 _COARSE = 4  # every fourth row and column makes the first estimate
 _COARSE_STEPS, _ANNEALED, _FINE_STEPS = 14, 6, 2  # at most; with errors of a crossing that shrink to the least
 _SETTLED = 0.1  # step of a coefficient, standard deviations of the prior, after which no other is made
@@ -55,7 +40,6 @@ _LONGEST_STEP = 1.5  # of a coefficient, standard deviations of the prior
 _FEWEST_NOISE, _SMALLEST_NOISE = 0.01, 3e-3  # as in `event_likelihood`
 _STEADY_S = 0.4
 _ACTIVE = 0.01  # weight of a silence, in that of a threshold just met, below which it is left out
-_SPAN_US = 100_000  # first and last instant are multiples of it, so that clocks that jitter share a light path
 _SAFE = 1e-3  # white levels under which no light is taken to lie
 
 
@@ -336,65 +320,3 @@ class EventSolver:
         for mine in np.split(order, starts[1:]) if len(order) else []:
             found[mine] = self._left[pixel[mine]] @ factors[node[mine[0]]]
         return found
-
-
-def event_images(
-    events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str, canvas: Plane
-) -> Single:
-    """Return the target that all events of a sequence show, where it is at each edge: float32 [N, 2, h, w].
-
-    One image with a weak prior, one with a strong one (`EVENT_PRIORS`): the first is sharp and noisy.
-
-    Args:
-        events: The stream of the whole sequence.
-        edges_us: Ascending edges of the grids, [N + 1], microseconds; the light is that between first and last.
-        motion: Of the target.
-        setup: Word of a setup whose light path and event pixel are known, see `load_setup`.
-        canvas: What is drawn.
-
-    Raises:
-        ConfigError: No setup is named, it is not linear, or its event model states no law of its crossings.
-        DataError: The motion is unknown.
-    """
-    if not setup:
-        raise ConfigError(
-            "Sampling.setup is empty; the surface 'likelihood' undoes the light path of a setup: give the "
-            "folder of `evnlos calibrate`"
-        )
-    if motion is None:
-        raise DataError(
-            "the motion is unknown, and the surface 'likelihood' needs it; state it in capture.yaml (`evnlos "
-            "track` finds it)"
-        )
-    edges_us = np.asarray(edges_us, np.int64)
-    if isinstance(motion, LineMotion):  # on the motion's own clock the recordings of a setup share a light path
-        began_us = round(1e6 * motion.start_s)
-        motion, edges_us = replace(motion.in_its_plane(), start_s=0.0), edges_us - began_us
-        events = replace(events, t_us=events.t_us - began_us)
-    span = (int(edges_us[0]) // _SPAN_US * _SPAN_US * 1e-6, -(-int(edges_us[-1]) // _SPAN_US) * _SPAN_US * 1e-6)
-    solver, prior = _solver(setup, motion, span, (events.height, events.width))
-    places = motion.position_m(edges_us[1:] * 1e-6)
-    images = []
-    with threadpool_limits(1):  # its products are small: a second thread mostly waits
-        solutions = solver(events).solutions(EVENT_PRIORS)
-    for z in solutions:
-        mask = np.clip(prior.image(z), 0.0, 1.0).astype(np.float32)
-        images.append(Target("events", mask, prior.target_plane.extent_m[0]).rasterise(canvas, places))
-    return np.stack(images, axis=1)
-
-
-@lru_cache(maxsize=2)
-def _solver(
-    setup: str, motion: Motion, span_s: tuple[float, float], shape: tuple[int, int]
-) -> tuple[EventSolver, PatternPrior]:
-    """Return the solver of a setup, and its prior: handwriting, as large as the usual target."""
-    known = load_setup(setup)
-    prior = handwritten_prior(Plane(CELLS, CELLS, TargetPlane().size_m / CELLS), COEFFICIENTS)
-    light = sequence_light(known, prior, motion.position_m, span_s, shape, RANK)
-    law = known.pixel.crossing_law(light.typical_dn)
-    if law is None:
-        raise ConfigError(
-            f"{setup}: its event model states no law of its crossings; give one of kind continuous, v2e, "
-            "brownian or circuit"
-        )
-    return EventSolver(light, law), prior

@@ -1,0 +1,201 @@
+"""All events of a sequence as two images of the target: what a network of whole sequences sees of them.
+
+The solutions z = (A + m)^-1 b of what the events say (`sequence_statistic`) at a weak and at a strong prior m,
+put where the target was at each instant. No sensor is quite the calibrated one, and an error that comes back
+event after event is not averaged away as noise is. Captures with known targets show it: with z* the true
+coefficients, b - A z* is noise of covariance A if the setup is right. What they share is taken from b, and what
+else they miss, by more than noise, is added to the covariance of b: with N that sum,
+
+    z = (A N^-1 A + m)^-1 A N^-1 (b - mean)
+
+| symbol | meaning | unit |
+|---|---|---|
+| A, b | information and score of the coefficients, `EventStatistic` | |
+| m | weight of the prior over its own, `EVENT_PRIORS` | |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from evnlos.errors import ConfigError, DataError
+from evnlos.inverse.sequence_light import EVENT_PRIORS, PatternPrior, handwritten_prior, sequence_light
+from evnlos.inverse.sequence_statistic import EventSolver, EventStatistic
+from evnlos.scene import LineMotion, Motion, Target, TargetPlane
+from evnlos.setups import load_setup
+from evnlos.tensor_file import TensorFile
+from evnlos.types import Events, Plane
+
+CELLS, COEFFICIENTS, RANK = 32, 120, 120
+"""Cells along a side of the target, patterns of its prior, factors of the light path."""
+EVENT_ERRORS_FILE = "events.safetensors"
+"""What captures showed of the errors of a calibrated setup, in its folder."""
+
+_SPAN_US = 100_000  # first and last instant are multiples of it, so that clocks that jitter share a light path
+_FEWEST = 4  # captures that tell of errors
+_LEAST = 1e-6  # noise of a coefficient, in the mean of all
+
+
+@dataclass(frozen=True)
+class AboutErrors:
+    """Description of a file of errors."""
+
+    captures: tuple[str, ...]
+    """Names of the captures."""
+
+
+@dataclass(frozen=True, eq=False)
+class EventErrors:
+    """What captures with known targets showed that a setup gets wrong of its events.
+
+    Args:
+        about: Names of the captures.
+        scores: Score of each about its true target, b - A z*, float32 [C, k].
+        information: Mean A of them, float32 [k, k].
+
+    Raises:
+        DataError: The sizes disagree.
+    """
+
+    about: AboutErrors
+    scores: torch.Tensor
+    information: torch.Tensor
+
+    def __post_init__(self) -> None:
+        count = self.information.shape[-1]
+        if self.scores.shape != (len(self.about.captures), count) or self.information.ndim != 2:
+            raise DataError(f"scores {list(self.scores.shape)} of {len(self.about.captures)} captures")
+
+    def corrected(self, statistic: EventStatistic, capture: str) -> EventStatistic:
+        """Return what events say once the errors that other captures showed are known.
+
+        Args:
+            statistic: What they say if the setup is right.
+            capture: Name of their capture, which does not count; fewer than 4 others change nothing.
+        """
+        others = self.scores.double().numpy()[[name != capture for name in self.about.captures]]
+        number, count = others.shape
+        if number < _FEWEST:
+            return statistic
+        root = np.linalg.cholesky(self.information.double().numpy() + np.eye(count))
+        seen = np.linalg.solve(root, others.T)  # of variance 1 each if the setup is right
+        mean = seen.mean(axis=1)
+        rest = seen - mean[:, None]
+        total = float(np.square(rest).sum()) / (number - 1)
+        # Of the mean and of the scatter, what noise alone would leave is no error (James and Stein).
+        mean *= max(0.0, 1.0 - total / number / max(float(mean @ mean), 1e-12))
+        rest *= np.sqrt(max(0.0, 1.0 - count / max(total, 1e-12)) / (number - 1))
+        spread, a = root @ rest, statistic.information
+        noise = a + spread @ spread.T + _LEAST * np.trace(a) / count * np.eye(count)
+        pushed = np.linalg.solve(noise, a).T  # A N^-1
+        return EventStatistic(statistic.z, pushed @ a, pushed @ (statistic.score - root @ mean))
+
+
+EVENT_ERRORS = TensorFile(
+    "evnlos-event-errors-1",
+    ("scores", "information"),
+    AboutErrors,
+    EventErrors,
+    "errors of a setup's events",
+    "the file that `evnlos calibrate` wrote beside setup.yaml",
+)
+"""Errors of events on disk."""
+
+
+def event_statistic(
+    events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str
+) -> tuple[EventStatistic, PatternPrior]:
+    """Return what all events of a sequence say of the target through a setup, and the prior over targets.
+
+    Arguments and errors as of `event_images`.
+    """
+    if not setup:
+        raise ConfigError(
+            "Sampling.setup is empty; the surface 'likelihood' undoes the light path of a setup: give the "
+            "folder of `evnlos calibrate`"
+        )
+    if motion is None:
+        raise DataError(
+            "the motion is unknown, and the surface 'likelihood' needs it; state it in capture.yaml (`evnlos "
+            "track` finds it)"
+        )
+    events, edges_us, motion = _on_own_clock(events, edges_us, motion)
+    span = (int(edges_us[0]) // _SPAN_US * _SPAN_US * 1e-6, -(-int(edges_us[-1]) // _SPAN_US) * _SPAN_US * 1e-6)
+    solver, prior = _solver(setup, motion, span, (events.height, events.width))
+    with threadpool_limits(1):  # its products are small: a second thread mostly waits
+        return solver(events), prior
+
+
+def event_images(
+    events: Events,
+    edges_us: NDArray[np.int64],
+    motion: Motion | None,
+    setup: str,
+    canvas: Plane,
+    capture: str | None = None,
+) -> NDArray[np.float32]:
+    """Return the target that all events of a sequence show, where it is at each edge: float32 [N, 2, h, w].
+
+    One image with a weak prior, one with a strong one (`EVENT_PRIORS`): the first is sharp and noisy.
+
+    Args:
+        events: The stream of the whole sequence.
+        edges_us: Ascending edges of the grids, [N + 1], microseconds; the light is that between first and last.
+        motion: Of the target.
+        setup: Word of a setup whose light path and event pixel are known, see `load_setup`.
+        canvas: What is drawn.
+        capture: Name of the capture, whose sensor errs as other captures of the setup showed (`EventErrors`);
+            None: the events are the setup's own, simulated.
+
+    Raises:
+        ConfigError: No setup is named, it is not linear, or its event model states no law of its crossings.
+        DataError: The motion is unknown, or the file of errors is damaged.
+    """
+    if motion is not None:
+        events, edges_us, motion = _on_own_clock(events, edges_us, motion)
+    statistic, prior = event_statistic(events, edges_us, motion, setup)
+    if capture is not None and (path := Path(setup) / EVENT_ERRORS_FILE).is_file():
+        statistic = EVENT_ERRORS.load(path, "").corrected(statistic, capture)
+    assert motion is not None
+    places = motion.position_m(edges_us[1:] * 1e-6)
+    images = []
+    for z in statistic.solutions(EVENT_PRIORS):
+        mask = np.clip(prior.image(z), 0.0, 1.0).astype(np.float32)
+        images.append(Target("events", mask, prior.target_plane.extent_m[0]).rasterise(canvas, places))
+    return np.stack(images, axis=1)
+
+
+def _on_own_clock(
+    events: Events, edges_us: NDArray[np.int64], motion: Motion
+) -> tuple[Events, NDArray[np.int64], Motion]:
+    """Return them on the clock of a line's own start, on which the recordings of a setup share a light path."""
+    edges_us = np.asarray(edges_us, np.int64)
+    if not isinstance(motion, LineMotion):
+        return events, edges_us, motion
+    began_us = round(1e6 * motion.start_s)
+    own = replace(motion.in_its_plane(), start_s=0.0)
+    return replace(events, t_us=events.t_us - began_us), edges_us - began_us, own
+
+
+@lru_cache(maxsize=2)
+def _solver(
+    setup: str, motion: Motion, span_s: tuple[float, float], shape: tuple[int, int]
+) -> tuple[EventSolver, PatternPrior]:
+    """Return the solver of a setup, and its prior: handwriting, as large as the usual target."""
+    known = load_setup(setup)
+    prior = handwritten_prior(Plane(CELLS, CELLS, TargetPlane().size_m / CELLS), COEFFICIENTS)
+    light = sequence_light(known, prior, motion.position_m, span_s, shape, RANK)
+    law = known.pixel.crossing_law(light.typical_dn)
+    if law is None:
+        raise ConfigError(
+            f"{setup}: its event model states no law of its crossings; give one of kind continuous, v2e, "
+            "brownian or circuit"
+        )
+    return EventSolver(light, law), prior
