@@ -44,7 +44,7 @@ class CalibrateCommand:
     captures: Folders
     """Capture folders of one setup and one camera."""
     out: OutFolder
-    """Folder for setup.yaml, training.yaml, pattern.safetensors, calibration.json and check.png."""
+    """Folder for setup.yaml, training.yaml, pattern and events.safetensors, calibration.json and check.png."""
     preset: str = "default"
     """Kind of wall: `default` is rough metal (GGX roughness, camera), `paper` the tPSF and an affine view."""
     config: Path | None = None
