@@ -274,8 +274,7 @@ TRAIN_CHARACTERS = "BCDEFHIJLMNOPQRTUVWXYZ0135678"
 """Characters of the prior."""
 TYPICAL = "G"
 """The character whose Picard plot is shown."""
-_TEST_WRITERS = 2
-_HAND = Strokes()
+_TEST_WRITERS, _HAND = 2, Strokes()
 _RIDGE = 1e-3  # white part of the prior, share of its mean variance: no shape is impossible
 
 

@@ -29,6 +29,7 @@ from evnlos.setups import Setup
 from evnlos.types import Plane
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 EVENT_PRIORS = (0.3, 2.0)
 """Weights of the prior, over its own, at which the events of a sequence are solved for the target: one image
@@ -64,7 +65,7 @@ class PatternPrior:
         """Number of coefficients."""
         return self.patterns.shape[1]
 
-    def coefficients(self, image: Array) -> Array:
+    def coefficients(self, image: Array | Single) -> Array:
         """Return the coefficients of a target [h, w], [k]: the patterns are orthogonal."""
         return (image.ravel() - self.mean) @ (self.patterns / np.square(self.patterns).sum(axis=0))
 

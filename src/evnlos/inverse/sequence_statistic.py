@@ -28,10 +28,8 @@ from evnlos.cameras.event_model import KNEE_DN, KNEE_SLOPE
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.inverse.event_likelihood import LikelihoodSettings, upward
 from evnlos.inverse.event_record import EventRecord, record_of
-from evnlos.inverse.sequence_light import Array, SequenceLight
+from evnlos.inverse.sequence_light import Array, SequenceLight, Single
 from evnlos.types import Events
-
-Single = NDArray[np.float32]
 
 _COARSE = 4  # every fourth row and column makes the first estimate
 _COARSE_STEPS, _ANNEALED, _FINE_STEPS = 14, 6, 2  # at most; with errors of a crossing that shrink to the least
