@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from evnlos.analysis import SequenceAnalysisSettings, event_information
+from evnlos.calibration import write_event_errors
 from evnlos.cameras import EventPixel, FrameCamera, simulate_events
 from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
-from evnlos.data import NlosDataset, Sampling, Simulation, simulate
+from evnlos.data import NlosDataset, Sampling, Simulation, capture_samples, read_capture, simulate
 from evnlos.data.sampling import surface_of
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import (
@@ -334,3 +335,22 @@ def test_few_captures_change_nothing_of_what_events_say() -> None:
     assert errors.corrected(statistic, "another") is not statistic
     with pytest.raises(DataError, match="of 2 captures"):
         EventErrors(AboutErrors(("a", "b")), errors.scores, errors.information)
+
+
+def test_a_setup_keeps_the_errors_that_its_captures_show(tiny_captures: list[Path], tmp_path: Path) -> None:
+    """Four captures: each has three others, which change nothing; a fifth has four."""
+    setup = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72))
+    save_yaml(to_dict(Simulation(setup=setup)), tmp_path / "setup.yaml")
+    capture = read_capture(tiny_captures[0])
+    another = replace(capture, name="another_A")
+    sampling = Sampling(surface="likelihood", setup=str(tmp_path))
+    before = capture_samples(another, sampling).surface
+    said = list[str]()
+    errors = write_event_errors(
+        tmp_path, tiny_captures, lambda step: said.append(f"{step.done} of {step.total}")
+    )
+    assert errors is not None and errors.about.captures == tuple(folder.name for folder in tiny_captures)
+    assert said[0] == "0 of 4" and said[-1] == "4 of 4" and torch.isfinite(errors.scores).all()
+    np.testing.assert_array_equal(capture_samples(capture, sampling).surface, before)
+    assert np.abs(capture_samples(another, sampling).surface - before).max() > 0.01
+    assert write_event_errors(tmp_path / "none", []) is None and not (tmp_path / "none").exists()
