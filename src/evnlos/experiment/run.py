@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from evnlos.calibration import SetupFit, fit_setup, rows_of, write_event_errors, write_setup
+from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, as_modality, import_captures, load_pattern, simulate
 from evnlos.data.pool import processes, run_tasks
@@ -92,6 +92,8 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
             write_setup(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), setup)
             _draw(fit, setup / "check.png")
             if sees_events and any(arm.sampling.surface == "likelihood" for arm in arms):
+                from evnlos.calibration import write_event_errors  # which takes a help text longer to show
+
                 used = {*fit.fitted, *fit.held_out}
                 write_event_errors(setup, [f for f in place.captures if f.resolve().name in used], progress)
         except DataError as error:

@@ -301,7 +301,7 @@ class PooledFrames(nn.Module):
         self._last = None
 
     def _whiten(self, white: Tensor) -> None:
-        """Take components W c [r] of those that there are, turned so that their offsets stay independent."""
+        """Take the components W c [r] in place of c, turned so that their offsets stay independent."""
         static, turn = torch.linalg.eigh((white * self.static.double()) @ white.T)
         white = (turn.T @ white).float()
         self.basis.copy_(self.basis @ white.T)
