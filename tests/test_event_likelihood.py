@@ -346,11 +346,12 @@ def test_a_setup_keeps_the_errors_that_its_captures_show(tiny_captures: list[Pat
     sampling = Sampling(surface="likelihood", setup=str(tmp_path))
     before = capture_samples(another, sampling).surface
     said = list[str]()
+    names = tuple(folder.name for folder in tiny_captures)
     errors = write_event_errors(
-        tmp_path, tiny_captures, lambda step: said.append(f"{step.done} of {step.total}")
+        tmp_path, tiny_captures, names, lambda step: said.append(f"{step.done} of {step.total}")
     )
-    assert errors is not None and errors.about.captures == tuple(folder.name for folder in tiny_captures)
+    assert errors is not None and errors.about.captures == names
     assert said[0] == "0 of 4" and said[-1] == "4 of 4" and torch.isfinite(errors.scores).all()
     np.testing.assert_array_equal(capture_samples(capture, sampling).surface, before)
     assert np.abs(capture_samples(another, sampling).surface - before).max() > 0.01
-    assert write_event_errors(tmp_path / "none", []) is None and not (tmp_path / "none").exists()
+    assert write_event_errors(tmp_path / "none", tiny_captures, ()) is None and not (tmp_path / "none").exists()

@@ -220,7 +220,9 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
     frames, kept = torch.rand(5, 24, 36), torch.tensor([[1.0, 1, 1, 1, 1], [1, 0, 1, 0, 0]])
     white = torch.eye(200, dtype=torch.float64) + 0.03 * torch.randn(200, 200, dtype=torch.float64)
     other = deepcopy(solver)
-    other._whiten(white)  # the noise of one component is then no longer that of another
+    other._take(
+        other.basis, other.light, other.along, other.static.diag().double(), white
+    )  # the noise of one component is then no longer that of another
 
     light = solver.light.double()
     away = (frames - solver.ambient).flatten(1).double() @ solver.basis.double()

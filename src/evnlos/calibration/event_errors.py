@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ _MOST = 16  # captures: a second or two each
 
 
 def write_event_errors(
-    setup: Path, captures: Sequence[Path], progress: Progress = silent
+    setup: Path, captures: Iterable[Path], names: Collection[str], progress: Progress = silent
 ) -> EventErrors | None:
     """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
 
@@ -31,39 +31,42 @@ def write_event_errors(
 
     Args:
         setup: Folder of a calibrated setup.
-        captures: Capture folders; of more than 16 every so many. Those without events, of unknown or several
-            targets, or of unknown motion, are passed over.
+        captures: Capture folders.
+        names: Names of those that the setup was calibrated with; of more than 16 every so many are taken. Those
+            without events, of unknown or several targets, or of unknown motion, are passed over.
         progress: Called as the captures are read.
 
     Returns:
         The errors; None, and nothing is written, where no capture shows them, or no law of the setup's event
         model is known.
     """
-    captures = captures[:: -(-len(captures) // _MOST)] if captures else captures
-    names, scores, information = list[str](), [], []
+    learned = [folder for folder in captures if folder.resolve().name in names]
+    learned = learned[:: max(1, -(-len(learned) // _MOST))]
+    found, scores, information = list[str](), [], []
     what = "errors of the events"
-    for number, folder in enumerate(captures):
-        progress(Step(what, number, len(captures), "captures"))
+    for number, folder in enumerate(learned):
+        progress(Step(what, number, len(learned), "captures"))
         capture = read_capture(folder, needs_frames=False)
         target = capture.target
         if not capture.has_events or capture.motion is None or target is None or capture.several is not None:
             continue
         try:
-            seen = event_statistic(capture.events, capture.frame_times_us, capture.motion, str(setup))
+            statistic, prior, _ = event_statistic(
+                capture.events, capture.frame_times_us, capture.motion, str(setup)
+            )
         except ConfigError:
             return None
-        statistic, prior = seen
         z = prior.coefficients(target.rasterise(prior.target_plane))
-        names.append(capture.name)
+        found.append(capture.name)
         scores.append(statistic.score - statistic.information @ z)
         information.append(statistic.information)
-    if not names:
+    if not found:
         return None
     tensors = {
         "scores": torch.from_numpy(np.stack(scores)).float(),
         "information": torch.from_numpy(np.mean(information, axis=0)).float(),
     }
-    about = AboutErrors(tuple(names))
+    about = AboutErrors(tuple(found))
     EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, about)
-    progress(Step(what, len(captures), len(captures), "captures"))
+    progress(Step(what, len(learned), len(learned), "captures"))
     return EventErrors(about, **tensors)

@@ -94,6 +94,11 @@ class SetupFit:
     known: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
     @property
+    def captures(self) -> tuple[str, ...]:
+        """Names of all captures that the calibration saw."""
+        return (*self.fitted, *self.held_out)
+
+    @property
     def unexplained(self) -> Residual | None:
         """What is left of the frames held out, the pattern taken, where that is far above noise; else None.
 

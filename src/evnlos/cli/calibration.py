@@ -112,9 +112,8 @@ class CalibrateCommand:
             say(f"warning: {line}")
         path = write_setup(fit, rows, self.out, self.force)
         if fit.pixel is not None and fit.known:
-            used = [one for one in self.captures if one.resolve().name in {*fit.fitted, *fit.held_out}]
             with ProgressBars() as progress:
-                write_event_errors(self.out, used, progress)
+                write_event_errors(self.out, self.captures, fit.captures, progress)
         if not self.json:
             print(
                 f"\nto pre-train on:   evnlos simulate --config {path.with_name(TRAINING_FILE)} --out DATASET"

@@ -94,8 +94,7 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
             if sees_events and any(arm.sampling.surface == "likelihood" for arm in arms):
                 from evnlos.calibration import write_event_errors  # which takes a help text longer to show
 
-                used = {*fit.fitted, *fit.held_out}
-                write_event_errors(setup, [f for f in place.captures if f.resolve().name in used], progress)
+                write_event_errors(setup, place.captures, fit.captures, progress)
         except DataError as error:
             raise CalibrationError(str(error)) from None
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))

@@ -111,10 +111,14 @@ EVENT_ERRORS = TensorFile(
 
 def event_statistic(
     events: Events, edges_us: NDArray[np.int64], motion: Motion | None, setup: str
-) -> tuple[EventStatistic, PatternPrior]:
-    """Return what all events of a sequence say of the target through a setup, and the prior over targets.
+) -> tuple[EventStatistic, PatternPrior, NDArray[np.float64]]:
+    """Return what all events of a sequence say of the target through a setup.
 
     Arguments and errors as of `event_images`.
+
+    Returns:
+        Information and score, the prior over targets that they are about, and where the target is at each edge
+        but the first, (x, y) in metres, [N, 2].
     """
     if not setup:
         raise ConfigError(
@@ -126,11 +130,15 @@ def event_statistic(
             "the motion is unknown, and the surface 'likelihood' needs it; state it in capture.yaml (`evnlos "
             "track` finds it)"
         )
-    events, edges_us, motion = _on_own_clock(events, edges_us, motion)
+    edges_us = np.asarray(edges_us, np.int64)
+    if isinstance(motion, LineMotion):  # on the motion's own clock the recordings of a setup share a light path
+        began_us = round(1e6 * motion.start_s)
+        motion, edges_us = replace(motion.in_its_plane(), start_s=0.0), edges_us - began_us
+        events = replace(events, t_us=events.t_us - began_us)
     span = (int(edges_us[0]) // _SPAN_US * _SPAN_US * 1e-6, -(-int(edges_us[-1]) // _SPAN_US) * _SPAN_US * 1e-6)
     solver, prior = _solver(setup, motion, span, (events.height, events.width))
     with threadpool_limits(1):  # its products are small: a second thread mostly waits
-        return solver(events), prior
+        return solver(events), prior, motion.position_m(edges_us[1:] * 1e-6)
 
 
 def event_images(
@@ -158,30 +166,14 @@ def event_images(
         ConfigError: No setup is named, it is not linear, or its event model states no law of its crossings.
         DataError: The motion is unknown, or the file of errors is damaged.
     """
-    if motion is not None:
-        events, edges_us, motion = _on_own_clock(events, edges_us, motion)
-    statistic, prior = event_statistic(events, edges_us, motion, setup)
+    statistic, prior, places = event_statistic(events, edges_us, motion, setup)
     if capture is not None and (path := Path(setup) / EVENT_ERRORS_FILE).is_file():
         statistic = EVENT_ERRORS.load(path, "").corrected(statistic, capture)
-    assert motion is not None
-    places = motion.position_m(edges_us[1:] * 1e-6)
     images = []
     for z in statistic.solutions(EVENT_PRIORS):
         mask = np.clip(prior.image(z), 0.0, 1.0).astype(np.float32)
         images.append(Target("events", mask, prior.target_plane.extent_m[0]).rasterise(canvas, places))
     return np.stack(images, axis=1)
-
-
-def _on_own_clock(
-    events: Events, edges_us: NDArray[np.int64], motion: Motion
-) -> tuple[Events, NDArray[np.int64], Motion]:
-    """Return them on the clock of a line's own start, on which the recordings of a setup share a light path."""
-    edges_us = np.asarray(edges_us, np.int64)
-    if not isinstance(motion, LineMotion):
-        return events, edges_us, motion
-    began_us = round(1e6 * motion.start_s)
-    own = replace(motion.in_its_plane(), start_s=0.0)
-    return replace(events, t_us=events.t_us - began_us), edges_us - began_us, own
 
 
 @lru_cache(maxsize=2)

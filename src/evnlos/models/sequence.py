@@ -252,16 +252,13 @@ class PooledFrames(nn.Module):
         # Few samples do not tell the noise of all components, which is at least that of the camera.
         variance, turn = torch.linalg.eigh(noise.T @ noise / len(noise))
         white = (turn / variance.clamp_min(operator.sigma**2).sqrt()).T
-        shifts = (offset - offset.mean(dim=0)).double() @ white.T
-        static, turn = torch.linalg.eigh(shifts.T @ shifts / count)
-        white = (turn.T @ white).float()
+        shifts = (offset - offset.mean(dim=0)).double()
         for buffer in (self.basis, self.light, self.along, self.static):
             buffer.zero_()
         self.ambient.copy_(ambient)
-        self.basis[:, :kept] = basis @ white.T
-        self.light[:kept, rows] = (white @ carry.T).unflatten(1, (-1, operator.size[1]))
-        self.along[:, :kept] = along @ white.T
-        self.static[:kept] = static.clamp_min(0).float()
+        light = torch.zeros(kept, *operator.size)
+        light[:, rows] = carry.T.unflatten(1, (-1, operator.size[1]))
+        self._take(basis, light, along, shifts.T @ shifts / count, white)
         prior = handwritten_prior(self.target_plane, _COEFFICIENTS)
         self.mean.copy_(torch.from_numpy(prior.mean).unflatten(0, self.target_plane.shape))
         self.patterns.copy_(torch.from_numpy(prior.patterns.T.copy()).unflatten(1, self.target_plane.shape))
@@ -297,17 +294,26 @@ class PooledFrames(nn.Module):
         self.light += (errors.T / gain).view_as(self.light)
         self.along.copy_(_polynomial(terms, code - gain * (shown @ self.light.flatten(1).T)))
         variance, turn = torch.linalg.eigh(missed.T @ missed / len(missed))
-        self._whiten((turn / variance.clamp_min(1.0).sqrt()) @ turn.T)
+        white = (turn / variance.clamp_min(1.0).sqrt()) @ turn.T
+        self._take(self.basis, self.light, self.along, self.static.diag().double(), white)
         self._last = None
 
-    def _whiten(self, white: Tensor) -> None:
-        """Take the components W c [r] in place of c, turned so that their offsets stay independent."""
-        static, turn = torch.linalg.eigh((white * self.static.double()) @ white.T)
-        white = (turn.T @ white).float()
-        self.basis.copy_(self.basis @ white.T)
-        self.light.copy_((white @ self.light.flatten(1)).unflatten(1, self.light.shape[1:]))
-        self.along.copy_(self.along @ white.T)
-        self.static.copy_(static.clamp_min(0).float())
+    def _take(self, basis: Tensor, light: Tensor, along: Tensor, offsets: Tensor, white: Tensor) -> None:
+        """Take components W c [k] of components c, turned so that their offsets are independent.
+
+        Args:
+            basis: Of c, [h w, k].
+            light: Theirs, [k, h, w].
+            along: Theirs, [7, k].
+            offsets: Covariance of the offsets of c, float64 [k, k].
+            white: W, float64 [k, k].
+        """
+        static, turn = torch.linalg.eigh(white @ offsets @ white.T)
+        white, count = (turn.T @ white).float(), len(white)
+        self.basis[:, :count] = basis @ white.T
+        self.light[:count] = torch.tensordot(white, light, dims=1)
+        self.along[:, :count] = along @ white.T
+        self.static[:count] = static.clamp_min(0).float()
 
     def forward(self, frames: Tensor, position_m: Tensor, kept: Tensor) -> Tensor:
         """Return the solutions of subsets of the time steps, targets [K, S, h, h].
