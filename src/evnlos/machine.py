@@ -199,7 +199,8 @@ class ProgressBars:
                 self._began = self._said = time.monotonic()
                 self._first = step.done
             self._step = step
-            self._show()
+            if not is_done or self._how == "bar":  # of lines, how a piece ended is the last
+                self._show()
             if is_done:  # what comes next, progress within this one's too, is no part of it
                 self._finish()
                 self._step = None
