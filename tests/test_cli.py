@@ -376,17 +376,16 @@ def test_what_is_wrong_is_told_before_the_work(tiny_captures, tmp_path, capsys, 
 
 
 def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkeypatch) -> None:
-    from evnlos import demo
-    from evnlos.data import SensorSize
+    from evnlos.data import SensorSize, simulations
     from evnlos.scene import HandwritingGlyphs
 
     few = replace(
-        demo.default(),
+        (usual := simulations.default()),
         glyphs=HandwritingGlyphs(characters="AB"),
-        setup=replace(demo.default().setup, sensor=SensorSize(25, 40)),
+        setup=replace(usual.setup, sensor=SensorSize(25, 40)),
         positions=8,
     )
-    monkeypatch.setattr(demo, "default", lambda: few)
+    monkeypatch.setattr(simulations, "default", lambda: few)
     one = ["--pretrain-epochs", 1, "--finetune-epochs", 1, "--e2e-epochs", 1, "--writers", 1, "--width", 8]
     one += ["--workers", 1, "--no-calibrate", "--single-epochs", 1]
     call("demo", "--out", tmp_path / "demo", "--captures", *tiny_captures, *one)
@@ -412,6 +411,8 @@ def test_the_demo_runs_on_given_captures(tiny_captures, tmp_path, capsys, monkey
 
 def test_the_demos_own_captures_hold_its_test_characters() -> None:
     from evnlos.demo import LAB_CHARACTERS, Demo
+    from evnlos.models import GENERIC
 
+    assert Demo().start == GENERIC
     assert set(Demo().test) < set(LAB_CHARACTERS)
     assert len(set(LAB_CHARACTERS)) == len(LAB_CHARACTERS)

@@ -139,7 +139,8 @@ with process_group() as processes:
     network(torch.ones(1, 3, 4, 4)).sum().backward()
     processes.wait()
 threads = {open(f"/proc/self/task/{task}/comm").read().strip() for task in os.listdir("/proc/self/task")}
-sys.stdout.write(f"threads {sorted(name for name in threads if 'gloo' in name)}\\n")  # at once: two processes write
+# In one call: two processes write to the same pipe.
+sys.stdout.write(f"threads {sorted(name for name in threads if 'gloo' in name)}\\n")
 """
 
 

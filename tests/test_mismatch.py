@@ -106,7 +106,7 @@ def test_the_pre_training_begins_with_layers_where_they_are_installed(tmp_path, 
         studies.append(study)
         raise CalibrationError("enough")
 
-    monkeypatch.setattr("evnlos.demo.run_study", stop)
+    monkeypatch.setattr("evnlos.experiment.run_study", stop)
     with pytest.raises(CalibrationError, match="enough"):
         run_demo(Demo(out=tmp_path / "out", captures=(tmp_path / "a_A",), start=start))
     begins = {arm.name: arm.start for arm in studies[0].arms}
@@ -123,7 +123,7 @@ def test_the_demo_trains_what_was_asked_for(tmp_path, monkeypatch):
     def stop(study: Study, *_) -> None:
         raise CalibrationError(" ".join(study.modalities))
 
-    monkeypatch.setattr("evnlos.demo.run_study", stop)
+    monkeypatch.setattr("evnlos.experiment.run_study", stop)
     with pytest.raises(CalibrationError, match=r"^event;"):
         run_demo(Demo(out=tmp_path / "out", captures=(tmp_path / "a_A",), modalities=("event",)))
     with pytest.raises(ConfigError, match="modalities names none"):

@@ -33,7 +33,7 @@ from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, Simulation, as_modality, simulate
 from evnlos.data.simulate import ranges_around
-from evnlos.demo import SEQUENCE_NETWORK
+from evnlos.demo import sequence_network
 from evnlos.machine import ProgressBars, Step
 from evnlos.models import SequenceReconstructor, Weights, layers_of, save_weights, with_rank
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, HandwritingGlyphs, LineMotion, Strokes
@@ -41,7 +41,7 @@ from evnlos.setups import RadiometricSetup
 from evnlos.training import LOSSES, Training, learning_rate_at
 from evnlos.training.settings import light_of
 
-_NETWORK = replace(SEQUENCE_NETWORK, frames="likelihood")
+_NETWORK = replace(sequence_network(), frames="likelihood")
 _EPOCHS = {"frame": 20, "event": 16, "fusion": 16}
 _WRITERS = {False: 2, True: 1}  # whether events are seen, which takes most of the time -> writers of each wall
 _VIEWS = 3  # of each sequence: all positions, every other one, some

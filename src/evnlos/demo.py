@@ -6,28 +6,20 @@ import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from evnlos.calibration import Calibration
-from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in
-from evnlos.data.lab import Lab, render_captures
-from evnlos.data.sampling import Sampling, character_of
-from evnlos.data.simulations import default
+from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in, character_of
 from evnlos.errors import CalibrationError, ConfigError, UnknownNameError
-from evnlos.experiment import Arm, Place, Study, gain_table, read_records, run_study
 from evnlos.machine import ProgressBars
-from evnlos.models import GENERIC, SequenceConfig, UNetConfig, layers_of, published
-from evnlos.report import collect_results, to_text, write_report
-from evnlos.scene import FontGlyphs
-from evnlos.setups import named_setup
-from evnlos.training import Training
 from evnlos.types import OutFolder
+
+if TYPE_CHECKING:  # what runs is imported where it runs: help texts and wrong words need none of it
+    from evnlos.data.lab import Lab
+    from evnlos.experiment import Study
+    from evnlos.models import SequenceConfig
 
 LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
 """What the rendered captures show."""
-
-# Half the rank of the full experiments: half the time, as good on few objects.
-SEQUENCE_NETWORK = SequenceConfig(width=32, rank=256, ridge_multipliers=(0.001, 0.01, 0.1, 1.0))
-"""The network that the demo trains."""
 
 _TEST = ("G", "K", "4", "9")
 
@@ -48,7 +40,7 @@ class Demo:
     """Writers of the simulated characters, 36 objects each."""
     redrawn: int = 7
     """How often each known target of the captures is drawn again and simulated."""
-    start: str = GENERIC
+    start: str = "generic"
     """Setup of installed weights whose layers the pre-training begins with; empty: random ones."""
     pretrain_epochs: int | None = None
     """Epochs on the simulated sequences; by default 4 from trained layers, 8 from random ones."""
@@ -85,7 +77,22 @@ class Demo:
     @property
     def lab(self) -> Lab:
         """The laboratory whose captures are rendered where none are given."""
+        from evnlos.data.lab import Lab
+        from evnlos.scene import FontGlyphs
+
         return Lab(glyphs=FontGlyphs(characters=LAB_CHARACTERS), seed=self.seed)
+
+
+def sequence_network(width: int = 32) -> SequenceConfig:
+    """Return the network that the demo trains.
+
+    Args:
+        width: Channels at its finest level; the layers that come with the package have 32.
+    """
+    from evnlos.models import SequenceConfig
+
+    # Half the rank of the full experiments: half the time, as good on few objects.
+    return SequenceConfig(width=width, rank=256, ridge_multipliers=(0.001, 0.01, 0.1, 1.0))
 
 
 def run_demo(settings: Demo) -> Path:
@@ -95,6 +102,11 @@ def run_demo(settings: Demo) -> Path:
         UnknownNameError: One of the captures is none.
         CalibrationError: No setup fits the captures.
     """
+    from evnlos.data.lab import render_captures
+    from evnlos.experiment import Place, gain_table, read_records, run_study
+    from evnlos.report import collect_results, to_text, write_report
+    from evnlos.setups import named_setup
+
     began, out = time.perf_counter(), settings.out
     captures = captures_in(settings.captures)
     place = Place((), out, settings.workers, trainings=settings.workers, force=settings.force)
@@ -146,12 +158,14 @@ def run_demo(settings: Demo) -> Path:
 
 def _with_layers(settings: Demo) -> tuple[Demo, list[str]]:
     """Return the settings without layers to begin with where there are none like them, and why."""
+    from evnlos.models import layers_of, published
+
     if not settings.start:
         return settings, []
     if not all(name in published() for name in layers_of(settings.start)):
         why = f"The layers {settings.start!r} are not installed (evnlos-weights brings them)"
-    elif settings.width != SEQUENCE_NETWORK.width:
-        why = f"The layers {settings.start!r} have {SEQUENCE_NETWORK.width} channels, not {settings.width}"
+    elif settings.width != (usual := sequence_network().width):
+        why = f"The layers {settings.start!r} have {usual} channels, not {settings.width}"
     else:
         return settings, []
     why += ": the pre-training began with random ones, and needs twice the epochs for less."
@@ -169,8 +183,15 @@ def _of_calibration(setup: Path) -> list[str]:
 
 def _study(settings: Demo, test: list[str]) -> Study:
     """Return the comparison of E2E and EPNP, with one seed."""
+    from evnlos.calibration import Calibration
+    from evnlos.data.sampling import Sampling
+    from evnlos.data.simulations import default
+    from evnlos.experiment import Arm, Study
+    from evnlos.models import UNetConfig
+    from evnlos.training import Training
+
     single = Training(network=UNetConfig(width=settings.width), epochs=settings.single_epochs)
-    network = replace(SEQUENCE_NETWORK, width=settings.width)
+    network = sequence_network(settings.width)
     alone = Training(epochs=settings.e2e_epochs, batch_size=16, network=network)
     solving = replace(network, frames="likelihood") if settings.calibrate else network
     plan = Training(batch_size=16, network=solving)

@@ -32,8 +32,8 @@ def write_event_errors(
     Args:
         setup: Folder of a calibrated setup.
         captures: Capture folders.
-        names: Names of those that the setup was calibrated with; of more than 16 every so many are taken. Those
-            without events, of unknown or several targets, or of unknown motion, are passed over.
+        names: Names of the captures that the setup was calibrated with; of more than 16 every so many are
+            taken. Those without events, of unknown or several targets, or of unknown motion, are passed over.
         progress: Called as the captures are read.
 
     Returns:

@@ -20,7 +20,6 @@ import tyro
 
 from evnlos import experiment
 from evnlos.app.serve import Server, serve
-from evnlos.calibration.captures import FEWEST
 from evnlos.cli.parsing import UnfitWordsError, drawn, say
 from evnlos.cli.recordings import Flat
 from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in, character_of
@@ -30,7 +29,6 @@ from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import SourceOptions, check_source, open_live
 from evnlos.machine import ProgressBars, Step
-from evnlos.mismatch import mismatch_setups, mismatch_table, run_mismatch
 from evnlos.types import OutFolder
 
 if TYPE_CHECKING:
@@ -45,6 +43,8 @@ class DemoCommand:
 
     def check_names(self) -> None:
         """Refuse captures that are not there, or too few, and characters to test on that none shows."""
+        from evnlos.calibration.captures import FEWEST
+
         one, found = self.settings, captures_in(self.settings.captures)
         left = len(found) - len(held_out(found or [Path(f"lab_{c}") for c in LAB_CHARACTERS], one.test))
         if found and one.calibrate and left < FEWEST:
@@ -61,8 +61,7 @@ class DemoCommand:
         run_demo(one)
 
 
-_WITHOUT_CAPTURES = ("simulation", "conditions", "generalization", "mismatch")
-"""Experiments that are no study on captures."""
+_WITHOUT_CAPTURES = ("simulation", "conditions", "generalization", "mismatch")  # no study on captures
 
 
 @dataclass(frozen=True)
@@ -75,13 +74,11 @@ class ExperimentCommand:
     simulation (handwriting, transfer to Comic), conditions (frames against events over light, noise, exposure,
     speed and setups), generalization (given weights on unseen hands, other things than characters, and other
     walls, with what their confidence says), and mismatch (the demo on walls, lenses and sensors that the
-    simulator does not describe).
-    """
+    simulator does not describe)."""
     captures: Path | None = None
     """Folder of the capture folders."""
     weights: Path | None = None
-    """Weights for generalization, which were trained for the setup OUT/setups/NAME, NAME as for --captures-of.
-    """
+    """Weights for generalization, trained for the setup OUT/setups/NAME, NAME as for --captures-of."""
     out: OutFolder = Path("experiments")
     """Folder for setups, datasets, runs, records and tables; experiments in one folder share what they can."""
     captures_of: str = "near"
@@ -127,6 +124,8 @@ class ExperimentCommand:
     def check_names(self) -> None:
         """Refuse the name of no experiment."""
         if self.name == "mismatch":
+            from evnlos.mismatch import mismatch_setups
+
             mismatch_setups(self.setups, self.captures)
         known = (*experiment.STUDIES, *_WITHOUT_CAPTURES)
         if self.name not in known:
@@ -250,6 +249,8 @@ class ExperimentCommand:
         drawn(shown, lambda: draw_confidence(checks, shown))
 
     def _mismatch(self) -> None:
+        from evnlos.mismatch import mismatch_table, run_mismatch
+
         names = ("out", "test", "modalities", "workers", "force", "robust", "writers")
         names += ("pretrain_epochs", "finetune_epochs", "e2e_epochs")
         base = replace(Demo(), **{name: value for name in names if (value := getattr(self, name))})

@@ -10,13 +10,15 @@ import threading
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.live.engine import Engine, Picture
 from evnlos.live.packet import ChunkQueue, Clock, EventSource, SystemClock
+
+if TYPE_CHECKING:
+    from evnlos.live.engine import Engine, Picture
 
 _KEPT = 100_000  # images whose times are kept: half an hour at 50 a second, 6 MB
 _RECENT = 100

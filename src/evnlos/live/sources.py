@@ -11,13 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evnlos.data.capture import read_capture
-from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.events.files.columns import cut, join, trusted_events
 from evnlos.events.recording import CropOptions, Recording
@@ -27,6 +26,9 @@ from evnlos.live.packet import Chunk, Clock, EventSource, SystemClock
 from evnlos.live.streams import DvSource, WordInput
 from evnlos.live.udp import AestreamSource, UdpSource
 from evnlos.types import Events
+
+if TYPE_CHECKING:
+    from evnlos.data.fixed_pattern import FixedPattern
 
 _NAP_S = 0.05  # longest sleep before `stop` is asked again
 
@@ -290,6 +292,8 @@ def capture_replay(
     Raises:
         DataError: The capture is damaged.
     """
+    from evnlos.data.capture import read_capture
+
     capture = read_capture(folder, needs_frames=False)
     if not capture.has_frames:
         images = []
