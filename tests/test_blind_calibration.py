@@ -11,7 +11,7 @@ from evnlos.calibration import Calibration, fit_setup
 from evnlos.calibration.blind_calibration import CELLS, WRITERS, FrameResiduals, fit_blind
 from evnlos.calibration.captures import read_capture_set
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.problem import handwritten_targets
+from evnlos.inverse.prior import handwritten_targets
 from evnlos.setups import PaperSetup, RadiometricSetup
 
 SETUP = RadiometricSetup(roughness=0.06)

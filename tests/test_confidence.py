@@ -270,7 +270,7 @@ def test_noise_that_grows_with_the_light_is_taken_off() -> None:
 def test_published_weights_refuse_a_wall_that_is_not_theirs() -> None:
     path = published_setup("near-frame-sequence")
     assert path is not None and published_setup("page-frame-sequence") is None and published_setup(path) is None
-    setup, weights = load_yaml(Simulation, path), load_weights("near-frame-sequence")
+    setup, weights = load_yaml(Simulation, path / "setup.yaml"), load_weights("near-frame-sequence")
     sampling = weights.sampling
     operator = FrameOperator(setup.setup, sampling)
     matte = replace(setup.setup, wall_material="lambert")

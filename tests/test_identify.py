@@ -17,7 +17,7 @@ from evnlos.config import save_yaml
 from evnlos.data import Simulation
 from evnlos.data.lab import Lab
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.problem import TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_targets
+from evnlos.inverse.prior import LETTERS, TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_targets, letters
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup, named_setup, setup_names, setup_preset
 
@@ -188,6 +188,15 @@ def test_prior_and_test_share_no_character():
     targets = handwritten_targets(SMALL.target_plane, 1)
     assert len(targets.names) == len(targets.test) == 2 * len(TEST_CHARACTERS)
     assert 0.004 < targets.stroke_m < 0.012
+
+
+def test_the_letters_that_come_with_the_package_are_those_of_their_glyphs():
+    packaged, names = letters(), LETTERS.objects()
+    assert len(packaged) == len(names) == LETTERS.writers * len(TRAIN_CHARACTERS)
+    side = len(packaged[0].mask)
+    glyphs = dataclasses.replace(LETTERS, target_plane=dataclasses.replace(LETTERS.target_plane, size_px=side))
+    for name, one in list(zip(names, packaged, strict=True))[::9]:
+        assert np.abs(one.mask - glyphs.target(name).mask).max() <= 0.501 / 255, name
 
 
 def test_a_sharp_setup_shows_more_than_a_matte_wall():

@@ -35,7 +35,7 @@ from evnlos.data import NlosDataset, Sampling, Simulation, as_modality, simulate
 from evnlos.data.simulate import ranges_around
 from evnlos.demo import sequence_network
 from evnlos.machine import ProgressBars, Step
-from evnlos.models import SequenceReconstructor, Weights, layers_of, save_weights, with_rank
+from evnlos.models import SequenceReconstructor, Weights, layers_of, save_weights
 from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, HandwritingGlyphs, LineMotion, Strokes
 from evnlos.setups import RadiometricSetup
 from evnlos.training import LOSSES, Training, learning_rate_at
@@ -213,7 +213,10 @@ def main() -> None:
             begins = first if as_modality(modality).needs_frames else None
             found = trained(modality, sorted(files), begins, settings, progress)
             # Whoever begins with these layers fits a closed-form part of his own.
-            save_weights(out / f"{layers_of('generic', modality)[0]}.safetensors", with_rank(found, 8))
+            save_weights(
+                out / f"{layers_of('generic', modality)[0]}.safetensors",
+                replace(found, network=found.network.reduced(8)),
+            )
             first = first or found
 
 

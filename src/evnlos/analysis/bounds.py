@@ -33,10 +33,10 @@ from evnlos.inverse import (
     predicted_record,
     sequence_light,
 )
-from evnlos.inverse.problem import handwritten_targets
+from evnlos.inverse.prior import handwritten_targets
 from evnlos.inverse.sequence_problem import position_subsets
 from evnlos.machine import note
-from evnlos.scene import LineMotion, Strokes
+from evnlos.scene import LineMotion
 from evnlos.setups import Setup
 from evnlos.types import Plane
 
@@ -198,7 +198,7 @@ def sequence_bounds(
     settings = settings or SequenceAnalysisSettings()
     target_plane = Plane(settings.cells, settings.cells, 0.08 / settings.cells)
     count = min(settings.coefficients, settings.cells**2)
-    prior = handwritten_prior(target_plane, count, settings.writers, Strokes())
+    prior = handwritten_prior(target_plane, count, settings.writers)
     grid = (min(setup.shape[0], _GRID[0]), min(setup.shape[1], _GRID[1]))
     span = (0.0, settings.duration_s)
     light = sequence_light(setup, prior, settings.motion.position_m, span, grid)

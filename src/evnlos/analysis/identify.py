@@ -25,7 +25,7 @@ from evnlos.setups import Setup
 from evnlos.types import derive_seed
 
 if TYPE_CHECKING:
-    from evnlos.inverse.problem import TargetPrior
+    from evnlos.inverse.prior import TargetPrior
     from evnlos.models import ConfidenceReport
 
 _SHAPE = 4  # bars of a quarter of the target plane tell where a letter is filled and where it is open
@@ -226,7 +226,7 @@ def identify(
     """
     settings = settings or AnalysisSettings()
     seen = linearized(setup, settings)
-    from evnlos.inverse.problem import handwritten_targets
+    from evnlos.inverse.prior import handwritten_targets
 
     targets = handwritten_targets(settings.target_plane, settings.writers)
     singular = singular_values(seen.matrix)

@@ -173,8 +173,8 @@ class Model:
 
     Args:
         weights: The network, its history, its confidence.
-        known_setup: Settings of the calibrated setup that the network was trained for, a YAML file; None for
-            the setup that the training's samples name, if it is still there.
+        known_setup: Folder of the calibrated setup that the network was trained for; None for the setup that
+            the training's samples name, if it is still there.
     """
 
     def __init__(self, weights: Weights, known_setup: Path | None = None) -> None:

@@ -3,9 +3,9 @@
 from .captures import Calibration as Calibration
 from .captures import CaptureSet as CaptureSet
 from .captures import read_capture_set as read_capture_set
-from .event_errors import write_event_errors as write_event_errors
 from .event_fit import PixelFit as PixelFit
 from .event_fit import fit_pixel as fit_pixel
+from .event_fit import write_event_errors as write_event_errors
 from .fit import Example as Example
 from .fit import SetupFit as SetupFit
 from .fit import fit_setup as fit_setup

@@ -29,7 +29,7 @@ from evnlos.calibration.transport_fit import (
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import SequenceOperator
-from evnlos.inverse.problem import handwritten_targets
+from evnlos.inverse.prior import handwritten_targets
 from evnlos.inverse.sequence_problem import strip_gram_of, strip_of
 from evnlos.machine import note
 from evnlos.optics import MatrixTransport

@@ -1,10 +1,15 @@
-"""Fitting the event pixel: simulate under the fitted light until the figures of the recordings agree."""
+"""Fitting the event pixel: simulate under the fitted light until the figures of the recordings agree.
+
+- The parameters of a pixel, each with its error, and how well they explain recordings that were held out.
+- What a calibrated setup gets wrong of the events of its own captures, for all that are solved after them.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,7 +28,16 @@ from evnlos.calibration.event_statistics import (
 )
 from evnlos.calibration.transport_fit import forward_jacobian, levenberg_marquardt
 from evnlos.cameras import EventPixel, PixelSettings
-from evnlos.machine import note
+from evnlos.data import read_capture
+from evnlos.errors import ConfigError
+from evnlos.inverse.event_images import (
+    EVENT_ERRORS,
+    EVENT_ERRORS_FILE,
+    AboutErrors,
+    EventErrors,
+    event_statistic,
+)
+from evnlos.machine import Progress, Step, note, silent
 from evnlos.types import Events
 
 _LOG_NAMES = ("threshold_on", "threshold_off", "threshold_sigma", "shot_noise_rate_hz")
@@ -37,6 +51,7 @@ CONTINUOUS = "continuous"
 _MOST_NOISE = 10.0  # times the events of pixels that see nothing
 _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
+_MOST_CAPTURES = 16  # that tell of errors: a second or two each
 
 
 @dataclass(frozen=True)
@@ -258,3 +273,53 @@ def shortest_interval_s(events: Sequence[Events], share: float = 1e-3) -> float:
     """
     every = np.concatenate([intervals(*by_pixel(one))[1] for one in events])
     return float(np.quantile(every, share)) * 1e-6 if len(every) else math.inf
+
+
+def write_event_errors(
+    setup: Path, captures: Iterable[Path], names: Collection[str], progress: Progress = silent
+) -> EventErrors | None:
+    """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
+
+    `event_images` takes it into account: for a capture that is among these, what the others showed.
+
+    Args:
+        setup: Folder of a calibrated setup.
+        captures: Capture folders.
+        names: Names of the captures that the setup was calibrated with; of more than 16 every so many are
+            taken. Those without events, of unknown or several targets, or of unknown motion, are passed over.
+        progress: Called as the captures are read.
+
+    Returns:
+        The errors; None, and nothing is written, where no capture shows them, or no law of the setup's event
+        model is known.
+    """
+    learned = [folder for folder in captures if folder.resolve().name in names]
+    learned = learned[:: max(1, -(-len(learned) // _MOST_CAPTURES))]
+    found, scores, information = list[str](), [], []
+    what = "errors of the events"
+    for number, folder in enumerate(learned):
+        progress(Step(what, number, len(learned), "captures"))
+        capture = read_capture(folder, needs_frames=False)
+        target = capture.target
+        if not capture.has_events or capture.motion is None or target is None or capture.several is not None:
+            continue
+        try:
+            statistic, prior, _ = event_statistic(
+                capture.events, capture.frame_times_us, capture.motion, str(setup)
+            )
+        except ConfigError:
+            return None
+        z = prior.coefficients(target.rasterise(prior.target_plane))
+        found.append(capture.name)
+        scores.append(statistic.score - statistic.information @ z)
+        information.append(statistic.information)
+    if not found:
+        return None
+    tensors = {
+        "scores": torch.from_numpy(np.stack(scores)).float(),
+        "information": torch.from_numpy(np.mean(information, axis=0)).float(),
+    }
+    about = AboutErrors(tuple(found))
+    EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, about)
+    progress(Step(what, len(learned), len(learned), "captures"))
+    return EventErrors(about, **tensors)

@@ -280,7 +280,6 @@ def reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:
 
 
 _CELLS, _COEFFICIENTS = 32, 120
-_RANK = 120  # factors of the light path; more than a hundred rough walls do not have
 _GAP_S = 0.4  # between the instants at which silences are looked at
 _NORMAL_90 = 1.645
 _FURTHEST = 0.15  # of fitted thresholds from the setup's, relative
@@ -320,7 +319,7 @@ def estimate_captures(
         shape = (capture.events.height, capture.events.width)
         key = (motion, span, shape, size)
         if key not in lights:
-            lights[key] = sequence_light(setup, prior, motion.position_m, span, shape, _RANK)
+            lights[key] = sequence_light(setup, prior, motion.position_m, span, shape)
         light = lights[key]
         begun = time.process_time()
         frames = record = law = None

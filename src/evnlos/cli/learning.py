@@ -32,7 +32,6 @@ from evnlos.models import (
     load_weights,
     published,
     save_weights,
-    with_rank,
 )
 from evnlos.models.confidence import COVERAGE
 from evnlos.training import (
@@ -286,7 +285,7 @@ class WeightsCommand:
             if self.half.exists():
                 raise DataError(f"{self.half} exists; give --half another name")
             if self.rank is not None:
-                loaded = with_rank(loaded, self.rank)
+                loaded = replace(loaded, network=loaded.network.reduced(self.rank))
             loaded = replace(loaded, scores=_scores(self.scores) if self.scores else loaded.scores)
             save_weights(self.half, loaded, torch.float16)
         found = describe(loaded)

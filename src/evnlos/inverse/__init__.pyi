@@ -34,15 +34,15 @@ from .operators import Solution as Solution
 from .operators import log_change as log_change
 from .operators import operator_norm as operator_norm
 from .operators import ridge_by_groups as ridge_by_groups
+from .prior import PatternPrior as PatternPrior
+from .prior import handwritten_prior as handwritten_prior
 from .problem import BackgroundModel as BackgroundModel
 from .problem import Problem as Problem
 from .problem import SeveralSequences as SeveralSequences
 from .problem import block_folds as block_folds
 from .sequence_light import FrameTerm as FrameTerm
 from .sequence_light import NormalEquations as NormalEquations
-from .sequence_light import PatternPrior as PatternPrior
 from .sequence_light import SequenceLight as SequenceLight
-from .sequence_light import handwritten_prior as handwritten_prior
 from .sequence_light import sequence_light as sequence_light
 from .sequence_problem import SequenceOperator as SequenceOperator
 from .sequence_problem import SequenceProblem as SequenceProblem

@@ -26,15 +26,16 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from evnlos.errors import ConfigError, DataError
-from evnlos.inverse.sequence_light import EVENT_PRIORS, PatternPrior, handwritten_prior, sequence_light
+from evnlos.inverse.prior import PatternPrior, handwritten_prior
+from evnlos.inverse.sequence_light import EVENT_PRIORS, sequence_light
 from evnlos.inverse.sequence_statistic import EventSolver, EventStatistic
 from evnlos.scene import LineMotion, Motion, Target, TargetPlane
 from evnlos.setups import load_setup
 from evnlos.tensor_file import TensorFile
 from evnlos.types import Events, Plane
 
-CELLS, COEFFICIENTS, RANK = 32, 120, 120
-"""Cells along a side of the target, patterns of its prior, factors of the light path."""
+CELLS, COEFFICIENTS = 32, 120
+"""Cells along a side of the target, patterns of its prior."""
 EVENT_ERRORS_FILE = "events.safetensors"
 """What captures showed of the errors of a calibrated setup, in its folder."""
 
@@ -183,7 +184,7 @@ def _solver(
     """Return the solver of a setup, and its prior: handwriting, as large as the usual target."""
     known = load_setup(setup)
     prior = handwritten_prior(Plane(CELLS, CELLS, TargetPlane().size_m / CELLS), COEFFICIENTS)
-    light = sequence_light(known, prior, motion.position_m, span_s, shape, RANK)
+    light = sequence_light(known, prior, motion.position_m, span_s, shape)
     law = known.pixel.crossing_law(light.typical_dn)
     if law is None:
         raise ConfigError(

@@ -29,11 +29,11 @@ from numpy.typing import NDArray
 from evnlos.cameras import CrossingLaw
 from evnlos.errors import ConfigError
 from evnlos.inverse.event_record import EventRecord, Levels, levels_of
+from evnlos.inverse.prior import PatternPrior
 from evnlos.inverse.sequence_light import (
     Array,
     FrameTerm,
     NormalEquations,
-    PatternPrior,
     SequenceLight,
 )
 

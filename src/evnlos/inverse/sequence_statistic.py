@@ -1,9 +1,9 @@
 """What all events of a sequence say of the target, in a second.
 
 The estimate of `event_likelihood`, in single precision: from every fourth row and column first, which need a
-sixteenth of the work, then from all pixels. Mean thresholds are those of the setup, and the filter counts as a
-delay 1 / w. What the last iteration leaves, information A and score b about the coefficients z of the prior, is
-all that the events say of the target there.
+sixteenth of the work, then a step from every second, and a last one from all. Mean thresholds are those of the
+setup, and the filter counts as a delay 1 / w. What the last iteration leaves, information A and score b about
+the coefficients z of the prior, is all that the events say of the target there.
 
 | symbol | meaning | unit |
 |---|---|---|
@@ -31,8 +31,8 @@ from evnlos.inverse.event_record import EventRecord, record_of
 from evnlos.inverse.sequence_light import Array, SequenceLight, Single
 from evnlos.types import Events
 
-_COARSE = 4  # every fourth row and column makes the first estimate
-_COARSE_STEPS, _ANNEALED, _FINE_STEPS = 14, 6, 2  # at most; with errors of a crossing that shrink to the least
+_STRIDES = (4, 2, 1)  # of the rows and columns that make the first, the second, and the last estimate
+_FIRST_STEPS, _ANNEALED = 14, 6  # at most, of the first; its errors of a crossing shrink to the least
 _SETTLED = 0.1  # step of a coefficient, standard deviations of the prior, after which no other is made
 _LONGEST_STEP = 1.5  # of a coefficient, standard deviations of the prior
 _FEWEST_NOISE, _SMALLEST_NOISE = 0.01, 3e-3  # as in `event_likelihood`
@@ -170,12 +170,14 @@ class EventSolver:
         span = (float(self.light.times_s[0]), float(self.light.times_s[-1]))
         record, last = record_of(events, self.law, span, self.settings.gap_s), self.settings.least_noise
         row, column = np.divmod(record.pixel, events.width)
-        first = record.of_pixels((row % _COARSE == 0) & (column % _COARSE == 0))
         unknown = np.zeros(self._seen.shape[2] + 1)
-        shares = np.minimum(np.arange(_COARSE_STEPS) / _ANNEALED, 1.0)
+        shares = np.minimum(np.arange(_FIRST_STEPS) / _ANNEALED, 1.0)
         noises = self.settings.first_noise ** (1 - shares) * last**shares
-        self.improve(first, unknown, noises)
-        return self.improve(record, unknown, np.full(_FINE_STEPS, last))
+        for stride in _STRIDES[:-1]:
+            part = record.of_pixels((row % stride == 0) & (column % stride == 0))
+            self.improve(part, unknown, noises)
+            noises = noises[-1:]
+        return self.improve(record, unknown, noises)
 
     def improve(self, record: EventRecord, unknown: Array, noises: Array) -> EventStatistic:
         """Return the statistic after a Gauss-Newton step at each error of a crossing; `unknown` is changed.

@@ -23,7 +23,6 @@ from evnlos.models.weights import (
     published_setup,
     published_single,
     save_weights,
-    with_rank,
 )
 
 __all__ = [
@@ -53,5 +52,4 @@ __all__ = [
     "published_setup",
     "published_single",
     "save_weights",
-    "with_rank",
 ]

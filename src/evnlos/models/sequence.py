@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_modality
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import ridge_by_groups
-from evnlos.inverse.sequence_light import handwritten_prior
+from evnlos.inverse.prior import handwritten_prior
 from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.models.confidence import on_canvas
 from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmbeddings, fit_input

@@ -27,6 +27,7 @@ from evnlos.files import write_atomically
 from evnlos.models.confidence import Confidence
 from evnlos.models.reconstructor import Reconstructor, ReconstructorSettings
 from evnlos.registry import migrate, todays_weights
+from evnlos.setups.files import calibrated_file
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
 
 VARIABLE = "EVNLOS_WEIGHTS"
@@ -111,7 +112,7 @@ def is_as_published(path: Path) -> bool:
 
 
 def published_setup(weights: str | Path) -> Path | None:
-    """Return the calibrated setup that published weights were trained for; None for other weights.
+    """Return the folder of the calibrated setup that published weights were trained for; None for others.
 
     Args:
         weights: A name of `published`, or what else stands for weights.
@@ -119,8 +120,13 @@ def published_setup(weights: str | Path) -> Path | None:
     name, known = todays_weights(str(weights)), published()
     if name not in known:
         return None
-    path = known[name].parent / f"{name.partition('-')[0]}.yaml"
-    return path if path.is_file() else None
+    return _setup_beside(known[name], name.partition("-")[0])
+
+
+def _setup_beside(weights: Path, name: str) -> Path | None:
+    """Return the folder of a calibrated setup that lies beside a weights file; None where there is none."""
+    folder = weights.parent / name
+    return folder if calibrated_file(folder) != folder else None
 
 
 def layers_of(setup: str, *modalities: str) -> list[str]:
@@ -254,19 +260,6 @@ def describe_network(network: Reconstructor) -> dict[str, Any]:
     }
 
 
-def with_rank(weights: Weights, rank: int) -> Weights:
-    """Return a copy of weights whose closed-form part has fewer components, the strongest.
-
-    Args:
-        weights: The weights; unchanged.
-        rank: Components to keep.
-
-    Raises:
-        ConfigError: There is no such part, or it has fewer components.
-    """
-    return replace(weights, network=weights.network.reduced(rank))
-
-
 def find_weights(word: str | Path) -> Path:
     """Return the file that `load_weights` reads.
 
@@ -365,6 +358,9 @@ def _network(about: dict[str, Any], tensors: dict[str, torch.Tensor], path: Path
             f"{seen.layout}: register the modality that it was trained with"
         )
     made_for: Sampling = from_dict(Sampling, sampling, source=f"{path}: sampling")  # type: ignore[arg-type]
+    # Weights that were handed on bring their setup along: its folder beside them comes before the one of old.
+    if made_for.setup and (beside := _setup_beside(path, Path(made_for.setup).name)):
+        made_for = replace(made_for, setup=str(beside))
     values = about.get("network")
     settings_class = ReconstructorSettings.class_for(values)
     settings: ReconstructorSettings = from_dict(settings_class, values, source=str(path))  # type: ignore[arg-type]

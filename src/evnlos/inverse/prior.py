@@ -1,0 +1,207 @@
+"""What hidden targets look like: Gaussian priors of written characters, and others to test them on.
+
+- Handwriting as a prior and as a test, on the cells of any plane.
+- Mean target, and the patterns in which targets differ most: a target as a few numbers.
+- The letters of the usual prior come with the package: drawing them takes ten seconds, and fonts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from evnlos.errors import ConfigError
+from evnlos.machine import note
+from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Strokes, Target
+from evnlos.types import Plane
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+TEST_CHARACTERS = "AGKS249"
+"""Characters that the prior never sees, from writers that it never sees."""
+TRAIN_CHARACTERS = "BCDEFHIJLMNOPQRTUVWXYZ0135678"
+"""Characters of the prior."""
+TYPICAL = "G"
+"""The character whose Picard plot is shown."""
+LETTERS = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=11, strokes=Strokes(faces="both"))
+"""Letters of the usual prior, as many writers as faces: handwriting, and print."""
+LETTERS_FILE, LETTER_PX = Path(__file__).with_name("letters.png"), 64
+"""They are drawn there, a row a writer, squares of so many pixels (`tools/draw_letters.py`)."""
+
+_TEST_WRITERS = 2
+_RIDGE = 1e-3  # white part of the prior, share of its mean variance: no shape is impossible
+
+
+@dataclass(frozen=True, eq=False)
+class TargetPrior:
+    """Targets to learn a prior from, and others to test on, drawn on the same cells.
+
+    Args:
+        mean: Mean training target, float64 [n], 0..1.
+        root: R with R R^T their covariance and a small white part, float64 [n, n].
+        test: Test targets, float64 [M, n].
+        names: Their names, [M].
+        stroke_m: Median stroke width of the test targets, metres.
+    """
+
+    mean: torch.Tensor
+    root: torch.Tensor
+    test: torch.Tensor
+    names: tuple[str, ...]
+    stroke_m: float
+
+    @property
+    def typical(self) -> int:
+        """Number of the test target that stands for all."""
+        return next(i for i, name in enumerate(self.names) if name.endswith(f"_{TYPICAL}"))
+
+
+@lru_cache(maxsize=2)
+def handwritten_targets(target_plane: Plane, writers: int = 6) -> TargetPrior:
+    """Return NIST-like handwriting as prior and test.
+
+    Training targets are also moved by a cell each way, so that the prior does not know the place to a cell.
+
+    Args:
+        target_plane: Cells of the target plane, square.
+        writers: Writers of the training targets.
+    """
+    mean, variance, axes = _gaussian_of(_drawn(writers), target_plane)
+    root = axes * variance.sqrt()
+    testing = HandwritingGlyphs(characters=TEST_CHARACTERS, writers=_TEST_WRITERS, first_writer=TRAIN_WRITERS)
+    targets = [testing.target(name) for name in testing.objects()]
+    test = torch.from_numpy(np.stack([one.rasterise(target_plane) for one in targets])).double().flatten(1)
+    stroke = float(np.median([stroke_width_m(one) for one in targets]))
+    return TargetPrior(mean, root, test, tuple(testing.objects()), stroke)
+
+
+@lru_cache(maxsize=2)
+def _drawn(writers: int) -> tuple[Target, ...]:
+    """Return training targets in the hands of some writers."""
+    training = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=writers)
+    found, names = [], training.objects()
+    for k, name in enumerate(names, 1):
+        note(f"handwritten target {k} of {len(names)}")
+        found.append(training.target(name))
+    return tuple(found)
+
+
+def letters() -> tuple[Target, ...]:
+    """Return `LETTERS` as they come with the package."""
+    with Image.open(LETTERS_FILE) as sheet:
+        drawn = np.asarray(sheet, np.float32) / 255
+    squares = drawn.reshape(-1, LETTER_PX, drawn.shape[1] // LETTER_PX, LETTER_PX).swapaxes(1, 2)
+    size_m = LETTERS.target_plane.size_m
+    return tuple(Target("letter", one, size_m) for one in squares.reshape(-1, LETTER_PX, LETTER_PX))
+
+
+def _gaussian_of(
+    targets: Iterable[Target], target_plane: Plane
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return mean [n], variances in ascending order [n], and axes [n, n] of targets, also moved by a cell."""
+    drawn = np.stack([one.rasterise(target_plane) for one in targets]).astype(np.float64)
+    moved = [np.roll(drawn, (dy, dx), axis=(1, 2)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    samples = torch.from_numpy(np.concatenate(moved)).flatten(1)  # [9 N, n]
+    variance, axes = torch.linalg.eigh(torch.cov(samples.mT))
+    return samples.mean(dim=0), variance.clamp(min=0) + _RIDGE * variance.mean(), axes
+
+
+def stroke_width_m(target: Target) -> float:
+    """Return the mean width of a target's strokes, metres: twice their area over the length of their border.
+
+    A stroke of width w and length l has the area w l and, but for its ends, a border of 2 l. The border's
+    length is the total variation of the mask.
+
+    Example:
+        >>> bar = np.zeros((100, 100)); bar[:, 40:50] = 1
+        >>> round(stroke_width_m(Target("bar", bar, 0.1)), 4)
+        0.01
+    """
+    mask = target.mask.astype(np.float64)
+    pixel_m = target.size_m / mask.shape[0]
+    border = float(np.hypot(*_slopes(mask)).sum())
+    return 2 * float(mask.sum()) / max(border, 1e-12) * pixel_m
+
+
+def _slopes(mask: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return forward differences along y and x, [S, S]."""
+    return np.diff(mask, axis=0, append=mask[-1:]), np.diff(mask, axis=1, append=mask[:, -1:])
+
+
+@dataclass(frozen=True, eq=False)
+class PatternPrior:
+    """Targets as mean + patterns @ z with z normal, independent and of variance 1.
+
+    Args:
+        target_plane: The target's cells.
+        mean: Mean target, [n].
+        patterns: One pattern a column, each as large as targets vary along it, [n, k].
+        rest: Variance of what the patterns leave out, mean over the cells.
+    """
+
+    target_plane: Plane
+    mean: Array
+    patterns: Array
+    rest: float
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return self.patterns.shape[1]
+
+    def coefficients(self, image: Array | Single) -> Array:
+        """Return the coefficients of a target [h, w], [k]: the patterns are orthogonal."""
+        return (image.ravel() - self.mean) @ (self.patterns / np.square(self.patterns).sum(axis=0))
+
+    def image(self, z: Array) -> Array:
+        """Return the target of coefficients [k], [h, w]."""
+        return (self.mean + self.patterns @ z).reshape(self.target_plane.shape)
+
+    def variance(self, covariance: Array) -> Array:
+        """Return the variance of each cell [h, w] at a covariance [k, k] of the coefficients, rest included."""
+        spread = np.einsum("nk,kl,nl->n", self.patterns, covariance, self.patterns, optimize=True)
+        return spread.reshape(self.target_plane.shape) + self.rest
+
+    def error(self, information: Array) -> float:
+        """Return the expected mean squared error of a cell after measurements with this information [k, k]."""
+        posterior = np.linalg.inv(np.eye(self.count) + information)
+        return float((posterior * (self.patterns.T @ self.patterns)).sum()) / len(self.mean) + self.rest
+
+
+@lru_cache(maxsize=2)
+def handwritten_prior(
+    target_plane: Plane,
+    coefficients: int = 150,
+    writers: int | None = None,
+) -> PatternPrior:
+    """Return the Gaussian of written targets by its largest patterns.
+
+    None of the targets shows A G K S 2 4 9.
+
+    Args:
+        target_plane: Cells of the target, square.
+        coefficients: Patterns that are kept.
+        writers: Writers of handwritten targets. None: the letters that come with the package, print among them,
+            since a prior of handwriting alone takes broad strokes for noise.
+
+    Raises:
+        ConfigError: More coefficients than cells, or none.
+    """
+    if not 1 <= coefficients <= target_plane.height * target_plane.width:
+        raise ConfigError(
+            f"coefficients is {coefficients}; give 1 to {target_plane.height * target_plane.width}, its cells"
+        )
+    mean, values, axes = _gaussian_of(letters() if writers is None else _drawn(writers), target_plane)
+    values, axes = values.flip(0), axes.flip(1)
+    patterns = axes[:, :coefficients] * values[:coefficients].sqrt()
+    return PatternPrior(
+        target_plane, mean.numpy(), patterns.numpy(), float(values[coefficients:].sum()) / len(axes)
+    )
