@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 from dataclasses import asdict, replace
 from html import unescape
 
@@ -270,7 +271,7 @@ def test_noise_that_grows_with_the_light_is_taken_off() -> None:
 def test_published_weights_refuse_a_wall_that_is_not_theirs() -> None:
     path = published_setup("near-frame-sequence")
     assert path is not None and published_setup("page-frame-sequence") is None and published_setup(path) is None
-    setup, weights = load_yaml(Simulation, path / "setup.yaml"), load_weights("near-frame-sequence")
+    setup, weights = load_yaml(Simulation, path), load_weights("near-frame-sequence")
     sampling = weights.sampling
     operator = FrameOperator(setup.setup, sampling)
     matte = replace(setup.setup, wall_material="lambert")
@@ -372,6 +373,13 @@ def test_own_weights_know_the_setup_that_their_samples_name(tmp_path) -> None:
         own.network.sampling = replace(weights.sampling, setup=named)
         save_weights(tmp_path / "own.pt", own)
         assert load_model(tmp_path / "own.pt").known_setup() == known
+    # Handed on, they bring it along: a folder beside them with the first part of their name.
+    (tmp_path / "own").mkdir()
+    shutil.copy(path, tmp_path / "own" / "setup.yaml")
+    own.network.sampling = replace(weights.sampling, setup="elsewhere/demo")
+    save_weights(tmp_path / "own-frame.safetensors", own)
+    assert load_weights(tmp_path / "own-frame.safetensors").sampling.setup == str(tmp_path / "own")
+    assert load_model(tmp_path / "own-frame.safetensors").known_setup() == load_setup(path)
 
 
 def test_each_verdict_says_what_is_guessed() -> None:

@@ -59,7 +59,7 @@ def test_a_folder_in_the_variable_comes_before_what_is_installed(tmp_path, monke
     monkeypatch.setenv("EVNLOS_WEIGHTS", str(tmp_path))
     assert published()[NAME] == tmp_path / f"{NAME}.safetensors"
     assert load_weights(NAME).modality.name == "event"
-    assert published_setup("near-frame") == FILES / "near"
+    assert published_setup("near-frame") == FILES / "near.yaml"
     (tmp_path / "SHA256SUMS").write_text(f"{'0' * 64}  {NAME}.safetensors\n")
     with pytest.raises(DataError, match="SHA-256 is not the one in SHA256SUMS"):
         load_weights(NAME)

@@ -173,8 +173,8 @@ class Model:
 
     Args:
         weights: The network, its history, its confidence.
-        known_setup: Folder of the calibrated setup that the network was trained for; None for the setup that
-            the training's samples name, if it is still there.
+        known_setup: Settings of the calibrated setup that the network was trained for, a YAML file, where the
+            training's samples name none.
     """
 
     def __init__(self, weights: Weights, known_setup: Path | None = None) -> None:
@@ -182,9 +182,7 @@ class Model:
 
     def known_setup(self) -> Setup | None:
         """Return the setup that the network was trained for; None where it is unknown."""
-        if self._known_setup is not None:
-            return load_setup(self._known_setup)
-        named = self.weights.sampling.setup
+        named = self.weights.sampling.setup or self._known_setup
         try:
             found = load_setup(named) if named else None
         except (ConfigError, DataError):  # moved, or of another machine

@@ -112,7 +112,7 @@ def is_as_published(path: Path) -> bool:
 
 
 def published_setup(weights: str | Path) -> Path | None:
-    """Return the folder of the calibrated setup that published weights were trained for; None for others.
+    """Return the calibrated setup of published weights whose samples name none; None for other weights.
 
     Args:
         weights: A name of `published`, or what else stands for weights.
@@ -120,12 +120,13 @@ def published_setup(weights: str | Path) -> Path | None:
     name, known = todays_weights(str(weights)), published()
     if name not in known:
         return None
-    return _setup_beside(known[name], name.partition("-")[0])
+    path = known[name].parent / f"{name.partition('-')[0]}.yaml"
+    return path if path.is_file() else None
 
 
-def _setup_beside(weights: Path, name: str) -> Path | None:
-    """Return the folder of a calibrated setup that lies beside a weights file; None where there is none."""
-    folder = weights.parent / name
+def _setup_beside(weights: Path) -> Path | None:
+    """Return the folder `near` of a calibrated setup beside a file `near-....safetensors`, if it is there."""
+    folder = weights.parent / weights.stem.partition("-")[0]
     return folder if calibrated_file(folder) != folder else None
 
 
@@ -358,8 +359,8 @@ def _network(about: dict[str, Any], tensors: dict[str, torch.Tensor], path: Path
             f"{seen.layout}: register the modality that it was trained with"
         )
     made_for: Sampling = from_dict(Sampling, sampling, source=f"{path}: sampling")  # type: ignore[arg-type]
-    # Weights that were handed on bring their setup along: its folder beside them comes before the one of old.
-    if made_for.setup and (beside := _setup_beside(path, Path(made_for.setup).name)):
+    # Weights that were handed on bring their setup along, which comes before the folder that it once was.
+    if made_for.setup and (beside := _setup_beside(path)):
         made_for = replace(made_for, setup=str(beside))
     values = about.get("network")
     settings_class = ReconstructorSettings.class_for(values)
