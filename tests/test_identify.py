@@ -20,6 +20,7 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.prior import LETTERS, TEST_CHARACTERS, TRAIN_CHARACTERS, handwritten_targets, letters
 from evnlos.scene import LineMotion, Scene, Target
 from evnlos.setups import PaperSetup, RadiometricSetup, named_setup, setup_names, setup_preset
+from evnlos.types import Plane
 
 SMALL = AnalysisSettings(cells=8, height=12, width=20, writers=1)
 
@@ -194,9 +195,9 @@ def test_the_letters_that_come_with_the_package_are_those_of_their_glyphs():
     packaged, names = letters(), LETTERS.objects()
     assert len(packaged) == len(names) == LETTERS.writers * len(TRAIN_CHARACTERS)
     side = len(packaged[0].mask)
-    glyphs = dataclasses.replace(LETTERS, target_plane=dataclasses.replace(LETTERS.target_plane, size_px=side))
+    squares = Plane(side, side, LETTERS.target_plane.size_m / side)
     for name, one in list(zip(names, packaged, strict=True))[::9]:
-        assert np.abs(one.mask - glyphs.target(name).mask).max() <= 0.501 / 255, name
+        assert np.abs(one.mask - LETTERS.target(name).rasterise(squares)).max() <= 0.501 / 255, name
 
 
 def test_a_sharp_setup_shows_more_than_a_matte_wall():

@@ -34,7 +34,7 @@ TYPICAL = "G"
 LETTERS = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=11, strokes=Strokes(faces="both"))
 """Letters of the usual prior, as many writers as faces: handwriting, and print."""
 LETTERS_FILE, LETTER_PX = Path(__file__).with_name("letters.png"), 64
-"""They are drawn there, a row a writer, squares of so many pixels (`tools/draw_letters.py`)."""
+"""They are drawn there, a row a writer, on squares of so many cells (`tools/draw_letters.py`)."""
 
 _TEST_WRITERS = 2
 _RIDGE = 1e-3  # white part of the prior, share of its mean variance: no shape is impossible
