@@ -131,7 +131,7 @@ def test_a_fit_says_which_trial_it_makes(monkeypatch) -> None:
 def test_identify_says_what_it_works_on(monkeypatch) -> None:
     """One stage of ten seconds and more, within which something new is told every second or so."""
     told = list[str]()
-    for room in ("analysis.identify", "analysis.linearized", "inverse.problem"):
+    for room in ("analysis.identify", "analysis.linearized", "inverse.prior"):
         monkeypatch.setattr(importlib.import_module(f"evnlos.{room}"), "note", told.append)
     identify(load_setup("matte-near"), AnalysisSettings(cells=8, height=12, width=20, writers=1))
     parts = ("light path", "handwritten target 2 of", "singular values", "modes at a noise", "bars of")

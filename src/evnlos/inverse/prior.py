@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
 from evnlos.errors import ConfigError
 from evnlos.machine import note
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Strokes, Target
 from evnlos.types import Plane
+from evnlos.untrusted import open_image
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -96,8 +96,8 @@ def _drawn(writers: int) -> tuple[Target, ...]:
 
 def letters() -> tuple[Target, ...]:
     """Return `LETTERS` as they come with the package."""
-    with Image.open(LETTERS_FILE) as sheet:
-        drawn = np.asarray(sheet, np.float32) / 255
+    with open_image(LETTERS_FILE) as sheet:
+        drawn = np.asarray(sheet, np.float32) / np.float32(255)
     squares = drawn.reshape(-1, LETTER_PX, drawn.shape[1] // LETTER_PX, LETTER_PX).swapaxes(1, 2)
     size_m = LETTERS.target_plane.size_m
     return tuple(Target("letter", one, size_m) for one in squares.reshape(-1, LETTER_PX, LETTER_PX))
