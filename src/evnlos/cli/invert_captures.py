@@ -36,6 +36,7 @@ from evnlos.inverse import (
     record_of,
     sequence_light,
 )
+from evnlos.inverse.event_images import CELLS, COEFFICIENTS
 from evnlos.inverse.inversion import Inversion, chosen_degree
 from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
@@ -279,7 +280,6 @@ def reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:
     return max(1, round(shape[0] / factor)), max(1, round(shape[1] / factor))
 
 
-_CELLS, _COEFFICIENTS = 32, 120
 _GAP_S = 0.4  # between the instants at which silences are looked at
 _NORMAL_90 = 1.645
 _FURTHEST = 0.15  # of fitted thresholds from the setup's, relative
@@ -314,7 +314,7 @@ def estimate_captures(
         if motion is None:
             raise ConfigError(f"{folder}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
         motion, size = motion.in_its_plane(), capture.info.target_size_m
-        prior = handwritten_prior(Plane(_CELLS, _CELLS, size / _CELLS), _COEFFICIENTS)
+        prior = handwritten_prior(Plane(CELLS, CELLS, size / CELLS), COEFFICIENTS)
         span = (float(capture.frame_times_us[0]) * 1e-6, float(capture.frame_times_us[-1]) * 1e-6)
         shape = (capture.events.height, capture.events.width)
         key = (motion, span, shape, size)

@@ -74,8 +74,7 @@ def handwritten_targets(target_plane: Plane, writers: int = 6) -> TargetPrior:
         target_plane: Cells of the target plane, square.
         writers: Writers of the training targets.
     """
-    mean, variance, axes = _gaussian_of(_drawn(writers), target_plane)
-    root = axes * variance.sqrt()
+    mean, root = _gaussian_of(_drawn(writers), target_plane)
     testing = HandwritingGlyphs(characters=TEST_CHARACTERS, writers=_TEST_WRITERS, first_writer=TRAIN_WRITERS)
     targets = [testing.target(name) for name in testing.objects()]
     test = torch.from_numpy(np.stack([one.rasterise(target_plane) for one in targets])).double().flatten(1)
@@ -102,15 +101,13 @@ def letters() -> tuple[Target, ...]:
     return tuple(Target("letter", one, size_m) for one in squares.reshape(-1, LETTER_PX, LETTER_PX))
 
 
-def _gaussian_of(
-    targets: Iterable[Target], target_plane: Plane
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return mean [n], variances in ascending order [n], and axes [n, n] of targets, also moved by a cell."""
+def _gaussian_of(targets: Iterable[Target], target_plane: Plane) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return mean [n] and root [n, n] of targets, also moved by a cell; shortest columns first."""
     drawn = np.stack([one.rasterise(target_plane) for one in targets]).astype(np.float64)
     moved = [np.roll(drawn, (dy, dx), axis=(1, 2)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     samples = torch.from_numpy(np.concatenate(moved)).flatten(1)  # [9 N, n]
     variance, axes = torch.linalg.eigh(torch.cov(samples.mT))
-    return samples.mean(dim=0), variance.clamp(min=0) + _RIDGE * variance.mean(), axes
+    return samples.mean(dim=0), axes * (variance.clamp(min=0) + _RIDGE * variance.mean()).sqrt()
 
 
 def stroke_width_m(target: Target) -> float:
@@ -198,9 +195,11 @@ def handwritten_prior(
         raise ConfigError(
             f"coefficients is {coefficients}; give 1 to {target_plane.height * target_plane.width}, its cells"
         )
-    mean, values, axes = _gaussian_of(letters() if writers is None else _drawn(writers), target_plane)
-    values, axes = values.flip(0), axes.flip(1)
-    patterns = axes[:, :coefficients] * values[:coefficients].sqrt()
-    return PatternPrior(
-        target_plane, mean.numpy(), patterns.numpy(), float(values[coefficients:].sum()) / len(axes)
-    )
+    if writers is None:
+        mean, root = _gaussian_of(letters(), target_plane)
+    else:
+        known = handwritten_targets(target_plane, writers)
+        mean, root = known.mean, known.root
+    patterns = root.flip(1)
+    rest = float(patterns[:, coefficients:].square().sum()) / len(patterns)
+    return PatternPrior(target_plane, mean.numpy(), patterns[:, :coefficients].contiguous().numpy(), rest)
