@@ -211,9 +211,14 @@ def drawn_for(config: Simulation, name: str) -> Simulation:
     others = {path: ends for path, ends in config.vary.items() if path not in optics}
     drawn = dataclasses.replace(config, vary={})  # else the ends of all ranges would be tried at each draw
     if optics:
-        group = derive_seed(config.seed, name, "rig") % config.setups
+        group = _optics_of(config, name)
         drawn = varied(drawn, optics, config.seed, f"rig {group}")  # the word decides the seed, so it stays
     return varied(drawn, others, config.seed, name)
+
+
+def _optics_of(config: Simulation, name: str) -> int:
+    """Return the number of the optics that an object shares with others; 0 where each has its own."""
+    return derive_seed(config.seed, name, "rig") % config.setups if config.setups else 0
 
 
 def needs_a_matrix(path: str) -> bool:
@@ -379,7 +384,10 @@ def simulate(
     )
     with claim_dataset(dataset, f"{first}-of-{stride}" if stride > 1 else "", Simulation) as dataset:
         share_names = set(config.glyphs.objects()[first - 1 :: stride])
-        missing = [name for name in dataset.missing() if name in share_names]
+        # Objects of the same optics follow each other, so that a process makes each matrix once.
+        missing = sorted(
+            (name for name in dataset.missing() if name in share_names), key=lambda name: _optics_of(config, name)
+        )
         what, total = f"simulate {dataset.folder.name}", len(share_names)
         there = total - len(missing)
         progress(Step(what, there, total, "objects"))
