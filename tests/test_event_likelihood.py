@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from evnlos.analysis import SequenceAnalysisSettings, event_information
+from evnlos.analysis import SequenceAnalysisSettings, check_sampling, event_information
 from evnlos.calibration import write_event_errors
 from evnlos.cameras import EventPixel, FrameCamera, simulate_events
 from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, Simulation, capture_samples, read_capture, simulate
 from evnlos.data.sampling import surface_of
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse import (
     AboutErrors,
     EventErrors,
@@ -33,7 +33,7 @@ from evnlos.inverse import (
     sequence_light,
 )
 from evnlos.metrics import psnr
-from evnlos.models import SequenceConfig
+from evnlos.models import SequenceConfig, Weights
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.types import Events, Plane
@@ -291,8 +291,35 @@ def test_the_surface_is_refused_without_setup_or_motion() -> None:
         event_images(events, edges, BENCH.motion, "", canvas)
     with pytest.raises(DataError, match="motion is unknown"):
         event_images(events, edges, None, "near", canvas)
+    with pytest.raises(UnknownNameError, match=r"'near'.*is not there: give the folder"):
+        event_images(events, edges, BENCH.motion, "near", canvas)
     with pytest.raises(ConfigError, match="whole recordings"):
         surface_of(events, edges, Sampling(surface="likelihood", setup="near"))
+
+
+def test_what_samples_and_weights_must_share(tmp_path: Path) -> None:
+    """A setup that was moved is the same one; a network of frames is not asked how events were shown."""
+    for name, setup in (("here", SETUP), ("there", SETUP), ("other", replace(SETUP, gain=0.9))):
+        (tmp_path / name).mkdir()
+        save_yaml(to_dict(Simulation(setup=setup)), tmp_path / name / "setup.yaml")
+    made = {
+        name: Sampling(surface="likelihood", setup=str(tmp_path / name)) for name in ("here", "there", "other")
+    }
+    plan = SequenceConfig(width=4, depth=1, rank=8)
+    sees = {modality: Weights(plan.build(modality, made["here"])) for modality in ("event", "frame")}
+    for same in (
+        made["here"],
+        made["there"],
+        replace(made["here"], setup=str(tmp_path / "here" / "setup.yaml")),
+    ):
+        check_sampling(sees["event"], same)
+    for another in (made["other"], replace(made["here"], setup=str(tmp_path / "gone")), Sampling()):
+        with pytest.raises(DataError, match="make them alike"):
+            check_sampling(sees["event"], another)
+    for fits in (made["other"], Sampling(surface="hots", tau_s=0.1)):
+        check_sampling(sees["frame"], fits)
+    with pytest.raises(DataError, match="make them alike"):
+        check_sampling(sees["frame"], Sampling(height=48))
 
 
 def errors_of(draw: np.random.Generator, captures: int, drift: float) -> tuple[EventErrors, np.ndarray]:

@@ -26,6 +26,7 @@ from evnlos.metrics import psnr
 from evnlos.models import FrameOperator, Weights, on_target_plane
 from evnlos.models.confidence import SIDE, on_canvas
 from evnlos.setups import Setup
+from evnlos.setups.files import same_setup
 from evnlos.types import Plane
 
 _TOGETHER = 128  # samples compared at a time
@@ -371,7 +372,11 @@ def check_sampling(weights: Weights, sampling: Sampling) -> None:
     Raises:
         DataError: Names the settings that differ.
     """
-    if weights.sampling != sampling:
+    made_for = weights.sampling
+    these = sampling if weights.modality.needs_events else sampling.of_frames()
+    # Only this surface is made through the setup, which may have been moved.
+    is_known = made_for.surface != "likelihood" or same_setup(made_for.setup, these.setup)
+    if not is_known or replace(made_for, setup="") != replace(these, setup=""):
         raise DataError(
-            f"the weights were trained on samples of {weights.sampling}; these are {sampling}: make them alike"
+            f"the weights were trained on samples of {made_for}; these are {these}: make them alike"
         )

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -182,12 +183,11 @@ class Model:
 
     def known_setup(self) -> Setup | None:
         """Return the setup that the network was trained for; None where it is unknown."""
-        named = self.weights.sampling.setup or self._known_setup
-        try:
-            found = load_setup(named) if named else None
-        except (ConfigError, DataError):  # moved, or of another machine
-            return None
-        return found if found is not None and found.is_linear else None
+        for named in filter(None, (self.weights.sampling.setup, self._known_setup)):
+            with suppress(ConfigError, DataError):  # moved, or of another machine
+                found = load_setup(named)
+                return found if found.is_linear else None
+        return None
 
     def reconstruct(
         self,

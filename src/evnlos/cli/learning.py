@@ -332,11 +332,14 @@ def to_text(name: str, found: dict[str, Any]) -> str:
     """Return the description as lines for people."""
     sees = "whole sequences" if found["sees_sequence"] else "one time step at a time"
     sampling = found["sampling"]
+    through = (
+        f", through the light path of {sampling['setup']}" if sampling.get("surface") == "likelihood" else ""
+    )
     lines = [
         f"{name}: {found['modality']}, {found['network']['kind']}: {sees}; {found['parameters']:,} trained "
         f"parameters, {found['numbers'] - found['parameters']:,} numbers in closed form",
         f"  maps {sampling.get('width')} x {sampling.get('height')}, pitch {sampling.get('pitch_m')} m, "
-        f"surface {sampling.get('surface')}, tau {sampling.get('tau_s')} s",
+        f"surface {sampling.get('surface')}, tau {sampling.get('tau_s')} s{through}",
     ]
     if name.startswith(f"{GENERIC}-"):
         lines.append(

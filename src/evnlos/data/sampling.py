@@ -94,6 +94,11 @@ class Sampling:
                 raise ConfigError(f"Sampling.{name} is {getattr(self, name)}; give a positive number")
         check_made(self)
 
+    def of_frames(self) -> Sampling:
+        """Return it as far as frames alone are concerned: the surface is the usual one."""
+        usual = Sampling()
+        return replace(self, surface=usual.surface, tau_s=usual.tau_s, radius=usual.radius)
+
     @property
     def canvas(self) -> Plane:
         """The part of the target's plane that the truth shows, centred on the middle of the travel."""

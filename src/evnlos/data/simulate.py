@@ -386,7 +386,8 @@ def simulate(
         share_names = set(config.glyphs.objects()[first - 1 :: stride])
         # Objects of the same optics follow each other, so that a process makes each matrix once.
         missing = sorted(
-            (name for name in dataset.missing() if name in share_names), key=lambda name: _optics_of(config, name)
+            (name for name in dataset.missing() if name in share_names),
+            key=lambda name: _optics_of(config, name),
         )
         what, total = f"simulate {dataset.folder.name}", len(share_names)
         there = total - len(missing)

@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from evnlos.errors import ConfigError, DataError
+from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse.prior import PatternPrior, handwritten_prior
 from evnlos.inverse.sequence_light import EVENT_PRIORS, sequence_light
 from evnlos.inverse.sequence_statistic import EventSolver, EventStatistic
@@ -182,7 +182,14 @@ def _solver(
     setup: str, motion: Motion, span_s: tuple[float, float], shape: tuple[int, int]
 ) -> tuple[EventSolver, PatternPrior]:
     """Return the solver of a setup, and its prior: handwriting, as large as the usual target."""
-    known = load_setup(setup)
+    try:
+        known = load_setup(setup)
+    except UnknownNameError:
+        raise UnknownNameError(
+            f"the setup {setup!r}, whose light path the events are solved through, is not there: give the "
+            "folder of `evnlos calibrate` that the samples were made with, from where its name leads to it, or "
+            "put a folder `near` beside weights `near-....safetensors`"
+        ) from None
     prior = handwritten_prior(Plane(CELLS, CELLS, TargetPlane().size_m / CELLS), COEFFICIENTS)
     light = sequence_light(known, prior, motion.position_m, span_s, shape)
     law = known.pixel.crossing_law(light.typical_dn)

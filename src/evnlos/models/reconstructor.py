@@ -65,7 +65,7 @@ class Reconstructor(nn.Module, ABC):
     Args:
         modality: What it sees.
         settings: Its settings.
-        sampling: The samples that it is made for.
+        sampling: The samples that it is made for; how events are shown matters where they are seen.
     """
 
     sees_sequence: ClassVar[bool] = False
@@ -75,7 +75,8 @@ class Reconstructor(nn.Module, ABC):
 
     def __init__(self, modality: Modality, settings: ReconstructorSettings, sampling: Sampling) -> None:
         super().__init__()
-        self.modality, self.settings, self.sampling = modality, settings, sampling
+        self.modality, self.settings = modality, settings
+        self.sampling = sampling if modality.needs_events else sampling.of_frames()
 
     @property
     def kind(self) -> str:

@@ -290,6 +290,19 @@ def calibrated_file(path: Path) -> Path:
     return next((file for file in files if file.is_file()), path)
 
 
+def same_setup(first: str, second: str) -> bool:
+    """Return whether two words name one setup: they are alike, or files or folders of the same settings.
+
+    Example:
+        >>> same_setup("main-near", "main-far")
+        False
+    """
+    if first == second:
+        return True
+    files = [calibrated_file(Path(word)) for word in (first, second)]
+    return all(file.is_file() for file in files) and len({file.read_bytes() for file in files}) == 1
+
+
 def calibrated_folder(word: str | Path) -> Path:
     """Return the folder that `calibrate` wrote, named by itself or by the settings file in it.
 
