@@ -1,5 +1,6 @@
 """The likelihood of a whole sequence: unbiased on simulated sensors, near the bound, its intervals cover."""
 
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -364,21 +365,40 @@ def test_few_captures_change_nothing_of_what_events_say() -> None:
         EventErrors(AboutErrors(("a", "b")), errors.scores, errors.information)
 
 
-def test_a_setup_keeps_the_errors_that_its_captures_show(tiny_captures: list[Path], tmp_path: Path) -> None:
-    """Four captures: each has three others, which change nothing; a fifth has four."""
+@pytest.mark.parametrize("drift", [0.0, 1.0])
+def test_the_gain_of_errors_is_that_of_captures_left_out(drift: float) -> None:
+    """Noise alone is no gain, what comes back is one; what a capture itself shows does not count."""
+    prior, gains = PatternPrior(Plane(4, 4, 0.02), np.full(16, 0.5), np.eye(16)[:, :12] / 8, 0.0), []
+    for seed in range(40):
+        draw = np.random.default_rng(seed)
+        errors, a = errors_of(draw, 15, drift)
+        hidden = draw.normal(size=(15, 12))
+        scores = hidden @ a + errors.scores.double().numpy()
+        statistics = [EventStatistic(z, a, score) for z, score in zip(hidden, scores, strict=True)]
+        gains.append(errors.gain_db(statistics, prior, [prior.image(z) for z in hidden]))
+    assert np.mean(gains) > 1.0 if drift else abs(np.mean(gains)) < 0.25
+
+
+def test_a_setup_keeps_the_errors_that_captures_gain_from(tiny_captures: list[Path], tmp_path: Path) -> None:
     setup = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72))
     save_yaml(to_dict(Simulation(setup=setup)), tmp_path / "setup.yaml")
-    capture = read_capture(tiny_captures[0])
-    another = replace(capture, name="another_A")
+    another = replace(read_capture(tiny_captures[0]), name="another_A")
     sampling = Sampling(surface="likelihood", setup=str(tmp_path))
     before = capture_samples(another, sampling).surface
-    said = list[str]()
-    names = tuple(folder.name for folder in tiny_captures)
+    # Four captures: each has three others, which change nothing, so nothing is gained, and an older file goes.
+    names, file = tuple(folder.name for folder in tiny_captures), tmp_path / "events.safetensors"
+    file.write_bytes(b"of an earlier calibration")
+    assert write_event_errors(tmp_path, tiny_captures, names) is None and not file.exists()
+    # With a twin each, they know their own errors.
+    twins = [shutil.copytree(folder, tmp_path / f"twin_{folder.name}") for folder in tiny_captures]
+    said, both = list[str](), [*tiny_captures, *twins]
     errors = write_event_errors(
-        tmp_path, tiny_captures, names, lambda step: said.append(f"{step.done} of {step.total}")
+        tmp_path,
+        both,
+        [folder.name for folder in both],
+        lambda step: said.append(f"{step.done} of {step.total}"),
     )
-    assert errors is not None and errors.about.captures == names
-    assert said[0] == "0 of 4" and said[-1] == "4 of 4" and torch.isfinite(errors.scores).all()
-    np.testing.assert_array_equal(capture_samples(capture, sampling).surface, before)
+    assert errors is not None and errors.about.gain_db > 0.5 and file.is_file()
+    assert said[0] == "0 of 8" and said[-1] == "8 of 8" and torch.isfinite(errors.scores).all()
     assert np.abs(capture_samples(another, sampling).surface - before).max() > 0.01
     assert write_event_errors(tmp_path / "none", tiny_captures, ()) is None and not (tmp_path / "none").exists()

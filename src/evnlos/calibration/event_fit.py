@@ -37,6 +37,8 @@ from evnlos.inverse.event_images import (
     EventErrors,
     event_statistic,
 )
+from evnlos.inverse.prior import PatternPrior
+from evnlos.inverse.sequence_statistic import EventStatistic
 from evnlos.machine import Progress, Step, note, silent
 from evnlos.types import Events
 
@@ -52,6 +54,7 @@ _MOST_NOISE = 10.0  # times the events of pixels that see nothing
 _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
 _MOST_CAPTURES = 16  # that tell of errors: a second or two each
+_LEAST_GAIN_DB = 0.5  # of captures corrected by others, below which no errors are kept
 
 
 @dataclass(frozen=True)
@@ -280,7 +283,9 @@ def write_event_errors(
 ) -> EventErrors | None:
     """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
 
-    `event_images` takes it into account: for a capture that is among these, what the others showed.
+    `event_images` takes it into account: for a capture that is among these, what the others showed. Where the
+    setup is right but for noise, its correction costs more than it brings, so each capture is corrected by the
+    others first, and the file is written where they gain at least 0.5 dB.
 
     Args:
         setup: Folder of a calibrated setup.
@@ -290,12 +295,14 @@ def write_event_errors(
         progress: Called as the captures are read.
 
     Returns:
-        The errors; None, and nothing is written, where no capture shows them, or no law of the setup's event
-        model is known.
+        The errors; None, and no file is there, where captures do not gain from them, none shows them, or no law
+        of the setup's event model is known.
     """
     learned = [folder for folder in captures if folder.resolve().name in names]
     learned = learned[:: max(1, -(-len(learned) // _MOST_CAPTURES))]
-    found, scores, information = list[str](), [], []
+    found, statistics, truths, scores = list[str](), list[EventStatistic](), [], []
+    (setup / EVENT_ERRORS_FILE).unlink(missing_ok=True)
+    prior: PatternPrior | None = None
     what = "errors of the events"
     for number, folder in enumerate(learned):
         progress(Step(what, number, len(learned), "captures"))
@@ -309,17 +316,21 @@ def write_event_errors(
             )
         except ConfigError:
             return None
-        z = prior.coefficients(target.rasterise(prior.target_plane))
+        truths.append(target.rasterise(prior.target_plane))
         found.append(capture.name)
-        scores.append(statistic.score - statistic.information @ z)
-        information.append(statistic.information)
-    if not found:
+        statistics.append(statistic)
+        scores.append(statistic.score - statistic.information @ prior.coefficients(truths[-1]))
+    progress(Step(what, len(learned), len(learned), "captures"))
+    if prior is None or not found:
         return None
     tensors = {
         "scores": torch.from_numpy(np.stack(scores)).float(),
-        "information": torch.from_numpy(np.mean(information, axis=0)).float(),
+        "information": torch.from_numpy(np.mean([one.information for one in statistics], axis=0)).float(),
     }
-    about = AboutErrors(tuple(found))
-    EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, about)
-    progress(Step(what, len(learned), len(learned), "captures"))
-    return EventErrors(about, **tensors)
+    errors = EventErrors(AboutErrors(tuple(found)), **tensors)
+    gain_db = errors.gain_db(statistics, prior, truths)
+    if gain_db < _LEAST_GAIN_DB:
+        return None
+    errors = replace(errors, about=replace(errors.about, gain_db=gain_db))
+    EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, errors.about)
+    return errors

@@ -16,6 +16,7 @@ else they miss, by more than noise, is added to the covariance of b: with N that
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -50,6 +51,8 @@ class AboutErrors:
 
     captures: tuple[str, ...]
     """Names of the captures."""
+    gain_db: float = 0.0
+    """What each gained from the others, decibels over the target plane, mean of both priors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,7 @@ class EventErrors:
     """What captures with known targets showed that a setup gets wrong of its events.
 
     Args:
-        about: Names of the captures.
+        about: Names of the captures, and what they gained.
         scores: Score of each about its true target, b - A z*, float32 [C, k].
         information: Mean A of them, float32 [k, k].
 
@@ -97,6 +100,26 @@ class EventErrors:
         noise = a + spread @ spread.T + _LEAST * np.trace(a) / count * np.eye(count)
         pushed = np.linalg.solve(noise, a).T  # A N^-1
         return EventStatistic(statistic.z, pushed @ a, pushed @ (statistic.score - root @ mean))
+
+    def gain_db(
+        self, statistics: Sequence[EventStatistic], prior: PatternPrior, truths: Sequence[NDArray[np.float64]]
+    ) -> float:
+        """Return what the captures gain where each is corrected by what the others showed, decibels.
+
+        The mean over captures and `EVENT_PRIORS` of 10 lg of the squared error before over that after.
+
+        Args:
+            statistics: What the events of each capture say if the setup is right.
+            prior: What they are about.
+            truths: True target of each, on the cells of the prior, [h, w].
+        """
+        gains = list[float]()
+        for name, statistic, true in zip(self.about.captures, statistics, truths, strict=True):
+            pairs = (one.solutions(EVENT_PRIORS) for one in (statistic, self.corrected(statistic, name)))
+            for both in zip(*pairs, strict=True):
+                before, after = (np.mean((np.clip(prior.image(z), 0.0, 1.0) - true) ** 2) for z in both)
+                gains.append(float(10 * np.log10(before / after)))
+        return float(np.mean(gains))
 
 
 EVENT_ERRORS = TensorFile(
