@@ -10,6 +10,7 @@ import pytest
 
 from evnlos.errors import ConfigError, DataError
 from evnlos.models import load_weights, published, published_for, published_setup
+from evnlos.setups import load_setup
 
 ROOT = Path(__file__).resolve().parent.parent
 DISTRIBUTION = ROOT / "packages" / "evnlos-weights"
@@ -36,6 +37,15 @@ def test_every_file_of_the_distribution_is_the_one_that_its_list_names() -> None
     assert set(stated) == set(there) and {path.stem for path in there.values()} == set(published())
     for name, path in there.items():
         assert hashlib.sha256(path.read_bytes()).hexdigest() == stated[name]
+
+
+@pytest.mark.parametrize("setup", ["near", "far"])
+def test_weights_of_sequences_bring_the_setup_that_they_see_through(setup) -> None:
+    """Whole, and without what one sensor's captures showed of its errors: the next sensor has others."""
+    for modality in ("frame", "event", "fusion"):
+        assert load_weights(f"{setup}-{modality}-sequence").sampling.setup == str(FILES / setup)
+    assert load_setup(str(FILES / setup)).is_linear
+    assert sorted(path.name for path in (FILES / setup).iterdir()) == ["setup.yaml", "wall.safetensors"]
 
 
 def test_the_core_holds_no_weights_and_stays_small() -> None:

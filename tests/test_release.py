@@ -87,6 +87,7 @@ def test_an_sdist_carries_its_version_and_no_weights(tool, tmp_path) -> None:
 
 def test_weights_are_those_of_their_sums(tool, tmp_path) -> None:
     wheel, content = tmp_path / "w.whl", {"near-frame.safetensors": b"weights", "near.yaml": b"kind: paper"}
+    content |= {"near/setup.yaml": b"kind: fitted", "near/wall.safetensors": b"wall"}
     for total, is_right in ((hashlib.sha256(b"weights").hexdigest(), True), ("0" * 64, False)):
         with zipfile.ZipFile(wheel, "w") as archive:
             for name, data in content.items():

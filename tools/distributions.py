@@ -47,7 +47,16 @@ IN_WHEEL = (
     "evnlos/report/style.css",
     "evnlos/analysis/classifier.safetensors",
 )
-IN_WEIGHTS = tuple(f"evnlos_weights/{name}" for name in ("SHA256SUMS", "near-frame.safetensors", "near.yaml"))
+IN_WEIGHTS = tuple(
+    f"evnlos_weights/{name}"
+    for name in (
+        "SHA256SUMS",
+        "near-frame.safetensors",
+        "near.yaml",
+        "near/setup.yaml",
+        "near/wall.safetensors",
+    )
+)
 READER = "analysis/classifier.safetensors"  # reads characters for a score; what is published lies elsewhere
 BUILD = "import sys, setuptools.build_meta as backend; print(getattr(backend, sys.argv[1])(sys.argv[2]))"
 

@@ -54,7 +54,7 @@ _MOST_NOISE = 10.0  # times the events of pixels that see nothing
 _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
 _MOST_CAPTURES = 16  # that tell of errors: a second or two each
-_LEAST_GAIN_DB = 0.5  # of captures corrected by others, below which no errors are kept
+_LEAST_GAIN_DB = 1.5  # of captures corrected by others; less, and networks of the simulation lose by it
 
 
 @dataclass(frozen=True)
@@ -284,8 +284,8 @@ def write_event_errors(
     """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
 
     `event_images` takes it into account: for a capture that is among these, what the others showed. Where the
-    setup is right but for noise, its correction costs more than it brings, so each capture is corrected by the
-    others first, and the file is written where they gain at least 0.5 dB.
+    setup is nearly right that costs more than it brings, so each capture is corrected by the others first, and
+    the file is written where they gain at least 1.5 dB.
 
     Args:
         setup: Folder of a calibrated setup.

@@ -245,16 +245,14 @@ def simulate_object(config: Simulation, name: str) -> tuple[Samples, Events]:
     """
     drawn = drawn_for(config, name)
     scene = scene_of(config, drawn, name)
-    setup = drawn.setup
-    wall = setup.observe(scene)
+    setup, wall = drawn.setup, drawn.setup.observe(scene)
     times_s = scene.position_times_s(config.positions)
     seed = derive_seed(config.seed, name, "events")
     events = setup.event_camera.record(wall, 0.0, drawn.duration_s, seed=seed)
     frames = setup.frame_camera.capture(wall, times_s, seed=derive_seed(config.seed, name, "frames"))
-    edges_us = edges_from(times_s)
     peak = 2**setup.frame_camera.bit_depth - 1
     return make_samples(
-        frames, peak, events, edges_us, config.sampling, motion=scene.motion, target=scene.target
+        frames, peak, events, edges_from(times_s), config.sampling, motion=scene.motion, target=scene.target
     ), events
 
 
@@ -272,9 +270,8 @@ def sequence_bytes(setup: Setup, target_size_m: float, duration_s: float, frames
         cells: Cells of the maps of each frame.
     """
     pixels = setup.sensor.height * setup.sensor.width
-    noise = pixels * duration_s * setup.pixel.noise_hz
-    wall = setup.bytes_of_a_scene(target_size_m)
-    return int(wall + 100 * pixels + frames * (4 * pixels + 32 * cells) + 26 * noise)
+    kept = 100 * pixels + frames * (4 * pixels + 32 * cells) + 26 * pixels * duration_s * setup.pixel.noise_hz
+    return int(setup.bytes_of_a_scene(target_size_m) + kept)
 
 
 def object_bytes(config: Simulation) -> int:
@@ -323,9 +320,8 @@ def split_of(config: Simulation) -> dict[str, list[str]]:
         held_out |= shown
     tested = [name for name in every if name in held_out]
     names = [name for name in every if name not in held_out]
-    count = round(config.validation * len(names))
     order = np.random.default_rng(derive_seed(config.seed, "split")).permutation(len(names))
-    chosen = {names[i] for i in order[:count]}
+    chosen = {names[i] for i in order[: round(config.validation * len(names))]}
     return {
         "train": [name for name in names if name not in chosen],
         "validation": [name for name in names if name in chosen],
@@ -372,23 +368,20 @@ def simulate(
     at_once = processes(workers, len(config.glyphs.objects()) // stride + 1)
     if not force:
         check_sequences(object_bytes(config), at_once)
-    values = to_dict(config)
     dataset = Dataset(
         Path(folder),
         "simulation",
         config.sampling,
         split_of(config),
-        config=values,
+        config=to_dict(config),
         config_hash=config_hash(config),
         optics=config.optics(),
     )
     with claim_dataset(dataset, f"{first}-of-{stride}" if stride > 1 else "", Simulation) as dataset:
         share_names = set(config.glyphs.objects()[first - 1 :: stride])
         # Objects of the same optics follow each other, so that a process makes each matrix once.
-        missing = sorted(
-            (name for name in dataset.missing() if name in share_names),
-            key=lambda name: _optics_of(config, name),
-        )
+        missing = [name for name in dataset.missing() if name in share_names]
+        missing.sort(key=lambda name: _optics_of(config, name))
         what, total = f"simulate {dataset.folder.name}", len(share_names)
         there = total - len(missing)
         progress(Step(what, there, total, "objects"))
