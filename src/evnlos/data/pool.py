@@ -132,7 +132,16 @@ class _Worker(SpawnProcess):
 
 
 class _Workers(SpawnContext):
-    Process = _Worker
+    """Where the processes of one pool come from, and which they are: the pool misses one that a signal met."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.started = list[_Worker]()
+        self.Process = self._worker  # type: ignore[assignment]
+
+    def _worker(self, *args: Any, **kwargs: Any) -> _Worker:
+        self.started.append(_Worker(*args, **kwargs))
+        return self.started[-1]
 
 
 @contextmanager
@@ -141,12 +150,12 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
 
     They don't hear Ctrl-C, which a terminal sends to all: this process ends them, also those that still start.
     """
-    pool = ProcessPoolExecutor(count, _Workers(), _begin)
+    pool = ProcessPoolExecutor(count, context := _Workers(), _begin)
     try:
         yield pool
         pool.shutdown()
     except BaseException:
-        running = list((pool._processes or {}).values())  # the manager takes them away as they end
+        running = context.started
         pool.shutdown(wait=False, cancel_futures=True)
         until = time.monotonic() + _GRACE_S
         while time.monotonic() < until and (running := [one for one in running if one.is_alive()]):

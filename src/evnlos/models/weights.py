@@ -302,11 +302,10 @@ def load_weights(path: str | Path) -> Weights:
         if is_known and not is_sealed:
             is_sealed = is_as_published(path)
             if not is_sealed:
-                raise ValueError(
-                    "its SHA-256 is not the one in SHA256SUMS beside it; install the weights again"
-                )
+                raise ValueError("its SHA-256 is not the one in SHA256SUMS beside it")
     except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path} is not a readable safetensors file: {' '.join(str(error).split())}") from None
+        why = " ".join(str(error).split()) + ("; install the weights again" if is_known else "")
+        raise DataError(f"{path} is not a readable safetensors file: {why}") from None
     about = migrate("weights", about) if isinstance(about, dict) else about
     if not isinstance(about, dict) or about.get("format") != _FORMAT:
         found = about.get("format", "no format") if isinstance(about, dict) else about
