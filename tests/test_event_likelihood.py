@@ -399,6 +399,11 @@ def test_a_setup_keeps_the_errors_that_captures_gain_from(tiny_captures: list[Pa
         lambda step: said.append(f"{step.done} of {step.total}"),
     )
     assert errors is not None and errors.about.gain_db > 1.5 and file.is_file()
+    assert errors.about.captures == tuple(folder.name for folder in both)
     assert said[0] == "0 of 8" and said[-1] == "8 of 8" and torch.isfinite(errors.scores).all()
-    assert np.abs(capture_samples(another, sampling).surface - before).max() > 0.01
+    after = capture_samples(another, sampling).surface
+    assert np.abs(after - before).max() > 0.01
+    # By its own name it does not count, and others correct it otherwise.
+    own = capture_samples(read_capture(tiny_captures[0]), sampling).surface
+    assert np.abs(own - after).max() > 0.001 and np.abs(own - before).max() > 0.01
     assert write_event_errors(tmp_path / "none", tiny_captures, ()) is None and not (tmp_path / "none").exists()

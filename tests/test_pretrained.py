@@ -78,6 +78,16 @@ def test_a_folder_in_the_variable_comes_before_what_is_installed(tmp_path, monke
         published()
 
 
+def test_a_sealed_file_has_to_be_the_one_that_is_stated_too(tmp_path, monkeypatch) -> None:
+    """Another network's file fits its own digest under any name."""
+    shutil.copy(FILES / "far-event-sequence.safetensors", tmp_path / "near-event-sequence.safetensors")
+    monkeypatch.setenv("EVNLOS_WEIGHTS", str(tmp_path))
+    assert load_weights("near-event-sequence").is_sealed  # none is stated
+    shutil.copy(FILES / "SHA256SUMS", tmp_path)
+    with pytest.raises(DataError, match="SHA-256 is not the one in SHA256SUMS"):
+        load_weights("near-event-sequence")
+
+
 def test_an_installed_distribution_is_found_by_its_entry_point(nothing_installed, monkeypatch) -> None:
     monkeypatch.syspath_prepend(str(FILES.parent))
     point = EntryPoint("published", "evnlos_weights", "evnlos.weights")

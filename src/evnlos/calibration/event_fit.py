@@ -321,16 +321,15 @@ def write_event_errors(
         statistics.append(statistic)
         scores.append(statistic.score - statistic.information @ prior.coefficients(truths[-1]))
     progress(Step(what, len(learned), len(learned), "captures"))
-    if prior is None or not found:
+    if prior is None:
         return None
     tensors = {
         "scores": torch.from_numpy(np.stack(scores)).float(),
         "information": torch.from_numpy(np.mean([one.information for one in statistics], axis=0)).float(),
     }
     errors = EventErrors(AboutErrors(tuple(found)), **tensors)
-    gain_db = errors.gain_db(statistics, prior, truths)
-    if gain_db < _LEAST_GAIN_DB:
+    about = replace(errors.about, gain_db=errors.gain_db(statistics, prior, truths))
+    if about.gain_db < _LEAST_GAIN_DB:
         return None
-    errors = replace(errors, about=replace(errors.about, gain_db=gain_db))
-    EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, errors.about)
-    return errors
+    EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, tensors, about)
+    return replace(errors, about=about)

@@ -96,8 +96,8 @@ def no_weights(what: str) -> UnknownNameError:
     )
 
 
-def is_as_published(path: Path) -> bool:
-    """Return whether a published file has the SHA-256 that is stated beside it.
+def is_as_published(path: Path) -> bool | None:
+    """Return whether a published file has the SHA-256 that is stated beside it; None where none is.
 
     Args:
         path: One of the files of `published`.
@@ -105,10 +105,12 @@ def is_as_published(path: Path) -> bool:
     try:
         lines = (path.parent / "SHA256SUMS").read_text(encoding="ascii").splitlines()
     except FileNotFoundError:
-        return False
+        return None
     stated = {name: digest for digest, name in (line.split() for line in lines)}
+    if path.name not in stated:
+        return None
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() == stated.get(path.name)
+        return hashlib.file_digest(file, "sha256").hexdigest() == stated[path.name]
 
 
 def published_setup(weights: str | Path) -> Path | None:
@@ -299,8 +301,9 @@ def load_weights(path: str | Path) -> Weights:
         text, tensors, is_sealed = read_sealed(path)
         about = json.loads(text)
         check_floats(tensors)
-        if is_known and not is_sealed:
-            is_sealed = is_as_published(path)
+        if is_known:  # what is stated beside a file comes before what it says of itself
+            as_stated = is_as_published(path)
+            is_sealed = is_sealed if as_stated is None else as_stated
             if not is_sealed:
                 raise ValueError("its SHA-256 is not the one in SHA256SUMS beside it")
     except (OSError, ValueError, RecursionError) as error:
