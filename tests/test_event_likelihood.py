@@ -250,6 +250,15 @@ def test_the_fast_estimate_is_that_of_the_slow_one(pixel: EventPixel, seed: int)
     assert 0.8 < expected < 1.25
 
 
+@pytest.mark.parametrize(("stride", "rank"), [(1, 200), (3, 200), (4, 2)])
+def test_the_light_of_some_rows_and_columns_is_that_of_all(stride: int, rank: int) -> None:
+    z, whole = np.random.default_rng(stride).normal(size=COUNT), light()
+    part = whole.every(stride, rank)
+    cut = replace(whole, left=whole.left[:, :rank], right=whole.right[:, :rank])(z).reshape(*whole.shape, -1)
+    assert part.shape == cut[::stride, ::stride].shape[:2]
+    np.testing.assert_allclose(part(z), cut[::stride, ::stride].reshape(len(part.left), -1), atol=1e-12)
+
+
 def test_the_surface_shows_the_target(tmp_path: Path) -> None:
     """Through simulation, shards and a network: what is stored is the target, twice, where it was."""
     glyphs = HandwritingGlyphs(writers=1, characters="EH")

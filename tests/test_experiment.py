@@ -45,6 +45,7 @@ from evnlos.experiment import (
     read_records,
     retrieved,
     run_simulated,
+    run_studies,
     run_study,
     summary_table,
     write_record,
@@ -229,6 +230,23 @@ def test_arms_begin_with_installed_layers(records, apart, tmp_path, monkeypatch)
     assert [len(load_weights(apart.out / "runs" / record.settings["run"]).history)] == [3]
 
 
+def test_a_study_begins_with_layers_where_its_networks_are_like_them() -> None:
+    study = replace(STUDIES["sequence"]("near"), modalities=("frame",))
+    begun = {arm.name: arm for arm in study.begun_with("generic").arms}
+    for before in study.arms:
+        arm = begun[before.name]
+        if before.pretraining is None:  # end to end
+            assert arm == before
+        else:
+            assert arm.start == "generic" and arm.first_training("frame").refit_embedding
+            assert arm.first_training("frame").network.width == 32 != before.pretraining.network.width
+            assert arm.anew == before.pretraining and arm.finetuning == before.finetuning
+    with pytest.raises(ConfigError, match="no network of captures"):
+        STUDIES["captures"]("near").begun_with("generic")
+    with pytest.raises(DataError, match="nothing-frame-sequence"):
+        study.begun_with("nothing")
+
+
 def test_an_ensemble_is_the_mean_of_its_images(records) -> None:
     """Squared error is convex: the mean image is at least as good as the mean error of its members."""
     by = {(r.arm, r.seed): np.array(r.positions["lab_4"]) for r in records}
@@ -286,8 +304,9 @@ def test_folds_are_trained_and_scored_apart(apart) -> None:
         shutil.copytree(apart.out / "setups" / "lab", apart.out / "setups" / half)
     characters = [character_of(folder.name) for folder in apart.captures]
     study = replace(STUDY, name="few", arms=ARMS[:1], seeds=(0,), refine=False)
-    for fold in folds_of(study, 2, characters):
-        run_study(fold, apart)
+    watch = Watch()
+    assert len(run_studies(folds_of(study, 2, characters), replace(apart, trainings=2), watch)) == 2
+    assert [step.done for step in watch.steps if step.what == "prepare folds"] == [0, 1]
     (merged,) = merge_folds(read_records(apart.out / "records" / "few-folds"), "lab")
     assert {character_of(name) for name in merged.scores["psnr_db"]} == set(characters)
     assert len(set(merged.settings["runs"])) == 2

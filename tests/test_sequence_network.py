@@ -251,6 +251,23 @@ def test_frames_are_solved_as_one_gaussian_posterior() -> None:
                 torch.testing.assert_close(image.double(), expected, **near)
 
 
+def test_motions_in_turn_are_solved_as_each_alone() -> None:
+    """What a solver keeps of the last motions belongs to them, and to its own numbers."""
+    torch.manual_seed(0)
+    solver = PooledFrames(Sampling(height=24, width=36, pitch_m=0.005, scored_rows=20), (0.5,), 50)
+    for buffer in solver.buffers():
+        buffer.copy_(torch.rand_like(buffer))
+    places, frames = torch.linspace(-0.05, 0.05, 6)[:, None] * torch.tensor([1.0, 0.2]), torch.rand(6, 24, 36)
+    parts = [slice(0, 6), slice(0, 3), slice(3, 6), slice(1, 5), slice(0, 6), slice(3, 6)]
+    for change in (1.0, 1.5):
+        solver.load_state_dict(solver.state_dict() | {"patterns": change * solver.patterns})
+        for part in parts:
+            kept = torch.ones(1, len(places[part]))
+            alone = deepcopy(solver)
+            alone.load_state_dict(solver.state_dict())  # which knows no motion then
+            torch.testing.assert_close(*(one(frames[part], places[part], kept) for one in (solver, alone)))
+
+
 def test_ridge_regression_leaves_out_group_after_group() -> None:
     """Against the penalty of each column, and what it misses, that solving anew without each group gives."""
     torch.manual_seed(1)

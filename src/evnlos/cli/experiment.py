@@ -28,7 +28,7 @@ from evnlos.errors import ConfigError, UnknownNameError
 from evnlos.files import write_atomically
 from evnlos.live.run import RateOptions, Run
 from evnlos.live.sources import SourceOptions, check_source, open_live
-from evnlos.machine import ProgressBars, Step
+from evnlos.machine import ProgressBars
 from evnlos.types import OutFolder
 
 if TYPE_CHECKING:
@@ -114,8 +114,10 @@ class ExperimentCommand:
     workers: int = 0
     """Processes that simulate; 0 = one for each core."""
     trainings: int = 1
-    """Networks that are trained at a time where there is no GPU, in as many times the memory; 0 = one for each
-    core. For experiments on captures."""
+    """Networks that are trained at a time, on the cores or on one GPU, in as many times the memory; 0 = one for
+    each core. For experiments on captures."""
+    start: str = ""
+    """Published layers that pre-trainings begin with, in smaller steps (generic, for sequence); or none."""
     force: bool = False
     """Begin although the machine's memory will hardly do."""
     metric: Literal["psnr_db", "psnr_box_db", "ssim", "ms_ssim", "haarpsi", "gmsd", "lpips"] = "psnr_db"
@@ -157,10 +159,7 @@ class ExperimentCommand:
             studies = experiment.folds_of(study, self.folds, [character_of(folder.name) for folder in folders])
             name += "-folds"
         with ProgressBars() as progress:
-            for done, one in enumerate(studies):
-                if self.folds:
-                    progress(Step("folds", done, len(studies), "folds"))
-                experiment.run_study(one, place, progress)
+            experiment.run_studies(studies, place, progress)
         records = experiment.read_records(self.out / "records" / name)
         if self.folds:
             records = experiment.merge_folds(records, self.captures_of)
@@ -190,6 +189,7 @@ class ExperimentCommand:
             writers=self.writers or study.writers,
         )
         study = experiment.on_sequences(study) if self.sequence else study
+        study = study.begun_with(self.start) if self.start else study
         return replace(study, arms=tuple(self._in_epochs(arm) for arm in study.arms))
 
     def _in_epochs(self, arm: Arm) -> Arm:

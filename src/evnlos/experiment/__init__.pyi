@@ -14,12 +14,13 @@ from .presets import generalization as generalization
 from .presets import on_sequences as on_sequences
 from .run import captures_of as captures_of
 from .run import folds_of as folds_of
-from .run import merge_folds as merge_folds
+from .run import run_studies as run_studies
 from .run import run_study as run_study
 from .study import Arm as Arm
 from .study import Place as Place
 from .study import Record as Record
 from .study import Study as Study
+from .study import merge_folds as merge_folds
 from .study import read_records as read_records
 from .study import write_record as write_record
 from .table import bounds_table as bounds_table

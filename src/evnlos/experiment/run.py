@@ -77,8 +77,43 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
         DataError: Fewer captures than an arm learns from.
         CalibrationError: Captures that no setup fits, or whose targets are unknown.
     """
-    for arm in study.arms:
-        _chosen(study, arm, place)
+    return run_studies((study,), place, progress)
+
+
+def run_studies(studies: Sequence[Study], place: Place, progress: Progress = silent) -> list[Record]:
+    """Run what is not done yet of several studies, as the folds of one; otherwise as `run_study`.
+
+    All that they learn from is made first, so that networks of all of them can be trained at a time.
+
+    Args:
+        studies: What to compare.
+        place: Where captures and results are.
+        progress: Called with each step of calibration, simulation, import, training and scoring.
+
+    Raises:
+        DataError: Fewer captures than an arm learns from.
+        CalibrationError: Captures that no setup fits, or whose targets are unknown.
+    """
+    for study in studies:
+        for arm in study.arms:
+            _chosen(study, arm, place)
+    networks = list[_Network]()
+    for done, study in enumerate(studies):
+        if len(studies) > 1:
+            progress(Step("prepare folds", done, len(studies), "folds"))
+        networks += _prepared(study, place, progress)
+    if place.trainings != 1:
+        return _together(networks, place.trainings, progress)
+    records = list[Record]()
+    for network in networks:
+        for run in network.runs:
+            train_one(run, progress)
+        records += network.scored(progress)
+    return records
+
+
+def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
+    """Calibrate, simulate and import what a study lacks, and return its networks, which are not trained."""
     setup = place.out / "setups" / study.setup
     needs_setup = study.correct_pattern or any(arm.needs_setup for arm in study.arms)
     sees_events = any(as_modality(name).needs_events for name in study.modalities)
@@ -106,14 +141,7 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
             learned = augmented(recorded, modality, progress) if arm.augment else recorded
             plans = [_planned(study, arm, modality, seed, made, learned, place) for seed in study.seeds]
             networks.append(_Network(study, arm, modality, plans, made, recorded, place))
-    if place.trainings != 1 and not torch.cuda.is_available():  # on a GPU one after the other
-        return _together(networks, place.trainings, progress)
-    records = list[Record]()
-    for network in networks:
-        for run in network.runs:
-            train_one(run, progress)
-        records += network.scored(progress)
-    return records
+    return networks
 
 
 @dataclass(frozen=True)
@@ -143,8 +171,9 @@ class _Network:
 def _together(networks: list[_Network], at_a_time: int, progress: Progress) -> list[Record]:
     """Train and score several networks at a time, and return the new records.
 
-    A network of this size gains little from a second core, so that as many trainings as there are cores, each
-    with its share of them, take less time than one after the other. What others wait for comes first.
+    A network of this size gains little from a second core, and does not fill a GPU, so that as many trainings
+    as there are cores, each with its share of them, take less time than one after the other. What others wait
+    for comes first.
     """
     todo = {run.out: run for network in networks for run in network.runs}
     todo = {out: run for out, run in todo.items() if not (out / "weights.safetensors").is_file()}
@@ -348,42 +377,3 @@ def folds_of(study: Study, folds: int, characters: Sequence[str]) -> list[Study]
                 )
             )
     return found
-
-
-def merge_folds(records: Sequence[Record], setup: str) -> list[Record]:
-    """Return one record per arm, modality and seed over all folds; those that lack a fold are left out.
-
-    Args:
-        records: Records of the studies of `folds_of`.
-        setup: Name of the setup, without that of its half.
-    """
-    groups: dict[tuple[str, str, int], list[Record]] = {}
-    for record in records:
-        if record.setup in (f"{setup}-a", f"{setup}-b"):
-            groups.setdefault((record.arm, record.modality, record.seed), []).append(record)
-    most = max((len(group) for group in groups.values()), default=0)
-    return [_merged(group, setup) for group in groups.values() if len(group) == most]
-
-
-def _merged(group: list[Record], setup: str) -> Record:
-    first = group[0]
-    scores = {metric: {k: v for r in group for k, v in r.scores[metric].items()} for metric in first.scores}
-    baselines = {
-        name: {metric: {k: v for r in group for k, v in r.baselines[name][metric].items()} for metric in table}
-        for name, table in first.baselines.items()
-        if all(name in record.baselines for record in group)
-    }
-    checks = {
-        key: float(np.average([r.checks[key] for r in group], weights=[len(r.positions) for r in group]))
-        for key in first.checks
-        if all(key in record.checks for record in group)
-    }
-    merged = replace(first, study=first.study.partition("/")[0], setup=setup, scores=scores)
-    return replace(
-        merged,
-        positions={name: values for record in group for name, values in record.positions.items()},
-        baselines=baselines,
-        checks=checks,
-        settings={"arm": first.arm, "runs": [record.settings.get("run") for record in group]},
-        read_as={name: seen for record in group for name, seen in record.read_as.items()},
-    )

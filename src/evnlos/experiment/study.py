@@ -5,6 +5,7 @@ JSON files that can be kept, compared and put into tables.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -169,6 +170,34 @@ class Study:
         if set(self.test) & set(self.validation):
             raise ConfigError("a character is for testing or for validation, not for both")
 
+    def begun_with(self, start: str) -> Study:
+        """Return the study with pre-trainings that begin with installed layers, where any are like the network.
+
+        Such a network becomes as wide as the layers, and learns in smaller steps.
+
+        Args:
+            start: First part of the names of the weights: "generic".
+
+        Raises:
+            ConfigError: They are like no network of the study.
+            DataError: They are not installed.
+        """
+        arms = list[Arm]()
+        for own in self.arms:
+            arm = replace(own, start=start, anew=own.pretraining)
+            names = [name for modality in self.modalities if (name := arm.layers(modality))]
+            if own.pretraining is not None and names:
+                width = load_weights(names[0]).network.settings.width
+                network: Any = replace(own.pretraining.network, width=width)
+                changed = replace(own.pretraining, network=network, learning_rate=1e-3, refit_embedding=True)
+                arm = replace(arm, pretraining=changed)
+            arms.append(arm if names else own)
+        if arms == list(self.arms):
+            raise ConfigError(
+                f"no network of {self.name} begins with the layers {start!r}; those of sequence do"
+            )
+        return replace(self, arms=tuple(arms))
+
     @property
     def split(self) -> str:
         """The split that is scored."""
@@ -183,7 +212,7 @@ class Place:
         captures: Capture folders of the study's setup.
         out: Folder for setups, datasets, runs and records.
         workers: Processes that simulate; 0 is one for each core.
-        trainings: Networks that are trained at a time where there is no GPU; 0 is one for each core.
+        trainings: Networks that are trained at a time, on the cores or on one GPU; 0 is one for each core.
         force: Whether simulations begin although the machine's memory will hardly do.
 
     Raises:
@@ -320,3 +349,42 @@ def read_records(folder: str | Path) -> list[Record]:
         except (ValueError, TypeError) as error:
             raise DataError(f"{path} is no record of an experiment: {error}") from None
     return records
+
+
+def merge_folds(records: Sequence[Record], setup: str) -> list[Record]:
+    """Return one record per arm, modality and seed over all folds; those that lack a fold are left out.
+
+    Args:
+        records: Records of the studies of `folds_of`.
+        setup: Name of the setup, without that of its half.
+    """
+    groups: dict[tuple[str, str, int], list[Record]] = {}
+    for record in records:
+        if record.setup in (f"{setup}-a", f"{setup}-b"):
+            groups.setdefault((record.arm, record.modality, record.seed), []).append(record)
+    most = max((len(group) for group in groups.values()), default=0)
+    return [_merged(group, setup) for group in groups.values() if len(group) == most]
+
+
+def _merged(group: list[Record], setup: str) -> Record:
+    first = group[0]
+    scores = {metric: {k: v for r in group for k, v in r.scores[metric].items()} for metric in first.scores}
+    baselines = {
+        name: {metric: {k: v for r in group for k, v in r.baselines[name][metric].items()} for metric in table}
+        for name, table in first.baselines.items()
+        if all(name in record.baselines for record in group)
+    }
+    checks = {
+        key: float(np.average([r.checks[key] for r in group], weights=[len(r.positions) for r in group]))
+        for key in first.checks
+        if all(key in record.checks for record in group)
+    }
+    merged = replace(first, study=first.study.partition("/")[0], setup=setup, scores=scores)
+    return replace(
+        merged,
+        positions={name: values for record in group for name, values in record.positions.items()},
+        baselines=baselines,
+        checks=checks,
+        settings={"arm": first.arm, "runs": [record.settings.get("run") for record in group]},
+        read_as={name: seen for record in group for name, seen in record.read_as.items()},
+    )

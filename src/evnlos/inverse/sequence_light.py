@@ -70,6 +70,22 @@ class SequenceLight:
         """Mean light of the mean target, DN."""
         return WHITE_DN * float(self.still.mean() + self.left.mean(axis=0) @ self.right[:, :, 0].mean(axis=0))
 
+    def every(self, stride: int, rank: int) -> SequenceLight:
+        """Return the light of every so many rows and columns, by the main factors alone.
+
+        Args:
+            stride: 1 keeps all of them.
+            rank: Most factors.
+        """
+
+        def kept(values: NDArray) -> NDArray:
+            image = values.reshape(*self.shape, -1)[::stride, ::stride]
+            return image.reshape(-1, values.shape[1])
+
+        shape = (-(-self.shape[0] // stride), -(-self.shape[1] // stride))
+        left = kept(self.left[:, :rank])
+        return SequenceLight(left, self.right[:, :rank], kept(self.still), self.times_s, shape)
+
     def place(self, t_s: Array) -> tuple[NDArray[np.int64], Array]:
         """Return of instants [N] the node before, and the share of the way to the next; clipped to the ends."""
         step = self.times_s[1] - self.times_s[0]
@@ -157,7 +173,7 @@ def sequence_light(
     strip = strip_of(places, Plane(side, side, pitch))
     resized = setup.resized(shape)
     matrix = resized.operator(strip, coarse).dense()
-    left, right = _factors(matrix, rank)
+    left, right = (factor.numpy() for factor in main_factors(matrix, rank))
     if coarse != shape:
         images = torch.from_numpy(left.T.copy()).unflatten(1, coarse)[None]
         fine = interpolate(images, size=shape, mode="bicubic", align_corners=False)
@@ -178,20 +194,28 @@ def sequence_light(
     return SequenceLight(left, responses, still, times, shape)
 
 
-def _factors(matrix: torch.Tensor, rank: int) -> tuple[Array, Array]:
+def main_factors(matrix: torch.Tensor, rank: int, tail: float = _TAIL) -> tuple[torch.Tensor, torch.Tensor]:
     """Return factors [P, r] and [r, cells] of a matrix [P, cells] by its largest singular values.
 
     By a randomised range finder with power iterations, whose draws are always the same (Halko, Martinsson and
-    Tropp, SIAM Review 53, 2011).
+    Tropp, SIAM Review 53, 2011). The columns of the first are orthogonal, the rows of the second orthonormal.
+
+    Args:
+        matrix: Of a light path.
+        rank: Most factors.
+        tail: Share of the largest singular value from which on factors are left out.
+
+    Raises:
+        ConfigError: The matrix is 0.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         _, values, axes = torch.svd_lowrank(matrix, q=min(rank + _EXTRA, *matrix.shape), niter=_POWERS)
     if not float(values[0]) > 0:
         raise ConfigError("the camera gets no light from the target; move the target or the camera")
-    kept = min(rank, int((values > _TAIL * values[0]).sum()))
+    kept = min(rank, int((values > tail * values[0]).sum()))
     right = axes[:, :kept].mT.contiguous()
-    return (matrix @ right.mT).numpy(), right.numpy()
+    return matrix @ right.mT, right
 
 
 @dataclass

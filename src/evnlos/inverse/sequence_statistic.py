@@ -16,7 +16,8 @@ the coefficients z of the prior, is all that the events say of the target there.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -31,7 +32,7 @@ from evnlos.inverse.event_record import EventRecord, record_of
 from evnlos.inverse.sequence_light import Array, SequenceLight, Single
 from evnlos.types import Events
 
-_STRIDES = (4, 2, 1)  # of the rows and columns that make the first, the second, and the last estimate
+_FIRST_GRIDS = ((4, 120), (2, 200))  # stride of rows and columns, and most factors, of what comes before all
 _FIRST_STEPS, _ANNEALED = 14, 6  # at most, of the first; its errors of a crossing shrink to the least
 _SETTLED = 0.1  # step of a coefficient, standard deviations of the prior, after which no other is made
 _LONGEST_STEP = 1.5  # of a coefficient, standard deviations of the prior
@@ -165,6 +166,14 @@ class EventSolver:
         self._moved = np.concatenate([np.diff(self._seen, axis=0), np.zeros_like(self._seen[:1])])
         self._step = float(light.times_s[1] - light.times_s[0])
 
+    @cached_property
+    def _coarse(self) -> list[tuple[int, EventSolver]]:
+        """Strides of rows and columns, and the solvers of what is left, which start the estimate."""
+        return [
+            (stride, EventSolver(self.light.every(stride, rank), self.law, self.settings))
+            for stride, rank in _FIRST_GRIDS
+        ]
+
     def __call__(self, events: Events) -> EventStatistic:
         """Return the statistic of a sequence's events, on the clock of the light."""
         span = (float(self.light.times_s[0]), float(self.light.times_s[-1]))
@@ -173,9 +182,11 @@ class EventSolver:
         unknown = np.zeros(self._seen.shape[2] + 1)
         shares = np.minimum(np.arange(_FIRST_STEPS) / _ANNEALED, 1.0)
         noises = self.settings.first_noise ** (1 - shares) * last**shares
-        for stride in _STRIDES[:-1]:
+        for stride, solver in self._coarse:
             part = record.of_pixels((row % stride == 0) & (column % stride == 0))
-            self.improve(part, unknown, noises)
+            row_there, column_there = np.divmod(part.pixel, events.width)
+            number = row_there // stride * solver.light.shape[1] + column_there // stride
+            solver.improve(replace(part, pixel=number), unknown, noises)
             noises = noises[-1:]
         return self.improve(record, unknown, noises)
 
@@ -230,7 +241,7 @@ class EventSolver:
         walk = law.noise**2 + law.walk_variance(seen_dn[crossed]) * wait[crossed]
         upwards = sign * (rate[crossed] / self._step + fall[crossed])
         spread = law.threshold_sigma**2
-        pixels = len(np.unique(record.pixel))
+        pixels = 1 + int((np.diff(record.pixel) != 0).sum())  # they are in order
 
         def update_trust(noise: float) -> None:
             own = walk + noise**2

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from evnlos.data import InMemoryDataset, Modality, NlosDataset, Sampling, as_mod
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse.operators import ridge_by_groups
 from evnlos.inverse.prior import handwritten_prior
+from evnlos.inverse.sequence_light import main_factors
 from evnlos.inverse.sequence_problem import SequenceOperator
 from evnlos.models.confidence import on_canvas
 from evnlos.models.embedding import FrameOperator, InputNormalization, LinearEmbeddings, fit_input
@@ -142,12 +144,13 @@ _FEWEST = 8  # objects to tell gain, offset and noise from
 _FEWEST_CAPTURES, _MOST_FRAMES, _PARTS = 4, 2048, 4  # that correct the light path; parts left out in turn
 _ALONG = 7  # terms of a polynomial of the position: 1, x, x^2, x^3, y, x y, y^2
 _RIDGE, _AT_ONCE = 1e-6, 1024  # frames
+_KEPT_ROWS = 3  # of as many motions: a sequence, its first half and its second
 
 
 def _forget(frames: nn.Module, _: object) -> None:
-    """Forget the rows of the last sequence, which were those of other numbers."""
+    """Forget the rows of the last sequences, which were those of other numbers."""
     assert isinstance(frames, PooledFrames)
-    frames._last = None
+    frames._last.clear()
 
 
 class PooledFrames(nn.Module):
@@ -197,7 +200,7 @@ class PooledFrames(nn.Module):
         self.register_buffer("static", torch.zeros(rank))
         self.register_buffer("mean", torch.zeros(self.target_plane.shape))
         self.register_buffer("patterns", torch.zeros(_COEFFICIENTS, *self.target_plane.shape))
-        self._last: tuple[bytes, tuple[Tensor, Tensor, Tensor]] | None = None
+        self._last = OrderedDict[bytes, tuple[Tensor, Tensor, Tensor]]()
         self.register_load_state_dict_post_hook(_forget)
 
     @property
@@ -227,11 +230,9 @@ class PooledFrames(nn.Module):
             raise DataError(f"{count} objects to tell light from noise; give {_FEWEST} or more")
         operator = FrameOperator(setup, self.sampling)
         matrix, ambient, rows = operator.matrix, operator.ambient.unflatten(0, operator.size), operator.rows
-        values, axes = torch.linalg.eigh((matrix.T @ matrix).double())
-        kept = min(self.basis.shape[1], int((values > _RIDGE**2 * values[-1]).sum()))
-        values, axes = values.flip(0)[:kept], axes.flip(1)[:, :kept]
-        basis = ((matrix.double() @ axes) / values.sqrt()).float()  # [h w, r]
-        carry = (axes * values.sqrt()).float()  # [cells, r]
+        left, right = main_factors(matrix, self.basis.shape[1], _RIDGE)
+        values, kept = left.norm(dim=0), len(right)
+        basis, carry = left / values, right.T * values  # [h w, r], [cells, r]
         parts = [slice(at, at + _AT_ONCE) for at in range(0, len(frames), _AT_ONCE)]
         code = torch.cat([(frames[part].float() - ambient).flatten(1) @ basis for part in parts])
         clean = torch.cat([truth[part][:, rows].float().flatten(1) @ carry for part in parts])
@@ -262,7 +263,7 @@ class PooledFrames(nn.Module):
         prior = handwritten_prior(self.target_plane, _COEFFICIENTS)
         self.mean.copy_(torch.from_numpy(prior.mean).unflatten(0, self.target_plane.shape))
         self.patterns.copy_(torch.from_numpy(prior.patterns.T.copy()).unflatten(1, self.target_plane.shape))
-        self._last = None
+        self._last.clear()
 
     def correct(self, frames: Tensor, truth: Tensor, position_m: Tensor, names: NDArray[np.str_]) -> None:
         """Take from captures with known targets what the setup's light path gets wrong.
@@ -296,7 +297,7 @@ class PooledFrames(nn.Module):
         variance, turn = torch.linalg.eigh(missed.T @ missed / len(missed))
         white = (turn / variance.clamp_min(1.0).sqrt()) @ turn.T
         self._take(self.basis, self.light, self.along, self.static.diag().double(), white)
-        self._last = None
+        self._last.clear()
 
     def _take(self, basis: Tensor, light: Tensor, along: Tensor, offsets: Tensor, white: Tensor) -> None:
         """Take components W c [k] of components c, turned so that their offsets are independent.
@@ -345,18 +346,21 @@ class PooledFrames(nn.Module):
         most = self.light.square().sum(dim=(1, 2)).topk(rank).indices.sort().values
         self.basis, self.along = self.basis[:, most].clone(), self.along[:, most].clone()
         self.light, self.static = self.light[most].clone(), self.static[most].clone()
-        self._last = None
+        self._last.clear()
 
     def _rows(self, position_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rows, known light and their products; sequences of the same places share them."""
         key = str(self.light.device).encode() + position_m.cpu().numpy().tobytes()
-        if self._last is None or self._last[0] != key:
+        if key not in self._last:
             carrier = MatrixTransport(self.light.flatten(1), self.sampling.canvas, (1, len(self.light)))
             seen = SequenceOperator(carrier, self.target_plane, position_m.cpu().double().numpy()).matrix()
             rows = (seen @ self.patterns.flatten(1).T).mT.double()  # [N, k, r]; sums lose digits in float32
             known = self._terms(position_m) @ self.along + seen @ self.mean.flatten()
-            self._last = key, (rows, known, rows @ rows.mT)
-        return self._last[1]
+            self._last[key] = rows, known, rows @ rows.mT
+            while len(self._last) > _KEPT_ROWS:
+                self._last.popitem(last=False)
+        self._last.move_to_end(key)
+        return self._last[key]
 
     def _terms(self, position_m: Tensor) -> Tensor:
         """Return the terms of the polynomial, [N, 7]; a place beyond all that were seen is the nearest one."""
