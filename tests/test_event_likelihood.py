@@ -321,6 +321,7 @@ def test_what_samples_and_weights_must_share(tmp_path: Path) -> None:
         made["here"],
         made["there"],
         replace(made["here"], setup=str(tmp_path / "here" / "setup.yaml")),
+        replace(made["there"], surface="corrected"),
     ):
         check_sampling(sees["event"], same)
     for another in (made["other"], replace(made["here"], setup=str(tmp_path / "gone")), Sampling()):
@@ -392,12 +393,14 @@ def test_a_setup_keeps_the_errors_that_captures_gain_from(tiny_captures: list[Pa
     setup = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72))
     save_yaml(to_dict(Simulation(setup=setup)), tmp_path / "setup.yaml")
     another = replace(read_capture(tiny_captures[0]), name="another_A")
-    sampling = Sampling(surface="likelihood", setup=str(tmp_path))
-    before = capture_samples(another, sampling).surface
+    sampling = Sampling(surface="corrected", setup=str(tmp_path))
+    before = capture_samples(another, replace(sampling, surface="likelihood")).surface
     # Four captures: each has three others, which change nothing, so nothing is gained, and an older file goes.
     names, file = tuple(folder.name for folder in tiny_captures), tmp_path / "events.safetensors"
     file.write_bytes(b"of an earlier calibration")
     assert write_event_errors(tmp_path, tiny_captures, names) is None and not file.exists()
+    with pytest.raises(DataError, match=r"has no events\.safetensors, which the surface 'corrected' takes"):
+        capture_samples(another, sampling)
     # With a twin each, they know their own errors.
     twins = [shutil.copytree(folder, tmp_path / f"twin_{folder.name}") for folder in tiny_captures]
     said, both = list[str](), [*tiny_captures, *twins]

@@ -50,10 +50,11 @@ from evnlos.experiment import (
     summary_table,
     write_record,
 )
-from evnlos.models import FrameOperator, UNetConfig, layers_of, load_weights
+from evnlos.inverse import EVENT_ERRORS, EVENT_ERRORS_FILE, AboutErrors
+from evnlos.models import FrameOperator, SequenceConfig, UNetConfig, layers_of, load_weights
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.setups import RadiometricSetup, load_setup
-from evnlos.training import Training
+from evnlos.training import Training, best_shown
 from watching import Watch
 
 SAMPLING = Sampling(height=32, width=48, pitch_m=0.005, scored_rows=24)
@@ -245,6 +246,39 @@ def test_a_study_begins_with_layers_where_its_networks_are_like_them() -> None:
         STUDIES["captures"]("near").begun_with("generic")
     with pytest.raises(DataError, match="nothing-frame-sequence"):
         study.begun_with("nothing")
+
+
+def test_a_fine_tuning_learns_from_the_events_that_its_start_draws_best(apart) -> None:
+    """Errors that captures are said to share are taken from their events, or not: the network tells."""
+    setup, shown = apart.out / "setups" / "lab", replace(SAMPLING, surface="likelihood")
+    names, draw = tuple(f"other_{k}" for k in range(5)), torch.Generator().manual_seed(0)
+    errors = {
+        "scores": 1e4 * (1 + torch.rand(5, 120, generator=draw)),  # far from any that the sensor has
+        "information": torch.eye(120),
+    }
+    EVENT_ERRORS.write(setup / EVENT_ERRORS_FILE, errors, AboutErrors(names, 1.0))
+    pre = replace(SMALL, network=SequenceConfig(width=4, depth=1, rank=8, ridge_multipliers=(1.0,)))
+    arms = tuple(replace(arm, pretraining=pre, sampling=shown) for arm in ARMS[1:])
+    study = replace(STUDY, name="events", arms=arms, modalities=("event",), seeds=(0,))
+    found = {record.arm: record for record in run_study(study, apart)}
+    made = [open_dataset(path) for path in (apart.out / "recorded").iterdir()]
+    recorded = {one.sampling.surface: one for one in made if one.sampling.is_solved}
+    wrong, right = recorded.pop("likelihood"), recorded.pop("corrected")
+    start = apart.out / "runs" / found["simulation only"].settings["run"]
+    assert best_shown((wrong, right), start) is best_shown((right, wrong), start) is wrong
+    for record in found.values():
+        assert record.settings["captures"] == wrong.folder.name
+        assert load_weights(apart.out / "runs" / record.settings["run"]).sampling.surface == "likelihood"
+    for name in wrong.objects():  # as if the errors were those of the sensor
+        shards = wrong.shard(name), right.shard(name)
+        contents = [shard.read_bytes() for shard in shards]
+        for shard, content in zip(shards, reversed(contents), strict=True):
+            shard.write_bytes(content)
+    assert best_shown((wrong, right), start) is right
+    again = {record.arm: record for record in run_study(replace(study, name="swapped", seeds=(1,)), apart)}
+    assert again["EPNP"].settings["captures"] == right.folder.name
+    assert load_weights(apart.out / "runs" / again["EPNP"].settings["run"]).sampling.surface == "corrected"
+    assert again["simulation only"].settings["captures"] == wrong.folder.name
 
 
 def test_an_ensemble_is_the_mean_of_its_images(records) -> None:

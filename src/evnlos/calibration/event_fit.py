@@ -54,7 +54,7 @@ _MOST_NOISE = 10.0  # times the events of pixels that see nothing
 _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
 _MOST_CAPTURES = 16  # that tell of errors: a second or two each
-_LEAST_GAIN_DB = 1.5  # of captures corrected by others; less, and networks of the simulation lose by it
+_LEAST_GAIN_DB = 0.3  # of captures corrected by others; with less the correction is not worth a trial
 
 
 @dataclass(frozen=True)
@@ -283,9 +283,10 @@ def write_event_errors(
 ) -> EventErrors | None:
     """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
 
-    `event_images` takes it into account: for a capture that is among these, what the others showed. Where the
-    setup is nearly right that costs more than it brings, so each capture is corrected by the others first, and
-    the file is written where they gain at least 1.5 dB.
+    The surface `corrected` takes it into account: for a capture that is among these, what the others showed.
+    Whether a network gains by it, only that network tells (`evnlos.training.best_shown`): one of the setup's
+    own simulation has learned what the setup gets wrong of its events. Where captures, each corrected by the
+    others, do not gain at least 0.3 dB before any network, there is nothing to try, and no file is written.
 
     Args:
         setup: Folder of a calibrated setup.

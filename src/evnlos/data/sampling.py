@@ -72,9 +72,10 @@ class Sampling:
     """Size of a pixel of the truth on the target's plane, metres."""
     scored_rows: int = 48
     """Rows in the middle of the canvas that are scored; the target never leaves them, pixels."""
-    surface: Literal["sae", "context", "hots", "trace", "likelihood"] = "sae"
+    surface: Literal["sae", "context", "hots", "trace", "likelihood", "corrected"] = "sae"
     """Kind of the time surface; `trace` = log light smoothed over all events, also later ones; `likelihood` =
-    the target that the events of the whole sequence make most likely through the light path of `setup`."""
+    the target that the events of the whole sequence make most likely through the light path of `setup`;
+    `corrected` = the same of captures, less what other captures showed that the setup gets wrong of events."""
     tau_s: float = 0.2
     """Time constant of the time surface, seconds; of `trace`, the time in which the light changes: 1 to 5."""
     radius: int = 3
@@ -93,6 +94,11 @@ class Sampling:
             if not getattr(self, name) > 0:
                 raise ConfigError(f"Sampling.{name} is {getattr(self, name)}; give a positive number")
         check_made(self)
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether the surface is the target that the events show through the light path of `setup`."""
+        return self.surface in ("likelihood", "corrected")
 
     def of_frames(self) -> Sampling:
         """Return it as far as frames alone are concerned: the surface is the usual one."""
@@ -148,9 +154,9 @@ def surface_of(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) 
         edges_us: N + 1 ascending instants, microseconds.
         sampling: Kind of the surface and its settings.
     """
-    if sampling.surface == "likelihood":
+    if sampling.is_solved:
         raise ConfigError(
-            "the surface 'likelihood' is made of whole recordings; give another --sampling.surface"
+            f"the surface {sampling.surface!r} is made of whole recordings; give another --sampling.surface"
         )
     tau_us = sampling.tau_s * 1e6
     if sampling.surface == "trace":
@@ -210,18 +216,19 @@ def iter_samples(
 ) -> Iterator[Samples]:
     """Yield what `make_samples` returns in blocks, at least one, whose memory does not grow with the positions.
 
-    Of the surfaces `trace` and `likelihood` alone all are held at once. `capture` is the name of a real
-    recording, see `event_images`.
+    Of the surfaces `trace`, `likelihood` and `corrected` alone all are held at once. `capture` is the name of a
+    real recording, which `corrected` takes, see `event_images`.
     """
     if len(edges_us) != len(frames) + 1:
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
     shape = (sampling.height, sampling.width)
     steps = max(1, _BLOCK_BYTES // (4 * (2 * events.width * events.height + math.prod(frames.shape[1:]))))
     tau_us, mode = sampling.tau_s * 1e6, sampling.surface
-    if mode == "likelihood":
+    if sampling.is_solved:
         from evnlos.inverse.event_images import event_images  # which compiles
 
-        images = event_images(events, edges_us, motion, sampling.setup, sampling.canvas, capture)
+        corrects = capture if mode == "corrected" else None
+        images = event_images(events, edges_us, motion, sampling.setup, sampling.canvas, corrects)
         surfaces = frame_blocks(images, steps)
     elif mode == "trace":
         surfaces = frame_blocks(event_trace(events, edges_us, tau_us), steps)
@@ -237,7 +244,7 @@ def iter_samples(
         if target is not None and motion is not None:
             truth = (several or Scene(target, motion)).truth(sampling.canvas, time_s)
         light = reduce_by_area(block / np.float32(peak), shape)
-        maps = surface if mode == "likelihood" else reduce_by_area(surface, shape)
+        maps = surface if sampling.is_solved else reduce_by_area(surface, shape)
         yield Samples(light, maps, truth, time_s, position, counts[part])
 
 

@@ -29,7 +29,7 @@ from evnlos.experiment.table import score_arm
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import HandwritingGlyphs
 from evnlos.setups import calibrated_file
-from evnlos.training import Training, augmented, choose_and_finetune, train
+from evnlos.training import Training, augmented, best_shown, choose_and_finetune, train
 from evnlos.types import derive_seed
 
 
@@ -38,14 +38,15 @@ class Run:
     """One training.
 
     Args:
-        data: What it learns from.
+        data: What it learns from: one dataset, or several that show the same captures in other ways, of which
+            the one is taken that its start draws best.
         settings: How.
         out: Its folder.
         start: Run, or name of installed weights, whose weights it starts from; None: random ones.
         choose: Whether captures held out decide how much of a fine-tuning is taken.
     """
 
-    data: Dataset
+    data: tuple[Dataset, ...]
     settings: Training
     out: Path
     start: Path | str | None = None
@@ -56,10 +57,11 @@ def train_one(run: Run, progress: Progress = silent) -> None:
     """Train what is not trained yet; `progress` is that of `train`."""
     if (run.out / "weights.safetensors").is_file():  # its folder's name holds a hash of what decides it
         return
+    data = run.data[0] if run.start is None else best_shown(run.data, run.start)
     if run.choose and run.start is not None:
-        choose_and_finetune(run.data, (run.settings,), run.out, run.start, progress=progress)
+        choose_and_finetune(data, (run.settings,), run.out, run.start, progress=progress)
         return
-    train(run.data, run.settings, run.out, run.start, progress)
+    train(data, run.settings, run.out, run.start, progress)
 
 
 def run_study(study: Study, place: Place, progress: Progress = silent) -> list[Record]:
@@ -126,19 +128,25 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
             fit = fit_setup(place.captures, settings, progress)
             write_setup(fit, rows_of(fit, settings.start.pixel, settings.start.frame_camera), setup)
             _draw(fit, setup / "check.png")
-            if sees_events and any(arm.sampling.surface == "likelihood" for arm in arms):
+            if sees_events and any(arm.sampling.is_solved for arm in arms):
                 from evnlos.calibration import write_event_errors  # which takes a help text longer to show
 
                 write_event_errors(setup, place.captures, fit.captures, progress)
         except DataError as error:
             raise CalibrationError(str(error)) from None
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))
+    from evnlos.inverse import EVENT_ERRORS_FILE  # which compiles
+
     networks = list[_Network]()
     for arm in study.arms:
-        recorded = _import(study, arm, place, progress)
+        recorded = (_import(study, arm, place, progress),)
+        if sees_events and arm.sampling.is_solved and arm.finetuning and (setup / EVENT_ERRORS_FILE).is_file():
+            corrected = replace(arm, sampling=replace(arm.sampling, surface="corrected"))
+            recorded += (_import(study, corrected, place, progress),)
         made = _simulate(study, arm, place, progress)
         for modality in study.modalities:
-            learned = augmented(recorded, modality, progress) if arm.augment else recorded
+            solves = as_modality(modality).needs_events
+            learned = (augmented(recorded[0], modality, progress),) if arm.augment else recorded[: 1 + solves]
             plans = [_planned(study, arm, modality, seed, made, learned, place) for seed in study.seeds]
             networks.append(_Network(study, arm, modality, plans, made, recorded, place))
     return networks
@@ -153,7 +161,7 @@ class _Network:
     modality: str
     plans: list[tuple[list[Run], dict[str, Any]]]
     made: Dataset | None
-    recorded: Dataset
+    recorded: tuple[Dataset, ...]
     place: Place
 
     @property
@@ -309,12 +317,18 @@ def _few(folders: list[Path], count: int, held_out: tuple[str, ...]) -> list[Pat
 
 
 def _planned(
-    study: Study, arm: Arm, modality: str, seed: int, made: Dataset | None, recorded: Dataset, place: Place
+    study: Study,
+    arm: Arm,
+    modality: str,
+    seed: int,
+    made: Dataset | None,
+    recorded: tuple[Dataset, ...],
+    place: Place,
 ) -> tuple[list[Run], dict[str, Any]]:
     """Return the trainings of an arm's network, each from the one before it, and what decided them."""
     runs: list[Run] = []
     begin = arm.layers(modality)
-    decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": recorded.folder.name}
+    decided: dict[str, Any] = {"arm": to_dict(arm), "seed": seed, "captures": recorded[0].folder.name}
     if arm.pretraining is not None:
         assert made is not None
         settings = replace(arm.first_training(modality), modality=modality, seed=seed)
@@ -323,13 +337,13 @@ def _planned(
             decides["from"] = arm.start
         key = config_hash(decides)[:8]
         out = place.out / "runs" / f"{study.setup}-pretrained-{modality}-seed{seed}-{key}"
-        runs.append(Run(made, settings, out, begin))
+        runs.append(Run((made,), settings, out, begin))
         decided |= {"simulation": made.config_hash}
     if arm.finetuning is not None:
         settings = replace(arm.finetuning, modality=modality, seed=seed)
         start = runs[-1].out if runs else begin
         decides = {
-            "data": recorded.folder.name,
+            "data": " ".join(one.folder.name for one in recorded),
             "settings": to_dict(settings),
             "from": start and Path(start).name,
         }

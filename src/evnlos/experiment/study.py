@@ -105,7 +105,7 @@ class Arm:
     @property
     def needs_setup(self) -> bool:
         """Whether the captures have to be calibrated first."""
-        return self.source == "calibrated" or self.sampling.surface == "likelihood"
+        return self.source == "calibrated" or self.sampling.is_solved
 
     def with_light_path(self, setup: Path, *, sees_events: bool = True) -> Arm:
         """Return the arm with a setup for the surface `likelihood`, where it is made and names none.
@@ -114,7 +114,7 @@ class Arm:
             setup: Folder of the calibrated setup.
             sees_events: Whether a network sees the surface; else a quick one takes its place.
         """
-        if self.sampling.surface != "likelihood":
+        if not self.sampling.is_solved:
             return self
         seen = replace(self.sampling, setup=self.sampling.setup or str(setup))
         return replace(self, sampling=seen if sees_events else replace(seen, surface=Sampling().surface))

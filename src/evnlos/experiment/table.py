@@ -63,7 +63,7 @@ def score_arm(
     modality: str,
     runs: list[tuple[Path, dict[str, Any]]],
     made: Dataset | None,
-    recorded: Dataset,
+    shown: tuple[Dataset, ...],
     place: Place,
     progress: Progress,
 ) -> list[Record]:
@@ -75,11 +75,11 @@ def score_arm(
         modality: What its networks see.
         runs: Each seed's run and what decided it.
         made: The simulated dataset of the pre-training, where there is one.
-        recorded: The captures.
+        shown: The captures, in one way or several; a network sees them as it learned from them.
         place: Where records are kept.
         progress: Called with each new record.
     """
-    folder = place.out / "records" / study.name
+    recorded, folder = shown[0], place.out / "records" / study.name
     there, new = records_there(folder), list[Record]()
     samples = NlosDataset(recorded, study.split, modality)
     means = NlosDataset(recorded, "train", modality).truth.float().mean(dim=0)
@@ -108,9 +108,11 @@ def score_arm(
     pictures = []
     for (run, settings), seed in zip(runs, study.seeds, strict=True):
         weights = load_weights(run)
-        check_sampling(weights, recorded.sampling)
-        settings = settings | {"run": run.name}
-        pictures.append(weights.network.infer(samples.inputs, samples.position_m, samples.names))
+        own = next((d for d in shown if d.sampling.surface == weights.sampling.surface), recorded)
+        check_sampling(weights, own.sampling)
+        settings = settings | {"run": run.name, "captures": own.folder.name}
+        inputs = samples.inputs if own is recorded else NlosDataset(own, study.split, modality).inputs
+        pictures.append(weights.network.infer(inputs, samples.position_m, samples.names))
         score_variants(pictures[-1], seed, settings, weights.mean_image)
         averaged = record(f"{arm.name}, averaged", seed, settings)
         if study.average and not weights.network.sees_sequence and not is_scored(averaged, there):

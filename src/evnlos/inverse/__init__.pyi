@@ -12,6 +12,8 @@ from .corner import Prior as Prior
 from .corner import estimate_corner as estimate_corner
 from .corner import noise_of as noise_of
 from .corner import read_penumbra as read_penumbra
+from .event_images import EVENT_ERRORS as EVENT_ERRORS
+from .event_images import EVENT_ERRORS_FILE as EVENT_ERRORS_FILE
 from .event_images import AboutErrors as AboutErrors
 from .event_images import EventErrors as EventErrors
 from .event_images import event_images as event_images

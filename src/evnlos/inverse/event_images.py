@@ -30,6 +30,7 @@ from evnlos.errors import ConfigError, DataError, UnknownNameError
 from evnlos.inverse.prior import PatternPrior, handwritten_prior
 from evnlos.inverse.sequence_light import EVENT_PRIORS, sequence_light
 from evnlos.inverse.sequence_statistic import EventSolver, EventStatistic
+from evnlos.machine import note
 from evnlos.scene import LineMotion, Motion, Target, TargetPlane
 from evnlos.setups import load_setup
 from evnlos.tensor_file import TensorFile
@@ -161,6 +162,7 @@ def event_statistic(
         events = replace(events, t_us=events.t_us - began_us)
     span = (int(edges_us[0]) // _SPAN_US * _SPAN_US * 1e-6, -(-int(edges_us[-1]) // _SPAN_US) * _SPAN_US * 1e-6)
     solver, prior = _solver(setup, motion, span, (events.height, events.width))
+    note("what the events say")
     with threadpool_limits(1):  # its products are small: a second thread mostly waits
         return solver(events), prior, motion.position_m(edges_us[1:] * 1e-6)
 
@@ -184,14 +186,20 @@ def event_images(
         setup: Word of a setup whose light path and event pixel are known, see `load_setup`.
         canvas: What is drawn.
         capture: Name of the capture, whose sensor errs as other captures of the setup showed (`EventErrors`);
-            None: the events are the setup's own, simulated.
+            None: the setup counts as right.
 
     Raises:
         ConfigError: No setup is named, it is not linear, or its event model states no law of its crossings.
-        DataError: The motion is unknown, or the file of errors is damaged.
+        DataError: The motion is unknown, or the file of errors is damaged or not there.
     """
+    path = Path(setup) / EVENT_ERRORS_FILE
+    if capture is not None and not path.is_file():
+        raise DataError(
+            f"{setup} has no {EVENT_ERRORS_FILE}, which the surface 'corrected' takes and `evnlos calibrate` "
+            "writes where captures gain by it; give --sampling.surface likelihood"
+        )
     statistic, prior, places = event_statistic(events, edges_us, motion, setup)
-    if capture is not None and (path := Path(setup) / EVENT_ERRORS_FILE).is_file():
+    if capture is not None:
         statistic = EVENT_ERRORS.load(path, "").corrected(statistic, capture)
     images = []
     for z in statistic.solutions(EVENT_PRIORS):
@@ -214,6 +222,7 @@ def _solver(
             "put a folder `near` beside weights `near-....safetensors`"
         ) from None
     prior = handwritten_prior(Plane(CELLS, CELLS, TargetPlane().size_m / CELLS), COEFFICIENTS)
+    note("light path of the events")
     light = sequence_light(known, prior, motion.position_m, span_s, shape)
     law = known.pixel.crossing_law(light.typical_dn)
     if law is None:

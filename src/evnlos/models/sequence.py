@@ -402,7 +402,7 @@ class SequenceReconstructor(Reconstructor):
         self.settings: SequenceConfig = settings
         size = (sampling.height, sampling.width)
         self.normalization = InputNormalization(modality, settings.scaling)
-        solved = "surface" if sampling.surface == "likelihood" else ""
+        solved = "surface" if sampling.is_solved else ""
         left_out = "frame" if settings.frames == "likelihood" else ""
         own = [modality.slices[group.name] for group in modality.groups if group.maps == (left_out,)]
         self._frame = own[0].start if own else None

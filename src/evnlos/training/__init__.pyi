@@ -5,6 +5,7 @@ from .choice import Choice as Choice
 from .choice import alternatives as alternatives
 from .choice import asymmetry as asymmetry
 from .choice import augmented as augmented
+from .choice import best_shown as best_shown
 from .choice import between as between
 from .choice import choose_and_finetune as choose_and_finetune
 from .choice import read_choice as read_choice

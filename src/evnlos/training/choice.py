@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -114,6 +115,7 @@ def choose_and_finetune(
         if (out / "weights.safetensors").is_file():
             return TrainingResult(out, _records(out))
         save_yaml(about, out / "run.yaml")
+        start.network.follow(dataset.sampling)
         gains = _cross_validated(dataset, candidates, trials, weights, start, folds, progress)
         choice = _choice(gains)
         if choice.candidate is None:
@@ -133,6 +135,23 @@ def choose_and_finetune(
         save_weights(out / "weights.safetensors", final)
     shutil.rmtree(trials, ignore_errors=True)
     return TrainingResult(out, log)
+
+
+def best_shown(datasets: Sequence[Dataset], weights: str | Path) -> Dataset:
+    """Return, of datasets that show the same objects in other ways, the one that weights draw best.
+
+    Args:
+        datasets: Their splits `train` hold the same objects, and these alone are read.
+        weights: Weights or run that have not learned from them.
+    """
+    if len(datasets) == 1:
+        return datasets[0]
+    start = load_weights(weights)
+    scores = list[float]()
+    for dataset in datasets:
+        samples = NlosDataset(dataset, "train", start.modality)
+        scores.append(float(_scores(start.network, samples, dataset, dataset.objects("train")).mean()))
+    return datasets[int(np.argmax(scores))]
 
 
 def read_choice(run: str | Path) -> Choice | None:
