@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from evnlos.cli import main
 from evnlos.config import save_yaml
@@ -52,6 +53,7 @@ from evnlos.experiment import (
 )
 from evnlos.inverse import EVENT_ERRORS, EVENT_ERRORS_FILE, AboutErrors
 from evnlos.models import FrameOperator, SequenceConfig, UNetConfig, layers_of, load_weights
+from evnlos.plot.figures import draw_scores
 from evnlos.scene import FontGlyphs, HandwritingGlyphs
 from evnlos.setups import RadiometricSetup, load_setup
 from evnlos.training import Training, best_shown
@@ -110,6 +112,22 @@ def test_every_arm_seed_and_refinement_has_its_record(records, place) -> None:
         assert {"zero", "mean", "placed", "nearest"} <= set(record.baselines)
         by = {name: np.mean(list(table["psnr_db"].values())) for name, table in record.baselines.items()}
         assert by["placed"] > by["mean"]  # the motion is known
+
+
+def test_the_command_prints_tables_and_draws_them(records, apart, monkeypatch, capsys) -> None:
+    asked = list[Study]()
+    monkeypatch.setattr("evnlos.experiment.run_studies", lambda studies, *_: asked.extend(studies))
+    root, out = str(apart.captures[0].parent), str(apart.out)
+    options = ["--captures", root, "--captures-of", "lab", "--out", out, "--test", "4"]
+    main(["experiment", "captures", *options, "--modalities", "fusion"])
+    assert [(study.setup, study.test, study.modalities) for study in asked] == [("lab", ("4",), ("fusion",))]
+    said = capsys.readouterr().out
+    assert "| EPNP - strongest E2E |" in said and "best linear estimate, lab" in said
+    assert (apart.out / "captures-lab-test.md").read_text() == said.removesuffix("\n")
+    with Image.open(apart.out / "captures-lab-test.png") as drawn:
+        assert min(drawn.size) > 200
+    with pytest.raises(DataError, match="no record of a network"):
+        draw_scores([record for record in records if record.seed < 0], "psnr_db", apart.out / "none.png")
 
 
 def test_a_second_run_does_nothing_again(records, place) -> None:

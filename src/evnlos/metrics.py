@@ -91,12 +91,19 @@ def ssim_terms(
     taps = torch.exp(-taps.square() / (2 * sigma**2))
     taps = taps / taps.sum()
     moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)  # [N, 5, H, W]
-    rows = taps.reshape(1, 1, -1, 1).expand(5, 1, window, 1)
-    columns = taps.reshape(1, 1, 1, -1).expand(5, 1, 1, window)
-    blurred = F.conv2d(F.conv2d(moments, rows, groups=5), columns, groups=5)
-    mx, my, xx, yy, xy = blurred.split(1, dim=1)
+    # As products with banded matrices: on images of this size several times as fast as convolutions.
+    rows, columns = (_banded(taps, side) for side in x.shape[-2:])
+    mx, my, xx, yy, xy = (rows @ moments @ columns.T).split(1, dim=1)
     vx, vy, cov = xx - mx * mx, yy - my * my, xy - mx * my
     return (2 * mx * my + _C1) / (mx * mx + my * my + _C1), (2 * cov + _C2) / (vx + vy + _C2)
+
+
+def _banded(taps: torch.Tensor, side: int) -> torch.Tensor:
+    """Return the matrix [side - w + 1, side] that blurs with taps [w] wherever they fit."""
+    places = side - len(taps) + 1
+    shift = torch.arange(side, device=taps.device) - torch.arange(places, device=taps.device)[:, None]
+    inside = (shift >= 0) & (shift < len(taps))
+    return torch.where(inside, taps[shift.clamp(0, len(taps) - 1)], 0.0)
 
 
 def checked(image: torch.Tensor, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

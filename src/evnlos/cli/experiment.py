@@ -148,26 +148,29 @@ class ExperimentCommand:
         getattr(self, f"_{self.name}" if self.name in _WITHOUT_CAPTURES else "_on_captures")()
 
     def _on_captures(self) -> None:
+        from evnlos.plot.figures import draw_scores
+
         study = self._study()
         assert self.captures is not None
         folders = tuple(experiment.captures_of(self.captures, self.captures_of))
         place = experiment.Place(folders, self.out, self.workers, self.trainings, self.force)
         name, studies = study.name, [study]
+        if self.folds and self.validation:
+            raise ConfigError("folds test every character: leave out --validation, or --folds")
         if self.folds:
-            if self.validation:
-                raise ConfigError("folds test every character: leave out --validation, or --folds")
             studies = experiment.folds_of(study, self.folds, [character_of(folder.name) for folder in folders])
             name += "-folds"
         with ProgressBars() as progress:
             experiment.run_studies(studies, place, progress)
         records = experiment.read_records(self.out / "records" / name)
-        if self.folds:
-            records = experiment.merge_folds(records, self.captures_of)
+        records = experiment.merge_folds(records, self.captures_of) if self.folds else records
         records = [r for r in records if r.setup == self.captures_of and r.split == study.split]
         text = _tables(name, records, self.metric)
-        text += experiment.bounds_table(self.out / "setups" / study.setup, folders[0], self.captures_of)
-        write_atomically(self.out / f"{name}-{self.captures_of}-{study.split}.md", text.encode())
+        text += experiment.bounds_table(self.out / "setups" / studies[0].setup, folders[0], self.captures_of)
+        path = self.out / f"{name}-{self.captures_of}-{study.split}.md"
+        write_atomically(path, text.encode())
         print(text)
+        drawn(image := path.with_suffix(".png"), lambda: draw_scores(records, self.metric, image))
 
     def _study(self) -> Study:
         """Return the named study with what the command line changes."""
@@ -214,8 +217,7 @@ class ExperimentCommand:
             experiment.run_simulated(settings, progress)
         text, everything = "", experiment.read_records(self.out / "records" / "simulation")
         for tested in ("nist", "comic"):
-            records = [record for record in everything if record.setup == tested]
-            text += _tables("simulation", records, self.metric) + "\n"
+            text += _tables("simulation", [r for r in everything if r.setup == tested], self.metric) + "\n"
         write_atomically(self.out / "simulation.md", text.encode())
         print(text)
 
@@ -266,13 +268,13 @@ class ExperimentCommand:
 
 
 def _tables(name: str, records: list, metric: str) -> str:
-    parts = [
-        f"# {name}, {records[0].setup}, {records[0].split} characters",
-        experiment.summary_table(records, metric),
-    ]
+    parts = [f"# {name}, {records[0].setup}, {records[0].split} characters"]
+    parts.append(experiment.summary_table(records, metric))
     arms = {record.arm for record in records if record.seed >= 0}
+    tried = any(arm.startswith("E2E") for arm in arms)
+    parts += [experiment.gain_table(records, arm) for arm in ("EPNP", "EPNP sequence") if tried and arm in arms]
     if {"EPNP", "E2E"} <= arms:
-        parts += [experiment.gain_table(records), experiment.character_table(records, ("E2E", "EPNP"), metric)]
+        parts.append(experiment.character_table(records, ("E2E", "EPNP"), metric))
     parts.append(experiment.checks_table(records))
     return "\n\n".join(parts) + "\n"
 
@@ -290,9 +292,7 @@ class AppCommand:
         """Run the page until it is interrupted."""
         say("starting: the first images are computed before the page opens, about 20 s")
         serve(self.server, self.weights, lambda address: print(f"{address}  (Ctrl+C stops it)", flush=True))
-        # A visitor's image may be in the making still, in compiled code on a thread of its own, which the
-        # interpreter would tear apart at its end; nothing of it is wanted any more.
-        say("stopped")
+        say("stopped")  # while compiled code may be at work still, which the interpreter would tear apart
         sys.stdout.flush()
         os._exit(0)
 

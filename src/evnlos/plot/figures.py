@@ -1,6 +1,6 @@
 """Figures that several commands draw; axes carry units, and colour maps keep their order in grey print.
 
-- An empty matplotlib figure, or one line that says what to install.
+- An empty matplotlib figure, or one line that says what to install; results with their intervals.
 - Films of a sequence: one column per stage of the light path, one image per position; NumPy and Pillow.
 - Events as images on any background: a space-time cloud, and slices through it; NumPy and Pillow.
 """
@@ -11,7 +11,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,55 @@ _GROUND = {"dark": (14, 16, 20), "light": (255, 255, 255)}
 _INK = {"dark": (226, 229, 235), "light": (29, 33, 38)}
 _DIM = {"dark": (146, 153, 166), "light": (96, 104, 116)}
 _GAP, _TITLE_PX, _NOTE_PX = 8, 15, 12
+
+
+class Scored(Protocol):
+    """What a record of an experiment tells: an arm's scores with one modality and seed, -1 for an ensemble."""
+
+    arm: str
+    modality: str
+    seed: int
+    scores: dict[str, dict[str, float]]
+
+
+def draw_scores(records: Sequence[Scored], metric: str, path: str | Path) -> Path:
+    """Draw the mean of a metric with its 95 % interval over characters and seeds: a row an arm, no ensembles.
+
+    Args:
+        records: Of one study on the same characters; each modality has a panel.
+        metric: Name of a score.
+        path: The image, PNG or SVG.
+
+    Raises:
+        MissingDependencyError: Matplotlib is not installed.
+        DataError: There is nothing to draw.
+    """
+    from evnlos.analysis.scores import paired_difference  # with PyTorch, which events alone do not need
+    from evnlos.data import modality_order
+
+    found: dict[str, dict[str, list[dict[str, float]]]] = {}
+    for one in sorted(records, key=lambda one: modality_order(one.modality)):
+        if one.seed >= 0:
+            found.setdefault(one.modality, {}).setdefault(one.arm, []).append(one.scores[metric])
+    names = list(dict.fromkeys(name for arms in found.values() for name in arms))
+    if not names:
+        raise DataError("there is no record of a network to draw; run the experiment first")
+    figure = new_figure((2.2 + 2.8 * len(found), 1.0 + 0.28 * len(names)))
+    panels = figure.subplots(1, len(found), sharey=True, sharex=True, squeeze=False)[0]
+    for axes, (modality, arms) in zip(panels, found.items(), strict=True):
+        for arm, seeds in arms.items():
+            each = [list(seed.values()) for seed in seeds]
+            mean = paired_difference(each, np.zeros(len(seeds[0])), list(seeds[0]))
+            axes.hlines(names.index(arm), mean.low, mean.high, color="0.45")
+            axes.plot(mean.mean, names.index(arm), "o", color="#1f5fa8", markersize=5)
+            text = {"textcoords": "offset points", "ha": "center", "fontsize": 7}
+            axes.annotate(f"{mean.mean:.1f}", (mean.mean, names.index(arm)), (0, 4), **text)
+        axes.set_title(modality, fontsize=10)
+        axes.set_xlabel(metric)
+        axes.grid(axis="x", color="0.9")
+    panels[0].set_yticks(range(len(names)), names, fontsize=8)
+    panels[0].set_ylim(len(names) - 0.5, -0.7)
+    return save_figure(figure, path, dpi=100)
 
 
 @dataclass(frozen=True, eq=False)
