@@ -54,6 +54,7 @@ def test_a_celex_pair(tmp_path):
         events="shot_EI_100M.bin",
         frames="shot_F_100M.bin",
         alignment={"offset_us": 30_000},
+        every=1,
     )
     events = stream(1280, 800, 500_000, adc=np.random.default_rng(0).integers(0, 4096, 4_000))
     write_events(folder / "shot_EI_100M.bin", events)
@@ -67,6 +68,48 @@ def test_a_celex_pair(tmp_path):
     import_captures([folder], tmp_path / "d")
     samples, _ = read_shard(open_dataset(tmp_path / "d").shard("shot_A"))
     assert samples.frame.shape == (2, 64, 96) and samples.truth is None
+    # By default a million pixels are more than are used: the middle ones of squares of 5 x 5.
+    usual = (folder / "capture.yaml").read_text().replace("every: 1\n", "")
+    (folder / "capture.yaml").write_text(usual)
+    fewer, whole = read_capture(folder), recording.events
+    assert "every 5 rows and columns: 256 x 160 pixels" in fewer.notes
+    assert fewer.frames.shape == (3, 160, 256) and fewer.frames.dtype == np.uint16
+    means = frames.reshape(3, 160, 5, 256, 5).mean(axis=(2, 4)) / 255
+    np.testing.assert_allclose(fewer.frames / fewer.peak, means, atol=1e-5)
+    kept = (whole.x % 5 == 2) & (whole.y % 5 == 2)
+    assert kept.any() and fewer.events.shape == (160, 256)
+    for name, values in (("t_us", whole.t_us), ("x", whole.x // 5), ("y", whole.y // 5), ("p", whole.p)):
+        np.testing.assert_array_equal(getattr(fewer.events, name), values[kept])
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_each_second_or_third_row_and_column_is_used_of_a_region(tmp_path, every: int):
+    """Rows and columns beyond the last whole square are left out."""
+    folder = folder_of(
+        tmp_path, events="e.npz", frames="frames", roi={"x": 3, "y": 1, "width": 11, "height": 7}
+    )
+    write_events(folder / "e.npz", stream(WIDTH, HEIGHT, 900_000))
+    (folder / "frames").mkdir()
+    frames = np.random.default_rng(1).integers(0, 255, (3, HEIGHT, WIDTH)).astype(np.uint8)
+    for number, frame in enumerate(frames):
+        Image.fromarray(frame).save(folder / "frames" / f"{number}.png")
+    whole = read_capture(folder)
+    (folder / "capture.yaml").write_text((folder / "capture.yaml").read_text() + f"every: {every}\n")
+    part, rows, columns = read_capture(folder), 7 // every, 11 // every
+    assert part.frames.shape[1:] == part.events.shape == (rows, columns)
+    squares = whole.frames[:, : rows * every, : columns * every].reshape(3, rows, every, columns, every)
+    np.testing.assert_allclose(part.frames / part.peak, squares.mean(axis=(2, 4)) / whole.peak, atol=1e-5)
+    middle, seen = every // 2, whole.events
+    inside = (seen.x < columns * every) & (seen.y < rows * every)
+    kept = inside & (seen.x % every == middle) & (seen.y % every == middle)
+    np.testing.assert_array_equal(part.events.t_us, seen.t_us[kept])
+    np.testing.assert_array_equal(part.events.x, seen.x[kept] // every)
+    for wrong, words in ((0, "every is 0; give 1"), (17, "every is 17; give 1"), (9, "11 x 7 pixels are used")):
+        text = (folder / "capture.yaml").read_text().replace(f"every: {every}", f"every: {wrong}")
+        (folder / "capture.yaml").write_text(text)
+        every = wrong
+        with pytest.raises(EvnlosError, match=words):
+            read_capture(folder)
 
 
 def test_frames_that_are_not_finite_are_refused(tmp_path):

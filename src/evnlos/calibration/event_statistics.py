@@ -19,6 +19,7 @@ from evnlos.cameras import PixelSettings, simulate_events
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.data.sampling import Sampling, make_samples, reduce_by_area
 from evnlos.errors import DataError
+from evnlos.events import thin_events
 from evnlos.machine import note
 from evnlos.setups import Setup
 from evnlos.types import Events, derive_seed
@@ -88,8 +89,8 @@ def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[R
         recordings.append(Recording(light, times, within(capture.events, first, last), int(k)))
     if not recordings:
         raise DataError(
-            f"the light of one capture needs {used >> 20} MiB, above {_MOST_BYTES >> 20}; fit frames alone "
-            "(--no-events) or record at a smaller size"
+            f"the light of one capture needs {used >> 20} MiB, above {_MOST_BYTES >> 20}; give a "
+            "larger `every` in capture.yaml (such rows and columns are used), or fit frames alone (--no-events)"
         )
     return recordings
 
@@ -97,18 +98,8 @@ def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[R
 def thinned(recording: Recording, pixels: int = _ENOUGH_PX) -> Recording:
     """Return every n-th row and column of a recording, so that about so many pixels are left."""
     stride = max(1, round(math.sqrt(recording.light[0].size / pixels)))
-    events = recording.events
-    kept = (events.x % stride == 0) & (events.y % stride == 0)
     light = np.ascontiguousarray(recording.light[:, ::stride, ::stride])
-    few = Events(
-        events.t_us[kept],
-        events.x[kept] // stride,
-        events.y[kept] // stride,
-        events.p[kept],
-        light.shape[2],
-        light.shape[1],
-    )
-    return replace(recording, light=light, events=few)
+    return replace(recording, light=light, events=thin_events(recording.events, stride))
 
 
 def within(events: Events, first_s: float, last_s: float) -> Events:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from evnlos.config import config_hash, to_dict
 from evnlos.data.capture_info import CaptureInfo, FilterInfo, inside, read_capture_info
 from evnlos.data.clocks import find_offset
-from evnlos.data.fixed_pattern import FixedPattern, mapped, prepare_frames
+from evnlos.data.fixed_pattern import FixedPattern, mapped, prepare_frames, used_pixels
 from evnlos.data.frames import read_frame_series
 from evnlos.data.sampling import (
     Samples,
@@ -36,7 +36,6 @@ from evnlos.errors import DataError, UnknownNameError, printable
 from evnlos.events import (
     CelexOptions,
     FrameStack,
-    crop_events,
     keep_known_polarity,
     read_events,
     read_triggers,
@@ -183,11 +182,8 @@ def read_capture(
         frames, told = prepare_frames(folder, info, series)
         times_us, in_time = _place_in_time(folder, info, events, frames, series.times_us)
         notes += told + in_time
-    roi = info.roi
-    if roi is not None:
-        events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
-        frames = mapped(frames, lambda one: one[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
-        notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
+    events, frames, told = used_pixels(info, events, frames)
+    notes += told
     if info.events is not None and not len(events):
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
     target = read_target(folder, info.target)

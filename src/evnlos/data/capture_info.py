@@ -13,6 +13,8 @@ from evnlos.events.recording import Recording
 from evnlos.files import write_atomically
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
+_MOST_EVERY = 16  # rows and columns of which one is used
+
 
 @dataclass(frozen=True)
 class CameraInfo:
@@ -125,9 +127,7 @@ class RegistrationInfo:
     def __post_init__(self) -> None:
         given = [name for name in ("homography", "points", "dots") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ConfigError(
-                f"registration: {' and '.join(given) or 'nothing'}; give homography, points or dots"
-            )
+            raise ConfigError(f"registration: {' and '.join(given) or 'none'}; give homography, points or dots")
 
 
 @dataclass(frozen=True)
@@ -223,6 +223,8 @@ class CaptureInfo:
     """Frame of an evenly lit surface, a file in the folder, of the frame camera's size."""
     roi: RegionInfo | None = None
     """Part of the event camera's sensor to use, after registration; none = all."""
+    every: int | None = None
+    """Each such row and column is used, of frames the mean; by default all of up to 300,000 pixels."""
     filters: FilterInfo = field(default_factory=FilterInfo)
     """Events to leave out."""
     setup: dict[str, Any] = field(default_factory=dict)
@@ -233,6 +235,8 @@ class CaptureInfo:
     def __post_init__(self) -> None:
         if self.events is None and self.frames is None:
             raise ConfigError("events and frames are null; state one of them")
+        if self.every is not None and not 1 <= self.every <= _MOST_EVERY:
+            raise ConfigError(f"every is {self.every}; give 1 (all rows and columns) to {_MOST_EVERY}")
         if self.events is None and self.alignment != AlignmentInfo():
             raise ConfigError("alignment is to the events' clock, and events is null; leave alignment out")
 
@@ -295,10 +299,8 @@ camera:
   # exposure_s: 0.01         # of a frame; the calibration blurs by it
   # clock_mhz: 100           # CeleX-V only, where the file's name does not say it
 
-events: {events}           # as the camera wrote it; the format is found from its content; null for a frame
-                             # camera alone, whose size is then above
-frames: {frames}               # a folder of images, a video, a table t_us,file, an AEDAT file or a ROS bag;
-                             # null for an event camera alone
+events: {events}           # as the camera wrote it; null for a frame camera alone, whose size is above
+frames: {frames}               # folder of images, video, table t_us,file, AEDAT file or ROS bag; null: none
 # frames_turned: true        # images that the CeleX-V program exported are turned by 180 degrees
 
 # Clocks. Leave out where both files share one; otherwise one of:
@@ -308,10 +310,10 @@ frames: {frames}               # a folder of images, a video, a table t_us,file,
 
 # Pixels. Leave out where frames and events share a sensor; otherwise four points or more that both saw:
 # registration: {{points: [[102, 80, 40, 33], [1180, 95, 601, 38], [1160, 690, 592, 440], [110, 702, 44, 446]]}}
-
 # dark: dark.png             # a frame with the lens covered
 # flat: flat.png             # a frame of an evenly lit surface
 # roi: {{x: 0, y: 0, width: {width}, height: {height}}}
+# every: 2                   # use each second row and column alone; of over 300,000 pixels some are left out
 # filters: {{hot_pixel_factor: 10, background_us: 20000}}
 
 # What was hidden: leave out when unknown. The mask is an image of the target, white shines.

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +22,11 @@ from evnlos.data.capture_info import CaptureInfo, inside
 from evnlos.data.frames import FrameSeries, read_image, warp_frames
 from evnlos.data.sampling import frame_homography, reduce_by_area
 from evnlos.errors import DataError
-from evnlos.events import FrameStack
+from evnlos.events import FrameStack, crop_events, thin_events
 from evnlos.files import write_atomically
 from evnlos.setups import Setup
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
+from evnlos.types import Events
 from evnlos.untrusted import check_memory
 
 
@@ -97,6 +99,38 @@ def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tupl
         return block if changed is None else np.round(changed * 65_535).astype(np.uint16)
 
     return mapped(frames, prepared), notes
+
+
+_MANY_PIXELS, _ENOUGH_PIXELS = 300_000, 40_000
+
+
+def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events, Any, list[str]]:
+    """Return events and frames of what is used of the sensor: a region, and every so many pixels of it.
+
+    Of a square of pixels the middle one's events are kept, and the mean of the frames, uint16. The light of the
+    wall is smooth: of more than 300,000 pixels, whose light takes gigabytes, about 40,000 are used by default.
+    """
+    notes, roi = list[str](), info.roi
+    if roi is not None:
+        events = crop_events(events, roi.x, roi.y, roi.width, roi.height)
+        frames = mapped(frames, lambda one: one[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
+        notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
+    pixels = events.width * events.height
+    usual = round(math.sqrt(pixels / _ENOUGH_PIXELS)) if pixels > _MANY_PIXELS else 1
+    if (side := info.every or usual) > 1:
+        rows, columns = (length // side for length in events.shape)
+        if not rows or not columns:
+            raise DataError(f"every is {side}, and {events.width} x {events.height} pixels are used; give less")
+        events = thin_events(crop_events(events, 0, 0, columns * side, rows * side), side, side // 2)
+
+        def binned(block: NDArray) -> NDArray:
+            squares = block[:, : rows * side, : columns * side].reshape(-1, rows, side, columns, side)
+            mean = squares.mean(axis=(2, 4), dtype=np.float64)
+            return np.round(mean * (65_535 / np.iinfo(block.dtype).max)).astype(np.uint16)
+
+        frames = mapped(frames, binned)
+        notes.append(f"every {side} rows and columns: {columns} x {rows} pixels")
+    return events, frames, notes
 
 
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less

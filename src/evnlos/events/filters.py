@@ -67,6 +67,27 @@ def crop_events(events: Events, x: int, y: int, width: int, height: int) -> Even
     return trusted_events({name: values[inside] for name, values in columns.items()}, width, height)
 
 
+def thin_events(events: Events, stride: int, first: int = 0) -> Events:
+    """Return the events of every so many rows and columns, on a sensor of these pixels alone.
+
+    Args:
+        events: The stream; it is not changed.
+        stride: 1 keeps all.
+        first: Row and column of the first pixel that is kept, below the stride.
+
+    Example:
+        >>> events = Events.empty(7, 5)
+        >>> thin_events(events, 2, 1).shape
+        (2, 3)
+    """
+    row, column = (along.astype(np.int64) - first for along in (events.y, events.x))
+    kept = (row % stride == 0) & (column % stride == 0) & (row >= 0) & (column >= 0)
+    columns = {**events.columns(), "x": (column // stride).astype(np.uint16)}
+    columns["y"] = (row // stride).astype(np.uint16)
+    height, width = (max(0, -(-(side - first) // stride)) for side in events.shape)
+    return trusted_events({name: values[kept] for name, values in columns.items()}, width, height)
+
+
 def check_box(shape: tuple[int, int], x: int, y: int, width: int, height: int) -> None:
     """Raise `ConfigError` unless the rectangle lies on a sensor of `shape` (rows, columns)."""
     if min(x, y) < 0 or min(width, height) < 1 or x + width > shape[1] or y + height > shape[0]:
