@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,10 +158,10 @@ def surface_of(events: Events, edges_us: NDArray[np.int64], sampling: Sampling) 
         raise ConfigError(
             f"the surface {sampling.surface!r} is made of whole recordings; give another --sampling.surface"
         )
-    tau_us = sampling.tau_s * 1e6
-    if sampling.surface == "trace":
+    tau_us, mode = sampling.tau_s * 1e6, cast(Any, sampling.surface)
+    if mode == "trace":
         return event_trace(events, edges_us, tau_us)
-    return time_surface(events, edges_us, tau_us, mode=sampling.surface, radius=sampling.radius)
+    return time_surface(events, edges_us, tau_us, mode=mode, radius=sampling.radius)
 
 
 def make_samples(
@@ -223,7 +223,7 @@ def iter_samples(
         raise DataError(f"{len(frames)} frames need {len(frames) + 1} edges, not {len(edges_us)}")
     shape = (sampling.height, sampling.width)
     steps = max(1, _BLOCK_BYTES // (4 * (2 * events.width * events.height + math.prod(frames.shape[1:]))))
-    tau_us, mode = sampling.tau_s * 1e6, sampling.surface
+    tau_us, mode = sampling.tau_s * 1e6, cast(Any, sampling.surface)
     if sampling.is_solved:
         from evnlos.inverse.event_images import event_images  # which compiles
 

@@ -8,7 +8,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -187,8 +187,8 @@ class Study:
             arm = replace(own, start=start, anew=own.pretraining)
             names = [name for modality in self.modalities if (name := arm.layers(modality))]
             if own.pretraining is not None and names:
-                width = load_weights(names[0]).network.settings.width
-                network: Any = replace(own.pretraining.network, width=width)
+                layers, network = load_weights(names[0]).network.settings, cast(Any, own.pretraining.network)
+                network = replace(network, width=cast(Any, layers).width)
                 changed = replace(own.pretraining, network=network, learning_rate=1e-3, refit_embedding=True)
                 arm = replace(arm, pretraining=changed)
             arms.append(arm if names else own)

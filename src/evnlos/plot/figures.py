@@ -11,7 +11,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,20 +74,11 @@ _DIM = {"dark": (146, 153, 166), "light": (96, 104, 116)}
 _GAP, _TITLE_PX, _NOTE_PX = 8, 15, 12
 
 
-class Scored(Protocol):
-    """What a record of an experiment tells: an arm's scores with one modality and seed, -1 for an ensemble."""
-
-    arm: str
-    modality: str
-    seed: int
-    scores: dict[str, dict[str, float]]
-
-
-def draw_scores(records: Sequence[Scored], metric: str, path: str | Path) -> Path:
+def draw_scores(records: Sequence[Any], metric: str, path: str | Path) -> Path:
     """Draw the mean of a metric with its 95 % interval over characters and seeds: a row an arm, no ensembles.
 
     Args:
-        records: Of one study on the same characters; each modality has a panel.
+        records: Of one study of `evnlos.experiment` on the same characters; each modality has a panel.
         metric: Name of a score.
         path: The image, PNG or SVG.
 
