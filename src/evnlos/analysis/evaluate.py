@@ -376,8 +376,7 @@ def check_sampling(weights: Weights, sampling: Sampling) -> None:
     these = sampling if weights.modality.needs_events else sampling.of_frames()
     # Only this surface is made through the setup, which may have been moved.
     is_known = not made_for.is_solved or same_setup(made_for.setup, these.setup)
-    if these.is_solved:  # the maps are alike whether errors are taken from them
-        these = replace(these, surface=made_for.surface if made_for.is_solved else these.surface)
+    these = these.corrected_as(made_for)  # the maps are alike whether errors are taken from them
     if not is_known or replace(made_for, setup="") != replace(these, setup=""):
         raise DataError(
             f"the weights were trained on samples of {made_for}; these are {these}: make them alike"

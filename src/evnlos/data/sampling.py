@@ -100,6 +100,10 @@ class Sampling:
         """Whether the surface is the target that the events show through the light path of `setup`."""
         return self.surface in ("likelihood", "corrected")
 
+    def corrected_as(self, other: Sampling) -> Sampling:
+        """Return it with errors taken from events as another has it, where both show the target so."""
+        return replace(self, surface=other.surface) if self.is_solved and other.is_solved else self
+
     def of_frames(self) -> Sampling:
         """Return it as far as frames alone are concerned: the surface is the usual one."""
         usual = Sampling()

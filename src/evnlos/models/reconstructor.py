@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -82,11 +82,6 @@ class Reconstructor(nn.Module, ABC):
     def kind(self) -> str:
         """The kind, as it stands in settings and files."""
         return self.settings.kind
-
-    def follow(self, sampling: Sampling) -> None:
-        """Take events from now on as samples show them that it goes on with: corrected, or not."""
-        if self.sampling.is_solved and sampling.is_solved:
-            self.sampling = replace(self.sampling, surface=sampling.surface)
 
     @abstractmethod
     def forward(self, x: Tensor) -> Tensor:

@@ -115,7 +115,7 @@ def choose_and_finetune(
         if (out / "weights.safetensors").is_file():
             return TrainingResult(out, _records(out))
         save_yaml(about, out / "run.yaml")
-        start.network.follow(dataset.sampling)
+        start.network.sampling = start.sampling.corrected_as(dataset.sampling)
         gains = _cross_validated(dataset, candidates, trials, weights, start, folds, progress)
         choice = _choice(gains)
         if choice.candidate is None:

@@ -243,7 +243,7 @@ def _network(settings: Training, start: Weights | None, sampling: Sampling) -> t
         if start is not None:
             network.take_layers(start.network)
         return network, settings
-    start.network.follow(sampling)
+    start.network.sampling = start.sampling.corrected_as(sampling)
     return start.network, replace(settings, network=start.network.settings, modality=start.modality.name)
 
 
