@@ -406,6 +406,19 @@ def test_light_of_recordings_follows_the_wall(folders) -> None:
     assert np.allclose(found[0].light[7], 255 * wall.irradiance(found[0].times_s[7]).numpy(), atol=1e-3)
 
 
+def test_some_pixels_of_a_large_sensor_tell_its_event_pixel(folders, monkeypatch) -> None:
+    """The light of a sensor of many pixels takes gigabytes: it is kept of each second row and column."""
+    fit, _ = read_capture_set(folders)
+    (whole,) = read_recordings(fit, SETUP, 1)
+    monkeypatch.setattr("evnlos.calibration.event_statistics._MOST_PX", whole.light[0].size // 4)
+    monkeypatch.setattr("evnlos.calibration.event_statistics._AT_ONCE", 7)
+    (part,) = read_recordings(fit, SETUP, 1)
+    np.testing.assert_allclose(part.light, whole.light[:, ::2, ::2], rtol=1e-6)
+    assert part.events.shape == part.light.shape[1:] and np.array_equal(part.times_s, whole.times_s)
+    kept = (whole.events.x % 2 == 0) & (whole.events.y % 2 == 0)
+    np.testing.assert_array_equal(part.events.t_us, whole.events.t_us[kept])
+
+
 def test_working_shape_keeps_the_sensor_s_shape() -> None:
     for shape in ((100, 160), (260, 346), (480, 640), (720, 1280), (7, 9)):
         height, width = working_shape(shape, 40)

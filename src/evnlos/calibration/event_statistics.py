@@ -27,6 +27,8 @@ from evnlos.types import Events, derive_seed
 _STEP_PX = 0.2  # the light is linear in time between two rendered instants
 _MOST_BYTES = 1 << 30
 _ENOUGH_PX = 4000  # pixels that tell as much about a model as all do: they do not see each other
+_MOST_PX = 20_000  # about as many are taken at all
+_AT_ONCE = 32  # instants that are rendered together
 _SETTLE = 0.05  # share of the recording in which the pixels' references forget their start
 _QUIET, _ACTIVE = 0.06, 0.5  # range of the log light of a pixel that sees nothing, and of one that sees much
 
@@ -69,10 +71,13 @@ class Recording:
 def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[Recording]:
     """Render the light of `count` captures, evenly chosen, from a fitted setup.
 
+    Of more than 45,000 pixels every second row and column is taken, or fewer, which tell as much.
+
     Raises:
-        DataError: The sensor is so large that not even one capture's light fits in 1 GiB.
+        DataError: The captures last so long that not even one's light fits in 1 GiB.
     """
-    height, width = capture_set.shape
+    stride = max(1, round(math.sqrt(math.prod(capture_set.shape) / _MOST_PX)))
+    pixels = math.prod(-(-side // stride) for side in capture_set.shape)
     chosen = np.unique(np.linspace(0, len(capture_set.captures) - 1, count).round().astype(int))
     recordings, used = [], 0
     for done, k in enumerate(chosen):
@@ -81,16 +86,19 @@ def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[R
         wall = setup.resized(capture_set.shape).observe(scene)
         first, last = (float(t) * 1e-6 for t in capture.frame_times_us[[0, -1]])
         steps = max(8, math.ceil((last - first) * wall.speed_px_s / _STEP_PX))
-        used += 4 * (steps + 1) * height * width
+        used += 4 * (steps + 1) * pixels
         if used > _MOST_BYTES:
             break
         times = np.linspace(first, last, steps + 1)
-        light = wall.irradiance(times).numpy() * np.float32(WHITE_DN)
-        recordings.append(Recording(light, times, within(capture.events, first, last), int(k)))
+        parts = np.array_split(times, math.ceil(len(times) / _AT_ONCE))
+        rendered = [wall.irradiance(part).numpy()[:, ::stride, ::stride] for part in parts]
+        light = np.concatenate(rendered) * np.float32(WHITE_DN)
+        seen = thin_events(within(capture.events, first, last), stride)
+        recordings.append(Recording(light, times, seen, int(k)))
     if not recordings:
         raise DataError(
-            f"the light of one capture needs {used >> 20} MiB, above {_MOST_BYTES >> 20}; give a "
-            "larger `every` in capture.yaml (such rows and columns are used), or fit frames alone (--no-events)"
+            f"the light of one capture needs {used >> 20} MiB, above {_MOST_BYTES >> 20}; fit frames alone "
+            "(--no-events) or record for less time"
         )
     return recordings
 
