@@ -15,7 +15,7 @@ from evnlos.types import OutFolder
 
 if TYPE_CHECKING:  # what runs is imported where it runs: help texts and wrong words need none of it
     from evnlos.data.lab import Lab
-    from evnlos.experiment import Study
+    from evnlos.experiment import Record, Study
     from evnlos.models import SequenceConfig
 
 LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
@@ -142,6 +142,7 @@ def run_demo(settings: Demo) -> Path:
         notes.append("The simulator was not fitted to this setup.")
 
     single = [record for record in records if record.arm in [arm.name for arm in study.arms]]
+    notes += _of_corrections(single, out)
     runs: list[str | Path] = [out / "runs" / record.settings["run"] for record in single]
     recorded = [out / "recorded" / record.settings["captures"] for record in single]  # E2E sees other surfaces
     with ProgressBars() as progress:
@@ -179,6 +180,16 @@ def _of_calibration(setup: Path) -> list[str]:
     notes = [f"The simulator was fitted to this setup, without the test characters{drawn}."]
     notes += [f"Warning: {line}." for line in found.get("warnings", [])]
     return [*notes, f"{found['expectation']}."] if "expectation" in found else notes
+
+
+def _of_corrections(records: list[Record], out: Path) -> list[str]:
+    """Return which networks learned from events less what other captures showed that the setup gets wrong."""
+    from evnlos.data import open_dataset
+
+    surfaces = [open_dataset(out / "recorded" / one.settings["captures"]).sampling.surface for one in records]
+    those = [f"{one.arm} {one.modality}" for one, s in zip(records, surfaces, strict=True) if s == "corrected"]
+    what = "What captures showed that the setup gets wrong of events was taken from them, as that helps"
+    return [f"{what}: {', '.join(those)}."] if those else []
 
 
 def _study(settings: Demo, test: list[str]) -> Study:
