@@ -350,7 +350,7 @@ def run_simulated(settings: Simulated, progress: Progress = silent) -> list[Reco
                 }
                 key = config_hash(decided)[:8]
                 run = settings.out / "runs" / f"paper-{arm.lower()}-{modality}-seed{seed}-{key}"
-                train_one(Run(data[source], plan, run, start), progress)
+                train_one(Run((data[source],), plan, run, start), progress)
                 first = first or run
                 test_sets = ("nist", "comic") if arm == "pre-trained" else ("comic",)
                 for tested in test_sets:

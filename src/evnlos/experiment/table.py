@@ -110,8 +110,9 @@ def score_arm(
         weights = load_weights(run)
         own = next((d for d in shown if d.sampling.surface == weights.sampling.surface), recorded)
         check_sampling(weights, own.sampling)
-        settings = settings | {"run": run.name, "captures": own.folder.name}
-        inputs = samples.inputs if own is recorded else NlosDataset(own, study.split, modality).inputs
+        inputs, settings = samples.inputs, settings | {"run": run.name}
+        if own is not recorded:
+            inputs, settings["captures"] = NlosDataset(own, study.split, modality).inputs, own.folder.name
         pictures.append(weights.network.infer(inputs, samples.position_m, samples.names))
         score_variants(pictures[-1], seed, settings, weights.mean_image)
         averaged = record(f"{arm.name}, averaged", seed, settings)
