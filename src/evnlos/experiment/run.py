@@ -194,7 +194,7 @@ def _together(networks: list[_Network], at_a_time: int, progress: Progress) -> l
     threads = max(1, torch.get_num_threads() // at_once)
     tasks = [partial(_trained, run, threads) for run in runs]
     tasks += [partial(_scored, network, threads) for network in networks]
-    records, done = list[Record](), 0
+    records, done, scored = list[Record](), 0, 0
     within = partial(_epochs_at_work, runs)
     progress(Step("train networks", 0, len(runs), "networks", within=within))
     with closing(run_tasks(_called, tasks, at_once, after)) as finished:
@@ -202,6 +202,9 @@ def _together(networks: list[_Network], at_a_time: int, progress: Progress) -> l
             if name:
                 done += 1
                 progress(Step("train networks", done, len(runs), "networks", name, within))
+            scored += not name
+            if done == len(runs):  # until then the trainings tell
+                progress(Step("score networks", scored, len(networks), "networks"))
             for record in found:
                 progress(Step(f"score {record.name}", 1, 1, "networks", record))
             records += found
