@@ -19,7 +19,7 @@ from evnlos.cameras import PixelSettings, simulate_events
 from evnlos.cameras.streams import WHITE_DN
 from evnlos.data.sampling import Sampling, make_samples, reduce_by_area
 from evnlos.errors import DataError
-from evnlos.events import thin_events
+from evnlos.events import stride_for, thin_events
 from evnlos.machine import note
 from evnlos.setups import Setup
 from evnlos.types import Events, derive_seed
@@ -76,7 +76,7 @@ def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[R
     Raises:
         DataError: The captures last so long that not even one's light fits in 1 GiB.
     """
-    stride = max(1, round(math.sqrt(math.prod(capture_set.shape) / _MOST_PX)))
+    stride = stride_for(math.prod(capture_set.shape), _MOST_PX)
     pixels = math.prod(-(-side // stride) for side in capture_set.shape)
     chosen = np.unique(np.linspace(0, len(capture_set.captures) - 1, count).round().astype(int))
     recordings, used = [], 0
@@ -105,7 +105,7 @@ def read_recordings(capture_set: CaptureSet, setup: Setup, count: int) -> list[R
 
 def thinned(recording: Recording, pixels: int = _ENOUGH_PX) -> Recording:
     """Return every n-th row and column of a recording, so that about so many pixels are left."""
-    stride = max(1, round(math.sqrt(recording.light[0].size / pixels)))
+    stride = stride_for(recording.light[0].size, pixels)
     light = np.ascontiguousarray(recording.light[:, ::stride, ::stride])
     return replace(recording, light=light, events=thin_events(recording.events, stride))
 

@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from evnlos.data.capture_info import CaptureInfo, inside
 from evnlos.data.frames import FrameSeries, read_image, warp_frames
 from evnlos.data.sampling import frame_homography, reduce_by_area
 from evnlos.errors import DataError
-from evnlos.events import FrameStack, crop_events, thin_events
+from evnlos.events import FrameStack, crop_events, stride_for, thin_events
 from evnlos.files import write_atomically
 from evnlos.setups import Setup
 from evnlos.tensor_file import check_floats, read_sealed, sealed_bytes
@@ -116,7 +115,7 @@ def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events,
         frames = mapped(frames, lambda one: one[:, roi.y : roi.y + roi.height, roi.x : roi.x + roi.width])
         notes.append(f"region {roi.width} x {roi.height} at ({roi.x}, {roi.y})")
     pixels = events.width * events.height
-    usual = round(math.sqrt(pixels / _ENOUGH_PIXELS)) if pixels > _MANY_PIXELS else 1
+    usual = stride_for(pixels, _ENOUGH_PIXELS) if pixels > _MANY_PIXELS else 1
     if (side := info.every or usual) > 1:
         rows, columns = (length // side for length in events.shape)
         if not rows or not columns:

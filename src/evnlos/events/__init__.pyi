@@ -34,6 +34,7 @@ from .filters import find_hot_pixels as find_hot_pixels
 from .filters import keep_known_polarity as keep_known_polarity
 from .filters import keep_supported as keep_supported
 from .filters import remove_flicker as remove_flicker
+from .filters import stride_for as stride_for
 from .filters import thin_events as thin_events
 from .recording import EventWindows as EventWindows
 from .surface import iter_time_surfaces as iter_time_surfaces

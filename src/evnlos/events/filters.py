@@ -11,6 +11,7 @@ edge is lost nor the first period of a lamp is kept; a stream is held back by th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -67,6 +68,16 @@ def crop_events(events: Events, x: int, y: int, width: int, height: int) -> Even
     return trusted_events({name: values[inside] for name, values in columns.items()}, width, height)
 
 
+def stride_for(pixels: int, enough: int) -> int:
+    """Return of which so many rows and columns one leaves about `enough` of the pixels.
+
+    Example:
+        >>> stride_for(640 * 480, 40_000)
+        3
+    """
+    return max(1, round(math.sqrt(pixels / enough)))
+
+
 def thin_events(events: Events, stride: int, first: int = 0) -> Events:
     """Return the events of every so many rows and columns, on a sensor of these pixels alone.
 
@@ -82,8 +93,8 @@ def thin_events(events: Events, stride: int, first: int = 0) -> Events:
     """
     row, column = (along.astype(np.int64) - first for along in (events.y, events.x))
     kept = (row % stride == 0) & (column % stride == 0) & (row >= 0) & (column >= 0)
-    columns = {**events.columns(), "x": (column // stride).astype(np.uint16)}
-    columns["y"] = (row // stride).astype(np.uint16)
+    moved = {"x": (column // stride).astype(np.uint16), "y": (row // stride).astype(np.uint16)}
+    columns = events.columns() | moved
     height, width = (max(0, -(-(side - first) // stride)) for side in events.shape)
     return trusted_events({name: values[kept] for name, values in columns.items()}, width, height)
 

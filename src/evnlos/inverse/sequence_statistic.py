@@ -183,10 +183,9 @@ class EventSolver:
         shares = np.minimum(np.arange(_FIRST_STEPS) / _ANNEALED, 1.0)
         noises = self.settings.first_noise ** (1 - shares) * last**shares
         for stride, solver in self._coarse:
-            part = record.of_pixels((row % stride == 0) & (column % stride == 0))
-            row_there, column_there = np.divmod(part.pixel, events.width)
-            number = row_there // stride * solver.light.shape[1] + column_there // stride
-            solver.improve(replace(part, pixel=number), unknown, noises)
+            kept = (row % stride == 0) & (column % stride == 0)
+            number = row[kept] // stride * solver.light.shape[1] + column[kept] // stride
+            solver.improve(replace(record.of_pixels(kept), pixel=number), unknown, noises)
             noises = noises[-1:]
         return self.improve(record, unknown, noises)
 
