@@ -6,13 +6,17 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from threadpoolctl import threadpool_info
 
+from evnlos.cli import VERBS, main
 from evnlos.data.pool import run_in_order, run_tasks
 from evnlos.errors import ConfigError
 from evnlos.machine import cores, undisturbed
@@ -121,6 +125,20 @@ def test_ctrl_c_waits_for_work_that_must_not_break_off() -> None:
     assert done == ["work"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+class _HalfMade:
+    """What fails as it goes where a signal left it half made, as handles of C libraries do."""
+
+    def __init__(self, begun: Path) -> None:
+        begun.touch()
+        until = time.monotonic() + 30.0
+        while time.monotonic() < until:
+            pass
+        self.handle = 1
+
+    def __del__(self) -> None:
+        del self.handle
+
+
 class _Freed:
     """What frees itself slowly, where Python lets no exception out."""
 
@@ -134,6 +152,11 @@ class _Freed:
             pass
 
 
+def _make(begun: Path | None) -> None:
+    if begun is not None:
+        _HalfMade(begun)
+
+
 def _free(begun: Path | None) -> None:
     if begun is not None:
         one = _Freed(begun)
@@ -141,10 +164,10 @@ def _free(begun: Path | None) -> None:
         time.sleep(60)
 
 
-def _leave_pool(folder: Path) -> None:
-    """Leave a pool while its tasks free something."""
+def _leave_pool(folder: Path, work: Callable[[Path | None], None]) -> None:
+    """Leave a pool while its tasks make or free something."""
     tasks = [folder / "0", folder / "1"]
-    pool = run_tasks(_free, [None, *tasks], 2)
+    pool = run_tasks(work, [None, *tasks], 2)
     next(pool)
     while not all(task.exists() for task in tasks):
         time.sleep(0.01)
@@ -154,10 +177,39 @@ def _leave_pool(folder: Path) -> None:
     assert not multiprocessing.active_children()
 
 
+def _interrupted_command(folder: Path) -> None:
+    """Run a command that makes something when Ctrl-C comes."""
+    doctor = SimpleNamespace(run=lambda: _HalfMade(folder / "begun"))
+    sys.modules["evnlos.cli.toy"] = SimpleNamespace(Doctor=lambda json: doctor)  # type: ignore[assignment]
+    VERBS["doctor"] = "toy.Doctor"
+
+    def interrupt() -> None:
+        while not (folder / "begun").exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=interrupt, daemon=True).start()
+    main(["doctor"])
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows ends processes without a signal")
-def test_a_worker_that_is_struck_while_it_frees_something_ends_in_silence(tmp_path: Path) -> None:
+def test_a_command_that_is_interrupted_while_it_makes_something_ends_in_one_line(tmp_path: Path) -> None:
     code = (
-        f"from test_threads import _leave_pool; from pathlib import Path; _leave_pool(Path({str(tmp_path)!r}))"
+        f"import test_threads as t; from pathlib import Path; t._interrupted_command(Path({str(tmp_path)!r}))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 130
+    assert ended.stderr == "evnlos doctor: interrupted; run the same command again to go on\n"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows ends processes without a signal")
+@pytest.mark.parametrize("work", ["_make", "_free"])
+def test_a_worker_that_is_struck_while_it_makes_or_frees_something_ends_in_silence(work, tmp_path) -> None:
+    code = (
+        f"import test_threads as t; from pathlib import Path; t._leave_pool(Path({str(tmp_path)!r}), t.{work})"
     )
     ended = subprocess.run(
         [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60

@@ -14,6 +14,7 @@ import re
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
@@ -116,11 +117,10 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt as stop:
         _end(verb, signal.SIGTERM if isinstance(stop, _Terminated) else signal.SIGINT)
     except Exception as error:
+        LOG.debug("where the error came from", exc_info=True)
         if wishes:  # a library that was interrupted while it was imported says so in its own way
-            LOG.debug("where the error came from", exc_info=True)
             _end(verb, wishes[-1])
         if isinstance(error, EvnlosError):
-            LOG.debug("where the error came from", exc_info=True)
             print(f"evnlos {verb}: error: {error}", file=sys.stderr)
             sys.exit(2)
         fault = fault_behind(error)
@@ -132,7 +132,6 @@ def main(argv: list[str] | None = None) -> None:
             text = f"{error}; nothing half-written was left"
         else:
             raise
-        LOG.debug("where the error came from", exc_info=True)
         print(f"evnlos {verb}: error: {printable(text)}", file=sys.stderr)
         sys.exit(2)
 
@@ -184,8 +183,9 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
     """Raise `KeyboardInterrupt` at Ctrl-C and `_Terminated` at SIGTERM, so that workers end and part files go.
 
     What is raised in a callback of the interpreter (`__del__`, a weak reference's) is lost there: then the
-    signal is sent again a moment later. A signal that is ignored (Ctrl-C in the background of a script) or that
-    somebody else handles stays so.
+    signal is sent again a moment later. Objects that the signal left half made, and that fail as they go, are
+    told to the log alone. A signal that is ignored (Ctrl-C in the background of a script) or that somebody else
+    handles stays so.
 
     Args:
         wishes: Each signal that comes is appended.
@@ -196,17 +196,18 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
         raise _Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
     def lost(what: sys.UnraisableHookArgs) -> None:
-        if not (wishes and issubclass(what.exc_type, KeyboardInterrupt)):
+        if not wishes:
             hook(what)
-            return
-        again = threading.Timer(0.02, os.kill, (os.getpid(), wishes[-1]))
-        again.daemon = True
-        again.start()
+        elif issubclass(what.exc_type, KeyboardInterrupt):
+            again = threading.Timer(0.02, os.kill, (os.getpid(), wishes[-1]))
+            again.daemon = True
+            again.start()
+        else:
+            LOG.debug("left half made by the signal: %r", what.object, exc_info=what.exc_value)
 
-    is_main = threading.current_thread() is threading.main_thread()
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    handlers = {number: how for number, how in usual.items() if is_main and signal.getsignal(number) is how}
-    if not handlers:
+    handlers = {number: how for number, how in usual.items() if signal.getsignal(number) is how}
+    if not handlers or threading.current_thread() is not threading.main_thread():
         yield
         return
     hook, sys.unraisablehook = sys.unraisablehook, lost
@@ -214,6 +215,9 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
         signal.signal(number, end)
     try:
         yield
+    except KeyboardInterrupt as stop:
+        traceback.clear_frames(stop.__traceback__)  # what it left half made goes while the hook listens
+        raise
     finally:
         sys.unraisablehook = hook
         for number, how in handlers.items():

@@ -170,7 +170,6 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
 def _begin() -> None:
     """Prepare a worker: one thread, an end that leaves no half-written file, and no life after its parent."""
     one_thread()
-    sys.unraisablehook = _end_anew
     signal.signal(signal.SIGTERM, _end)
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -179,13 +178,16 @@ def _begin() -> None:
 
 def _end(*_: object) -> None:
     """End the task at hand, and this worker with it."""
+    sys.unraisablehook = _end_anew
     sys.exit(128 + signal.SIGTERM)
 
 
 def _end_anew(lost: Any) -> None:
-    """End a moment later where the signal struck what lets no exception out, as a library's callback."""
+    """End a moment later where the signal struck what lets no exception out, as a library's callback.
+
+    Objects that the signal left half made may fail as they go: that is no news.
+    """
     if lost.exc_type is not SystemExit:
-        sys.__unraisablehook__(lost)
         return
     again = threading.Timer(_AGAIN_S, signal.raise_signal, (signal.SIGTERM,))
     again.daemon = True
