@@ -235,7 +235,8 @@ def test_the_draw_of_the_holdout_follows_the_seed(folders) -> None:
         ({"target": {"mask": None}}, "no known target mask"),
         ({"motion": None}, "no known motion"),
         ({"camera": {"name": "another"}}, "differ in camera"),
-        ({"setup": {"distance_m": 0.5}}, "differ in setup"),
+        ({"setup": {"distance_m": 0.5}}, "differ in setup.distance_m"),
+        ({"setup": {"rendered": {"setup": {"kind": "room"}}}}, "rendered of different setups"),
         ({"target": {"size_m": 0.05}}, "differ in target_size_m"),
     ],
 )
@@ -244,6 +245,14 @@ def test_unfit_captures_are_named(copies, change, words) -> None:
     with pytest.raises(DataError, match=words) as error:
         read_capture_set(copies)
     assert copies[1].name in str(error.value) and "\n" not in str(error.value)
+
+
+def test_captures_may_differ_in_notes(copies) -> None:
+    """A set whose rendering an older version began, and notes of the day."""
+    for copy in copies:
+        edit(copy, setup={"day": copy.name, "rendered": {"by": copy.name}})
+    fit, held = read_capture_set(copies)
+    assert sorted(fit.names + held.names) == sorted(copy.name for copy in copies)
 
 
 def test_too_few_captures_and_unknown_names(folders, copies) -> None:

@@ -240,20 +240,21 @@ def _motion(capture: Capture) -> LineMotion:
 
 
 def _check_same_setup(first: Capture, other: Capture) -> None:
-    """Refuse captures of another camera, setup or target than the first one's."""
+    """Refuse captures of another camera, setup or target than the first one's; other notes are free."""
+    notes, others = (one.info.setup | one.info.setup.get("rendered", {}) for one in (first, other))
     pairs = {
         "camera": (first.info.camera, other.info.camera),
-        "setup": (first.info.setup, other.info.setup),
+        **{f"setup.{key}": (notes.get(key), others.get(key)) for key in ("distance_m", "wall", "ambient")},
         "target_size_m": tuple(one.target.size_m if one.target else None for one in (first, other)),
         "size": (first.frames.shape[1:], other.frames.shape[1:]),
         "bit depth": (str(first.frames.dtype), str(other.frames.dtype)),
     }
+    cure = "calibrate the captures of one setup and one camera at a time"
     for what, (mine, theirs) in pairs.items():
         if mine != theirs:
-            raise DataError(
-                f"{first.name} and {other.name} differ in {what} ({mine} and {theirs}); "
-                "calibrate the captures of one setup and one camera at a time"
-            )
+            raise DataError(f"{first.name} and {other.name} differ in {what} ({mine} and {theirs}); {cure}")
+    if notes.get("setup") != others.get("setup"):
+        raise DataError(f"{first.name} and {other.name} were rendered of different setups; {cure}")
 
 
 Array = NDArray[np.float64]
