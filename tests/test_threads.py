@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,8 +18,8 @@ import torch
 from threadpoolctl import threadpool_info
 
 from evnlos.cli import VERBS, main
-from evnlos.data.pool import run_in_order, run_tasks
-from evnlos.errors import ConfigError
+from evnlos.data.pool import run_in_order, run_tasks, workers_kept
+from evnlos.errors import ConfigError, EvnlosError
 from evnlos.machine import cores, undisturbed
 
 
@@ -216,3 +217,45 @@ def test_a_worker_that_is_struck_while_it_makes_or_frees_something_ends_in_silen
     )
     assert ended.returncode == 0, ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def _process(_: int) -> int:
+    return os.getpid()
+
+
+def _end(number: int) -> int:
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()
+
+
+def test_processes_that_are_kept_serve_the_next_call_and_end_with_the_block() -> None:
+    with workers_kept():
+        first = set(run_tasks(_process, range(6), 2))
+        with workers_kept():  # an experiment within a demo
+            second = set(run_tasks(_process, range(6), 2))
+        assert first & second  # of two, one may have done all of a call
+        with pytest.raises(EvnlosError, match="died 3 times"):
+            list(run_tasks(_end, [0, 1], 2))
+        assert set(run_tasks(_process, range(6), 2)).isdisjoint(first | second)  # a broken pool is not kept
+        assert multiprocessing.active_children()
+    assert not multiprocessing.active_children()
+    assert set(run_tasks(_process, range(2), 2)) and not multiprocessing.active_children()
+
+
+def test_no_more_tasks_run_at_a_time_than_asked_for_among_kept_processes(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("evnlos.data.pool.cores", lambda: 4)
+    with workers_kept():
+        list(run_tasks(_process, range(4), 4))
+        at_once = list(run_tasks(partial(_beside, tmp_path), range(6), 2))
+    assert 1 <= max(at_once) <= 2
+
+
+def _beside(folder: Path, number: int) -> int:
+    """Return how many run at a time."""
+    mine = folder / str(number)
+    mine.touch()
+    time.sleep(0.2)
+    count = len(list(folder.iterdir()))
+    mine.unlink()
+    return count

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in, character_of
+from evnlos.data.pool import workers_kept
 from evnlos.errors import CalibrationError, ConfigError, UnknownNameError
 from evnlos.machine import ProgressBars
 from evnlos.types import OutFolder
@@ -95,6 +96,7 @@ def sequence_network(width: int = 32) -> SequenceConfig:
     return SequenceConfig(width=width, rank=256, ridge_multipliers=(0.001, 0.01, 0.1, 1.0))
 
 
+@workers_kept()
 def run_demo(settings: Demo) -> Path:
     """Run the main job, or what is left of it, and return the path of the report.
 

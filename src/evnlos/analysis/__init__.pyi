@@ -12,7 +12,6 @@ from .evaluate import CHECKS as CHECKS
 from .evaluate import Evaluation as Evaluation
 from .evaluate import assess as assess
 from .evaluate import check_sampling as check_sampling
-from .evaluate import confusion as confusion
 from .evaluate import evaluate as evaluate
 from .evaluate import reconstruct as reconstruct
 from .identify import Identification as Identification
@@ -26,5 +25,6 @@ from .model import curve_over_positions as curve_over_positions
 from .model import load_model as load_model
 from .scores import Scores as Scores
 from .scores import available_lpips as available_lpips
+from .scores import confusion as confusion
 from .scores import load_lpips as load_lpips
 from .scores import score as score

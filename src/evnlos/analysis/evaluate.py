@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evnlos.analysis.confidence import ConfidenceCheck, check_confidence
-from evnlos.analysis.scores import CHARACTERS, Perceptual, Scores, read_characters, score
+from evnlos.analysis.scores import CHARACTERS, Perceptual, Scores, read_characters, score, score_once
 from evnlos.config import to_dict
 from evnlos.data import Dataset, Modality, NlosDataset, Sampling, character_of, read_shard, read_shard_index
 from evnlos.errors import DataError
@@ -30,8 +30,8 @@ from evnlos.setups.files import same_setup
 from evnlos.types import Plane
 
 _TOGETHER = 128  # samples compared at a time
+_MOST_KEPT_BYTES = 1 << 26  # of what training objects would have shown, for the next network
 _SMALLEST = 1e-3
-_MOST_NAMED = 8  # of what is taken for something else
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,39 +74,70 @@ def compare_with_training(
     Raises:
         DataError: The dataset has no training objects, or a shard is damaged.
     """
-    rows, pitch_m = dataset.sampling.scored, dataset.sampling.pitch_m
-    names = dataset.objects("train")
+    names, rows = dataset.objects("train"), dataset.sampling.scored
+    changed = tuple(dataset.shard(n).stat().st_mtime_ns for n in (*names, *dataset.objects(split)))
+    key = (dataset.folder, dataset.config_hash, samples.modality.name, changed)
+    if key not in _SHOWN:
+        _SHOWN.clear()
+        _SHOWN[key] = _shown(samples, dataset, split)
+    shown, truth = _SHOWN[key], samples.truth[:, rows].float()
+    if shown is None:
+        return None
+    closest_db = torch.full((len(images),), -torch.inf)
+    for part, moved in shown.moved or _moved(dataset, shown.nearest_of):
+        closest_db[part] = torch.maximum(closest_db[part], psnr(images[part], moved))
+    return Comparison(shown.nearest, shown.placed, (psnr(images, truth) > closest_db).numpy())
+
+
+class _Shown(NamedTuple):
+    """What of a comparison is the same for all images of a split; `moved` where it is small."""
+
+    nearest: Tensor
+    placed: Tensor
+    nearest_of: list[tuple[Tensor, Tensor]]
+    moved: list[tuple[Tensor, Tensor]]
+
+
+_SHOWN: dict[tuple, _Shown | None] = {}  # of the last dataset
+
+
+def _moved(dataset: Dataset, nearest_of: list[tuple[Tensor, Tensor]]) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield numbers of samples, and what each training object would have shown there, [n, H, W]."""
+    for name, (step, away_m) in zip(dataset.objects("train"), nearest_of, strict=True):
+        true = _read(dataset, name)[1]
+        for part in torch.arange(len(step)).split(_TOGETHER):
+            moved = _shifted(true[step[part]], away_m[part] / dataset.sampling.pitch_m)
+            yield part, moved[:, dataset.sampling.scored]
+
+
+def _shown(samples: NlosDataset, dataset: Dataset, split: str) -> _Shown | None:
+    names, rows = dataset.objects("train"), dataset.sampling.scored
     tested = [read_shard_index(dataset.shard(name)).position_m for name in dataset.objects(split)]
-    known = [read_shard_index(dataset.shard(name)).position_m for name in names]
-    if any(where is None for where in (*tested, *known)):
+    known = [where for name in names if (where := read_shard_index(dataset.shard(name)).position_m) is not None]
+    if any(where is None for where in tested) or len(known) < len(names):
         return None
     at_m = np.concatenate([where for where in tested if where is not None])  # [N, 2]
-    nearest_of = [_nearest(where, at_m) for where in known if where is not None]
-    parts = [slice(first, first + _TOGETHER) for first in range(0, len(images), _TOGETHER)]
-    truth, spread = samples.truth[:, rows].float(), _Spread(samples.modality)
-    closest_db = torch.full((len(images),), -torch.inf)
+    nearest_of = [_nearest(where, at_m) for where in known]
+    spread, count = _Spread(samples.modality), len(at_m)
     target = torch.zeros(SIDE, SIDE)  # mean of the training objects
-    difference = torch.empty(len(names), len(images), samples.modality.channels)  # mean squares, [G, N, C]
-    for number, (name, (step, away_m)) in enumerate(zip(names, nearest_of, strict=True)):
+    difference = torch.empty(len(names), count, samples.modality.channels)  # mean squares, [G, N, C]
+    for number, (name, (step, _), seen_m) in enumerate(zip(names, nearest_of, known, strict=True)):
         inputs, true = _read(dataset, name, samples.modality)
-        seen_m = known[number]
-        assert seen_m is not None
         target += on_target_plane(true, dataset.sampling.canvas, seen_m).mean(dim=(0, 1)) / len(names)
-        for part in parts:
+        for part in torch.arange(count).split(_TOGETHER):
             seen = inputs[step[part]]
             spread.add(seen)
             difference[number, part] = (seen - samples.inputs[part].float()).square().mean(dim=(2, 3))
-            moved = _shifted(true[step[part]], away_m[part] / pitch_m)[:, rows]
-            closest_db[part] = torch.maximum(closest_db[part], psnr(images[part], moved))
     owner = (difference / spread.per_channel().square()).sum(dim=2).argmin(dim=0)  # [N]
-    nearest = torch.empty_like(truth)
+    nearest = torch.empty_like(samples.truth[:, rows].float())
     for number in owner.unique().tolist():
         step, away_m = nearest_of[number]
-        _, true = _read(dataset, names[number], samples.modality)
+        true = _read(dataset, names[number])[1]
         for chosen in torch.nonzero(owner == number)[:, 0].split(_TOGETHER):
-            nearest[chosen] = _shifted(true[step[chosen]], away_m[chosen] / pitch_m)[:, rows]
+            nearest[chosen] = _shifted(true[step[chosen]], away_m[chosen] / dataset.sampling.pitch_m)[:, rows]
     placed = on_canvas(target, dataset.sampling.canvas, at_m)[:, rows].contiguous()
-    return Comparison(nearest, placed, (psnr(images, truth) > closest_db).numpy())
+    small = len(names) * nearest.nbytes <= _MOST_KEPT_BYTES
+    return _Shown(nearest, placed, nearest_of, list(_moved(dataset, nearest_of)) if small else [])
 
 
 class _Spread:
@@ -140,14 +171,14 @@ def _nearest(known_m: NDArray[np.float64], at_m: NDArray[np.float64]) -> tuple[T
     return torch.from_numpy(step), torch.from_numpy(away[np.arange(len(step)), step])
 
 
-def _read(dataset: Dataset, name: str, modality: Modality) -> tuple[Tensor, Tensor]:
-    """Return inputs [K, C, H, W] and true images [K, H, W] of a training object, float32."""
+def _read(dataset: Dataset, name: str, modality: Modality | None = None) -> tuple[Tensor, Tensor]:
+    """Return inputs [K, C, H, W] of a training object (none without a modality), and true images [K, H, W]."""
     samples, _ = read_shard(dataset.shard(name))
     if samples.truth is None:
-        raise DataError(
-            f"{dataset.shard(name)} has no truth (unknown target or motion), and {name} is learned from"
-        )
-    return modality.inputs(samples.frame, samples.surface), torch.from_numpy(samples.truth)
+        lacks = "has no truth (unknown target or motion)"
+        raise DataError(f"{dataset.shard(name)} {lacks}, and {name} is learned from")
+    inputs = torch.empty(0) if modality is None else modality.inputs(samples.frame, samples.surface)
+    return inputs, torch.from_numpy(samples.truth)
 
 
 def _shifted(images: Tensor, shift_px: Tensor) -> Tensor:
@@ -300,7 +331,7 @@ def assess(
     if learned and (found := compare_with_training(images, samples, dataset, split)) is not None:
         blank |= {"placed": found.placed, "nearest": found.nearest}
         checks["nearer_to_truth"] = round(float(found.nearer_to_truth.mean()), 4)
-    baselines = {name: score(image, truth, perceptual) for name, image in blank.items()}
+    baselines = {name: score_once(image, truth, perceptual) for name, image in blank.items()}
     scores = score(images, truth, perceptual)
     return Evaluation(images, truth, samples.names, scores, baselines, checks, read_as)
 
@@ -323,27 +354,6 @@ def _reading(
     for (name, character), count in Counter(zip(names.tolist(), named, strict=True)).most_common():
         read_as.setdefault(name, {})[character] = count
     return found, read_as
-
-
-def confusion(seen: Sequence[dict[str, dict[str, int]]]) -> str:
-    """Return what the reader takes for something else, the most first, as "G as C 12 %"; shares of each object.
-
-    Args:
-        seen: As `Record.read_as`, of one or several records.
-    """
-    counts: dict[str, Counter[str]] = defaultdict(Counter)
-    for one in seen:
-        for name, read in one.items():
-            counts[character_of(name)].update(read)
-    wrong = [
-        (count / read.total(), f"{true} as {character}")
-        for true, read in counts.items()
-        for character, count in read.items()
-        if character != true
-    ]
-    wrong.sort(key=lambda pair: -pair[0])
-    more = [f"{len(wrong) - _MOST_NAMED} more"] if len(wrong) > _MOST_NAMED else []
-    return ", ".join([f"{words} {share:.0%}" for share, words in wrong[:_MOST_NAMED]] + more)
 
 
 def reconstruct(

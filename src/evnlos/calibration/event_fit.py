@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from evnlos.calibration.event_statistics import (
 from evnlos.calibration.transport_fit import forward_jacobian, levenberg_marquardt
 from evnlos.cameras import EventPixel, PixelSettings
 from evnlos.data import read_capture
+from evnlos.data.pool import run_in_order
 from evnlos.errors import ConfigError
 from evnlos.inverse.event_images import (
     EVENT_ERRORS,
@@ -278,8 +280,36 @@ def shortest_interval_s(events: Sequence[Events], share: float = 1e-3) -> float:
     return float(np.quantile(every, share)) * 1e-6 if len(every) else math.inf
 
 
+@dataclass(frozen=True)
+class _Solved:
+    """What the events of a capture say, and its target."""
+
+    name: str
+    statistic: EventStatistic
+    prior: PatternPrior
+    truth: NDArray[np.float32]
+
+
+def _solve(setup: str, folder: Path) -> _Solved | None:
+    """Solve the events of a capture; None where it has none, or its target or motion is not known.
+
+    Raises:
+        ConfigError: No law of the setup's event model is known.
+    """
+    capture = read_capture(folder, needs_frames=False)
+    target = capture.target
+    if not capture.has_events or capture.motion is None or target is None or capture.several is not None:
+        return None
+    statistic, prior, _ = event_statistic(capture.events, capture.frame_times_us, capture.motion, setup)
+    return _Solved(capture.name, statistic, prior, target.rasterise(prior.target_plane))
+
+
 def write_event_errors(
-    setup: Path, captures: Iterable[Path], names: Collection[str], progress: Progress = silent
+    setup: Path,
+    captures: Iterable[Path],
+    names: Collection[str],
+    progress: Progress = silent,
+    workers: int = 1,
 ) -> EventErrors | None:
     """Find what captures with known targets show of the errors of a setup's events, and write it to its folder.
 
@@ -294,6 +324,7 @@ def write_event_errors(
         names: Names of the captures that the setup was calibrated with; of more than 16 every so many are
             taken. Those without events, of unknown or several targets, or of unknown motion, are passed over.
         progress: Called as the captures are read.
+        workers: Processes that solve the captures; 0 is one for each core.
 
     Returns:
         The errors; None, and no file is there, where captures do not gain from them, none shows them, or no law
@@ -301,34 +332,29 @@ def write_event_errors(
     """
     learned = [folder for folder in captures if folder.resolve().name in names]
     learned = learned[:: max(1, -(-len(learned) // _MOST_CAPTURES))]
-    found, statistics, truths, scores = list[str](), list[EventStatistic](), [], []
     (setup / EVENT_ERRORS_FILE).unlink(missing_ok=True)
-    prior: PatternPrior | None = None
-    what = "errors of the events"
-    for number, folder in enumerate(learned):
-        progress(Step(what, number, len(learned), "captures"))
-        capture = read_capture(folder, needs_frames=False)
-        target = capture.target
-        if not capture.has_events or capture.motion is None or target is None or capture.several is not None:
-            continue
-        try:
-            statistic, prior, _ = event_statistic(
-                capture.events, capture.frame_times_us, capture.motion, str(setup)
-            )
-        except ConfigError:
-            return None
-        truths.append(target.rasterise(prior.target_plane))
-        found.append(capture.name)
-        statistics.append(statistic)
-        scores.append(statistic.score - statistic.information @ prior.coefficients(truths[-1]))
-    progress(Step(what, len(learned), len(learned), "captures"))
-    if prior is None:
+    what, solved = "errors of the events", list[_Solved]()
+    progress(Step(what, 0, len(learned), "captures"))
+    try:
+        found = run_in_order(partial(_solve, str(setup)), learned, workers)
+        for done, one in enumerate(found, start=1):
+            solved += [one] if one else []
+            progress(Step(what, done, len(learned), "captures"))
+    except ConfigError:
         return None
+    if not solved:
+        return None
+    prior = solved[0].prior
+    statistics, truths = [one.statistic for one in solved], [one.truth for one in solved]
+    scores = [
+        one.score - one.information @ prior.coefficients(truth)
+        for one, truth in zip(statistics, truths, strict=True)
+    ]
     tensors = {
         "scores": torch.from_numpy(np.stack(scores)).float(),
         "information": torch.from_numpy(np.mean([one.information for one in statistics], axis=0)).float(),
     }
-    errors = EventErrors(AboutErrors(tuple(found)), **tensors)
+    errors = EventErrors(AboutErrors(tuple(one.name for one in solved)), **tensors)
     about = replace(errors.about, gain_db=errors.gain_db(statistics, prior, truths))
     if about.gain_db < _LEAST_GAIN_DB:
         return None

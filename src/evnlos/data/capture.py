@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,16 +20,17 @@ from evnlos.data.capture_info import CaptureInfo, FilterInfo, inside, read_captu
 from evnlos.data.clocks import find_offset
 from evnlos.data.fixed_pattern import FixedPattern, mapped, prepare_frames, used_pixels
 from evnlos.data.frames import read_frame_series
+from evnlos.data.pool import run_tasks
 from evnlos.data.sampling import (
     Samples,
     Sampling,
-    character_of,
     iter_samples,
     join_samples,
     line_of,
     noted_distance_m,
     read_others,
     read_target,
+    split_of,
     time_steps,
 )
 from evnlos.data.store import Dataset, claim_dataset, write_shard
@@ -311,6 +313,7 @@ def import_captures(
     frames_topic: str | None = None,
     look: Callable[[Capture], None] | None = None,
     progress: Progress = silent,
+    workers: int = 1,
 ) -> Dataset:
     """Import capture folders as a dataset, or what is missing of it, and return it.
 
@@ -327,6 +330,7 @@ def import_captures(
         look: Called with each capture that was read, before its samples are made: to tell of it, or to draw it.
             Its frames are a `FrameStack` where they take more than 64 MiB.
         progress: Called when the work begins and as each shard is in place, with the capture's name.
+        workers: Processes, 0 is one for each core; where `look` is given, this one.
 
     Returns:
         The dataset.
@@ -337,7 +341,7 @@ def import_captures(
     paths = by_name([Path(folder).resolve() for folder in folders])
     if not paths:
         raise DataError("no captures given; name at least one capture folder")
-    split = _split(list(paths), list(test), list(validation))
+    split = split_of(list(paths), list(test), list(validation))
     # Read every description first: a wrong folder is an error before anything is written.
     for path in paths.values():
         if not path.exists():
@@ -353,38 +357,36 @@ def import_captures(
     lacks = {n: kind for n, one in infos.items() for kind in ("frames", "events") if not getattr(one, kind)}
     config |= {"lacks": lacks} if lacks else {}
     dataset = Dataset(Path(out), "captures", sampling, split, config=config, config_hash=config_hash(sampling))
-    first = next(iter(paths.values()))
-    captures: dict[str, Capture] = {_name_of(first): read(first)}
     with claim_dataset(dataset):
         what, total, missing = f"import {dataset.folder.name}", len(paths), dataset.missing()
         progress(Step(what, total - len(missing), total, "captures"))
-        for done, name in enumerate(missing, start=total - len(missing) + 1):
-            capture = captures.pop(name, None) or read(paths[name])
-            if look is not None:
-                look(capture)
-            samples = _samples_of(capture, sampling, pattern)
-            attributes = {
-                "object": name,
-                "config_hash": dataset.config_hash,
-                "camera": capture.info.camera.name,
-            }
-            write_shard(dataset.shard(name), samples, attributes, count=len(capture.frames) - 1)
-            progress(Step(what, done, total, "captures", name))
+        write = partial(_write, dataset, pattern, read, look)
+        todo = [paths[name] for name in missing]
+        with closing(run_tasks(write, todo, 1 if look else workers)) as written:
+            for done, name in enumerate(written, start=total - len(missing) + 1):
+                progress(Step(what, done, total, "captures", name))
     return dataset
 
 
-def _split(names: list[str], test: list[str], validation: list[str]) -> dict[str, list[str]]:
-    split: dict[str, list[str]] = {"train": [], "validation": [], "test": []}
-    for wanted in (*test, *validation):
-        if not any(wanted in (name, character_of(name)) for name in names):
-            raise DataError(f"no capture is named {wanted} or shows it; held-out names must be among them")
-    for name in names:
-        keys = {name, character_of(name)}
-        in_test, in_validation = bool(keys & set(test)), bool(keys & set(validation))
-        if in_test and in_validation:
-            raise DataError(f"{name} is held out for testing and for validation; choose one")
-        split["test" if in_test else "validation" if in_validation else "train"].append(name)
-    return split
+def _write(
+    dataset: Dataset,
+    pattern: FixedPattern | None,
+    read: Callable[[Path], Capture],
+    look: Callable[[Capture], None] | None,
+    path: Path,
+) -> str:
+    """Write the shard of a capture and return its name."""
+    capture = read(path)
+    if look is not None:
+        look(capture)
+    samples = _samples_of(capture, dataset.sampling, pattern)
+    attributes = {
+        "object": capture.name,
+        "config_hash": dataset.config_hash,
+        "camera": capture.info.camera.name,
+    }
+    write_shard(dataset.shard(capture.name), samples, attributes, count=len(capture.frames) - 1)
+    return capture.name
 
 
 def _digest_of(info: CaptureInfo) -> str:

@@ -76,18 +76,18 @@ def run_tasks(
     after = after or [()] * len(pending)
     while left:
         flying: dict[Future, int] = {}
-        with _workers(workers) as pool:
-            try:
-                yield from _drain(pool, function, pending, left, after, flying, workers)
-            except BrokenProcessPool:
-                # The pool can't say which task killed the worker: all that were in flight get a try more.
-                for i in flying.values():
-                    tries[i] += 1
-                if max(tries) >= _TRIES:
-                    raise EvnlosError(
-                        f"a worker process died {_TRIES} times (killed, or out of memory?); "
-                        "run again with fewer at a time (--workers, --trainings): what is finished is kept"
-                    ) from None
+        try:
+            with _workers(workers) as (pool, ahead):
+                yield from _drain(pool, function, pending, left, after, flying, ahead)
+        except BrokenProcessPool:
+            # The pool can't say which task killed the worker: all that were in flight get a try more.
+            for i in flying.values():
+                tries[i] += 1
+            if max(tries) >= _TRIES:
+                raise EvnlosError(
+                    f"a worker process died {_TRIES} times (killed, or out of memory?); "
+                    "run again with fewer at a time (--workers, --trainings): what is finished is kept"
+                ) from None
 
 
 def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
@@ -107,19 +107,38 @@ def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], work
     if workers <= 1:
         yield from _run_here(function, pending)
         return
-    with _workers(workers) as pool:
-        try:
+    try:
+        with _workers(workers) as (pool, ahead):
             flying: deque[Future] = deque()
             for task in pending:
                 flying.append(pool.submit(function, task))
-                if len(flying) >= 2 * workers:
+                if len(flying) >= ahead:
                     yield flying.popleft().result()
             while flying:
                 yield flying.popleft().result()
-        except BrokenProcessPool:
-            raise EvnlosError(
-                "a worker process died (killed, or out of memory?); run the command again with fewer --workers"
-            ) from None
+    except BrokenProcessPool:
+        raise EvnlosError(
+            "a worker process died (killed, or out of memory?); run the command again with fewer --workers"
+        ) from None
+
+
+@contextmanager
+def workers_kept() -> Iterator[None]:
+    """Let the processes of one call within the block serve the next, with what they have imported and prepared.
+
+    They are one for each core; calls that ask for more have their own, and so have calls within others.
+    """
+    global _kept
+    if _kept is not None:
+        yield
+        return
+    _kept = []
+    try:
+        yield
+    finally:
+        at_rest, _kept = _kept, None
+        for one in at_rest:
+            one.end()
 
 
 class _Worker(SpawnProcess):
@@ -144,19 +163,17 @@ class _Workers(SpawnContext):
         return self.started[-1]
 
 
-@contextmanager
-def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Give a pool whose processes end with the block, at once where it is left early, and with this process.
+class _Pool:
+    """A pool of processes. They don't hear Ctrl-C, which a terminal sends to all: this process ends them."""
 
-    They don't hear Ctrl-C, which a terminal sends to all: this process ends them, also those that still start.
-    """
-    pool = ProcessPoolExecutor(count, context := _Workers(), _begin)
-    try:
-        yield pool
-        pool.shutdown()
-    except BaseException:
-        running = context.started
-        pool.shutdown(wait=False, cancel_futures=True)
+    def __init__(self, count: int) -> None:
+        self.count, self._context = count, _Workers()
+        self.executor = ProcessPoolExecutor(count, self._context, _begin)
+
+    def end(self) -> None:
+        """End the processes, also those that still start; what they are at is broken off."""
+        running = self._context.started
+        self.executor.shutdown(wait=False, cancel_futures=True)
         until = time.monotonic() + _GRACE_S
         while time.monotonic() < until and (running := [one for one in running if one.is_alive()]):
             for process in running:  # again and again: a task in the queue may begin after the first time
@@ -164,7 +181,29 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
             wait_for([process.sentinel for process in running], _GRACE_S / 20)
         for process in running:
             process.kill()
+
+
+_kept: list[_Pool] | None = None  # those at rest; None: each ends with the call that it is for
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[tuple[ProcessPoolExecutor, int]]:
+    """Give a pool for so many tasks at a time, and how many may be in flight; it ends with the block.
+
+    It ends at once where the block is left early. Within `workers_kept` it goes on to the next block otherwise,
+    and may have more processes: then no task waits in its queue, where an idle one would take it.
+    """
+    keeps = _kept is not None and count <= cores()
+    pool = _kept.pop() if keeps and _kept else _Pool(cores() if keeps else count)
+    try:
+        yield pool.executor, 2 * count if pool.count == count else count
+    except BaseException:
+        pool.end()
         raise
+    if keeps and _kept is not None:
+        _kept.append(pool)
+    else:
+        pool.executor.shutdown()
 
 
 def _begin() -> None:
@@ -224,12 +263,12 @@ def _drain(
     left: set[int],
     after: Sequence[Collection[int]],
     flying: dict[Future, int],
-    workers: int,
+    ahead: int,
 ) -> Iterator[Result]:
-    """Keep twice as many tasks in flight as there are workers, so that memory stays bounded."""
+    """Keep so many tasks in flight, so that memory stays bounded."""
     queue = sorted(left)
     while queue or flying:
-        for i in [i for i in queue if left.isdisjoint(after[i])][: 2 * workers - len(flying)]:
+        for i in [i for i in queue if left.isdisjoint(after[i])][: ahead - len(flying)]:
             flying[pool.submit(function, tasks[i])] = i
             queue.remove(i)
         done, _ = wait(flying, return_when=FIRST_COMPLETED)

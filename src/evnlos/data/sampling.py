@@ -298,6 +298,25 @@ def time_steps(folder: Path, info: CaptureInfo, events: Events) -> tuple[NDArray
     return np.broadcast_to(np.uint8(0), (len(times_us), *events.shape)), times_us
 
 
+def split_of(names: list[str], test: list[str], validation: list[str]) -> dict[str, list[str]]:
+    """Return which captures are learned from, and which are held out, by name or character.
+
+    Raises:
+        DataError: A held-out name that no capture has, or one that is held out twice.
+    """
+    split: dict[str, list[str]] = {"train": [], "validation": [], "test": []}
+    for wanted in (*test, *validation):
+        if not any(wanted in (name, character_of(name)) for name in names):
+            raise DataError(f"no capture is named {wanted} or shows it; held-out names must be among them")
+    for name in names:
+        keys = {name, character_of(name)}
+        in_test, in_validation = bool(keys & set(test)), bool(keys & set(validation))
+        if in_test and in_validation:
+            raise DataError(f"{name} is held out for testing and for validation; choose one")
+        split["test" if in_test else "validation" if in_validation else "train"].append(name)
+    return split
+
+
 def character_of(name: str) -> str:
     """Return what an object shows, from its name: the part behind the last underscore.
 

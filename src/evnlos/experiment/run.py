@@ -20,7 +20,7 @@ import torch
 from evnlos.calibration import SetupFit, fit_setup, rows_of, write_setup
 from evnlos.config import config_hash, load_yaml, to_dict
 from evnlos.data import Dataset, Simulation, as_modality, import_captures, load_pattern, simulate
-from evnlos.data.pool import processes, run_tasks
+from evnlos.data.pool import processes, run_tasks, workers_kept
 from evnlos.data.sampling import character_of
 from evnlos.data.simulations import default, randomized
 from evnlos.errors import CalibrationError, ConfigError, DataError, MissingDependencyError
@@ -82,6 +82,7 @@ def run_study(study: Study, place: Place, progress: Progress = silent) -> list[R
     return run_studies((study,), place, progress)
 
 
+@workers_kept()
 def run_studies(studies: Sequence[Study], place: Place, progress: Progress = silent) -> list[Record]:
     """Run what is not done yet of several studies, as the folds of one; otherwise as `run_study`.
 
@@ -131,7 +132,7 @@ def _prepared(study: Study, place: Place, progress: Progress) -> list[_Network]:
             if sees_events and any(arm.sampling.is_solved for arm in arms):
                 from evnlos.calibration import write_event_errors  # which takes a help text longer to show
 
-                write_event_errors(setup, place.captures, fit.captures, progress)
+                write_event_errors(setup, place.captures, fit.captures, progress, place.workers)
         except DataError as error:
             raise CalibrationError(str(error)) from None
         progress(Step(f"calibrate {study.setup}", 1, 1, "setups"))
@@ -192,12 +193,11 @@ def _together(networks: list[_Network], at_a_time: int, progress: Progress) -> l
     after += [{place[run.out] for run in network.runs if run.out in place} for network in networks]
     at_once = max(1, processes(at_a_time, len(after)))
     threads = max(1, torch.get_num_threads() // at_once)
-    tasks = [partial(_trained, run, threads) for run in runs]
-    tasks += [partial(_scored, network, threads) for network in networks]
+    tasks = [*(partial(_trained, run) for run in runs), *(partial(_scored, network) for network in networks)]
     records, done, scored = list[Record](), 0, 0
     within = partial(_epochs_at_work, runs)
     progress(Step("train networks", 0, len(runs), "networks", within=within))
-    with closing(run_tasks(_called, tasks, at_once, after)) as finished:
+    with closing(run_tasks(partial(_called, threads), tasks, at_once, after)) as finished:
         for name, found in finished:
             if name:
                 done += 1
@@ -224,20 +224,24 @@ def _epochs_at_work(runs: Sequence[Run]) -> tuple[float, str]:
     return part, ", ".join(words)
 
 
-def _called(task: Callable[[], tuple[str, list[Record]]]) -> tuple[str, list[Record]]:
-    return task()
-
-
-def _trained(run: Run, threads: int) -> tuple[str, list[Record]]:
-    """Train to the end, with so many threads; return the name of the run's folder, and no record."""
+def _called(threads: int, task: Callable[[], tuple[str, list[Record]]]) -> tuple[str, list[Record]]:
+    """Call with so many threads."""
+    before = torch.get_num_threads()
     torch.set_num_threads(threads)
+    try:
+        return task()
+    finally:
+        torch.set_num_threads(before)
+
+
+def _trained(run: Run) -> tuple[str, list[Record]]:
+    """Train to the end; return the name of the run's folder, and no record."""
     train_one(run)
     return run.out.name, []
 
 
-def _scored(network: _Network, threads: int) -> tuple[str, list[Record]]:
-    """Score with so many threads; return no name, and the records."""
-    torch.set_num_threads(threads)
+def _scored(network: _Network) -> tuple[str, list[Record]]:
+    """Score; return no name, and the records."""
     return "", network.scored(silent)
 
 
@@ -305,8 +309,8 @@ def _import(study: Study, arm: Arm, place: Place, progress: Progress) -> Dataset
         }
     )
     out = place.out / "recorded" / f"{study.setup}-{key[:8]}"
-    split = {"test": held, "validation": study.validation}
-    return import_captures(chosen, out, arm.sampling, **split, pattern=pattern, progress=progress)
+    how = {"test": held, "validation": study.validation, "pattern": pattern, "workers": place.workers}
+    return import_captures(chosen, out, arm.sampling, **how, progress=progress)
 
 
 def _few(folders: list[Path], count: int, held_out: tuple[str, ...]) -> list[Path]:

@@ -211,7 +211,7 @@ class Place:
     Args:
         captures: Capture folders of the study's setup.
         out: Folder for setups, datasets, runs and records.
-        workers: Processes that simulate; 0 is one for each core.
+        workers: Processes that simulate, import and solve; 0 is one for each core.
         trainings: Networks that are trained at a time, on the cores or on one GPU; 0 is one for each core.
         force: Whether simulations begin although the machine's memory will hardly do.
 

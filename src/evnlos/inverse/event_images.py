@@ -103,7 +103,7 @@ class EventErrors:
         return EventStatistic(statistic.z, pushed @ a, pushed @ (statistic.score - root @ mean))
 
     def gain_db(
-        self, statistics: Sequence[EventStatistic], prior: PatternPrior, truths: Sequence[NDArray[np.float64]]
+        self, statistics: Sequence[EventStatistic], prior: PatternPrior, truths: Sequence[NDArray[np.floating]]
     ) -> float:
         """Return what the captures gain where each is corrected by what the others showed, decibels.
 
