@@ -11,7 +11,7 @@ import pytest
 
 from evnlos.cli import main
 from evnlos.data import CaptureInfo, open_dataset, read_capture
-from evnlos.data.capture_check import Finding, _offset, check_capture
+from evnlos.data.capture_check import Finding, _offset, check_capture, compare_clocks
 from evnlos.data.capture_info import CAMERAS, AlignmentInfo, CameraInfo, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
 from evnlos.data.lab import Lab, render_captures
@@ -284,6 +284,49 @@ def test_rates_of_false_alarms_and_of_shifts_that_are_found(shared_data, tmp_pat
         shares = sum(level != "good" for level in found), sum(level == "bad" for level in found)
         print(f"{shift_us / 1e6:g} s: not good {shares[0]}, bad {shares[1]} of {len(found)}")
         assert shares[0] >= not_good * len(found) and shares[1] >= bad * len(found)
+
+
+def beside(lags_us: list[int], info: CaptureInfo) -> list[str]:
+    """Return the levels of captures whose lags are such, as one camera took them."""
+    found = {str(n): [Finding("clock offset", "good", "", "", lag)] for n, lag in enumerate(lags_us)}
+    out = compare_clocks(found, dict.fromkeys(found, info))
+    return [one.level for several in out.values() for one in several]
+
+
+def test_a_clock_that_differs_from_the_others_is_found_beside_them(steady) -> None:
+    lags = [-38_000, -41_000, -35_000, -44_000, -40_000, -31_000, -43_000, 62_000]
+    assert beside(lags, steady.info) == ["good"] * 7 + ["bad"]
+    assert beside([*lags[:7], 10_000], steady.info) == ["good"] * 7 + ["doubtful"]
+    assert beside(lags[1:], steady.info) == ["good"] * 7  # the middle of so few tells little
+    found = {str(n): [Finding("clock offset", "good", "", "", lag)] for n, lag in enumerate(lags)}
+    infos = dict.fromkeys(found, steady.info)
+    (cured,) = compare_clocks(found, infos)["7"]
+    assert "0.10 s too early" in cured.found and "7 other captures" in cured.found
+    assert "offset_us: 102000" in cured.cure and "offset_us" not in found["7"][0].cure
+    other = replace(steady.info, camera=replace(steady.info.camera, name="another"))
+    assert compare_clocks(found, infos | {"7": other}) == found
+
+
+def test_a_tenth_of_a_second_is_found_beside_other_captures(shared_data, tmp_path) -> None:
+    """No false alarm among captures of one camera; the share of shifts that are found."""
+    sets = {name: sorted((shared_data / "captures").glob(f"{name}_*")) for name in ("near", "far")}
+    for name in ("brushed", "one-sided"):
+        words = ["lab", "--out", str(tmp_path / name), "--setup", name, "--glyphs.characters", "ABCDEFGH"]
+        main(words)
+        sets[name] = sorted((tmp_path / name).glob(f"{name}_*"))
+    for name, folders in sets.items():
+        captures = [read_capture(folder) for folder in folders]
+        lags = [one.lag_us for capture in captures for one in _offset(capture) if one.lag_us is not None]
+        assert len(lags) == len(captures)
+        assert set(beside(lags, captures[0].info)) == {"good"}, name
+        shifted = [
+            beside([*lags[:k], lags[k] + shift, *lags[k + 1 :]], captures[0].info)
+            for k in range(len(lags))
+            for shift in (-100_000, 100_000)
+        ]
+        share = sum(levels.count("good") == len(lags) - 1 for levels in shifted) / len(shifted)
+        print(f"{name}: {share:.2f} of shifts by 0.1 s found")
+        assert share >= (0.95 if name == "near" else 0.35)
 
 
 def test_frames_in_reversed_order_are_found(steady) -> None:

@@ -12,9 +12,10 @@ from PIL import Image
 
 from evnlos import EvnlosError, import_captures, open_dataset, read_capture
 from evnlos.cli import main
-from evnlos.data import Capture, FixedPattern, Sampling, check_image, read_shard
+from evnlos.data import Capture, FixedPattern, Sampling, read_shard
 from evnlos.data.frames import homography_from_points
 from evnlos.events import FrameStack, write_aedat4, write_celex_frames, write_events
+from evnlos.plot.preview import check_image
 from evnlos.types import Events
 from ros_files import IMAGE, PACKET, Cdr, Recording, Ros1, event_array, image, write_bag, write_mcap
 

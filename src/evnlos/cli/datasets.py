@@ -26,21 +26,21 @@ from evnlos.data import (
     Capture,
     Sampling,
     Simulation,
-    check_image,
     import_captures,
     load_pattern,
     randomized,
     read_capture,
     simulate,
 )
-from evnlos.data.capture_check import Finding, check_capture
-from evnlos.data.capture_info import CAMERAS, begin_capture
+from evnlos.data.capture_check import Finding, check_capture, compare_clocks
+from evnlos.data.capture_info import CAMERAS, CaptureInfo, begin_capture
 from evnlos.data.lab import Lab, compare_published, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
 from evnlos.data.simulations import PRESETS, estimate
 from evnlos.errors import ConfigError, DataError, EvnlosError, UnknownNameError
 from evnlos.files import check_folder, write_atomically
 from evnlos.machine import ProgressBars, counted
+from evnlos.plot.preview import check_image
 from evnlos.setups import load_setup
 from evnlos.setups.base import is_camera
 from evnlos.setups.load import is_name
@@ -242,11 +242,12 @@ class CaptureCommand:
     def _check(self) -> None:
         """Tell of each capture in full, or of several in a table with what is not good below it."""
         found, failed = dict[str, list[Finding]](), dict[str, str]()
+        infos = dict[str, CaptureInfo]()
         with ProgressBars() as progress:
             for folder in counted(self.folders, progress, "check", len(self.folders), "captures"):
                 try:
                     capture = read_capture(folder, needs_frames=False, needs_events=False)
-                    found[str(folder)] = check_capture(capture)
+                    found[str(folder)], infos[str(folder)] = check_capture(capture), capture.info
                 except EvnlosError as error:
                     if len(self.folders) == 1:
                         raise
@@ -254,6 +255,7 @@ class CaptureCommand:
                     continue
                 if len(self.folders) == 1 and not self.json:
                     print("\n".join(capture.notes))
+        found = compare_clocks(found, infos)
         if self.json:
             page = [
                 {"capture": Path(name).name, "findings": [asdict(one) for one in all_]}

@@ -5,7 +5,6 @@ from .capture import capture_samples as capture_samples
 from .capture import captures_in as captures_in
 from .capture import import_captures as import_captures
 from .capture import read_capture as read_capture
-from .capture_check import check_image as check_image
 from .capture_info import CaptureInfo as CaptureInfo
 from .fixed_pattern import PATTERN_FILE as PATTERN_FILE
 from .fixed_pattern import FixedPattern as FixedPattern

@@ -1,33 +1,32 @@
 """Is a capture worth a day of recordings? What was recorded, in plain words, and how to mend it.
 
-- One image per capture, for the eye: do frames and events show the same thing at the same time?
+- Of several captures by one camera: whose clocks differ from the others'?
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from evnlos.data.capture import Capture
-from evnlos.data.clocks import LEAST_AGREEMENT, find_lag
+from evnlos.data.capture_info import CaptureInfo
+from evnlos.data.clocks import FEWEST_LAGS, LEAST_AGREEMENT, beside_others, find_lag
 from evnlos.data.fixed_pattern import light_path
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
-from evnlos.events import event_histogram, find_hot_pixels, frame_blocks
+from evnlos.events import find_hot_pixels
 from evnlos.events.cleaning import find_flicker
-from evnlos.events.volume import OFF_RGB, ON_RGB
-from evnlos.types import Events
 
 Level = Literal["good", "doubtful", "bad"]
 
 _DARK_DN, _BORDER = 3, 0.08
 _BLOCK = 6  # pixels: single ones tell nothing of the light
 _FEWEST_EVENTS = 2_000
+_SURELY = 1.5  # times what is usual
 
 
 @dataclass(frozen=True)
@@ -39,12 +38,14 @@ class Finding:
         level: "good", "doubtful" (look at it) or "bad" (a reconstruction will suffer).
         found: What was measured, with its unit and the limit.
         cure: What to do; empty where nothing is to do.
+        lag_us: What to add to the frames' times, microseconds, where the clocks could be compared.
     """
 
     what: str
     level: Level
     found: str
     cure: str = ""
+    lag_us: int | None = None
 
 
 def check_capture(capture: Capture) -> list[Finding]:
@@ -281,118 +282,57 @@ def _offset(capture: Capture) -> Iterator[Finding]:
         )
         return
     way, told = "late" if lag.lag_us < 0 else "early", abs(lag.lag_us) > lag.unsure_us
-    yield _finding(
+    finding = _finding(
         "clock offset",
         abs(lag.lag_us) <= lag.limit_us,
         not told,
         f"the frames' times are {abs(lag.lag_us) * 1e-6:.2f} s too {way} for the events (up to "
         f"{lag.unsure_us * 1e-6:.2f} s cannot be told from what pixels do by themselves)",
-        _offset_cure(capture, lag.lag_us)
+        _offset_cure(capture.info, lag.lag_us)
         if told
         else "to be sure, record a blink of the light, or a trigger_channel",
     )
+    yield replace(finding, lag_us=lag.lag_us)
 
 
-def _offset_cure(capture: Capture, lag_us: int) -> str:
-    stated = capture.info.alignment.offset_us
+def compare_clocks(
+    found: Mapping[str, list[Finding]], infos: Mapping[str, CaptureInfo]
+) -> dict[str, list[Finding]]:
+    """Return the findings with the clock offset that a capture has alone among those of its camera.
+
+    A capture by itself cannot tell a tenth of a second from what its pixels do. Beside others, whose pixels do
+    the same, it can.
+
+    Args:
+        found: Findings of each capture, by name.
+        infos: What is known about each capture.
+    """
+    alike, out = defaultdict[Any, list[str]](list), dict(found)
+    lags = {name: one.lag_us for name, several in found.items() for one in several if one.lag_us is not None}
+    for name in lags:
+        motion = infos[name].motion
+        alike[infos[name].camera, motion and motion.speed_m_s].append(name)
+    for names in alike.values():
+        if len(names) < FEWEST_LAGS:
+            continue
+        away, usual = beside_others([lags[name] for name in names])
+        for name, one in zip(names, away.tolist(), strict=True):
+            if abs(one) > usual:
+                way, sure = "late" if one < 0 else "early", abs(one) > _SURELY * usual
+                alone = Finding(
+                    "clock offset",
+                    "bad" if sure else "doubtful",
+                    f"the frames' times are {abs(one) * 1e-6:.2f} s too {way} beside those of "
+                    f"{len(names) - 1} other captures by this camera ({usual * 1e-6:.2f} s is usual)",
+                    _offset_cure(infos[name], round(one)),
+                    lags[name],
+                )
+                out[name] = [alone if other.lag_us is not None else other for other in found[name]]
+    return out
+
+
+def _offset_cure(info: CaptureInfo, lag_us: int) -> str:
+    stated = info.alignment.offset_us
     if stated == "auto":
         return f"auto went astray: state offset_us in capture.yaml, what auto found {lag_us:+d}"
     return f"state alignment: {{offset_us: {stated + lag_us}}} in capture.yaml, or wire a trigger_channel"
-
-
-_PANEL_PX, _GAP_PX, _CAPTION_PX, _PLOT_PX = 320, 12, 24, 150
-_INK, _PAPER, _LINE = (40, 42, 48), (255, 255, 255), (210, 212, 216)
-_BINS = 200
-
-
-def check_image(capture: Capture) -> Image.Image:
-    """Return the frame at the busiest moment, the events of its interval, both overlaid, and curves over time.
-
-    The curves are the events per second and the mean change of the frames, each on its own scale: peaks of the
-    one should stand above peaks of the other.
-
-    Args:
-        capture: A capture that was read.
-    """
-    times = capture.frame_times_us
-    rates, centres_s = _event_rate(capture.events, times)
-    changes = _frame_changes(capture.frames if capture.has_frames else capture.frames[:, :8, :8], capture.peak)
-    edges = np.searchsorted(capture.events.t_us, times, side="right")
-    chosen = int(np.argmax(np.diff(edges))) + 1 if len(times) > 1 else 0
-    start, stop = (int(edges[chosen - 1]), int(edges[chosen])) if chosen else (0, len(capture.events))
-    grey = _stretched(capture.frames[chosen].astype(np.float32))  # [H, W], 0..1
-    tint = _events_tint(capture.events[start:stop])  # [H, W, 3], and how strong
-    white, strength = np.full((*grey.shape, 3), 255.0), tint[1][..., None]
-    pictures = [
-        (f"frame {chosen} at {times[chosen] / 1e6:.3f} s", np.repeat(255 * grey[..., None], 3, axis=2)),
-        (f"{stop - start:,} events before it", white * (1 - strength) + tint[0] * strength),
-        ("overlay", 255 * grey[..., None] * (1 - strength) + tint[0] * strength),
-    ]
-    scale = _PANEL_PX / grey.shape[1]
-    high = max(1, round(grey.shape[0] * scale))
-    width = 3 * _PANEL_PX + 4 * _GAP_PX
-    plot_top = 2 * _CAPTION_PX + high + 2 * _GAP_PX
-    sheet = Image.new("RGB", (width, plot_top + _PLOT_PX + 2 * _CAPTION_PX), _PAPER)
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
-    draw.text((_GAP_PX, 5), f"{capture.name}: {capture.info.camera.name}", _INK, font)
-    how = Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX
-    for k, (caption, picture) in enumerate(pictures):
-        left = _GAP_PX + k * (_PANEL_PX + _GAP_PX)
-        panel = Image.fromarray(np.round(picture).astype(np.uint8)).resize((_PANEL_PX, high), how)
-        sheet.paste(panel, (left, 2 * _CAPTION_PX))
-        draw.text((left, _CAPTION_PX + 4), caption, _INK, font)
-    box = (_GAP_PX, plot_top, width - _GAP_PX, plot_top + _PLOT_PX)
-    draw.rectangle(box, outline=_LINE)
-    middles_s = (times[1:] + times[:-1]) / 2e6
-    span = float(min(centres_s[0], times[0] / 1e6)), float(max(centres_s[-1], times[-1] / 1e6))
-    _curve(draw, box, span, centres_s, rates, ON_RGB)
-    _curve(draw, box, span, middles_s, changes, OFF_RGB)
-    at = box[0] + (times[chosen] / 1e6 - span[0]) / max(span[1] - span[0], 1e-9) * (box[2] - box[0])
-    draw.line((at, box[1], at, box[3]), _LINE)
-    below = box[3] + 5
-    draw.text((box[0], below), f"events per second, up to {rates.max():,.0f}", ON_RGB, font)
-    peak = f"{100 * changes.max():.2f}" if len(changes) else "0"
-    draw.text((box[0] + 260, below), f"change from frame to frame, up to {peak} % of white", OFF_RGB, font)
-    draw.text((box[2] - 170, below), f"{span[0]:.2f} s to {span[1]:.2f} s", _INK, font)
-    return sheet
-
-
-def _event_rate(events: Events, times_us: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-    """Return events per second in equal bins over events and frames, and the bins' middles in seconds."""
-    ends = np.concatenate([events.t_us[:1], events.t_us[-1:], times_us[[0, -1]]])
-    low, high = ends.min(), ends.max() + 1
-    counts, edges = np.histogram(events.t_us, _BINS, (float(low), float(high)))
-    return counts / (np.diff(edges) * 1e-6), (edges[1:] + edges[:-1]) / 2e6
-
-
-def _frame_changes(frames: NDArray, peak: float) -> NDArray[np.float64]:
-    """Return the mean absolute change from frame to frame, [N - 1], in parts of white.
-
-    Of blocks of 8 x 8 pixels: noise that is independent from pixel to pixel would hide the rest.
-    """
-    shape = max(1, frames.shape[1] // 8), max(1, frames.shape[2] // 8)
-    small = np.concatenate([reduce_by_area(block, shape) for block in frame_blocks(frames)])
-    return np.abs(np.diff(small, axis=0)).mean(axis=(1, 2), dtype=np.float64) / peak
-
-
-def _stretched(picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    low, high = np.percentile(picture, [1, 99.5])
-    return np.clip((picture - low) / max(high - low, 1e-6), 0, 1)
-
-
-def _events_tint(events: Events) -> tuple[NDArray, NDArray]:
-    """Return the colour of each pixel's prevailing sign, [H, W, 3], and its strength, [H, W], 0..1."""
-    on, off = event_histogram(events)[0]
-    both = on + off
-    full = np.percentile(both[both > 0], 95) if both.any() else 1.0
-    colour = np.where((on > off)[..., None], ON_RGB, OFF_RGB).astype(float)
-    return colour, np.clip(both / full, 0, 1)
-
-
-def _curve(draw: ImageDraw.ImageDraw, box, span, x: NDArray, y: NDArray, colour) -> None:
-    if len(x) < 2 or not y.max() > 0:
-        return
-    left, top, right, bottom = box
-    columns = left + (x - span[0]) / max(span[1] - span[0], 1e-9) * (right - left)
-    rows = bottom - 4 - y / y.max() * (bottom - top - 8)
-    draw.line([(float(a), float(b)) for a, b in zip(columns, rows, strict=True)], colour, 2)

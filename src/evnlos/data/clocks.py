@@ -1,13 +1,15 @@
 """The clocks of frames and events: how far they are apart, and whether a capture says so.
 
 - How far the frames' clock is from the events' clock, found from what both saw move.
-- How far the frames of a capture are from its events, told by the course of the light in both.
+- How far the frames of a capture are from its events, told by the course of the light in both, and beside
+  what other captures by the same camera tell.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -224,6 +226,9 @@ _LAGS = 201
 _LOBE, _SHARE_OF_LOBE, _SENSORS_SHARE = 0.9, 0.1, 0.05
 _NEARLY = 0.7  # of the best threshold's agreement: low thresholds agree best whatever the sensor's is
 _FEWEST_FRAMES = 6
+_USUAL_US = 20_000
+FEWEST_LAGS = 8
+"""Recordings of which the middle tells what is usual."""
 _DARK_SHARE = 1e-3  # of the peak
 
 
@@ -311,6 +316,21 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
     limit = max((0.5 if is_even else 1.0) * between, _SHARE_OF_LOBE * float(width), left_open)
     unsure = limit + _SENSORS_SHARE * float(width)
     return ClockLag(round(float(lag)), round(limit), round(unsure), float(top), float(backwards.max()))
+
+
+def beside_others(lags_us: Sequence[int]) -> tuple[NDArray[np.float64], float]:
+    """Return how far the lag of each recording is from the middle of the others', [N], and what is usual.
+
+    A lag that one has alone is not what pixels do by themselves. Usual are 20 ms, or 4 + 28 / N deviations
+    (from the median distance from the median), which one set of normal lags in a hundred passes.
+
+    Args:
+        lags_us: Lags of N recordings by one camera at one speed, `FEWEST_LAGS` or more, microseconds.
+    """
+    lags = np.asarray(lags_us, np.float64)
+    away = np.array([lag - np.median(np.delete(lags, number)) for number, lag in enumerate(lags)])
+    deviation = 1.4826 * float(np.median(np.abs(lags - np.median(lags))))
+    return away, max(_USUAL_US, (4 + 28 / len(lags)) * deviation)
 
 
 def _ratios(events: Events) -> list[tuple[float, float]]:
