@@ -1,5 +1,6 @@
 """Loose recordings as a laboratory produces them become captures: every source of frames, clock and pixels."""
 
+import shutil
 import struct
 import tracemalloc
 from itertools import pairwise
@@ -501,3 +502,19 @@ def test_the_command_tells_what_it_did_and_draws_it(tmp_path, capsys):
         assert sheet.size[0] > 900
     main(["import", str(folder), "--out", str(tmp_path / "e"), "--no-check-images"])
     assert not (tmp_path / "e" / "checks").exists()
+
+
+def test_a_capture_that_was_recorded_anew_is_not_taken_for_the_old_one(tiny_captures, tmp_path, capsys) -> None:
+    folder, other = tmp_path / "shot_A", next(one for one in tiny_captures if one.name != "lab_A")
+    shutil.copytree(next(one for one in tiny_captures if one.name == "lab_A"), folder)
+    (tmp_path / "lab.yaml").write_text("evnlos: rendered")  # the record beside captures is none
+    words = ["import", str(tmp_path / "*"), "--out", str(tmp_path / "out" / "d"), "--no-check-images"]
+    main(words)
+    first = read_shard(tmp_path / "out" / "d" / "shot_A.h5")[0]
+    assert "1 capture (1 train" in capsys.readouterr().out
+    shutil.copy(other / "events.raw", folder / "events.raw")
+    with pytest.raises(SystemExit) as stop:
+        main([word.replace(str(tmp_path / "*"), str(folder)) for word in words])
+    assert stop.value.code == 2 and "captures" in capsys.readouterr().err
+    again = read_shard(tmp_path / "out" / "d" / "shot_A.h5")[0]
+    np.testing.assert_array_equal(first.surface, again.surface)

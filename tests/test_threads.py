@@ -203,7 +203,7 @@ def test_a_command_that_is_interrupted_while_it_makes_something_ends_in_one_line
         [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60
     )
     assert ended.returncode == 130
-    assert ended.stderr == "evnlos doctor: interrupted; run the same command again to go on\n"
+    assert ended.stderr == "evnlos doctor: interrupted; run the same command again\n"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows ends processes without a signal")

@@ -225,7 +225,7 @@ class ContainerSource:
             try:
                 container = stack.enter_context(open_container(self.path))
             except (av.error.FFmpegError, OSError, ValueError) as error:
-                cure = "give MP4, MKV, AVI or another container that holds its images itself"
+                cure = "give MP4, MKV, AVI or another ordinary video file"
                 if self.path.suffix.lower() in _OF_EVENTS:
                     cure += "; `evnlos info` tells what an event file holds"
                 found = f"{self.path}: not a video that FFmpeg reads ({_reason(error)})"

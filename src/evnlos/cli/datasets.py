@@ -178,7 +178,7 @@ class LabCommand:
             progress = told_first(lambda: [say(note) for note in lab.glyphs.notes()], bars)
             rendered = render_captures(lab, self.out, None, self.workers, progress, self.force, record)
             differing = compare_published(self.set, rendered, progress) if self.set else {}
-        print(f"{self.out}: {len(rendered)} captures; settings and the drawn sensor in {self.out / record}")
+        print(f"{self.out}: {_counted(len(rendered))}; settings and the drawn sensor in {self.out / record}")
         if self.set is not None:
             print(f"{len(rendered) - len(differing)} of them have the published SHA-256")
         for name, text in differing.items():
@@ -303,6 +303,10 @@ class CaptureCommand:
         result(self.json, about, f"{text}; next: evnlos capture check {folder}")
 
 
+def _counted(captures: int) -> str:
+    return f"{captures} capture" + "s" * (captures != 1)
+
+
 _MARKS = {"good": "  good   ", "doubtful": "? look   ", "bad": "! BAD    "}
 
 
@@ -378,7 +382,7 @@ class ImportCommand:
                 progress=progress,
             )
         counts = ", ".join(f"{len(names)} {split}" for split, names in dataset.split.items())
-        text = f"{self.out}: {len(dataset.objects())} captures ({counts})"
+        text = f"{self.out}: {_counted(len(dataset.objects()))} ({counts})"
         result(self.json, {"out": str(self.out), "split": dataset.split}, text)
         if self.check_images and not self.json:
             print(f"check images: {self.out / 'checks'}")

@@ -333,7 +333,7 @@ def to_text(name: str, found: dict[str, Any]) -> str:
     sees = "whole sequences" if found["sees_sequence"] else "one time step at a time"
     sampling = found["sampling"]
     is_solved = sampling.get("surface") in ("likelihood", "corrected")
-    through = f", through the light path of {sampling['setup']}" if is_solved else ""
+    through = f", through the light path of {sampling.get('setup') or 'each setup'}" if is_solved else ""
     lines = [
         f"{name}: {found['modality']}, {found['network']['kind']}: {sees}; {found['parameters']:,} trained "
         f"parameters, {found['numbers'] - found['parameters']:,} numbers in closed form",

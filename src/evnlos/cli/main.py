@@ -82,6 +82,7 @@ VERBS: dict[str, str] = {
 }
 """The command of each verb, as module in `evnlos.cli` and class. A class whose settings have presets names them
 in `PRESETS`; one whose settings have a setup says in `with_setup` where it goes."""
+_GO_ON = ("simulate", "lab", "import", "train", "finetune", "experiment", "demo", "fetch")  # what was begun
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -145,7 +146,7 @@ def _end(verb: str, number: int) -> NoReturn:
 
 def _farewell(verb: str, number: int) -> str:
     how = "terminated" if number == signal.SIGTERM else "interrupted"
-    return f"evnlos {verb}: {how}; run the same command again to go on"
+    return f"evnlos {verb}: {how}; run the same command again{' to go on' if verb in _GO_ON else ''}"
 
 
 @contextmanager

@@ -30,12 +30,12 @@ T = TypeVar("T")
 _PATHS = tyro.constructors.PrimitiveConstructorSpec(
     "*",
     "PATH [PATH ...]",
-    lambda words: tuple(matching_paths(words)),
+    lambda words: tuple(path for path in matching_paths(words) if not path.name.endswith("lab.yaml")),
     lambda value: isinstance(value, tuple),
     lambda paths: [str(path) for path in paths],
 )
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional, _PATHS]
-"""One or more folders, or patterns that match some, given without a flag."""
+"""One or more folders, or patterns that match some, without a flag; the record of `lab` is left out."""
 Flat = Annotated[T, tyro.conf.arg(name="")]
 """Settings whose flags carry no prefix."""
 Presets = Mapping[str, Callable[[], T]]

@@ -355,7 +355,7 @@ class IdentifyCommand:
         for limit in limits.values():
             print(f"\n{limit.table()}")
         if self.out is not None:
-            print(f"{self.out}: identify.json, and what could be drawn")
+            print(f"{self.out}: {', '.join(sorted(path.name for path in self.out.iterdir()))}")
 
 
 @dataclass(frozen=True)

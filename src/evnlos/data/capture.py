@@ -241,21 +241,19 @@ def _place_in_time(
     folder: Path, info: CaptureInfo, events: Events, frames: NDArray, times_us: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], list[str]]:
     """Return the frames' times on the events' clock."""
-    alignment = info.alignment
-    if alignment.trigger_channel is not None:
+    alignment, channel = info.alignment, info.alignment.trigger_channel
+    if channel is not None:
         assert info.events is not None
         triggers = read_triggers(inside(folder, info.events), topic=info.events_topic)
-        chosen = triggers.t_us[triggers.rising & (triggers.channel == alignment.trigger_channel)]
+        chosen = triggers.t_us[triggers.rising & (triggers.channel == channel)]
         if len(chosen) != len(frames):
             raise DataError(
-                f"{folder / info.events}: {len(chosen)} rising edges on channel {alignment.trigger_channel} "
+                f"{folder / info.events}: {len(chosen)} rising edges on channel {channel} "
                 f"for {len(frames)} frames; check the channel, or leave out frames without an edge"
             )
         if len(chosen) and max(abs(int(chosen[0])), abs(int(chosen[-1]))) > _MOST_US // 2:
             raise DataError(f"{folder / info.events}: its triggers are later than {_MOST_US // 2} us")
-        return chosen + int(alignment.offset_us), [
-            f"frame times from trigger channel {alignment.trigger_channel}"
-        ]
+        return chosen + int(alignment.offset_us), [f"frame times from trigger channel {channel}"]
     if alignment.offset_us != "auto":
         offset = int(alignment.offset_us)
         if abs(int(times_us[0]) + offset) > _MOST_US or abs(int(times_us[-1]) + offset) > _MOST_US:
@@ -352,7 +350,7 @@ def import_captures(
     optional = {"needs_frames": False, "needs_events": False}
     read = partial(read_capture, most_frame_bytes=_HELD_BYTES, **topics, **optional, lazy_frames=True)
     infos = {name: read_capture_info(path, **topics) for name, path in sorted(paths.items())}
-    described = {name: _digest_of(info) for name, info in infos.items()}
+    described = {name: _digest_of(paths[name], info) for name, info in infos.items()}
     config = {"captures": described, "sampling": to_dict(sampling), "pattern": pattern and pattern.digest}
     lacks = {n: kind for n, one in infos.items() for kind in ("frames", "events") if not getattr(one, kind)}
     config |= {"lacks": lacks} if lacks else {}
@@ -389,10 +387,14 @@ def _write(
     return capture.name
 
 
-def _digest_of(info: CaptureInfo) -> str:
-    """Return the hash of a description; settings of files with several streams count where they are made."""
-    values = to_dict(info)
+def _digest_of(path: Path, info: CaptureInfo) -> str:
+    """Return the hash of a description and of the sizes of its files; streams count where they are named."""
+    values, folder = to_dict(info), path if path.is_dir() else path.parent
     for key in ("events_topic", "frames_topic", "recording"):
         if values[key] is None:
             del values[key]
+    named = [folder / name for name in (info.events, info.frames, info.target and info.target.mask) if name]
+    files = [one for there in named for one in (sorted(there.glob("*")) if there.is_dir() else [there])]
+    own = [one for one in files if one.is_file() and one.resolve().is_relative_to(folder.resolve())]
+    values["bytes"] = [one.stat().st_size for one in own]
     return config_hash(values)

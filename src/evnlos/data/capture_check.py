@@ -287,7 +287,8 @@ def _offset(capture: Capture) -> Iterator[Finding]:
         abs(lag.lag_us) <= lag.limit_us,
         not told,
         f"the frames' times are {abs(lag.lag_us) * 1e-6:.2f} s too {way} for the events (up to "
-        f"{lag.unsure_us * 1e-6:.2f} s cannot be told from what pixels do by themselves)",
+        f"{lag.limit_us * 1e-6:.2f} s is usual, up to {lag.unsure_us * 1e-6:.2f} s cannot be told from what "
+        "pixels do by themselves)",
         _offset_cure(capture.info, lag.lag_us)
         if told
         else "to be sure, record a blink of the light, or a trigger_channel",

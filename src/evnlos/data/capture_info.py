@@ -394,6 +394,6 @@ def inside(folder: Path, name: str, by: str = "capture.yaml") -> Path:
     if not path.is_relative_to(folder.resolve()):
         raise DataError(f"{folder}: {name!r} lies outside the capture folder; put the file into it")
     if not there:
-        how = f"{folder / by} names it, or leaves its name to the default; null where there is no such camera"
+        how = f"{folder / by} names it, or leaves its name to the default; null where there is no such thing"
         raise DataError(f"{path} does not exist; {how}")
     return path

@@ -18,6 +18,7 @@ from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.optics.operator import LinearTransport
 from evnlos.types import Plane
 
+_ROUGHEST = 2.0  # slope of the microfacets
 _MAX_KERNEL = 4097  # samples per side; larger means that the length scale and the pitch do not belong together
 
 
@@ -306,6 +307,10 @@ class GGX:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ConfigError(f"{name} is {value}; give a positive number")
+            if name != "n" and value is not None and value > _ROUGHEST:
+                raise ConfigError(
+                    f"the roughness {name} is {value}; give up to {_ROUGHEST:g}: polished 0.005, brushed 0.1"
+                )
         if not self.k >= 0:
             raise ConfigError(f"k is {self.k}; give 0 or more")
 

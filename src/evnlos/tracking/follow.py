@@ -278,7 +278,7 @@ def track_warnings(capture: Capture, setup: Setup | None, track: Track) -> list[
         )
     if track.misfit is not None and track.misfit > _MOST_MISFIT:
         warnings.append(
-            f"the setup leaves {track.misfit:.1f} times the noise in the frames, {_MOST_MISFIT:g} is the most: "
+            f"the setup leaves {track.misfit:.2f} times the noise in the frames, {_MOST_MISFIT:g} is the most: "
             "positions are worse than their stated deviations; calibrate this very setup (`evnlos calibrate`)"
         )
     return warnings
