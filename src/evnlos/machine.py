@@ -259,7 +259,8 @@ class ProgressBars:
         assert self._step is not None
         step, passed = self._step, self._said - self._began
         speed = (done - self._first) / passed
-        left = (step.total - done) / speed if speed > 0 and step.total else None
+        alike = step.unit != "stages" or callable(step.within)  # stages last as long as they do
+        left = (step.total - done) / speed if speed > 0 and step.total and alike else None
         if self._how == "json":
             said = {"what": step.what, "done": step.done, "total": step.total, "unit": step.unit}
             said |= {"within": text, "elapsed_s": round(passed, 1)}
