@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from evnlos.calibration.event_fit import CONTINUOUS, choose_pixel, fit_pixel
-from evnlos.calibration.event_models import figures_of, is_better, misfit
+from evnlos.calibration.event_models import figures_of, is_better, is_near, misfit
 from evnlos.calibration.event_statistics import Recording, thinned
 from evnlos.cameras import (
     EVENT_MODELS,
     BrownianPixel,
+    CircuitPixel,
     EventPixel,
     EventStream,
     ReadoutPixel,
@@ -132,3 +133,14 @@ def test_a_model_must_be_better_by_more_than_chance() -> None:
     assert is_better(before, before - 2) and not is_better(before, before - 0.4)
     assert not is_better(before, before - 2 + 8 * np.random.default_rng(0).normal(size=20))
     assert not is_better(before, before + 1) and math.isfinite(float(before.sum()))
+    # Where the first is not of the sensor's kind, less is enough, but not nothing.
+    assert is_better(before, before - 0.4, near=False) and not is_better(before, before - 0.1, near=False)
+
+
+def test_a_model_is_near_what_a_sensor_of_its_kind_sends() -> None:
+    """A circuit in dim light is not: its noise is slow, and makes most of its events."""
+    dim = CircuitPixel(0.16, 0.2, 0.01, photocurrent_a_per_dn=1e-15, follower_a=3e-12)
+    for pixel, is_of_its_kind in ((CONTINUOUS_PIXEL, True), (dim, False)):
+        recorded = [thinned(recording(pixel, k)) for k in (0, 1)]
+        found = fit_pixel(recorded, EventPixel()).pixel
+        assert is_near(misfit(recorded, found, 1), recorded, found, 1) == is_of_its_kind

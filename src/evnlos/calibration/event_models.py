@@ -29,7 +29,8 @@ _FLOOR = 0.05  # relative error of a figure that no model is held to
 _FEWEST = 1e-3  # events per pixel per second that count as none
 _BIN_S, _BLOCK_PX = 0.4, 5
 _SHARED = ("threshold_on", "threshold_off", "threshold_sigma", "leak_rate_hz", "shot_noise_rate_hz")
-_MARGIN = 0.05
+_MARGIN, _LESS = 0.05, 0.02
+_NEAR = 1.5  # times the misfit of a model's own events: sensors of its kind have 1.0 to 1.1, others 1.4 to 2.8
 _FURTHEST = 0.7  # of a step along a logarithm: a factor of two
 _EDGE = 0.02  # of a parameter's range
 
@@ -203,10 +204,32 @@ def misfit(recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> 
     return np.concatenate(parts)
 
 
-def is_better(before: Array, after: Array) -> bool:
-    """Return whether a model's misfit is lower by a twentieth, and by over thrice the difference's scatter."""
+def is_near(found: Array, recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> bool:
+    """Return whether a misfit is less than half as large again as that of the model's own events.
+
+    Args:
+        found: `misfit` of the pixel.
+        recordings: Light and events.
+        pixel: The pixel.
+        seed: Seed of the simulations.
+    """
+    drawn = simulated(recordings, pixel, derive_seed(seed, "drawn"))
+    own = [replace(recording, events=events) for recording, events in zip(recordings, drawn, strict=True)]
+    return float(found.sum()) < _NEAR * float(misfit(own, pixel, seed).sum())
+
+
+def is_better(before: Array, after: Array, near: bool = True) -> bool:
+    """Return whether a model's misfit is lower by a twentieth, and by over thrice the difference's scatter.
+
+    Args:
+        before: Misfit of the model that is kept otherwise, by stretches of time.
+        after: That of the other.
+        near: Whether the first one is of the recordings' kind. Where it is not, nothing speaks for it, and a
+            fiftieth is enough.
+    """
     gain = before - after
-    return bool(gain.sum() > max(3 * math.sqrt(len(gain)) * gain.std(), _MARGIN * before.sum()))
+    least = max(3 * math.sqrt(len(gain)) * gain.std(), _MARGIN * before.sum()) if near else _LESS * before.sum()
+    return bool(gain.sum() > least)
 
 
 def _volume(recording: Recording, events: Events) -> Array:
