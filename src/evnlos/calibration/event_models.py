@@ -205,7 +205,7 @@ def misfit(recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> 
 
 
 def is_near(found: Array, recordings: Sequence[Recording], pixel: PixelSettings, seed: int) -> bool:
-    """Return whether a misfit is less than half as large again as that of the model's own events.
+    """Return whether a misfit is below 1.5 times that of the model's own events.
 
     Args:
         found: `misfit` of the pixel.
