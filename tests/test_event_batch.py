@@ -154,3 +154,10 @@ def test_windows_are_slices_by_time_and_a_loader_takes_them() -> None:
             wrong()
     with pytest.raises(IndexError):
         windows[len(windows)]
+
+
+def test_windows_tell_a_wrong_map_at_once() -> None:
+    events = Events([1, 5, 9, 14], [0, 1, 0, 1], [0, 0, 0, 0], [1, 0, 1, 1], width=2, height=1)
+    for name, options in (("voxl", {}), ("voxel", {}), ("voxel", {"bin": 5})):
+        with pytest.raises(DataError):
+            EventWindows(events, 5, name, **options)

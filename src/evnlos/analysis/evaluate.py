@@ -75,7 +75,8 @@ def compare_with_training(
         DataError: The dataset has no training objects, or a shard is damaged.
     """
     names, rows = dataset.objects("train"), dataset.sampling.scored
-    changed = tuple(dataset.shard(n).stat().st_mtime_ns for n in (*names, *dataset.objects(split)))
+    shards = [dataset.shard(name) for name in (*names, *dataset.objects(split))]
+    changed = tuple(path.stat().st_mtime_ns if path.is_file() else 0 for path in shards)
     key = (dataset.folder, dataset.config_hash, samples.modality.name, changed)
     if key not in _SHOWN:
         _SHOWN.clear()

@@ -281,11 +281,9 @@ def _event_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     rate = f"{amount(found['rate_hz'], 'ev/s')} on average"
     if found["duration_us"] > WINDOW_US:
         peak = amount(found["peak_10ms_hz"], "ev/s")
-        rate += f", {peak} in the busiest {window_ms} ms (from {_at(found['peak_at_us'])})"
+        rate += f", {peak} in the busiest {window_ms} ms ({_at(found['peak_at_us'])})"
     share = 100 * busiest["events"] / found["events"]
-    silence = (
-        f"the longest {found['longest_silence_us'] / 1e3:.3g} ms, from {_at(found['longest_silence_at_us'])}"
-    )
+    silence = f"the longest {_length(found['longest_silence_us'])}, {_at(found['longest_silence_at_us'])}"
     rows = [
         ("events", f"{found['events']:,} in {length:.6g} s, from {first:.6f} s on the file's clock"),
         ("rate", rate),
@@ -302,7 +300,11 @@ def _event_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _at(time_us: int) -> str:
-    return f"{time_us / 1e6:.6g} s"
+    return f"{time_us / 1e6:.6g} s after the first event"
+
+
+def _length(time_us: int) -> str:
+    return f"{time_us / 1e3:.3g} ms" if time_us < 1_000_000 else f"{time_us / 1e6:.6g} s"
 
 
 def _polarity(found: dict[str, Any]) -> str:

@@ -350,7 +350,7 @@ class EventWindows:
         **options: Options of the representation.
 
     Raises:
-        DataError: No event, or a length that is not positive.
+        DataError: No event, a length that is not positive, or a representation or option that there is not.
 
     Example:
         >>> events = Events([1, 5, 9, 14], [0, 1, 0, 1], [0, 0, 0, 0], [1, 0, 1, 1], width=2, height=1)
@@ -377,6 +377,7 @@ class EventWindows:
             )
         self.start_us = int(events.t_us[0]) - 1 if start_us is None else start_us
         self.representation, self.transform, self.options = representation, transform, options
+        self._made(events[:1])  # a wrong name or option is told here, not by a worker
 
     def __len__(self) -> int:
         span = int(self.events.t_us[-1]) - self.start_us - self.window_us
@@ -386,9 +387,12 @@ class EventWindows:
         if not -len(self) <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
         begin = self.start_us + index % len(self) * self.stride_us
-        item: Any = self.events.between(begin, begin + self.window_us)
-        if self.representation is not None:
-            from evnlos.events.batch import event_batch  # whose kernels a recording does not need
-
-            item = event_batch([item], self.representation, **self.options)[0].numpy()  # type: ignore[arg-type]
+        item = self._made(self.events.between(begin, begin + self.window_us))
         return item if self.transform is None else self.transform(item)
+
+    def _made(self, events: Events) -> Any:
+        if self.representation is None:
+            return events
+        from evnlos.events.batch import event_batch  # whose kernels a recording does not need
+
+        return event_batch([events], self.representation, **self.options)[0].numpy()  # type: ignore[arg-type]
