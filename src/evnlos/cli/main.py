@@ -184,9 +184,8 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
     """Raise `KeyboardInterrupt` at Ctrl-C and `_Terminated` at SIGTERM, so that workers end and part files go.
 
     What is raised in a callback of the interpreter (`__del__`, a weak reference's) is lost there: then the
-    signal is sent again a moment later. Objects that the signal left half made, and that fail as they go, are
-    told to the log alone. A signal that is ignored (Ctrl-C in the background of a script) or that somebody else
-    handles stays so.
+    signal is sent again a moment later. Objects that the signal left half made fail as they go, in silence. A
+    signal that is ignored (Ctrl-C in the background of a script) or that somebody else handles stays so.
 
     Args:
         wishes: Each signal that comes is appended.
@@ -212,6 +211,7 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
         yield
         return
     hook, sys.unraisablehook = sys.unraisablehook, lost
+    loud, sys.excepthook = sys.excepthook, lambda *error: None if wishes else loud(*error)
     for number in handlers:
         signal.signal(number, end)
     try:
@@ -220,7 +220,7 @@ def _terminable(wishes: list[int]) -> Iterator[None]:
         traceback.clear_frames(stop.__traceback__)  # what it left half made goes while the hook listens
         raise
     finally:
-        sys.unraisablehook = hook
+        sys.unraisablehook, sys.excepthook = hook, loud
         for number, how in handlers.items():
             signal.signal(number, how)
 

@@ -218,7 +218,12 @@ def _begin() -> None:
 def _end(*_: object) -> None:
     """End the task at hand, and this worker with it."""
     sys.unraisablehook = _end_anew
+    sys.excepthook = _told_nobody  # which C extensions call where they let no exception out
     sys.exit(128 + signal.SIGTERM)
+
+
+def _told_nobody(*_: object) -> None:
+    """Say nothing of an exception."""
 
 
 def _end_anew(lost: Any) -> None:
