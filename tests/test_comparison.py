@@ -1,6 +1,7 @@
 """Reading characters, telling memory from sight, and intervals for differences."""
 
 import json
+import os
 import random
 import subprocess
 import sys
@@ -195,6 +196,23 @@ def test_the_truth_is_nearest_to_itself_and_a_memory_to_none(tiny_recorded) -> N
     assert found is not None and found.nearer_to_truth.all() and found.nearest.shape == truth.shape
     again = compare_with_training(found.nearest, samples, tiny_recorded, "test")
     assert again is not None and not again.nearer_to_truth.any()
+
+
+def test_what_is_kept_for_the_next_network_is_of_its_split(tiny, tmp_path) -> None:
+    """Also where all files are of one instant, as on file systems that count whole seconds."""
+    dataset = simulate(tiny, tmp_path / "d")
+    one, other, *rest = dataset.objects()
+    dataset = replace(dataset, split={"train": rest, "validation": [one], "test": [other]})
+    for name in dataset.objects():
+        os.utime(dataset.shard(name), (1e9, 1e9))
+    for _ in range(2):
+        for split in ("test", "validation"):
+            samples = NlosDataset(dataset, split, "fusion")
+            truth = samples.truth.float()[:, dataset.sampling.scored].contiguous()
+            found = compare_with_training(truth, samples, dataset, split)
+            nearest, _ = stacked(truth, samples, dataset)
+            assert found is not None
+            torch.testing.assert_close(found.nearest, nearest, rtol=0, atol=2e-3)
 
 
 def test_comparing_takes_memory_for_one_object_at_a_time(tmp_path) -> None:

@@ -76,10 +76,11 @@ def compare_with_training(
     """
     names, rows = dataset.objects("train"), dataset.sampling.scored
     shards = [dataset.shard(name) for name in (*names, *dataset.objects(split))]
-    changed = tuple(path.stat().st_mtime_ns if path.is_file() else 0 for path in shards)
-    key = (dataset.folder, dataset.config_hash, samples.modality.name, changed)
+    stands = tuple((path, path.stat().st_mtime_ns if path.is_file() else 0) for path in shards)
+    key = (samples.modality.name, split, dataset.config_hash, stands)
     if key not in _SHOWN:
-        _SHOWN.clear()
+        if len(_SHOWN) >= _MOST_SHOWN:
+            _SHOWN.clear()
         _SHOWN[key] = _shown(samples, dataset, split)
     shown, truth = _SHOWN[key], samples.truth[:, rows].float()
     if shown is None:
@@ -99,7 +100,8 @@ class _Shown(NamedTuple):
     moved: list[tuple[Tensor, Tensor]]
 
 
-_SHOWN: dict[tuple, _Shown | None] = {}  # of the last dataset
+_SHOWN: dict[tuple, _Shown | None] = {}  # of the last datasets and modalities
+_MOST_SHOWN = 4
 
 
 def _moved(dataset: Dataset, nearest_of: list[tuple[Tensor, Tensor]]) -> Iterator[tuple[Tensor, Tensor]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -337,10 +338,10 @@ def write_event_errors(
     what, solved = "errors of the events", list[_Solved]()
     progress(Step(what, 0, len(learned), "captures"))
     try:
-        found = run_in_order(partial(_solve, str(setup)), learned, workers)
-        for done, one in enumerate(found, start=1):
-            solved += [one] if one else []
-            progress(Step(what, done, len(learned), "captures"))
+        with closing(run_in_order(partial(_solve, str(setup)), learned, workers)) as found:
+            for done, one in enumerate(found, start=1):
+                solved += [one] if one else []
+                progress(Step(what, done, len(learned), "captures"))
     except ConfigError:
         return None
     if not solved:

@@ -30,7 +30,7 @@ T = TypeVar("T")
 _PATHS = tyro.constructors.PrimitiveConstructorSpec(
     "*",
     "PATH [PATH ...]",
-    lambda words: tuple(path for path in matching_paths(words) if not path.name.endswith("lab.yaml")),
+    lambda words: tuple(path for path in matching_paths(words) if not f".{path.name}".endswith(".lab.yaml")),
     lambda value: isinstance(value, tuple),
     lambda paths: [str(path) for path in paths],
 )

@@ -333,14 +333,15 @@ class IdentifyCommand:
             known = {"bounds": limits[one.name].summary()} if one.name in limits else {}
             return one.summary(arrays=arrays) | known
 
+        written = list[str | None]()
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
             for one in found:
                 path = self.out / f"identify_{one.name}.png"
-                drawn(path, partial(draw_identification, one, path))
+                written.append(drawn(path, partial(draw_identification, one, path)))
             if len(found) > 1:
                 path = self.out / "identify_setups.png"
-                drawn(path, partial(draw_setups, found, path))
+                written.append(drawn(path, partial(draw_setups, found, path)))
             curves = json.dumps([summary(one, True) for one in found], indent=1)
             write_atomically(self.out / "identify.json", curves.encode())
         if self.json:
@@ -355,7 +356,8 @@ class IdentifyCommand:
         for limit in limits.values():
             print(f"\n{limit.table()}")
         if self.out is not None:
-            print(f"{self.out}: {', '.join(sorted(path.name for path in self.out.iterdir()))}")
+            names = ["identify.json", *(Path(one).name for one in written if one)]
+            print(f"{self.out}: {', '.join(names)}")
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,9 @@ def run_tasks(
                 ) from None
 
 
-def run_in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+def run_in_order(
+    function: Callable[[Task], Result], tasks: Iterable[Task], workers: int
+) -> Generator[Result, None, None]:
     """Run `function` on each task ahead of its use and yield the results in the order of the tasks.
 
     Args:
