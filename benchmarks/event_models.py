@@ -44,6 +44,7 @@ def models() -> dict[str, Callable[[np.ndarray, np.ndarray], int]]:
         "continuous, true logarithm": replace(continuous, logarithm="true"),
         "brownian": BrownianPixel(),
         "circuit": CircuitPixel(),
+        "circuit, one pole": CircuitPixel(poles=1),
         "readout (row) behind continuous": ReadoutPixel(continuous, "row", 5e-7, 2e-8),
     }
 

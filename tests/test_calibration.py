@@ -499,6 +499,18 @@ def test_frames_left_far_above_the_noise_are_warned_of_and_refused_without_targe
     assert drawn[1] - drawn[0] > 2 * (narrow[1] - narrow[0])  # no wall fits: sensors and walls are randomized
 
 
+def test_where_events_alone_are_left_the_wall_stays(fit, tmp_path) -> None:
+    left = Residual(before=0.9, after=0.75, noise=0.4)
+    wrong = replace(fit, residuals={**fit.residuals, "counts held out": left})
+    counts, training = warnings_of(wrong)
+    assert "75 % is left where noise alone leaves 40 %" in counts
+    assert training == "training.yaml draws event pixels from wide ranges around this fit"
+    write_setup(wrong, rows_of(wrong, EventPixel(), FrameCamera()), tmp_path)
+    drawn, narrow = load_yaml(Simulation, tmp_path / "training.yaml").vary, fit.training.vary
+    wider = {name for name in drawn if drawn[name] != narrow.get(name)}
+    assert "setup.pixel.threshold_on" in wider and all(name.startswith("setup.pixel.") for name in wider)
+
+
 def test_less_is_expected_of_events_whose_counts_are_left(fit) -> None:
     for after, less in ((0.47, False), (0.54, True)):
         left = Residual(before=0.62, after=after, noise=0.46)

@@ -155,7 +155,99 @@ def test_after_an_event_a_pixel_rests() -> None:
         assert len(events) > 200
 
 
-@pytest.mark.parametrize("name", ["dark_current_a", "kappa", "threshold_on", "noise_factor", "initial_phase"])
+def pole_of(pixel: CircuitPixel, current: float) -> tuple[float, float, float]:
+    """Return mean lag [s], noise [rms, log units] and its correlation time [s], from sums over small steps."""
+    m, rest, noise = (np.asarray(part).squeeze() for part in pixel.matrices(np.array([current])))
+    step = 1e-4
+    decay, settled = expm(step * m), solve_continuous_lyapunov(m, -noise)
+    response, echo, lag, memory = rest, settled, 0.0, 0.0
+    for _ in range(4_000):
+        lag, memory = lag + step * response[2], memory + step * echo[2, 2]
+        response, echo = decay @ response, decay @ echo
+    memory = memory / settled[2, 2] - step / 2 if settled[2, 2] > 0 else 1.0
+    return lag - step / 2 * rest[2], math.sqrt(settled[2, 2]), memory
+
+
+def one_pole(
+    pixel: CircuitPixel, light: np.ndarray, times: np.ndarray, steps: int, runs: int, seed: int
+) -> list:
+    """Return (time, run, sign) of events of `runs` pixels of one pole: a loop over `steps` in each interval."""
+    draw, logs = (
+        np.random.default_rng(seed),
+        np.log1p(light * pixel.photocurrent_a_per_dn / pixel.dark_current_a),
+    )
+    reference, events = np.full(runs, logs[0]), []
+    lag = np.zeros(runs)
+    noise = pole_of(pixel, pixel.dark_current_a * math.exp(logs[0]))[1] * draw.normal(size=runs)
+    before = logs[0] + noise
+    for k in range(len(times) - 1):
+        delay, rms, memory = pole_of(pixel, pixel.dark_current_a * math.exp((logs[k] + logs[k + 1]) / 2))
+        h, change = (times[k + 1] - times[k]) / steps, (logs[k + 1] - logs[k]) / steps
+        for n in range(steps):
+            lag = math.exp(-h / delay) * lag - delay / h * (1 - math.exp(-h / delay)) * change
+            keep = math.exp(-h / memory)
+            noise = keep * noise + rms * math.sqrt(1 - keep**2) * draw.normal(size=runs)
+            now = logs[k] + (n + 1) * change + lag + noise
+            for i in np.nonzero(np.abs(now - reference) >= pixel.threshold_on)[0]:
+                sign = int(np.sign(now[i] - reference[i]))
+                while abs(now[i] - reference[i]) >= pixel.threshold_on:
+                    reference[i] += sign * pixel.threshold_on
+                    share = (reference[i] - before[i]) / (now[i] - before[i])
+                    events.append((times[k] + (n + min(max(share, 0.0), 1.0)) * h, i, sign))
+            before = now
+    return events
+
+
+POLE = replace(PLAIN, poles=1)
+
+
+def test_without_noise_one_pole_follows_its_slow_reference() -> None:
+    pixel = replace(POLE, noise_factor=0.0)
+    times = np.linspace(0.0, 0.3, 101)
+    light = dn(3e-14) * np.exp(1.2 * np.sin(2 * np.pi * 8 * times))
+    events = simulate_events(light[:, None, None], times, pixel)
+    expected = one_pole(pixel, light, times, 2, 1, 0)
+    assert len(events) == len(expected) > 15
+    assert events.p.tolist() == [sign > 0 for _, _, sign in expected]
+    # the table's currents are 2 % apart
+    assert np.abs(events.t_us * 1e-6 - [time for time, _, _ in expected]).max() < 2e-4
+
+
+def test_noise_of_one_pole_is_that_of_its_slow_reference() -> None:
+    pixel = replace(POLE, threshold_on=0.1, threshold_off=0.1)
+    frames, times = static(1e-14, 1.5, 300, 50)
+    found = simulate_events(frames, times, pixel, seed=4)
+    steps = math.ceil(0.03 / (0.0258 * pixel.follower_f / pixel.follower_a))
+    expected = one_pole(pixel, frames[:, 0, 0], times, steps, 300, 5)
+    assert len(expected) > 1000
+    assert abs(len(found) - len(expected)) < 4 * math.sqrt(2 * (len(found) + len(expected)))
+    assert np.mean(found.p) == pytest.approx(0.5, abs=0.05)
+
+
+def test_one_pole_sends_about_what_three_equations_do() -> None:
+    """Noise of dim pixels within a sixth, and as many events of a slow swing within a twentieth."""
+    for current in (3e-15, 1e-14):
+        frames, times = static(current, 3.0, 100, 100)
+        pixel = replace(PLAIN, threshold_on=0.08, threshold_off=0.08)
+        one, three = (len(simulate_events(frames, times, replace(pixel, poles=n), seed=1)) for n in (1, 3))
+        assert three > 300 and one == pytest.approx(three, rel=1 / 6)
+    times = np.linspace(0.0, 2.0, 201)
+    light = (dn(3e-14) * np.exp(0.8 * np.sin(2 * np.pi * times)))[:, None, None] * np.ones((1, 1, 40))
+    one, three = (len(simulate_events(light, times, replace(PLAIN, poles=n), seed=1)) for n in (1, 3))
+    assert three > 500 and one == pytest.approx(three, rel=0.05)
+
+
+def test_after_an_event_a_pixel_of_one_pole_rests() -> None:
+    times = np.linspace(0.0, 1.0, 101)
+    light = dn(1e-12) * np.exp(2.0 * np.sin(2 * np.pi * 2 * times))[:, None, None] * np.ones((1, 1, 50))
+    events = simulate_events(light, times, replace(POLE, refractory_s=0.02), seed=1)
+    assert min(np.diff(events.t_us[events.x == x]).min() for x in range(50)) >= 19_998
+    assert len(events) > 200
+
+
+@pytest.mark.parametrize(
+    "name", ["dark_current_a", "kappa", "threshold_on", "noise_factor", "poles", "initial_phase"]
+)
 def test_wrong_settings_are_refused(name) -> None:
     with pytest.raises(ConfigError, match=name):
-        CircuitPixel(**{name: -1.0})
+        replace(PLAIN, **{name: -1.0})

@@ -380,5 +380,9 @@ def test_a_randomized_simulation_draws_sensors_and_walls_from_wide_ranges():
     for one in places:
         assert wide.vary[f"setup.{one.name}"] == pytest.approx((one.value - 0.002, one.value + 0.002))
     assert wide.setups == 6 and randomized(wide) == wide and narrow.setups == 2
+    pixels = randomized(narrow, walls=False)
+    assert pixels.vary["setup.gain"] == (0.9, 1.1) and pixels.setup == narrow.setup and pixels.setups == 2
+    ranges = {n: r for n, r in wide.vary.items() if n.startswith("setup.pixel.")}
+    assert pixels.vary == {**narrow.vary, **ranges}
     drawn = {drawn_for(wide, name).setup.pixel.threshold_off for name in ("a", "b", "c")}
     assert len(drawn) == 3

@@ -23,15 +23,19 @@ from evnlos.types import Events
 
 SHAPE = (60, 48)
 
-REGISTERED = sorted(kind for kind in EVENT_MODELS if EVENT_MODELS[kind].__module__.startswith("evnlos."))
+ONE_POLE = "circuit, one pole"
+OURS = sorted(kind for kind in EVENT_MODELS if EVENT_MODELS[kind].__module__.startswith("evnlos."))
+MODELS = [*OURS, ONE_POLE]
 
 
 def events_of(kind, light, times, blocks=(), **options):
     """Return the events of a model's pixels as they come, of light that comes in blocks."""
-    model = EVENT_MODELS[kind]
-    pixel = model(event_s=2e-6) if model is ReadoutPixel else model()
-    if model is V2ePixel:
-        pixel = replace(pixel, shot_noise_rate_hz=2.0)
+    chosen = {
+        ONE_POLE: CircuitPixel(poles=1),
+        "readout": ReadoutPixel(event_s=2e-6),
+        "v2e": V2ePixel(shot_noise_rate_hz=2.0),
+    }
+    pixel = chosen[kind] if kind in chosen else EVENT_MODELS[kind]()
     stream = EventStream(pixel, (light.shape[1], light.shape[2]), **options)
     for frames, instants in zip(np.split(light, blocks), np.split(times, blocks), strict=True):
         stream.push(frames, instants)
@@ -42,7 +46,7 @@ def columns(events):
     return np.stack([events.t_us, events.x, events.y, events.p])
 
 
-@pytest.mark.parametrize("kind", REGISTERED)
+@pytest.mark.parametrize("kind", MODELS)
 def test_events_are_a_function_of_light_and_seed_alone(kind) -> None:
     """The same for any blocks, tiles and threads; others for another seed; in order, within the recording."""
     times = np.linspace(0.0, 0.4, 81)
@@ -57,7 +61,7 @@ def test_events_are_a_function_of_light_and_seed_alone(kind) -> None:
     assert columns(other).shape != columns(whole).shape or (columns(other) != columns(whole)).any()
 
 
-@pytest.mark.parametrize("kind", REGISTERED)
+@pytest.mark.parametrize("kind", MODELS)
 def test_thresholds_that_are_given_are_those_of_the_pixels(kind) -> None:
     """Light that rises by 1.2 log units: four events at 0.27, at most one at 1.5."""
     times = np.linspace(0.0, 0.5, 101)
@@ -102,9 +106,20 @@ def test_a_sensor_of_another_law_is_told_and_its_numbers_come_back() -> None:
     assert set(found.compared) == {CONTINUOUS, "continuous, true logarithm", "brownian"}
 
 
+def test_a_circuit_in_dim_light_is_told() -> None:
+    """Its noise is slow, and larger where it is dark: no other model follows."""
+    circuit = CircuitPixel(0.16, 0.2, 0.01, photocurrent_a_per_dn=1e-15, dark_current_a=1e-15, follower_a=3e-12)
+    first, found, held = chosen(circuit)
+    assert isinstance(found.pixel, CircuitPixel) and ONE_POLE in found.compared
+    few = [thinned(r) for r in held]
+    assert not is_near(misfit(few, first.pixel, 1), few, first.pixel, 1)
+    truth, wrong = (misfit(few, p, 1).sum() for p in (replace(circuit, poles=1), first.pixel))
+    assert misfit(few, found.pixel, 1).sum() < truth + 0.3 * (wrong - truth)
+
+
 def test_a_sensor_of_the_usual_law_keeps_it() -> None:
     first, found, _ = chosen(CONTINUOUS_PIXEL)
-    assert replace(found, compared={}) == first
+    assert replace(found, compared={}) == first and ONE_POLE not in found.compared
 
 
 def test_figures_are_rates_by_light_and_motion() -> None:

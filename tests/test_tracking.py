@@ -633,6 +633,17 @@ def test_the_command_inverts_a_sequence(capture, tmp_path, capsys) -> None:
     assert db["tikhonov", 8] > db["tikhonov", 1]
     assert db["tikhonov", 8] > 14
     assert set(np.load(tmp_path / "i.npz")) == {f"{folder.name}_tikhonov_{n}" for n in (1, 8)}
+    left = {row["positions"]: row["unexplained"] for row in rows}
+    assert left[1] is None and 0 <= left[8] < 0.05  # one frame tells nothing of the setup
+
+
+def test_the_command_says_where_a_setup_is_not_that_of_the_capture(capture, tmp_path, capsys) -> None:
+    folder, _ = capture
+    options = ["--cells", "10", "--solver", "tikhonov", "--out", str(tmp_path / "i.png")]
+    main(["invert", str(folder), "--setup", "matte-near", *options])
+    out, err = capsys.readouterr()
+    assert "of the light unexplained beside the noise" in out.splitlines()[-1]
+    assert f"{folder.name}: the setup leaves" in err and "do not believe the image" in err
 
 
 def test_a_folder_without_a_setup_is_no_photograph(capture, capsys) -> None:

@@ -391,6 +391,8 @@ def check_sampling(weights: Weights, sampling: Sampling) -> None:
     is_known = not made_for.is_solved or same_setup(made_for.setup, these.setup)
     these = these.corrected_as(made_for)  # the maps are alike whether errors are taken from them
     if not is_known or replace(made_for, setup="") != replace(these, setup=""):
+        differ = [name for name, value in vars(made_for).items() if value != getattr(these, name)]
+        trained, given = (", ".join(f"{n} {getattr(one, n)}" for n in differ) for one in (made_for, these))
         raise DataError(
-            f"the weights were trained on samples of {made_for}; these are {these}: make them alike"
+            f"the weights were trained on samples of {trained}; these have {given}: make them alike"
         )

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evnlos.calibration.event_models import MODELS, fit_model, is_better, is_near, misfit
+from evnlos.calibration.event_models import MODELS, SLOW, fit_model, is_better, is_near, misfit
 from evnlos.calibration.event_statistics import (
     Recording,
     Regions,
@@ -56,6 +56,7 @@ CONTINUOUS = "continuous"
 _MOST_NOISE = 10.0  # times the events of pixels that see nothing
 _GRID = (20, 32)  # blocks of the map of counts, rows and columns
 _BIN_S = 0.1
+_SLOW_PX = 1_000  # of the fit of a model that is slow to simulate
 _MOST_CAPTURES = 16  # that tell of errors: a second or two each
 _LEAST_GAIN_DB = 0.3  # of captures corrected by others; with less the correction is not worth a trial
 
@@ -125,7 +126,8 @@ def choose_pixel(
     """Return the fit of the event model whose events are nearest to those of captures held out.
 
     Another model than v2e's must be better by a twentieth, and by over thrice the scatter of the difference;
-    where v2e's is far from the recordings, by a fiftieth.
+    where v2e's is far from the recordings, by a fiftieth. Models that are slow to simulate are tried, with
+    fewer pixels, where no other is near to what is held out.
 
     Args:
         known: The fit of v2e's continuous pixel.
@@ -136,8 +138,11 @@ def choose_pixel(
     few, judged = ([thinned(r) for r in part] for part in (recordings, held))
     best, least = known, misfit(judged, known.pixel, seed)
     compared, near = {CONTINUOUS: float(least.sum())}, is_near(least, judged, known.pixel, seed)
-    for name in MODELS:
-        found = fit_model(few, name, known.pixel, seed=seed)
+    for name in sorted(MODELS, key=SLOW.count):
+        if name in SLOW and (near or is_near(least, judged, best.pixel, seed)):
+            continue
+        told = [thinned(r, _SLOW_PX) for r in recordings] if name in SLOW else few
+        found = fit_model(told, name, known.pixel, seed=seed)
         pixel, cutoff = found.pixel, None
         if isinstance(pixel, EventPixel):
             corner, cutoff = _scan_cutoff(few, pixel, seed)

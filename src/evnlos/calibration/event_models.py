@@ -17,6 +17,7 @@ from evnlos.calibration.transport_fit import levenberg_marquardt
 from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import EventPixel
 from evnlos.cameras.pixels.brownian import BrownianPixel
+from evnlos.cameras.pixels.circuit import CircuitPixel
 from evnlos.errors import ConfigError
 from evnlos.machine import note
 from evnlos.types import Events, derive_seed
@@ -79,8 +80,21 @@ MODELS: dict[str, tuple[PixelSettings, tuple[Free, ...]]] = {
             Free("photon_noise", 1e-3, 1.0, 0.1),
         ),
     ),
+    "circuit, one pole": (
+        CircuitPixel(photocurrent_a_per_dn=2.8e-15, follower_a=5e-12, poles=1),
+        (
+            *_THRESHOLDS,
+            Free("photocurrent_a_per_dn", 1e-17, 3e-14, 0.2),
+            Free("follower_a", 5e-13, 3e-11, 0.2),
+            Free("leak_rate_hz", 0.0, 10.0, 0.03, log=False),
+            Free("noise_factor", 0.2, 5.0, 0.1),
+        ),
+    ),
 }
 """Event models beside v2e's continuous one: a start, and what is fitted."""
+SLOW = ("circuit, one pole",)
+"""Those that are slow to simulate: tried where no other comes near to the recordings."""
+_STARTS = {"photocurrent_a_per_dn": (1e-16, 5e-16, 2.5e-15, 1.2e-14)}  # whose range needs a search
 
 
 @dataclass(frozen=True)
@@ -164,6 +178,10 @@ def fit_model(
 
     bounds = [(_encoded(f, f.low), _encoded(f, f.high)) for f in free]
     first = [_encoded(f, min(max(getattr(start, f.name), f.low), f.high)) for f in free]
+    for place, one in enumerate(free):
+        tried = [[*first[:place], _encoded(one, v), *first[place + 1 :]] for v in _STARTS.get(one.name, ())]
+        if tried:
+            first = min(tried, key=lambda values: float(residual(np.array(values)).square().sum()))
     # A bold step may end where a pixel sends a hundred times the events: half a minute that tells nothing.
     most = [_FURTHEST if f.log else 0.5 * (f.high - f.low) for f in free]
     steps = [f.step for f in free]

@@ -128,7 +128,7 @@ def _pixel_rows(fit: SetupFit, start: Any) -> list[Row]:
 
 def unit_of(name: str) -> str:
     """Return the unit of an event pixel's number by its name."""
-    endings = {"_per_dn_hz": "Hz/DN", "_hz": "Hz", "_dn": "DN", "noise": "log units"}
+    endings = {"_per_dn_hz": "Hz/DN", "_a_per_dn": "A/DN", "_hz": "Hz", "_dn": "DN", "_a": "A", "_factor": ""}
     return next((unit for ending, unit in endings.items() if name.endswith(ending)), "log units")
 
 
@@ -165,15 +165,17 @@ def warnings_of(fit: SetupFit) -> list[str]:
         found.append(f"{names}: ended on the bound of the search, so its error means nothing; {cure}")
     if fit.unexplained is not None:
         found.append(f"{_left(fit.unexplained)}; {cure}")
-    found += _event_warnings(fit)
-    if _fits_nothing(fit):
-        found.append(f"{TRAINING_FILE} draws sensors and walls from wide ranges around this fit")
-    return found
+    of_events = _event_warnings(fit)
+    if drawn := "sensors and walls" if fit.unexplained is not None else "event pixels" if of_events else "":
+        of_events.append(f"{TRAINING_FILE} draws {drawn} from wide ranges around this fit")
+    return [*found, *of_events]
 
 
-def _fits_nothing(fit: SetupFit) -> bool:
-    """Return whether no wall or no event pixel makes what the cameras recorded."""
-    return fit.unexplained is not None or bool(_event_warnings(fit))
+def _to_train_on(fit: SetupFit) -> Simulation:
+    """Return the simulation for training: what makes nothing like the recordings is drawn from wide ranges."""
+    if fit.unexplained is None and not _event_warnings(fit):
+        return fit.training
+    return randomized(fit.training, walls=fit.unexplained is not None)
 
 
 def _event_warnings(fit: SetupFit) -> list[str]:
@@ -308,8 +310,8 @@ def write_setup(fit: SetupFit, rows: list[Row], out: Path, force: bool = False) 
             f"{_ANOTHER_WALL} {_TRY[fit.targets]}"
         )
     save_pattern(fit.noise.pattern, out / PATTERN_FILE)
-    training = randomized(fit.training) if _fits_nothing(fit) else fit.training
-    save_yaml(_with_targets(fit, _with_wall(fit, training, out), out / TARGETS), out / TRAINING_FILE)
+    training = _with_targets(fit, _with_wall(fit, _to_train_on(fit), out), out / TARGETS)
+    save_yaml(training, out / TRAINING_FILE)
     save_yaml(_with_wall(fit, fit.simulation, out), out / CALIBRATED_FILE)
     return out / CALIBRATED_FILE
 

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import atexit
 import difflib
 import itertools
 import math
+import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -222,6 +224,7 @@ def fit_wall(
     search = search_wall(fit, known, freedoms, plane, columns=columns)
     rest = rest_of(fit, held, search.state, plane)
     folder = Path(tempfile.mkdtemp(prefix="evnlos-wall-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)  # the setup is read from it until it is saved
     strip = travelled(fit, held, _CELL_M).extent_m
     found = _setup(rest.wall, search.state.pose, rest.ambient, folder / WALL_FILE, strip, fit.shape)
     coarse = wall_data(fit, 25, plane, every=8)

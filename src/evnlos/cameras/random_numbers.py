@@ -144,6 +144,23 @@ def random_normal(seed, stream, pixel, counter):
 
 
 @njit(cache=True, error_model="numpy")
+def random_triple(seed, stream, pixel, counter, factor, out):
+    """Fill `out` [3] with normal numbers of the covariance factor factor^T, factor lower triangular."""
+    a, b = random_normals(seed, stream, pixel, counter)
+    c, _ = random_normals(seed, stream, pixel, counter + 1)
+    out[0] = factor[0, 0] * a
+    out[1] = factor[1, 0] * a + factor[1, 1] * b
+    out[2] = factor[2, 0] * a + factor[2, 1] * b + factor[2, 2] * c
+
+
+@njit(cache=True, error_model="numpy")
+def normal_row(seed, stream, first, counter, normal):
+    """Fill two normal numbers of each of N pixels from `first` on, [2 N]."""
+    for i in range(len(normal) // 2):
+        normal[2 * i], normal[2 * i + 1] = random_normals(seed, stream, first + i, counter)
+
+
+@njit(cache=True, error_model="numpy")
 def normal_field(seed, stream, count):
     """Return one normal number per pixel, float64 [count]."""
     field = np.empty(count)
@@ -168,6 +185,22 @@ def exponential_field(seed, stream, count):
     for pixel in range(count):
         field[pixel] = random_exponential(seed, stream, pixel, 0)
     return field
+
+
+def stationary(m: NDArray, noise: NDArray) -> NDArray[np.float64]:
+    """Return P of M P + P M^T + noise = 0, [L, 3, 3]: the covariance that x' = M x + noise settles at."""
+    one = np.eye(3)
+    system = np.einsum("lij,kn->likjn", m, one) + np.einsum("ij,lkn->likjn", one, m)
+    return np.linalg.solve(system.reshape(-1, 9, 9), -noise.reshape(-1, 9, 1)).reshape(-1, 3, 3)
+
+
+def factor_of(covariance: NDArray) -> NDArray[np.float64]:
+    """Return lower-triangular factors of covariances, zero where they are."""
+    if not covariance.any():
+        return np.zeros_like(covariance)
+    scale = np.sqrt(np.einsum("lii->li", covariance))
+    correlation = covariance / scale[:, :, None] / scale[:, None, :]
+    return scale[:, :, None] * np.linalg.cholesky(correlation + 1e-12 * np.eye(3))
 
 
 @cache

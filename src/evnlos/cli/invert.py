@@ -194,7 +194,7 @@ class InvertCommand:
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, setup: Path) -> None:
-        from evnlos.cli.invert_captures import SequenceOptions, invert_captures
+        from evnlos.cli.invert_captures import SequenceOptions, invert_captures, sequence_doubts
         from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
@@ -207,28 +207,29 @@ class InvertCommand:
         regularization: dict[str, float | None] = {"tikhonov": REGULARIZATION_TIKHONOV, "tv": REGULARIZATION_TV}
         if self.regularization == "gcv" and self.solver != "tikhonov":
             raise ConfigError(
-                "--regularization gcv serves --solver tikhonov only; give a number, or leave "
-                "--regularization out"
+                "--regularization gcv serves --solver tikhonov only; give a number, or leave the flag out"
             )
         if self.regularization != "cv":
             number, rule = _weight(self.regularization)
             if number is None and rule != "gcv":
-                raise ConfigError(
-                    f"--regularization is {self.regularization!r}; with captures give gcv or a number"
-                )
+                raise ConfigError(f"--regularization is {self.regularization!r}; give gcv or a number")
             regularization = dict.fromkeys(regularization, number)
         solvers = tuple(regularization) if self.solver == "all" else (self.solver,)
         used = (self.positions, self.pattern, self.track, solvers, regularization)
         options = SequenceOptions(setup, *used, self.cells, self.columns, self.static, self.subsets)
         with ProgressBars() as progress:
             found, pictures = invert_captures(self.files, options, progress)
+        for doubt in sequence_doubts(found["rows"]):
+            say(f"warning: {doubt}")
         most = max(row["positions"] for row in found["rows"])
         best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
         panels = [(name, image[None]) for name, image in best.items()]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
         _save_arrays(self.out, arrays)
-        table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{found['seconds']} s"
+        left = max((row["unexplained"] or 0.0 for row in found["rows"]), default=0.0)
+        last = f"{100 * left:.1f} % of the light unexplained beside the noise; {found['seconds']} s"
+        table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{last}"
         print(json.dumps(found) if self.json else table)
 
     def _film(self, word: Path, sides_m: tuple[float, float]) -> None:

@@ -1,8 +1,8 @@
 """What `evnlos invert` does with captures and with still images.
 
-- `evnlos invert CAPTURE... --setup SETUP`: one image of each object from its whole sequence.
-- `evnlos invert PICTURE... --setup transport.safetensors`: still images of the wall, a measured setup.
-- `evnlos invert CAPTURE... --setup SETUP --from events|frames|both`: one likelihood of a whole sequence.
+- `CAPTURE... --setup SETUP`: one image of each object from its whole sequence.
+- `PICTURE... --setup transport.safetensors`: still images of the wall, a measured setup.
+- `CAPTURE... --setup SETUP --from events|frames|both`: one likelihood of a whole sequence.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ from evnlos.scene import Target
 from evnlos.setups import Setup, load_setup
 from evnlos.setups.base import linear_kinds
 from evnlos.setups.measured import averaged
+from evnlos.tracking import temporal_noise, track_capture, track_warnings
 from evnlos.types import Plane
 
 
@@ -93,18 +94,17 @@ def invert_captures(
     pattern = pattern_of(options.setup, options.pattern)
     height, width = captures[0].frames.shape[1:]
     if any(capture.frames.shape != captures[0].frames.shape for capture in captures):
-        raise ConfigError(
-            "the captures differ in the number or the size of their frames; invert them one by one"
-        )
-    columns = min(options.columns, width)
-    shape = (max(1, round(height * columns / width)), columns)
+        raise ConfigError("the captures differ in number or size of their frames; invert them one by one")
+    shape = (max(1, round(height * (columns := min(options.columns, width)) / width)), columns)
     light = torch.stack([object_light(c.frames[1:], c.peak, setup, shape, pattern) for c in captures])
+    noise = torch.tensor([temporal_noise(one.numpy()) if len(one) > 2 else math.inf for one in light])
     pictures: dict[str, torch.Tensor] = {}
     rows: list[dict[str, Any]] = []
-    groups = _by_motion(captures, options, setup, progress)
-    total = len(groups)
+    total = len(groups := _by_motion(captures, options, setup, progress))
     for done, (motion, members) in enumerate(counted(groups, progress, "invert", total, "motions")):
-        size = _target_size_m(captures[members[0]], _is_tracked(captures[members[0]], options))
+        size = captures[members[0]].info.target_size_m
+        if _is_tracked(captures[members[0]], options):
+            size *= 1.25  # a tracked position is that of the light's middle, which need not be the target's
         target_plane = Plane(options.cells, options.cells, size / options.cells)
         progress(Step("invert", done, total, "motions", within="light path of the setup"))
         transport = matrix_of(setup.resized((height, width)).operator(strip_of(motion, target_plane), shape))
@@ -115,27 +115,32 @@ def invert_captures(
                     SequenceOperator(transport, target_plane, motion[chosen]), options.static, gram
                 )
                 images = light[members][:, chosen]
+                free = problem.tikhonov(images)  # weighted by generalised cross-validation
+                left = (free.residual.square() / (problem.samples - free.dof) - noise[members] ** 2).clamp(
+                    min=0
+                )
+                moving = (images - images.mean(dim=1, keepdim=True)).square().mean(dim=(1, 2, 3))
+                shares = (left / moving).sqrt().tolist() if count > 2 else [None] * len(members)
                 for solver in options.solvers:
                     progress(Step("invert", done, total, "motions", within=f"{solver}, {count} positions"))
-                    found = _solve(problem, images, solver, options.regularization[solver])
-                    for member, image in zip(members, found, strict=True):
+                    found = _solve(problem, images, solver, options.regularization[solver], free)
+                    for member, image, share in zip(members, found, shares, strict=True):
                         name = captures[member].name
-                        db = score(captures[member], image, size, motion)
-                        rows.append({"capture": name, "positions": count, "solver": solver, "psnr_db": db})
+                        row = {"capture": name, "positions": count, "solver": solver, "unexplained": share}
+                        rows.append({**row, "psnr_db": score(captures[member], image, size, motion)})
                         pictures[f"{name}_{solver}_{count}"] = image
     figures = {"setup": str(options.setup), "captures": [c.name for c in captures], "rows": rows}
-    figures["seconds"] = round(time.perf_counter() - clock, 1)
-    return figures, pictures
+    return {**figures, "seconds": round(time.perf_counter() - clock, 1)}, pictures
 
 
-def _solve(problem: SequenceProblem, images: torch.Tensor, solver: str, factor: float | None) -> torch.Tensor:
-    first = problem.tikhonov(images)
+def _solve(
+    problem: SequenceProblem, images: torch.Tensor, solver: str, factor: float | None, free: Solution
+) -> torch.Tensor:
     if factor is None:
-        return first.image
-    regularization = factor * first.noise_sigma**2
+        return free.image
     if solver == "tikhonov":
-        return problem.tikhonov(images, regularization).image
-    found = problem.total_variation(images, regularization, tolerance=1e-5)
+        return problem.tikhonov(images, factor * free.noise_sigma**2).image
+    found = problem.total_variation(images, factor * free.noise_sigma**2, tolerance=1e-5)
     if not found.converged:
         say(f"warning: tv stopped after {found.iterations} iterations before it had converged")
     return found.image
@@ -148,8 +153,6 @@ def _by_motion(
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
     for k, capture in enumerate(captures):
         if _is_tracked(capture, options):
-            from evnlos.tracking import track_capture, track_warnings
-
             progress(Step("track", k, len(captures), "captures", within=capture.name))
             found = track_capture(capture, setup)
             for warning in track_warnings(capture, setup, found):
@@ -164,12 +167,6 @@ def _by_motion(
 
 def _is_tracked(capture: Capture, options: SequenceOptions) -> bool:
     return options.track or capture.motion is None
-
-
-def _target_size_m(capture: Capture, tracked: bool) -> float:
-    # A tracked position is that of the light's middle, which need not be the target's.
-    size = capture.info.target_size_m
-    return 1.25 * size if tracked else size
 
 
 def score(capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]) -> float | None:
@@ -256,8 +253,7 @@ def invert_stills(
         solution = inversion.solve(name, options.regularization, options.rule, options.noise_sigma)
         found["solutions"][name] = figures_of(name, solution)
         images[name] = solution.image
-    found["seconds"] = round(time.perf_counter() - clock, 1)
-    return found, images
+    return {**found, "seconds": round(time.perf_counter() - clock, 1)}, images
 
 
 def figures_of(name: str, solution: Solution) -> dict[str, Any]:
@@ -282,6 +278,7 @@ def reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:
 
 _GAP_S = 0.4  # between the instants at which silences are looked at
 _NORMAL_90 = 1.645
+_MOST_LEFT = 0.1  # of the light's own changes
 _FURTHEST = 0.15  # of fitted thresholds from the setup's, relative
 
 
@@ -338,9 +335,8 @@ def estimate_captures(
                 )
             record = record_of(capture.events, law, span, _GAP_S)
         found = estimate_sequence(light, prior, law, record, frames)
-        row = _row(capture, found, prior.target_plane)
-        row["seconds"] = round(time.process_time() - begun, 1)
-        rows.append(row)
+        seconds = round(time.process_time() - begun, 1)
+        rows.append({**_row(capture, found, prior.target_plane), "seconds": seconds})
         pictures[capture.name] = torch.from_numpy(found.image)
         pictures[f"{capture.name} deviation"] = torch.from_numpy(found.deviation)
     return {"setup": str(word), "from": evidence, "rows": rows}, pictures
@@ -371,8 +367,13 @@ def _row(capture: Capture, found: SequenceEstimate, target_plane: Plane) -> dict
 
 
 def sequence_doubts(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return why estimates from events are not to be believed, a line each."""
+    """Return why images are not to be believed, a line each."""
     return [
+        f"{name}: the setup leaves {100 * share:.0f} % of the light unexplained beside the noise, right ones 1 "
+        "to 3 %: do not believe the image; calibrate this very setup (`evnlos calibrate`)"
+        for name, share in {row["capture"]: row.get("unexplained") or 0.0 for row in rows}.items()
+        if share > _MOST_LEFT
+    ] + [
         f"{row['capture']}: the events fit the setup only with thresholds {row['threshold_factors']} times its "
         "own; do not believe the image, calibrate pixel and optics on this sensor"
         for row in rows

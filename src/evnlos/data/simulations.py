@@ -72,12 +72,14 @@ _WIDE = {
     "setup.pixel.leak_rate_hz": 0.7,
     "setup.pixel.leak_rate_per_dn_hz": 0.7,
     "setup.pixel.photon_noise": 0.5,
+    "setup.pixel.photocurrent_a_per_dn": 0.3,
+    "setup.pixel.noise_factor": 0.5,
 }
 _WIDE_PLACE_M = 0.002
 _WIDE_SETUPS = 6
 
 
-def randomized(simulation: Simulation) -> Simulation:
+def randomized(simulation: Simulation, walls: bool = True) -> Simulation:
     """Return a simulation whose sensors and walls are drawn from wide ranges around those that it has.
 
     What a network learns from it depends less on how well the setup is known (domain randomization; Tobin et
@@ -86,15 +88,18 @@ def randomized(simulation: Simulation) -> Simulation:
 
     Args:
         simulation: The simulation, as a rule that of a calibrated setup.
+        walls: Whether walls, light and frame cameras are drawn, too, or event pixels alone.
     """
-    ranges = ranges_around(simulation, _WIDE)
-    places = {p.name: p.value for p in simulation.setup.parameters() if p.role == "place"}
-    setup = simulation.setup.with_parameters(places)  # what follows from other numbers is written out
-    ranges |= {f"setup.{name}": (v - _WIDE_PLACE_M, v + _WIDE_PLACE_M) for name, v in places.items()}
+    chosen = {name: spread for name, spread in _WIDE.items() if walls or name.startswith("setup.pixel.")}
+    ranges, setup, setups = ranges_around(simulation, chosen), simulation.setup, simulation.setups
+    if walls:
+        places = {p.name: p.value for p in setup.parameters() if p.role == "place"}
+        setup = setup.with_parameters(places)  # what follows from other numbers is written out
+        ranges |= {f"setup.{name}": (v - _WIDE_PLACE_M, v + _WIDE_PLACE_M) for name, v in places.items()}
+        setups = max(setups, _WIDE_SETUPS) if setups else setups
     for path, (low, high) in simulation.vary.items():
         wide = ranges.get(path, (low, high))
         ranges[path] = (min(low, wide[0]), max(high, wide[1]))
-    setups = max(simulation.setups, _WIDE_SETUPS) if simulation.setups else simulation.setups
     return replace(simulation, setup=setup, vary=ranges, setups=setups)
 
 

@@ -1,8 +1,4 @@
-"""The photoreceptor with currents: settings, array and kernels.
-
-- The kernels of the photoreceptor with currents: its state carried from threshold to threshold, exactly.
-
-A photoreceptor with currents: bandwidth and noise follow from the light (the model of Graca and Delbruck).
+"""The photoreceptor with currents: bandwidth and noise follow from the light (the model of Graca and Delbruck).
 
 With I light and dark current together, q the charge of an electron, U = kT/q, gs = I / U, gm = kappa gs,
 ga = kappa I_pr / U, R = V_A / (2 I_pr), A = ga R kappa, three voltages obey
@@ -16,6 +12,11 @@ and a pixel sends an event where v_sf, in log units of light, has moved by a thr
 (R. Graca and T. Delbruck, arXiv 2304.04706 and 2505.07386). Within a short step I is frozen; what the light
 does and what the noise does add, since the equations are linear. Both are advanced exactly, by the matrix
 exponential of the step for a table of currents; the noise starts in its stationary state.
+
+With `poles` 1, v_sf follows x with one time constant and carries one Ornstein-Uhlenbeck noise: that of the
+same mean lag, and that of the same variance and correlation time as the three equations have at each current,
+
+    lag = -(M^-1 c)_3,  rms^2 = P_33,  memory = -(M^-1 P)_33 / P_33,  P the covariance of what settles.
 """
 
 from __future__ import annotations
@@ -45,12 +46,16 @@ from evnlos.cameras.random_numbers import (
     STREAM_CIRCUIT,
     STREAM_CIRCUIT_START,
     STREAM_LEAK_PHASE,
+    factor_of,
     fast_log,
     normal_field,
-    random_normals,
+    normal_row,
+    random_triple,
+    stationary,
     uniform_field,
 )
 from evnlos.cameras.streams import Columns, Light, grown, joined, sort_times
+from evnlos.errors import ConfigError
 
 LEVEL = 0.02
 """Distance of two currents of the table, e-fold."""
@@ -67,6 +72,15 @@ class Table(NamedTuple):
     push: NDArray[np.float64]  # M^-1 (exp(M h) - 1) c / h: what a change of log light takes away, [L, 3]
     kick: NDArray[np.float64]  # Cholesky factor of the noise of a step, [L, 3, 3]
     settled: NDArray[np.float64]  # Cholesky factor of the stationary noise, [L, 3, 3]
+
+
+class Pole(NamedTuple):
+    """One step h of the equations with one time constant each, for currents `LEVEL` apart; all [L]."""
+
+    decay: NDArray[np.float64]  # exp(-h / lag)
+    push: NDArray[np.float64]  # lag (1 - exp(-h / lag)) / h: what a change of log light takes away
+    keep: NDArray[np.float64]  # exp(-h / memory) of the noise
+    kick: NDArray[np.float64]  # rms of the noise of a step, log units
 
 
 class State(NamedTuple):
@@ -93,22 +107,6 @@ class Pixel(NamedTuple):
     seed: np.uint64
 
 
-def stationary(m: NDArray, noise: NDArray) -> NDArray[np.float64]:
-    """Return P of M P + P M^T + noise = 0, [L, 3, 3]: the covariance of what settles."""
-    one = np.eye(3)
-    system = np.einsum("lij,kn->likjn", m, one) + np.einsum("ij,lkn->likjn", one, m)
-    return np.linalg.solve(system.reshape(-1, 9, 9), -noise.reshape(-1, 9, 1)).reshape(-1, 3, 3)
-
-
-def factor_of(covariance: NDArray) -> NDArray[np.float64]:
-    """Return lower-triangular factors of covariances, zero where they are."""
-    if not covariance.any():
-        return np.zeros_like(covariance)
-    scale = np.sqrt(np.einsum("lii->li", covariance))
-    correlation = covariance / scale[:, :, None] / scale[:, None, :]
-    return scale[:, :, None] * np.linalg.cholesky(correlation + 1e-12 * np.eye(3))
-
-
 @njit(cache=True, error_model="numpy", inline="always")
 def apply(matrix, vector, i, add, scale):
     """Replace row i of `vector` by matrix @ row + scale * add."""
@@ -118,29 +116,51 @@ def apply(matrix, vector, i, add, scale):
 
 
 @njit(cache=True, error_model="numpy")
-def normals(seed, stream, pixel, counter, factor, out):
-    """Fill `out` [3] with normal numbers of the covariance factor factor^T."""
-    a, b = random_normals(seed, stream, pixel, counter)
-    c, _ = random_normals(seed, stream, pixel, counter + 1)
-    out[0] = factor[0, 0] * a
-    out[1] = factor[1, 0] * a + factor[1, 1] * b
-    out[2] = factor[2, 0] * a + factor[2, 1] * b + factor[2, 2] * c
-
-
-@njit(cache=True, error_model="numpy")
 def catch_up(i, level, state, table, pixel, kick):
     """Bring a pixel's noise up to date: step by step, or drawn anew where it has forgotten."""
     if state.stale[i] > _FORGOTTEN:
-        normals(pixel.seed, STREAM_CIRCUIT, i, state.drawn[i], table.settled[level], kick)
+        random_triple(pixel.seed, STREAM_CIRCUIT, i, state.drawn[i], table.settled[level], kick)
         state.drawn[i] += np.uint32(2)
         for n in range(3):
             state.noise[i, n] = kick[n]
     else:
         for _ in range(state.stale[i]):
-            normals(pixel.seed, STREAM_CIRCUIT, i, state.drawn[i], table.kick[level], kick)
+            random_triple(pixel.seed, STREAM_CIRCUIT, i, state.drawn[i], table.kick[level], kick)
             state.drawn[i] += np.uint32(2)
             apply(table.decay[level], state.noise, i, kick, 1.0)
     state.stale[i] = 0
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def cross(out, count, i, at, h, before, now, state, pixel):
+    """Send a pixel's events of a step from `at`, in which its follower goes from `before` to `now`."""
+    left = h
+    if state.deaf[i] > at:
+        if state.deaf[i] >= at + h:
+            state.reference[i] = now
+            return out, count
+        share = (state.deaf[i] - at) / h
+        before += share * (now - before)
+        left -= state.deaf[i] - at
+        at, state.reference[i] = state.deaf[i], before
+    while True:
+        lift = now - state.reference[i]
+        sign = 1 if lift >= pixel.on[i] else (-1 if lift <= -pixel.off[i] else 0)
+        if sign == 0:
+            return out, count
+        state.reference[i] += pixel.on[i] if sign > 0 else -pixel.off[i]
+        share = 0.0
+        if now != before:
+            share = min(max((state.reference[i] - before) / (now - before), 0.0), 1.0)
+        if count == len(out[0]):
+            out = grown(out[0]), grown(out[1]), grown(out[2])
+        out[0][count] = np.int64(np.rint((at + share * left) * 1e6))
+        out[1][count], out[2][count] = i, sign > 0
+        count += 1
+        if pixel.refractory > 0.0:
+            state.deaf[i] = at + share * left + pixel.refractory
+            state.reference[i] = now
+            return out, count
 
 
 @njit(cache=True, error_model="numpy")
@@ -150,16 +170,13 @@ def run_interval(out, count, i, start, length, steps, x1, state, table, pixel, k
     change = (x1 - x0) / steps
     top = len(table.decay) - 1
     middle = min(int(0.5 * (x0 + x1) / LEVEL + 0.5), top)
-    rms = 0.0
-    for n in range(3):
-        rms += table.settled[middle, 2, n] ** 2
-    margin = _SAFE * math.sqrt(rms)
+    rms = math.sqrt((table.settled[middle, 2] ** 2).sum())
     deaf = state.deaf[i] > start
     # without its noise: how far does the response go, and can it come near a threshold?
     if not deaf:
         lift = x0 + state.lag[i, 2] - state.reference[i]
         reach = max(abs(state.lag[i, 0]), abs(state.lag[i, 1]), abs(state.lag[i, 2])) + abs(x1 - x0)
-        reach += pixel.leak * length + margin
+        reach += pixel.leak * length + _SAFE * rms
         if lift + reach < pixel.on[i] and lift - reach > -pixel.off[i]:
             for _ in range(steps):
                 apply(table.decay[middle], state.lag, i, table.push[middle], -change)
@@ -172,39 +189,12 @@ def run_interval(out, count, i, start, length, steps, x1, state, table, pixel, k
     for k in range(steps):
         level = min(int((x0 + (k + 0.5) * change) / LEVEL + 0.5), top)
         apply(table.decay[level], state.lag, i, table.push[level], -change)
-        normals(pixel.seed, STREAM_CIRCUIT, i, state.drawn[i], table.kick[level], kick)
+        random_triple(pixel.seed, STREAM_CIRCUIT, i, state.drawn[i], table.kick[level], kick)
         state.drawn[i] += np.uint32(2)
         apply(table.decay[level], state.noise, i, kick, 1.0)
         now = x0 + (k + 1) * change + state.lag[i, 2] + state.noise[i, 2]
         state.reference[i] -= pixel.leak * h
-        at = start + k * h
-        if state.deaf[i] > at:
-            if state.deaf[i] >= at + h:
-                state.reference[i] = now
-                before = now
-                continue
-            share = (state.deaf[i] - at) / h
-            before += share * (now - before)
-            at, state.reference[i] = state.deaf[i], before
-        left = start + (k + 1) * h - at
-        while True:
-            lift = now - state.reference[i]
-            sign = 1 if lift >= pixel.on[i] else (-1 if lift <= -pixel.off[i] else 0)
-            if sign == 0:
-                break
-            state.reference[i] += pixel.on[i] if sign > 0 else -pixel.off[i]
-            share = 0.0
-            if now != before:
-                share = min(max((state.reference[i] - before) / (now - before), 0.0), 1.0)
-            if count == len(out[0]):
-                out = grown(out[0]), grown(out[1]), grown(out[2])
-            out[0][count] = np.int64(np.rint((at + share * left) * 1e6))
-            out[1][count], out[2][count] = i, sign > 0
-            count += 1
-            if pixel.refractory > 0.0:
-                state.deaf[i] = at + share * left + pixel.refractory
-                state.reference[i] = now
-                break
+        out, count = cross(out, count, i, start + k * h, h, before, now, state, pixel)
         before = now
     state.x[i] = x1
     return out, count
@@ -222,12 +212,97 @@ def run_frames(frames, origin, times, steps, first, last, state, tables, which, 
     out = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_)
     count, kick = np.int64(0), np.empty(3)
     for k in range(len(frames)):
-        length = times[k + 1] - times[k]
-        w = which[k]
+        length, w = times[k + 1] - times[k], which[k]
         table = Table(tables.decay[w], tables.push[w], tables.kick[w], tables.settled[w])
         for i in range(first, last):
             x1 = min(fast_log(1.0 + pixel.factor * np.float64(frames[k, i - origin])), pixel.top)
             out, count = run_interval(out, count, i, times[k], length, steps[k], x1, state, table, pixel, kick)
+    return out[0][:count], out[1][:count], out[2][:count]
+
+
+# Each of the following loops writes few arrays: with more, a compiler gives up proving that none overlap.
+
+
+@njit(cache=True, error_model="numpy")
+def noise_row(noise, keep, kick, normal, which):
+    """Advance the noise by a step, with the first or the second of two normal numbers."""
+    for i in range(len(noise)):
+        noise[i] = keep[i] * noise[i] + kick[i] * normal[2 * i + which]
+
+
+@njit(cache=True, error_model="numpy")
+def lag_row(lag, decay, push):
+    """Advance the response by a step."""
+    for i in range(len(lag)):
+        lag[i] = decay[i] * lag[i] - push[i]
+
+
+@njit(cache=True, error_model="numpy")
+def stand_row(x0, x1, share, leaked, lag, noise, now):
+    """Fill where the follower stands, `share` of the way between two frames, over a reference that leaked."""
+    for i in range(len(now)):
+        now[i] = x0[i] + share * (x1[i] - x0[i]) + (lag[i] + noise[i] + leaked)
+
+
+@njit(cache=True, error_model="numpy")
+def flag_row(now, reference, on, off, deaf, at, flags):
+    """Flag the pixels that meet a threshold in a step or rest at its start."""
+    for i in range(len(now)):
+        lift = now[i] - reference[i]
+        flags[i] = (lift >= on[i]) | (lift <= -off[i]) | (deaf[i] > at)
+
+
+@njit(cache=True, error_model="numpy")
+def send_row(out, count, start, at, h, before, now, flags, state, pixel):
+    """Send the events of the flagged pixels, from `start` on, in a step."""
+    for i in range(len(flags)):
+        if flags[i]:
+            out, count = cross(out, count, start + i, at, h, before[i], now[i], state, pixel)
+    return out, count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def run_poles(frames, origin, times, steps, first, last, tile_px, state, tables, which, pixel):
+    """Run pixels of one time constant through a block of light; arguments and result as of `run_frames`.
+
+    tables  `Pole` with a first axis for each length of a step;  tile_px  pixels that go through it together
+    """
+    out = np.empty(1024, np.int64), np.empty(1024, np.int32), np.empty(1024, np.bool_)
+    count, top = np.int64(0), tables.decay.shape[1] - 1
+    for start in range(first, last, tile_px):
+        size = min(tile_px, last - start)
+        stop = start + size
+        rows, normal, flags = np.empty((10, size)), np.empty(2 * size), np.empty(size, np.bool_)
+        lag, noise, before, now, x0, x1 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+        decay, push, keep, kick = rows[6], rows[7], rows[8], rows[9]
+        lag[:], noise[:], x0[:] = state.lag[start:stop, 2], state.noise[start:stop, 2], state.x[start:stop]
+        on, off, deaf = pixel.on[start:stop], pixel.off[start:stop], state.deaf[start:stop]
+        reference, drawn, leaked = state.reference[start:stop], state.drawn[start], 0.0
+        stand_row(x0, x0, 0.0, leaked, lag, noise, before)
+        for k in range(len(frames)):
+            h, w = (times[k + 1] - times[k]) / steps[k], which[k]
+            for i in range(size):
+                x1[i] = min(fast_log(1.0 + pixel.factor * np.float64(frames[k, start - origin + i])), pixel.top)
+                level = min(int(0.5 * (x0[i] + x1[i]) / LEVEL + 0.5), top)
+                decay[i], keep[i] = tables.decay[w, level], tables.keep[w, level]
+                push[i], kick[i] = tables.push[w, level] * (x1[i] - x0[i]) / steps[k], tables.kick[w, level]
+            for n in range(steps[k]):
+                at = times[k] + n * h
+                leaked += pixel.leak * h
+                if n % 2 == 0:
+                    normal_row(pixel.seed, STREAM_CIRCUIT, start, drawn, normal)
+                    drawn += np.uint32(1)
+                lag_row(lag, decay, push)
+                noise_row(noise, keep, kick, normal, n % 2)
+                stand_row(x0, x1, (n + 1) / steps[k], leaked, lag, noise, now)
+                flag_row(now, reference, on, off, deaf, at, flags)
+                if flags.any():
+                    out, count = send_row(out, count, start, at, h, before, now, flags, state, pixel)
+                before, now = now, before
+            x0, x1 = x1, x0
+        state.drawn[start:stop] = drawn
+        reference -= leaked
+        state.lag[start:stop, 2], state.noise[start:stop, 2], state.x[start:stop] = lag, noise, x0
     return out[0][:count], out[1][:count], out[2][:count]
 
 
@@ -236,6 +311,8 @@ _RANGE = 3.0
 """Currents stay below the amplifier's by this factor: the equations ask for it."""
 _STEP_SHARE = 0.1
 """Longest step, in time constants of the follower: between two steps its output counts as a line."""
+_POLE_SHARE = 1.0
+"""The same of one pole, whose noise would have ever shorter swings in ever shorter steps."""
 
 
 @EVENT_MODELS.register
@@ -262,6 +339,8 @@ class CircuitPixel(ThresholdPixel):
         kappa: Slope factor of the transistors, 0 to 1.
         early_v: V_A, volt.
         noise_factor: Factor of all noise voltages; 1 = the shot noise of the currents, 0 = none.
+        poles: 3 = the equations; 1 = one time constant for the response and one for the noise, much faster:
+            nearly the same events of pixels that are slower than their follower, half the noise of others.
         leak_rate_hz: Rate of the leak's ON events, hertz per pixel.
         refractory_s: Time after an event in which the reference follows the light, seconds.
         initial_phase: "rest" = the reference stands at the settled level, "random" = anywhere between the
@@ -304,6 +383,8 @@ class CircuitPixel(ThresholdPixel):
     """Early voltage of the amplifier, volt."""
     noise_factor: float = 1.0
     """Factor of all noise voltages; 1 = the shot noise of the currents, 0 = none."""
+    poles: Literal[3, 1] = 3
+    """3 = the equations; 1 = one time constant for the response and one for the noise."""
     leak_rate_hz: float = 0.1
     """Rate of the leak's ON events, hertz per pixel."""
     refractory_s: float = 0.0
@@ -324,6 +405,8 @@ class CircuitPixel(ThresholdPixel):
         require(self, "kappa", 0.1, 1.0, "(no unit)")
         require(self, "early_v", 0.1, 1e3, "volt")
         require(self, "noise_factor", 0.0, 100.0, "(no unit); 0 switches the noise off")
+        if self.poles not in (3, 1):
+            raise ConfigError(f"poles is {self.poles!r}; give 3 or 1")
         require(self, "leak_rate_hz", 0.0, math.inf, "hertz; 0 switches it off")
         require(self, "refractory_s", 0.0, math.inf, "seconds; 0 switches it off")
         check_phase(self.initial_phase)
@@ -440,21 +523,35 @@ class CircuitArray(EventModel):
         current = settings.dark_current_a * np.exp(LEVEL * np.arange(int(top / LEVEL) + 2))
         self._m, self._rest, noise = settings.matrices(current)
         self._covariance = stationary(self._m, noise)
-        self._longest = _STEP_SHARE * _THERMAL_V * settings.follower_f / settings.follower_a
-        self._tables: dict[float, Table] = {}
+        share = _STEP_SHARE if settings.poles == 3 else _POLE_SHARE
+        self._longest = share * _THERMAL_V * settings.follower_f / settings.follower_a
+        self._tables: dict[float, Table | Pole] = {}
 
-    def _table(self, h: float) -> Table:
+    def _table(self, h: float) -> Table | Pole:
         """Return one step of h seconds; kept, as most steps are alike."""
         key = float(f"{h:.9g}")
         if key not in self._tables:
             if len(self._tables) > 64:
                 self._tables.clear()
-            decay = torch.matrix_exp(torch.from_numpy(self._m * key)).numpy()
-            push = np.linalg.solve(self._m, (decay - np.eye(3)) @ self._rest[:, None])[..., 0] / key
-            noise = self._covariance - decay @ self._covariance @ decay.transpose(0, 2, 1)
-            parts = decay, push, factor_of(noise), factor_of(self._covariance)
-            self._tables[key] = Table(*(np.ascontiguousarray(part, dtype=np.float64) for part in parts))
+            self._tables[key] = self._steps(key) if self.settings.poles == 3 else self._pole(key)
         return self._tables[key]
+
+    def _steps(self, h: float) -> Table:
+        """Return one step of the three equations."""
+        decay = torch.matrix_exp(torch.from_numpy(self._m * h)).numpy()
+        push = np.linalg.solve(self._m, (decay - np.eye(3)) @ self._rest[:, None])[..., 0] / h
+        noise = self._covariance - decay @ self._covariance @ decay.transpose(0, 2, 1)
+        parts = decay, push, factor_of(noise), factor_of(self._covariance)
+        return Table(*(np.ascontiguousarray(part, dtype=np.float64) for part in parts))
+
+    def _pole(self, h: float) -> Pole:
+        """Return one step with one time constant each for response and noise."""
+        lag = -np.linalg.solve(self._m, self._rest[:, None])[:, 2, 0]
+        variance = self._covariance[:, 2, 2]
+        memory = -np.linalg.solve(self._m, self._covariance)[:, 2, 2] / np.maximum(variance, 1e-300)
+        memory = np.where(variance > 0, memory, lag)
+        kick = np.sqrt(-np.expm1(-2 * h / memory) * variance)
+        return Pole(np.exp(-h / lag), -lag * np.expm1(-h / lag) / h, np.exp(-h / memory), kick)
 
     def start(self, frame: NDArray, time_s: float) -> None:
         """Let all pixels have settled to the first light, DN [N], their noise in its stationary state."""
@@ -485,14 +582,16 @@ class CircuitArray(EventModel):
         keys = [float(f"{h:.9g}") for h in lengths / steps]
         distinct = list(dict.fromkeys(keys))
         tables = [self._table(key) for key in distinct]
-        stacked = Table(*(np.stack([getattr(table, name) for table in tables]) for name in Table._fields))
+        stacked = type(tables[0])(*map(np.stack, zip(*tables, strict=True)))
         which = np.array([distinct.index(key) for key in keys])
 
         def work(first: int, last: int) -> Columns:
             frames, origin = light.pixels(first, last)
-            return run_frames(
-                frames, origin, times, steps, first, last, self._state, stacked, which, self._pixel
-            )
+            where = frames, origin, times, steps, first, last
+            what = self._state, stacked, which, self._pixel
+            if self.settings.poles == 3:
+                return run_frames(*where, *what)
+            return run_poles(*where, self._tile_px, *what)
 
         tiles = list(map_shares(work, len(self._state.x), self._tile_px, self._threads, light.most_px))
         self._time = float(times_s[-1])
