@@ -43,7 +43,7 @@ TRUTHS = {
         "noise_factor": (0.7, 1.5),
     },
 }
-SIZES = {"continuous": (100, 1.0), "brownian": (100, 1.0), "circuit": (64, 0.25)}  # pixels, factor of the times
+PIXELS = 100
 LIGHTS = (
     (KnownLight("sine", 60.0, 2.0, 0.7), 4.0),
     (KnownLight("sine", 60.0, 20.0, 0.7), 0.5),
@@ -62,10 +62,10 @@ def one_draw(name: str, number: int) -> dict:
     truth["threshold_sigma"] = ratio * 0.5 * (truth["threshold_on"] + truth["threshold_off"])
     start = CANDIDATES[name][0]
     pixel = replace(start, **{key: value for key, value in truth.items() if key != MISMATCH})
-    count, factor = SIZES[name]
+    count = PIXELS
     recordings = []
     for light, seconds in LIGHTS:
-        times, level = waveform(light, max(factor * seconds, 1.0 / light.frequency_hz))
+        times, level = waveform(light, max(seconds, 1.0 / light.frequency_hz))
         lit = np.repeat(level[:, None].astype(np.float32), count, axis=1)[:, None]
         recordings.append(LitRecording(np.ascontiguousarray(lit), times, Events.empty(count, 1), known=light))
     events = simulated_events(recordings, pixel, derive_seed(seed, "recorded"))

@@ -2,18 +2,21 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from evnlos.calibration import CALIBRATION_VALUES_FILE
+from evnlos.data import STANDARD_MODALITIES
 from evnlos.demo import Demo, run_demo
-from evnlos.errors import CalibrationError, ConfigError
+from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import Record, Study
 from evnlos.experiment.study import write_record
 from evnlos.mismatch import finding, mismatch_table, run_mismatch
 from evnlos.models import layers_of
 
+CAPTURE = "camera: {name: a camera, width: 40, height: 25}\n"
 LEFT = {
     "frames fit": {"before": 0.5, "after": 0.04, "noise": 0.03},
     "frames held out": {"before": 0.5, "after": 0.09, "noise": 0.03},
@@ -99,7 +102,7 @@ def test_the_pre_training_begins_with_layers_where_they_are_installed(tmp_path, 
     for name in layers_of("generic"):
         (tmp_path / f"{name}.safetensors").touch()
     (tmp_path / "a_A").mkdir()
-    (tmp_path / "a_A" / "capture.yaml").write_text("x: 1")
+    (tmp_path / "a_A" / "capture.yaml").write_text(CAPTURE)
     studies = []
 
     def stop(study: Study, *_) -> None:
@@ -118,7 +121,7 @@ def test_the_pre_training_begins_with_layers_where_they_are_installed(tmp_path, 
 
 def test_the_demo_trains_what_was_asked_for(tmp_path, monkeypatch):
     (tmp_path / "a_A").mkdir()
-    (tmp_path / "a_A" / "capture.yaml").write_text("x: 1")
+    (tmp_path / "a_A" / "capture.yaml").write_text(CAPTURE)
 
     def stop(study: Study, *_) -> None:
         raise CalibrationError(" ".join(study.modalities))
@@ -128,6 +131,31 @@ def test_the_demo_trains_what_was_asked_for(tmp_path, monkeypatch):
         run_demo(Demo(out=tmp_path / "out", captures=(tmp_path / "a_A",), modalities=("event",)))
     with pytest.raises(ConfigError, match="modalities names none"):
         Demo(modalities=())
+
+
+@pytest.mark.parametrize(("lacks", "asked"), [("events", STANDARD_MODALITIES), ("frames", ("event",))])
+def test_the_demo_takes_captures_without_events_for_what_they_are(tmp_path, monkeypatch, lacks, asked):
+    for name, also in (("a_A", ""), ("a_B", f"{lacks}: null\n")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "capture.yaml").write_text(also + CAPTURE)
+    studies = []
+
+    def stop(study: Study, *_) -> None:
+        studies.append(study)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("evnlos.experiment.run_study", stop)
+    demo = Demo(out=tmp_path / "out", captures=(tmp_path,), modalities=asked)
+    if lacks == "frames":
+        with pytest.raises(DataError, match="a_B holds events alone"):
+            run_demo(demo)
+        return
+    with pytest.raises(CalibrationError, match="enough"):
+        run_demo(demo)
+    (study,) = studies
+    assert study.modalities == ("frame",) and not study.calibration.events
+    with pytest.raises(DataError, match="a_B holds frames alone, no events; give --modalities frame"):
+        run_demo(replace(demo, modalities=("event",)))
 
 
 def test_unknown_setups_and_empty_folders_are_refused(tmp_path):

@@ -23,7 +23,6 @@ from evnlos.calibration import (
     read_lit_events,
     read_manifest,
     refractory_of,
-    shortened,
     simulated_events,
     tick_of,
     value_of,
@@ -156,14 +155,6 @@ def test_the_scale_of_a_number_and_its_inverse() -> None:
             assert position_of(one, value) == pytest.approx(u[k], abs=1e-9)
             if one.name != MISMATCH:
                 assert getattr(pixel, one.name) == pytest.approx(value)
-
-
-def test_a_circuit_sees_less_of_long_recordings() -> None:
-    long = [replace(one, times_s=np.array([0.0, 50.0, 100.0])) for one in recorded(EventPixel(), 1, 200)[2:]]
-    short = shortened("circuit", long)
-    assert shortened("continuous", long) == long
-    assert short[0].light.shape[2] == 96 and short[0].times_s[-1] < 10
-    assert short[0].events.width == 96 and short[0].light.shape[0] == len(short[0].times_s)
 
 
 def test_time_stamps_on_a_grid_are_no_refractory_period() -> None:

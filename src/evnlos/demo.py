@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in, character_of
 from evnlos.data.pool import workers_kept
-from evnlos.errors import CalibrationError, ConfigError, UnknownNameError
+from evnlos.errors import CalibrationError, ConfigError, DataError, UnknownNameError
 from evnlos.machine import ProgressBars
 from evnlos.types import OutFolder
 
@@ -127,8 +127,9 @@ def run_demo(settings: Demo) -> Path:
                 lab, out / "captures", workers=settings.workers, progress=progress, force=settings.force
             )
     settings, lacking = _with_layers(settings)
-    notes += lacking
-    study = _study(settings, held_out(folders, settings.test))
+    settings, alone = _with_cameras(settings, folders)
+    notes += lacking + alone
+    study = _study(settings, held_out(folders, settings.test), events=not alone)
     place = replace(place, captures=tuple(sorted(folders)))
     try:
         with ProgressBars() as progress:
@@ -175,6 +176,29 @@ def _with_layers(settings: Demo) -> tuple[Demo, list[str]]:
     return replace(settings, start=""), [why]
 
 
+def _with_cameras(settings: Demo, folders: list[Path]) -> tuple[Demo, list[str]]:
+    """Return the settings that see frames alone where a capture has no events, and why.
+
+    Raises:
+        DataError: A capture has no frames, or none of what the networks are to see is of frames alone.
+    """
+    from evnlos.data.capture_info import read_capture_info
+
+    alone = list[str]()
+    for folder in folders:
+        info = read_capture_info(folder)
+        info.check_cameras(folder.name, frames=True, events=False)
+        alone += [folder.name] if info.events is None else []
+    if not alone:
+        return settings, []
+    if not (seen := tuple(name for name in settings.modalities if not MODALITIES[name].needs_events)):
+        raise DataError(f"{alone[0]} holds frames alone, no events; give --modalities frame, or leave it out")
+    why = (
+        f"{len(alone)} of {len(folders)} captures hold frames alone ({alone[0]} first); so networks see frames."
+    )
+    return replace(settings, modalities=seen), [why]
+
+
 def _of_calibration(setup: Path) -> list[str]:
     """Return what the calibration found, and what it warns of."""
     drawn = f" ({setup.parent.name}/{setup.name}/check.png)" if (setup / "check.png").is_file() else ""
@@ -194,8 +218,8 @@ def _of_corrections(records: list[Record], out: Path) -> list[str]:
     return [f"{what}: {', '.join(those)}."] if those else []
 
 
-def _study(settings: Demo, test: list[str]) -> Study:
-    """Return the comparison of E2E and EPNP, with one seed."""
+def _study(settings: Demo, test: list[str], events: bool) -> Study:
+    """Return the comparison of E2E and EPNP, with one seed; `events`: whether the captures have any."""
     from evnlos.calibration import Calibration
     from evnlos.data.sampling import Sampling
     from evnlos.data.simulations import default
@@ -231,7 +255,7 @@ def _study(settings: Demo, test: list[str]) -> Study:
         writers=settings.writers,
         redrawn=settings.redrawn,
         simulation=replace(default(), seed=settings.seed),
-        calibration=Calibration(event_captures=2, columns=48, seed=settings.seed),
+        calibration=Calibration(events=events, event_captures=2, columns=48, seed=settings.seed),
         setups=2,
         robust=settings.robust,
         refine=False,

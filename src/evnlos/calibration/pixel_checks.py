@@ -29,7 +29,6 @@ _FEWEST_PAIRS = 30  # intervals that are all alike before they count as the refr
 _FINE_TICKS = 5  # ticks of the time stamps that a refractory period must last to be told from them
 _PILE = 5.0  # times as many intervals at the shortest as just above it
 _STATIC_S, _STATIC_PX = 10.0, 200
-_CIRCUIT_S, _CIRCUIT_PX = 1.0, 64
 _BINS = 24
 
 
@@ -287,9 +286,7 @@ def at_lights(fit: CandidateFit, levels_dn: Sequence[float], seed: int) -> tuple
         levels_dn: Light, DN.
         seed: Seed of the simulations.
     """
-    is_slow = fit.name == "circuit"
-    seconds, pixels = (_CIRCUIT_S, _CIRCUIT_PX) if is_slow else (_STATIC_S, _STATIC_PX)
-    found = []
+    seconds, pixels, found = _STATIC_S, _STATIC_PX, []
     for level in levels_dn:
         times, light = waveform(KnownLight("static", level), seconds)
         still = np.repeat(light[:, None].astype(np.float32), pixels, axis=1)[:, None]

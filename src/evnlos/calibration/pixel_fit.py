@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 
 from evnlos.calibration.event_models import Free
-from evnlos.calibration.pixel_light import LitRecording, part_of
+from evnlos.calibration.pixel_light import LitRecording
 from evnlos.calibration.pixel_statistics import (
     NEAR,
     Array,
@@ -55,9 +55,6 @@ _MAY_BE_NONE = (MISMATCH, "leak_rate_hz", "shot_noise_rate_hz", "leak_rate_per_d
 _STUCK = 0.6  # misfit at which an attempt may have ended beside the likeliest place
 _ATTEMPTS = 3
 _REPLICATES = 4
-_STEP_S = 1.5e-4  # of a circuit pixel with the default follower
-_CIRCUIT_STEPS = 4_000_000  # of pixels and time, in one simulation
-_CIRCUIT_PX = 96
 
 _THRESHOLDS = (
     Free("threshold_on", 0.03, 1.5, 0.05),
@@ -83,7 +80,7 @@ CANDIDATES: dict[str, tuple[PixelSettings, tuple[Free, ...]]] = {
         ),
     ),
     "circuit": (
-        CircuitPixel(),
+        CircuitPixel(poles=1),
         (
             *_THRESHOLDS,
             Free("photocurrent_a_per_dn", 1e-17, 3e-14, 0.2),
@@ -100,7 +97,7 @@ class PixelFitSettings:
     """How a pixel is fitted."""
 
     models: tuple[str, ...] = tuple(CANDIDATES)
-    """Models to fit and compare: continuous; continuous, true logarithm; brownian; circuit (takes minutes)."""
+    """Models to fit and compare: continuous; continuous, true logarithm; brownian; circuit (with one pole)."""
     pixels: int = 800
     """Pixels that are fitted; half as many are held out."""
     most_s: float = 30.0
@@ -241,22 +238,6 @@ def pixel_at(start: PixelSettings, free: Sequence[Free], u: Array) -> PixelSetti
     if ratio is not None:
         changes["threshold_sigma"] = ratio * 0.5 * (changes["threshold_on"] + changes["threshold_off"])
     return replace(start, **changes)  # type: ignore[type-var]
-
-
-def shortened(name: str, recordings: Sequence[LitRecording]) -> list[LitRecording]:
-    """Return what of the recordings a model is fitted to: of those for a circuit, fewer pixels and seconds.
-
-    Args:
-        name: Name in `CANDIDATES`.
-        recordings: Light and events.
-    """
-    total = sum(float(one.times_s[-1]) for one in recordings)
-    pixels = recordings[0].light.shape[2]
-    if name != "circuit" or total / _STEP_S * pixels <= _CIRCUIT_STEPS:
-        return list(recordings)
-    few = min(pixels, max(_CIRCUIT_PX, int(_CIRCUIT_STEPS * _STEP_S / total)))
-    seconds = _CIRCUIT_STEPS * _STEP_S / few / len(recordings)
-    return [part_of(one, few, seconds) for one in recordings]
 
 
 def fit_candidate(

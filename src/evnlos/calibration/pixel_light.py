@@ -258,28 +258,6 @@ def lit_recording(one: LitEvents, pixels: NDArray[np.int64], most_s: float) -> L
     return LitRecording(lit, times, few, known=known, crossing_s=crossing)
 
 
-def part_of(recording: LitRecording, pixels: int, seconds: float) -> LitRecording:
-    """Return the first pixels and seconds of a recording.
-
-    Args:
-        recording: Light and events.
-        pixels: Pixels at most.
-        seconds: Seconds at most.
-    """
-    end = min(seconds, float(recording.times_s[-1]))
-    count = int(np.searchsorted(recording.times_s, end, "right"))
-    times, light = recording.times_s[:count], recording.light[:count, :, :pixels]
-    if times[-1] < end:
-        share = np.float32((end - times[-1]) / (recording.times_s[count] - times[-1]))
-        following = recording.light[count, :, :pixels]
-        times = np.append(times, end)
-        light = np.concatenate([light, (light[-1] + share * (following - light[-1]))[None]])
-    kept = (recording.events.x < pixels) & (recording.events.t_us <= round(end * 1e6))
-    few = replace(recording.events[kept], width=pixels)
-    crossing = None if recording.crossing_s is None else recording.crossing_s[:pixels]
-    return replace(recording, light=np.ascontiguousarray(light), times_s=times, events=few, crossing_s=crossing)
-
-
 def waveform(known: KnownLight, seconds: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return instants [T], seconds, and the light there [T], DN: linear in between.
 

@@ -31,7 +31,6 @@ from evnlos.calibration.pixel_fit import (
     PixelFitSettings,
     fit_candidate,
     panels_of,
-    shortened,
 )
 from evnlos.calibration.pixel_light import LitEvents, LitRecording, choose_panel, lit_recording
 from evnlos.cameras import PixelSettings, ReadoutPixel
@@ -155,13 +154,9 @@ def fit_known_light(
         [lit_recording(one, pixels, settings.most_s) for one in known] for pixels in (panel.fitted, panel.held)
     )
     dead_s = refractory.value if refractory.state == "identified" else 0.0
-    full, fits = panels_of(fitted), []
-    for name in settings.models:
-        part = shortened(name, fitted)
-        panels = full if part[0] is fitted[0] else panels_of(part)
-        fits.append(fit_candidate(name, panels, settings, dead_s, progress))
-    slow = "circuit" in settings.models
-    judged = panels_of(shortened("circuit", held) if slow else held, full)
+    full = panels_of(fitted)
+    fits = [fit_candidate(name, full, settings, dead_s, progress) for name in settings.models]
+    judged = panels_of(held, full)
     ranking = compared(fits, judged, settings, progress)
     best = next(fit for fit in fits if fit.name == ranking[0].name)
     names = [one.name for one in known]
