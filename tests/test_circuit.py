@@ -60,6 +60,17 @@ def test_noise_rates_are_those_of_small_steps() -> None:
     assert abs(found - expected) < 4 * math.sqrt(2 * (found + expected) / 400)
 
 
+def test_noise_carries_crossings_ahead_as_its_law_says() -> None:
+    """Noise that is drawn anew each time constant, light that nears a threshold by 0.5 log units a second."""
+    for current in (3e-15, 1e-14, 1e-13):
+        law, rms = PLAIN.crossing_law(dn(current)), PLAIN.noise_rms(current)
+        step = 0.5 / (2 * math.pi * PLAIN.bandwidth_hz(current))
+        count = math.ceil(14 * rms / step)
+        away = step * (count / 2 - np.arange(count))  # from 7 rms below the threshold to 7 above
+        met = np.random.default_rng(1).normal(scale=rms, size=(4000, count)) >= away
+        assert law.ahead == pytest.approx(np.median(away[met.argmax(axis=1)]), abs=0.1 * rms + step)
+
+
 def test_bright_pixels_make_no_noise_events() -> None:
     pixel = replace(PLAIN, threshold_on=0.15, threshold_off=0.15)
     frames, times = static(1e-12, 4.0, 150)

@@ -11,7 +11,7 @@ import torch
 
 from evnlos.analysis import SequenceAnalysisSettings, check_sampling, event_information
 from evnlos.calibration import write_event_errors
-from evnlos.cameras import EventPixel, FrameCamera, simulate_events
+from evnlos.cameras import CircuitPixel, EventPixel, FrameCamera, PixelSettings, simulate_events
 from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
 from evnlos.data import NlosDataset, Sampling, Simulation, capture_samples, read_capture, simulate
@@ -41,6 +41,8 @@ from evnlos.types import Events, Plane
 
 COUNT = 24
 PIXEL = EventPixel(0.12, 0.14, 0.02, 60.0, 0.02, 0.05)
+NOISY = replace(PIXEL, shot_noise_rate_hz=0.2)
+DIM = CircuitPixel(0.16, 0.2, 0.02, 3e-15, follower_a=3e-12, noise_factor=1.5, poles=1)
 SETUP = RadiometricSetup(cell_m=0.01, gain=0.8, ambient=0.08, sensor=SensorSize(20, 32), pixel=PIXEL)
 BENCH = SequenceAnalysisSettings(positions=20, counts=(20,), cells=8, crossing_noise=0.04)
 SEQUENCES, EXACT = 6, 0.003  # the error of a crossing in a pixel that has none, interpolation included
@@ -65,14 +67,16 @@ def truth(seed: int) -> np.ndarray:
     return np.random.default_rng([seed, 9]).standard_normal(COUNT)
 
 
-def simulated(seed: int, pixel: EventPixel = PIXEL) -> Events:
-    """The events of the project's own continuous pixel, with mismatch, filter, leak and noise events."""
+def simulated(seed: int, pixel: PixelSettings = PIXEL) -> Events:
+    """The events of one of the project's own pixels, with mismatch, filter, leak and noise."""
     frames = 255 * np.maximum(light()(truth(seed)), 1e-3).T.reshape(-1, *light().shape)
     return simulate_events(frames.astype(np.float32), light().times_s, pixel, seed=seed)
 
 
-def recorded(seed: int, pixel: EventPixel = PIXEL) -> EventRecord:
-    return record_of(simulated(seed, pixel), pixel.crossing_law(40.0), (0.0, BENCH.duration_s), 0.4)
+def recorded(seed: int, pixel: PixelSettings = PIXEL) -> EventRecord:
+    law = pixel.crossing_law(40.0)
+    assert law is not None
+    return record_of(simulated(seed, pixel), law, (0.0, BENCH.duration_s), 0.4)
 
 
 def photographed(seed: int, camera: FrameCamera, known: bool) -> FrameTerm:
@@ -134,6 +138,19 @@ def test_many_noise_events_are_told_from_signals(from_truth: bool) -> None:
     assert np.mean([one.noise_share for one in found]) > 0.25
     assert 10 * np.log10(np.mean(reached) / np.mean([one.expected_error for one in found])) < 0.5
     assert 0.86 < np.mean(np.array(away) < 1.645) < 0.94
+
+
+def test_noise_that_carries_crossings_ahead_is_no_contrast() -> None:
+    """A turn of the light then needs less than a threshold; who does not know it is further from the truth."""
+    law, found = DIM.crossing_law(40.0), {}
+    assert 0.02 < law.ahead < 0.06
+    for ahead in (0.0, law.ahead):
+        known = replace(law, ahead=ahead)
+        ones = [estimate_sequence(light(), prior(), known, recorded(seed, DIM)) for seed in range(4)]
+        away = [np.abs(one.image - prior().image(truth(s))) / one.deviation for s, one in enumerate(ones)]
+        found[ahead] = np.mean([error(one, s) for s, one in enumerate(ones)]), np.mean(np.array(away) < 1.645)
+    (before, covered_before), (after, covered) = found.values()
+    assert 10 * np.log10(before / after) > 1.0 and covered > max(covered_before, 0.8)
 
 
 def test_it_stays_at_the_truth() -> None:
@@ -226,13 +243,11 @@ def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) 
     assert "--from takes whole sequences" in capsys.readouterr().err
 
 
-NOISY = replace(PIXEL, shot_noise_rate_hz=0.2)
-
-
-@pytest.mark.parametrize("pixel", [PIXEL, NOISY], ids=["few noise events", "many"])
+@pytest.mark.parametrize("pixel", [PIXEL, NOISY, DIM], ids=["few noise events", "many", "slow noise"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_fast_estimate_is_that_of_the_slow_one(pixel: EventPixel, seed: int) -> None:
+def test_the_fast_estimate_is_that_of_the_slow_one(pixel: PixelSettings, seed: int) -> None:
     law = pixel.crossing_law(40.0)
+    assert law is not None
     solver, unknown = EventSolver(light(), law), np.zeros(COUNT + 1)
     record = recorded(seed, pixel)
     slow = estimate_sequence(light(), prior(), law, record)

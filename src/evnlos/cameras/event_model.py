@@ -81,8 +81,10 @@ class CrossingLaw:
     """What an event of a threshold pixel says of the light, in numbers: the constants of a likelihood.
 
     Between two events of a pixel the filtered log light P, less the leak's share, moves by +threshold_on or
-    -threshold_off, with dP/dt = bandwidth(I) (ln I - P). The error of that change has the variance
-    noise^2 + walk_variance(I) times the time between the two. Light I is in DN, 255 = white.
+    -threshold_off, less ahead (s - s'), s = +1 or -1 the sign of the event and s' that of the one before, 0 for
+    a first light: noise carries each ahead, so that a turn needs less than a threshold. dP/dt = bandwidth(I)
+    (ln I - P). The error of that change has the variance noise^2 + walk_variance(I) times the time between the
+    two. Light I is in DN, 255 = white.
 
     Args:
         threshold_on: Mean threshold of ON events, log units.
@@ -93,6 +95,7 @@ class CrossingLaw:
         leak_per_dn: What each DN of light adds to that.
         events_hz: Events without cause, but for the leak's, hertz per pixel.
         noise: Standard deviation of the change between two events, whatever its length, log units.
+        ahead: How far noise that comes and goes carries a crossing ahead of the light, log units; `noise_lead`.
         walk: Strengths (a, b) of a random walk and its dark light k, DN: variance (a sqrt(I) / (I + k) + b)^2
             per second.
         cutoff_hz: Corner frequency of the low-pass filter at white, hertz; 0 = none.
@@ -110,6 +113,7 @@ class CrossingLaw:
     leak_per_dn: float = 0.0
     events_hz: float = 0.0
     noise: float = 0.0
+    ahead: float = 0.0
     walk: tuple[float, float, float] = (0.0, 0.0, 1.0)
     cutoff_hz: float = 0.0
     floor_dn: float = 20.0
@@ -142,6 +146,35 @@ class CrossingLaw:
         photon, floor, dark = self.walk
         seen = self.exposure * np.maximum(light, 0.0)
         return (photon * np.sqrt(seen) / (seen + dark) + floor) ** 2
+
+
+_USUAL_RATE = 0.5  # of log light at a crossing, per second
+
+
+def noise_lead(rms: float, memory_s: float, rate: float = _USUAL_RATE) -> float:
+    """Return by how much noise lets log light that nears a threshold as a ramp cross it early, log units, >= 0.
+
+    Noise that is drawn anew each `memory_s` is above u rms in a share Q(u) of the draws. Until the light is u
+    rms away it has been so rate memory_s / rms draws apart, so that the first crossing has the median
+    phi(u) - u Q(u) = ln 2 rate memory_s / rms, with phi and Q the normal density and upper tail.
+
+    Args:
+        rms: Standard deviation of the noise, log units.
+        memory_s: Its correlation time, seconds.
+        rate: Of the log light, log units per second.
+
+    Example:
+        >>> round(noise_lead(0.026, 0.0025), 3)
+        0.037
+    """
+    if rms <= 0:
+        return 0.0
+    wanted, low, high = math.log(2) * rate * memory_s / rms, 0.0, 8.0
+    for _ in range(50):
+        u = 0.5 * (low + high)
+        passed = math.exp(-0.5 * u * u) / math.sqrt(2 * math.pi) - 0.5 * u * math.erfc(u / math.sqrt(2))
+        low, high = (u, high) if passed > wanted else (low, u)
+    return rms * low
 
 
 class PixelSettings(Kinded):

@@ -1,9 +1,9 @@
 """One likelihood of a whole sequence: the target from events, from frames, or from both, with its uncertainty.
 
 With z the coefficients of the Gaussian prior and L(i, t; z) the filtered log light of pixel i:
-- Between two events of a pixel, L (with the leak's share) moves by D = +theta_on or -theta_off, with the error
-  of a crossing. What a pixel's own thresholds differ from the mean is integrated out in closed form, by
-  polarity.
+- Between two events of a pixel, L (with the leak's share) moves by D = +theta_on or -theta_off, less what noise
+  carries both ahead (`CrossingLaw.ahead`), with the error of a crossing. What a pixel's own thresholds differ
+  from the mean is integrated out in closed form, by polarity.
 - What is observed is a time: the level's density times |dD/dt|, without which contrasts come out too low.
 - The error of a crossing is estimated, from events of a pixel and polarity; too large, contrasts are too high.
 - An event is a signal or noise: that density, by what the pixel's other events say of its threshold, or the
@@ -70,9 +70,7 @@ class LikelihoodSettings:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.threshold_error) and self.threshold_error >= 0):
-            raise ConfigError(
-                f"LikelihoodSettings.threshold_error is {self.threshold_error}; give 0 or a positive number"
-            )
+            raise ConfigError(f"LikelihoodSettings.threshold_error is {self.threshold_error}; give 0 or more")
         for name in ("least_noise", "leak_error", "gap_s", "first_noise"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ConfigError(f"LikelihoodSettings.{name} is {getattr(self, name)}; give a positive number")
@@ -275,6 +273,7 @@ class _State:
         self.wait = record.t_s - record.t_s[record.origin]
         self.change = record.change(light, levels) + nuisances[2] * self.wait
         self.residual = np.where(record.sign > 0, self.theta[0], -self.theta[1]) - self.change
+        self.residual -= law.ahead * (record.sign - record.sign[record.origin])
         self.noise = math.hypot(noise, law.noise)
         self.variance = record.variance(light, seen, law, noise)
         self.group = 2 * record.pixel + (record.sign > 0)
@@ -364,14 +363,15 @@ class _State:
         order = free[np.lexsort((-sign * self.change[free], record.origin[free]))]
         at = order[np.diff(record.origin[order], prepend=-1) != 0]
         offset, variance = (column[2 * record.pixel[at] + (sign > 0)] for column in self.offsets(trust))
-        theta = self.theta[0 if sign > 0 else 1]
+        theta = self.theta[0 if sign > 0 else 1] - self.law.ahead * (1 - sign * record.sign[record.origin[at]])
         room = theta + sign * offset - sign * self.change[at]
         width = np.sqrt(variance + self.noise**2)
         scaled = torch.from_numpy(room / width)
         ratio = torch.exp(-0.5 * scaled**2 - torch.special.log_ndtr(scaled)).numpy() / math.sqrt(2 * math.pi)
         bend = np.clip(ratio * (ratio + scaled.numpy()), 0.0, 1.0)
         near = unmet[record.origin[at]] * bend > _ACTIVE
-        at, room, width, variance, ratio, bend = (c[near] for c in (at, room, width, variance, ratio, bend))
+        found = at, theta, room, width, variance, ratio, bend
+        at, theta, room, width, variance, ratio, bend = (column[near] for column in found)
         curve = bend / width**2
         precision = unmet[record.origin[at]] * curve / np.maximum(1.0 - curve * variance, 1e-6)
         seen = room + ratio / width / curve  # y as if it were observed

@@ -39,6 +39,7 @@ from evnlos.cameras.event_model import (
     ThresholdPixel,
     check_pattern_seed,
     check_phase,
+    noise_lead,
     require,
 )
 from evnlos.cameras.pixels.arrays import check_tiling, map_shares, pixel_thresholds
@@ -452,11 +453,10 @@ class CircuitPixel(ThresholdPixel):
     def crossing_law(self, light_dn: float = 60.0) -> CrossingLaw:
         """Return what an event says of the light; noise and bandwidth are those at the light `light_dn`."""
         current = self.dark_current_a + self.photocurrent_a_per_dn * light_dn
-        return self._law(
-            noise=math.sqrt(2.0) * self.noise_rms(current),
-            cutoff_hz=self.bandwidth_hz(current),
-            floor_dn=1e9,  # one bandwidth at all light
-        )
+        rms, corner = self.noise_rms(current), self.bandwidth_hz(current)
+        ahead = noise_lead(rms, 1.0 / (2.0 * math.pi * corner))
+        # one bandwidth at all light
+        return self._law(noise=math.sqrt(2.0) * rms, ahead=ahead, cutoff_hz=corner, floor_dn=1e9)
 
     def noise_rms(self, current_a: float) -> float:
         """Return the standard deviation of the follower's noise, log units, at a current in ampere."""
