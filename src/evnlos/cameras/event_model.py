@@ -154,9 +154,9 @@ _USUAL_RATE = 0.5  # of log light at a crossing, per second
 def noise_lead(rms: float, memory_s: float, rate: float = _USUAL_RATE) -> float:
     """Return by how much noise lets log light that nears a threshold as a ramp cross it early, log units, >= 0.
 
-    Noise that is drawn anew each `memory_s` is above u rms in a share Q(u) of the draws. Until the light is u
-    rms away it has been so rate memory_s / rms draws apart, so that the first crossing has the median
-    phi(u) - u Q(u) = ln 2 rate memory_s / rms, with phi and Q the normal density and upper tail.
+    Noise that is drawn anew each `memory_s` passes u rms with the probability Q(u), the normal upper tail. The
+    light nears by rate memory_s a draw, so that before it is u rms away the expected number of passages is
+    rms / (rate memory_s) times the integral of Q from u on, phi(u) - u Q(u). Where that is ln 2 is the median.
 
     Args:
         rms: Standard deviation of the noise, log units.
