@@ -165,7 +165,7 @@ def noise_lead(rms: float, memory_s: float, rate: float = _USUAL_RATE) -> float:
 
     Example:
         >>> round(noise_lead(0.026, 0.0025), 3)
-        0.037
+        0.038
     """
     if rms <= 0:
         return 0.0
