@@ -370,8 +370,8 @@ class _State:
         ratio = torch.exp(-0.5 * scaled**2 - torch.special.log_ndtr(scaled)).numpy() / math.sqrt(2 * math.pi)
         bend = np.clip(ratio * (ratio + scaled.numpy()), 0.0, 1.0)
         near = unmet[record.origin[at]] * bend > _ACTIVE
-        found = at, theta, room, width, variance, ratio, bend
-        at, theta, room, width, variance, ratio, bend = (column[near] for column in found)
+        at, theta, room, width = at[near], theta[near], room[near], width[near]
+        variance, ratio, bend = variance[near], ratio[near], bend[near]
         curve = bend / width**2
         precision = unmet[record.origin[at]] * curve / np.maximum(1.0 - curve * variance, 1e-6)
         seen = room + ratio / width / curve  # y as if it were observed
