@@ -26,10 +26,11 @@ import torch.nn.functional as F
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from evnlos.data import Sampling, character_of
+from evnlos.data import Capture, Sampling, character_of
 from evnlos.errors import DataError
 from evnlos.metrics import HAAR_LEAST_SIDE, gmsd, haarpsi, ms_ssim, psnr, ssim
 from evnlos.models.sequence import TargetGrid
+from evnlos.scene import Target
 from evnlos.tensor_file import read_sealed
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
@@ -335,6 +336,28 @@ def aligned_mean(images: Tensor, position_m: NDArray, names: NDArray, sampling: 
         mine = torch.from_numpy(np.flatnonzero(names == name))
         found[mine] = grid.on_canvas(grid.mean(images[mine], places[mine]), places[mine])
     return found
+
+
+def target_psnr(
+    capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]
+) -> float | None:
+    """Return the PSNR of an image [cells, cells] on the standard sample, dB; None where the truth is unknown.
+
+    Args:
+        capture: The capture.
+        image: The target plane.
+        size_m: Its side, metres.
+        motion: Its centre at the frames 1, 2, ..., [N, 2], metres.
+    """
+    scene = capture.scene
+    if scene is None:
+        return None
+    sampling = Sampling()
+    target = Target("found", image.clamp(0, 1).float().numpy(), size_m)
+    drawn = target.rasterise(sampling.canvas, motion)
+    truth = scene.truth(sampling.canvas, capture.frame_times_us[1:] * 1e-6)
+    rows = sampling.scored
+    return round(float(psnr(torch.from_numpy(drawn[:, rows]), torch.from_numpy(truth[:, rows])).mean()), 3)
 
 
 def confusion(seen: Sequence[dict[str, dict[str, int]]]) -> str:

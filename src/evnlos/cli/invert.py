@@ -194,7 +194,7 @@ class InvertCommand:
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, setup: Path) -> None:
-        from evnlos.cli.invert_captures import SequenceOptions, invert_captures, sequence_doubts
+        from evnlos.cli.invert_captures import SequenceOptions, invert_captures, sequence_doubts, shares_left
         from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
@@ -227,9 +227,9 @@ class InvertCommand:
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
         arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
         _save_arrays(self.out, arrays)
-        left = max((row["unexplained"] or 0.0 for row in found["rows"]), default=0.0)
-        last = f"{100 * left:.1f} % of the light unexplained beside the noise; {found['seconds']} s"
-        table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{last}"
+        left = shares_left(found["rows"]).values()
+        told = f"{100 * max(left):.1f} % of the light unexplained beside the noise; " if left else ""
+        table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{told}{found['seconds']} s"
         print(json.dumps(found) if self.json else table)
 
     def _film(self, word: Path, sides_m: tuple[float, float]) -> None:

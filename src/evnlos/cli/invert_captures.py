@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evnlos.analysis import target_psnr
 from evnlos.analysis.bounds import canvas_decibel
 from evnlos.calibration.scan.importer import fill_bad
 from evnlos.cli.parsing import say
 from evnlos.data import Capture, load_pattern, pattern_of, read_capture
 from evnlos.data.fixed_pattern import object_light
 from evnlos.data.frames import read_image
-from evnlos.data.sampling import Sampling
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
     FrameTerm,
@@ -35,6 +35,7 @@ from evnlos.inverse import (
     handwritten_prior,
     record_of,
     sequence_light,
+    unexplained,
 )
 from evnlos.inverse.event_images import CELLS, COEFFICIENTS
 from evnlos.inverse.inversion import Inversion, chosen_degree
@@ -42,13 +43,11 @@ from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
 from evnlos.inverse.tikhonov import Rule
 from evnlos.machine import Progress, Step, counted, silent
-from evnlos.metrics import psnr
 from evnlos.optics import MatrixTransport
-from evnlos.scene import Target
 from evnlos.setups import Setup, load_setup
 from evnlos.setups.base import linear_kinds
 from evnlos.setups.measured import averaged
-from evnlos.tracking import temporal_noise, track_capture, track_warnings
+from evnlos.tracking import temporal_noise
 from evnlos.types import Plane
 
 
@@ -95,12 +94,14 @@ def invert_captures(
     height, width = captures[0].frames.shape[1:]
     if any(capture.frames.shape != captures[0].frames.shape for capture in captures):
         raise ConfigError("the captures differ in number or size of their frames; invert them one by one")
-    shape = (max(1, round(height * (columns := min(options.columns, width)) / width)), columns)
+    columns = min(options.columns, width)
+    shape = (max(1, round(height * columns / width)), columns)
     light = torch.stack([object_light(c.frames[1:], c.peak, setup, shape, pattern) for c in captures])
     noise = torch.tensor([temporal_noise(one.numpy()) if len(one) > 2 else math.inf for one in light])
     pictures: dict[str, torch.Tensor] = {}
     rows: list[dict[str, Any]] = []
-    total = len(groups := _by_motion(captures, options, setup, progress))
+    groups = _by_motion(captures, options, setup, progress)
+    total = len(groups)
     for done, (motion, members) in enumerate(counted(groups, progress, "invert", total, "motions")):
         size = captures[members[0]].info.target_size_m
         if _is_tracked(captures[members[0]], options):
@@ -116,18 +117,16 @@ def invert_captures(
                 )
                 images = light[members][:, chosen]
                 free = problem.tikhonov(images)  # weighted by generalised cross-validation
-                left = (free.residual.square() / (problem.samples - free.dof) - noise[members] ** 2).clamp(
-                    min=0
-                )
-                moving = (images - images.mean(dim=1, keepdim=True)).square().mean(dim=(1, 2, 3))
-                shares = (left / moving).sqrt().tolist() if count > 2 else [None] * len(members)
+                shares: list[float | None] = [None] * len(members)
+                if count > 2:
+                    shares = unexplained(free, problem.samples, images, noise[members]).tolist()
                 for solver in options.solvers:
                     progress(Step("invert", done, total, "motions", within=f"{solver}, {count} positions"))
                     found = _solve(problem, images, solver, options.regularization[solver], free)
                     for member, image, share in zip(members, found, shares, strict=True):
                         name = captures[member].name
                         row = {"capture": name, "positions": count, "solver": solver, "unexplained": share}
-                        rows.append({**row, "psnr_db": score(captures[member], image, size, motion)})
+                        rows.append({**row, "psnr_db": target_psnr(captures[member], image, size, motion)})
                         pictures[f"{name}_{solver}_{count}"] = image
     figures = {"setup": str(options.setup), "captures": [c.name for c in captures], "rows": rows}
     return {**figures, "seconds": round(time.perf_counter() - clock, 1)}, pictures
@@ -153,6 +152,8 @@ def _by_motion(
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
     for k, capture in enumerate(captures):
         if _is_tracked(capture, options):
+            from evnlos.tracking import track_capture, track_warnings
+
             progress(Step("track", k, len(captures), "captures", within=capture.name))
             found = track_capture(capture, setup)
             for warning in track_warnings(capture, setup, found):
@@ -167,26 +168,6 @@ def _by_motion(
 
 def _is_tracked(capture: Capture, options: SequenceOptions) -> bool:
     return options.track or capture.motion is None
-
-
-def score(capture: Capture, image: torch.Tensor, size_m: float, motion: NDArray[np.float64]) -> float | None:
-    """Return the PSNR of an image [cells, cells] on the standard sample, dB; None where the truth is unknown.
-
-    Args:
-        capture: The capture.
-        image: The target plane.
-        size_m: Its side, metres.
-        motion: Its centre at the frames 1, 2, ..., [N, 2], metres.
-    """
-    scene = capture.scene
-    if scene is None:
-        return None
-    sampling = Sampling()
-    target = Target("found", image.clamp(0, 1).float().numpy(), size_m)
-    drawn = target.rasterise(sampling.canvas, motion)
-    truth = scene.truth(sampling.canvas, capture.frame_times_us[1:] * 1e-6)
-    rows = sampling.scored
-    return round(float(psnr(torch.from_numpy(drawn[:, rows]), torch.from_numpy(truth[:, rows])).mean()), 3)
 
 
 _FINEST = 48  # pixels a side that a rough wall's light needs
@@ -349,7 +330,7 @@ def _row(capture: Capture, found: SequenceEstimate, target_plane: Plane) -> dict
     motion = capture.motion.position_m(capture.frame_times_us[1:] * 1e-6)
     row: dict[str, Any] = {
         "capture": capture.name,
-        "psnr_db": score(capture, torch.from_numpy(found.image), size, motion),
+        "psnr_db": target_psnr(capture, torch.from_numpy(found.image), size, motion),
         "expected_db": round(canvas_decibel(found.expected_error, target_plane), 2),
     }
     if capture.target is not None:
@@ -366,12 +347,18 @@ def _row(capture: Capture, found: SequenceEstimate, target_plane: Plane) -> dict
     return row
 
 
+def shares_left(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Return what the setup leaves unexplained of each capture, by most positions, where enough are told."""
+    told = sorted((row for row in rows if row.get("unexplained") is not None), key=lambda row: row["positions"])
+    return {row["capture"]: row["unexplained"] for row in told}
+
+
 def sequence_doubts(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return why images are not to be believed, a line each."""
     return [
         f"{name}: the setup leaves {100 * share:.0f} % of the light unexplained beside the noise, right ones 1 "
         "to 3 %: do not believe the image; calibrate this very setup (`evnlos calibrate`)"
-        for name, share in {row["capture"]: row.get("unexplained") or 0.0 for row in rows}.items()
+        for name, share in shares_left(rows).items()
         if share > _MOST_LEFT
     ] + [
         f"{row['capture']}: the events fit the setup only with thresholds {row['threshold_factors']} times its "

@@ -36,6 +36,7 @@ from .operators import Solution as Solution
 from .operators import log_change as log_change
 from .operators import operator_norm as operator_norm
 from .operators import ridge_by_groups as ridge_by_groups
+from .operators import unexplained as unexplained
 from .prior import PatternPrior as PatternPrior
 from .prior import handwritten_prior as handwritten_prior
 from .problem import BackgroundModel as BackgroundModel

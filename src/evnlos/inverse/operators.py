@@ -229,6 +229,20 @@ class Solution:
     history: tuple[float, ...] = ()
 
 
+def unexplained(solution: Solution, samples: int, images: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+    """Return the share of what changes along sequences that a solution leaves beside their noise, [B].
+
+    Args:
+        solution: What was found, with its degrees of freedom.
+        samples: Samples of each sequence.
+        images: The sequences, [B, N, H, W].
+        noise: Standard deviation of a sample's noise in each, [B].
+    """
+    left = solution.residual.square() / (samples - solution.dof) - noise**2
+    moving = (images - images.mean(dim=1, keepdim=True)).square().mean(dim=(1, 2, 3))
+    return (left.clamp(min=0) / moving).sqrt()
+
+
 class LogChange:
     """The change of the wall's log light, A dx / I0, for a change dx of the hidden scene.
 
