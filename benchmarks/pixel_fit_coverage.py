@@ -62,12 +62,11 @@ def one_draw(name: str, number: int) -> dict:
     truth["threshold_sigma"] = ratio * 0.5 * (truth["threshold_on"] + truth["threshold_off"])
     start = CANDIDATES[name][0]
     pixel = replace(start, **{key: value for key, value in truth.items() if key != MISMATCH})
-    count = PIXELS
     recordings = []
     for light, seconds in LIGHTS:
         times, level = waveform(light, max(seconds, 1.0 / light.frequency_hz))
-        lit = np.repeat(level[:, None].astype(np.float32), count, axis=1)[:, None]
-        recordings.append(LitRecording(np.ascontiguousarray(lit), times, Events.empty(count, 1), known=light))
+        lit = np.repeat(level[:, None].astype(np.float32), PIXELS, axis=1)[:, None]
+        recordings.append(LitRecording(np.ascontiguousarray(lit), times, Events.empty(PIXELS, 1), known=light))
     events = simulated_events(recordings, pixel, derive_seed(seed, "recorded"))
     panels = panels_of([replace(one, events=found) for one, found in zip(recordings, events, strict=True)])
     begin, cpu = time.time(), time.process_time()

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from evnlos.calibration import CALIBRATION_VALUES_FILE
-from evnlos.data import STANDARD_MODALITIES
 from evnlos.demo import Demo, run_demo
 from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import Record, Study
@@ -133,11 +132,15 @@ def test_the_demo_trains_what_was_asked_for(tmp_path, monkeypatch):
         Demo(modalities=())
 
 
-@pytest.mark.parametrize(("lacks", "asked"), [("events", STANDARD_MODALITIES), ("frames", ("event",))])
-def test_the_demo_takes_captures_without_events_for_what_they_are(tmp_path, monkeypatch, lacks, asked):
-    for name, also in (("a_A", ""), ("a_B", f"{lacks}: null\n")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "capture.yaml").write_text(also + CAPTURE)
+def one_lacks(folder: Path, what: str) -> Path:
+    """Write two captures, one of them without events or frames."""
+    for name, also in (("a_A", ""), ("a_B", f"{what}: null\n")):
+        (folder / name).mkdir()
+        (folder / name / "capture.yaml").write_text(also + CAPTURE)
+    return folder
+
+
+def test_the_demo_sees_frames_where_captures_have_no_events(tmp_path, monkeypatch):
     studies = []
 
     def stop(study: Study, *_) -> None:
@@ -145,17 +148,18 @@ def test_the_demo_takes_captures_without_events_for_what_they_are(tmp_path, monk
         raise CalibrationError("enough")
 
     monkeypatch.setattr("evnlos.experiment.run_study", stop)
-    demo = Demo(out=tmp_path / "out", captures=(tmp_path,), modalities=asked)
-    if lacks == "frames":
-        with pytest.raises(DataError, match="a_B holds events alone"):
-            run_demo(demo)
-        return
+    demo = Demo(out=tmp_path / "out", captures=(one_lacks(tmp_path, "events"),))
     with pytest.raises(CalibrationError, match="enough"):
         run_demo(demo)
     (study,) = studies
     assert study.modalities == ("frame",) and not study.calibration.events
     with pytest.raises(DataError, match="a_B holds frames alone, no events; give --modalities frame"):
         run_demo(replace(demo, modalities=("event",)))
+
+
+def test_the_demo_refuses_captures_without_frames(tmp_path):
+    with pytest.raises(DataError, match="a_B holds events alone"):
+        run_demo(Demo(out=tmp_path / "out", captures=(one_lacks(tmp_path, "frames"),), modalities=("event",)))
 
 
 def test_unknown_setups_and_empty_folders_are_refused(tmp_path):

@@ -138,8 +138,8 @@ def choose_pixel(
     few, judged = ([thinned(r) for r in part] for part in (recordings, held))
     best, least = known, misfit(judged, known.pixel, seed)
     compared, near = {CONTINUOUS: float(least.sum())}, is_near(least, judged, known.pixel, seed)
-    for name in sorted(MODELS, key=SLOW.count):
-        if name in SLOW and (near or is_near(least, judged, best.pixel, seed)):
+    for name in MODELS:
+        if name in SLOW and (near or (best is not known and is_near(least, judged, best.pixel, seed))):
             continue
         told = [thinned(r, _SLOW_PX) for r in recordings] if name in SLOW else few
         found = fit_model(told, name, known.pixel, seed=seed)

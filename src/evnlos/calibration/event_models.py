@@ -46,6 +46,7 @@ class Free:
         high: Largest value.
         step: Step of the finite difference, relative where `log`.
         log: Whether the search runs over its logarithm.
+        starts: Values to begin at, the best of which is taken, where one alone may end beside the best fit.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Free:
     high: float
     step: float
     log: bool = True
+    starts: tuple[float, ...] = ()
 
 
 _THRESHOLDS = (
@@ -84,17 +86,16 @@ MODELS: dict[str, tuple[PixelSettings, tuple[Free, ...]]] = {
         CircuitPixel(photocurrent_a_per_dn=2.8e-15, follower_a=5e-12, poles=1),
         (
             *_THRESHOLDS,
-            Free("photocurrent_a_per_dn", 1e-17, 3e-14, 0.2),
+            Free("photocurrent_a_per_dn", 1e-17, 3e-14, 0.2, starts=(1e-16, 5e-16, 2.5e-15, 1.2e-14)),
             Free("follower_a", 5e-13, 3e-11, 0.2),
             Free("leak_rate_hz", 0.0, 10.0, 0.03, log=False),
             Free("noise_factor", 0.2, 5.0, 0.1),
         ),
     ),
 }
-"""Event models beside v2e's continuous one: a start, and what is fitted."""
+"""Event models beside v2e's continuous one, slow ones last: a start, and what is fitted."""
 SLOW = ("circuit, one pole",)
 """Those that are slow to simulate: tried where no other comes near to the recordings."""
-_STARTS = {"photocurrent_a_per_dn": (1e-16, 5e-16, 2.5e-15, 1.2e-14)}  # whose range needs a search
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,7 @@ def fit_model(
     bounds = [(_encoded(f, f.low), _encoded(f, f.high)) for f in free]
     first = [_encoded(f, min(max(getattr(start, f.name), f.low), f.high)) for f in free]
     for place, one in enumerate(free):
-        tried = [[*first[:place], _encoded(one, v), *first[place + 1 :]] for v in _STARTS.get(one.name, ())]
+        tried = [[*first[:place], _encoded(one, v), *first[place + 1 :]] for v in one.starts]
         if tried:
             first = min(tried, key=lambda values: float(residual(np.array(values)).square().sum()))
     # A bold step may end where a pixel sends a hundred times the events: half a minute that tells nothing.

@@ -141,6 +141,15 @@ class CrossingLaw:
         """Return by how much the reference falls at light in DN, log units per second, [...]."""
         return self.leak + self.leak_per_dn * self.exposure * np.maximum(light, 0.0)
 
+    def lead(self, sign: Any, before: Any) -> Any:
+        """Return what noise takes from the change between two events, log units: ahead (s - s').
+
+        Args:
+            sign: +1 or -1, of the later one [...].
+            before: Of the earlier one, 0 for a first light [...].
+        """
+        return self.ahead * (sign - before)
+
     def walk_variance(self, light: NDArray) -> NDArray:
         """Return the variance that a random walk gains at light in DN, log units squared per second, [...]."""
         photon, floor, dark = self.walk

@@ -7,6 +7,7 @@ Random numbers that are functions of (seed, stream, pixel, counter): no state, s
 The generator is the finaliser of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014; constants of Stafford's
 variant 13), chained over the four keys.
 
+- Noise with a memory: the covariance that a linear process settles at, and its factor, for numbers of that.
 - Electrons of a frame: shot noise and read noise of every pixel from numbers that depend on its keys only.
 """
 
@@ -89,7 +90,7 @@ STREAM_PHOTONS, STREAM_FEW_PHOTONS = 10, 11
 STREAM_WALK, STREAM_BARRIER, STREAM_PASSAGE, STREAM_PENDING = 12, 13, 14, 15
 STREAM_READOUT_HOT, STREAM_READOUT_GAP, STREAM_READOUT_CHOICE, STREAM_READOUT_JITTER = 16, 17, 18, 19
 STREAM_DEAD, STREAM_RATE_CONTROL = 20, 21
-STREAM_CIRCUIT, STREAM_CIRCUIT_START, STREAM_CIRCUIT_BRIDGE = 22, 23, 24
+STREAM_CIRCUIT, STREAM_CIRCUIT_START = 22, 23
 STREAM_CELEX = 25
 
 JITTER_SIZE = 4096

@@ -273,7 +273,7 @@ class _State:
         self.wait = record.t_s - record.t_s[record.origin]
         self.change = record.change(light, levels) + nuisances[2] * self.wait
         self.residual = np.where(record.sign > 0, self.theta[0], -self.theta[1]) - self.change
-        self.residual -= law.ahead * (record.sign - record.sign[record.origin])
+        self.residual -= law.lead(record.sign, record.sign[record.origin])
         self.noise = math.hypot(noise, law.noise)
         self.variance = record.variance(light, seen, law, noise)
         self.group = 2 * record.pixel + (record.sign > 0)
@@ -363,7 +363,7 @@ class _State:
         order = free[np.lexsort((-sign * self.change[free], record.origin[free]))]
         at = order[np.diff(record.origin[order], prepend=-1) != 0]
         offset, variance = (column[2 * record.pixel[at] + (sign > 0)] for column in self.offsets(trust))
-        theta = self.theta[0 if sign > 0 else 1] - self.law.ahead * (1 - sign * record.sign[record.origin[at]])
+        theta = self.theta[0 if sign > 0 else 1] - sign * self.law.lead(sign, record.sign[record.origin[at]])
         room = theta + sign * offset - sign * self.change[at]
         width = np.sqrt(variance + self.noise**2)
         scaled = torch.from_numpy(room / width)

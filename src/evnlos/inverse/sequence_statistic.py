@@ -239,7 +239,7 @@ class EventSolver:
         sign = record.sign[crossed].astype(np.float64)
         of = 2 * record.pixel[crossed] + (sign > 0)
         residual = np.where(sign > 0, law.threshold_on, -law.threshold_off) - change[crossed]
-        residual -= law.ahead * (sign - record.sign[record.origin[crossed]])
+        residual -= law.lead(sign, record.sign[record.origin[crossed]])
         walk = law.noise**2 + law.walk_variance(seen_dn[crossed]) * wait[crossed]
         upwards = sign * (rate[crossed] / self._step + fall[crossed])
         spread = law.threshold_sigma**2
@@ -280,8 +280,8 @@ class EventSolver:
             begin = np.flatnonzero((furthest >= 0) & (unmet > _ACTIVE))
             quiet = furthest[begin]
             group = 2 * record.pixel[quiet] + (side > 0)
-            lead = law.ahead * (1.0 - side * record.sign[begin])
-            room = theta - lead + side * (offset[group] - change[quiet])
+            met = theta - side * law.lead(side, record.sign[begin])
+            room = met + side * (offset[group] - change[quiet])
             width = np.sqrt(variance[group] + law.noise**2 + noise**2)
             scaled = torch.from_numpy(room / width)
             ratio = torch.exp(-0.5 * scaled**2 - torch.special.log_ndtr(scaled)).numpy() / math.sqrt(
@@ -291,10 +291,7 @@ class EventSolver:
             near = unmet[begin] * bends > _ACTIVE
             curve = bends[near] / width[near] ** 2
             precision = unmet[begin][near] * curve / np.maximum(1.0 - curve * variance[group][near], 1e-6)
-            seen = (
-                side * (theta - lead[near] - room[near] - ratio[near] / width[near] / curve)
-                - change[quiet[near]]
-            )
+            seen = side * (met[near] - room[near] - ratio[near] / width[near] / curve) - change[quiet[near]]
             parts.append((quiet[near], np.full(int(near.sum()), float(side)), precision, seen))
         at, sides, weights, seen = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.lexsort((sides, record.pixel[at]))
