@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from evnlos.data import correct_frames, read_capture
 from evnlos.data.clocks import find_offset
-from evnlos.data.frames import find_dots, homography_from_points, registration_error, warp_frames
+from evnlos.data.fixed_pattern import warp_frames
+from evnlos.data.frames import find_dots, homography_from_points, registration_error
 from evnlos.errors import DataError
 from evnlos.types import Events
 

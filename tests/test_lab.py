@@ -14,12 +14,10 @@ from PIL import Image
 from evnlos.cli import main
 from evnlos.config import from_dict, load_yaml, read_yaml, save_yaml
 from evnlos.data import Sampling, SensorSize, capture_samples, read_capture
+from evnlos.data.capture_check import PUBLISHED, compare_published, content_digest
 from evnlos.data.lab import (
-    PUBLISHED,
     SENSOR_SPREAD,
     Lab,
-    compare_published,
-    content_digest,
     lab_preset,
     published_lab,
     render_captures,

@@ -10,6 +10,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -22,6 +23,14 @@ OutFile = Path
 """The same: a file in a folder that is there."""
 OutImage = Path
 """The same: a file whose ending names a format of images."""
+
+Colour = Literal["red", "green", "blue"]
+COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
+"""Colours in the order of an image's channels."""
+LUMA_601 = 299, 587, 114
+"""What red, green and blue count in grey, thousandths: Rec. 601, as Pillow, OpenCV and v2e take it."""
+Mosaic = Literal["rggb", "grbg", "gbrg", "bggr"]
+"""Bayer's mosaic of colour filters: two pixels of the first row, then of the second, from the top left."""
 
 _MAX_SIDE = 65_536  # x and y are uint16
 

@@ -2,7 +2,7 @@
 
 from evnlos.cameras.event_camera import EventCamera
 from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, PixelSettings
-from evnlos.cameras.frame_camera import FrameCamera
+from evnlos.cameras.frame_camera import FrameCamera, colour_filters, mosaicked, of_mosaic
 from evnlos.cameras.pixel import EventPixel, V2ePixel
 from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.circuit import CircuitPixel
@@ -26,7 +26,10 @@ __all__ = [
     "PixelSettings",
     "ReadoutPixel",
     "V2ePixel",
+    "colour_filters",
     "load_pixel",
+    "mosaicked",
+    "of_mosaic",
     "pixel_preset",
     "simulate_events",
 ]

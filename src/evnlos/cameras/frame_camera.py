@@ -1,4 +1,4 @@
-"""A frame camera: exposure, shot noise, read noise, fixed pattern, gain, quantisation."""
+"""A frame camera: exposure, shot noise, read noise, fixed pattern, gain, quantisation; colour filters."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.random_numbers import check_seed, fill_electrons
 from evnlos.config import check_made
 from evnlos.errors import ConfigError, DataError
+from evnlos.types import COLOURS, LUMA_601, Colour, Mosaic
 
 _GAUSS = {1: [(0.0, 1.0)], 3: [(-math.sqrt(0.6), 5 / 18), (0.0, 8 / 18), (math.sqrt(0.6), 5 / 18)]}
 
@@ -270,3 +271,72 @@ def check_extremes(lowest: float, highest: float) -> None:
     """Refuse light of which an extreme is not finite, or below 0."""
     if not (lowest >= 0 and highest < math.inf):  # false for NaN, which an extreme keeps
         raise DataError("irradiance holds NaN, infinity or negative light; give at least 0, 1.0 = white")
+
+
+def colour_filters(mosaic: Mosaic, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return which pixels see red, green and blue behind Bayer's mosaic, bool [3, H, W].
+
+    Args:
+        mosaic: The first 2 x 2 pixels, row by row.
+        shape: Size (H, W) of the sensor, pixels.
+
+    Example:
+        >>> colour_filters("rggb", (2, 4)).sum(axis=(1, 2))
+        array([2, 4, 2])
+    """
+    square = np.array([["rgb".index(one) for one in mosaic[row : row + 2]] for row in (0, 2)])
+    seen = np.tile(square, [-(-side // 2) for side in shape])[: shape[0], : shape[1]]
+    return seen == np.arange(3)[:, None, None]
+
+
+def mosaicked(pictures: NDArray, mosaic: Mosaic) -> NDArray:
+    """Return what a sensor with colour filters has of coloured pictures [..., H, W, 3]: [..., H, W]."""
+    seen = np.moveaxis(colour_filters(mosaic, pictures.shape[-3:-1]), 0, -1)  # type: ignore[arg-type]
+    return np.where(seen, pictures, 0).sum(axis=-1, dtype=pictures.dtype)
+
+
+def of_mosaic(raw: NDArray, mosaic: Mosaic, colour: Colour | None = None) -> NDArray[np.uint16]:
+    """Return one colour of raw values behind a mosaic, or their grey, at every pixel.
+
+    With m the pixels of the colour and k the kernel (1 2 1)^T (1 2 1), for green without its corners, the
+    colour is (k * (m raw)) / (k * m): bilinear, and exact on m. Grey is the luma of the three (Rec. 601).
+    Beyond the border the sensor is mirrored about its last pixels, which keeps the mosaic.
+
+    Args:
+        raw: Digital numbers, uint8 or uint16 [..., H, W], at least 2 x 2 pixels.
+        mosaic: Its colour filters.
+        colour: The colour; None is grey.
+
+    Returns:
+        uint16 [..., H, W]; of 8 bits times 257, so that white stays white.
+
+    Raises:
+        DataError: Fewer than 2 x 2 pixels.
+
+    Example:
+        >>> of_mosaic(np.array([[4, 2], [2, 1]], np.uint8) * 20, "rggb", "green") // 257
+        array([[40, 40],
+               [40, 40]], dtype=uint16)
+    """
+    if min(raw.shape[-2:]) < 2:
+        raise DataError(f"a mosaic of {raw.shape[-2]} x {raw.shape[-1]} pixels; give 2 x 2 or more")
+    values = raw.astype(np.float32) * (257 if raw.dtype == np.uint8 else 1)
+    filters = colour_filters(mosaic, raw.shape[-2:]).astype(np.float32)  # type: ignore[arg-type]
+    shares = np.array(LUMA_601) / 1000 if colour is None else [float(one == colour) for one in COLOURS]
+    found = np.zeros(raw.shape, np.float32)
+    for k, (mask, share) in enumerate(zip(filters, shares, strict=True)):
+        if share:
+            found += np.float32(share) * _around(values * mask, k != 1) / _around(mask, k != 1)
+    return np.rint(found).astype(np.uint16)
+
+
+def _around(image: NDArray[np.float32], corners: bool) -> NDArray[np.float32]:
+    """Return an image [..., H, W] convolved with (1 2 1)^T (1 2 1), or that without corners; mirrored."""
+    padded = np.pad(image, [(0, 0)] * (image.ndim - 2) + [(1, 1), (1, 1)], mode="reflect")
+    height, width = image.shape[-2:]
+    found = np.zeros_like(image)
+    for down, right in np.ndindex(3, 3):
+        weight = (2 - abs(down - 1)) * (2 - abs(right - 1))
+        if corners or weight > 1:
+            found += np.float32(weight) * padded[..., down : down + height, right : right + width]
+    return found

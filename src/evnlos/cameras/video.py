@@ -36,7 +36,7 @@ from evnlos.cameras.video_files import (
     to_light,
 )
 from evnlos.errors import ConfigError, DataError
-from evnlos.types import Events
+from evnlos.types import Colour, Events
 from evnlos.untrusted import MOST_SENSOR_PIXELS, check_memory, no_file
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")
@@ -61,6 +61,7 @@ class Video:
         tone: Tone curve that is undone.
         white: Value of white in the file.
         box: Part of the frame that is read (left, top, right, bottom), pixels; None = all of it.
+        colour: Colour that is taken of coloured frames; None = all of them, as grey.
     """
 
     path: Path
@@ -73,6 +74,7 @@ class Video:
     white: float
     source: PictureSource = field(repr=False)
     box: tuple[int, int, int, int] | None = None
+    colour: Colour | None = None
 
     def part(self, box: tuple[int, int, int, int]) -> Video:
         """Return the same video of which only a part (left, top, right, bottom) of each frame becomes light.
@@ -104,7 +106,7 @@ class Video:
             if self.box is not None:
                 left, top, right, bottom = self.box
                 picture = picture[top:bottom, left:right]
-            light = to_light(picture, self.tone, self.white)
+            light = to_light(picture, self.tone, self.white, self.colour)
             if picture.dtype.kind == "f" and not np.isfinite(light).all():
                 raise DataError(f"{self.path}: frame {number} holds NaN or infinity; leave it out or mend it")
             yield time_s / self.slow_motion, _resized(light, self.width, self.height)
@@ -118,6 +120,7 @@ def open_video(
     tone: Tone = "as-is",
     white: float | None = None,
     scale: str | None = None,
+    colour: Colour | None = None,
 ) -> Video:
     """Return a video that is read frame by frame, as light with the instants of its frames.
 
@@ -130,6 +133,7 @@ def open_video(
             undo that curve first (luminance of Rec. 709); white stays white.
         white: Value of white in the file, 0.001 to 1e9; by default 255, or 65535 for 16 bits.
         scale: Size to work at, "WIDTHxHEIGHT" or a factor such as "0.5"; by default that of the file.
+        colour: Colour to take of coloured frames; None is all of them, as grey.
 
     Raises:
         DataError: The path is absent, no video, or of one frame; or times are needed.
@@ -157,7 +161,7 @@ def open_video(
         raise DataError(f"{shown}: its frames carry no times; give fps (--fps)")
     chosen = white or source.white or _white_of_floats(shown, source)
     width, height = _working_size(scale, source.size)
-    return Video(shown, width, height, source.frames, fps, slow_motion, tone, chosen, source)
+    return Video(shown, width, height, source.frames, fps, slow_motion, tone, chosen, source, colour=colour)
 
 
 def video_events(

@@ -20,6 +20,7 @@ from PIL import Image, UnidentifiedImageError
 
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
 from evnlos.files import new_file, new_folder
+from evnlos.types import COLOURS, LUMA_601, Colour
 from evnlos.untrusted import MOST_IMAGE_PIXELS, NUMPY_ERRORS, open_container, open_image, open_regular
 
 Picture = NDArray
@@ -28,11 +29,12 @@ Tone = Literal["as-is", "srgb", "rec709"]
 """What the numbers of an image mean: light as they are, or codes of a tone curve to undo."""
 
 _OF_EVENTS = (".raw", ".h5", ".npz", ".aedat", ".aedat4", ".bag", ".db3", ".mcap", ".bin", ".csv", ".dat")
-_LUMA_601 = 299, 587, 114  # thousandths: of a grey pixel the sum is exactly its value
 _LUMINANCE_709 = 0.2126, 0.7152, 0.0722
 
 
-def to_light(picture: Picture, tone: Tone = "as-is", white: float = 255.0) -> NDArray[np.float32]:
+def to_light(
+    picture: Picture, tone: Tone = "as-is", white: float = 255.0, colour: Colour | None = None
+) -> NDArray[np.float32]:
     """Return an image as light in DN: 255 = white.
 
     With the value v = image / white, "as-is" gives 255 v; "srgb" gives 255 times v / 12.92 up to 0.04045 and
@@ -43,14 +45,18 @@ def to_light(picture: Picture, tone: Tone = "as-is", white: float = 255.0) -> ND
         picture: Grey [H, W] or colour [H, W, 3]; uint8, uint16 or floating point.
         tone: Curve to undo.
         white: Value of white.
+        colour: Colour to take; None weighs all of them.
 
     Example:
         >>> to_light(np.array([[0, 188, 255]], np.uint8), "srgb").round(1)
         array([[  0. , 128.2, 255. ]], dtype=float32)
     """
+    if colour is not None and picture.ndim == 3:
+        picture = picture[..., COLOURS.index(colour)]
     if tone == "as-is":
         if picture.ndim == 3:
-            weights = np.array(_LUMA_601, np.int32 if picture.dtype.kind == "u" else np.float64)
+            # In whole numbers: of a grey pixel the sum is exactly its value.
+            weights = np.array(LUMA_601, np.int32 if picture.dtype.kind == "u" else np.float64)
             picture = (picture @ weights) / 1000.0  # [H, W]
         return (picture * (255.0 / white)).astype(np.float32)
     if picture.dtype.kind == "u":

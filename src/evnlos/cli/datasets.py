@@ -32,9 +32,9 @@ from evnlos.data import (
     read_capture,
     simulate,
 )
-from evnlos.data.capture_check import Finding, check_capture, compare_clocks
+from evnlos.data.capture_check import Finding, check_capture, compare_clocks, compare_published
 from evnlos.data.capture_info import CAMERAS, CaptureInfo, begin_capture
-from evnlos.data.lab import Lab, compare_published, lab_of, published_lab, render_captures
+from evnlos.data.lab import Lab, lab_of, published_lab, render_captures
 from evnlos.data.pool import run_on_dask, run_tasks
 from evnlos.data.simulations import PRESETS, estimate
 from evnlos.errors import ConfigError, DataError, EvnlosError, UnknownNameError

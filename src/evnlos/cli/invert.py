@@ -6,6 +6,7 @@ import io
 import json
 import re
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import torch
 import tyro
+from numpy.typing import NDArray
 
 from evnlos.cli.parsing import check_files, drawn, say, tracks_text
 from evnlos.cli.recordings import Folders
@@ -58,6 +60,8 @@ class InvertCommand:
     """Captures: columns to which frames are reduced, pixels."""
     subsets: int = 1
     """Captures: choices of so many positions to average the scores over."""
+    colours: bool = False
+    """Captures: an image in colour, by the solvers, of frames in colour."""
     evidence: Annotated[Literal["frames", "events", "both"] | None, tyro.conf.arg(name="from")] = None
     """Captures: estimate the target from these by one likelihood of the whole sequence and a Gaussian prior of
     handwriting, with the uncertainty of each cell; none = the solvers, which take frames. Events need the
@@ -98,6 +102,10 @@ class InvertCommand:
         ):
             if value < least:
                 raise ConfigError(f"--{flag} is {value}; give {least} or more")
+        if self.regularization == "gcv" and self.solver != "tikhonov":
+            raise ConfigError("--regularization gcv serves --solver tikhonov only; give that, or a number")
+        if self.colours and (self.setup is None or self.evidence or self.changing or self.pattern):
+            raise ConfigError("--colours takes captures, by the solvers; leave --from, --changing, --pattern")
         if self.setup is not None:
             still = all(path.is_file() for path in self.files)
             (self._invert_stills if still else self._invert_captures)(self.setup)
@@ -115,10 +123,6 @@ class InvertCommand:
         from evnlos.plot.results import draw_inversion
 
         regularization, rule = _weight(self.regularization)
-        if self.solver == "all" and rule == "gcv" and regularization is None:
-            raise ConfigError(
-                "--regularization gcv serves --solver tikhonov only; use cv, discrepancy or a number"
-            )
         # Matrices of a thousand rows: threads that wait for each other cost more than they save.
         torch.set_num_threads(1)
         clock = time.perf_counter()
@@ -159,8 +163,7 @@ class InvertCommand:
             for name, row in found["solutions"].items()
         ]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
-        arrays: dict[str, Any] = {name.replace(" ", "_"): s.image.numpy() for name, s in solved.items()}
-        _save_arrays(self.out, arrays)
+        _save_arrays(self.out, {name: solution.image for name, solution in solved.items()})
         found["seconds"] = round(time.perf_counter() - clock, 1)
         print(json.dumps(found) if self.json else to_text(found))
 
@@ -171,10 +174,6 @@ class InvertCommand:
 
         setup = load_setup(path)
         regularization, rule = _weight(self.regularization)
-        if rule == "gcv" and self.solver != "tikhonov":
-            raise ConfigError(
-                "--regularization gcv serves --solver tikhonov only; use cv, discrepancy or a number"
-            )
         torch.set_num_threads(1)
         solvers = ("tikhonov", "tv") if self.solver == "all" else (self.solver,)
         options = StillOptions(
@@ -188,13 +187,12 @@ class InvertCommand:
             for file, image in zip(self.files, images, strict=True)
         ]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
-        arrays: dict[str, Any] = {name: images.numpy() for name, images in pictures.items()}
-        _save_arrays(self.out, arrays)
+        _save_arrays(self.out, pictures)
         found["file"] = " ".join(found["files"])
         print(json.dumps(found) if self.json else to_text(found))
 
     def _invert_captures(self, setup: Path) -> None:
-        from evnlos.cli.invert_captures import SequenceOptions, invert_captures, sequence_doubts, shares_left
+        from evnlos.cli import invert_captures as work
         from evnlos.plot.results import draw_inversion
 
         torch.set_num_threads(1)
@@ -205,10 +203,6 @@ class InvertCommand:
             self._estimate(setup, self.evidence)
             return
         regularization: dict[str, float | None] = {"tikhonov": REGULARIZATION_TIKHONOV, "tv": REGULARIZATION_TV}
-        if self.regularization == "gcv" and self.solver != "tikhonov":
-            raise ConfigError(
-                "--regularization gcv serves --solver tikhonov only; give a number, or leave the flag out"
-            )
         if self.regularization != "cv":
             number, rule = _weight(self.regularization)
             if number is None and rule != "gcv":
@@ -216,18 +210,20 @@ class InvertCommand:
             regularization = dict.fromkeys(regularization, number)
         solvers = tuple(regularization) if self.solver == "all" else (self.solver,)
         used = (self.positions, self.pattern, self.track, solvers, regularization)
-        options = SequenceOptions(setup, *used, self.cells, self.columns, self.static, self.subsets)
+        options = work.SequenceOptions(setup, *used, self.cells, self.columns, self.static, self.subsets)
         with ProgressBars() as progress:
-            found, pictures = invert_captures(self.files, options, progress)
-        for doubt in sequence_doubts(found["rows"]):
+            invert = work.invert_colours if self.colours else work.invert_captures
+            found, pictures = invert(self.files, options, progress)
+        for doubt in work.sequence_doubts(found["rows"]):
             say(f"warning: {doubt}")
         most = max(row["positions"] for row in found["rows"])
         best = {name: image for name, image in pictures.items() if name.endswith(f"_{most}")}
-        panels = [(name, image[None]) for name, image in best.items()]
+        panels = [(name, image if self.colours else image[None]) for name, image in best.items()]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
-        arrays: dict[str, Any] = {name: image.numpy() for name, image in pictures.items()}
-        _save_arrays(self.out, arrays)
-        left = shares_left(found["rows"]).values()
+        _save_arrays(self.out, pictures)
+        if levels := [row["level"] for row in found["rows"] if self.colours and None not in row["level"]]:
+            say("red, green, blue are {:.2f}, {:.2f}, {:.2f} of the truth".format(*np.mean(levels, axis=0)))
+        left = work.shares_left(found["rows"]).values()
         told = f"{100 * max(left):.1f} % of the light unexplained beside the noise; " if left else ""
         table = f"{' '.join(found['captures'])}\n{sequence_table(found['rows'])}\n{told}{found['seconds']} s"
         print(json.dumps(found) if self.json else table)
@@ -294,15 +290,15 @@ class InvertCommand:
             say(f"warning: {doubt}")
         panels = [(name, image[None]) for name, image in pictures.items()]
         found["picture"] = drawn(self.out, lambda: draw_inversion(self.out, panels))
-        arrays: dict[str, Any] = {name.replace(" ", "_"): image.numpy() for name, image in pictures.items()}
-        _save_arrays(self.out, arrays)
+        _save_arrays(self.out, pictures)
         print(json.dumps(found) if self.json else sequence_text(found))
 
 
-def _save_arrays(picture: Path, arrays: dict[str, Any]) -> None:
-    """Write arrays as NPZ beside the image that shows them."""
+def _save_arrays(picture: Path, arrays: Mapping[str, torch.Tensor | NDArray]) -> None:
+    """Write arrays as NPZ beside the image that shows them, without spaces in their names."""
     content = io.BytesIO()
-    np.savez(content, **arrays)
+    named: dict[str, Any] = {name.replace(" ", "_"): np.asarray(one) for name, one in arrays.items()}
+    np.savez(content, **named)
     write_atomically(picture.with_suffix(".npz"), content.getvalue())
 
 

@@ -1,6 +1,6 @@
 """What `evnlos invert` does with captures and with still images.
 
-- `CAPTURE... --setup SETUP`: one image of each object from its whole sequence.
+- `CAPTURE... --setup SETUP`: one image of each object from its whole sequence, grey or in colour.
 - `PICTURE... --setup transport.safetensors`: still images of the wall, a measured setup.
 - `CAPTURE... --setup SETUP --from events|frames|both`: one likelihood of a whole sequence.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 from evnlos.analysis import target_psnr
 from evnlos.analysis.bounds import canvas_decibel
-from evnlos.calibration.scan.importer import fill_bad
+from evnlos.calibration.scan.importer import stills_as_scanned
 from evnlos.cli.parsing import say
 from evnlos.data import Capture, load_pattern, pattern_of, read_capture
 from evnlos.data.fixed_pattern import object_light
-from evnlos.data.frames import read_image
 from evnlos.errors import ConfigError
 from evnlos.inverse import (
     FrameTerm,
@@ -43,12 +42,10 @@ from evnlos.inverse.operators import Solution
 from evnlos.inverse.sequence_problem import matrix_of, position_subsets, strip_gram_of, strip_of
 from evnlos.inverse.tikhonov import Rule
 from evnlos.machine import Progress, Step, counted, silent
-from evnlos.optics import MatrixTransport
 from evnlos.setups import Setup, load_setup
 from evnlos.setups.base import linear_kinds
-from evnlos.setups.measured import averaged
 from evnlos.tracking import temporal_noise
-from evnlos.types import Plane
+from evnlos.types import COLOURS, Colour, Plane
 
 
 @dataclass(frozen=True)
@@ -65,6 +62,7 @@ class SequenceOptions:
     columns: int
     static: float
     subsets: int
+    colour: Colour | None = None
 
 
 def linear_setup(word: Path | str) -> Setup:
@@ -89,14 +87,17 @@ def invert_captures(
     clock = time.perf_counter()
     setup = linear_setup(options.setup)
     reads = counted(folders, progress, "read", len(folders), "captures")
-    captures = [read_capture(one, needs_events=False) for one in reads]
-    pattern = pattern_of(options.setup, options.pattern)
+    captures = [read_capture(one, needs_events=False, colour=options.colour) for one in reads]
+    # A pattern is that of grey frames.
+    pattern = pattern_of(options.setup, options.pattern) if options.colour is None else None
     height, width = captures[0].frames.shape[1:]
     if any(capture.frames.shape != captures[0].frames.shape for capture in captures):
         raise ConfigError("the captures differ in number or size of their frames; invert them one by one")
     columns = min(options.columns, width)
     shape = (max(1, round(height * columns / width)), columns)
-    light = torch.stack([object_light(c.frames[1:], c.peak, setup, shape, pattern) for c in captures])
+    whites = [one.peak * one.info.camera.balance for one in captures]
+    pairs = zip(captures, whites, strict=True)
+    light = torch.stack([object_light(one.frames[1:], white, setup, shape, pattern) for one, white in pairs])
     noise = torch.tensor([temporal_noise(one.numpy()) if len(one) > 2 else math.inf for one in light])
     pictures: dict[str, torch.Tensor] = {}
     rows: list[dict[str, Any]] = []
@@ -118,18 +119,55 @@ def invert_captures(
                 images = light[members][:, chosen]
                 free = problem.tikhonov(images)  # weighted by generalised cross-validation
                 shares: list[float | None] = [None] * len(members)
-                if count > 2:
+                if (
+                    count > 2 and captures[members[0]].info.camera.mosaic is None
+                ):  # behind one, neighbours share noise
                     shares = unexplained(free, problem.samples, images, noise[members]).tolist()
+                    shares = [None if share == math.inf else share for share in shares]  # nothing moves
                 for solver in options.solvers:
                     progress(Step("invert", done, total, "motions", within=f"{solver}, {count} positions"))
                     found = _solve(problem, images, solver, options.regularization[solver], free)
                     for member, image, share in zip(members, found, shares, strict=True):
                         name = captures[member].name
                         row = {"capture": name, "positions": count, "solver": solver, "unexplained": share}
+                        row["level"] = _level(captures[member], image, target_plane)
                         rows.append({**row, "psnr_db": target_psnr(captures[member], image, size, motion)})
                         pictures[f"{name}_{solver}_{count}"] = image
     figures = {"setup": str(options.setup), "captures": [c.name for c in captures], "rows": rows}
     return {**figures, "seconds": round(time.perf_counter() - clock, 1)}, pictures
+
+
+def _level(capture: Capture, image: torch.Tensor, plane: Plane) -> float | None:
+    """Return how bright an image is over the truth, by least squares; None where that is not known."""
+    if capture.target is None:
+        return None
+    truth = torch.from_numpy(capture.target.rasterise(plane)).to(image)
+    return round(float((image * truth).sum() / truth.square().sum().clamp(min=1e-12)), 3)
+
+
+def invert_colours(
+    folders: Sequence[Path], options: SequenceOptions, progress: Progress = silent
+) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Return what `invert_captures` does, of red, green and blue: targets [3, cells, cells].
+
+    A PSNR is that of the mean square over the colours; `level` is how bright each is over the truth.
+
+    Raises:
+        ConfigError: The frames are grey.
+    """
+    parts = [invert_captures(folders, replace(options, colour=one), progress) for one in COLOURS]
+    pictures = {name: torch.stack([found[name] for _, found in parts]) for name in parts[0][1]}
+    if all(torch.equal(image[0], image[1]) and torch.equal(image[1], image[2]) for image in pictures.values()):
+        raise ConfigError(f"{folders[0]}: its frames are grey; leave --colours, or state camera.mosaic")
+    rows = []
+    for same in zip(*(figures["rows"] for figures, _ in parts), strict=True):
+        errors = [10 ** (-0.1 * row["psnr_db"]) for row in same if row["psnr_db"] is not None]
+        # The least, as a colour that the target hardly has tells nothing of the setup.
+        shares = [row["unexplained"] for row in same if row["unexplained"] is not None]
+        row = {**same[0], "unexplained": min(shares, default=None), "level": [row["level"] for row in same]}
+        rows.append({**row, "psnr_db": round(-10 * math.log10(np.mean(errors)), 3) if errors else None})
+    seconds = sum(figures["seconds"] for figures, _ in parts)
+    return {**parts[0][0], "rows": rows, "seconds": round(seconds, 1)}, pictures
 
 
 def _solve(
@@ -170,9 +208,6 @@ def _is_tracked(capture: Capture, options: SequenceOptions) -> bool:
     return options.track or capture.motion is None
 
 
-_FINEST = 48  # pixels a side that a rough wall's light needs
-
-
 @dataclass(frozen=True)
 class StillOptions:
     """What `evnlos invert` was told about still images."""
@@ -191,40 +226,17 @@ def invert_stills(
 ) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the figures, and the images [files, h, w] on the scanned cells by solver.
 
-    The dark frame (the scan's own where none is given) is taken off, unusable pixels are filled in alike in
-    the images and in the matrix, both are reduced, and the operator is brought to norm 1.
-
     Raises:
-        ConfigError: An image does not have the scan's size or is one that the scan was not.
+        ConfigError: As for `stills_as_scanned`.
         DataError: An image can't be read.
     """
     clock = time.perf_counter()
-    measured = setup.measurement()
-    pictures = [read_image(path, measured.shape) for path in files]
-    peaks = {float(np.iinfo(picture.dtype).max) for picture in pictures}
-    if len(peaks) > 1:
-        raise ConfigError("the images have 8 and 16 bits; give images of one camera")
-    white = float(measured.about.white_dn or peaks.pop())
-    if (brightest := max(int(picture.max()) for picture in pictures)) > white:
-        raise ConfigError(f"an image reaches {brightest} DN, the scan's white is {white:g}; save both alike")
-    light = torch.from_numpy(np.stack(pictures).astype(np.float32)) / white
-    if options.dark is None:
-        light = light - setup.ambient_light(measured.shape)
-    else:
-        light = light - torch.from_numpy(read_image(options.dark, measured.shape).astype(np.float32)) / white
-    filled = fill_bad(light.numpy(), measured.bad.numpy(), measured.shape)
-    shape = reduced(measured.shape, options.bin)
-    flat = averaged(torch.from_numpy(filled).flatten(1).mT, measured.shape, shape)
-    image = flat.mT.unflatten(1, shape).double()
-    image = image / image.abs().max().clamp(min=1e-12)
-    cells = measured.about.plane
-    matrix = setup.operator(cells, shape).dense()
-    operator = MatrixTransport(matrix / torch.linalg.matrix_norm(matrix, 2), cells, shape)
+    operator, image = stills_as_scanned(files, setup, options.dark, options.bin)
     degree = chosen_degree(operator, image) if options.degree is None else options.degree
     found: dict[str, Any] = {
         "files": [str(path) for path in files],
         "setup": setup.wall_description(),
-        "wall": list(shape),
+        "wall": list(operator.shape),
         "background_degree": degree,
         "solutions": {},
     }
@@ -246,15 +258,6 @@ def figures_of(name: str, solution: Solution) -> dict[str, Any]:
         "misfit": solution.noise_sigma,
         "iterations": solution.iterations,
     }
-
-
-def reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:
-    """Return the size (h, w) that images are reduced to: pixels binned, by default at most 48 a side."""
-    most = max(shape)
-    factor = most / min(most, _FINEST) if bin is None else bin
-    if not 1 <= factor <= min(shape):
-        raise ConfigError(f"the binning is {bin}; give 1 to {min(shape)} pixels")
-    return max(1, round(shape[0] / factor)), max(1, round(shape[1] / factor))
 
 
 _GAP_S = 0.4  # between the instants at which silences are looked at

@@ -1,7 +1,4 @@
-"""A capture: one real (or pseudo-real) recording as a folder of frames, events and what is known about them.
-
-- Real recordings become the same kind of dataset as simulated ones.
-"""
+"""A capture: a recording as a folder of frames, events and what is known about them; datasets of captures."""
 
 from __future__ import annotations
 
@@ -44,7 +41,7 @@ from evnlos.events import (
 )
 from evnlos.machine import Progress, Step, silent
 from evnlos.scene import LineMotion, Scene, SeveralTargets, Target
-from evnlos.types import Events, matching_paths
+from evnlos.types import Colour, Events, matching_paths
 from evnlos.untrusted import no_file
 
 _HELD_BYTES = 1 << 26  # frames of an import that take more are read as they are asked for
@@ -144,6 +141,7 @@ def read_capture(
     needs_frames: bool = True,
     needs_events: bool = True,
     lazy_frames: bool = False,
+    colour: Colour | None = None,
 ) -> Capture:
     """Read a capture folder (`capture.yaml`, event file, frames, mask), or one file of events and frames.
 
@@ -157,6 +155,7 @@ def read_capture(
         needs_frames: Whether a capture of an event camera alone is refused; else black frames mark its steps.
         needs_events: Whether a capture of a frame camera alone is refused; else it has no events.
         lazy_frames: Whether frames that take more memory are a `FrameStack`, in place of an error.
+        colour: Colour of the frames and of the target to take; None is what capture.yaml says.
 
     Raises:
         DataError: A file is missing, a frame has another size than the camera, clock or pixels do not fit, or
@@ -170,7 +169,7 @@ def read_capture(
         raise UnknownNameError(
             f"{folder} is not a folder; give the folder of a capture (it holds capture.yaml)"
         )
-    info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic)
+    info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic).in_colour(colour)
     name, folder = _name_of(folder), folder.parent if folder.is_file() else folder
     info.check_cameras(folder, frames=needs_frames, events=needs_events)
     is_alone = info.frames is None
@@ -188,7 +187,7 @@ def read_capture(
     notes += told
     if info.events is not None and not len(events):
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
-    target = read_target(folder, info.target)
+    target = read_target(folder, info.target, info.camera.colour)
     held = cast(Any, frames) if is_alone or isinstance(frames, FrameStack) else np.ascontiguousarray(frames)
     others = read_others(folder, info, times_us)
     return Capture(name, info, events, held, times_us, target, tuple(map(printable, notes)), others)

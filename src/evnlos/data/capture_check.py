@@ -1,18 +1,22 @@
 """Is a capture worth a day of recordings? What was recorded, in plain words, and how to mend it.
 
 - Of several captures by one camera: whose clocks differ from the others'?
+- Of published captures: are they the published ones?
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from evnlos.data.capture import Capture
+from evnlos.config import read_yaml
+from evnlos.data.capture import Capture, read_capture
 from evnlos.data.capture_info import CaptureInfo
 from evnlos.data.clocks import FEWEST_LAGS, LEAST_AGREEMENT, beside_others, find_lag
 from evnlos.data.fixed_pattern import light_path
@@ -20,6 +24,7 @@ from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.events import find_hot_pixels
 from evnlos.events.cleaning import find_flicker
+from evnlos.machine import Progress, Step, silent
 
 Level = Literal["good", "doubtful", "bad"]
 
@@ -337,3 +342,56 @@ def _offset_cure(info: CaptureInfo, lag_us: int) -> str:
     if stated == "auto":
         return f"auto went astray: state offset_us in capture.yaml, what auto found {lag_us:+d}"
     return f"state alignment: {{offset_us: {stated + lag_us}}} in capture.yaml, or wire a trigger_channel"
+
+
+PUBLISHED = Path(__file__).with_name("published_captures.yaml")
+"""For each published set: character -> SHA-256 of its capture's content, and its number of events."""
+_ROUNDING = 0.01  # share of the events by which processors and versions of libraries may differ
+
+
+def content_digest(capture: Capture) -> str:
+    """Return the SHA-256 of what a capture holds: events, frames and their times, and the target's mask.
+
+    How the files are packed has no part in it, nor has `capture.yaml`.
+    """
+    found, events = hashlib.sha256(), capture.events
+    mask = b"" if capture.target is None else np.round(capture.target.mask * 255).astype(np.uint8)
+    for values in (
+        np.asarray(events.t_us, "<i8"),
+        np.asarray(events.x, "<u2"),
+        np.asarray(events.y, "<u2"),
+        np.asarray(events.p, np.uint8),
+        np.asarray(capture.frame_times_us, "<i8"),
+        capture.frames,
+        mask,
+    ):
+        found.update(np.ascontiguousarray(values).tobytes() if isinstance(values, np.ndarray) else values)
+    return found.hexdigest()
+
+
+def compare_published(name: str, folders: list[Path], progress: Progress = silent) -> dict[str, str]:
+    """Compare captures with the published ones, and return what differs, a line for each capture that does.
+
+    Args:
+        name: Set, as for `published_lab`.
+        folders: Capture folders of the set.
+        progress: Called as each is read.
+
+    Raises:
+        DataError: A capture is another one: its number of events is more than a hundredth off.
+    """
+    listed, differing = read_yaml(PUBLISHED)[name], dict[str, str]()
+    for done, folder in enumerate(folders):
+        progress(Step(f"compare {name}", done, len(folders), "captures", folder))
+        digest, events = listed[folder.name.removeprefix(f"{name}_")]
+        capture = read_capture(folder)
+        count = len(capture.events)
+        if abs(count - events) > _ROUNDING * events:
+            raise DataError(
+                f"{folder} holds {count:,} events, the published one {events:,}; it is another capture: "
+                "delete it and render it again"
+            )
+        if content_digest(capture) != digest:
+            differing[folder.name] = f"{count:,} events, published {events:,}"
+    progress(Step(f"compare {name}", len(folders), len(folders), "captures"))
+    return differing

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,9 +12,11 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.events.files.registry import find_format
 from evnlos.events.recording import Recording
 from evnlos.files import write_atomically
+from evnlos.types import COLOURS, LUMA_601, Colour, Mosaic
 from evnlos.untrusted import MOST_SENSOR_PIXELS
 
 _MOST_EVERY = 16  # rows and columns of which one is used
+_TEMPLATE = Path(__file__).with_name("capture_template.yaml")
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,13 @@ class CameraInfo:
     """Exposure of a frame, seconds."""
     clock_mhz: int | None = None
     """Clock of a CeleX-V sensor, MHz, where the file's name does not say it."""
+    mosaic: Mosaic | None = None
+    """Colour filters on the pixels of the frame camera, whose files hold raw values: the colours of two pixels
+    of the first row, then of the second; null for files of grey or whole coloured pixels."""
+    colour: Colour | None = None
+    """Colour of the frames and of the target's image that is used; null is all of them, as grey."""
+    white_balance: tuple[float, float, float] | None = None
+    """Red, green and blue of a white target in the frames, up to a factor; null is alike."""
 
     def __post_init__(self) -> None:
         sides = f"camera is {self.width} x {self.height} pixels"
@@ -39,6 +49,21 @@ class CameraInfo:
             raise ConfigError(f"{sides}; give sides of 1 to 65536")
         if self.width * self.height > MOST_SENSOR_PIXELS:
             raise ConfigError(f"{sides}; at most {MOST_SENSOR_PIXELS:,} are read")
+        if self.white_balance is not None and not all(0 < one < math.inf for one in self.white_balance):
+            raise ConfigError(f"camera.white_balance is {self.white_balance}; give three numbers above 0")
+
+    @property
+    def balance(self) -> float:
+        """What a white target has in the frames as they are used, over what it has as grey (Rec. 601)."""
+        if self.colour is None or self.white_balance is None:
+            return 1.0
+        return balances(self.white_balance)[COLOURS.index(self.colour)]
+
+
+def balances(white: tuple[float, float, float]) -> list[float]:
+    """Return red, green and blue of a white target over its grey, from those up to a factor."""
+    grey = sum(share * one for share, one in zip(LUMA_601, white, strict=True)) / sum(LUMA_601)
+    return [one / grey for one in white]
 
 
 @dataclass(frozen=True)
@@ -246,6 +271,10 @@ class CaptureInfo:
             if is_needed and getattr(self, key) is None:
                 raise DataError(f"{name} holds {other} alone ({key}: null in capture.yaml); this needs {key}")
 
+    def in_colour(self, colour: Colour | None) -> CaptureInfo:
+        """Return the same capture with one colour of its frames in use; None leaves it as it is described."""
+        return self if colour is None else replace(self, camera=replace(self.camera, colour=colour))
+
     @property
     def target_size_m(self) -> float:
         """Side of the target plane, metres: the given one, or the usual one where none is."""
@@ -285,45 +314,6 @@ def _info_of_recording(path: Path, events_topic: str | None, frames_topic: str |
         next(recording.pieces(), None)
     camera = CameraInfo(*recording.shape[::-1], name=recording.report.format)
     return CaptureInfo(camera, path.name, path.name, events_topic=events_topic, frames_topic=frames_topic)
-
-
-_TEMPLATE = """\
-# One capture: a hidden target moves past, an event camera, a frame camera or both watch the wall.
-# Lines with # are notes, or settings that you may need; `evnlos capture check FOLDER` says what is wrong.
-
-camera:
-  name: {name}
-  width: {width}             # pixels of the event camera's sensor
-  height: {height}
-  frame_rate_hz: 30.0        # of the frames, where their file carries no times
-  # exposure_s: 0.01         # of a frame; the calibration blurs by it
-  # clock_mhz: 100           # CeleX-V only, where the file's name does not say it
-
-events: {events}           # as the camera wrote it; null for a frame camera alone, whose size is above
-frames: {frames}               # folder of images, video, table t_us,file, AEDAT file or ROS bag; null: none
-# frames_turned: true        # images that the CeleX-V program exported are turned by 180 degrees
-
-# Clocks. Leave out where both files share one; otherwise one of:
-# alignment: {{offset_us: 41000}}         # event time = frame time + offset
-# alignment: {{trigger_channel: 0}}       # the frame camera's exposure is wired to the event camera
-# alignment: {{offset_us: auto}}          # blink the light a few times, irregularly, at the start
-
-# Pixels. Leave out where frames and events share a sensor; otherwise four points or more that both saw:
-# registration: {{points: [[102, 80, 40, 33], [1180, 95, 601, 38], [1160, 690, 592, 440], [110, 702, 44, 446]]}}
-# dark: dark.png             # a frame with the lens covered
-# flat: flat.png             # a frame of an evenly lit surface
-# roi: {{x: 0, y: 0, width: {width}, height: {height}}}
-# every: 2                   # use each second row and column alone; of over 300,000 pixels some are left out
-# filters: {{hot_pixel_factor: 10, background_us: 20000}}
-
-# What was hidden: leave out when unknown. The mask is an image of the target, white shines.
-# target: {{name: R, mask: target.png, size_m: 0.08}}
-# How it moved: the centre is at start_m + speed_m_s (t - start_us), relative to the middle of the travel.
-# motion: {{start_m: -0.08, speed_m_s: 0.02, direction: [1, 0], start_us: 0}}
-
-# Your notes about the setup; the calibration takes distance_m (target's plane to wall) as measured.
-# setup: {{distance_m: 0.30, wall: rough aluminium, ambient: dark room}}
-"""
 
 
 CAMERAS = {
@@ -371,7 +361,9 @@ def begin_capture(
         raise DataError(f"the sensor is {width} x {height} pixels; give its width and height")
     folder.mkdir(parents=True, exist_ok=True)
     one_line = " ".join(name.replace(":", " ").split())
-    text = _TEMPLATE.format(name=one_line, width=width, height=height, events=events, frames=frames)
+    text = _TEMPLATE.read_text(encoding="utf-8").format(
+        name=one_line, width=width, height=height, events=events, frames=frames
+    )
     write_atomically(path, text.encode())
     return path
 

@@ -1,6 +1,6 @@
 """What a frame camera adds to what it saw, dark signal and uneven response, and how it is taken away.
 
-- A dark frame and a flat field, as a capture's folder holds them.
+- A dark frame and a flat field, as a capture's folder holds them; frames on the event camera's pixels.
 - The fixed pattern that a calibration found, its file, and where a setup has it.
 - What is left of frames without the setup's ambient light.
 """
@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
 from evnlos.data.capture_info import CaptureInfo, inside
-from evnlos.data.frames import FrameSeries, read_image, warp_frames
+from evnlos.data.frames import FrameSeries, map_points, read_image
 from evnlos.data.sampling import frame_homography, reduce_by_area
 from evnlos.errors import DataError
 from evnlos.events import FrameStack, crop_events, stride_for, thin_events
@@ -68,12 +69,80 @@ def mapped(frames: Any, work: Callable[[NDArray], NDArray]) -> Any:
     return frames.mapped(work) if isinstance(frames, FrameStack) else work(frames)
 
 
+_MAX_SAMPLES = 8  # a side, in a pixel of the event camera
+
+
+@njit(cache=True)
+def _warp(frames, back, samples, out, covered):
+    height, width = frames.shape[1], frames.shape[2]
+    for row in range(out.shape[1]):
+        for column in range(out.shape[2]):
+            inside = 0
+            for i in range(samples):
+                for j in range(samples):
+                    x, y = column + (j + 0.5) / samples - 0.5, row + (i + 0.5) / samples - 0.5
+                    w = back[2, 0] * x + back[2, 1] * y + back[2, 2]
+                    u = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / w if w != 0 else -1e9
+                    v = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / w if w != 0 else -1e9
+                    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+                        continue
+                    u, v = min(max(u, 0.0), width - 1.0), min(max(v, 0.0), height - 1.0)
+                    left, top = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
+                    right, low = min(left + 1, width - 1), min(top + 1, height - 1)
+                    a, b = u - left, v - top
+                    inside += 1
+                    for n in range(len(frames)):
+                        upper = (1 - a) * frames[n, top, left] + a * frames[n, top, right]
+                        lower = (1 - a) * frames[n, low, left] + a * frames[n, low, right]
+                        out[n, row, column] += (1 - b) * upper + b * lower
+            covered[row, column] = inside / (samples * samples)
+            if inside:
+                for n in range(len(frames)):
+                    out[n, row, column] /= inside
+
+
+def warp_frames(
+    frames: NDArray, matrix: ArrayLike, shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return frames on another camera's pixels, and how much of each of these the frames cover.
+
+    A pixel is the mean of bilinear samples on a square grid in it, as many as keep them about a source pixel
+    apart (at most 8 x 8), so that a finer camera is averaged and not merely picked from.
+
+    Args:
+        frames: [N, H, W], any real numbers; pixel centres are at whole coordinates.
+        matrix: Homography from frame coordinates (x, y) to those of the result, [3, 3].
+        shape: Rows and columns of the result.
+
+    Returns:
+        float32 [N, *shape], 0 where nothing is covered, and the covered part, float32 [*shape], 0..1.
+
+    Raises:
+        DataError: The matrix cannot be inverted, or the frames cover nothing.
+    """
+    matrix = np.asarray(matrix, float)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
+        raise DataError(f"the homography {matrix.tolist()} cannot be inverted; give 3 rows of 3 numbers")
+    back = np.linalg.inv(matrix)
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    steps = map_points(back, middle + np.array([[0, 0], [1, 0], [0, 1]]))
+    scale = max(np.hypot(*(steps[1] - steps[0])), np.hypot(*(steps[2] - steps[0])))
+    samples = int(np.clip(np.ceil(scale - 1e-9), 1, _MAX_SAMPLES)) if np.isfinite(scale) else 1
+    out = np.zeros((len(frames), *shape), np.float64)
+    covered = np.zeros(shape, np.float32)
+    _warp(np.ascontiguousarray(frames, dtype=np.float32), back, samples, out, covered)
+    if not covered.any():
+        raise DataError("after registration the frames lie outside the event camera's view; check the points")
+    return out.astype(np.float32), covered
+
+
 def prepare_frames(folder: Path, info: CaptureInfo, series: FrameSeries) -> tuple[Any, list[str]]:
     """Return the frames on the event camera's pixels; their digital numbers stay where nothing is to do."""
     frames, notes = series.images, []
     size = frames.shape[1:]
     peak = float(np.iinfo(frames.dtype).max)
-    dark, flat = (read_image(inside(folder, name), size) if name else None for name in (info.dark, info.flat))
+    filters = size, info.camera.colour, info.camera.mosaic
+    dark, flat = (read_image(inside(folder, one), *filters) if one else None for one in (info.dark, info.flat))
     is_corrected = dark is not None or flat is not None
     if is_corrected:
         notes.append(f"frames corrected by {' and '.join(name for name in (info.dark, info.flat) if name)}")
@@ -255,7 +324,7 @@ def light_path(frames: NDArray) -> NDArray[np.float64]:
 
 def object_light(
     frames: NDArray,
-    peak: int,
+    peak: float,
     setup: Setup,
     shape: tuple[int, int],
     pattern: FixedPattern | None = None,
@@ -264,7 +333,7 @@ def object_light(
 
     Args:
         frames: Digital numbers [N, H, W].
-        peak: Largest digital number.
+        peak: Digital number of white.
         setup: The setup that says how much ambient light there is.
         shape: Size (h, w) of the result, pixels.
         pattern: The camera's fixed pattern, to be taken off first.

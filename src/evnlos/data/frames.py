@@ -1,6 +1,6 @@
-"""The frames of a capture: read in whatever form they lie in its folder, and laid on the events' pixels.
+"""The frames of a capture: read in whatever form they lie in its folder, as grey or one of their colours.
 
-- A homography from points, and the resampling by it.
+- A homography from points.
 - A grid of bright dots, as a screen or a board of lamps shows it, found in a frame or in a map of events.
 """
 
@@ -17,10 +17,12 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 
+from evnlos.cameras.frame_camera import of_mosaic
 from evnlos.cameras.video import open_video
 from evnlos.data.capture_info import CaptureInfo, inside
 from evnlos.errors import DataError
 from evnlos.events import FrameReader, FrameStack, gather_frames, iter_frames
+from evnlos.types import COLOURS, Colour, Mosaic
 from evnlos.untrusted import check_memory, memory_left, open_image, open_regular
 
 _RECORDINGS = (".aedat4", ".aedat", ".bag", ".db3", ".mcap", ".bin")
@@ -41,8 +43,20 @@ class FrameSeries:
     what: str
 
 
-def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
-    """Read a grey image as uint8 or uint16 [H, W]; `size` is (rows, columns)."""
+def read_image(
+    path: Path, size: tuple[int, int] | None = None, colour: Colour | None = None, mosaic: Mosaic | None = None
+) -> NDArray:
+    """Read an image, or one colour of it, as uint8 or uint16 [H, W].
+
+    Args:
+        path: Its file.
+        size: Rows and columns that it has to have.
+        colour: The colour; None is grey. A grey image has the same of each.
+        mosaic: Colour filters, where the file holds raw values behind them.
+
+    Raises:
+        DataError: It can't be read, or has another size.
+    """
     try:
         with open_image(path) as image:
             if size is not None and image.size != (size[1], size[0]):
@@ -50,10 +64,15 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> NDArray:
                 raise DataError(f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}")
             if image.mode == "F" and not np.isfinite(np.asarray(image)).all():
                 raise DataError(f"{path} holds NaN or infinity; leave it out or mend it")
-            array = np.asarray(image if image.mode.startswith("I;16") else image.convert("L"))
+            if image.mode.startswith("I;16"):
+                array = np.asarray(image)
+            elif mosaic is not None or colour is None:
+                array = np.asarray(image.convert("L"))
+            else:
+                array = np.asarray(image.convert("RGB"))[..., COLOURS.index(colour)]
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise DataError(f"{path} can't be read as an image: {error}") from None
-    return array
+    return array if mosaic is None else of_mosaic(array, mosaic, colour)
 
 
 def read_frame_series(
@@ -79,8 +98,10 @@ def read_frame_series(
     most = min(memory_left() // 4, 1 << 31) if most_bytes is None else most_bytes
     size = None if info.registration is not None else (info.camera.height, info.camera.width)
     if path.suffix.lower() == ".csv":
-        return _from_table(folder, path, size, most)
+        return _from_table(folder, path, info, size, most)
     if path.suffix.lower() in _RECORDINGS:
+        if info.camera.colour is not None or info.camera.mosaic is not None:
+            raise DataError(f"{path}: its frames are read as grey; save them as images to take their colours")
         read = lambda: iter_frames(path, topic=info.frames_topic)  # noqa: E731
     else:
         read = _video_frames(folder, path, info, None if is_lazy else most)
@@ -113,7 +134,9 @@ def _video_frames(folder: Path, path: Path, info: CaptureInfo, most: int | None)
         for one in path.iterdir():
             inside(folder, str(one.relative_to(folder.resolve())), f"{info.frames}")
     timed = path.is_file() and path.suffix.lower() != ".npy"
-    video = open_video(path, fps=None if timed else _rate(path, info))
+    camera = info.camera
+    colour = camera.colour if camera.mosaic is None else None
+    video = open_video(path, fps=None if timed else _rate(path, info), colour=colour)
     if most is not None:
         _check_size(path, (video.frames or 1) * video.width * video.height * 2, most)
 
@@ -121,12 +144,16 @@ def _video_frames(folder: Path, path: Path, info: CaptureInfo, most: int | None)
         for k, (time_s, light) in enumerate(video):
             if not np.isfinite(light).all():
                 raise DataError(f"{path}: frame {k} holds NaN or infinity; give finite values")
-            yield round(time_s * 1e6), np.clip(np.round(light * (65_535 / 255)), 0, 65_535).astype(np.uint16)
+            levels = np.clip(np.round(light * (65_535 / 255)), 0, 65_535).astype(np.uint16)
+            told = levels if camera.mosaic is None else of_mosaic(levels, camera.mosaic, camera.colour)
+            yield round(time_s * 1e6), told
 
     return frames
 
 
-def _from_table(folder: Path, path: Path, size: tuple[int, int] | None, most: int) -> FrameSeries:
+def _from_table(
+    folder: Path, path: Path, info: CaptureInfo, size: tuple[int, int] | None, most: int
+) -> FrameSeries:
     try:
         with open_regular(path) as opened, TextIOWrapper(opened, encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
@@ -144,11 +171,12 @@ def _from_table(folder: Path, path: Path, size: tuple[int, int] | None, most: in
         before = named.setdefault(row["file"] or "", k)
         if before != k:
             raise DataError(f"{path}: frames {before} and {k} are both {row['file']}; name every image once")
-    first = read_image(inside(folder, rows[0]["file"] or "", path.name), size)
+    filters = size, info.camera.colour, info.camera.mosaic
+    first = read_image(inside(folder, rows[0]["file"] or "", path.name), *filters)
     _check_size(path, len(rows) * first.nbytes, most)
     images = np.empty((len(rows), *first.shape), first.dtype)
     for k, row in enumerate(rows):
-        image = read_image(inside(folder, row["file"] or "", path.name), size) if k else first
+        image = read_image(inside(folder, row["file"] or "", path.name), *filters) if k else first
         if image.shape != first.shape or image.dtype != first.dtype:
             raise DataError(
                 f"{path}: frame {k} is {image.dtype} {image.shape}, frame 0 {first.dtype} "
@@ -170,7 +198,6 @@ def _check_times(path: Path, times: NDArray[np.int64]) -> None:
         raise DataError(f"{path}: frame {i + 1} at {times[i + 1]} us follows {times[i]} us; times must ascend")
 
 
-_MAX_SAMPLES = 8  # a side, in a pixel of the event camera
 _FLAT = 1e-6  # ratio of singular values below which points lie on a line
 
 
@@ -202,7 +229,7 @@ def homography_from_points(source: ArrayLike, target: ArrayLike) -> NDArray[np.f
     if not (np.isfinite(sources).all() and np.isfinite(targets).all()):
         raise DataError("a point of the registration is not finite; give pixels")
     a, b = _normaliser(sources), _normaliser(targets)
-    p, q = _map(a, sources), _map(b, targets)
+    p, q = map_points(a, sources), map_points(b, targets)
     zero, one = np.zeros(len(p)), np.ones(len(p))
     rows = np.concatenate(
         [
@@ -228,7 +255,8 @@ def _normaliser(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1]])
 
 
-def _map(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def map_points(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where a homography [3, 3] puts points (x, y), [N, 2] pixels."""
     mapped = np.column_stack([points, np.ones(len(points))]) @ matrix.T
     return mapped[:, :2] / mapped[:, 2:]
 
@@ -241,72 +269,8 @@ def registration_error(matrix: NDArray, source: ArrayLike, target: ArrayLike) ->
         source: Points (x, y), [N, 2], pixels.
         target: Where they should be, [N, 2], pixels.
     """
-    away = _map(np.asarray(matrix, float), np.asarray(source, float)) - np.asarray(target, float)
+    away = map_points(np.asarray(matrix, float), np.asarray(source, float)) - np.asarray(target, float)
     return float(np.sqrt((away**2).sum(axis=1).mean()))
-
-
-@njit(cache=True)
-def _warp(frames, back, samples, out, covered):
-    height, width = frames.shape[1], frames.shape[2]
-    for row in range(out.shape[1]):
-        for column in range(out.shape[2]):
-            inside = 0
-            for i in range(samples):
-                for j in range(samples):
-                    x, y = column + (j + 0.5) / samples - 0.5, row + (i + 0.5) / samples - 0.5
-                    w = back[2, 0] * x + back[2, 1] * y + back[2, 2]
-                    u = (back[0, 0] * x + back[0, 1] * y + back[0, 2]) / w if w != 0 else -1e9
-                    v = (back[1, 0] * x + back[1, 1] * y + back[1, 2]) / w if w != 0 else -1e9
-                    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
-                        continue
-                    u, v = min(max(u, 0.0), width - 1.0), min(max(v, 0.0), height - 1.0)
-                    left, top = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
-                    right, low = min(left + 1, width - 1), min(top + 1, height - 1)
-                    a, b = u - left, v - top
-                    inside += 1
-                    for n in range(len(frames)):
-                        upper = (1 - a) * frames[n, top, left] + a * frames[n, top, right]
-                        lower = (1 - a) * frames[n, low, left] + a * frames[n, low, right]
-                        out[n, row, column] += (1 - b) * upper + b * lower
-            covered[row, column] = inside / (samples * samples)
-            if inside:
-                for n in range(len(frames)):
-                    out[n, row, column] /= inside
-
-
-def warp_frames(
-    frames: NDArray, matrix: ArrayLike, shape: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return frames on another camera's pixels, and how much of each of these the frames cover.
-
-    A pixel is the mean of bilinear samples on a square grid in it, as many as keep them about a source pixel
-    apart (at most 8 x 8), so that a finer camera is averaged and not merely picked from.
-
-    Args:
-        frames: [N, H, W], any real numbers; pixel centres are at whole coordinates.
-        matrix: Homography from frame coordinates (x, y) to those of the result, [3, 3].
-        shape: Rows and columns of the result.
-
-    Returns:
-        float32 [N, *shape], 0 where nothing is covered, and the covered part, float32 [*shape], 0..1.
-
-    Raises:
-        DataError: The matrix cannot be inverted, or the frames cover nothing.
-    """
-    matrix = np.asarray(matrix, float)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
-        raise DataError(f"the homography {matrix.tolist()} cannot be inverted; give 3 rows of 3 numbers")
-    back = np.linalg.inv(matrix)
-    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
-    steps = _map(back, middle + np.array([[0, 0], [1, 0], [0, 1]]))
-    scale = max(np.hypot(*(steps[1] - steps[0])), np.hypot(*(steps[2] - steps[0])))
-    samples = int(np.clip(np.ceil(scale - 1e-9), 1, _MAX_SAMPLES)) if np.isfinite(scale) else 1
-    out = np.zeros((len(frames), *shape), np.float64)
-    covered = np.zeros(shape, np.float32)
-    _warp(np.ascontiguousarray(frames, dtype=np.float32), back, samples, out, covered)
-    if not covered.any():
-        raise DataError("after registration the frames lie outside the event camera's view; check the points")
-    return out.astype(np.float32), covered
 
 
 _SMALLEST = 3  # pixels of a dot

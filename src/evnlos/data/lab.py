@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -14,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from evnlos.cameras import EventPixel, FrameCamera, V2ePixel
+from evnlos.cameras import EventPixel, FrameCamera, V2ePixel, mosaicked
 from evnlos.config import check_made, differing_keys, from_dict, read_yaml, save_yaml, to_dict
-from evnlos.data.capture import Capture, read_capture
+from evnlos.data.capture_info import balances
 from evnlos.data.pool import processes, run_tasks
 from evnlos.data.sampling import character_of, mask_file, stated_targets
 from evnlos.data.simulate import check_ranges, check_sequences, sequence_bytes, varied
@@ -31,12 +31,9 @@ from evnlos.scene import FontGlyphs, Glyphs, LineMotion, OtherTarget, Scene, Sev
 from evnlos.scene.fonts import find_font
 from evnlos.setups import RadiometricSetup, Setup, named_setup, setup_preset
 from evnlos.setups.load import is_name
-from evnlos.types import derive_seed
+from evnlos.types import COLOURS, LUMA_601, Mosaic, derive_seed
 
-PUBLISHED = Path(__file__).with_name("published_captures.yaml")
-"""For each published set: character -> SHA-256 of its capture's content, and its number of events."""
 _PUBLISHED_GAIN = {"near": 1.7, "far": 1.0}  # white levels of the brightest pixel
-_ROUNDING = 0.01  # share of the events by which processors and versions of libraries may differ
 
 SENSOR_SPREAD: dict[str, tuple[float, float]] = {
     "setup.pixel.threshold_on": (0.18, 0.28),
@@ -100,6 +97,13 @@ class Lab:
     """Targets that are there beside each object; in a settings file alone."""
     cover: bool = False
     """Whether a later target hides those before it as far as it shines itself; else their light adds."""
+    palette: tuple[str, ...] = ()
+    """Colours of each object in bands from its top, RRGGBB, hexadecimal shares of white light; with any, frames
+    are in colour, and events of the luma."""
+    mosaic: Mosaic | None = None
+    """Colour filters of the frame camera; without them each pixel of a coloured frame sees all colours."""
+    white_balance: tuple[float, float, float] = (0.8, 1.0, 0.6)
+    """What coloured frames have of white: red, green and blue, up to a factor."""
     duration_s: float = 8.0
     """Length of a sequence, seconds."""
     frame_rate_hz: float = 5.0
@@ -126,9 +130,19 @@ class Lab:
             raise ConfigError(
                 f"Lab.setup.frame_camera.bit_depth is {self.setup.frame_camera.bit_depth}; captures hold 8 bits"
             )
+        for one in self.palette:
+            if not re.fullmatch(r"[0-9A-Fa-f]{6}", one):
+                raise ConfigError(f"Lab.palette has {one!r}; give six hexadecimal digits, such as ff8000")
+        if not all(0 < one < float("inf") for one in self.white_balance):
+            raise ConfigError(f"Lab.white_balance is {self.white_balance}; give three numbers above 0")
         _ = self.setup.event_camera  # refuses a step that does not fit the model
         check_ranges(self, self.spread)
         check_made(self)
+
+    @property
+    def is_coloured(self) -> bool:
+        """Whether its frames are in colour."""
+        return bool(self.palette) or self.mosaic is not None
 
     def drawn(self) -> Lab:
         """Return the lab with its sensor's settings drawn from `spread`: a function of the seed and the name.
@@ -212,54 +226,6 @@ def published_lab(name: str, asked: Lab | None = None) -> Lab:
         time_step_s=0.004,
     )
     return Lab(name=name, glyphs=glyphs, setup=setup, spread={}, seed=28)
-
-
-def content_digest(capture: Capture) -> str:
-    """Return the SHA-256 of what a capture holds: events, frames and their times, and the target's mask.
-
-    How the files are packed has no part in it, nor has `capture.yaml`.
-    """
-    found, events = hashlib.sha256(), capture.events
-    mask = b"" if capture.target is None else np.round(capture.target.mask * 255).astype(np.uint8)
-    for values in (
-        np.asarray(events.t_us, "<i8"),
-        np.asarray(events.x, "<u2"),
-        np.asarray(events.y, "<u2"),
-        np.asarray(events.p, np.uint8),
-        np.asarray(capture.frame_times_us, "<i8"),
-        capture.frames,
-        mask,
-    ):
-        found.update(np.ascontiguousarray(values).tobytes() if isinstance(values, np.ndarray) else values)
-    return found.hexdigest()
-
-
-def compare_published(name: str, folders: list[Path], progress: Progress = silent) -> dict[str, str]:
-    """Compare captures with the published ones, and return what differs, a line for each capture that does.
-
-    Args:
-        name: Set, as for `published_lab`.
-        folders: Capture folders of the set.
-        progress: Called as each is read.
-
-    Raises:
-        DataError: A capture is another one: its number of events is more than a hundredth off.
-    """
-    listed, differing = read_yaml(PUBLISHED)[name], dict[str, str]()
-    for done, folder in enumerate(folders):
-        progress(Step(f"compare {name}", done, len(folders), "captures", folder))
-        digest, events = listed[folder.name.removeprefix(f"{name}_")]
-        capture = read_capture(folder)
-        count = len(capture.events)
-        if abs(count - events) > _ROUNDING * events:
-            raise DataError(
-                f"{folder} holds {count:,} events, the published one {events:,}; it is another capture: "
-                "delete it and render it again"
-            )
-        if content_digest(capture) != digest:
-            differing[folder.name] = f"{count:,} events, published {events:,}"
-    progress(Step(f"compare {name}", len(folders), len(folders), "captures"))
-    return differing
 
 
 def render_captures(
@@ -349,15 +315,46 @@ def _scene(lab: Lab, name: str) -> Scene | SeveralTargets:
     return with_others(scene, lab.others, lab.cover, lab.seed)
 
 
+def _in_light(lab: Lab, scene: Scene | SeveralTargets, weights: ArrayLike) -> Scene | SeveralTargets:
+    """Return the scene as light that counts red, green and blue by `weights`, which add up to 1, shows it."""
+    if not lab.palette:
+        return scene
+    bands = np.array([list(bytes.fromhex(one)) for one in lab.palette]) @ np.asarray(weights) / 255
+    shown = tuple(replace(one, target=one.target.banded(bands)) for one in scene.scenes)
+    return replace(scene, scenes=shown) if isinstance(scene, SeveralTargets) else shown[0]
+
+
+_WAVELENGTHS_M = 650e-9, 550e-9, 450e-9  # of `COLOURS`
+
+
+def _coloured(
+    lab: Lab, scene: Scene | SeveralTargets, times_s: NDArray[np.float64], seed: int
+) -> NDArray[np.uint8]:
+    """Return frames [N, H, W, 3], or [N, H, W] behind a mosaic: one exposure a colour."""
+    pictures, whites = [], balances(lab.white_balance)
+    for k, colour in enumerate(COLOURS):
+        light = {"gain": lab.setup.gain * whites[k], "ambient": lab.setup.ambient * whites[k]}
+        if isinstance(lab.setup, RadiometricSetup):
+            light["wavelength_m"] = _WAVELENGTHS_M[k]
+        wall = replace(lab.setup, **light).observe_all(_in_light(lab, scene, np.eye(3)[k]))
+        pictures.append(lab.setup.frame_camera.capture(wall, times_s, seed=derive_seed(seed, colour)))
+    stacked = np.stack(pictures, axis=-1)
+    return stacked if lab.mosaic is None else mosaicked(stacked, lab.mosaic)
+
+
 def _render(task: tuple[Lab, str, Path]) -> Path:
     """Render a capture into a folder that is there whole or not at all."""
     lab, name, folder = task
     scene = _scene(lab, name)
-    wall = lab.setup.observe_all(scene)
+    wall = lab.setup.observe_all(_in_light(lab, scene, np.array(LUMA_601) / sum(LUMA_601)))
     times_s = np.arange(round(lab.duration_s * lab.frame_rate_hz) + 1) / lab.frame_rate_hz
     seed = derive_seed(lab.seed, name)
     events = lab.setup.event_camera.record(wall, 0.0, lab.duration_s, seed=derive_seed(seed, "events"))
-    frames = lab.setup.frame_camera.capture(wall, times_s, seed=derive_seed(seed, "frames"))
+    of_frames = derive_seed(seed, "frames")
+    if lab.is_coloured:
+        frames = _coloured(lab, scene, times_s, of_frames)
+    else:
+        frames = lab.setup.frame_camera.capture(wall, times_s, seed=of_frames)
     with new_folder(folder) as draft:
         (draft / "frames").mkdir()
         write_events(draft / "events.raw", events)
@@ -367,7 +364,9 @@ def _render(task: tuple[Lab, str, Path]) -> Path:
             rows.append(f"{round(time_s * 1e6)},frames/{k:04d}.png")
         (draft / "frames.csv").write_text("\n".join(rows) + "\n")
         for k, one in enumerate(scene.scenes):
-            Image.fromarray(np.round(one.target.mask * 255).astype(np.uint8)).save(draft / mask_file(k))
+            colours = [_in_light(lab, one, weights).scenes[0].target.mask for weights in np.eye(3)]
+            mask = np.stack(colours, axis=-1) if lab.palette else one.target.mask
+            Image.fromarray(np.round(mask * 255).astype(np.uint8)).save(draft / mask_file(k))
         save_yaml(_description(lab, folder.name, scene), draft / "capture.yaml")
     return folder
 
@@ -382,6 +381,8 @@ def _description(lab: Lab, name: str, scene: Scene | SeveralTargets) -> dict[str
             "height": setup.sensor.height,
             "frame_rate_hz": lab.frame_rate_hz,
             "exposure_s": setup.frame_camera.exposure_s,
+            **({} if lab.mosaic is None else {"mosaic": lab.mosaic}),
+            **({"white_balance": list(lab.white_balance)} if lab.is_coloured else {}),
         },
         "events": "events.raw",
         "frames": "frames.csv",

@@ -30,7 +30,7 @@ from evnlos.events import (
     time_surface,
 )
 from evnlos.scene import LineMotion, Motion, Scene, SeveralTargets, Target
-from evnlos.types import Events, Plane
+from evnlos.types import Colour, Events, Plane
 
 _BLOCK_BYTES = 1 << 26  # of frames and surfaces at the sensor's resolution
 
@@ -370,18 +370,19 @@ def mask_file(number: int) -> str:
     return f"other{number}.png" if number else "target.png"
 
 
-def read_target(folder: Path, info: TargetInfo | None) -> Target | None:
-    """Return the target of a capture with its mask; None where there is none."""
+def read_target(folder: Path, info: TargetInfo | None, colour: Colour | None) -> Target | None:
+    """Return the target of a capture with its mask in one colour, or as grey; None where there is none."""
     if info is None or info.mask is None:
         return None
-    mask = read_image(inside(folder, info.mask))
+    mask = read_image(inside(folder, info.mask), colour=colour)
     return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.size_m)
 
 
 def read_others(folder: Path, info: CaptureInfo, times_us: NDArray[np.int64]) -> tuple[Scene, ...]:
     """Return the other targets of a capture with their motions, as far as both are known."""
     seconds = max(float(times_us[-1]) * 1e-6, 1e-6)
-    found = [(read_target(folder, one), line_of(one.motion, noted_distance_m(info))) for one in info.others]
+    z_m, colour = noted_distance_m(info), info.camera.colour
+    found = [(read_target(folder, one, colour), line_of(one.motion, z_m)) for one in info.others]
     return tuple(Scene(one, line, seconds) for one, line in found if one is not None and line is not None)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -324,6 +324,16 @@ class Target:
             return NotImplemented
         same = (self.name, self.size_m) == (other.name, other.size_m)
         return same and np.array_equal(self.mask, other.mask)
+
+    def banded(self, brightness: ArrayLike) -> Target:
+        """Return the target in bands of equal height, from the top, each brighter or darker than it was.
+
+        Args:
+            brightness: What the mask is multiplied by in each band, [bands], 0..1.
+        """
+        factors = np.asarray(brightness, np.float32)
+        rows = np.arange(len(self.mask)) * len(factors) // len(self.mask)
+        return replace(self, mask=self.mask * factors[rows, None])
 
     def turned(self, rotation_rad: float) -> Target:
         """Return the target turned about its centre, on a larger plane; a coarse mask gets half the pixel.

@@ -1,8 +1,9 @@
-"""From a scan's folder to a measured transport."""
+"""From a scan's folder to a measured transport; still images as such a setup sees them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +14,12 @@ from numpy.typing import NDArray
 from evnlos.calibration.scan.folder import ScanInfo, frame_reader, read_scan_frames, read_scan_info
 from evnlos.calibration.scan.frames import Agreement, ScanLight, compare_repeats, read_light
 from evnlos.calibration.scan.matrix import Denoising, PsfCheck, choose_denoising, denoised, matrix_from_psf
+from evnlos.data.frames import read_image
 from evnlos.errors import ConfigError, DataError
+from evnlos.optics import MatrixTransport
+from evnlos.setups import Setup
 from evnlos.setups.files import About, Measurement
-from evnlos.setups.measured import image_motion_px_m
+from evnlos.setups.measured import averaged, image_motion_px_m
 from evnlos.types import Plane
 
 _LEAST_SIGNAL = 3.0
@@ -280,3 +284,59 @@ def _first_warnings(info: ScanInfo, light: ScanLight) -> list[str]:
             "distorts the matrix: expose longer, use more bits, or hadamard patterns"
         )
     return found
+
+
+_FINEST = 48  # pixels a side that a rough wall's light needs
+
+
+def stills_as_scanned(
+    files: Sequence[Path], setup: Setup, dark: Path | None = None, bin: int | None = None
+) -> tuple[MatrixTransport, torch.Tensor]:
+    """Return a measured setup as an operator of norm 1, and still images of its wall as that sees them.
+
+    The dark frame (the scan's own where none is given) is taken off, unusable pixels are filled in alike in
+    the images and in the matrix, and both are reduced.
+
+    Args:
+        files: The images.
+        setup: The setup, of a scan.
+        dark: An image taken without the hidden object.
+        bin: Pixels per side to average; None leaves at most 48 a side.
+
+    Returns:
+        The operator, and the images over the brightest of their pixels, float64 [files, h, w].
+
+    Raises:
+        ConfigError: An image does not have the scan's size or is one that the scan was not.
+        DataError: An image can't be read.
+    """
+    measured = setup.measurement()
+    pictures = [read_image(path, measured.shape) for path in files]
+    peaks = {float(np.iinfo(picture.dtype).max) for picture in pictures}
+    if len(peaks) > 1:
+        raise ConfigError("the images have 8 and 16 bits; give images of one camera")
+    white = float(measured.about.white_dn or peaks.pop())
+    if (brightest := max(int(picture.max()) for picture in pictures)) > white:
+        raise ConfigError(f"an image reaches {brightest} DN, the scan's white is {white:g}; save both alike")
+    light = torch.from_numpy(np.stack(pictures).astype(np.float32)) / white
+    if dark is None:
+        light = light - setup.ambient_light(measured.shape)
+    else:
+        light = light - torch.from_numpy(read_image(dark, measured.shape).astype(np.float32)) / white
+    filled = fill_bad(light.numpy(), measured.bad.numpy(), measured.shape)
+    shape = _reduced(measured.shape, bin)
+    flat = averaged(torch.from_numpy(filled).flatten(1).mT, measured.shape, shape)
+    image = flat.mT.unflatten(1, shape).double()
+    cells = measured.about.plane
+    matrix = setup.operator(cells, shape).dense()
+    operator = MatrixTransport(matrix / torch.linalg.matrix_norm(matrix, 2), cells, shape)
+    return operator, image / image.abs().max().clamp(min=1e-12)
+
+
+def _reduced(shape: tuple[int, int], bin: int | None) -> tuple[int, int]:
+    """Return the size (h, w) that images are reduced to: pixels binned, by default at most 48 a side."""
+    most = max(shape)
+    factor = most / min(most, _FINEST) if bin is None else bin
+    if not 1 <= factor <= min(shape):
+        raise ConfigError(f"the binning is {bin}; give 1 to {min(shape)} pixels")
+    return max(1, round(shape[0] / factor)), max(1, round(shape[1] / factor))
