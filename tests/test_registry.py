@@ -80,6 +80,12 @@ class Cone(Shape):
     kind: Literal["cone"] = "cone"
 
 
+def test_installed_packages_are_looked_through_for_other_kinds_alone(monkeypatch) -> None:
+    monkeypatch.setattr(rooms, "entry_points", lambda **_: pytest.fail("each look takes milliseconds"))
+    Shape.registry.check("ball")
+    assert "box" in Shape.registry
+
+
 def test_two_classes_cannot_have_one_kind() -> None:
     @dataclass(frozen=True)
     class Other(Shape):

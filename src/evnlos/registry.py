@@ -95,7 +95,7 @@ class Registry(Generic[T]):
         return iter(found)
 
     def __contains__(self, kind: object) -> bool:
-        return kind in list(self)
+        return kind in self._classes or kind in list(self)  # the list asks every installed package
 
 
 def _name(thing: object) -> str:

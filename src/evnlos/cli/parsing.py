@@ -215,7 +215,7 @@ def parse(command: type, words: list[str], verb: str, default: Any = None) -> An
     try:
         with contextlib.redirect_stderr(said), _unwrapped(words):
             # The kinds of glyphs and transport come from preset or file; flags change the numbers of that kind.
-            config = (tyro.conf.AvoidSubcommands,)
+            config = (tyro.conf.AvoidSubcommands, tyro.conf.HelptextFromCommentsOff)
             found = tyro.cli(command, args=words, prog=f"evnlos {verb}", default=default, config=config)
     except SystemExit as end:
         if not end.code:
