@@ -237,7 +237,7 @@ def quick_commands(folder: Path) -> list[Command]:
     write_events(folder / "in.raw", events)
     source = str(folder / "in.raw")
     return [
-        Command(f"convert {kind}", ("convert", source, "OUT", "--force"), f"a{kind}")
+        Command(f"convert {kind}", ("convert", source, "--out", "OUT", "--force"), f"a{kind}")
         for kind in (".h5", ".aedat4", ".csv")
     ]
 
@@ -307,7 +307,7 @@ def all_commands(folder: Path) -> list[Command]:
             ),
         ),
         Command("experiment", (*study, "--out", "OUT"), given=given),
-        Command("report", ("report", run, "--data", data, "--out", "OUT"), "out.html"),
+        Command("report", ("report", run, "--data", data, "--force", "--out", "OUT"), "out.html"),
     ]
 
 

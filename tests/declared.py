@@ -55,18 +55,18 @@ reconstruct captures/lab_icon_000 --weights fused --out images
 live captures/lab_icon_000 --weights fused --headless --out watched --speed 8
 track captures/lab_icon_000 --json
 invert captures/lab_icon_000 --setup small.yaml --solver tikhonov --columns 24 --cells 8 --out solved.png
-invert photograph.npz --out photograph.png
+invert photograph.npz --out hidden.png
 scan plan scan
 scan plan tray --display 1920 1080 --pattern hadamard --show page
 events video --fps 100 --out events.h5
 pixel fit events.h5 --light unknown --out fitted
 info events.h5
-convert events.h5 events.raw
-clean events.h5 clean.raw --background-ms auto
-convert events.h5 events.npz
-convert events.h5 events.csv
-convert events.h5 events.mcap
-convert events.h5 events.aedat4
+convert events.h5 --out events.raw
+clean events.h5 --out clean.raw --background-ms auto
+convert events.h5 --out events.npz
+convert events.h5 --out events.csv
+convert events.h5 --out events.mcap
+convert events.h5 --out events.aedat4
 info events.mcap
 preview events.h5 --out events.gif
 corner door.gif --simulate --scene.size 128 96 --scene.fps 10 --scene.seconds 8 --scene.contrast 0.05

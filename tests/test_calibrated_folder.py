@@ -123,9 +123,8 @@ def test_invert_and_track_take_the_pattern_of_the_calibrated_folder(tmp_path, ca
     save_pattern(FixedPattern(np.ones((24, 36), np.float32), offset), folder / "pattern.safetensors")
 
     def figure(*words: str | Path) -> object:
-        main(
-            [str(word) for word in ("invert", capture, "--cells", 8, "--solver", "tikhonov", "--json", *words)]
-        )
+        options = ("--cells", 8, "--solver", "tikhonov", "--json", "--force")
+        main([str(word) for word in ("invert", capture, *options, *words)])
         return json.loads(capsys.readouterr().out)["rows"][0]["psnr_db"]
 
     out = ("--out", tmp_path / "i.png")
@@ -133,7 +132,9 @@ def test_invert_and_track_take_the_pattern_of_the_calibrated_folder(tmp_path, ca
     assert figure("--setup", folder, *out) == stated != figure("--setup", bare, *out)
 
     def position(*words: str | Path) -> object:
-        main([str(word) for word in ("track", capture, "--out", tmp_path / "t.png", "--json", *words)])
+        main(
+            [str(word) for word in ("track", capture, "--out", tmp_path / "t.png", "--json", "--force", *words)]
+        )
         return json.loads(capsys.readouterr().out)["position_sigma"]
 
     stated = position("--setup", bare, "--pattern", folder)

@@ -238,13 +238,13 @@ def test_frames_of_a_file_that_changed_meanwhile_are_refused(tmp_path):
 
 def test_convert_tells_what_the_new_file_does_not_hold(tmp_path, capsys):
     davis_bag(tmp_path / "a.bag")
-    main(["convert", str(tmp_path / "a.bag"), str(tmp_path / "a.h5")])
+    main(["convert", str(tmp_path / "a.bag"), "--out", str(tmp_path / "a.h5")])
     told = capsys.readouterr().err
     assert (
         "a.h5 holds events alone, not the frames (/davis/image_raw; evnlos import" in told
         and "trigger" not in told
     )
-    main(["clean", str(tmp_path / "a.bag"), str(tmp_path / "b.h5")])
+    main(["clean", str(tmp_path / "a.bag"), "--out", str(tmp_path / "b.h5")])
     assert "b.h5 holds events alone" in capsys.readouterr().err
 
 

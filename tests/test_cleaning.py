@@ -202,14 +202,28 @@ def test_lamps_and_noise_go_and_what_moves_stays(lamps):
 def test_the_command_cleans_any_file(lamps, tmp_path, capsys):
     raw, out = tmp_path / "lamps.raw", tmp_path / "clean.npz"
     write_events(raw, lamps[0])
-    main(["clean", str(raw), str(out), "--background-ms", "auto", "--json"])
+    main(["clean", str(raw), "--out", str(out), "--background-ms", "auto", "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["flicker_hz"] == pytest.approx(100.4, abs=0.05) and found["background_us"] > 1000
     assert found["kept"] == len(read_events(out)) < found["events"] == len(lamps[0])
     assert sum(found[name] for name in ("kept", "hot_events", "flicker_events", "background_events")) == len(
         lamps[0]
     )
-    main(["clean", str(raw), str(out), "--force", "--hot-factor", "none", "--flicker", "none", "--stop", "0.5"])
+    main(
+        [
+            "clean",
+            str(raw),
+            "--out",
+            str(out),
+            "--force",
+            "--hot-factor",
+            "none",
+            "--flicker",
+            "none",
+            "--stop",
+            "0.5",
+        ]
+    )
     assert capsys.readouterr().out.endswith("left out: nothing\n")
     half = read_events(out)
     assert half == lamps[0][lamps[0].t_us < int(lamps[0].t_us[0]) + 500_000]
@@ -232,7 +246,7 @@ def test_the_command_cleans_any_file(lamps, tmp_path, capsys):
 def test_what_cannot_be_is_one_line_and_writes_nothing(words, said, tmp_path: Path, capsys):
     write_events(tmp_path / "a.npz", scattered(1))
     with pytest.raises(SystemExit) as end:
-        main(["clean", str(tmp_path / "a.npz"), str(tmp_path / "b.npz"), *words])
+        main(["clean", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.npz"), *words])
     err = capsys.readouterr().err
     assert end.value.code == 2 and said in err and len(err.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
@@ -240,6 +254,6 @@ def test_what_cannot_be_is_one_line_and_writes_nothing(words, said, tmp_path: Pa
 
 def test_nothing_that_stays_is_an_empty_recording_of_the_same_sensor(tmp_path):
     write_events(tmp_path / "a.npz", Events([5, 900], [0, 9], [0, 8], [1, 0], 12, 9))
-    main(["clean", str(tmp_path / "a.npz"), str(tmp_path / "b.npz"), "--background-ms", "1"])
+    main(["clean", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.npz"), "--background-ms", "1"])
     empty = read_events(tmp_path / "b.npz")
     assert len(empty) == 0 and empty.shape == (9, 12)

@@ -275,7 +275,7 @@ def test_info_shows_damage_and_never_refuses_it(tmp_path: Path, capsys) -> None:
     shown = capsys.readouterr().out
     assert "1 truncated" in shown and "39,999 in" in shown
     assert "(evnlos convert --on-error salvage)" in fails(
-        capsys, "convert", tmp_path / "cut.raw", tmp_path / "cut.h5"
+        capsys, "convert", tmp_path / "cut.raw", "--out", tmp_path / "cut.h5"
     )
     call("info", tmp_path / "cut.raw", "--json")
     assert json.loads(capsys.readouterr().out)["faults"] == {"truncated": 1}
@@ -318,9 +318,9 @@ def test_every_format_becomes_hdf5_and_comes_back(tmp_path: Path, capsys, format
     events = random_events()
     write_events(tmp_path / "a.npz", events)
     there, back = tmp_path / f"b{format.suffixes[0]}", tmp_path / "c.h5"
-    call("convert", tmp_path / "a.npz", there, "--format", format.name)
+    call("convert", tmp_path / "a.npz", "--out", there, "--format", format.name)
     assert "40,000 events" in capsys.readouterr().out
-    call("convert", there, back)
+    call("convert", there, "--out", back)
     assert read_events(back) == events
     assert left_in(tmp_path) == {"a.npz", there.name, "c.h5"}
 
@@ -329,7 +329,7 @@ def test_a_part_of_a_recording(tmp_path: Path, capsys) -> None:
     events = random_events(adc=True)
     write_events(tmp_path / "a.h5", events)
     cut = ["--start", 0.5, "--stop", 1.25, "--box", 5, 10, 20, 12]
-    call("convert", tmp_path / "a.h5", tmp_path / "b.h5", *cut)
+    call("convert", tmp_path / "a.h5", "--out", tmp_path / "b.h5", *cut)
     since = events.t_us - events.t_us[0]
     chosen = (since >= 500_000) & (since < 1_250_000)
     chosen &= (events.x >= 5) & (events.x < 25) & (events.y >= 10) & (events.y < 22)
@@ -338,20 +338,20 @@ def test_a_part_of_a_recording(tmp_path: Path, capsys) -> None:
     for name, column in events.columns().items():
         shift = {"x": 5, "y": 10}.get(name, 0)
         np.testing.assert_array_equal(part.columns()[name], column[chosen] - shift if shift else column[chosen])
-    call("convert", tmp_path / "a.h5", tmp_path / "c.raw", "--keep-known-polarity")
+    call("convert", tmp_path / "a.h5", "--out", tmp_path / "c.raw", "--keep-known-polarity")
     kept = keep_known_polarity(events)
     assert read_events(tmp_path / "c.raw") == Events(kept.t_us, kept.x, kept.y, kept.p, 40, 30)
-    call("convert", tmp_path / "a.h5", tmp_path / "none.h5", "--start", 100)
+    call("convert", tmp_path / "a.h5", "--out", tmp_path / "none.h5", "--start", 100)
     assert read_events(tmp_path / "none.h5").shape == (30, 40)
     capsys.readouterr()
 
 
 def test_the_sensor_size_can_be_given(tmp_path: Path, capsys) -> None:
     (tmp_path / "a.csv").write_text("x,y,p,t\n1,2,1,10\n3,0,0,20\n")
-    call("convert", tmp_path / "a.csv", tmp_path / "b.h5")
+    call("convert", tmp_path / "a.csv", "--out", tmp_path / "b.h5")
     shown = capsys.readouterr()
     assert read_events(tmp_path / "b.h5").shape == (3, 4) and "--width" in shown.err
-    call("convert", tmp_path / "a.csv", tmp_path / "b.h5", "--width", 8, "--height", 6, "--force")
+    call("convert", tmp_path / "a.csv", "--out", tmp_path / "b.h5", "--width", 8, "--height", 6, "--force")
     assert read_events(tmp_path / "b.h5").shape == (6, 8)
     assert "--width" not in capsys.readouterr().err
 
@@ -361,9 +361,9 @@ def test_damage_ends_a_conversion_unless_it_is_to_be_left_out(tmp_path: Path, ca
     write_events(tmp_path / "a.raw", events, format="EVT2")
     (tmp_path / "cut.raw").write_bytes((tmp_path / "a.raw").read_bytes()[:-3])
     before = left_in(tmp_path)
-    assert "copy it again" in fails(capsys, "convert", tmp_path / "cut.raw", tmp_path / "b.h5")
+    assert "copy it again" in fails(capsys, "convert", tmp_path / "cut.raw", "--out", tmp_path / "b.h5")
     assert left_in(tmp_path) == before
-    call("convert", tmp_path / "cut.raw", tmp_path / "b.h5", "--on-error", "salvage")
+    call("convert", tmp_path / "cut.raw", "--out", tmp_path / "b.h5", "--on-error", "salvage")
     assert "1 truncated" in capsys.readouterr().err
     assert read_events(tmp_path / "b.h5") == events[:-1]
 
@@ -374,18 +374,18 @@ def test_wrong_conversions_leave_nothing(tmp_path: Path, capsys, monkeypatch) ->
     Path("there.npz").write_bytes(b"precious")
     before = left_in(tmp_path)
     for match, *arguments in (
-        ("--force", "a.h5", "there.npz"),
-        ("the file that is read", "a.h5", "a.h5", "--force"),
-        ("suffix ''", "a.h5", "b"),
-        ("format 'EVT9'", "a.h5", "b.raw", "--format", "EVT9"),
-        ("no such file", "absent.h5", "b.h5"),
-        ("no such folder", "a.h5", "absent/b.h5"),
-        ("unknown polarity", "a.h5", "b.raw"),
-        ("leaves the sensor", "a.h5", "b.h5", "--box", 30, 0, 20, 10),
-        ("sides >= 1", "a.h5", "b.h5", "--box", 0, 0, 0, 10),
-        ("after the start", "a.h5", "b.h5", "--start", 2, "--stop", 1),
-        ("0 or more", "a.h5", "b.h5", "--start", -1),
-        ("the sensor is 20 x 20", "a.h5", "b.h5", "--width", 20, "--height", 20),
+        ("--force", "a.h5", "--out", "there.npz"),
+        ("the file that is read", "a.h5", "--out", "a.h5", "--force"),
+        ("suffix ''", "a.h5", "--out", "b"),
+        ("format 'EVT9'", "a.h5", "--out", "b.raw", "--format", "EVT9"),
+        ("no such file", "absent.h5", "--out", "b.h5"),
+        ("no such folder", "a.h5", "--out", "absent/b.h5"),
+        ("unknown polarity", "a.h5", "--out", "b.raw"),
+        ("leaves the sensor", "a.h5", "--out", "b.h5", "--box", 30, 0, 20, 10),
+        ("sides >= 1", "a.h5", "--out", "b.h5", "--box", 0, 0, 0, 10),
+        ("after the start", "a.h5", "--out", "b.h5", "--start", 2, "--stop", 1),
+        ("0 or more", "a.h5", "--out", "b.h5", "--start", -1),
+        ("the sensor is 20 x 20", "a.h5", "--out", "b.h5", "--width", 20, "--height", 20),
     ):
         line = fails(capsys, "convert", *arguments)
         assert match in line, line

@@ -195,7 +195,7 @@ def test_the_lab_renders_what_a_coloured_camera_sees(coloured):
 
 
 def test_a_picture_in_colour(coloured, tmp_path, capsys):
-    words = ["--setup", str(coloured["setup"]), "--solver", "tikhonov", "--cells", "12", "--json"]
+    words = ["--setup", str(coloured["setup"]), "--solver", "tikhonov", "--cells", "12", "--json", "--force"]
     out = tmp_path / "found.png"
     main(["invert", str(coloured["bands"]), *words, "--colours", "--out", str(out)])
     told = json.loads(capsys.readouterr().out)

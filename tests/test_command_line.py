@@ -110,7 +110,7 @@ def test_json_is_one_object(recording, tmp_path, capsys) -> None:
         main([*map(str, words), "--json"])
         return json.loads(capsys.readouterr().out)
 
-    made = printed("convert", recording, tmp_path / "same.h5")
+    made = printed("convert", recording, "--out", tmp_path / "same.h5")
     assert made["events"] == 3 and made["bytes"] == (tmp_path / "same.h5").stat().st_size
     assert printed("cite")["evnlos"].startswith("@software{evnlos")
 
@@ -175,7 +175,8 @@ def test_a_pattern_stands_for_the_captures_that_it_matches(tiny_captures, tmp_pa
         ["experiment", "simulation", "--out", "file/x"],
         ["live", "CAPTURE", "--out", "file/x"],
         ["events", "clip.gif", "--out", "file/x.h5"],
-        ["convert", "CAPTURE/events.raw", "file/x.h5"],
+        ["convert", "CAPTURE/events.raw", "--out", "file/x.h5"],
+        ["clean", "CAPTURE/events.raw", "--out", "file/x.h5"],
         ["preview", "CAPTURE/events.raw", "--out", "file/x.gif"],
         ["corner", "clip.gif", "--edge", "9", "9", "--wall", "9", "0", "--end", "0", "9", "--out", "file/x"],
     ],
@@ -194,6 +195,51 @@ def test_where_a_result_goes_is_looked_at_before_it_is_worked_for(
         main(words)
     said = capsys.readouterr().err
     assert end.value.code == 2 and said.count("\n") == 1 and "file is a file; give another place" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "there"),
+    [
+        (["track", "CAPTURE", "--out", "a.png"], "a.png"),
+        (["track", "CAPTURE"], "track.json"),
+        (["invert", "wall.npz", "--out", "wall.png"], "wall.npz"),
+        (["report", "run", "--data", "d"], "report.csv"),
+        (["events", "a.gif", "--out", "a.h5"], "a.h5"),
+        (["events", "a.gif", "--out", "a.h5", "--preview", "a.gif"], "a.gif"),
+        (["convert", "a.raw", "--out", "a.csv"], "a.csv"),
+        (["clean", "a.raw", "--out", "a.csv"], "a.csv"),
+        (["preview", "a.raw"], "a.gif"),
+        (["preview", "a.raw", "--out", "b.png"], "b.png"),
+        (["identify", "main-near", "--out", "limits"], "limits/identify.json"),
+        (
+            ["corner", "a.mp4", *["--edge", "9", "9", "--wall", "9", "0", "--end", "0", "9"]],
+            "corner/summary.json",
+        ),
+        (["corner", "a.mp4", "--simulate"], "a.json"),
+        (["scan", "import", "tray"], "tray/transport.safetensors"),
+        (["scan", "import", "tray", "--out", "wall.safetensors"], "wall.png"),
+        (["scan", "rehearse", "tray"], "tray/film.mp4"),
+        (["pixel", "fit", "led.raw", "--out", "fit"], "fit/pixel.yaml"),
+        (["calibrate", "CAPTURE", "--out", "setup"], "setup/setup.yaml"),
+    ],
+)
+def test_nothing_is_replaced_without_force(words, there, tiny_captures, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(there).parent.mkdir(exist_ok=True)
+    Path(there).write_text("precious")
+    with pytest.raises(SystemExit) as end:
+        main([str(tiny_captures[0]) if word == "CAPTURE" else word for word in words])
+    told = capsys.readouterr().err
+    assert end.value.code == 2 and told.count("\n") == 1 and f"{there} exists; give another" in told
+    assert "--force" in told and Path(there).read_text() == "precious"
+    assert {path for path in tmp_path.rglob("*") if path.is_file()} == {tmp_path / there}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_what_writes_a_file_has_force(verb) -> None:
+    fields = command_of(verb).__dataclass_fields__
+    if "out" in fields and str(fields["out"].type).startswith(("OutFile", "OutImage")):
+        assert "force" in fields
 
 
 @pytest.mark.parametrize(

@@ -489,13 +489,13 @@ def test_a_killed_conversion_ends_with_the_same_bytes(suffix: str, tmp_path) -> 
     write_events(tmp_path / "in.raw", events, format="EVT2")
     whole, killed = tmp_path / f"whole{suffix}", tmp_path / "b" / f"whole{suffix}"
     killed.parent.mkdir()
-    main(["convert", str(tmp_path / "in.raw"), str(whole)])
-    dies_at(1, ["convert", str(tmp_path / "in.raw"), str(killed)])
+    main(["convert", str(tmp_path / "in.raw"), "--out", str(whole)])
+    dies_at(1, ["convert", str(tmp_path / "in.raw"), "--out", str(killed)])
     assert not killed.exists() and len(list(killed.parent.iterdir())) == 1
     alive = next(killed.parent.iterdir())
     alive = alive.with_name(re.sub(r"\.\d+\.(\w+\.part)$", rf".{os.getpid()}.\1", alive.name))
     alive.write_bytes(b"of a process that lives")
-    main(["convert", str(tmp_path / "in.raw"), str(killed)])
+    main(["convert", str(tmp_path / "in.raw"), "--out", str(killed)])
     assert killed.read_bytes() == whole.read_bytes()
     assert sorted(killed.parent.iterdir()) == sorted([alive, killed])  # what was left half-written is swept
 

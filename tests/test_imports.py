@@ -171,7 +171,7 @@ def test_help_needs_no_library_of_the_work_and_says_the_same() -> None:
         (["invert", "nope", "--setup", "main-near"], "nope: no such file"),
         (["pixel", "fit", "nope", "--light", "sine", "10", "0.5", "--out", "d"], "nope: no such file"),
         (["events", "nope.mp4", "--out", "e.h5"], "nope.mp4: no such file"),
-        (["clean", "nope.raw", "e.h5"], "nope.raw: no such file"),
+        (["clean", "nope.raw", "--out", "e.h5"], "nope.raw: no such file"),
         (["corner", "nope.mp4", "--edge", "9", "9", "--wall", "9", "0", "--end", "0", "9"], "no such file"),
     ],
 )

@@ -220,7 +220,17 @@ def test_networks_at_work_are_told_with_their_epochs(tmp_path) -> None:
 
 
 def test_invert_tells_its_captures_and_its_solvers(tiny_captures, tmp_path, capsys) -> None:
-    words = ["invert", str(tiny_captures[0]), "--setup", "main-near", "--cells", "8", "--columns", "16"]
+    words = [
+        "invert",
+        str(tiny_captures[0]),
+        "--setup",
+        "main-near",
+        "--cells",
+        "8",
+        "--columns",
+        "16",
+        "--force",
+    ]
     for more, told in (
         (["--positions", "2"], "invert: 0 of 1 motions (light path of the setup)"),
         (["--from", "frames"], "invert: 0 of 1"),

@@ -635,7 +635,20 @@ def test_the_command_inverts_a_sequence(capture, tmp_path, capsys) -> None:
     assert set(np.load(tmp_path / "i.npz")) == {f"{folder.name}_tikhonov_{n}" for n in (1, 8)}
     left = {row["positions"]: row["unexplained"] for row in rows}
     assert left[1] is None and 0 <= left[8] < 0.05  # one frame tells nothing of the setup
-    main(["invert", str(folder), "--setup", str(setup), "--positions", "1", "--solver", "tikhonov", *out])
+    main(
+        [
+            "invert",
+            str(folder),
+            "--setup",
+            str(setup),
+            "--positions",
+            "1",
+            "--solver",
+            "tikhonov",
+            *out,
+            "--force",
+        ]
+    )
     assert "unexplained" not in capsys.readouterr().out
 
 
@@ -646,7 +659,9 @@ def test_the_command_says_where_a_setup_is_not_that_of_the_capture(capture, tmp_
     out, err = capsys.readouterr()
     assert "of the light unexplained beside the noise" in out.splitlines()[-1]
     assert f"{folder.name}: the setup leaves" in err and "do not believe the image" in err
-    main(["invert", str(folder), "--setup", "matte-near", "--positions", "8", "1", *options])  # in any order
+    main(
+        ["invert", str(folder), "--setup", "matte-near", "--positions", "8", "1", *options, "--force"]
+    )  # any order
     assert "do not believe the image" in capsys.readouterr().err
 
 

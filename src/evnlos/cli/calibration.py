@@ -21,10 +21,9 @@ from evnlos.calibration.scan.film import FilmReading
 from evnlos.calibration.scan.importer import ScanImport
 from evnlos.calibration.scan.plan import ScanPlan
 from evnlos.cameras import load_pixel
-from evnlos.cli.parsing import check_files, check_there, drawn, say
-from evnlos.cli.recordings import Flat, Folders, Presets
+from evnlos.cli.parsing import check_files, check_there, drawn, refuse_existing, say
+from evnlos.cli.recordings import Flat, Folders, Force, Presets
 from evnlos.config import to_dict
-from evnlos.errors import ConfigError
 from evnlos.lab import Phone
 from evnlos.machine import ProgressBars
 from evnlos.setups import load_setup
@@ -134,6 +133,7 @@ class ScanCommand:
     out: OutFile | None = None
     """import: the transport, a .safetensors file; by default transport.safetensors in the folder. A check
     image goes to the same name with .png."""
+    force: Force = False
     film: Path | None = None
     """import: a video of the wall while the show of `plan --show page` or `video` ran; characters that it moved
     become captures, FOLDER/captures/*, with simulated events beside the filmed frames."""
@@ -187,6 +187,7 @@ class ScanCommand:
         from evnlos.calibration.scan import rehearse_film
         from evnlos.cli.invert_captures import linear_setup
 
+        refuse_existing(self.force, self.folder / "film.mp4")
         with ProgressBars() as progress:
             path = rehearse_film(self.folder, linear_setup(self.setup), self.phone, progress=progress)
         print(json.dumps({"film": str(path)}) if self.json else f"{path}: simulated, no phone saw this")
@@ -217,12 +218,13 @@ class ScanCommand:
 
         torch.set_num_threads(1)
         out = self.folder / f"transport{SUFFIX}" if self.out is None else self.out
+        shown = out.with_suffix(".png")
+        refuse_existing(self.force, out, shown)
         film = self._filmed()
         result = import_scan(self.folder, self.settings)
         checksum = write_measurement(out, result.measurement)
         for capture in () if film is None else film.captures:
             add_events(self.folder, capture, out)
-        shown = out.with_suffix(".png")
         picture = drawn(shown, lambda: draw_scan(shown, result.measurement, result.raw))
         for warning in result.warnings:
             say(f"warning: {warning}")
@@ -330,8 +332,7 @@ class PixelCommand:
     PX_PER_S [DIRECTION_DEG], frames [FILE], or unknown. Of a capture folder its frames by default."""
     white: float = 255.0
     """The level that counts as 255 DN, so that levels may be lux or any linear unit."""
-    force: bool = False
-    """Replace pixel.yaml where it exists."""
+    force: Force = False
     json: bool = False
     """Print one JSON object."""
     settings: Flat[PixelFitSettings] = field(default_factory=PixelFitSettings)
@@ -354,8 +355,7 @@ class PixelCommand:
         )
         from evnlos.plot.results import draw_pixel_fit
 
-        if (self.out / PIXEL_FILE).exists() and not self.force:
-            raise ConfigError(f"{self.out / PIXEL_FILE} exists; give another --out, or --force to replace it")
+        refuse_existing(self.force, self.out / PIXEL_FILE)
         manifest = read_manifest(self.recording, KnownLight.of(self.light) if self.light else None, self.white)
         with ProgressBars() as progress:
             fit = fit_known_light(manifest, self.settings, progress)

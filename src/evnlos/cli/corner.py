@@ -14,8 +14,8 @@ import tyro
 from numpy.typing import NDArray
 
 from evnlos.cameras.video import Tone, Video, open_video
-from evnlos.cli.parsing import check_files, drawn, say
-from evnlos.cli.recordings import Flat, refuse_existing, result
+from evnlos.cli.parsing import check_files, drawn, refuse_existing, say
+from evnlos.cli.recordings import Flat, Force, result
 from evnlos.errors import ConfigError, DataError
 from evnlos.files import write_atomically
 from evnlos.inverse import CornerImage, FloorSector, Penumbra
@@ -103,7 +103,7 @@ class CornerCommand:
     floor_size: tuple[float, float] = (1.0, 1.0)
     """Sides of that rectangle, first to second corner and second to third, any unit: their ratio counts."""
     out: OutFolder = Path("corner")
-    """Folder for result.png, summary.json and corner.npz; files of these names are replaced."""
+    """Folder for result.png, summary.json and corner.npz."""
     start: float = 0.0
     """Begin, seconds."""
     stop: float | None = None
@@ -123,8 +123,7 @@ class CornerCommand:
     """Film a simulated corner instead, with its truth beside it, and print the command that looks at it."""
     scene: FilmOptions = field(default_factory=FilmOptions)
     """simulate: what is filmed."""
-    force: bool = False
-    """simulate: replace the video where it exists."""
+    force: Force = False
     json: bool = False
     """Print one JSON object."""
 
@@ -142,7 +141,9 @@ class CornerCommand:
         from evnlos.plot.setup import draw_corner
         from evnlos.tracking import track_bearings
 
-        sector, video = self._sector(), self._video()
+        sector = self._sector()
+        refuse_existing(self.force, *(self.out / name for name in ("result.png", "summary.json", "corner.npz")))
+        video = self._video()
         box, index, bearings = sector.pixels((video.height, video.width))
         truth = None if self.truth is None else _true_bearings(self.truth)
         with ProgressBars() as progress:
@@ -181,9 +182,8 @@ class CornerCommand:
         result(self.json, found, "\n".join([where, *misses, *words[1:], words[0]]))
 
     def _film(self) -> None:
-        refuse_existing(self.video, self.force)
         about = self.video.with_suffix(".json") if self.video.suffix else Path(f"{self.video}.json")
-        refuse_existing(about, self.force)
+        refuse_existing(self.force, self.video, about)
         made = self.scene.write(self.video, self.tone, self.json)
         write_atomically(about, json.dumps(made).encode())
         words = [f"evnlos corner {self.video}"]

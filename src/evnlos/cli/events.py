@@ -21,16 +21,16 @@ from evnlos.cameras.event_model import Phase, PixelSettings
 from evnlos.cameras.pixel import EventPixel, Logarithm, Mode
 from evnlos.cameras.sensors import load_pixel
 from evnlos.cameras.video import Tone, Video, check_video, open_video, video_events
-from evnlos.cli.parsing import check_files, say
+from evnlos.cli.parsing import check_files, refuse_existing, say
 from evnlos.cli.recordings import (
     EventFile,
     Flat,
+    Force,
     ReadOptions,
     SelectionOptions,
     amount,
     counted,
     look_of,
-    refuse_existing,
     result,
     say_of,
     write_preview,
@@ -42,7 +42,7 @@ from evnlos.events.files.columns import OnError
 from evnlos.events.recording import CropOptions, Recording
 from evnlos.machine import Progress, ProgressBars, Step
 from evnlos.machine import counted as frames_counted
-from evnlos.types import Events
+from evnlos.types import Events, OutFile
 
 
 @dataclass(frozen=True)
@@ -161,9 +161,7 @@ class EventsCommand:
                 self.out.mkdir(parents=True, exist_ok=True)
                 replace(self, video=(video,), out=out).run()
             return
-        refuse_existing(self.out, self.force)
-        if self.preview is not None:
-            refuse_existing(self.preview, self.force)
+        refuse_existing(self.force, self.out, *([self.preview] if self.preview else []))
         look = look_of(self.preview) if self.preview else None
         pixel = self.changes.applied(load_pixel(self.pixel))
         writer = EventWriter(self.out, format=self.format)
@@ -279,7 +277,7 @@ class CleanCommand:
 
     file: EventFile
     """Event file of any format that is read; it may be larger than memory."""
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    out: OutFile
     """The file to write; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv."""
     hot_factor: float | Literal["none"] = 10.0
     """Pixels with more than that many times the events of the median pixel around them go; none keeps all."""
@@ -298,8 +296,7 @@ class CleanCommand:
     """strict: damage ends it, and nothing is written; salvage: damage is left out and told."""
     reading: Flat[ReadOptions] = field(default_factory=ReadOptions)
     taking: Flat[SelectionOptions] = field(default_factory=SelectionOptions)
-    force: bool = False
-    """Replace the file where it exists."""
+    force: Force = False
     json: bool = False
     """Print one JSON object."""
 
@@ -309,7 +306,6 @@ class CleanCommand:
 
     def run(self) -> None:
         """Look and clean, with a progress bar over the events of each."""
-        refuse_existing(self.out, self.force)
         if self.out.exists() and self.file.exists() and self.out.samefile(self.file):
             raise ConfigError(f"{self.out} is the file that is read; give another name")
         cleaner = Cleaner(

@@ -18,7 +18,7 @@ import tyro
 from numpy.typing import NDArray
 
 from evnlos.cli.parsing import check_files, drawn, say, tracks_text
-from evnlos.cli.recordings import Folders
+from evnlos.cli.recordings import Folders, Force
 from evnlos.errors import ConfigError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
@@ -86,6 +86,7 @@ class InvertCommand:
     """Exponents of the screen's falloff, horizontal and vertical; by default the file's."""
     out: OutImage = Path("inversion.png")
     """The image; the numbers go to the same name with .npz."""
+    force: Force = False
     json: bool = False
     """Print one JSON object."""
 
@@ -270,9 +271,8 @@ class InvertCommand:
             "evidence": found.evidence,
             "picture": drawn(self.out, lambda: draw_inversion(self.out, panels)),
         }
-        _save_arrays(
-            self.out, {"times_s": found.times_s, "film": found.mean, "film_deviation": found.deviation}
-        )
+        arrays = {"times_s": found.times_s, "film": found.mean, "film_deviation": found.deviation}
+        _save_arrays(self.out, arrays)
         result["seconds"] = round(time.perf_counter() - clock, 1)
         print(json.dumps(result) if self.json else film_text(result))
 

@@ -82,6 +82,8 @@ VERBS: dict[str, str] = {
 }
 """The command of each verb, as module in `evnlos.cli` and class. A class whose settings have presets names them
 in `PRESETS`; one whose settings have a setup says in `with_setup` where it goes."""
+_BESIDE = {"track": (".json",), "invert": (".npz",), "report": (".csv",), "scan": (".png",)}
+"""Endings of what a command writes beside its `out`, under the same name."""
 _GO_ON = ("simulate", "lab", "import", "train", "finetune", "experiment", "demo", "fetch")  # what was begun
 
 
@@ -308,7 +310,8 @@ def _command(verb: str, rest: list[str]) -> Any:
     made = parse(command, rest, verb, _defaults(command, rest))
     for one in (made, getattr(made, "settings", None)):
         if isinstance(out := getattr(one, "out", None), Path) and not getattr(made, "dry_run", False):
-            check_out(out, type(one).__annotations__.get("out", ""))
+            kind, force = type(one).__annotations__.get("out", ""), getattr(made, "force", False)
+            check_out(out, kind, force, _BESIDE.get(verb, ()))
     return made
 
 
@@ -369,15 +372,11 @@ def _of_kinds(settings: Any, words: list[str], prefix: str = "--") -> Any:
 
 def _overview() -> str:
     lines = [f"evnlos {__version__}: seeing moving objects around a corner with an event camera", ""]
-    lines.append("usage: evnlos COMMAND [options]; evnlos COMMAND --help shows units and defaults")
-    lines.append("")
-    lines += [f"  {verb:<12} {summary_of(verb)}" for verb in VERBS]
-    lines.append("")
-    lines.append(f"with every command: {FLAG} {{{','.join(LEVELS)}}}, or the variable {VARIABLE}; --version")
-    lines.append(
-        f"                    {PROGRESS_FLAG} {{{','.join(SHOWN)}}}, or the variable {PROGRESS}; {QUIET_FLAG}"
-    )
-    return "\n".join(lines)
+    lines += ["usage: evnlos COMMAND [options]; evnlos COMMAND --help shows units and defaults", ""]
+    lines += [*(f"  {verb:<12} {summary_of(verb)}" for verb in VERBS), ""]
+    lines += [f"with every command: {FLAG} {{{','.join(LEVELS)}}}, or the variable {VARIABLE}; --version"]
+    shown = f"{PROGRESS_FLAG} {{{','.join(SHOWN)}}}, or the variable {PROGRESS}; {QUIET_FLAG}"
+    return "\n".join([*lines, f"                    {shown}"])
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -141,8 +141,6 @@ def listen(arguments: list[str]) -> list[str]:
 
 _RULE = re.compile(r"^[\s─╰╯-]*$")
 _HELP_INDENT = 8  # columns before the text that explains an option
-
-
 _CAMERAS = ("sensor", "frame-camera", "pixel")
 _RENAMED = {  # flag of an older version -> the words of today
     "--rig": ("--setup",),
@@ -161,8 +159,6 @@ _RENAMED_IN = {  # the same, of one command
     ("experiment", "--no-joint"): ("--no-sequence",),
 }
 _EXPERIMENTS = {"joint": "sequence", "shots": "capture-count", "carry-over": "generalization"}  # today's by old
-
-
 _MOVED = {  # beginning of the flags of a setting that moved, by command
     "simulate": {"--transport.": "--setup."} | {f"--{part}.": f"--setup.{part}." for part in _CAMERAS},
     "lab": {"--transport.": "--setup."} | {f"--{part}.": f"--setup.{part}." for part in _CAMERAS},
@@ -253,9 +249,8 @@ def in_one_line(box: str) -> str:
         >>> in_one_line(" Wrong \n ------ \n  No such: \n      --a \n  ------ \n  For full helptext, x \n")
         'No such: --a'
     """
-    lines = [line.rstrip(" │")[2:].rstrip() for line in box.splitlines()]
     sections: list[list[str]] = [[]]
-    for line in lines[1:]:  # without the title
+    for line in (line.rstrip(" │")[2:].rstrip() for line in box.splitlines()[1:]):  # without the title
         if _RULE.match(line):
             sections.append([])
         elif len(line) - len(line.lstrip()) < _HELP_INDENT:
@@ -345,15 +340,23 @@ def flag_value(words: list[str], flag: str) -> str | None:
 _IMAGES = {".png", ".svg", ".pdf", ".eps", ".ps", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ""}
 
 
-def check_out(path: Path, kind: str) -> None:
+def refuse_existing(force: bool, *paths: Path) -> None:
+    """Raise where a file would be replaced without --force."""
+    if not force and (there := next((path for path in paths if path.exists()), None)):
+        raise ConfigError(f"{there} exists; give another name, or --force to replace it")
+
+
+def check_out(path: Path, kind: str, force: bool = False, beside: Sequence[str] = ()) -> None:
     """Raise where a result could not be written, before it is worked for; nothing is made or changed.
 
     Args:
         path: File or folder that the command will write.
         kind: How the command calls it: OutFolder, OutFile or OutImage of `evnlos.types`; Path tells nothing.
+        force: Files may be replaced.
+        beside: Endings of the files that the command writes beside its file.
 
     Raises:
-        ConfigError: It, or the nearest folder above it that exists, cannot be written, or is of another kind.
+        ConfigError: It, or the folder above it, cannot be written, is of another kind, or would be replaced.
     """
     if kind.startswith("OutFolder") and path.exists() and not path.is_dir():
         raise ConfigError(f"{path} is a file; give the name of a folder")
@@ -366,6 +369,7 @@ def check_out(path: Path, kind: str) -> None:
         raise ConfigError(f"{path} is a folder; give the name of a file")
     if kind.startswith("OutImage") and path.suffix.lower() not in _IMAGES:
         raise ConfigError(f"{path} is no image of a known format; end its name in .png, .svg or .pdf")
+    refuse_existing(force, path, *map(path.with_suffix, beside))
 
 
 def _check_writable(path: Path) -> None:
@@ -374,13 +378,9 @@ def _check_writable(path: Path) -> None:
         place = place.parent
     if place != path.absolute() and not place.is_dir():
         raise ConfigError(f"{path} cannot be made: {place} is a file; give another place")
-    if not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)) or _is_read_only(place):
+    is_fixed = hasattr(os, "statvfs") and os.statvfs(place).f_flag & os.ST_RDONLY  # which root's rights hide
+    if is_fixed or not os.access(place, os.W_OK | (os.X_OK if place.is_dir() else 0)):
         raise ConfigError(f"{path} cannot be written: {place} is not writable; give another place")
-
-
-def _is_read_only(place: Path) -> bool:
-    """Return whether a file system takes no file, which an administrator's rights hide."""
-    return hasattr(os, "statvfs") and bool(os.statvfs(place).f_flag & os.ST_RDONLY)
 
 
 def tracks_text(told: dict[str, Any]) -> str:

@@ -17,14 +17,14 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from evnlos.cli.parsing import say
+from evnlos.cli.parsing import refuse_existing, say
 from evnlos.errors import ConfigError, DataError, printable
 from evnlos.events import CelexOptions, EventWriter, ReadReport
 from evnlos.events.files.columns import OnError
 from evnlos.events.recording import WINDOW_US, Box, CropOptions, Recording, Summary, summarise
 from evnlos.machine import ProgressBars, Step
 from evnlos.plot.preview import Background, PreviewOptions, Style, preview_images
-from evnlos.types import Events, matching_paths
+from evnlos.types import Events, OutFile, matching_paths
 
 T = TypeVar("T")
 _PATHS = tyro.constructors.PrimitiveConstructorSpec(
@@ -42,6 +42,8 @@ Presets = Mapping[str, Callable[[], T]]
 """Settings by the name that `--preset` gives."""
 EventFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
 """An event file, given without a flag."""
+Force = Annotated[bool, tyro.conf.arg(help="Replace files of these names that exist.")]
+"""Whether results may be replaced; without it no command does."""
 
 
 def result(as_json: bool, values: Mapping[str, Any], text: str) -> None:
@@ -84,12 +86,6 @@ class SelectionOptions:
         return CropOptions(self.start, self.stop, Box(*self.box) if self.box else None, known_polarity)
 
 
-def refuse_existing(path: Path, force: bool) -> None:
-    """Raise where a file would be replaced without --force."""
-    if path.exists() and not force:
-        raise ConfigError(f"{path} exists; give another name, or --force to replace it")
-
-
 def counted(pieces: Iterable[Events], name: str, total: int | None = None) -> Iterator[Events]:
     """Yield the pieces, and show how many events have gone by."""
     done = 0
@@ -129,7 +125,7 @@ class ConvertCommand:
 
     file: EventFile
     """Event file of any format that is read; it may be larger than memory."""
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    out: OutFile
     """The file to write; its ending says the format: .h5, .npz, .raw (EVT3), .mcap, .aedat4, .csv,
     ..._100M.bin."""
     format: str | None = None
@@ -140,14 +136,12 @@ class ConvertCommand:
     taking: Flat[SelectionOptions] = field(default_factory=SelectionOptions)
     keep_known_polarity: bool = False
     """Leave out events whose polarity the camera did not give; RAW formats cannot hold them."""
-    force: bool = False
-    """Replace the file where it exists."""
+    force: Force = False
     json: bool = False
     """Print one JSON object."""
 
     def run(self) -> None:
         """Convert, with a progress bar over the events."""
-        refuse_existing(self.out, self.force)
         if self.out.exists() and self.file.exists() and self.out.samefile(self.file):
             raise ConfigError(f"{self.out} is the file that is read; give another name")
         recording = self.reading.open(self.file, self.on_error)
@@ -340,10 +334,12 @@ class PreviewCommand:
     """About the longest side of an image, pixels; larger sensors are added up, smaller ones magnified."""
     reading: Flat[ReadOptions] = field(default_factory=ReadOptions)
     taking: Flat[SelectionOptions] = field(default_factory=SelectionOptions)
+    force: Force = False
 
     def run(self) -> None:
         """Read the file twice, to see how much it holds and to draw it, and write the image."""
         out = self.out or Path(self.file.name).with_suffix(".gif")
+        refuse_existing(self.force, out)
         look = look_of(out, self.style, self.background, self.frames, self.window_ms, self.side)
         recording = self.reading.open(self.file, "salvage")
         size = write_preview(recording, self.taking.cut(), out, look)

@@ -20,8 +20,8 @@ import tyro
 
 from evnlos.analysis.bounds import SequenceAnalysisSettings
 from evnlos.analysis.linearized import AnalysisSettings
-from evnlos.cli.parsing import check_there, drawn, say
-from evnlos.cli.recordings import Flat, Folders, result
+from evnlos.cli.parsing import check_there, drawn, refuse_existing, say
+from evnlos.cli.recordings import Flat, Folders, Force, result
 from evnlos.errors import ConfigError, EvnlosError
 from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
@@ -47,8 +47,7 @@ class ReconstructCommand:
     weights: Path | None = None
     """Weights file, run's folder, or name of published weights (`evnlos weights` lists them); none takes the
     published ones for frames of the setup with the nearest distance, of whole sequences if the motion is known
-    or found (--track).
-    """
+    or found (--track)."""
     out: OutFolder = Path("reconstruction")
     """Folder for the images; new or empty."""
     pattern: Path | None = None
@@ -124,11 +123,8 @@ def show_first(demo: Path, captures: Sequence[Path], lab: Lab, force: bool) -> N
     except EvnlosError as error:
         say(f"note: no first reconstruction: {error}")
         return
-    print(
-        "\n".join(
-            [f"{out / 'result.png'}: {capture.name} by {found['weights']}, published", *found["in_words"]]
-        )
-    )
+    first = f"{out / 'result.png'}: {capture.name} by {found['weights']}, published"
+    print("\n".join([first, *found["in_words"]]))
 
 
 @dataclass(frozen=True)
@@ -145,6 +141,7 @@ class TrackCommand:
     of a calibrated --setup."""
     out: OutImage = Path("track.png")
     """The image; the numbers go to the same name with .json."""
+    force: Force = False
     json: bool = False
     """Print one JSON object."""
     settings: Flat[Tracking] = field(default_factory=Tracking)
@@ -290,6 +287,7 @@ class IdentifyCommand:
     """All named walls, as a table."""
     out: OutFolder | None = None
     """Folder for a figure of each setup and identify.json with all curves."""
+    force: Force = False
     json: bool = False
     """Print one JSON object, or a list where several setups are requested."""
     seed: int = 0
@@ -314,6 +312,7 @@ class IdentifyCommand:
         from evnlos.setups import named_setup, setup_names
 
         names = [*self.setups, *self.setup, *(setup_names() if self.all else [])]
+        refuse_existing(self.force, *([self.out / "identify.json"] if self.out else []))
         if not names:
             raise ConfigError(
                 f"no setup given; give a settings file, --all, or names: {', '.join(setup_names())}"
@@ -374,7 +373,8 @@ class ReportCommand:
     """The setup: a name, a settings file, or the folder that `calibrate` wrote, as `identify` takes it: it is
     drawn, and what it can show stands beside the results. The setup of a simulated dataset is known."""
     out: OutFile = Path("report.html")
-    """The page."""
+    """The page; the scores go to the same name with .csv."""
+    force: Force = False
     json: bool = False
     """Print one JSON object: mean scores of each run and baseline."""
 
