@@ -286,6 +286,17 @@ def test_setup_files(tmp_path):
     assert named_setup(path).setup.frame_camera.read_noise_e == 3.0
 
 
+@pytest.mark.parametrize("stem", ["setup", "training"])
+def test_a_file_whose_name_says_nothing_is_called_as_its_folder(stem, tmp_path, monkeypatch):
+    path = tmp_path / "copper" / f"{stem}.yaml"
+    path.parent.mkdir()
+    save_yaml(setup_preset("hard"), path)
+    monkeypatch.chdir(path.parent)
+    assert named_setup(path).name == named_setup(path.name).name == "copper"
+    path.rename("tin.yaml")
+    assert named_setup("tin.yaml").name == "tin"
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [

@@ -284,7 +284,7 @@ NAMED: dict[str, Callable[[], Setup]] = {
 """Setups by name: walls with -near or -far, rooms, and the setups of the presets of `evnlos simulate`."""
 
 
-_TOLD_BY_FOLDER = ("setup", "rig", "lab", "dataset")  # files that are distinguished by their folder
+_TOLD_BY_FOLDER = ("setup", "training", "transport", "rig", "lab", "dataset")  # a folder has one of each
 
 
 def load_setup(word: str | Path) -> Setup:
