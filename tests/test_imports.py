@@ -192,6 +192,20 @@ def test_words_and_names_of_nothing_are_refused_before_any_library_is_loaded(
     assert not set(HEAVY) & set(modules)
 
 
+def test_a_capture_is_begun_without_any_library(tmp_path) -> None:
+    code = (
+        "import sys\n"
+        "from evnlos.__main__ import main\n"
+        f"sys.argv = ['evnlos', 'capture', 'init', {str(tmp_path / 'shot')!r}, '--camera', 'evk4']\n"
+        "main()\n"
+        "print(*sorted(sys.modules))"
+    )
+    told, modules = subprocess.check_output([sys.executable, "-c", code], text=True).splitlines()
+    assert told.startswith(f"{tmp_path / 'shot' / 'capture.yaml'}: edit it")
+    assert "width: 1280" in (tmp_path / "shot" / "capture.yaml").read_text()
+    assert not set(HEAVY) & set(modules.split())
+
+
 def test_what_stands_in_for_a_library_cannot_be_gone_through() -> None:
     """A show's order of patterns is drawn while its command is described: a loop over it took all memory."""
     code = (

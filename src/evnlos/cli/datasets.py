@@ -232,6 +232,11 @@ class CaptureCommand:
         if self.action == "check" and len(self.folders) == 1:
             check_there(read_capture, *self.folders)
 
+    @property
+    def is_light(self) -> bool:
+        """Whether it runs without the libraries that the others need."""
+        return self.action == "init"
+
     def _init(self) -> None:
         self.check_names()
         folder, other = self.folders[0], (self.camera or "my camera", 0, 0, "events.raw", "frames")
@@ -241,8 +246,7 @@ class CaptureCommand:
 
     def _check(self) -> None:
         """Tell of each capture in full, or of several in a table with what is not good below it."""
-        found, failed = dict[str, list[Finding]](), dict[str, str]()
-        infos = dict[str, CaptureInfo]()
+        found, failed, infos = dict[str, list[Finding]](), dict[str, str](), dict[str, CaptureInfo]()
         with ProgressBars() as progress:
             for folder in counted(self.folders, progress, "check", len(self.folders), "captures"):
                 try:
@@ -257,10 +261,7 @@ class CaptureCommand:
                     print("\n".join(capture.notes))
         found = compare_clocks(found, infos)
         if self.json:
-            page = [
-                {"capture": Path(name).name, "findings": [asdict(one) for one in all_]}
-                for name, all_ in found.items()
-            ]
+            page = [{"capture": Path(k).name, "findings": [*map(asdict, v)]} for k, v in found.items()]
             page += [{"capture": Path(name).name, "error": text} for name, text in failed.items()]
             print(json.dumps(page[0] if len(self.folders) == 1 else page))
         elif len(self.folders) == 1:

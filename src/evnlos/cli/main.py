@@ -109,8 +109,7 @@ def main(argv: list[str] | None = None) -> None:
             if verb not in VERBS:
                 raise ConfigError(_unknown(verb))
             with _ended_at_once(verb) if argv is None else nullcontext():
-                _answer_at_once(verb, rest)
-                command = _command(verb, rest)
+                command = _answer_at_once(verb, rest) or _command(verb, rest)
             LOG.debug("%s", command)
             with redirect_stdout(cast(TextIO, PlainOutput(sys.stdout))):
                 command.run()
@@ -249,11 +248,11 @@ def _unknown(verb: str) -> str:
     return f"unknown command {printable(verb[:80])!r}; {cure}"
 
 
-def _answer_at_once(verb: str, rest: list[str]) -> None:
+def _answer_at_once(verb: str, rest: list[str]) -> Any:
     """Print help, or refuse what does not fit and names of nothing, before the work's libraries are imported.
 
-    Where the words fit, or where only those libraries can tell, nothing happens: a setup, a file of settings or
-    a kind that another package brings decides which flags there are.
+    Return the command where it needs none of them (`is_light`), else None: so where only they can tell, since a
+    setup, a file of settings or a kind that another package brings decides which flags there are.
 
     Raises:
         UnfitWordsError: A word does not fit.
@@ -261,8 +260,8 @@ def _answer_at_once(verb: str, rest: list[str]) -> None:
         SystemExit: Help was asked for, and printed.
     """
     if verb == "doctor" or set(WORK_LIBRARIES) & set(sys.modules):
-        return
-    refusal = None
+        return None
+    refusal = light = None
     try:
         with without_work_libraries():
             command = command_of(verb)
@@ -273,12 +272,14 @@ def _answer_at_once(verb: str, rest: list[str]) -> None:
                 made = parse(command, rest, verb, _defaults(command, rest))
                 check_names(rest)
                 getattr(made, "check_names", tuple)()
+                light = made if getattr(made, "is_light", False) else None
     except (UnfitWordsError, UnknownNameError) as error:
         refusal = error
     except Exception:  # a library was needed after all
         LOG.debug("%s is not described without its libraries", verb, exc_info=True)
     if refusal is not None:
         raise refusal
+    return light
 
 
 def _check_kinds(settings: Any, words: list[str], prefix: str = "--") -> None:
