@@ -235,6 +235,15 @@ def test_nothing_is_replaced_without_force(words, there, tiny_captures, tmp_path
     assert {path for path in tmp_path.rglob("*") if path.is_file()} == {tmp_path / there}
 
 
+@pytest.mark.parametrize("verb", ["events", "invert", "report", "capture", "import", "calibrate"])
+def test_what_is_read_can_not_be_left_out_by_the_words_of_the_help(verb, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main([verb, "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    place = shown.partition("positional arguments")[2].partition("options")[0]
+    assert "(required)" in place and "(default: )" not in place and "[PATH" not in shown
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_what_writes_a_file_has_force(verb) -> None:
     fields = command_of(verb).__dataclass_fields__

@@ -50,7 +50,10 @@ def test_unknown_keys_name_the_nearest_setting() -> None:
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"positions": "many"}, "positions = 'many'"),
+        ({"positions": "many"}, "positions = 'many': give a whole number"),
+        ({"positions": 2.5}, "positions = 2.5: give a whole number"),
+        ({"duration_s": "long"}, "duration_s = 'long': give a number"),
+        ({"setup": {"pixel": {"threshold_on": "big"}}}, "setup.pixel.threshold_on = 'big': give a number"),
         ({"positions": 0}, "at least 1"),
         ({"duration_s": -1.0}, "positive"),
         ({"pixel": {"threshold_on": 0.0}}, "threshold_on"),

@@ -47,6 +47,11 @@ UNSIGNED = (
 )  # fmt: skip
 """What the names of numbers end in that are never negative."""
 _NO_UNIT, _MOST_COUNT = (1e-30, 1e30), 2**63 - 1
+_CURES: dict[Any, str] = {  # in place of pydantic's words
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "give a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "give a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "give true or false") | {"string_type": "give a text"},
+}
 BESIDE = types.MappingProxyType({"beside": True})
 """Metadata of a field that names a file or folder; in a YAML file it is relative to that file's folder."""
 LONG_YAML = 1 << 26
@@ -101,17 +106,13 @@ def from_dict(
         found = _adapter(cls).validate_python(values)
     except ValidationError as error:
         first = error.errors()[0]
-        loc, value = tuple(first["loc"]), first.get("input")
-        if first["type"] == NESTED and "ctx" in first:
-            loc, value = (*loc, *first["ctx"]["loc"]), first["ctx"]["input"]
+        loc, value, fault = tuple(first["loc"]), first.get("input"), first["type"]
+        if fault == NESTED and "ctx" in first:
+            loc, value, fault = (*loc, *first["ctx"]["loc"]), first["ctx"]["input"], first["ctx"]["fault"]
         place = ".".join(str(part) for part in loc) or "(top level)"
-        raise ConfigError(f"{source}: {place} = {_shown(value)}: {first['msg']}") from None
-    except (
-        ArithmeticError,
-        MemoryError,
-        TypeError,
-        LookupError,
-    ) as error:  # of a range that only fits together
+        cure = _CURES.get(fault, first["msg"])
+        raise ConfigError(f"{source}: {place} = {_shown(value)}: {cure}") from None
+    except (ArithmeticError, MemoryError, TypeError, LookupError) as error:  # a range that only fits together
         raise ConfigError(f"{source}: its numbers do not fit together ({error})") from None
     return found
 

@@ -164,7 +164,8 @@ class Kinded:
                 return TypeAdapter(cls.class_for(values)).validate_python(values)
             except ValidationError as error:  # the place of the setting within the whole is known one level up
                 first = error.errors()[0]
-                inner = {"loc": first["loc"], "input": first.get("input"), **first.get("ctx", {})}
+                inner = {"input": first.get("input"), "fault": first["type"], **first.get("ctx", {})}
+                inner["loc"] = (*first["loc"], *inner.get("loc", ()))
                 raise PydanticCustomError(NESTED, "{text}", {**inner, "text": first["msg"]}) from None
 
         return core_schema.no_info_plain_validator_function(validated)

@@ -106,7 +106,11 @@ _VIDEO_ENDINGS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".gif
 class EventsCommand:
     """Turn any video into the events that an event camera would send: files, animations, images, arrays."""
 
-    video: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO")]
+    video: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="VIDEO", help_behavior_hint="(required)"),
+    ]
     """Video file (mp4, avi, mkv, ...), GIF, APNG, WebP, images or a folder of them, .npy [T, H, W(, 3)]; or a
     folder of videos."""
     out: Path

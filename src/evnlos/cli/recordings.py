@@ -34,7 +34,8 @@ _PATHS = tyro.constructors.PrimitiveConstructorSpec(
     lambda value: isinstance(value, tuple),
     lambda paths: [str(path) for path in paths],
 )
-Folders = Annotated[tuple[Path, ...], tyro.conf.Positional, _PATHS]
+_SOME = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(required)")  # to the parser none would do
+Folders = Annotated[tuple[Path, ...], tyro.conf.Positional, _SOME, _PATHS]
 """One or more folders, or patterns that match some, without a flag; the record of `lab` is left out."""
 Flat = Annotated[T, tyro.conf.arg(name="")]
 """Settings whose flags carry no prefix."""
