@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-UNITS = "(?:second|pixel|position|step|image|object|capture|shot|frame|sample|event|sequence|setup|row)"
+UNITS = "(?:second|pixel|position|step|image|object|capture|shot|frame|sample|event|sequence|setup|row|unit)"
 RATES = "(?:events?|Hz|hertz|metres?|seconds?|s|ms|us|ns|kB|MB|GB|dB|bytes|steps|frames|samples|dots|shard)"
 BANNED = {
     "rightly": "correctly",
@@ -21,7 +21,7 @@ BANNED = {
     r"\bit were\b": "it was, or it is",
     "takes no look": "is skipped",
     r"nor does the": "say what it does",
-    "the price:": "a limitation:",
+    r"the price\**:": "a limitation:",
     "whole pass": "whole sequence",
     "not ours to": "not licensed",
     "by heart": "memorizes",

@@ -420,7 +420,7 @@ class Fit:
         lights: The light of the strip's cells.
         poses: x, y (metres), ln(distance), turn (radians) of each frame, [N, 4]; of K targets [N, K, 4].
         kinds: Which of them are looked for.
-        scale: Metres a unit of each.
+        scale: Metres per unit of each.
     """
 
     def __init__(
