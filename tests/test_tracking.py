@@ -865,7 +865,7 @@ def test_several_objects_of_a_capture_are_followed_and_drawn(tmp_path, capsys) -
     assert told["warnings"] == []
     wrong = yaml.safe_load((tmp_path / "setup.yaml").read_text())
     (tmp_path / "setup.yaml").write_text(yaml.safe_dump({**wrong, "distance_m": 0.36}))
-    main([*words, "--out", str(tmp_path / "path.png")])
+    main([*words, "--out", str(tmp_path / "path.png"), "--force"])
     shown = capsys.readouterr()
     assert "U: error" in shown.out and "capture.yaml states a distance" in shown.err
 

@@ -97,13 +97,6 @@ class Lab:
     """Targets that are there beside each object; in a settings file alone."""
     cover: bool = False
     """Whether a later target hides those before it as far as it shines itself; else their light adds."""
-    palette: tuple[str, ...] = ()
-    """Colours of each object in bands from its top, RRGGBB, hexadecimal shares of white light; with any, frames
-    are in colour, and events of the luma."""
-    mosaic: Mosaic | None = None
-    """Colour filters of the frame camera; without them each pixel of a coloured frame sees all colours."""
-    white_balance: tuple[float, float, float] = (0.8, 1.0, 0.6)
-    """What coloured frames have of white: red, green and blue, up to a factor."""
     duration_s: float = 8.0
     """Length of a sequence, seconds."""
     frame_rate_hz: float = 5.0
@@ -115,6 +108,13 @@ class Lab:
     """Settings drawn once for the setup, uniformly: dotted name -> (low, high); {} takes them as they stand."""
     seed: int = 0
     """Seed of every draw, the sensor's own settings among them."""
+    palette: tuple[str, ...] = ()
+    """Colours of each object in bands from its top, RRGGBB, hexadecimal shares of white light; with any, frames
+    are in colour, and events of the luma."""
+    mosaic: Mosaic | None = None
+    """Colour filters of the frame camera; without them each pixel of a coloured frame sees all colours."""
+    white_balance: tuple[float, float, float] = (0.8, 1.0, 0.6)
+    """What coloured frames have of white: red, green and blue, up to a factor."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", self.name):

@@ -96,8 +96,9 @@ _MOST_MISFIT = 1.2  # times the noise: calibrated setups leave 0.95 to 1.05 of c
 class Tracking:
     """How a recording is followed."""
 
-    columns: int = 80
-    """Columns to which frames and counts are reduced, pixels."""
+    columns: int | None = None
+    """Columns to which frames and counts are reduced, pixels; none = 80, and 40 with depth, whose light takes
+    minutes and gigabytes at 80."""
     window_s: float = 0.05
     """Length of a window of events that gives one velocity, seconds."""
     events: bool = True
@@ -117,13 +118,18 @@ class Tracking:
     """Degree of the ambient light over the wall, as a polynomial."""
 
     def __post_init__(self) -> None:
-        if self.columns < 16:
+        if self.columns is not None and self.columns < 16:
             raise ConfigError(f"Tracking.columns is {self.columns}; give 16 pixels or more")
         if self.targets != "auto" and not 1 <= self.targets <= MOST_TARGETS:
             raise ConfigError(f"Tracking.targets is {self.targets}; give 1 to {MOST_TARGETS}, or auto")
         for name in ("window_s", "target_size_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"Tracking.{name} is {getattr(self, name)}; give a positive number")
+
+    @property
+    def most_columns(self) -> int:
+        """Columns to which frames are reduced, pixels."""
+        return self.columns or (40 if self.depth else 80)
 
 
 def track_several(
@@ -144,15 +150,11 @@ def track_several(
     if setup is None:
         raise ConfigError(f"Tracking.targets is {settings.targets} and needs a setup: give its file (--setup)")
     if settings.depth or settings.turning:
-        raise ConfigError(
-            f"Tracking.targets is {settings.targets}; depth and turning are found of one: leave them out"
-        )
-    small = reduced(_levels(capture, pattern), settings.columns)
+        raise ConfigError(f"Tracking.targets is {settings.targets}; depth and turning are found of one alone")
+    small = reduced(_levels(capture, pattern), settings.most_columns)
     times_s, noise = capture.frame_times_us.astype(np.float64) * 1e-6, temporal_noise(small)
     if not noise > 0:
-        raise DataError(
-            f"{capture.name}: its frames show no noise; give a recording with frames that are not clipped"
-        )
+        raise DataError(f"{capture.name}: its frames show no noise; give a recording that is not clipped")
     light = torch.from_numpy(small - static_light(small, settings.degree))
     size_m, gains = settings.target_size_m, list[float]()
     if settings.targets == "auto":
@@ -248,7 +250,7 @@ def track_frames(
             raise ConfigError(f"Tracking.{name} needs a setup: give its file (--setup), or leave {name} out")
     if settings.targets != 1:
         raise ConfigError(f"Tracking.targets is {settings.targets}; `track_several` follows several, this one")
-    small = reduced(frames, settings.columns)
+    small = reduced(frames, settings.most_columns)
     noise = temporal_noise(small)
     found = register(small, static_light(small, settings.degree), noise)
     by_events = None
@@ -268,7 +270,9 @@ def track_warnings(capture: Capture, setup: Setup | None, track: Track) -> list[
         track: What was found.
     """
     warnings = []
-    stated = capture.distance_m
+    stated, motion = capture.distance_m, capture.motion
+    if stated is not None and motion is not None:  # of the start; the setup's is the mean
+        stated += motion.retreat_m_s * (float(np.mean(capture.frame_times_us)) * 1e-6 - motion.start_s)
     known_m = None if setup is None else setup.default_distance_m
     if known_m is not None and stated is not None and abs(stated / known_m - 1) > _SAME_DISTANCE:
         warnings.append(

@@ -361,8 +361,8 @@ class Lights:
             away = DepthTransport(lambda _: own, 0.99 * self._own_m, 1.01 * self._own_m, strip, shape)
         self._basis, self._away = away.basis.double(), copy(away)
         self._known: dict[float, tuple[torch.Tensor, torch.Tensor]] = {}
-        splines = spline_coefficients(away.nodes.double().unflatten(-1, strip.shape))
-        self._away.nodes = splines.flatten(-2)
+        planes = (one.double().unflatten(-1, strip.shape) for one in away.nodes)  # all at once take gigabytes
+        self._away.nodes = torch.stack([spline_coefficients(one).flatten(-2).float() for one in planes])
 
     def seen(self, light: torch.Tensor) -> torch.Tensor:
         """Return frames [N, H, W] as their parts [N, P], float64."""
@@ -373,7 +373,8 @@ class Lights:
         if log_distance not in self._known:
             self._known.clear()  # poses in a plane ask for the same one again
             distance_m = self._own_m * math.exp(log_distance)
-            self._known[log_distance] = self._away.coefficients(distance_m), self._away.slope(distance_m)
+            away = self._away
+            self._known[log_distance] = away.coefficients(distance_m).double(), away.slope(distance_m).double()
         return self._known[log_distance]
 
     def taps(
@@ -435,16 +436,14 @@ class Fit:
         self._found = (*poses.shape[1:-1], *target_plane.shape)
         targets = math.prod(poses.shape[1:-1])
         self._each, self._kinds = kinds, kinds * targets
-        self._sights = [
-            [(*lights.at(float(pose[2])), *lights.taps(target_plane, pose)) for pose in one]
-            for one in poses.reshape(len(poses), targets, -1)
-        ]
-        self.maps = torch.stack(
-            [
-                torch.cat([(own[:, at] * w).sum(dim=1) for own, _, at, w, _ in each], dim=1)
-                for each in self._sights
-            ]
-        )  # [N, P, K n n]
+        every = poses.reshape(len(poses), targets, -1)
+        self._sights = [[(float(one[2]), *lights.taps(target_plane, one)) for one in each] for each in every]
+        # The lights of a distance are made anew where they are needed: one for each frame takes gigabytes.
+        self._lights, maps = lights, list[torch.Tensor]()
+        for each in self._sights:
+            own = [(lights.at(away)[0][:, at] * weights).sum(dim=1) for away, at, weights, _ in each]
+            maps.append(torch.cat(own, dim=1))
+        self.maps = torch.stack(maps)  # [N, P, K n n]
         self._total = self.maps.sum(dim=0)
         self._still = (1 - mean_weight(len(poses), _STATIC)) / len(poses)
         self.surprise = self.volume = 0.0  # of the state of `step`, for `log_evidence`
@@ -507,12 +506,13 @@ class Fit:
         rows = []
         for sights in self._sights:
             each = []
-            for (own, away, at, weights, ways), one in zip(sights, image.reshape(len(sights), -1), strict=True):
+            for (away, at, weights, ways), one in zip(sights, image.reshape(len(sights), -1), strict=True):
+                own, by_distance = self._lights.at(away)
                 for kind in self._each:
                     cells = torch.zeros(own.shape[1], dtype=image.dtype)
                     used = weights if kind == 2 else ways[kind]
                     cells.index_add_(0, at.flatten(), (used * one).flatten())
-                    each.append((away if kind == 2 else own) @ cells / self._scale[kind])
+                    each.append((by_distance if kind == 2 else own) @ cells / self._scale[kind])
             rows.append(torch.stack(each))
         return torch.stack(rows)
 
