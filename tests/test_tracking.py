@@ -311,7 +311,7 @@ KINDS = [[0, 1], [0, 1, 2], [0, 1, 3], [0, 1, 2, 3]]
 
 @pytest.fixture(scope="module")
 def lights() -> Lights:
-    return Lights(SETUP, Plane(30, 36, 0.012), SHAPE, depth=True)
+    return Lights(SETUP, Plane(20, 24, 0.012), SHAPE, depth=True)
 
 
 @pytest.mark.parametrize("kinds", KINDS)
