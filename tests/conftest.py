@@ -1,6 +1,7 @@
 """Fixtures that several test files use."""
 
 import os
+import sys
 import zipfile
 from pathlib import Path
 
@@ -12,6 +13,11 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import hypothesis
 import pytest
 import tyro  # noqa: F401  Its import reads all builtins, and stumbles over what a doctest leaves as `_`.
+
+# Bytecode is kept beside the sources, where numba keeps what it compiles: without it each of the hundreds of
+# programs that tests start would compile the package anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -57,6 +63,10 @@ THOROUGH = (
 """Tests, or files of them, that take long and repeat at another instant or format what a quicker one tests."""
 
 
+BEGUN_SECOND = ("test_brownian", "test_circuit", "test_event_models")
+"""Files with which the second of two processes begins: they compile other kernels than the first ones do."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Take `--thorough` and `--coverage`."""
     parser.addoption("--coverage", action="store_true", help="print the share of the statements that ran")
@@ -95,6 +105,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         left_out = [item for item in items if item.get_closest_marker("thorough")]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
+    if everything and "PYTEST_XDIST_WORKER" in os.environ:  # each process begins with its share of the list
+        second = [item for item in items if item.path.stem in BEGUN_SECOND]
+        others = [item for item in items if item.path.stem not in BEGUN_SECOND]
+        half = len(items) // 2
+        items[:] = [*others[:half], *second, *others[half:]]
 
 
 @pytest.fixture(scope="session")

@@ -132,9 +132,8 @@ def test_invert_and_track_take_the_pattern_of_the_calibrated_folder(tmp_path, ca
     assert figure("--setup", folder, *out) == stated != figure("--setup", bare, *out)
 
     def position(*words: str | Path) -> object:
-        main(
-            [str(word) for word in ("track", capture, "--out", tmp_path / "t.png", "--json", "--force", *words)]
-        )
+        tracked = ("track", capture, "--cells", 8, "--out", tmp_path / "t.png", "--json", "--force")
+        main([str(word) for word in (*tracked, *words)])
         return json.loads(capsys.readouterr().out)["position_sigma"]
 
     stated = position("--setup", bare, "--pattern", folder)

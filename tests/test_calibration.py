@@ -435,9 +435,14 @@ def test_working_shape_keeps_the_sensor_s_shape() -> None:
         assert height * shape[1] / (width * shape[0]) == pytest.approx(1, abs=0.01)
 
 
-@pytest.mark.parametrize(("group", "limit"), [("near", 0.11), ("far", 0.18)])
+@pytest.mark.parametrize(
+    ("group", "limit"), [("near", 0.11), pytest.param("far", 0.18, marks=pytest.mark.thorough)]
+)
 def test_independent_captures_are_fitted(shared_data, group, limit) -> None:
-    """A few characters of captures that other optics made; docs/calibration.md has the full figures."""
+    """A few characters of captures that other optics made; docs/calibration.md has the full figures.
+
+    The far ones repeat at another distance what the near ones show.
+    """
     folders = [shared_data / "captures" / f"{group}_{c}" for c in "ABHOTX"]
     if not folders[0].is_dir():
         pytest.skip(f"no captures at {folders[0].parent}")

@@ -65,7 +65,7 @@ def test_events_are_a_function_of_light_and_seed_alone(kind) -> None:
 def test_thresholds_that_are_given_are_those_of_the_pixels(kind) -> None:
     """Light that rises by 1.2 log units: four events at 0.27, at most one at 1.5."""
     times = np.linspace(0.0, 0.5, 101)
-    light = np.repeat(60.0 * np.exp(2.4 * times)[:, None, None], 32, axis=1).repeat(2, axis=2)
+    light = np.float32(60.0 * np.exp(2.4 * times))[:, None, None] * np.ones((32, 2), np.float32)
     on = np.broadcast_to([0.27, 1.5], (32, 2))
     events = events_of(kind, light, times, seed=1, thresholds=(on, np.full((32, 2), 1.5)))
     assert 3.4 < np.median(np.bincount(events.y[events.x == 0], minlength=32)) < 4.6

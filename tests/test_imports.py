@@ -231,9 +231,8 @@ def test_a_scan_with_a_show_is_planned(tmp_path: Path) -> None:
 def cpu_s(words: list[str]) -> float:
     """Return the CPU time of a run, seconds; its bytecode is kept, as an installation keeps it."""
     resource = pytest.importorskip("resource")
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, *words], env=environment, capture_output=True)
+    subprocess.run([sys.executable, *words], capture_output=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
@@ -253,8 +252,7 @@ def test_help_wrong_words_and_unknown_names_take_little_more_than_the_parser(wor
     """Beside NumPy and the parser, run in turn with it: half a second where these take an eighth of one."""
     cpu_s(["-m", "evnlos", *words])  # which compiles
     runs = [["-m", "evnlos", *words], ["-c", "import numpy, tyro, yaml"]]
-    ratios = [own / libraries for own, libraries in ([cpu_s(one) for one in runs] for _ in range(4))]
-    assert min(ratios) < 4
+    assert any(own < 4 * libraries for own, libraries in ([cpu_s(one) for one in runs] for _ in range(4)))
 
 
 def test_what_was_described_without_libraries_runs_with_them(tiny, tmp_path) -> None:
