@@ -125,6 +125,27 @@ def test_noise_that_is_stated_too_low_is_found() -> None:
     assert found.noise_factor == pytest.approx(3.0, rel=0.05)
 
 
+def test_offsets_of_pixels_are_found_and_taken_for_no_light_of_the_plane() -> None:
+    """Ambient light that nobody knows and a camera's pattern: twenty times the noise in all."""
+    truth, shape = FilmPrior(0.4, 0.7, 0.01, 0.02), (8, 12)
+    operator = MatrixTransport(torch.from_numpy(draw(96, 20) / 5), PLANE, shape)
+    film, _, _ = covariances(truth, operator, 0.0, 0.05)
+    root, noise = np.linalg.cholesky(film + 1e-12 * np.eye(len(film))), torch.full(shape, 0.05)
+    errors, covered = [], []
+    for seed in range(4):
+        x = (root @ draw(len(film), seed=seed)).reshape(6, 4, 5)
+        frames = operator(torch.from_numpy(x)) + 0.05 * torch.from_numpy(draw(6, *shape, seed=seed + 20))
+        clean = estimate_film(operator, frames, TIMES, noise)
+        shifted = frames + torch.from_numpy(draw(*shape, seed=seed + 40))
+        found = estimate_film(operator, shifted, TIMES, noise)
+        assert clean.static < 0.5 and found.static == pytest.approx(20, rel=0.3)
+        fixed = estimate_film(operator, shifted, TIMES, noise, static=1.0)
+        errors.append([float(np.square(one.mean - x).mean()) for one in (clean, found, fixed)])
+        covered.append((np.abs(found.mean - x) < 1.645 * found.deviation).mean())
+    small, middle, large = np.mean(errors, axis=0)
+    assert small < middle < 0.5 * large and np.mean(covered) > 0.8
+
+
 def test_a_film_is_known_at_every_instant_and_its_wall_is_linear() -> None:
     images = np.stack([closing_hand(0.0, 8), closing_hand(1.0, 8)])
     film = Film(images, [1.0, 3.0])

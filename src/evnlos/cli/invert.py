@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 REGULARIZATION_TIKHONOV = 4.0  # best on eight characters of one setup, docs/inversion.md
 REGULARIZATION_TV = 0.3  # likewise
 _EXPLAINED = 2.0  # times the camera's noise that frames may keep
+_BRIGHTEST = 5.0  # by which cells of a plane may change that shines with 1
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,9 @@ class InvertCommand:
     default that of a calibrated --setup."""
     track: bool = False
     """Captures: find the motion in the recording also where capture.yaml states it."""
-    static: float = 1.0
-    """Captures: standard deviation of a pixel's constant offset over that of its noise."""
+    static: float | None = None
+    """Captures: standard deviation of a pixel's constant offset over that of its noise; by default 1, with
+    --changing that of what rests and no plane explains."""
     cells: int = 24
     """Captures: cells per side of the target plane; with --changing along its longer side."""
     columns: int = 64
@@ -211,7 +213,8 @@ class InvertCommand:
             regularization = dict.fromkeys(regularization, number)
         solvers = tuple(regularization) if self.solver == "all" else (self.solver,)
         used = (self.positions, self.pattern, self.track, solvers, regularization)
-        options = work.SequenceOptions(setup, *used, self.cells, self.columns, self.static, self.subsets)
+        static = 1.0 if self.static is None else self.static
+        options = work.SequenceOptions(setup, *used, self.cells, self.columns, static, self.subsets)
         with ProgressBars() as progress:
             invert = work.invert_colours if self.colours else work.invert_captures
             found, pictures = invert(self.files, options, progress)
@@ -268,6 +271,7 @@ class InvertCommand:
             "cells": list(plane.shape),
             "prior": found.prior._asdict(),
             "noise_factor": found.noise_factor,
+            "static": found.static,
             "evidence": found.evidence,
             "picture": drawn(self.out, lambda: draw_inversion(self.out, panels)),
         }
@@ -329,10 +333,10 @@ def film_text(found: dict[str, Any]) -> str:
         f"{found['capture']}: {found['images']} images of {width} x {height} cells",
         f"prior of the largest likelihood: cells change by {prior['deviation']:.3g}, rest within "
         f"{prior['deviation'] * prior['resting']:.3g}, at {100 * prior['speed_m_s']:.3g} cm per second",
-        f"noise {found['noise_factor']:.2f} times the camera's",
+        f"noise {found['noise_factor']:.2f} times the camera's, offsets {found['static']:.3g} times that",
     ]
-    if found["noise_factor"] > _EXPLAINED:
-        lines.append("warning: no plane at this place explains the frames; check setup and ambient light")
+    if found["noise_factor"] > _EXPLAINED or prior["deviation"] > _BRIGHTEST:
+        lines.append("warning: no plane here explains the frames; give a larger one, or check the setup")
     lines.append("; ".join([*([found["picture"]] if found["picture"] else []), f"{found['seconds']} s"]))
     return "\n".join(lines)
 

@@ -41,6 +41,7 @@ Array = NDArray[np.float64]
 _KEPT = 1e-13  # of the largest squared gain; what lies below is rounding
 _LENGTHS = (1 / 16, 1 / 4, 1)  # of correlation that are tried, over the plane's longer side
 _LEAST_FRAMES = 3
+_LEAST_FREE = 30  # pixels more than modes, to tell what no plane explains
 
 
 class FilmPrior(NamedTuple):
@@ -68,6 +69,7 @@ class FilmEstimate:
         evidence: Natural logarithm of the marginal likelihood over that of an empty plane.
         noise_factor: Standard deviation of the frames' noise over the one that was stated, by what no plane
             explains; 1 where there are too few pixels to tell.
+        static: Standard deviation of a pixel's constant offset over that of its noise, given or found.
     """
 
     times_s: Array
@@ -76,6 +78,7 @@ class FilmEstimate:
     prior: FilmPrior
     evidence: float
     noise_factor: float
+    static: float
 
     def interval(self, deviations: float = 1.645) -> tuple[Array, Array]:
         """Return the lower and upper bound of each cell, [T, h, w] each; 1.645 deviations hold 90 %."""
@@ -145,7 +148,7 @@ class _Film:
     """The frames in the modes of a plane's covariance of one length."""
 
     def __init__(
-        self, gram: Array, seen: Array, energy: float, samples: int, plane: Plane, length_m: float
+        self, gram: Array, seen: Array, energy: float, rest: float, samples: int, plane: Plane, length_m: float
     ) -> None:
         smooth = normal_matrix(Gradient("dark"), torch.zeros(plane.shape, dtype=torch.float64)).numpy()
         covariance = np.linalg.inv(smooth + (plane.pitch_m / length_m) ** 2 * np.eye(len(smooth)))
@@ -160,6 +163,10 @@ class _Film:
         freedom = (steps - 1) * (samples - int(kept.sum()))
         self.noise = math.sqrt(max(left / freedom, 1e-12)) if freedom >= steps - 1 else 1.0
         self.z, self.gain, self.length_m = z / self.noise, gain / self.noise, length_m
+        # What rests and no plane explains has the variance 1 / T + static^2 a pixel, in units of the noise.
+        outside = rest / self.noise**2 - float((self.z.mean(axis=0) ** 2).sum())
+        free = samples - int(kept.sum())
+        self.static = math.sqrt(max(outside / free - 1 / steps, 0.0)) if free >= _LEAST_FREE else 1.0
         images = torch.from_numpy(self.basis.T.copy()).unflatten(1, plane.shape)
         slope = Gradient("dark")(images).square().sum(dim=(1, 2, 3)) / images.square().sum(dim=(1, 2))
         self.wave_number = slope.sqrt().numpy() / plane.pitch_m
@@ -179,7 +186,7 @@ def estimate_film(
     times_s: ArrayLike,
     noise_std: torch.Tensor,
     *,
-    static: float = 1.0,
+    static: float | None = None,
     prior: FilmPrior | None = None,
 ) -> FilmEstimate:
     """Return the film of a hidden plane from frames of the wall: the exact posterior of the model above.
@@ -190,7 +197,8 @@ def estimate_film(
         times_s: Times of the frames, [T], seconds, increasing.
         noise_std: Standard deviation of a pixel's noise, [H, W], white levels, above 0; one common factor is
             estimated from what no plane explains.
-        static: Standard deviation of a pixel's constant offset over that of its noise, 0 or more.
+        static: Standard deviation of a pixel's constant offset over that of its noise, 0 or more: of the
+            camera's pattern, and of unknown ambient light. None takes that of what rests and no plane explains.
         prior: The prior; None takes the one of the largest marginal likelihood.
 
     Raises:
@@ -215,19 +223,21 @@ def estimate_film(
     matrix = weight[:, None] * operator.dense(torch.float64)  # [P, C]
     light = frames.double().flatten(1) * weight  # [T, P]
     gram, seen = (matrix.mT @ matrix).numpy(), (light @ matrix).numpy()
-    energy = float((light - light.mean(dim=0)).square().sum())
+    middle = light.mean(dim=0)
+    energy, rest = float((light - middle).square().sum()), float(middle.square().sum())
     dt = np.diff(times, prepend=times[0])
     lengths = [max(plane.extent_m) * share for share in _LENGTHS] if prior is None else [prior.length_m]
     best: tuple[float, FilmPrior, _Film] | None = None
     for length in lengths:
-        film = _Film(gram, seen, energy, matrix.shape[0], plane, length)
-        found = prior or _likeliest(film, dt, static)
-        evidence = film.evidence(found, dt, static)
+        film = _Film(gram, seen, energy, rest, matrix.shape[0], plane, length)
+        film.static = film.static if static is None else static
+        found = prior or _likeliest(film, dt, film.static)
+        evidence = film.evidence(found, dt, film.static)
         if best is None or evidence > best[0]:
             best = evidence, found, film
     assert best is not None
     evidence, chosen, film = best
-    modes = film.smoothed(chosen, dt, static)
+    modes = film.smoothed(chosen, dt, film.static)
     basis = chosen.deviation * film.basis
     return FilmEstimate(
         times,
@@ -236,11 +246,16 @@ def estimate_film(
         chosen,
         evidence,
         film.noise,
+        film.static,
     )
 
 
 def _likeliest(film: _Film, dt_s: Array, static: float) -> FilmPrior:
-    """Return the prior of the largest marginal likelihood at one length of correlation."""
+    """Return the prior of the largest marginal likelihood at one length of correlation.
+
+    ln rho has the weak prior N(0, 1): behind large offsets the frames say nothing of what rests, and to take it
+    for nothing would be to know it.
+    """
     from scipy.optimize import minimize
 
     step, seconds = float(np.median(dt_s[1:])), float(dt_s.sum())
@@ -253,7 +268,7 @@ def _likeliest(film: _Film, dt_s: Array, static: float) -> FilmPrior:
 
     start = np.array([math.log(0.3), 0.0, math.log(0.02 / step / float(np.median(film.wave_number)))])
     found = minimize(
-        lambda logs: -film.smoothed(prior_at(logs), dt_s, static).log_likelihood,
+        lambda logs: 0.5 * logs[1] ** 2 - film.smoothed(prior_at(logs), dt_s, static).log_likelihood,
         start,
         method="Nelder-Mead",
         options={"xatol": 0.05, "fatol": 0.1, "maxfev": 120, "initial_simplex": start + np.eye(4, 3, -1)},
@@ -266,12 +281,12 @@ def _check(
     frames: torch.Tensor,
     times: Array,
     noise_std: torch.Tensor,
-    static: float,
+    static: float | None,
     prior: FilmPrior | None,
 ) -> None:
     if not isinstance(operator.source, Plane):
         raise ConfigError("the operator starts from patches; give one from a Plane of square cells")
-    if not (math.isfinite(static) and static >= 0):
+    if static is not None and not (math.isfinite(static) and static >= 0):
         raise ConfigError(f"static is {static}; give 0 or more, finite")
     if prior is not None and not all(math.isfinite(value) and value > 0 for value in prior):
         raise ConfigError(f"the prior is {tuple(prior)}; give positive, finite numbers")
