@@ -1,16 +1,26 @@
-"""The main job on one page: calibrate, simulate the setup, pre-train, fine-tune, train end to end, report."""
+"""The main job on one page: calibrate, simulate the setup, pre-train, fine-tune, train end to end, report.
+
+- Scenes beyond the main job, each a few commands and a page: colour, depth, several targets, one that changes.
+"""
 
 from __future__ import annotations
 
+import html
 import json
+import mimetypes
+import shlex
+import subprocess
+import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from evnlos.config import from_dict, read_yaml, save_yaml
 from evnlos.data import MODALITIES, STANDARD_MODALITIES, captures_in, character_of
 from evnlos.data.pool import workers_kept
 from evnlos.errors import CalibrationError, ConfigError, DataError, UnknownNameError
+from evnlos.files import write_atomically
 from evnlos.machine import ProgressBars
 from evnlos.types import OutFolder
 
@@ -31,6 +41,9 @@ class Demo:
 
     out: OutFolder = Path("demo")
     """Folder for everything that the demo makes; run it again to go on after an interruption."""
+    scene: str = ""
+    """A scene in place of the main job: colour, several, depth, changing or corner; a page in OUT/SCENE shows
+    the commands, what they find, and what fails. Of the other settings it takes `out` alone."""
     captures: tuple[Path, ...] = ()
     """Capture folders, or the folder above them; without any, pseudo-real ones are rendered."""
     test: tuple[str, ...] = _TEST
@@ -68,6 +81,12 @@ class Demo:
         for name, value in vars(self).items():
             if type(value) is int and value < (least := int(name not in ("workers", "redrawn", "seed"))):
                 raise ConfigError(f"Demo.{name} is {value}; give {least} or more")
+        if self.scene and replace(self, scene="") != Demo(self.out):
+            raise ConfigError(
+                f"Demo.scene is {self.scene!r}, which takes `out` alone; leave the other settings"
+            )
+        if self.scene:
+            scene_of(self.scene)
         if not self.test:
             raise ConfigError("Demo.test names no character; give some of the captures', e.g. G K 4 9")
         if not self.modalities:
@@ -98,7 +117,7 @@ def sequence_network(width: int = 32) -> SequenceConfig:
 
 @workers_kept()
 def run_demo(settings: Demo) -> Path:
-    """Run the main job, or what is left of it, and return the path of the report.
+    """Run the main job or a scene, or what is left of it, and return the path of the report.
 
     Raises:
         UnknownNameError: One of the captures is none.
@@ -109,6 +128,8 @@ def run_demo(settings: Demo) -> Path:
     from evnlos.report import collect_results, to_text, write_report
     from evnlos.setups import named_setup
 
+    if settings.scene:
+        return run_scene(settings.scene, settings.out / settings.scene)
     began, out = time.perf_counter(), settings.out
     captures = captures_in(settings.captures)
     place = Place((), out, settings.workers, trainings=settings.workers, force=settings.force)
@@ -272,3 +293,94 @@ def held_out(folders: list[Path], wanted: tuple[str, ...]) -> list[str]:
             f"test has {lacking[0]!r}, and no capture shows it; give some of {' '.join(there)}"
         )
     return [c for c in wanted if c in there] or there[::7]
+
+
+@dataclass(frozen=True)
+class HiddenScene:
+    """Something hidden, the commands that find it, and what to make of what they find."""
+
+    title: str
+    shows: str
+    right: str
+    fails: str
+    steps: tuple[str, ...]
+    pictures: dict[str, str]
+    files: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def scene_of(name: str) -> HiddenScene:
+    """Return a scene by its name.
+
+    Raises:
+        UnknownNameError: There is none of this name.
+    """
+    path = Path(__file__).with_name("scenes.yaml")
+    if name not in (scenes := read_yaml(path)):
+        raise UnknownNameError(f"scene is {name!r}; give one of {', '.join(scenes)}")
+    return from_dict(HiddenScene, scenes[name], source=str(path))
+
+
+def run_scene(name: str, out: Path) -> Path:
+    """Run the commands of a scene, or those that are left, in its folder; write its page and return its path.
+
+    Args:
+        name: The scene.
+        out: Its folder.
+
+    Raises:
+        UnknownNameError: There is no such scene.
+        DataError: A command failed; it has said why.
+    """
+    scene, began = scene_of(name), time.perf_counter()
+    out.mkdir(parents=True, exist_ok=True)
+    for file, content in scene.files.items():
+        save_yaml(content, out / file)
+    record = out / "steps.json"
+    done: dict[str, str] = json.loads(record.read_text()) if record.is_file() else {}
+    for number, step in enumerate(scene.steps, 1):
+        if step in done:
+            continue
+        print(f"{number} of {len(scene.steps)}: {step}", flush=True)
+        words = [sys.executable, "-m", "evnlos", *_expanded(shlex.split(step)[1:], out)]
+        ran = subprocess.run(words, cwd=out, stdout=subprocess.PIPE, encoding="utf-8")
+        print(ran.stdout, end="", flush=True)
+        if ran.returncode:
+            raise DataError(f"step {number} of the scene {name!r} failed; the command again goes on there")
+        done[step] = ran.stdout
+        write_atomically(record, json.dumps(done, indent=1).encode())
+    path = out / "index.html"
+    write_atomically(path, _scene_page(scene, out, done).encode())
+    print(f"page: {path} ({time.perf_counter() - began:.0f} s)")
+    return path
+
+
+def _expanded(words: list[str], folder: Path) -> list[str]:
+    """Return words with patterns of files replaced by those that match, as a shell does."""
+    found = [sorted(folder.glob(one)) if "[" in one else [] for one in words]
+    names = zip(words, found, strict=True)
+    return [n for word, some in names for n in ([str(one.relative_to(folder)) for one in some] or [word])]
+
+
+def _scene_page(scene: HiddenScene, out: Path, said: dict[str, str]) -> str:
+    from evnlos.report.page import page_head
+    from evnlos.report.pictures import data_uri
+
+    figures = []
+    for file, caption in scene.pictures.items():
+        kind = mimetypes.guess_type(file)[0] or "image/png"
+        image = (
+            f"<img class=moving src='{data_uri((out / file).read_bytes(), kind)}' alt='{html.escape(caption)}'>"
+        )
+        figures.append(f"<figure>{image}<figcaption>{html.escape(caption)}</figcaption></figure>")
+    steps = [f"<pre>$ {html.escape(step)}\n{html.escape(said[step])}</pre>" for step in scene.steps]
+    parts = [
+        page_head(scene.title),
+        f"<h1>{html.escape(scene.title)}</h1><p>{html.escape(scene.shows)}</p>",
+        f"<div class=movies>{''.join(figures)}</div>",
+        f"<p><b>What is right.</b> {html.escape(scene.right)}</p>",
+        f"<p><b>What fails.</b> {html.escape(scene.fails)}</p>",
+        "<h2>How</h2><p>Everything is simulated. These commands made it, in this folder:</p>",
+        *steps,
+        "</html>",
+    ]
+    return "\n".join(parts)

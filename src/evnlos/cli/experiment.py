@@ -55,9 +55,9 @@ class DemoCommand:
         """Show a first reconstruction, run the demo, and print the table and the path of the report."""
         from evnlos.cli.results import show_first
 
-        one = self.settings
         self.check_names()
-        show_first(one.out, one.captures, one.lab, one.force)
+        if not (one := self.settings).scene:
+            show_first(one.out, one.captures, one.lab, one.force)
         run_demo(one)
 
 

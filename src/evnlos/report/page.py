@@ -136,6 +136,16 @@ _METRIC_KEYS = ("psnr_db", "psnr_box_db", "ssim", "ms_ssim", "haarpsi", "gmsd", 
 _STYLE = Path(__file__).parent / "style.css"
 
 
+def page_head(title: str) -> str:
+    """Return what a page begins with: its title, and its style."""
+    style = _STYLE.read_text(encoding="utf-8")
+    return (
+        "<!doctype html><html lang=en><meta charset=utf-8>"
+        "<meta name=viewport content='width=device-width,initial-scale=1'>"
+        f"<title>{html.escape(title)}</title><style>{style}</style>"
+    )
+
+
 def write_report(
     path: str | Path,
     dataset: Dataset,
@@ -164,9 +174,7 @@ def write_report(
     words, metrics = Glossary(), available_metrics(results)
     content = "\n".join(
         [
-            "<!doctype html><html lang=en><meta charset=utf-8>",
-            "<meta name=viewport content='width=device-width,initial-scale=1'>",
-            f"<title>evnlos report</title><style>{_STYLE.read_text(encoding='utf-8')}</style>",
+            page_head("evnlos report"),
             _head(dataset, results, notes, split, words),
             setup_section(setup.name if setup else "", setup.setup if setup else None),
             summary_section(results),
