@@ -33,6 +33,8 @@ LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
 """What the rendered captures show."""
 
 _TEST = ("G", "K", "4", "9")
+_REPLACE = ("corner", "invert", "preview", "track")  # with --force they replace files
+_EMBEDDED_BYTES = 4_000_000  # larger images stay beside the page of a scene
 
 
 @dataclass(frozen=True)
@@ -341,8 +343,10 @@ def run_scene(name: str, out: Path) -> Path:
         if step in done:
             continue
         print(f"{number} of {len(scene.steps)}: {step}", flush=True)
-        words = [sys.executable, "-m", "evnlos", *_expanded(shlex.split(step)[1:], out)]
-        ran = subprocess.run(words, cwd=out, stdout=subprocess.PIPE, encoding="utf-8")
+        words = _expanded(shlex.split(step)[1:], out)
+        words += ["--force"] if words[0] in _REPLACE else []  # what an interrupted step left
+        program = [sys.executable, "-m", "evnlos", *words]
+        ran = subprocess.run(program, cwd=out, stdout=subprocess.PIPE, encoding="utf-8")
         print(ran.stdout, end="", flush=True)
         if ran.returncode:
             raise DataError(f"step {number} of the scene {name!r} failed; the command again goes on there")
@@ -367,10 +371,10 @@ def _scene_page(scene: HiddenScene, out: Path, said: dict[str, str]) -> str:
 
     figures = []
     for file, caption in scene.pictures.items():
-        kind = mimetypes.guess_type(file)[0] or "image/png"
-        image = (
-            f"<img class=moving src='{data_uri((out / file).read_bytes(), kind)}' alt='{html.escape(caption)}'>"
-        )
+        kind, where = mimetypes.guess_type(file)[0] or "image/png", out / file
+        is_small = where.stat().st_size <= _EMBEDDED_BYTES
+        source = data_uri(where.read_bytes(), kind) if is_small else html.escape(file)
+        image = f"<img class=moving src='{source}' alt='{html.escape(caption)}'>"
         figures.append(f"<figure>{image}<figcaption>{html.escape(caption)}</figcaption></figure>")
     steps = [f"<pre>$ {html.escape(step)}\n{html.escape(said[step])}</pre>" for step in scene.steps]
     parts = [
