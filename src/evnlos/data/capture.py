@@ -389,9 +389,10 @@ def _write(
 def _digest_of(path: Path, info: CaptureInfo) -> str:
     """Return the hash of a description and of the sizes of its files; streams count where they are named."""
     values, folder = to_dict(info), path if path.is_dir() else path.parent
-    for key in ("events_topic", "frames_topic", "recording"):
-        if values[key] is None:
-            del values[key]
+    later = {"": ("events_topic", "frames_topic", "recording"), "camera": ("mosaic", "colour", "white_balance")}
+    for place, key in [(values.get(part, values), key) for part, keys in later.items() for key in keys]:
+        if place[key] is None:  # as captures had it before there was such a key
+            del place[key]
     named = [folder / name for name in (info.events, info.frames, info.target and info.target.mask) if name]
     files = [one for there in named for one in (sorted(there.glob("*")) if there.is_dir() else [there])]
     own = [one for one in files if one.is_file() and one.resolve().is_relative_to(folder.resolve())]
