@@ -1,6 +1,7 @@
 """Frames in colour: filters on the pixels, one colour of a capture, a coloured lab, pictures in colour."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -14,6 +15,7 @@ from evnlos import FrameCamera, read_capture
 from evnlos.cameras import colour_filters, mosaicked, of_mosaic
 from evnlos.cli import main
 from evnlos.config import save_yaml, to_dict
+from evnlos.data.capture_check import check_capture
 from evnlos.data.lab import Lab, render_captures
 from evnlos.errors import ConfigError, DataError
 from evnlos.scene import FontGlyphs
@@ -121,6 +123,22 @@ def test_raw_values_behind_a_mosaic_are_read_in_one_colour(tmp_path, frames):
     found = read_capture(folder, needs_events=False, colour="green").frames / 65_535
     expected = np.clip((of_mosaic(raw, "grbg", "green") - 10 * 257.0) / (65_535 - 10 * 257), 0, 1)
     np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_filters_that_nobody_stated_are_told(coloured, tmp_path):
+    """Raw values that are taken for grey draw a chequered wall; other captures raise no alarm."""
+    folder = tmp_path / "raw_E"
+    shutil.copytree(coloured["mosaic"], folder)
+    said = yaml.safe_load((folder / "capture.yaml").read_text())
+    for stated in (None, "rggb"):
+        said["camera"]["mosaic"] = stated
+        (folder / "capture.yaml").write_text(yaml.safe_dump(said))
+        found = [one for one in check_capture(read_capture(folder)) if one.what == "colour filters"]
+        assert [(one.level, "camera.mosaic" in one.cure) for one in found] == (
+            [] if stated else [("bad", True)]
+        )
+    for name in ("grey", "bands"):
+        assert all(one.what != "colour filters" for one in check_capture(read_capture(coloured[name])))
 
 
 def test_bad_words_about_colour_are_refused(tmp_path):

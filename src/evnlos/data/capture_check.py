@@ -19,7 +19,7 @@ from evnlos.config import read_yaml
 from evnlos.data.capture import Capture, read_capture
 from evnlos.data.capture_info import CaptureInfo
 from evnlos.data.clocks import FEWEST_LAGS, LEAST_AGREEMENT, beside_others, find_lag
-from evnlos.data.fixed_pattern import light_path
+from evnlos.data.fixed_pattern import light_path, unlike_neighbours
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import DataError
 from evnlos.events import find_hot_pixels
@@ -32,6 +32,7 @@ _DARK_DN, _BORDER = 3, 0.08
 _BLOCK = 6  # pixels: single ones tell nothing of the light
 _FEWEST_EVENTS = 2_000
 _SURELY = 1.5  # times what is usual
+_MOSAIC = 0.03  # by which the diagonals of 2 x 2 pixels differ: smooth light and a pattern make far less
 
 
 @dataclass(frozen=True)
@@ -67,16 +68,8 @@ def check_capture(capture: Capture) -> list[Finding]:
         cure = "a network of frames needs none; for fusion and a finer track record an event camera beside it"
         alone = Finding("events", "doubtful", "none: a frame camera alone", cure)
         return [*_light(capture), *_movement(capture), *_motion(capture), alone, *_frame_times(capture)]
-    return [
-        *_light(capture),
-        *_movement(capture),
-        *_motion(capture),
-        *_events(capture),
-        *_flicker(capture),
-        *_clock(capture),
-        *_frame_times(capture),
-        *_offset(capture),
-    ]
+    looks = (_light, _movement, _motion, _events, _flicker, _clock, _frame_times, _offset)
+    return [finding for look in looks for finding in look(capture)]
 
 
 def _finding(what: str, good: bool, bearable: bool, found: str, cure: str) -> Finding:
@@ -97,15 +90,18 @@ def _light(capture: Capture) -> Iterator[Finding]:
         "shorten the exposure, close the aperture, or dim the ambient light",
     )
     share = float(np.median(frames) / peak)
-    dark = float((frames <= _DARK_DN).mean())
-    yield _finding(
-        "brightness",
-        dark < 0.05,
-        dark < 0.5,
-        f"the middle pixel is at {100 * share:.0f} % of the range; {100 * dark:.0f} % are darker than "
-        f"{_DARK_DN + 1} digital numbers",
-        "lengthen the exposure, open the aperture, or bring the wall nearer",
-    )
+    dark, at = float((frames <= _DARK_DN).mean()), f"the middle pixel is at {100 * share:.0f} % of the range"
+    found = f"{at}; {100 * dark:.0f} % are darker than {_DARK_DN + 1} digital numbers"
+    cure = "lengthen the exposure, open the aperture, or bring the wall nearer"
+    yield _finding("brightness", dark < 0.05, dark < 0.5, found, cure)
+    if capture.info.camera.mosaic is None and (unlike := unlike_neighbours(frames)) > _MOSAIC:
+        found = (
+            f"pixels of a 2 x 2 square differ by {100 * unlike:.0f} %, as raw values behind colour filters do"
+        )
+        cure = (
+            f"state camera.mosaic in capture.yaml, e.g. rggb; it is {capture.info.camera.mosaic or 'left out'}"
+        )
+        yield Finding("colour filters", "bad", found, cure)
 
 
 def _movement(capture: Capture) -> Iterator[Finding]:

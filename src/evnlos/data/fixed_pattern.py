@@ -201,6 +201,22 @@ def used_pixels(info: CaptureInfo, events: Events, frames: Any) -> tuple[Events,
     return events, frames, notes
 
 
+def unlike_neighbours(frames: NDArray) -> float:
+    """Return by how much the diagonals of squares of 2 x 2 pixels differ over the sensor, share of the mean.
+
+    Behind Bayer filters one is green and the other red and blue; light that grows evenly has the same on both.
+
+    Args:
+        frames: Digital numbers [N, H, W].
+    """
+    rows, columns = (side // 2 * 2 for side in frames.shape[1:])
+    if not rows or not columns:
+        return 0.0
+    mean = frames[:, :rows, :columns].mean(axis=0, dtype=np.float64)
+    (a, b), (c, d) = mean.reshape(rows // 2, 2, columns // 2, 2).mean(axis=(0, 2))
+    return float(abs(a + d - b - c) / max(a + b + c + d, 2.0)) * 2
+
+
 _LEAST = 0.1  # sensitivity below which a pixel is dead: nothing is divided by less
 
 
