@@ -95,7 +95,8 @@ def invert_captures(
         raise ConfigError("the captures differ in number or size of their frames; invert them one by one")
     columns = min(options.columns, width)
     shape = (max(1, round(height * columns / width)), columns)
-    whites = [one.peak * one.info.camera.balance for one in captures]
+    # Of all three colours the setup is that of grey; of one that capture.yaml chose it is its own.
+    whites = [one.peak * (one.info.camera.balance if options.colour else 1.0) for one in captures]
     pairs = zip(captures, whites, strict=True)
     light = torch.stack([object_light(one.frames[1:], white, setup, shape, pattern) for one, white in pairs])
     noise = torch.tensor([temporal_noise(one.numpy()) if len(one) > 2 else math.inf for one in light])
