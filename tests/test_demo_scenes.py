@@ -58,6 +58,9 @@ def test_a_scene_runs_goes_on_and_shows_what_its_commands_said(tmp_path, monkeyp
     assert "A &lt;small&gt; letter" in page and "hidden &amp; known" in page and "http" not in page
     assert page.count("data:image/png") == 1 and page.count("data:image/gif") == 1
     assert "$ evnlos info made/tiny_[L]/events.raw\n" in page and "36 x 24" in page
+    lacking = replace(TINY, pictures={**TINY.pictures, "undrawn.png": "nothing"})
+    monkeypatch.setattr(evnlos.demo, "scene_of", lambda name: lacking)
+    assert "undrawn.png is not there" in run_scene("tiny", tmp_path / "tiny").read_text()
     broken = replace(TINY, steps=(*TINY.steps, "evnlos info nowhere.raw"))
     monkeypatch.setattr(evnlos.demo, "scene_of", lambda name: broken)
     with pytest.raises(DataError, match=r"step 4 of the scene 'tiny' failed; the command again goes on there"):

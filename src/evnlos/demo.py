@@ -9,6 +9,7 @@ import html
 import json
 import mimetypes
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -344,7 +345,9 @@ def run_scene(name: str, out: Path) -> Path:
             continue
         print(f"{number} of {len(scene.steps)}: {step}", flush=True)
         words = _expanded(shlex.split(step)[1:], out)
-        words += ["--force"] if words[0] in _REPLACE else []  # what an interrupted step left
+        if words[0] == "calibrate":  # what an interrupted step left
+            shutil.rmtree(out / words[words.index("--out") + 1], ignore_errors=True)
+        words += ["--force"] if words[0] in _REPLACE else []
         program = [sys.executable, "-m", "evnlos", *words]
         ran = subprocess.run(program, cwd=out, stdout=subprocess.PIPE, encoding="utf-8")
         print(ran.stdout, end="", flush=True)
@@ -372,6 +375,9 @@ def _scene_page(scene: HiddenScene, out: Path, said: dict[str, str]) -> str:
     figures = []
     for file, caption in scene.pictures.items():
         kind, where = mimetypes.guess_type(file)[0] or "image/png", out / file
+        if not where.is_file():  # the commands have said why, and go on
+            figures.append(f"<p>{html.escape(file)} is not there: images need evnlos[plot].</p>")
+            continue
         is_small = where.stat().st_size <= _EMBEDDED_BYTES
         source = data_uri(where.read_bytes(), kind) if is_small else html.escape(file)
         image = f"<img class=moving src='{source}' alt='{html.escape(caption)}'>"

@@ -299,8 +299,9 @@ def of_mosaic(raw: NDArray, mosaic: Mosaic, colour: Colour | None = None) -> NDA
     """Return one colour of raw values behind a mosaic, or their grey, at every pixel.
 
     With m the pixels of the colour and k the kernel (1 2 1)^T (1 2 1), for green without its corners, the
-    colour is (k * (m raw)) / (k * m): bilinear, and exact on m. Grey is the luma of the three (Rec. 601).
-    Beyond the border the sensor is mirrored about its last pixels, which keeps the mosaic.
+    colour is (k * (m raw)) / (k * m): bilinear, and exact on m. Grey is the luma of the three (Rec. 601),
+    and white where a pixel's own value is: what is clipped stays so. Beyond the border the sensor is mirrored
+    about its last pixels, which keeps the mosaic.
 
     Args:
         raw: Digital numbers, uint8 or uint16 [..., H, W], at least 2 x 2 pixels.
@@ -327,7 +328,10 @@ def of_mosaic(raw: NDArray, mosaic: Mosaic, colour: Colour | None = None) -> NDA
     for k, (mask, share) in enumerate(zip(filters, shares, strict=True)):
         if share:
             found += np.float32(share) * _around(values * mask, k != 1) / _around(mask, k != 1)
-    return np.rint(found).astype(np.uint16)
+    levels = np.rint(found).astype(np.uint16)
+    if colour is None:
+        levels[raw >= np.iinfo(raw.dtype).max] = 65_535
+    return levels
 
 
 def _around(image: NDArray[np.float32], corners: bool) -> NDArray[np.float32]:

@@ -120,11 +120,11 @@ def invert_captures(
                 images = light[members][:, chosen]
                 free = problem.tikhonov(images)  # weighted by generalised cross-validation
                 shares: list[float | None] = [None] * len(members)
-                if (
-                    count > 2 and captures[members[0]].info.camera.mosaic is None
-                ):  # behind one, neighbours share noise
-                    shares = unexplained(free, problem.samples, images, noise[members]).tolist()
-                    shares = [None if share == math.inf else share for share in shares]  # nothing moves
+                if count > 2:
+                    told = unexplained(free, problem.samples, images, noise[members]).tolist()
+                    # Behind a mosaic neighbours share their noise, and where nothing moves there is no share.
+                    known = [captures[member].info.camera.mosaic is None for member in members]
+                    shares = [a if ok and a < math.inf else None for a, ok in zip(told, known, strict=True)]
                 for solver in options.solvers:
                     progress(Step("invert", done, total, "motions", within=f"{solver}, {count} positions"))
                     found = _solve(problem, images, solver, options.regularization[solver], free)
@@ -143,6 +143,8 @@ def _level(capture: Capture, image: torch.Tensor, plane: Plane) -> float | None:
     if capture.target is None:
         return None
     truth = torch.from_numpy(capture.target.rasterise(plane)).to(image)
+    if not truth.any():  # a colour that it does not have
+        return None
     return round(float((image * truth).sum() / truth.square().sum().clamp(min=1e-12)), 3)
 
 
@@ -158,8 +160,9 @@ def invert_colours(
     """
     parts = [invert_captures(folders, replace(options, colour=one), progress) for one in COLOURS]
     pictures = {name: torch.stack([found[name] for _, found in parts]) for name in parts[0][1]}
-    if all(torch.equal(image[0], image[1]) and torch.equal(image[1], image[2]) for image in pictures.values()):
-        raise ConfigError(f"{folders[0]}: its frames are grey; leave --colours, or state camera.mosaic")
+    for name, image in pictures.items():
+        if torch.equal(image[0], image[1]) and torch.equal(image[1], image[2]):
+            raise ConfigError(f"{name}: its frames are grey; leave it or --colours, or state camera.mosaic")
     rows = []
     for same in zip(*(figures["rows"] for figures, _ in parts), strict=True):
         errors = [10 ** (-0.1 * row["psnr_db"]) for row in same if row["psnr_db"] is not None]
@@ -191,6 +194,9 @@ def _by_motion(
     groups: dict[bytes, tuple[NDArray[np.float64], list[int]]] = {}
     for k, capture in enumerate(captures):
         if _is_tracked(capture, options):
+            if options.colour is not None:  # each colour would be centred on its own light
+                cure = "state it in capture.yaml (`evnlos track` finds it), and leave --track"
+                raise ConfigError(f"{capture.name}: --colours needs a motion that is known; {cure}")
             from evnlos.tracking import track_capture, track_warnings
 
             progress(Step("track", k, len(captures), "captures", within=capture.name))

@@ -90,8 +90,9 @@ def _light(capture: Capture) -> Iterator[Finding]:
         "shorten the exposure, close the aperture, or dim the ambient light",
     )
     share = float(np.median(frames) / peak)
-    dark, at = float((frames <= _DARK_DN).mean()), f"the middle pixel is at {100 * share:.0f} % of the range"
-    found = f"{at}; {100 * dark:.0f} % are darker than {_DARK_DN + 1} digital numbers"
+    least = _DARK_DN * (257 if capture.info.camera.mosaic and peak > 255 else 1)  # 8 bits became 16
+    dark, at = float((frames <= least).mean()), f"the middle pixel is at {100 * share:.0f} % of the range"
+    found = f"{at}; {100 * dark:.0f} % are darker than {least + 1} digital numbers"
     cure = "lengthen the exposure, open the aperture, or bring the wall nearer"
     yield _finding("brightness", dark < 0.05, dark < 0.5, found, cure)
     if capture.info.camera.mosaic is None and (unlike := unlike_neighbours(frames)) > _MOSAIC:

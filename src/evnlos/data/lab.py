@@ -330,7 +330,7 @@ _WAVELENGTHS_M = 650e-9, 550e-9, 450e-9  # of `COLOURS`
 def _coloured(
     lab: Lab, scene: Scene | SeveralTargets, times_s: NDArray[np.float64], seed: int
 ) -> NDArray[np.uint8]:
-    """Return frames [N, H, W, 3], or [N, H, W] behind a mosaic: one exposure a colour."""
+    """Return frames [N, H, W, 3], or [N, H, W] behind a mosaic: one exposure per colour."""
     pictures, whites = [], balances(lab.white_balance)
     for k, colour in enumerate(COLOURS):
         light = {"gain": lab.setup.gain * whites[k], "ambient": lab.setup.ambient * whites[k]}

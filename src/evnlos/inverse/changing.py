@@ -163,7 +163,7 @@ class _Film:
         freedom = (steps - 1) * (samples - int(kept.sum()))
         self.noise = math.sqrt(max(left / freedom, 1e-12)) if freedom >= steps - 1 else 1.0
         self.z, self.gain, self.length_m = z / self.noise, gain / self.noise, length_m
-        # What rests and no plane explains has the variance 1 / T + static^2 a pixel, in units of the noise.
+        # What rests and no plane explains has the variance 1 / T + static^2 per pixel, in units of the noise.
         outside = rest / self.noise**2 - float((self.z.mean(axis=0) ** 2).sum())
         free = samples - int(kept.sum())
         self.static = math.sqrt(max(outside / free - 1 / steps, 0.0)) if free >= _LEAST_FREE else 1.0
@@ -253,8 +253,8 @@ def estimate_film(
 def _likeliest(film: _Film, dt_s: Array, static: float) -> FilmPrior:
     """Return the prior of the largest marginal likelihood at one length of correlation.
 
-    ln rho has the weak prior N(0, 1): behind large offsets the frames say nothing of what rests, and to take it
-    for nothing would be to know it.
+    ln rho has the weak prior N(0, 1): behind large offsets the frames say nothing of what rests, and intervals
+    have to be as wide as that.
     """
     from scipy.optimize import minimize
 
