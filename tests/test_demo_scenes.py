@@ -21,7 +21,8 @@ TINY = HiddenScene(
     (
         "evnlos lab --config tiny.yaml --out made",
         "evnlos preview made/tiny_L/events.raw --out events.gif",
-        "evnlos info made/tiny_[L]/events.raw",
+        "evnlos invert made/tiny_[L] --setup main-near --solver tikhonov --out found.png",
+        "evnlos info made/tiny_L/events.raw",
     ),
     {"made/tiny_L/target.png": "hidden & known", "events.gif": "the events"},
     {
@@ -54,19 +55,19 @@ def test_a_scene_runs_goes_on_and_shows_what_its_commands_said(tmp_path, monkeyp
     monkeypatch.setattr(evnlos.demo, "scene_of", lambda name: TINY)
     page = run_scene("tiny", tmp_path / "tiny").read_text()
     shown = capfd.readouterr().out
-    assert "1 of 3: evnlos lab" in shown and "1 capture" in shown and "page: " in shown
+    assert "1 of 4: evnlos lab" in shown and "1 capture" in shown and "page: " in shown
     assert "A &lt;small&gt; letter" in page and "hidden &amp; known" in page and "http" not in page
     assert page.count("data:image/png") == 1 and page.count("data:image/gif") == 1
-    assert "$ evnlos info made/tiny_[L]/events.raw\n" in page and "36 x 24" in page
+    assert "$ evnlos info made/tiny_L/events.raw\n" in page and "36 x 24" in page
     lacking = replace(TINY, pictures={**TINY.pictures, "undrawn.png": "nothing"})
     monkeypatch.setattr(evnlos.demo, "scene_of", lambda name: lacking)
     assert "undrawn.png is not there" in run_scene("tiny", tmp_path / "tiny").read_text()
     broken = replace(TINY, steps=(*TINY.steps, "evnlos info nowhere.raw"))
     monkeypatch.setattr(evnlos.demo, "scene_of", lambda name: broken)
-    with pytest.raises(DataError, match=r"step 4 of the scene 'tiny' failed; the command again goes on there"):
+    with pytest.raises(DataError, match=r"step 5 of the scene 'tiny' failed; the command again goes on there"):
         run_scene("tiny", tmp_path / "tiny")
     told = capfd.readouterr()
-    assert "1 of 4" not in told.out and "4 of 4" in told.out and "nowhere.raw" in told.err
+    assert "1 of 5" not in told.out and "5 of 5" in told.out and "nowhere.raw" in told.err
 
 
 def test_a_scene_is_named_and_takes_nothing_beside_its_folder(tmp_path, capsys):

@@ -344,7 +344,7 @@ def run_scene(name: str, out: Path) -> Path:
         if step in done:
             continue
         print(f"{number} of {len(scene.steps)}: {step}", flush=True)
-        words = _expanded(shlex.split(step)[1:], out)
+        words = shlex.split(step)[1:]
         if words[0] == "calibrate":  # what an interrupted step left
             shutil.rmtree(out / words[words.index("--out") + 1], ignore_errors=True)
         words += ["--force"] if words[0] in _REPLACE else []
@@ -359,13 +359,6 @@ def run_scene(name: str, out: Path) -> Path:
     write_atomically(path, _scene_page(scene, out, done).encode())
     print(f"page: {path} ({time.perf_counter() - began:.0f} s)")
     return path
-
-
-def _expanded(words: list[str], folder: Path) -> list[str]:
-    """Return words with patterns of files replaced by those that match, as a shell does."""
-    found = [sorted(folder.glob(one)) if "[" in one else [] for one in words]
-    names = zip(words, found, strict=True)
-    return [n for word, some in names for n in ([str(one.relative_to(folder)) for one in some] or [word])]
 
 
 def _scene_page(scene: HiddenScene, out: Path, said: dict[str, str]) -> str:

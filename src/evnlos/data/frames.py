@@ -67,8 +67,7 @@ def read_image(
             if image.mode.startswith("I;16"):
                 array = np.asarray(image)
             elif mosaic is not None or colour is None:
-                whole = np.asarray(image.convert("RGB")) if mosaic is not None else np.zeros(1)
-                if (whole != whole[..., :1]).any():
+                if mosaic is not None and np.ptp(np.asarray(image.convert("RGB")), axis=-1).any():
                     raise DataError(f"{path} holds whole colours, no raw values; leave camera.mosaic out")
                 array = np.asarray(image.convert("L"))
             else:

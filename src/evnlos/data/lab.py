@@ -334,7 +334,7 @@ def _coloured(
     pictures, whites = [], balances(lab.white_balance)
     for k, colour in enumerate(COLOURS):
         light = {"gain": lab.setup.gain * whites[k], "ambient": lab.setup.ambient * whites[k]}
-        if isinstance(lab.setup, RadiometricSetup):
+        if hasattr(lab.setup, "wavelength_m"):
             light["wavelength_m"] = _WAVELENGTHS_M[k]
         wall = replace(lab.setup, **light).observe_all(_in_light(lab, scene, np.eye(3)[k]))
         pictures.append(lab.setup.frame_camera.capture(wall, times_s, seed=derive_seed(seed, colour)))

@@ -148,7 +148,15 @@ class _Film:
     """The frames in the modes of a plane's covariance of one length."""
 
     def __init__(
-        self, gram: Array, seen: Array, energy: float, rest: float, samples: int, plane: Plane, length_m: float
+        self,
+        gram: Array,
+        seen: Array,
+        energy: float,
+        rest: float,
+        samples: int,
+        plane: Plane,
+        length_m: float,
+        static: float | None,
     ) -> None:
         smooth = normal_matrix(Gradient("dark"), torch.zeros(plane.shape, dtype=torch.float64)).numpy()
         covariance = np.linalg.inv(smooth + (plane.pitch_m / length_m) ** 2 * np.eye(len(smooth)))
@@ -166,18 +174,19 @@ class _Film:
         # What rests and no plane explains has the variance 1 / T + static^2 per pixel, in units of the noise.
         outside = rest / self.noise**2 - float((self.z.mean(axis=0) ** 2).sum())
         free = samples - int(kept.sum())
-        self.static = math.sqrt(max(outside / free - 1 / steps, 0.0)) if free >= _LEAST_FREE else 1.0
+        found = math.sqrt(max(outside / free - 1 / steps, 0.0)) if free >= _LEAST_FREE else 1.0
+        self.static = found if static is None else static
         images = torch.from_numpy(self.basis.T.copy()).unflatten(1, plane.shape)
         slope = Gradient("dark")(images).square().sum(dim=(1, 2, 3)) / images.square().sum(dim=(1, 2))
         self.wave_number = slope.sqrt().numpy() / plane.pitch_m
 
-    def smoothed(self, prior: FilmPrior, dt_s: Array, static: float) -> ModeSeries:
+    def smoothed(self, prior: FilmPrior, dt_s: Array) -> ModeSeries:
         keep = np.exp(-dt_s[:, None] * prior.speed_m_s * self.wave_number)
-        return smooth_modes(self.z, prior.deviation * self.gain, keep, prior.resting, static)
+        return smooth_modes(self.z, prior.deviation * self.gain, keep, prior.resting, self.static)
 
-    def evidence(self, prior: FilmPrior, dt_s: Array, static: float) -> float:
-        empty = smooth_modes(self.z, 0 * self.gain, np.zeros_like(self.z), 0.0, static)
-        return self.smoothed(prior, dt_s, static).log_likelihood - empty.log_likelihood
+    def evidence(self, prior: FilmPrior, dt_s: Array) -> float:
+        empty = smooth_modes(self.z, 0 * self.gain, np.zeros_like(self.z), 0.0, self.static)
+        return self.smoothed(prior, dt_s).log_likelihood - empty.log_likelihood
 
 
 def estimate_film(
@@ -229,15 +238,14 @@ def estimate_film(
     lengths = [max(plane.extent_m) * share for share in _LENGTHS] if prior is None else [prior.length_m]
     best: tuple[float, FilmPrior, _Film] | None = None
     for length in lengths:
-        film = _Film(gram, seen, energy, rest, matrix.shape[0], plane, length)
-        film.static = film.static if static is None else static
-        found = prior or _likeliest(film, dt, film.static)
-        evidence = film.evidence(found, dt, film.static)
+        film = _Film(gram, seen, energy, rest, matrix.shape[0], plane, length, static)
+        found = prior or _likeliest(film, dt)
+        evidence = film.evidence(found, dt)
         if best is None or evidence > best[0]:
             best = evidence, found, film
     assert best is not None
     evidence, chosen, film = best
-    modes = film.smoothed(chosen, dt, film.static)
+    modes = film.smoothed(chosen, dt)
     basis = chosen.deviation * film.basis
     return FilmEstimate(
         times,
@@ -250,7 +258,7 @@ def estimate_film(
     )
 
 
-def _likeliest(film: _Film, dt_s: Array, static: float) -> FilmPrior:
+def _likeliest(film: _Film, dt_s: Array) -> FilmPrior:
     """Return the prior of the largest marginal likelihood at one length of correlation.
 
     ln rho has the weak prior N(0, 1): behind large offsets the frames say nothing of what rests, and intervals
@@ -268,7 +276,7 @@ def _likeliest(film: _Film, dt_s: Array, static: float) -> FilmPrior:
 
     start = np.array([math.log(0.3), 0.0, math.log(0.02 / step / float(np.median(film.wave_number)))])
     found = minimize(
-        lambda logs: 0.5 * logs[1] ** 2 - film.smoothed(prior_at(logs), dt_s, static).log_likelihood,
+        lambda logs: 0.5 * logs[1] ** 2 - film.smoothed(prior_at(logs), dt_s).log_likelihood,
         start,
         method="Nelder-Mead",
         options={"xatol": 0.05, "fatol": 0.1, "maxfev": 120, "initial_simplex": start + np.eye(4, 3, -1)},
