@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from evnlos.calibration import CALIBRATION_VALUES_FILE
-from evnlos.demo import Demo, run_demo
+from evnlos.demo import ROBUST, Demo, run_demo
 from evnlos.errors import CalibrationError, ConfigError, DataError
 from evnlos.experiment import Record, Study
 from evnlos.experiment.study import write_record
@@ -93,6 +93,22 @@ def test_each_setup_is_run_and_a_refusal_is_a_row(tmp_path, monkeypatch):
     assert [one.setup for one in found] == ["flat", "odd"] and found[1].refused == "no setup fits"
     written = (tmp_path / "out" / "mismatch.md").read_text()
     assert "| odd | refused: no setup fits |" in written and "| flat | frame |" in written
+
+
+def test_robust_networks_stand_beside_the_others(tmp_path, monkeypatch):
+    (tmp_path / "captures" / "flat" / "flat_A").mkdir(parents=True)
+    (tmp_path / "captures" / "flat" / "flat_A" / "capture.yaml").write_text("x: 1")
+
+    def demo(settings: Demo) -> None:
+        drawn, gained = (ROBUST, 0.5) if settings.robust else ("", 0.0)
+        scores = {(f"simulation only{drawn}", "frame"): 18 + gained, (f"EPNP{drawn}", "frame"): 22 + gained}
+        keep(settings.out, settings.seed, {("E2E", "frame"): 20.0, **scores}, [])
+
+    monkeypatch.setattr("evnlos.mismatch.run_demo", demo)
+    found = run_mismatch(Demo(out=tmp_path / "out", robust=True), (), tmp_path / "captures")
+    table = mismatch_table(found)
+    assert "| EPNP - E2E | simulation only, robust | EPNP, robust |" in table
+    assert "| 20.00 | 18.00 | 22.00 | +2.00 | 18.50 | 22.50 |" in table
 
 
 @pytest.mark.parametrize("start", ["generic", "nowhere", ""])

@@ -33,6 +33,9 @@ if TYPE_CHECKING:  # what runs is imported where it runs: help texts and wrong w
 LAB_CHARACTERS = "ACDEGHKLOPSTUXZ2479"
 """What the rendered captures show."""
 
+ROBUST = ", robust"
+"""Ends the names of arms whose simulations draw sensors and walls from wide ranges."""
+
 _TEST = ("G", "K", "4", "9")
 _REPLACE = ("corner", "invert", "preview", "track")  # with --force they replace files
 _EMBEDDED_BYTES = 4_000_000  # larger images stay beside the page of a scene
@@ -179,7 +182,7 @@ def run_demo(settings: Demo) -> Path:
     for note in notes:
         print(note)
     print(to_text(results))
-    print(gain_table(records))
+    print(gain_table(records, f"EPNP{ROBUST if settings.robust else ''}"))
     print(f"report: {path} ({time.perf_counter() - began:.0f} s)")
     return path
 
@@ -262,14 +265,15 @@ def _study(settings: Demo, test: list[str], events: bool) -> Study:
     # Gentle, so that it forgets little; captures held out of it choose how much of it is taken, if any.
     after = replace(plan, epochs=settings.finetune_epochs, learning_rate=5e-4, keep_normalization=True)
     source = "calibrated" if settings.calibrate else "uncalibrated"
+    drawn = ROBUST if settings.robust else ""
     alone_sees = Sampling(surface="hots", radius=1)  # of the time surfaces, validation characters chose it
     sees = Sampling(surface="likelihood") if settings.calibrate else alone_sees
     return Study(
         "demo",
         "demo",
         (
-            Arm("simulation only", source, before, None, settings.start, anew, sampling=sees),
-            Arm("EPNP", source, before, after, settings.start, anew, choose=True, sampling=sees),
+            Arm(f"simulation only{drawn}", source, before, None, settings.start, anew, sampling=sees),
+            Arm(f"EPNP{drawn}", source, before, after, settings.start, anew, choose=True, sampling=sees),
             Arm("E2E, single positions", "none", None, single, sampling=alone_sees),
             Arm("E2E", "none", None, alone, sampling=alone_sees),
         ),

@@ -12,7 +12,7 @@ from evnlos.calibration import CALIBRATION_VALUES_FILE
 from evnlos.config import write_atomically
 from evnlos.data import STANDARD_MODALITIES
 from evnlos.data.lab import lab_of, render_captures
-from evnlos.demo import Demo, run_demo
+from evnlos.demo import ROBUST, Demo, run_demo
 from evnlos.errors import CalibrationError, UnknownNameError
 from evnlos.experiment import Record, means_of, read_records
 from evnlos.machine import Progress, silent
@@ -64,7 +64,8 @@ def run_mismatch(
     """Run the demo on each setup, one after the other, and return what came of it; run it again to go on.
 
     Args:
-        base: Settings of the demo; `out` holds a folder for each setup and seed.
+        base: Settings of the demo; `out` holds a folder for each setup and seed. Where they are robust,
+            networks that learned from wide ranges stand beside those that learned from the fitted setup.
         setups: Names of setups: of the rooms of `evnlos lab`, or of folders in `captures`; all by default.
         captures: Folder that holds a folder of captures for each setup; None renders the rooms.
         seeds: Seeds of the demo.
@@ -88,7 +89,8 @@ def run_mismatch(
             outs.append(out)
             out.mkdir(parents=True, exist_ok=True)
             try:
-                run_demo(replace(base, captures=tuple(folders), out=out, seed=seed))
+                for robust in sorted({False, base.robust}):
+                    run_demo(replace(base, captures=tuple(folders), out=out, seed=seed, robust=robust))
             except CalibrationError as error:
                 write_atomically(out / _REFUSED, str(error).encode())
         found.append(finding(name, outs))
@@ -158,6 +160,9 @@ def _left(residuals: dict[str, dict[str, float]], kind: str) -> tuple[float, flo
 def mismatch_table(found: list[Finding]) -> str:
     """Return Markdown: a row for each setup and modality, and the margins that matter below it."""
     head = ["setup", "sees", "left / noise, %", "mean image", "E2E", "simulation only", "EPNP", "EPNP - E2E"]
+    drawn = [f"{arm}{ROBUST}" for arm in ("simulation only", "EPNP")]
+    drawn = [arm for arm in drawn if any(name == arm for one in found for name, _ in one.psnr_db)]
+    head += drawn
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in found:
         for modality in [p for p in STANDARD_MODALITIES if p in one.mean_image_db]:
@@ -168,6 +173,7 @@ def mismatch_table(found: list[Finding]) -> str:
             e2e, epnp = one.best_e2e(modality), one.of("EPNP", modality)
             numbers = (one.mean_image_db[modality], e2e, one.of("simulation only", modality), epnp)
             cells = [one.setup, modality, left, *(f"{v:.2f}" for v in numbers), f"{epnp - e2e:+.2f}"]
+            cells += [f"{one.of(arm, modality):.2f}" for arm in drawn]
             lines.append(f"| {' | '.join(cells)} |")
         if one.refused:
             lines.append(f"| {one.setup} | refused: {one.refused} |" + " |" * (len(head) - 2))

@@ -86,7 +86,7 @@ class ExperimentCommand:
     setups: tuple[str, ...] = ()
     """For mismatch: rooms of `evnlos lab`, or, with --captures, folders of captures in it; all by default."""
     robust: bool = False
-    """For mismatch: draw sensors and walls of the simulated objects from wide ranges around the fitted ones."""
+    """For mismatch: beside the others, networks that learned from sensors and walls drawn from wide ranges."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of initial weights and order of the samples."""
     modalities: tuple[str, ...] = STANDARD_MODALITIES
