@@ -22,7 +22,6 @@ from evnlos.untrusted import open_regular
 
 T = TypeVar("T")
 
-
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast where it was built
 _MOST_BYTES, _BYTES_A_NODE = 1 << 20, 16
 _MOST_DEPTH = 100
@@ -51,6 +50,9 @@ _CURES: dict[Any, str] = {  # in place of pydantic's words
     **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "give a whole number"),
     **dict.fromkeys(("float_type", "float_parsing"), "give a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "give true or false") | {"string_type": "give a text"},
+    **dict.fromkeys(("tuple_type", "list_type"), "give a list") | {"literal_error": "give {expected}"},
+    **dict.fromkeys(("dict_type", "dataclass_type"), "give a mapping of names to values"),
+    **{"too_long": "give at most {max_length} values", "missing": "a value is required here"},
 }
 BESIDE = types.MappingProxyType({"beside": True})
 """Metadata of a field that names a file or folder; in a YAML file it is relative to that file's folder."""
@@ -94,9 +96,7 @@ def from_dict(
     from pydantic import ValidationError  # here: `import evnlos` stays quick
 
     if not isinstance(values, dict):
-        raise ConfigError(
-            f"{source} holds a {type(values).__name__}; give a mapping of setting names to values"
-        )
+        raise ConfigError(f"{source} holds a {type(values).__name__}; give a mapping of names to values")
     try:
         values = _migrated(cls, values, folder)
     except ConfigError as error:  # a kind that nobody knows
@@ -110,8 +110,9 @@ def from_dict(
         if fault == NESTED and "ctx" in first:
             loc, value, fault = (*loc, *first["ctx"]["loc"]), first["ctx"]["input"], first["ctx"]["fault"]
         place = ".".join(str(part) for part in loc) or "(top level)"
-        cure = _CURES.get(fault, first["msg"])
-        raise ConfigError(f"{source}: {place} = {_shown(value)}: {cure}") from None
+        cure = _CURES.get(fault, "").format(**first.get("ctx", {})) or first["msg"].removeprefix("Value error, ")
+        said = place if fault == "missing" else f"{place} = {_shown(value)}"
+        raise ConfigError(f"{source}: {said}: {cure}") from None
     except (ArithmeticError, MemoryError, TypeError, LookupError) as error:  # a range that only fits together
         raise ConfigError(f"{source}: its numbers do not fit together ({error})") from None
     return found
@@ -353,8 +354,7 @@ def check_numbers(value: Any, what: str, name: str = "", *, may_be_tiny: bool = 
             check_numbers(inner, what, name, may_be_tiny=may_be_tiny)
     elif isinstance(value, numbers.Real) and not isinstance(value, bool):
         least, most = next((ends for unit, ends in RANGES.items() if name.endswith(unit)), _NO_UNIT)
-        if may_be_tiny:
-            least = 0
+        least = 0 if may_be_tiny else least
         if isinstance(value, numbers.Integral):
             least, most = 0, min(most, _MOST_COUNT)
         elif value == 0:
