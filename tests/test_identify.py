@@ -337,6 +337,15 @@ def test_bad_sizes():
         LinearEstimator.known(torch.eye(3), torch.zeros(3), torch.eye(4))
 
 
+@pytest.mark.parametrize("there", ["identify.json", "identify_matte-near.png"])
+def test_no_figure_is_replaced_unasked(tmp_path, capsys, there):
+    (tmp_path / there).write_text("mine")
+    with pytest.raises(SystemExit):
+        main(["identify", "matte-near", "--out", str(tmp_path)])
+    assert f"{there} exists" in capsys.readouterr().err
+    assert (tmp_path / there).read_text() == "mine"
+
+
 def test_no_setup(capsys):
     with pytest.raises(SystemExit):
         main(["identify"])

@@ -665,6 +665,14 @@ def test_the_command_says_where_a_setup_is_not_that_of_the_capture(capture, tmp_
     assert "do not believe the image" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("there", ["t_1.png", "t_images.png"])
+def test_no_picture_of_one_of_several_targets_is_replaced_unasked(capture, tmp_path, capsys, there) -> None:
+    (tmp_path / there).write_text("mine")
+    with pytest.raises(SystemExit):
+        main(["track", str(capture[0]), "--targets", "2", "--out", str(tmp_path / "t.png")])
+    assert f"{there} exists" in capsys.readouterr().err
+
+
 def test_a_folder_without_a_setup_is_no_photograph(capture, capsys) -> None:
     with pytest.raises(SystemExit):
         main(["invert", str(capture[0])])

@@ -160,6 +160,8 @@ class TrackCommand:
         from evnlos.plot.results import draw_track
         from evnlos.tracking import Tracks, track_capture, track_several, track_warnings
 
+        if self.settings.targets != 1:
+            refuse_existing(self.force, *(self.out.with_stem(f"{self.out.stem}_{k}") for k in (1, "images")))
         with ProgressBars() as progress:
             with progress.stage("track", "read the capture", 0, 3):
                 capture = read_capture(self.capture, needs_events=False)
@@ -225,8 +227,7 @@ def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | No
         found["turn_identified"] = track.turn.is_identified
     if truth is not None:
         error = track.position - truth
-        rate = np.gradient(truth, track.time_s, axis=0)
-        speed = np.hypot(rate[:, 0], rate[:, 1])
+        speed = np.hypot(*np.gradient(truth, track.time_s, axis=0).T)
         found["position_offset"] = error.mean(axis=0).tolist()
         found["position_error"] = float(np.sqrt(np.square(error - error.mean(axis=0)).sum(axis=1).mean()))
         found["speed_error_percent"] = float(
@@ -312,12 +313,11 @@ class IdentifyCommand:
         from evnlos.setups import named_setup, setup_names
 
         names = [*self.setups, *self.setup, *(setup_names() if self.all else [])]
-        refuse_existing(self.force, *([self.out / "identify.json"] if self.out else []))
         if not names:
-            raise ConfigError(
-                f"no setup given; give a settings file, --all, or names: {', '.join(setup_names())}"
-            )
+            raise ConfigError(f"no setup given; give a file, --all, or names: {', '.join(setup_names())}")
         setups = [named_setup(name) for name in names]
+        made = ["identify.json", *(f"identify_{one.name}.png" for one in setups), "identify_setups.png"]
+        refuse_existing(self.force, *(self.out / name for name in made if self.out))
         found, limits, stages = [], {}, len(setups) * (1 + self.bounds)
         with ProgressBars() as progress:
             for one in setups:
