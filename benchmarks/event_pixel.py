@@ -31,7 +31,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from evnlos.cameras import EventCamera, EventPixel, simulate_events
-from evnlos.cameras.simulation import Mode
+from evnlos.cameras.pixel import Mode
 from evnlos.data.simulations import paper
 from evnlos.optics import Irradiance as CameraWall
 from evnlos.scene import Scene

@@ -2,18 +2,21 @@
 
 import contextlib
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from evnlos.cli import main
 from evnlos.data import CaptureInfo, open_dataset, read_capture
 from evnlos.data.capture_check import Finding, _offset, check_capture, compare_clocks
 from evnlos.data.capture_info import CAMERAS, AlignmentInfo, CameraInfo, begin_capture, read_capture_info
 from evnlos.data.clocks import expected_counts
+from evnlos.data.frames import from_start
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize
 from evnlos.data.store import read_shard
@@ -128,6 +131,65 @@ def test_clocks_that_do_not_meet_are_named(capture) -> None:
     times = capture.frame_times_us.copy()
     times[4:] += 700_000
     assert levels(replace(capture, frame_times_us=times))["frame times"] == "doubtful"
+
+
+def test_events_of_mirrored_pixels_or_exchanged_polarity_are_named(capture) -> None:
+    events = capture.events
+    for changed, says in (
+        ({"p": ~events.p}, "exchange ON and OFF"),
+        ({"x": (events.width - 1 - events.x).astype(events.x.dtype)}, "left and right"),
+    ):
+        found = {one.what: one for one in check_capture(replace(capture, events=replace(events, **changed)))}
+        assert found["pixels"].level == "bad" and says in found["pixels"].cure and "clock offset" not in found
+
+
+def test_holes_in_the_events_and_repeated_frames_are_named(capture) -> None:
+    t_us, frames = capture.events.t_us, capture.frame_times_us
+    there = (t_us < frames[len(frames) // 2]) | (t_us > frames[len(frames) // 2 + 2])
+    found = levels(replace(capture, events=capture.events[there]))
+    assert found["holes"] in ("doubtful", "bad") and "holes" not in levels(capture)
+    again = np.repeat(capture.frames[::2], 2, axis=0)[: len(capture.frames)]
+    assert levels(replace(capture, frames=again))["repeated frames"] == "bad"
+
+
+def test_a_path_that_is_nowhere_near_the_wall_is_named(tiny_captures, tmp_path, capture) -> None:
+    away = replace(capture.info.motion, start_m=0.9)
+    one = replace(capture, info=replace(capture.info, motion=away))
+    found = next(one for one in check_capture(one) if one.what == "motion")
+    assert found.level == "bad" and "start_us" in found.cure and "0.5 m is safe" in found.found
+    shutil.copytree(tiny_captures[0], tmp_path / "one")
+    path = tmp_path / "one" / "capture.yaml"
+    text = path.read_text()
+    assert "speed_m_s: 0.02" in text
+    path.write_text(text.replace("speed_m_s: 0.02", "speed_m_s: 20.0"))
+    with pytest.raises(DataError, match=r"from start_m while frames are taken.*mend speed_m_s, or start_us"):
+        read_capture(tmp_path / "one")
+
+
+def test_a_clock_that_counts_from_1970_is_read(capture, monkeypatch) -> None:
+    """Live recordings are stamped so; a second then is a number that no motion was allowed to start at."""
+    late_us = 1_753_870_845_000_000
+    info = replace(capture.info, motion=replace(capture.info.motion, start_us=late_us + 250_000))
+    events = replace(capture.events, t_us=capture.events.t_us + late_us)
+    found = from_start(Path("here"), info, events, capture.frame_times_us + late_us)
+    assert found[0].motion.start_us == 250_000 and "1753870845 s" in found[3][0]
+    np.testing.assert_array_equal(found[1].t_us, capture.events.t_us)
+    np.testing.assert_array_equal(found[2], capture.frame_times_us)
+    same = from_start(Path("here"), capture.info, capture.events, capture.frame_times_us)
+    assert same[1] is capture.events and same[3] == []
+
+
+def test_digits_may_be_names_and_a_mask_has_to_shine(tiny_captures, tmp_path) -> None:
+    shutil.copytree(tiny_captures[0], tmp_path / "one")
+    path = tmp_path / "one" / "capture.yaml"
+    text = path.read_text()
+    before, _, after = text.partition("target:\n")
+    path.write_text(f"{before}target:\n{re.sub(r'name: .*', 'name: 4', after, count=1)}")
+    read = read_capture(tmp_path / "one")
+    assert read.info.target.name == "4"
+    Image.fromarray(np.zeros((8, 8), np.uint8)).save(tmp_path / "one" / read.info.target.mask)
+    with pytest.raises(DataError, match="black all over"):
+        read_capture(tmp_path / "one")
 
 
 def test_a_new_folder_explains_itself_and_is_read_back(tmp_path, capsys) -> None:

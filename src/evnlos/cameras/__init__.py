@@ -1,6 +1,6 @@
 """What a camera makes of the light on the wall: frames and events."""
 
-from evnlos.cameras.event_camera import EventCamera
+from evnlos.cameras.event_camera import EventCamera, EventStream, simulate_events
 from evnlos.cameras.event_model import EVENT_MODELS, CrossingLaw, EventModel, PixelSettings
 from evnlos.cameras.frame_camera import FrameCamera, colour_filters, mosaicked, of_mosaic
 from evnlos.cameras.pixel import EventPixel, V2ePixel
@@ -8,7 +8,6 @@ from evnlos.cameras.pixels.brownian import BrownianPixel
 from evnlos.cameras.pixels.circuit import CircuitPixel
 from evnlos.cameras.pixels.readout import FlickeringWall, ReadoutPixel
 from evnlos.cameras.sensors import CelexCamera, CelexPixel, load_pixel, pixel_preset
-from evnlos.cameras.simulation import EventStream, simulate_events
 
 __all__ = [
     "EVENT_MODELS",

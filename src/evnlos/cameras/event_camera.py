@@ -1,25 +1,41 @@
-"""An event camera that looks at a wall in continuous time."""
+"""Event cameras: what they make of a video, of light in blocks of frames, and of a wall in continuous time.
+
+- Events from light that arrives in blocks of frames: bounded memory for recordings of any length.
+- Events of a video: the function most users need.
+- An event camera that looks at a wall, and chooses its instants from the motion.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_model import PixelSettings
+from evnlos.cameras.event_model import Irradiance, PixelSettings
 from evnlos.cameras.pixel import EventPixel, Mode, in_mode
 from evnlos.cameras.pixels.continuous_math import log_light
-from evnlos.cameras.simulation import EventStream
-from evnlos.cameras.streams import WHITE_DN, ImageStrips, StripLight
+from evnlos.cameras.random_numbers import check_seed
+from evnlos.cameras.streams import (
+    WHITE_DN,
+    Columns,
+    Frames,
+    ImageStrips,
+    Light,
+    StripLight,
+    check_light,
+    check_times,
+    join,
+    sort_times,
+)
 from evnlos.errors import ConfigError, DataError
 from evnlos.types import Events
 
+_BLOCK_STEPS = 256
 _CHUNK_BYTES = 64 << 20
 _CHUNK_STEPS = 32
 _STRIP_STEPS = 64
@@ -31,22 +47,159 @@ _BLOCK = 512
 _MOST_STEPS = 10_000_000
 
 
-class Irradiance(Protocol):
-    """What an event camera needs to know about the light: its image at any instant, and how fast it moves."""
+class EventStream:
+    """An array of event pixels that takes light block by block and keeps its state in between.
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Size of the image (height, width), pixels."""
-        ...
+    The events are the same bytes for any division of the frames into blocks, any number of threads and any
+    size of tile.
 
-    @property
-    def speed_px_s(self) -> float:
-        """Upper bound of the speed of the image on the sensor, pixels per second."""
-        ...
+    Args:
+        pixel: Settings of the pixels: an `EventPixel`, or those of any other event model.
+        shape: Sensor size (height, width), pixels.
+        mode: "v2e" steps an `EventPixel` from frame to frame as v2e does; "exact" runs the model that the
+            settings name.
+        seed: Seed of mismatch and noise, 0 to 2**64 - 1.
+        thresholds: Thresholds (on, off) of each pixel, [H, W] each, log units; None draws them.
+        threads: Number of threads; None = as many as torch uses.
+        tile_px: Pixels that run through a block together; None = a size that fits the cache.
 
-    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
-        """Return the image at the instants `t_s` [T] in seconds, float32 [T, H, W], 1.0 = white."""
-        ...
+    Raises:
+        ConfigError: Unknown mode, seed, thread count or threshold maps out of range.
+
+    Example:
+        >>> from evnlos.cameras import EventPixel
+        >>> stream = EventStream(EventPixel(leak_rate_hz=0, shot_noise_rate_hz=0), (2, 3))
+        >>> stream.push(np.full((1, 2, 3), 50.0), [0.0])
+        >>> stream.push(np.full((2, 2, 3), 50.0), [0.1, 0.2])
+        >>> stream.finish()
+        Events(0 events, 3 x 2)
+    """
+
+    def __init__(
+        self,
+        pixel: PixelSettings,
+        shape: tuple[int, int],
+        *,
+        mode: Mode = "exact",
+        seed: int = 0,
+        thresholds: tuple[ArrayLike, ArrayLike] | None = None,
+        threads: int | None = None,
+        tile_px: int | None = None,
+    ) -> None:
+        pixel = in_mode(pixel, mode)
+        if len(shape) != 2 or min(shape) < 1:
+            raise ConfigError(f"shape is {tuple(shape)}; give (height, width), at least 1 pixel each")
+        self.shape, self._disordered = shape, pixel.disorder_s > 0
+        self._array = pixel.model(shape, check_seed(seed), thresholds, tile_px=tile_px, threads=threads)
+        self._blocks: list[Columns] = []
+        self._last_s = -np.inf
+
+    def push(self, frames: ArrayLike | torch.Tensor, times_s: ArrayLike | torch.Tensor) -> None:
+        """Take the next frames; the first frame ever is the light to which all pixels have settled.
+
+        Args:
+            frames: Light in DN (255 = white; fractions and more than 255 allowed), [T, H, W], at least 0.
+            times_s: Instants of the frames, [T], seconds, ascending, after those of the block before.
+
+        Raises:
+            DataError: Wrong shapes, NaN, negative light, or times that do not ascend.
+        """
+        light = check_light(frames)
+        if light.shape[1:] != tuple(self.shape):
+            raise DataError(f"frames are {light.shape[1]} x {light.shape[2]}; the sensor is {self.shape}")
+        self.push_light(Frames(np.ascontiguousarray(light).reshape(len(light), math.prod(self.shape))), times_s)
+
+    def push_light(self, light: Light, times_s: ArrayLike | torch.Tensor) -> None:
+        """Take the next light, in whatever form.
+
+        Args:
+            light: Light in DN at the instants.
+            times_s: Its instants, [T], seconds, ascending, after those before.
+
+        Raises:
+            DataError: Not one time an instant, times that do not ascend, or what `light` raises.
+        """
+        times_s = check_times(times_s, len(light), self._last_s)
+        if not len(times_s):
+            return
+        first = 0
+        if np.isneginf(self._last_s):
+            frames, _ = light[:1].pixels(0, self.shape[0] * self.shape[1])
+            self._array.start(frames[0], float(times_s[0]))
+            first = 1
+        self._last_s = float(times_s[-1])
+        for k in range(first, len(times_s), _BLOCK_STEPS):
+            block = slice(k, k + _BLOCK_STEPS)
+            self._blocks.append(self._array.advance(light[block], times_s[block]))
+
+    def finish(self) -> Events:
+        """Return all events since the last call, in order; the pixels keep their state."""
+        time_us, where, on = join(self._blocks)
+        if self._disordered:
+            time_us, where, on = sort_times(time_us, where, on)
+        height, width = self.shape
+        y = where // width
+        return Events(time_us, (where - y * width).astype(np.uint16), y.astype(np.uint16), on, width, height)
+
+
+def simulate_events(
+    frames: ArrayLike | torch.Tensor,
+    times_s: ArrayLike | torch.Tensor,
+    pixel: PixelSettings | None = None,
+    mode: Mode = "exact",
+    seed: int = 0,
+    thresholds: tuple[ArrayLike, ArrayLike] | None = None,
+    *,
+    threads: int | None = None,
+    tile_px: int | None = None,
+) -> Events:
+    """Return the events that an array of event pixels sends while it watches a video.
+
+    With L(I) = ln I above 20 DN and I ln(20) / 20 below, the filter's output P obeys
+    dP/dt = 2 pi fc (I + 20) / 275 (L(I) - P), and a pixel sends an event whenever P has moved by a threshold
+    away from its reference, which then follows by that threshold. The first frame gives the state at rest.
+
+    Args:
+        frames: Light in DN (255 = white; fractions and more than 255 allowed), [T, H, W], at least 0, numpy or
+            torch; linear in time between the frames.
+        times_s: Instants of the frames, [T], seconds, ascending; any spacing.
+        pixel: Settings of the pixels: an `EventPixel`, or those of another event model, which then says what
+            happens; None = the paper's.
+        mode: "exact" solves for the instants in continuous time. "v2e" steps from frame to frame and gives the
+            same multiset of events as v2e at commit cac6384 wherever no random number is involved.
+        seed: Seed of mismatch and noise, 0 to 2**64 - 1: same seed, same bytes, for any threads and tiles.
+        thresholds: Thresholds (on, off) of each pixel, [H, W] each, log units; None draws them.
+        threads: Number of threads; None = as many as torch uses.
+        tile_px: Pixels that run together; None = a size that fits the cache.
+
+    Returns:
+        Events ordered by time, then row, then column, OFF before ON.
+
+    Raises:
+        DataError: Wrong shapes, NaN, negative light, or times that do not ascend.
+        ConfigError: Unknown mode, seed, thread count or threshold maps out of range.
+
+    Example:
+        >>> times_s = np.linspace(0.0, 0.1, 11)
+        >>> frames = 50.0 * np.exp(5.0 * times_s)[:, None, None] * np.ones((1, 1))
+        >>> pixel = EventPixel(threshold_sigma=0, cutoff_hz=0, leak_rate_hz=0, shot_noise_rate_hz=0)
+        >>> simulate_events(frames, times_s, pixel).t_us // 1000
+        array([30, 60, 90])
+    """
+    shape = np.shape(frames)
+    if len(shape) != 3 or 0 in shape[1:]:
+        raise DataError(f"frames has shape {tuple(shape)}; give [T, H, W] with at least one pixel")
+    stream = EventStream(
+        EventPixel() if pixel is None else pixel,
+        (int(shape[1]), int(shape[2])),
+        mode=mode,
+        seed=seed,
+        thresholds=thresholds,
+        threads=threads,
+        tile_px=tile_px,
+    )
+    stream.push(frames, times_s)
+    return stream.finish()
 
 
 @dataclass(frozen=True)
@@ -86,7 +239,10 @@ class EventCamera:
         step = self.time_step_s
         if step is not None and not (math.isfinite(step) and step > 0):
             raise ConfigError(f"EventCamera.time_step_s is {step}; give a positive number of seconds, or None")
-        check_time_step(in_mode(self.pixel, self.mode), step)
+        if (pixel := in_mode(self.pixel, self.mode)).stepped and step is None:
+            raise ConfigError(
+                f"{type(pixel).__name__} (mode v2e) depends on the time step; give time_step_s, e.g. 0.001"
+            )
 
     def record(
         self, wall: Irradiance, t0: float, t1: float, *, seed: int = 0, threads: int | None = None
@@ -167,40 +323,19 @@ class EventCamera:
                 step = min(longest, step * min(1.5, 0.9 * math.sqrt(limit / max(error, 1e-12))))
 
 
-def check_time_step(pixel: PixelSettings, time_step_s: float | None) -> None:
-    """Refuse a model whose physics depends on the time step where none is stated.
-
-    Args:
-        pixel: Settings of the pixels.
-        time_step_s: Fixed time step, seconds; None = chosen from the motion.
-
-    Raises:
-        ConfigError: A stepped model without a time step.
-    """
-    if pixel.stepped and time_step_s is None:
-        raise ConfigError(
-            f"{type(pixel).__name__} (mode v2e) depends on the time step; give time_step_s, e.g. 0.001"
-        )
-
-
 def _record_at(stream: EventStream, wall: Irradiance, times_s: NDArray[np.float64]) -> None:
     """Let the pixels see the wall at given instants: strip by strip where it can be had so, else in frames."""
     most = min(_most_steps(wall), len(times_s))
     frames = None
+    render: Callable[..., ImageStrips | None] | None = getattr(type(wall), "strips", None)
     for part in np.split(times_s, range(_STRIP_STEPS, len(times_s), _STRIP_STEPS)):
-        strips = _strips_of(wall, part)
+        strips = render(wall, part) if callable(render) else None
         if strips is not None:
             stream.push_light(StripLight(strips), part)
             continue
         frames = np.empty((most, *wall.shape), np.float32) if frames is None else frames
         for few in np.split(part, range(most, len(part), most)):
             stream.push(_render(wall, few, frames[: len(few)]), few)
-
-
-def _strips_of(wall: Irradiance, times_s: NDArray[np.float64]) -> ImageStrips | None:
-    """Return the light of a wall whose class says how to render some pixels without the others (`strips`)."""
-    render: Callable[..., ImageStrips | None] | None = getattr(type(wall), "strips", None)
-    return render(wall, times_s) if callable(render) else None
 
 
 def _most_steps(wall: Irradiance) -> int:
@@ -213,9 +348,7 @@ def _longest_step(wall: Irradiance, t0: float, t1: float) -> float:
     """Return the step that moves the image by four pixels, at most an eighth of the recording."""
     speed = float(wall.speed_px_s)
     if not (math.isfinite(speed) and speed >= 0):
-        raise ConfigError(
-            f"the wall's speed_px_s is {speed}; give a finite number of pixels per second, 0 or more"
-        )
+        raise ConfigError(f"the wall's speed_px_s is {speed}; give pixels per second, 0 or more")
     own = float(getattr(wall, "longest_step_s", math.inf))  # of light that changes without motion
     step = min((t1 - t0) / _FEWEST_STEPS, _LONGEST_SHIFT_PX / max(speed, 1e-12), own)
     if (t1 - t0) / step > _MOST_STEPS:

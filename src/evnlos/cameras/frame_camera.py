@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_camera import Irradiance
+from evnlos.cameras.event_model import Irradiance
 from evnlos.cameras.random_numbers import check_seed, fill_electrons
 from evnlos.config import check_made
 from evnlos.errors import ConfigError, DataError
@@ -161,6 +161,15 @@ class FrameCamera:
     def dn_per_electron(self) -> float:
         """Digital numbers that an electron adds."""
         return (self.white - self.black_level) * self.gain / self.full_well_e
+
+    def per_light(self) -> FrameCamera:
+        """Return the camera whose noise is that of this one in white levels of the light, not of the frame.
+
+        Where electrons are collected over the exposure, a frame shows electrons_per_s exposure_s / full_well_e
+        times the light. White of that camera is 1 / gain, in light.
+        """
+        share = self.white_e / self.full_well_e
+        return replace(self, full_well_e=self.white_e, gain=self.gain * share, electrons_per_s=None)
 
     def noise_variance(self, light: torch.Tensor, frames: int = 1, fpn_corrected: bool = True) -> torch.Tensor:
         """Return the variance of the noise at a mean light: shot, read, rounding, fixed pattern.

@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from evnlos.cameras.event_camera import Irradiance
-from evnlos.cameras.event_model import PixelSettings
+from evnlos.cameras.event_camera import EventStream
+from evnlos.cameras.event_model import Irradiance, PixelSettings
 from evnlos.cameras.frame_camera import FrameCamera
 from evnlos.cameras.pixel import EventPixel, Mode
-from evnlos.cameras.simulation import EventStream
 from evnlos.cameras.video_files import (
     AnimationSource,
     ArraySource,

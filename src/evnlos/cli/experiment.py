@@ -71,10 +71,9 @@ class ExperimentCommand:
     name: Annotated[str, tyro.conf.Positional]
     """captures (E2E against EPNP), paper (its settings), frozen, capture-count, surface, thresholds, loss,
     width, embedding, sequence (whole sequences) or objects (how many are simulated); without captures:
-    simulation (handwriting, transfer to Comic), conditions (frames against events over light, noise, exposure,
-    speed and setups), generalization (given weights on unseen hands, other things than characters, and other
-    walls, with what their confidence says), and mismatch (the demo on walls, lenses and sensors that the
-    simulator does not describe)."""
+    simulation (handwriting, transfer to Comic), conditions (frames against events over light, speed, shade and
+    more), generalization (given weights on unseen hands, other things and walls, with what their confidence
+    says), and mismatch (the demo on walls, lenses and sensors that the simulator does not describe)."""
     captures: Path | None = None
     """Folder of the capture folders."""
     weights: Path | None = None
@@ -222,14 +221,16 @@ class ExperimentCommand:
         print(text)
 
     def _conditions(self) -> None:
-        chosen = experiment.conditions(experiment.base_simulation(self.writers or 2))
+        from evnlos.plot.figures import draw_regimes
+
+        out, shown = self.out / "conditions", self.out / "regimes.png"
         with ProgressBars() as progress:
-            findings = experiment.sweep_parameters(
-                chosen, self.out / "conditions", self.workers, progress=progress, force=self.force
-            )
-        text = experiment.conditions_table(findings) + "\n"
+            found = experiment.sweep_parameters(experiment.conditions(), out, self.workers, progress=progress)
+            mapped = experiment.sweep_parameters(experiment.regimes(), out, self.workers, "", progress)
+        text = experiment.conditions_table(found) + "\n"
         write_atomically(self.out / "conditions.md", text.encode())
         print(text)
+        drawn(shown, lambda: draw_regimes(mapped, shown))
 
     def _generalization(self) -> None:
         from evnlos.plot.results import draw_confidence

@@ -16,7 +16,7 @@ from evnlos.config import config_hash, to_dict
 from evnlos.data.capture_info import CaptureInfo, FilterInfo, inside, read_capture_info
 from evnlos.data.clocks import find_offset
 from evnlos.data.fixed_pattern import FixedPattern, mapped, prepare_frames, used_pixels
-from evnlos.data.frames import read_frame_series
+from evnlos.data.frames import from_start, read_frame_series
 from evnlos.data.pool import run_tasks
 from evnlos.data.sampling import (
     Samples,
@@ -172,8 +172,7 @@ def read_capture(
     info = read_capture_info(folder, events_topic=events_topic, frames_topic=frames_topic).in_colour(colour)
     name, folder = _name_of(folder), folder.parent if folder.is_file() else folder
     info.check_cameras(folder, frames=needs_frames, events=needs_events)
-    is_alone = info.frames is None
-    series = None if is_alone else read_frame_series(folder, info, most_frame_bytes, lazy_frames)
+    series = None if info.frames is None else read_frame_series(folder, info, most_frame_bytes, lazy_frames)
     events, told = _read_events(folder, info)
     if series is None:
         frames, times_us = time_steps(folder, info, events)
@@ -184,11 +183,13 @@ def read_capture(
         times_us, in_time = _place_in_time(folder, info, events, frames, series.times_us)
         notes += told + in_time
     events, frames, told = used_pixels(info, events, frames)
-    notes += told
+    info, events, times_us, counted = from_start(folder, info, events, times_us)
+    notes += told + counted
     if info.events is not None and not len(events):
         raise DataError(f"{folder}: no event is left; check the region and the filters in capture.yaml")
     target = read_target(folder, info.target, info.camera.colour)
-    held = cast(Any, frames) if is_alone or isinstance(frames, FrameStack) else np.ascontiguousarray(frames)
+    is_held = series is None or isinstance(frames, FrameStack)
+    held = cast(Any, frames) if is_held else np.ascontiguousarray(frames)
     others = read_others(folder, info, times_us)
     return Capture(name, info, events, held, times_us, target, tuple(map(printable, notes)), others)
 
@@ -220,9 +221,8 @@ def _read_events(folder: Path, info: CaptureInfo) -> tuple[Events, list[str]]:
         notes.append("the camera gave no polarity: all events count as darker")
         events = replace(events, polarity_known=None)
     elif events.polarity_known is not None:
-        count = len(events)
+        notes.append(f"{int((~events.polarity_known).sum()):,} events without polarity left out")
         events = keep_known_polarity(events)
-        notes.append(f"{count - len(events):,} events without polarity left out")
     filters = info.filters
     if filters != FilterInfo():
         from evnlos.events import CleanOptions, clean_events

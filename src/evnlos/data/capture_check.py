@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from evnlos.errors import DataError
 from evnlos.events import find_hot_pixels
 from evnlos.events.cleaning import find_flicker
 from evnlos.machine import Progress, Step, silent
+from evnlos.types import Events
 
 Level = Literal["good", "doubtful", "bad"]
 
@@ -32,6 +34,10 @@ _DARK_DN, _BORDER = 3, 0.08
 _BLOCK = 6  # pixels: single ones tell nothing of the light
 _FEWEST_EVENTS = 2_000
 _SURELY = 1.5  # times what is usual
+_CLEARLY = 1.2  # times the agreement of frames and events
+_FAR_M = 0.5  # behind that little light of a target reaches what a camera sees of the wall
+_WEAK_FLICKER = 0.15  # of the rate: what little lamps sway
+_USUAL_EVENTS, _FEW_HOLES = 100, 0.05  # events between two frames of which none is no chance; share of them
 _MOSAIC = 0.03  # by which the diagonals of 2 x 2 pixels differ: smooth light and a pattern make far less
 
 
@@ -82,13 +88,9 @@ def _finding(what: str, good: bool, bearable: bool, found: str, cure: str) -> Fi
 def _light(capture: Capture) -> Iterator[Finding]:
     frames, peak = capture.frames, capture.peak
     clipped = float((frames >= peak).mean())
-    yield _finding(
-        "saturation",
-        clipped < 1e-3,
-        clipped < 0.02,
-        f"{100 * clipped:.2f} % of the frames' pixels are clipped",
-        "shorten the exposure, close the aperture, or dim the ambient light",
-    )
+    found = f"{100 * clipped:.2f} % of the frames' pixels are clipped"
+    cure = "shorten the exposure, close the aperture, or dim the ambient light"
+    yield _finding("saturation", clipped < 1e-3, clipped < 0.02, found, cure)
     share = float(np.median(frames) / peak)
     least = _DARK_DN * (257 if capture.info.camera.mosaic and peak > 255 else 1)  # 8 bits became 16
     dark, at = float((frames <= least).mean()), f"the middle pixel is at {100 * share:.0f} % of the range"
@@ -119,21 +121,13 @@ def _movement(capture: Capture) -> Iterator[Finding]:
     moved = np.sqrt(np.maximum(variance - noise**2 * (1 + 3 * sure), 0.0))
     largest = float(np.quantile(moved, 0.95))
     ratio = largest / max(noise, 1e-6)
-    yield _finding(
-        "movement",
-        ratio > 1.0,
-        ratio > 0.25,
-        f"the wall's light changes by {ratio:.2f} times the frames' noise (1 is safe)",
-        "check that the target moved and is lit, dim the ambient light, roughen less",
-    )
+    found = f"the wall's light changes by {ratio:.2f} times the frames' noise (1 is safe)"
+    cure = "check that the target moved and is lit, dim the ambient light, roughen less"
+    yield _finding("movement", ratio > 1.0, ratio > 0.25, found, cure)
     contrast = largest / max(float(np.median(frames)), 1.0)
-    yield _finding(
-        "wall contrast",
-        contrast > 0.05,
-        contrast > 0.01,
-        f"the light that moves is {contrast:.2f} times the wall's own (0.05 is safe)",
-        "dim the ambient light, light the target more, take a shinier wall",
-    )
+    found = f"the light that moves is {contrast:.2f} times the wall's own (0.05 is safe)"
+    cure = "dim the ambient light, light the target more, take a shinier wall"
+    yield _finding("wall contrast", contrast > 0.05, contrast > 0.01, found, cure)
     if ratio <= 0.25:
         return
     v, u = max(1, round(_BORDER * height)), max(1, round(_BORDER * width))
@@ -142,13 +136,9 @@ def _movement(capture: Capture) -> Iterator[Finding]:
     inner = moved[v:-v, u:-u]
     edge = np.concatenate([moved[:v].ravel(), moved[-v:].ravel(), moved[:, :u].ravel(), moved[:, -u:].ravel()])
     outside = float(edge.mean() / max(inner.mean(), 1e-6))
-    yield _finding(
-        "region",
-        outside < 0.7,
-        outside < 1.2,
-        f"the border changes {outside:.2f} times as much as the inside (below 0.7 is safe)",
-        "turn the camera to where the light moves, or take a wider lens or region",
-    )
+    found = f"the border changes {outside:.2f} times as much as the inside (below 0.7 is safe)"
+    cure = "turn the camera to where the light moves, or take a wider lens or region"
+    yield _finding("region", outside < 0.7, outside < 1.2, found, cure)
 
 
 def _motion(capture: Capture) -> Iterator[Finding]:
@@ -161,6 +151,14 @@ def _motion(capture: Capture) -> Iterator[Finding]:
     if motion is None or len(capture.frames) < 5:
         return
     stated = motion.position_m(capture.frame_times_us * 1e-6)
+    away_m = float(np.hypot(*stated.mean(axis=0)))
+    if away_m > _FAR_M:
+        found = f"the stated path's middle is {away_m:.2f} m from that of the travel ({_FAR_M:g} m is safe)"
+        assert capture.info.motion is not None
+        late_us = capture.frame_times_us[0] - capture.info.motion.start_us
+        cure = f"mend start_m or start_us of motion: the first frame is {late_us} us after start_us"
+        yield Finding("motion", "bad", found, cure)
+        return
     z, p = ((one - one.mean(axis=0)) @ [1, 1j] for one in (light_path(capture.frames), stated))
     k = np.vdot(p, z) / max(np.vdot(p, p).real, 1e-12)
     explained = 1 - np.vdot(z - k * p, z - k * p).real / max(np.vdot(z, z).real, 1e-12)
@@ -180,56 +178,44 @@ def _events(capture: Capture) -> Iterator[Finding]:
     span_s = max(float(events.t_us[-1] - events.t_us[0]) * 1e-6, 1e-6)
     pixels = events.width * events.height
     rate = len(events) / span_s / pixels
-    yield _finding(
-        "event rate",
-        0.05 <= rate <= 50,
-        0.01 <= rate <= 200,
-        f"{rate:.2f} events per pixel per second (0.05 to 50 is safe)",
-        "lower the thresholds, dim the ambient light, light the target more, or move it faster"
-        if rate < 0.05
-        else "raise the thresholds, or look for flicker and a camera that shakes",
-    )
+    found = f"{rate:.2f} events per pixel per second (0.05 to 50 is safe)"
+    cure = "raise the thresholds, or look for flicker and a camera that shakes"
+    if rate < 0.05:
+        cure = "lower the thresholds, dim the ambient light, light the target more, or move it faster"
+    yield _finding("event rate", 0.05 <= rate <= 50, 0.01 <= rate <= 200, found, cure)
     on = float(events.p.mean())
-    yield _finding(
-        "polarity balance",
-        0.25 < on < 0.75,
-        0.1 < on < 0.9,
-        f"{100 * on:.0f} % of the events are ON (25 to 75 % is safe)",
-        "set the thresholds of both polarities alike; a leak makes ON events alone",
-    )
+    found = f"{100 * on:.0f} % of the events are ON (25 to 75 % is safe)"
+    cure = "set the thresholds of both polarities alike; a leak makes ON events alone"
+    yield _finding("polarity balance", 0.25 < on < 0.75, 0.1 < on < 0.9, found, cure)
     counts = np.bincount(events.y.astype(np.int64) * events.width + events.x, minlength=pixels)
     silent = float((counts == 0).mean())
-    yield _finding(
-        "silent pixels",
-        silent < 0.5,
-        silent < 0.9,
-        f"{100 * silent:.0f} % of the pixels sent nothing (below 50 % is safe)",
-        "lower the thresholds; a linear map of so few events shows little",
-    )
+    found = f"{100 * silent:.0f} % of the pixels sent nothing (below 50 % is safe)"
+    cure = "lower the thresholds; a linear map of so few events shows little"
+    yield _finding("silent pixels", silent < 0.5, silent < 0.9, found, cure)
     hot = find_hot_pixels(events)
     share = float(counts.reshape(events.shape)[hot].sum() / len(events))
-    yield _finding(
-        "hot pixels",
-        share < 0.02,
-        share < 0.2,
-        f"{int(hot.sum())} pixels send {100 * share:.1f} % of the events (2 % is safe)",
-        "set filters: {hot_pixel_factor: 10} in capture.yaml",
-    )
+    found = f"{int(hot.sum())} pixels send {100 * share:.1f} % of the events (2 % is safe)"
+    cure = "set filters: {hot_pixel_factor: 10} in capture.yaml"
+    yield _finding("hot pixels", share < 0.02, share < 0.2, found, cure)
 
 
 def _flicker(capture: Capture) -> Iterator[Finding]:
     """Look for a line near twice the mains' frequency in the rate of events."""
-    line = find_flicker(capture.events) if len(capture.events) >= _FEWEST_EVENTS else None
+    events = capture.events
+    line = find_flicker(events) if len(events) >= _FEWEST_EVENTS else None
     if line is None:
-        text = f"{len(capture.events)} events are too few or too short to tell"
+        text = f"{len(events)} events are too few or too short to tell"
         yield Finding("flicker", "doubtful", text, "record longer")
         return
+    phase = 2 * np.pi * line.frequency_hz * 1e-6 * (events.t_us - events.t_us[0])
+    both = [phase[events.p == kind] for kind in (False, True)]
+    depth = max(2 * abs(np.exp(1j * one).mean()) for one in both if len(one))
     yield _finding(
         "flicker",
-        not line.is_there,
-        line.strength < 10 * line.limit,
+        not line.is_there or depth < _WEAK_FLICKER,
+        line.strength < 10 * line.limit or depth < 2 * _WEAK_FLICKER,
         f"the rate's line at {line.frequency_hz:.1f} Hz is {line.strength:.0f} times its surroundings "
-        f"({line.limit:.0f} is safe)",
+        f"({line.limit:.0f} is safe) and sways it by {100 * depth:.0f} % ({100 * _WEAK_FLICKER:.0f} % is safe)",
         "light with direct current or daylight: mains lamps flicker; filters: {flicker_hz: "
         f"{line.frequency_hz:.2f}}} in capture.yaml takes their events away",
     )
@@ -239,25 +225,27 @@ def _clock(capture: Capture) -> Iterator[Finding]:
     frames, events = capture.frame_times_us, capture.events.t_us
     both = min(frames[-1], events[-1]) - max(frames[0], events[0])
     share = float(max(both, 0) / max(frames[-1] - frames[0], 1))
-    yield _finding(
-        "clock",
-        share > 0.95,
-        share > 0.5,
-        f"events cover {100 * share:.0f} % of the frames' time (95 % is safe)",
-        "check alignment in capture.yaml: offset_us, auto, or a trigger_channel",
-    )
+    found = f"events cover {100 * share:.0f} % of the frames' time (95 % is safe)"
+    cure = "check alignment in capture.yaml: offset_us, auto, or a trigger_channel"
+    yield _finding("clock", share > 0.95, share > 0.5, found, cure)
+    counts = np.diff(np.searchsorted(events, frames))[(frames[:-1] >= events[0]) & (frames[1:] <= events[-1])]
+    usual, holes = float(np.median(counts)) if len(counts) else 0.0, int((counts == 0).sum())
+    if holes and usual >= _USUAL_EVENTS:
+        found = f"no event between {holes} pairs of frames, where {usual:.0f} are usual"
+        cure = "packets were lost: record again, with a quicker disk or port, or fewer events"
+        yield _finding("holes", False, holes < _FEW_HOLES * len(counts), found, cure)
 
 
 def _frame_times(capture: Capture) -> Iterator[Finding]:
     steps = np.diff(capture.frame_times_us)
     uneven = float(np.abs(steps - np.median(steps)).max() / max(float(np.median(steps)), 1.0))
-    yield _finding(
-        "frame times",
-        uneven < 0.2,
-        True,
-        f"the most uneven step is off by {100 * uneven:.0f} % (20 % is safe)",
-        "frames were dropped or the rate changed; a position is as long as its step",
-    )
+    found = f"the most uneven step is off by {100 * uneven:.0f} % (20 % is safe)"
+    cure = "frames were dropped or the rate changed; a position is as long as its step"
+    yield _finding("frame times", uneven < 0.2, True, found, cure)
+    if again := sum(bool((one == before).all()) for before, one in itertools.pairwise(capture.frames)):
+        found = f"{again} of {len(capture.frames)} frames are the one before again"
+        cure = "leave repeated frames out, or record at the rate that the camera really has"
+        yield Finding("repeated frames", "bad", found, cure)
 
 
 def _offset(capture: Capture) -> Iterator[Finding]:
@@ -265,24 +253,29 @@ def _offset(capture: Capture) -> Iterator[Finding]:
     lag = find_lag(capture.events, capture.frames, capture.frame_times_us)
     if lag is None:
         return
+    if not lag.told or abs(lag.lag_us) > lag.unsure_us:
+        least = max(_CLEARLY * lag.agreement, lag.backwards, LEAST_AGREEMENT)
+        for other, cure in _other_pixels(capture.events):
+            seen = find_lag(other, capture.frames, capture.frame_times_us)
+            if seen is not None and seen.agreement > least:
+                found = f"events would fit better so: correlation {seen.agreement:.2f}, not {lag.agreement:.2f}"
+                yield Finding("pixels", "bad", found, cure)
+                return
     if lag.reversed:
-        yield Finding(
-            "clock offset",
-            "bad",
-            f"the events fit the frames in reversed order: correlation {lag.backwards:.2f}, forwards "
-            f"{lag.agreement:.2f}",
-            "put the frames' files into the order in which they were taken",
-        )
+        found = f"the events fit the frames in reversed order: correlation {lag.backwards:.2f}, forwards "
+        cure = "put the frames' files into the order in which they were taken"
+        yield Finding("clock offset", "bad", f"{found}{lag.agreement:.2f}", cure)
         return
+    blink = "record a blink of the light, or a trigger_channel"
     if not lag.told:
-        yield Finding(
-            "clock offset",
-            "doubtful",
+        found = (
             f"frames and events share too little to tell: correlation {lag.agreement:.2f} "
-            f"({LEAST_AGREEMENT:g} is needed), frames reversed {lag.backwards:.2f}",
-            "record a blink of the light, or a trigger_channel",
+            f"({LEAST_AGREEMENT:g} is needed), frames reversed {lag.backwards:.2f}"
         )
+        yield Finding("clock offset", "doubtful", found, blink)
         return
+    if capture.info.dark is None:
+        blink = f"a black level of the frames makes some of it: give a dark frame (dark); {blink}"
     way, told = "late" if lag.lag_us < 0 else "early", abs(lag.lag_us) > lag.unsure_us
     finding = _finding(
         "clock offset",
@@ -291,11 +284,17 @@ def _offset(capture: Capture) -> Iterator[Finding]:
         f"the frames' times are {abs(lag.lag_us) * 1e-6:.2f} s too {way} for the events (up to "
         f"{lag.limit_us * 1e-6:.2f} s is usual, up to {lag.unsure_us * 1e-6:.2f} s cannot be told from what "
         "pixels do by themselves)",
-        _offset_cure(capture.info, lag.lag_us)
-        if told
-        else "to be sure, record a blink of the light, or a trigger_channel",
+        _offset_cure(capture.info, lag.lag_us) if told else f"to be sure, {blink}",
     )
     yield replace(finding, lag_us=lag.lag_us)
+
+
+def _other_pixels(events: Events) -> Iterator[tuple[Events, str]]:
+    """Yield the events as they were with other polarities or pixels, and how to mend that."""
+    flip, (x, y) = "of events or frames: both see one wall", (events.x, events.y)
+    yield replace(events, p=~events.p), "exchange ON and OFF of the events' file"
+    yield replace(events, x=(events.width - 1 - x).astype(x.dtype)), f"exchange left and right {flip}"
+    yield replace(events, y=(events.height - 1 - y).astype(y.dtype)), f"exchange top and bottom {flip}"
 
 
 def compare_clocks(

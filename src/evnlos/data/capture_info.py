@@ -299,9 +299,13 @@ def read_capture_info(
         return _info_of_recording(folder, events_topic, frames_topic)
     if not (path := folder / "capture.yaml").is_file():
         inside = sorted(one.parent.name for one in folder.glob("*/capture.yaml"))
-        held = f" (it holds {len(inside)} captures, such as {inside[0]})" if inside else ""
+        held = f" (it holds {len(inside)}: {folder}/*)" if inside else ""
         raise ConfigError(f"{folder} holds no capture.yaml; give the folder of one capture{held}")
-    return from_dict(CaptureInfo, read_yaml(path), source=str(path))
+    values = read_yaml(path)
+    for one in (values.get("target"), *(values.get("others") or ())):  # digits are characters, too
+        if isinstance(one, dict) and type(one.get("name")) is int:
+            one["name"] = str(one["name"])
+    return from_dict(CaptureInfo, values, source=str(path))
 
 
 def _info_of_recording(path: Path, events_topic: str | None, frames_topic: str | None) -> CaptureInfo:

@@ -308,7 +308,7 @@ def find_lag(events: Events, frames: NDArray, times_us: NDArray[np.int64]) -> Cl
     top, pairs, curves = max(courses, key=lambda course: course[0])
     best = int(np.argmax([one.max() for one in curves]))
     backwards = curve(expected_counts(level[::-1], *pairs[best]))
-    near = [_middle(lags, one) for one in curves if one.max() >= _NEARLY * top]
+    near = [_middle(lags, one) for one in curves if one.max() >= min(_NEARLY * top, top)]
     lag, width = np.mean(near, axis=0)
     left_open = 0.5 * float(np.ptp([middle for middle, _ in near]))
     between = float(np.median(np.diff(times_us)))

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -22,9 +23,10 @@ from evnlos.cameras.video import open_video
 from evnlos.data.capture_info import CaptureInfo, inside
 from evnlos.errors import DataError
 from evnlos.events import FrameReader, FrameStack, gather_frames, iter_frames
-from evnlos.types import COLOURS, Colour, Mosaic
+from evnlos.types import COLOURS, Colour, Events, Mosaic
 from evnlos.untrusted import check_memory, memory_left, open_image, open_regular
 
+_FURTHEST_M, _LONG_AGO_US = 10.0, 3_600_000_000
 _RECORDINGS = (".aedat4", ".aedat", ".bag", ".db3", ".mcap", ".bin")
 
 
@@ -113,10 +115,45 @@ def read_frame_series(
     _check_times(path, series.times_us)
     if size is not None and series.images.shape[1:] != size:
         high, wide = series.images.shape[1:]
-        raise DataError(
-            f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}: state a registration"
-        )
+        cure = "state a registration" if size != (wide, high) else "exchange width and height of camera"
+        raise DataError(f"{path} is {wide} x {high} pixels; the camera has {size[1]} x {size[0]}: {cure}")
     return series
+
+
+def from_start(
+    folder: Path, info: CaptureInfo, events: Events, times_us: NDArray[np.int64]
+) -> tuple[CaptureInfo, Events, NDArray[np.int64], list[str]]:
+    """Return a capture on a clock of its own where the files' began an hour or more before, in 1970, say.
+
+    Times and stated motions move by whole seconds, and a note says by how many.
+
+    Args:
+        folder: Its folder, for messages.
+        info: What is known about it.
+        events: Its events, or none.
+        times_us: Times of its frames on the events' clock, [N], microseconds.
+
+    Raises:
+        DataError: By a stated motion the target is far away while frames are taken: a wrong clock, or unit.
+    """
+    for motion in (one.motion for one in (info, *info.others) if one.motion is not None and len(times_us)):
+        since_us = [int(times_us[k]) - motion.start_us for k in (0, -1)]
+        if (away_m := abs(motion.speed_m_s) * max(map(abs, since_us)) * 1e-6) > _FURTHEST_M:
+            raise DataError(
+                f"{folder}: by its motion the target is {away_m:.3g} m from start_m while frames are taken (at "
+                f"most {_FURTHEST_M:g} m): mend speed_m_s, or start_us: the first frame is at {times_us[0]} us"
+            )
+    first_us = min(int(one[0]) for one in (events.t_us, times_us) if len(one)) // 1_000_000 * 1_000_000
+    if first_us < _LONG_AGO_US:
+        return info, events, times_us, []
+
+    def moved(one: Any) -> Any:
+        motion = one.motion
+        return replace(one, motion=motion and replace(motion, start_us=motion.start_us - first_us))
+
+    info = replace(moved(info), others=tuple(map(moved, info.others)))
+    note = f"times count from {first_us // 1_000_000} s of the files' clock"
+    return info, replace(events, t_us=events.t_us - first_us), times_us - first_us, [note]
 
 
 def _rate(path: Path, info: CaptureInfo) -> float:

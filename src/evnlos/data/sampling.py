@@ -375,6 +375,8 @@ def read_target(folder: Path, info: TargetInfo | None, colour: Colour | None) ->
     if info is None or info.mask is None:
         return None
     mask = read_image(inside(folder, info.mask), colour=colour)
+    if colour is None and not mask.any():
+        raise DataError(f"{folder / info.mask} is black all over; what is white shines")
     return Target(info.name, mask.astype(np.float32) / np.float32(np.iinfo(mask.dtype).max), info.size_m)
 
 

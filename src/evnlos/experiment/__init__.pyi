@@ -2,11 +2,9 @@
 
 from .conditions import Condition as Condition
 from .conditions import Finding as Finding
-from .conditions import Simulated as Simulated
-from .conditions import base_simulation as base_simulation
 from .conditions import conditions as conditions
 from .conditions import conditions_table as conditions_table
-from .conditions import run_simulated as run_simulated
+from .conditions import regimes as regimes
 from .conditions import sweep_parameters as sweep_parameters
 from .presets import STUDIES as STUDIES
 from .presets import GeneralizationResult as GeneralizationResult
@@ -16,6 +14,8 @@ from .run import captures_of as captures_of
 from .run import folds_of as folds_of
 from .run import run_studies as run_studies
 from .run import run_study as run_study
+from .simulated import Simulated as Simulated
+from .simulated import run_simulated as run_simulated
 from .study import Arm as Arm
 from .study import Place as Place
 from .study import Record as Record

@@ -1,367 +1,399 @@
-"""Experiments on simulations alone.
+"""Where events win: frames and events of the same moving targets, over light, speed, shade, ripple and more.
 
-- Where events win: frames and events of the same sequences, over light, noise, exposure and speed.
-- The paper's experiment without captures: learn from handwriting, test on unseen hands, go over to Comic.
+The best linear estimate says what each is worth, and simulated sequences what an estimate makes of it. Events
+are those of a true logarithm over a dark level; frames collect electrons over the best exposure, with the best
+gain.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import asdict, dataclass, field, replace
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 
-from evnlos.analysis import available_lpips, evaluate
+from evnlos.analysis import bounds
 from evnlos.analysis.scores import paired_difference
-from evnlos.config import config_hash, to_dict
-from evnlos.data import STANDARD_MODALITIES, Simulation, as_modality, simulate, simulate_object
-from evnlos.data.pool import processes, run_in_order
-from evnlos.data.simulate import check_sequences, object_bytes
-from evnlos.data.simulations import paper
-from evnlos.experiment.run import Run, train_one
-from evnlos.experiment.study import Record, is_scored, keep_scores, records_there
+from evnlos.cameras import EventCamera, EventPixel, FlickeringWall, FrameCamera
+from evnlos.config import from_dict
+from evnlos.data.pool import run_in_order
 from evnlos.files import write_atomically
+from evnlos.inverse import (
+    FrameTerm,
+    PatternPrior,
+    SequenceLight,
+    estimate_sequence,
+    handwritten_prior,
+    record_of,
+    sequence_light,
+)
+from evnlos.inverse.prior import TEST_CHARACTERS
 from evnlos.machine import Progress, Step, silent
-from evnlos.metrics import psnr
-from evnlos.models import fit_linear, load_weights
-from evnlos.scene import DIGITS, TRAIN_WRITERS, UPPER_CASE, FontGlyphs, HandwritingGlyphs
+from evnlos.optics import Irradiance
+from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Scene, Target
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.setups.load import FAR_M
-from evnlos.training import Training
+from evnlos.types import Plane, derive_seed
 
 FULL = 0.85
-"""White levels of the brightest pixel: as if the exposure had been set so that nothing is clipped."""
+"""White levels of the brightest pixel of the base at 10 ms: nothing is clipped."""
 
 EVENT_BYTES = 4
 """Bytes of an event in a plain stream of 32-bit words."""
 
-FRAME_RATE_HZ = 100.0
-"""Frames per second of the paper's frame camera: what its data volume is counted with."""
+EVIDENCE = ("frames", "events", "both")
+"""What a target is estimated from."""
+
+_PIXEL = EventPixel(
+    threshold_on=0.2,
+    threshold_off=0.2,
+    threshold_sigma=0.02,
+    cutoff_hz=300.0,
+    leak_rate_hz=0.1,
+    shot_noise_rate_hz=0.1,
+    logarithm="true",
+    dark_dn=0.2,
+    cutoff_floor_dn=0.2,
+)
+_CAMERA = FrameCamera(electrons_per_s=1.5e6)  # white fills the well in 10 ms
+_SENSOR = SensorSize(50, 80)
+_TRAVEL_M, _FASTEST_HZ, _RIPPLE_HZ = 0.16, 100.0, 100.0
+_PLACE_M, _SPEED = 0.01, 0.1  # what an unknown motion may be off by: place, and share of the speed
+_CELLS = Plane(32, 32, 0.0025)
+_GAINS = tuple(2.0**k for k in range(8))
+_GAP = 0.05  # between the instants at which silences are looked at, share of the sequence
+_CROSSING_NOISE = 0.04  # error of a crossing beside the event model's own, log units
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One setting of the world, changed from the base.
+    """One setting of the world; what is not stated is the base's: rough metal, 0.30 m, bright light, 8 s."""
 
-    Args:
-        factor: What was changed.
-        value: Its value.
-        unit: Its unit.
-        simulation: The whole simulation.
-    """
+    name: str
+    """Its name in tables."""
+    light: float = 1.0
+    """Share of the base's light."""
+    ambient: float = 0.1
+    """Ambient light over the largest signal."""
+    speed_m_s: float = 0.02
+    """Speed of the target over its way of 0.16 m, metres per second."""
+    frames: int = 40
+    """Most frames of the sequence; a camera takes at most 100 per second."""
+    bit_depth: int = 8
+    """Bits of the frame camera."""
+    shade: float = 1.0
+    """How much darker the wall is lit where it is darkest, in smooth patches."""
+    ripple: float = 0.0
+    """Amplitude of the lamps' ripple at 100 Hz, share of all light."""
+    is_motion_known: bool = True
+    """Whether place and speed are known, or within 10 mm and a tenth."""
+    roughness: float = 0.05
+    """Roughness of the metal."""
+    distance_m: float = 0.3
+    """Distance from target to wall, metres."""
 
-    factor: str
-    value: float
-    unit: str
-    simulation: Simulation
+    @property
+    def duration_s(self) -> float:
+        """Length of the sequence, seconds."""
+        return _TRAVEL_M / self.speed_m_s
+
+    @property
+    def asked(self) -> bounds.SequenceAnalysisSettings:
+        """The motion and the numbers of positions that are asked for."""
+        most = max(1, min(self.frames, int(_FASTEST_HZ * self.duration_s)))
+        counts = (*(n for n in (1, 2, 5, 10, 20, 40) if n < most), most)
+        return bounds.SequenceAnalysisSettings(_TRAVEL_M, self.speed_m_s, most, counts)
+
+    @property
+    def setup(self) -> RadiometricSetup:
+        """The wall and its cameras; the exposure of the frames is not chosen yet."""
+        gain = self.light * FULL / (1 + self.ambient)
+        return RadiometricSetup(
+            gain=gain,
+            ambient=gain * self.ambient,
+            roughness=self.roughness,
+            distance_m=self.distance_m,
+            sensor=_SENSOR,
+            frame_camera=replace(_CAMERA, bit_depth=self.bit_depth),
+            pixel=_PIXEL,
+        )
+
+    def shading(self) -> NDArray[np.float64]:
+        """Return what share of its light each part of the wall gets, [H, W], 1 / shade to 1."""
+        down, across = (np.arange(n) / n for n in (_SENSOR.height, _SENSOR.width))
+        waves = np.sin(4 * np.pi * down)[:, None] * np.sin(6 * np.pi * across)
+        return self.shade ** (-0.5 * (1 + waves))
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What frames and events showed under one condition.
+    """What frames and events are worth under one condition.
 
     Args:
-        factor: What was changed.
-        value: Its value.
-        unit: Its unit.
-        psnr_db: str -> mean PSNR of the linear estimate on the test writer, dB.
-        mean_db: PSNR of the mean image, dB.
-        gain_db: PSNR of events minus that of frames: mean, low and high end of the 95 % interval over objects.
-        events_per_pixel: Events per pixel and sequence.
-        event_bytes_s: Data of the events, bytes per second.
-        frame_bytes_s: Data of 8-bit frames at `FRAME_RATE_HZ`, bytes per second.
+        condition: The condition.
+        exposure_s: The best exposure of the frames, at most the time between two.
+        gain: Their best gain.
+        counts: Numbers of positions.
+        prior_db: PSNR of the prior's mean, dB.
+        expected_db: "frames", "events", "both" -> expected PSNR for each number of positions, dB.
+        measured_db: The same -> PSNR of simulated whole sequences, one a character, dB; empty without motion.
+        events_per_pixel: Events per pixel and sequence, noise among them.
+        event_bytes: The events as 32-bit words, and packed (zlib), bytes.
+        frame_bytes: The frames as they are, and packed, bytes.
     """
 
-    factor: str
-    value: float
-    unit: str
-    psnr_db: dict[str, float]
-    mean_db: float
-    gain_db: tuple[float, float, float]
+    condition: Condition
+    exposure_s: float
+    gain: float
+    counts: tuple[int, ...]
+    prior_db: float
+    expected_db: dict[str, tuple[float, ...]]
+    measured_db: dict[str, tuple[float, ...]]
     events_per_pixel: float
-    event_bytes_s: float
-    frame_bytes_s: float
+    event_bytes: tuple[int, int]
+    frame_bytes: tuple[int, int]
 
 
-def base_simulation(writers: int = 2) -> Simulation:
-    """Return the world that the conditions are changed from: rough metal, 0.30 m, and the paper's pixel.
-
-    Args:
-        writers: Writers to learn from.
-    """
-    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"
-    return _lit(
-        Simulation(
-            glyphs=HandwritingGlyphs(characters=letters, writers=writers),
-            setup=RadiometricSetup(cell_m=0.005),
-            validation=0.0,
+def conditions() -> list[Condition]:
+    """Return all conditions, the base first."""
+    return [
+        Condition("base"),
+        *(Condition(f"light {share:g}", light=share) for share in (0.1, 0.01, 0.001)),
+        *(Condition(f"speed {speed:g} m/s", speed_m_s=speed) for speed in (0.08, 0.32, 1.28)),
+        *(
+            Condition(f"light {share:g}, {speed:g} m/s", light=share, speed_m_s=speed)
+            for share, speed in ((0.1, 1.28), (0.01, 0.32), (0.001, 0.08))
         ),
-        0.1,
-    )
+        *(Condition(f"shade 1:{shade:g}", shade=shade) for shade in (30.0, 1000.0)),
+        Condition("shade 1:1000, 12 bits", shade=1000.0, bit_depth=12),
+        *(Condition(f"ripple {100 * ripple:g} %", ripple=ripple) for ripple in (0.04, 0.2)),
+        *(Condition(f"{count} frame{'s' * (count > 1)}", frames=count) for count in (10, 3, 1)),
+        Condition("motion unknown", is_motion_known=False),
+        Condition("motion unknown, 10 frames", frames=10, is_motion_known=False),
+        *(Condition(f"ambient {ratio:g} of the signal", ambient=ratio) for ratio in (0.5, 2.0, 8.0)),
+        *(Condition(f"roughness {alpha:g}", roughness=alpha) for alpha in (0.02, 0.2)),
+        Condition(f"distance {FAR_M:g} m", distance_m=FAR_M),
+    ]
 
 
-def conditions(base: Simulation) -> list[Condition]:
-    """Return all conditions: the base, then one factor at a time.
-
-    - ambient: ambient light over the largest signal; the exposure is set so that nothing is clipped.
-    - light: share of the base's light that is left, with the same exposure.
-    - read noise of the frame camera, electrons.
-    - exposure of the frames, seconds; their gain is set so that the level stays.
-    - speed of the target, metres per second, over the same way; the surface's time constant follows it.
-    - difficulty of the setup: roughness of the metal, a matte wall, distance from target to wall, metres; the
-      brightest pixel stays as bright.
-    """
-    found = [Condition("base", 1.0, "", base)]
-    found += [Condition("ambient", r, "of the signal", _lit(base, r)) for r in (0.0, 0.5, 2.0, 8.0)]
-    for share in (0.3, 0.1, 0.03):
-        light = replace(base.setup, gain=base.setup.gain * share, ambient=base.setup.ambient * share)
-        found.append(Condition("light", share, "of the base", replace(base, setup=light)))
-    for noise in (30.0, 100.0, 300.0):
-        camera = replace(base.frame_camera, read_noise_e=noise)
-        found.append(
-            Condition(
-                "read noise", noise, "electrons", replace(base, setup=replace(base.setup, frame_camera=camera))
-            )
-        )
-    for exposure in (0.03, 0.1, 0.3):
-        camera = replace(base.frame_camera, exposure_s=exposure)
-        found.append(
-            Condition("exposure", exposure, "s", replace(base, setup=replace(base.setup, frame_camera=camera)))
-        )
-    length = base.motion.speed_m_s * base.duration_s
-    for speed in (0.005, 0.08, 0.32):
-        # The time constant follows the time in which the target moves by a stroke.
-        tau_s = base.sampling.tau_s * base.motion.speed_m_s / speed
-        moved = replace(
-            base,
-            motion=replace(base.motion, speed_m_s=speed),
-            duration_s=length / speed,
-            sampling=replace(base.sampling, tau_s=tau_s),
-        )
-        found.append(Condition("speed", speed, "m/s", moved))
-    setup: Any = base.setup  # a radiometric one, see `base_simulation`
-    for roughness in (0.02, 0.1, 0.2):
-        wall = replace(setup, roughness=roughness)
-        found.append(Condition("roughness", roughness, "of the wall", replace(base, setup=wall)))
-    matte = replace(setup, wall_material="lambert")
-    found.append(Condition("albedo", matte.albedo, "of a matte wall", replace(base, setup=matte)))
-    far = replace(setup, distance_m=FAR_M)
-    found.append(Condition("distance", FAR_M, "m", replace(base, setup=far)))
-    return found
+def regimes() -> list[Condition]:
+    """Return the conditions of the map of light against speed."""
+    lights, speeds = (1.0, 0.1, 0.03, 0.01, 0.003, 0.001), (0.02, 0.08, 0.32, 1.28)
+    return [Condition("regime", light=share, speed_m_s=speed) for speed in speeds for share in lights]
 
 
 def sweep_parameters(
-    chosen: list[Condition],
+    chosen: Sequence[Condition],
     out: Path,
     workers: int = 0,
-    rank: int = 192,
+    characters: str = TEST_CHARACTERS,
     progress: Progress = silent,
-    force: bool = False,
 ) -> list[Finding]:
     """Measure each condition and return the findings; what is done is read back.
-
-    All modalities get the same estimator, the linear one that is best for each, fitted anew to each condition:
-    a network would add its own luck to every difference.
 
     Args:
         chosen: The conditions.
         out: Folder for one JSON file a condition.
         workers: Processes; 0 is one for each core.
-        rank: Components of the linear estimate.
+        characters: Targets of the simulated sequences, in a hand that the prior does not know; none = bounds
+            alone.
         progress: Called when the work begins and of a condition and when it is done.
-        force: Whether to begin although the machine's memory will hardly do.
     """
-    processes(workers, 1)
     out.mkdir(parents=True, exist_ok=True)
-    findings = list[Finding]()
-    for k, condition in enumerate(chosen):
-        path = out / f"{config_hash(condition.simulation)}.json"
-        if path.is_file():
-            known = json.loads(path.read_text())
-            finding = Finding(**known | {"gain_db": tuple(known["gain_db"])})
-        else:
-            finding = measure(condition, workers, rank, force)
-            write_atomically(path, json.dumps(asdict(finding), indent=1).encode())
-        findings.append(finding)
-        what = f"{condition.factor} {condition.value:g} {condition.unit}".strip()
-        progress(Step(f"conditions ({what})", k + 1, len(chosen), "conditions", finding))
-    return findings
+    keys = [json.dumps([asdict(one), characters]).encode() for one in chosen]
+    paths = [out / f"{hashlib.sha256(key).hexdigest()[:16]}.json" for key in keys]
+    todo = [k for k, path in enumerate(paths) if not path.is_file()]
+    progress(Step("conditions", len(chosen) - len(todo), len(chosen), "conditions"))
+    made = run_in_order(partial(measure, characters=characters), [chosen[k] for k in todo], workers)
+    for done, (k, finding) in enumerate(zip(todo, made, strict=True), 1):
+        write_atomically(paths[k], json.dumps(asdict(finding), indent=1).encode())
+        at = len(chosen) - len(todo) + done
+        progress(Step(f"conditions ({chosen[k].name})", at, len(chosen), "conditions", finding))
+    return [from_dict(Finding, json.loads(path.read_text()), source=str(path)) for path in paths]
 
 
-def measure(condition: Condition, workers: int = 0, rank: int = 192, force: bool = False) -> Finding:
-    """Simulate sequences, fit the linear estimate to some writers, and score it on one that it has not seen.
+def measure(condition: Condition, characters: str = TEST_CHARACTERS) -> Finding:
+    """Return the bounds under a condition, and what simulated sequences give.
+
+    The best linear estimate (`evnlos.analysis.bounds`) sets the exposure and the gain of the frames: those with
+    which a few of them tell most. An unknown place (10 mm) and speed (a tenth) are two more unknowns.
 
     Args:
-        condition: The world.
-        workers: Processes; 0 is one for each core.
-        rank: Components of the linear estimate.
-        force: Whether to begin although the machine's memory will hardly do.
+        condition: The condition.
+        characters: As of `sweep_parameters`.
     """
-    config = condition.simulation
-    assert isinstance(config.glyphs, HandwritingGlyphs)
-    if not force:
-        check_sequences(object_bytes(config), processes(workers, len(config.glyphs.objects())))
-    unseen = replace(config, glyphs=replace(config.glyphs, writers=1, first_writer=TRAIN_WRITERS))
-    learned = list(run_in_order(_sequence, [(config, name) for name in config.glyphs.objects()], workers))
-    tested = list(run_in_order(_sequence, [(unseen, name) for name in unseen.glyphs.objects()], workers))
-    rows = config.sampling.scored
-    truth = torch.cat([p.truth for p in tested])[:, rows]
-    names = np.concatenate([[p.name] * len(p.truth) for p in tested])
-    scores: dict[str, np.ndarray] = {}
-    for modality in map(as_modality, STANDARD_MODALITIES):
-        seen, known = ([modality.inputs(p.frame, p.surface) for p in part] for part in (learned, tested))
-        owners = np.concatenate([[p.name] * len(p.truth) for p in learned])
-        truths = torch.cat([p.truth for p in learned])
-        estimate = fit_linear(torch.cat(seen), truths, owners, rank, modality=modality)
-        scores[modality.name] = psnr(estimate(torch.cat(known))[:, rows], truth).numpy()
-    blank = torch.cat([p.truth for p in learned]).mean(dim=0)[rows].expand_as(truth)
-    gain = paired_difference(scores["event"], scores["frame"], names)
-    pixels = config.sensor.height * config.sensor.width
-    events = float(np.mean([p.events for p in tested]))
+    setup, asked = condition.setup, condition.asked
+    prior = handwritten_prior(_CELLS)
+    span = (0.0, asked.duration_s)
+    light = sequence_light(setup, prior, asked.motion.position_m, span, setup.shape, fineness=2.0)
+    shade = condition.shading().ravel()
+    light = replace(light, left=light.left * shade[:, None], still=light.still * shade[:, None])
+    glyphs = HandwritingGlyphs(characters=TEST_CHARACTERS, writers=1, first_writer=TRAIN_WRITERS)
+    targets = {name[-1]: glyphs.target(name) for name in glyphs.objects()}
+    references = [prior.coefficients(targets[one].rasterise(_CELLS)) for one in "AS2"]
+    few, slowest = min(asked.positions, 5), asked.duration_s / asked.positions
+    few = replace(asked, positions=few, counts=(few,))
+    tried = list[tuple[float, FrameCamera]]()
+    for exposure in np.geomspace(1e-4, slowest, 10).tolist():
+        blurred = light.exposed(exposure)
+        for gain in _GAINS:
+            camera = replace(setup.frame_camera, exposure_s=exposure, gain=gain)
+            told = _of_frames(blurred, references[0], setup, camera, few)
+            tried.append((prior.error(told[0]), camera))
+    camera = min(tried, key=lambda one: one[0])[1]
+    unknown = () if condition.is_motion_known else _motions(light, references, asked)
+    lights = unknown or [light] * len(references)
+    law = _PIXEL.crossing_law(light.typical_dn)
+    found: dict[str, list[NDArray[np.float64]]] = {name: [] for name in EVIDENCE}
+    for seen, z in zip(lights, references, strict=True):
+        z = np.concatenate([z, np.zeros(seen.right.shape[2] - 1 - len(z))])
+        frames = _of_frames(seen.exposed(camera.exposure_s), z, setup, camera, asked)
+        events = bounds.event_information(seen, z, law, asked, (_CROSSING_NOISE,))[0][0]
+        for name, information in zip(EVIDENCE, (frames, events, frames + events), strict=True):
+            found[name].append(np.stack([_known(one, prior.count) for one in information]))
+    expected = {
+        name: tuple(
+            round(bounds.canvas_decibel(float(np.mean([prior.error(r[n]) for r in each])), _CELLS), 3)
+            for n in range(len(asked.counts))
+        )
+        for name, each in found.items()
+    }
+    runs = [_sequence(condition, light, camera, prior, targets[one]) for one in characters]
+    measured = {name: tuple(run[name] for run in runs) for name in EVIDENCE if condition.is_motion_known}
+    sizes = np.mean([run["bytes"] for run in runs], axis=0) if runs else np.zeros(4)
+    per_pixel = float(sizes[0]) / EVENT_BYTES / len(light.left)
+    sizes = [round(float(one)) for one in sizes]
     return Finding(
-        condition.factor,
-        condition.value,
-        condition.unit,
-        {name: round(float(values.mean()), 3) for name, values in scores.items()},
-        round(float(psnr(blank, truth).mean()), 3),
-        (round(gain.mean, 3), round(gain.low, 3), round(gain.high, 3)),
-        round(events / pixels, 3),
-        round(events * EVENT_BYTES / config.duration_s),
-        round(FRAME_RATE_HZ * pixels),
+        condition,
+        round(camera.exposure_s, 6),
+        camera.gain,
+        asked.counts,
+        round(bounds.canvas_decibel(prior.error(np.zeros((prior.count, prior.count))), _CELLS), 3),
+        expected,
+        measured,
+        round(per_pixel, 3),
+        (sizes[0], sizes[1]),
+        (sizes[2], sizes[3]),
     )
 
 
-def conditions_table(findings: list[Finding]) -> str:
-    """Return Markdown: a row a condition."""
-    lines = [
-        "| condition | frame dB | event dB | fusion dB | mean image dB | event - frame dB, 95 % interval | "
-        "events per pixel | events kB/s | frames kB/s |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for f in findings:
-        what = "base" if f.factor == "base" else f"{f.factor} {f.value:g} {f.unit}"
-        mean, low, high = f.gain_db
-        scores = " | ".join(f"{f.psnr_db[p]:.2f}" for p in STANDARD_MODALITIES)
-        lines.append(
-            f"| {what} | {scores} | {f.mean_db:.2f} | {mean:+.2f} [{low:+.2f}, {high:+.2f}] | "
-            f"{f.events_per_pixel:.1f} | {f.event_bytes_s / 1e3:.0f} | {f.frame_bytes_s / 1e3:.0f} |"
-        )
-    return "\n".join(lines)
+def _of_frames(
+    light: SequenceLight,
+    z: NDArray[np.float64],
+    setup: RadiometricSetup,
+    camera: FrameCamera,
+    asked: bounds.SequenceAnalysisSettings,
+) -> NDArray[np.float64]:
+    """Return the information of exposed frames, [counts, k, k]."""
+    return bounds.frame_information(light, z, replace(setup, frame_camera=camera.per_light()), asked)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sequence:
-    name: str
-    frame: np.ndarray
-    surface: np.ndarray
-    truth: torch.Tensor
-    events: int
+def _known(information: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return what is known of the target alone, [k, k], where further unknowns of variance 1 are left open."""
+    target, mixed, rest = information[:count, :count], information[:count, count:], information[count:, count:]
+    return target - mixed @ np.linalg.solve(np.eye(len(rest)) + rest, mixed.T) if len(rest) else target
 
 
-def _sequence(task: tuple[Simulation, str]) -> _Sequence:
-    config, name = task
-    samples, events = simulate_object(config, name)
-    assert samples.truth is not None  # a simulation knows its target
-    return _Sequence(name, samples.frame, samples.surface, torch.from_numpy(samples.truth), len(events))
-
-
-def _lit(config: Simulation, ratio: float) -> Simulation:
-    """Return the simulation with ambient light of `ratio` times the largest signal, both within the range."""
-    gain = FULL / (1 + ratio)
-    return replace(config, setup=replace(config.setup, gain=gain, ambient=gain * ratio))
-
-
-NAME = "simulation"
-"""Name of the experiment."""
+def _motions(
+    light: SequenceLight, references: Sequence[NDArray[np.float64]], asked: bounds.SequenceAnalysisSettings
+) -> list[SequenceLight]:
+    """Return the light with two more patterns: what place and speed change of each reference's light."""
+    found = []
+    for z in references:
+        rate = np.gradient(light.right @ np.append(1.0, z), light.times_s, axis=0)  # [T, r]
+        late = light.times_s[:, None] - asked.duration_s / 2
+        more = np.stack([rate * _PLACE_M / asked.speed_m_s, rate * late * _SPEED], axis=2)
+        found.append(replace(light, right=np.concatenate([light.right, more], axis=2)))
+    return found
 
 
 @dataclass(frozen=True)
-class Simulated:
-    """Settings of the experiment."""
+class _ShadedWall:
+    """A wall in patches of shade."""
 
-    out: Path
-    """Folder for datasets, runs and records."""
-    sensor: SensorSize = field(default_factory=SensorSize)
-    """Sensor; the paper's has 960 x 600 pixels."""
-    writers: int = TRAIN_WRITERS
-    """Writers of the 26 letters to pre-train on; the paper has 39."""
-    pretraining: Training = field(default_factory=lambda: Training(epochs=4))
-    """Pre-training on handwriting."""
-    finetuning: Training = field(default_factory=lambda: Training(epochs=10, learning_rate=5e-4))
-    """Fine-tuning on Comic characters."""
-    end_to_end: Training = field(default_factory=lambda: Training(epochs=24))
-    """Training on Comic characters alone."""
-    modalities: tuple[str, ...] = STANDARD_MODALITIES
-    """What the networks see."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of initial weights and order of the samples."""
-    test: str = "GK49"
-    """Comic characters that no network is trained on."""
-    workers: int = 0
-    """Processes that simulate; 0 = one for each core."""
-    force: bool = False
-    """Begin although the machine's memory will hardly do."""
+    wall: Irradiance
+    condition: Condition
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.wall.shape
+
+    @property
+    def speed_px_s(self) -> float:
+        return self.wall.speed_px_s
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        return self.wall.irradiance(t_s) * torch.from_numpy(self.condition.shading().astype(np.float32))
 
 
-def simulations(settings: Simulated) -> dict[str, Simulation]:
-    """Return the three sets: handwriting to train on, a hand held out, and Comic letters and digits."""
-    base = replace(paper(), setup=replace(paper().setup, sensor=settings.sensor))
-    unseen = HandwritingGlyphs(writers=1, first_writer=TRAIN_WRITERS)
-    comic = FontGlyphs(characters=UPPER_CASE + DIGITS)
-    return {
-        "train": replace(base, glyphs=HandwritingGlyphs(writers=settings.writers)),
-        "nist": replace(base, glyphs=unseen, validation=0.0, held_out=UPPER_CASE),
-        "comic": replace(base, glyphs=comic, validation=0.0, held_out=settings.test),
-    }
+def _sequence(
+    condition: Condition, light: SequenceLight, camera: FrameCamera, prior: PatternPrior, target: Target
+) -> dict[str, Any]:
+    """Return the PSNR of a simulated sequence for each kind of evidence, dB, and the bytes of recordings."""
+    setup, asked = condition.setup, condition.asked
+    span, pixels = (0.0, asked.duration_s), len(light.left)
+    wall = _ShadedWall(setup.observe(Scene(target, asked.motion, asked.duration_s)), condition)
+    lit = FlickeringWall(wall, condition.ripple, _RIPPLE_HZ) if condition.ripple else wall
+    seed = derive_seed(0, "conditions", target.name)
+    events = EventCamera(setup.pixel).record(lit, *span, seed=seed)
+    times = np.arange(1, asked.positions + 1) * asked.duration_s / asked.positions
+    frames = camera.capture(lit, times, seed)
+    sensitivity, offset_e = camera.fixed_pattern(setup.shape, seed)  # known, as by calibration
+    seen = (frames / camera.dn_per_electron - offset_e) / (camera.white_e * sensitivity)
+    inside = (frames < camera.white).all(axis=0).ravel()  # clipped pixels tell little
+    part = replace(light, left=light.left[inside], still=light.still[inside], shape=(1, int(inside.sum())))
+    term = FrameTerm(
+        part.exposed(camera.exposure_s),
+        seen.reshape(len(times), pixels)[:, inside],
+        times,
+        camera.per_light(),
+        known_pattern=True,
+    )
+    law = _PIXEL.crossing_law(light.typical_dn)
+    record = record_of(events, law, span, _GAP * asked.duration_s)
+    evidence = {"frames": (None, None, term), "events": (law, record, None), "both": (law, record, term)}
+    truth = target.rasterise(_CELLS)
+    found: dict[str, Any] = {}
+    for name, known in evidence.items():
+        image = estimate_sequence(light, prior, *known).image
+        found[name] = round(bounds.canvas_decibel(float(np.square(image - truth).mean()), _CELLS), 3)
+    steps = np.diff(events.t_us, prepend=0) & 0xFFFF
+    place = (2 * (events.y.astype(np.int64) * events.width + events.x) + events.p) & 0xFFFF
+    streams = np.stack([steps, place]).astype(np.uint16).tobytes(), frames.tobytes()
+    packed = [len(zlib.compress(one)) for one in streams]
+    found["bytes"] = (EVENT_BYTES * len(events), packed[0], frames.nbytes, packed[1])
+    return found
 
 
-def run_simulated(settings: Simulated, progress: Progress = silent) -> list[Record]:
-    """Run what is not done yet, and return the records that are new.
-
-    Three arms: "pre-trained" (handwriting alone), "EPNP" (then fine-tuned on Comic), "E2E" (Comic alone). The
-    first is scored on the hand held out and on Comic, the others on the Comic characters held out.
-
-    Args:
-        settings: What to run, and where.
-        progress: Called with each step of simulation, training and scoring.
-    """
-    data, records = {}, list[Record]()
-    for name, config in simulations(settings).items():
-        folder = settings.out / "simulations" / f"paper-{name}-{config_hash(config)[:8]}"
-        data[name] = simulate(config, folder, settings.workers, progress=progress, force=settings.force)
-    for modality in settings.modalities:
-        for seed in settings.seeds:
-            plans = [
-                ("pre-trained", settings.pretraining, "train", False),
-                ("EPNP", settings.finetuning, "comic", True),
-                ("E2E", settings.end_to_end, "comic", False),
-            ]
-            first: Path | None = None
-            for arm, plan, source, goes_on in plans:
-                plan = replace(plan, modality=modality, seed=seed)
-                start = first if goes_on else None
-                decided = {
-                    "settings": to_dict(plan),
-                    "data": data[source].config_hash,
-                    "from": start.name if start else None,
-                }
-                key = config_hash(decided)[:8]
-                run = settings.out / "runs" / f"paper-{arm.lower()}-{modality}-seed{seed}-{key}"
-                train_one(Run((data[source],), plan, run, start), progress)
-                first = first or run
-                test_sets = ("nist", "comic") if arm == "pre-trained" else ("comic",)
-                for tested in test_sets:
-                    record = _record(arm, modality, seed, run, tested, decided)
-                    folder = settings.out / "records" / NAME
-                    if not is_scored(record, records_there(folder)):
-                        found = evaluate(load_weights(run), data[tested], "test", available_lpips())
-                        records.append(keep_scores(record, found, folder, progress))
-    return records
-
-
-def _record(arm: str, modality: str, seed: int, run: Path, tested: str, decided: dict[str, Any]) -> Record:
-    """Return a record without its scores."""
-    return Record(NAME, tested, arm, modality, seed, "test", {}, {}, {}, {}, decided | {"run": run.name})
+def conditions_table(findings: Sequence[Finding]) -> str:
+    """Return Markdown: a row a condition; of a cell "bound / measured" the whole sequence counts."""
+    head = ["condition", "frames", "exposure, gain", "frame, one", "events, one", "frames, all", "events, all"]
+    head += ["both, all", "events - frames, 95 % interval", "events a pixel", "events kB", "frames kB"]
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for one in findings:
+        cells = [one.condition.name, str(one.counts[-1]), f"{1e3 * one.exposure_s:.3g} ms, {one.gain:g}"]
+        cells += [f"{one.expected_db[name][0]:.1f}" for name in EVIDENCE[:2]]
+        for name in EVIDENCE:
+            known = one.measured_db.get(name)
+            cells.append(f"{one.expected_db[name][-1]:.1f}" + (f" / {np.mean(known):.1f}" if known else ""))
+        gap = one.expected_db["events"][-1] - one.expected_db["frames"][-1]
+        if known := one.measured_db.get("events"):
+            names = np.arange(len(known)).astype(str)
+            gain = paired_difference(np.array(known), np.array(one.measured_db["frames"]), names)
+            cells.append(f"{gap:+.1f} / {gain.mean:+.1f} [{gain.low:+.1f}, {gain.high:+.1f}]")
+        else:
+            cells.append(f"{gap:+.1f}")
+        cells.append(f"{one.events_per_pixel:.1f}")
+        cells += [
+            f"{size / 1e3:.0f} ({packed / 1e3:.0f})" for size, packed in (one.event_bytes, one.frame_bytes)
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)

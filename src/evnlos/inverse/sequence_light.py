@@ -86,6 +86,23 @@ class SequenceLight:
         left = kept(self.left[:, :rank])
         return SequenceLight(left, self.right[:, :rank], kept(self.still), self.times_s, shape)
 
+    def exposed(self, exposure_s: float) -> SequenceLight:
+        """Return the light averaged over exposures about each instant, with the nodes of `FrameCamera`.
+
+        Args:
+            exposure_s: Exposure time, seconds.
+        """
+        right, still = np.zeros_like(self.right), np.zeros_like(self.still)
+        moves = self.still.shape[1] > 1
+        offsets, weights = FrameCamera(exposure_s=exposure_s).instants(0.0)
+        for offset, weight in zip(offsets, weights, strict=True):
+            node, share = self.place(self.times_s + offset)
+            ends = share[:, None, None]
+            right += weight * ((1 - ends) * self.right[node] + ends * self.right[node + 1])
+            if moves:
+                still += weight * ((1 - share) * self.still[:, node] + share * self.still[:, node + 1])
+        return SequenceLight(self.left, right, still if moves else self.still, self.times_s, self.shape)
+
     def place(self, t_s: Array) -> tuple[NDArray[np.int64], Array]:
         """Return of instants [N] the node before, and the share of the way to the next; clipped to the ends."""
         step = self.times_s[1] - self.times_s[0]
@@ -130,6 +147,7 @@ def sequence_light(
     span_s: tuple[float, float],
     shape: tuple[int, int] | None = None,
     rank: int = 200,
+    fineness: float = 1.0,
 ) -> SequenceLight:
     """Return the light of a moving target on a camera.
 
@@ -145,6 +163,9 @@ def sequence_light(
         shape: Size (H, W) of the images; None is the sensor's.
         rank: Most factors. Events see the logarithm of the light, and of a wall of rough metal 120 factors
             would cost their estimate 0.7 dB, where more than 200 bring nothing.
+        fineness: How many times finer than its blur asks for the setup's cells are. Behind rough metal the
+            light is right to 3e-3 of its changes with 1, and to 3e-4 with 2, which forty frames of little
+            noise need.
 
     Raises:
         ConfigError: The setup is not linear, or gets no light.
@@ -167,7 +188,7 @@ def sequence_light(
         )
     times = np.linspace(*span_s, count)
     places = position_m(times)
-    cells = setup.coarsened().target_cells()
+    cells = setup.coarsened(1 / fineness).target_cells()
     pitch = prior.target_plane.pitch_m if cells is None else max(cells.pitch_m, prior.target_plane.pitch_m)
     side = max(1, math.ceil(prior.target_plane.height * prior.target_plane.pitch_m / pitch - 1e-6))
     strip = strip_of(places, Plane(side, side, pitch))

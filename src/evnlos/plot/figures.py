@@ -114,6 +114,27 @@ def draw_scores(records: Sequence[Any], metric: str, path: str | Path) -> Path:
     return save_figure(figure, path, dpi=100)
 
 
+def draw_regimes(findings: Sequence[Any], path: str | Path) -> Path:
+    """Draw by how much events of a whole sequence lead its frames, dB, over light and speed.
+
+    Args:
+        findings: Of the conditions `evnlos.experiment.regimes`.
+        path: The image, PNG or SVG.
+    """
+    db = {(one.condition.light, one.condition.speed_m_s): one.expected_db for one in findings}
+    lights, speeds = (sorted({place[k] for place in db}) for k in (0, 1))
+    lead = np.array([[db[a, b]["events"][-1] - db[a, b]["frames"][-1] for b in speeds] for a in lights])
+    axes, most = (figure := new_figure((5.4, 3.6))).subplots(), float(abs(lead).max())
+    axes.imshow(lead, cmap=signed_map(), vmin=-most, vmax=most, aspect="auto", origin="lower")
+    for (row, column), value in np.ndenumerate(lead):
+        axes.text(column, row, f"{value:+.1f}", ha="center", va="center", color="k" if value > 0 else "w")
+    axes.set_xticks(range(len(speeds)), map("{:g}".format, speeds))
+    axes.set_yticks(range(len(lights)), map("{:g}".format, lights))
+    axes.set(xlabel="speed of the target, m/s", ylabel="light, share of the base's")
+    axes.set_title("events less frames, expected PSNR, dB", fontsize=10)
+    return save_figure(figure, path, dpi=100)
+
+
 @dataclass(frozen=True, eq=False)
 class Column:
     """One stage of a film.

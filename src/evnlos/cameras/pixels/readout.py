@@ -23,16 +23,17 @@ import torch
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_camera import Irradiance
 from evnlos.cameras.event_model import (
     EVENT_MODELS,
     CrossingLaw,
     EventModel,
+    Irradiance,
     LogCurve,
     PixelSettings,
     check_pattern_seed,
     require,
 )
+from evnlos.cameras.frame_camera import FrameCamera
 from evnlos.cameras.pixel import MAX_JITTER, EventPixel
 from evnlos.cameras.random_numbers import (
     STREAM_CELEX,
@@ -537,3 +538,14 @@ class FlickeringWall:
         phase = 2.0 * math.pi * self.frequency_hz * np.atleast_1d(np.asarray(t_s, np.float64))
         factor = torch.from_numpy(1.0 + self.contrast * np.sin(phase)).to(light)
         return light * factor[:, None, None]
+
+    def exposed(self, t_s: ArrayLike, exposure_s: float) -> NDArray[np.float64]:
+        """Return the light averaged over exposures about the instants `t_s` [T], [T, H, W], white levels.
+
+        The wall's own light moves little meanwhile (`FrameCamera.instants`); the ripple's mean is exact.
+        """
+        instants, camera = np.atleast_1d(np.asarray(t_s, np.float64)), FrameCamera(exposure_s=exposure_s)
+        nodes = [camera.instants(float(time)) for time in instants]
+        light = np.stack([np.tensordot(w, self.wall.irradiance(t).double().numpy(), 1) for t, w in nodes])
+        ripple = np.sin(2.0 * math.pi * self.frequency_hz * instants) * np.sinc(self.frequency_hz * exposure_s)
+        return light * (1.0 + self.contrast * ripple)[:, None, None]
