@@ -467,3 +467,25 @@ def test_a_capture_without_any_camera_or_a_clock_of_nothing_is_refused() -> None
         CaptureInfo(CameraInfo(8, 8), events=None, frames=None)
     with pytest.raises(ConfigError, match="leave alignment out"):
         CaptureInfo(CameraInfo(8, 8), events=None, alignment=AlignmentInfo(offset_us="auto"))
+
+
+@pytest.mark.parametrize(("spin_deg_s", "error"), [(0.0, 1e-4), (3.0, 5e-3)])
+def test_the_light_of_a_capture_does_not_depend_on_when_its_clock_began(capture, spin_deg_s, error) -> None:
+    """A camera's clock begins when it is switched on, not when the target sets out."""
+    late_us = 1_000_345_678
+    motion = replace(capture.info.motion, spin_deg_s=spin_deg_s)
+    capture = replace(capture, info=replace(capture.info, motion=motion))
+    motion = replace(motion, start_us=motion.start_us + late_us)
+    late = replace(
+        capture,
+        info=replace(capture.info, motion=motion),
+        frame_times_us=capture.frame_times_us + late_us,
+    )
+    setup = RadiometricSetup(sensor=SensorSize(12, 18), cell_m=0.01)
+    assert late.scene.duration_s == pytest.approx(capture.scene.duration_s)
+    times = capture.frame_times_us[[0, 3, -1]] * 1e-6
+    soon, later = (setup.observe(one.scene) for one in (capture, late))
+    expected = soon.irradiance(times).numpy()
+    found = later.irradiance(times + late_us * 1e-6).numpy()
+    np.testing.assert_allclose(found, expected, atol=error * expected.max())
+    assert later.speed_px_s == pytest.approx(soon.speed_px_s, rel=1e-6)

@@ -103,7 +103,7 @@ class Capture:
         motion = self.motion
         if self.target is None or motion is None:
             return None
-        return Scene(self.target, motion, duration_s=max(float(self.frame_times_us[-1]) * 1e-6, 1e-6))
+        return Scene.watched(self.target, motion, self.frame_times_us)
 
     @property
     def several(self) -> SeveralTargets | None:

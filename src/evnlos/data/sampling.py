@@ -382,10 +382,10 @@ def read_target(folder: Path, info: TargetInfo | None, colour: Colour | None) ->
 
 def read_others(folder: Path, info: CaptureInfo, times_us: NDArray[np.int64]) -> tuple[Scene, ...]:
     """Return the other targets of a capture with their motions, as far as both are known."""
-    seconds = max(float(times_us[-1]) * 1e-6, 1e-6)
     z_m, colour = noted_distance_m(info), info.camera.colour
     found = [(read_target(folder, one, colour), line_of(one.motion, z_m)) for one in info.others]
-    return tuple(Scene(one, line, seconds) for one, line in found if one is not None and line is not None)
+    known = [(one, line) for one, line in found if one is not None and line is not None]
+    return tuple(Scene.watched(one, line, times_us) for one, line in known)
 
 
 def noted_distance_m(info: CaptureInfo) -> float | None:

@@ -111,7 +111,7 @@ def covered_plane(scene: Scene, mount: Mount, cell_m: float) -> Plane:
         cell_m: Side of a cell, metres.
     """
     half = scene.target.size_m / 2
-    place = scene.motion.position_m(np.linspace(0, scene.duration_s, _INSTANTS))
+    place = scene.motion.position_m(scene.instants(_INSTANTS))
     low, high = place.min(axis=0) - half, place.max(axis=0) + half
     if mount.brightness > 0:
         low, high = low - mount.rim_m, high + mount.rim_m

@@ -231,7 +231,7 @@ class SpaceWall:
     ) -> None:
         self.scene, self._distance_m = scene, distance_m
         # The fastest point of the target; between the instants it may be a little faster.
-        x, y, z, turn = self._pose(np.linspace(0.0, scene.duration_s, _INSTANTS))
+        x, y, z, turn = self._pose(scene.instants(_INSTANTS))
         reach_m = scene.target.size_m / (math.sqrt(2) if turn.any() else 2)
         moved = np.linalg.norm(np.diff([x, y, z]), axis=0) + reach_m * np.abs(np.diff(turn))
         speed_m_s = _FASTER * float(moved.max()) * (_INSTANTS - 1) / scene.duration_s
@@ -241,7 +241,8 @@ class SpaceWall:
         self._keys: dict[int, torch.Tensor] = {}
         self._samples: dict[int, torch.Tensor] = {}
         beyond_s = (_TAIL + 4) * self._key_s  # of the scene, where its spline's tail lies
-        x, y, z, turn = self._pose(np.linspace(-beyond_s, scene.duration_s + beyond_s, _INSTANTS))
+        first_s, last_s = scene.instants(2)
+        x, y, z, turn = self._pose(np.linspace(first_s - beyond_s, last_s + beyond_s, _INSTANTS))
         sides = [
             (math.floor((one.min() - reach_m) / pitch_m) - 1, math.ceil((one.max() + reach_m) / pitch_m) + 1)
             for one in (x, y)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
@@ -394,5 +394,5 @@ def with_others(
 ) -> Scene | SeveralTargets:
     """Return a scene with other targets beside its own, or itself where there are none."""
     drawn = [(one.glyphs.target(one.glyphs.objects()[0], seed), one.motion) for one in others]
-    scenes = (scene, *(Scene(target, motion, scene.duration_s) for target, motion in drawn))
+    scenes = (scene, *(replace(scene, target=target, motion=motion) for target, motion in drawn))
     return SeveralTargets(scenes, cover) if others else scene

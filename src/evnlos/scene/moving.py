@@ -452,7 +452,8 @@ class Scene:
     Args:
         target: The hidden target.
         motion: Where its centre is at every instant.
-        duration_s: Length of the recording that starts at 0 s, seconds.
+        duration_s: Length of the recording, seconds.
+        start_s: Its first instant, on the clock of the motion, seconds.
 
     Raises:
         DataError: The duration is not positive and finite.
@@ -466,16 +467,27 @@ class Scene:
     target: Target
     motion: Motion = field(default_factory=LineMotion)
     duration_s: float = 8.0
+    start_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.duration_s) and self.duration_s > 0):
             raise DataError(f"Scene.duration_s is {self.duration_s}; give a positive number of seconds")
 
+    @classmethod
+    def watched(cls, target: Target, motion: Motion, times_us: NDArray[np.int64]) -> Scene:
+        """Return a target as it is watched from the first to the last of some instants [N], microseconds."""
+        first_s, last_s = (float(times_us[k]) * 1e-6 for k in (0, -1))
+        return cls(target, motion, max(last_s - first_s, 1e-6), first_s)
+
     def position_times_s(self, n: int = 40) -> NDArray[np.float64]:
-        """Return the instants k duration / n, k = 1..n, of `n` equidistant positions, float64 [n], seconds."""
+        """Return the instants start + k duration / n, k = 1..n, of `n` equidistant positions, [n], seconds."""
         if n < 1:
             raise DataError(f"n is {n}; ask for 1 position or more")
-        return np.arange(1, n + 1) * self.duration_s / n
+        return self.start_s + np.arange(1, n + 1) * self.duration_s / n
+
+    def instants(self, count: int) -> NDArray[np.float64]:
+        """Return equally spaced instants from the first to the last, [count], seconds."""
+        return np.linspace(self.start_s, self.start_s + self.duration_s, count)
 
     @property
     def scenes(self) -> tuple[Scene, ...]:
@@ -489,7 +501,7 @@ class Scene:
     @property
     def moves_in_space(self) -> bool:
         """Whether the target turns, or its distance from the wall changes, while it is watched."""
-        pose = self.pose(np.linspace(0.0, self.duration_s, _PROBES))
+        pose = self.pose(self.instants(_PROBES))
         return bool(pose.rotation_rad.any() or np.ptp(pose.z_m) > 0)  # NaN is the setup's own distance
 
     def truth(self, plane: Plane, t_s: ArrayLike) -> NDArray[np.float32]:
@@ -514,11 +526,11 @@ class SeveralTargets:
     drawn = earlier (1 - mask) + mask.
 
     Args:
-        scenes: Each target with its motion, of one duration, in the order in which they are drawn.
+        scenes: Each target with its motion, of one time, in the order in which they are drawn.
         cover: Whether a later target hides earlier ones. All of them are then at the setup's own distance.
 
     Raises:
-        DataError: There is no target, durations differ, or targets that cover each other state a distance or
+        DataError: There is no target, their times differ, or targets that cover each other state a distance or
             turn.
     """
 
@@ -526,11 +538,10 @@ class SeveralTargets:
     cover: bool = False
 
     def __post_init__(self) -> None:
-        durations = {one.duration_s for one in self.scenes}
-        if len(durations) != 1:
-            raise DataError(
-                f"{len(self.scenes)} scenes last {sorted(durations)} s; give one or more of one length"
-            )
+        lasting = {(one.start_s, one.start_s + one.duration_s) for one in self.scenes}
+        if len(lasting) != 1:
+            told = ", ".join(f"{first:g} to {last:g} s" for first, last in sorted(lasting))
+            raise DataError(f"{len(self.scenes)} scenes last from {told}; give one or more of one time")
         for one in self.scenes if self.cover else ():
             if one.moves_in_space or np.isfinite(one.pose(0.0).z_m):
                 raise DataError(

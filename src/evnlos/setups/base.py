@@ -354,7 +354,7 @@ def stated_distance_m(setup: Setup, scene: Scene) -> float | None:
     Raises:
         ConfigError: The target turns, approaches or retreats.
     """
-    pose = scene.pose(np.linspace(0.0, scene.duration_s, _PROBES))
+    pose = scene.pose(scene.instants(_PROBES))
     if np.any(pose.rotation_rad != 0):
         most = float(np.degrees(np.abs(pose.rotation_rad).max()))
         raise ConfigError(

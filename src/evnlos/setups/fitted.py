@@ -302,7 +302,7 @@ class FittedSetup(Setup):
 
     def _check_travel(self, scene: Scene) -> NDArray[np.float64]:
         """Return centres along the motion [65, 2], metres; refuse those off the strip."""
-        positions = scene.motion.position_m(np.linspace(0.0, scene.duration_s, 65))
+        positions = scene.motion.position_m(scene.instants(65))
         reach = np.abs(positions).max(axis=0) + scene.target.size_m / 2
         for name, needed, side in zip(("width", "height"), reach, self.strip_m, strict=True):
             if needed > side / 2 + self.cell_m:

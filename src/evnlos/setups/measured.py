@@ -192,7 +192,7 @@ class MeasuredSetup(Setup):
         return torch.einsum("pij,ik,jl->pkl", cells, y, x).flatten(1)
 
     def _check_travel(self, scene: Scene, plane: Plane) -> None:
-        positions = scene.motion.position_m(np.linspace(0.0, scene.duration_s, 65))
+        positions = scene.motion.position_m(scene.instants(65))
         half = scene.target.size_m / 2
         for k, axis in enumerate(("width", "height")):
             reach = np.abs(positions[:, k] - plane.center_m[k]).max() + half

@@ -344,7 +344,7 @@ class RadiometricSetup(Setup):
         return 4 * self.shape[0] * self.shape[1] * (source.height * source.width + round(keyframes))
 
     def _check_travel(self, scene: Scene) -> None:
-        positions = scene.motion.position_m(np.linspace(0.0, scene.duration_s, 65))
+        positions = scene.motion.position_m(scene.instants(65))
         reach = np.abs(positions).max(axis=0) + scene.target.size_m / 2
         for name, needed, side in zip(("width", "height"), reach, self.strip_m, strict=True):
             if needed > side / 2 + self.cell_m:

@@ -169,7 +169,7 @@ class RoomSetup(Setup):
         plane = covered_plane(scene, self.mount, self.cell_m)
         matrix = _matrix(self._light_path(), self.shape, plane)
         count = max(1, math.ceil(scene.duration_s / self.key_frame_s - 1e-9))
-        times = np.linspace(0, scene.duration_s, count + 1)
+        times = scene.instants(count + 1)
         frames = np.empty((count + 1, matrix.shape[0]), np.float32)
         for first in range(0, count + 1, _TOGETHER):
             few = slice(first, first + _TOGETHER)
@@ -292,7 +292,8 @@ class RoomSetup(Setup):
         # The image of a mirror moves by a part of the way; that of a lobe by less than the target.
         tangent = 2 * math.tan(math.radians(self.field_of_view_deg) / 2) / self.shape[1]
         nearest = self.camera_distance_m * math.cos(math.radians(self.field_of_view_deg) / 2)
-        return scene.motion.speed_bound_m_s(0.0, scene.duration_s) / (tangent * nearest)
+        first, last = scene.instants(2).tolist()
+        return scene.motion.speed_bound_m_s(first, last) / (tangent * nearest)
 
 
 @lru_cache(maxsize=1)
