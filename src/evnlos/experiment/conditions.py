@@ -56,12 +56,12 @@ _PIXEL = EventPixel(
     threshold_on=0.2,
     threshold_off=0.2,
     threshold_sigma=0.02,
-    cutoff_hz=300.0,
+    cutoff_hz=1000.0,
     leak_rate_hz=0.1,
-    shot_noise_rate_hz=0.1,
+    shot_noise_rate_hz=0.2,
     logarithm="true",
     dark_dn=0.2,
-    cutoff_floor_dn=0.2,
+    cutoff_floor_dn=28.0,  # a tenth of the bandwidth is left in the dark
 )
 _CAMERA = FrameCamera(electrons_per_s=1.5e6)  # white fills the well in 10 ms
 _SENSOR = SensorSize(50, 80)
