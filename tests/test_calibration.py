@@ -30,18 +30,19 @@ from evnlos.calibration import (
 )
 from evnlos.calibration.event_fit import shortest_interval_s
 from evnlos.calibration.event_statistics import _block_counts, count_map, read_recordings, within
-from evnlos.calibration.frame_model import FrameModel, fit_frame_noise, working_shape
+from evnlos.calibration.frame_model import FrameModel, fit_frame_noise, frame_doubt, working_shape
 from evnlos.calibration.transport_fit import levenberg_marquardt, values_of
 from evnlos.cameras import EventPixel, FrameCamera
 from evnlos.cli import main
 from evnlos.config import load_yaml, save_yaml
-from evnlos.data import load_pattern
+from evnlos.data import load_pattern, read_capture
 from evnlos.data.lab import Lab, render_captures
 from evnlos.data.simulate import SensorSize, Simulation, simulate_object
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse import FrameTerm, handwritten_prior, sequence_light
 from evnlos.scene import FontGlyphs, pen_width
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.types import Events
+from evnlos.types import Events, Plane
 
 SETUP = RadiometricSetup(
     roughness=0.07,
@@ -592,3 +593,26 @@ def check_rows(stated: dict[str, list[str]], found: dict[str, list[str]]) -> Non
         assert float(found[name][0]) == pytest.approx(float(before), rel=0.03, abs=limit), name
         assert float(found[name][1]) == pytest.approx(float(after), rel=0.03, abs=limit), name
         assert rest[-1:] == found[name][2:][-1:], name
+
+
+def test_frames_are_doubted_where_the_light_path_is_wrong(tiny_captures) -> None:
+    """A right light path needs little more than its noise; a wall taken for twice as rough is not believed."""
+    fitted, held = read_capture_set(tiny_captures, holdout=("L", "T"))
+    right = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72))
+    noise = fit_frame_noise(fitted, FrameModel(fitted, fitted.shape).predict(right).numpy(), right.frame_camera)
+    assert frame_doubt(held, right, noise) <= 10
+    assert frame_doubt(held, replace(right, roughness=0.1), noise) >= 100
+
+
+def test_doubted_frames_are_worth_less(tiny_captures) -> None:
+    capture = read_capture(tiny_captures[0])
+    setup = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(48, 72))
+    times_s = capture.frame_times_us * 1e-6
+    prior = handwritten_prior(Plane(16, 16, 0.005), 40)
+    light = sequence_light(setup, prior, capture.motion.position_m, (0.0, float(times_s[-1])), (48, 72))
+    frames = (capture.frames / 255.0).reshape(len(times_s), -1)
+    plain, doubted = (
+        FrameTerm(light, frames, times_s, setup.frame_camera, True, doubt).normal for doubt in (1.0, 25.0)
+    )
+    np.testing.assert_allclose(25 * doubted.information, plain.information)
+    np.testing.assert_allclose(25 * doubted.score, plain.score)

@@ -19,7 +19,7 @@ from evnlos.calibration.blind_calibration import fit_blind
 from evnlos.calibration.captures import Calibration, CaptureSet, read_capture_set
 from evnlos.calibration.event_fit import PixelFit, choose_pixel, fit_pixel
 from evnlos.calibration.event_statistics import event_residuals, read_recordings
-from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise
+from evnlos.calibration.frame_model import FrameModel, FrameNoise, fit_frame_noise, frame_doubt
 from evnlos.calibration.transport_fit import Residual, TransportFit, fit_transport
 from evnlos.calibration.wall_search import check_measured, fit_wall
 from evnlos.cameras import PixelSettings
@@ -78,6 +78,7 @@ class SetupFit:
         targets: Whether the captures' targets were known.
         mean_frame: Residual of the frames held out where the mean of the fitted frames stands for the model.
         known: Masks of the known targets by capture, [S, S] each: pre-training draws them again.
+        frame_doubt: By how much the variance of the frames' noise is raised when they are solved for a target.
     """
 
     simulation: Simulation
@@ -92,6 +93,7 @@ class SetupFit:
     targets: Literal["known", "unknown"] = "known"
     mean_frame: float = math.inf
     known: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    frame_doubt: float = 1.0
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -241,6 +243,7 @@ def fit_setup(
         settings.targets,
         float(seen.relative((seen.frames - models["fit"].frames.mean(dim=0)) * seen.weight)),
         known,
+        1.0 if wall is None else frame_doubt(held, optics.setup, noise),
     )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +18,13 @@ from evnlos.cameras import FrameCamera
 from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse import FrameTerm, SequenceLight, handwritten_prior, sequence_light
 from evnlos.setups import Setup
 from evnlos.types import Plane
+
+FACTORS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+"""By how much the variance of the frames' noise may be raised."""
+_GRID, _CELLS = (50, 80), 32  # pixels on which captures are solved, and cells of the target
 
 
 @dataclass(frozen=True)
@@ -356,3 +362,37 @@ def local_square(image: NDArray) -> NDArray[np.float64]:
     padded = np.pad(np.asarray(image, dtype=np.float64), 1, mode="reflect", reflect_type="odd")
     around = padded[1:-1, :-2] + padded[1:-1, 2:] + padded[:-2, 1:-1] + padded[2:, 1:-1]
     return (2 * padded[1:-1, 1:-1] - around / 2) ** 2 / 5
+
+
+def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
+    """Return by how much the variance of the frames' noise is to be raised when they are solved for a target.
+
+    What a light path gets wrong moves with the target, so that it does not average over frames and pixels, as
+    noise does. Frames whose noise alone counts are believed in what they do not tell. The factor is the one at
+    which the best linear estimate of the targets of captures held out has the least squared error.
+
+    Args:
+        held: Captures with known targets, which the light path was not fitted to.
+        setup: The fitted setup, linear.
+        noise: The frame camera's noise and pattern.
+    """
+    grid = (min(held.shape[0], _GRID[0]), min(held.shape[1], _GRID[1]))
+    together = held.shape[0] * held.shape[1] / (grid[0] * grid[1])  # pixels whose mean is one of the grid
+    plane = Plane(_CELLS, _CELLS, held.target_size_m / _CELLS)
+    prior, errors, lights = handwritten_prior(plane), np.zeros(len(FACTORS)), dict[Any, SequenceLight]()
+    for k, (capture, scene) in enumerate(zip(held.captures, held.scenes, strict=True)):
+        times_s = held.times_s(k)
+        span_s = (float(times_s[0]), float(times_s[-1]))
+        key = (scene.motion, span_s)
+        if key not in lights:
+            lights[key] = sequence_light(setup, prior, scene.motion.position_m, span_s, grid)
+        light = lights[key]
+        frames = noise.pattern.correct(capture.frames, held.peak)
+        values = np.asarray(reduce_by_area(frames, grid), np.float64).reshape(len(frames), -1)
+        told = FrameTerm(light, values, times_s, noise.camera, known_pattern=True).normal
+        truth = scene.target.rasterise(plane)
+        for n, factor in enumerate(FACTORS):
+            information = told.information * (together / factor)
+            z: Any = np.linalg.solve(np.eye(prior.count) + information, told.score * (together / factor))
+            errors[n] += float(np.square(prior.image(z) - truth).sum())
+    return FACTORS[int(errors.argmin())]

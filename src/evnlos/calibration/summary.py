@@ -325,7 +325,8 @@ def _with_wall(fit: SetupFit, simulation: Simulation, out: Path) -> Simulation:
     if Path(setup.file).resolve() != path:
         write_atomically(path, Path(setup.file).read_bytes())
     left = round(fit.residuals["frames held out, without pattern"].unexplained, 4)
-    return simulation.with_setup(file=str(path), misfit="; ".join(warnings_of(fit)), unexplained=left)
+    told = {"misfit": "; ".join(warnings_of(fit)), "unexplained": left, "frame_doubt": fit.frame_doubt}
+    return simulation.with_setup(file=str(path), **told)
 
 
 def _with_targets(fit: SetupFit, simulation: Simulation, folder: Path) -> Simulation:

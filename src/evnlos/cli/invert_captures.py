@@ -316,7 +316,8 @@ def estimate_captures(
             levels = capture.frames / peak if known is None else known.correct(capture.frames, peak)
             values = np.asarray(levels, np.float64).reshape(len(levels), -1)
             times = np.asarray(capture.frame_times_us * 1e-6, np.float64)
-            frames = FrameTerm(light, values, times, setup.frame_camera, known is not None)
+            camera, factor = setup.frame_camera, setup.frame_doubt
+            frames = FrameTerm(light, values, times, camera, known is not None, factor)
         if evidence != "frames":
             law = setup.pixel.crossing_law(light.typical_dn)
             if law is None:

@@ -227,7 +227,7 @@ def track_values(capture: Capture, track: Track, truth: NDArray[np.float64] | No
         found["turn_identified"] = track.turn.is_identified
     if truth is not None:
         error = track.position - truth
-        speed = np.hypot(*np.gradient(truth, track.time_s, axis=0).T)
+        speed = np.linalg.norm(np.gradient(truth, track.time_s, axis=0), axis=1)
         found["position_offset"] = error.mean(axis=0).tolist()
         found["position_error"] = float(np.sqrt(np.square(error - error.mean(axis=0)).sum(axis=1).mean()))
         found["speed_error_percent"] = float(

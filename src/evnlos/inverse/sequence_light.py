@@ -307,19 +307,26 @@ class FrameTerm:
         times_s: Instants, [N], seconds.
         camera: The frame camera.
         known_pattern: Whether its fixed pattern was taken off; else an offset of each pixel is integrated out.
+        doubt: By how much the variance of the noise is raised, for what the light path gets wrong.
 
     Raises:
         DataError: The frames are not those of the light's pixels.
     """
 
     def __init__(
-        self, light: SequenceLight, frames: Array, times_s: Array, camera: FrameCamera, known_pattern: bool
+        self,
+        light: SequenceLight,
+        frames: Array,
+        times_s: Array,
+        camera: FrameCamera,
+        known_pattern: bool,
+        doubt: float = 1.0,
     ) -> None:
         pixels = len(light.left)
         if frames.shape != (len(times_s), pixels):
             raise DataError(f"the frames are {frames.shape}; give [{len(times_s)}, {pixels}], one row a frame")
         mean = torch.from_numpy(frames.mean(axis=0).astype(np.float64))
-        weight = 1.0 / camera.noise_variance(mean).numpy()
+        weight = 1.0 / (doubt * camera.noise_variance(mean).numpy())
         spread = np.zeros(pixels) if known_pattern else camera.pattern_variance(mean).sqrt().numpy()
         node, share = light.place(times_s)
         still = light.still.astype(np.float64)

@@ -252,7 +252,7 @@ class PooledFrames(nn.Module):
         noise = (left - offset[owner]).double()
         # Few samples do not tell the noise of all components, which is at least that of the camera.
         variance, turn = torch.linalg.eigh(noise.T @ noise / len(noise))
-        white = (turn / variance.clamp_min(operator.sigma**2).sqrt()).T
+        white = (turn / (variance.clamp_min(operator.sigma**2) * setup.frame_doubt).sqrt()).T
         shifts = (offset - offset.mean(dim=0)).double()
         for buffer in (self.basis, self.light, self.along, self.static):
             buffer.zero_()

@@ -98,6 +98,8 @@ class Setup(Kinded, ABC):
     """What the kind's model adds to a real wall, in words; see `without_artifacts`."""
     unexplained: ClassVar[float] = 0.0
     """Share of the light that the setup gets wrong; 0 = not known. A calibrated setup has it as a setting."""
+    frame_doubt: ClassVar[float] = 1.0
+    """By how much the variance of the frames' noise is raised when they are solved; as a setting likewise."""
 
     kind: str = ""
     """Kind of this setup."""

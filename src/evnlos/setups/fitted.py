@@ -81,6 +81,8 @@ class FittedSetup(Setup):
     """What the calibration could not explain; empty = nothing worth a warning."""
     unexplained: float = 0.0  # pyright: ignore[reportIncompatibleVariableOverride]
     """Share of the light of captures held out that the calibration left beside the noise; 0 = not known."""
+    frame_doubt: float = 1.0  # pyright: ignore[reportIncompatibleVariableOverride]
+    """By how much the variance of the frames' noise is raised when they are solved for a target, at least 1."""
 
     def fitted(self) -> FittedWall:
         """Return the fitted wall; the file is read once.
@@ -298,7 +300,7 @@ class FittedSetup(Setup):
         return _companion_transport(self._key(), shape), shown
 
     def _key(self) -> FittedSetup:
-        return replace(self.optics(), companion=1.0, misfit="", unexplained=0.0)
+        return replace(self.optics(), companion=1.0, misfit="", unexplained=0.0, frame_doubt=1.0)
 
     def _check_travel(self, scene: Scene) -> NDArray[np.float64]:
         """Return centres along the motion [65, 2], metres; refuse those off the strip."""
