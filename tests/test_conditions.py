@@ -48,7 +48,7 @@ def test_light_sets_what_frames_and_events_are_worth(tmp_path) -> None:
             b >= max(f, e) for f, e, b in zip(*(one.expected_db[k] for k in module.EVIDENCE), strict=True)
         )
     assert dim.expected_db["frames"][-1] < bright.expected_db["frames"][-1] - 0.5
-    assert dim.exposure_s > bright.exposure_s and dim.gain > bright.gain
+    assert dim.exposure_s > bright.exposure_s
     for name in module.EVIDENCE:
         assert lost.expected_db[name][-1] < bright.expected_db[name][-1]
         assert abs(bright.measured_db[name][0] - bright.expected_db[name][-1]) < 3

@@ -227,9 +227,8 @@ class ExperimentCommand:
         with ProgressBars() as progress:
             found = experiment.sweep_parameters(experiment.conditions(), out, self.workers, progress=progress)
             mapped = experiment.sweep_parameters(experiment.regimes(), out, self.workers, "", progress)
-        text = experiment.conditions_table(found) + "\n"
+        print(text := experiment.conditions_table(found) + "\n")
         write_atomically(self.out / "conditions.md", text.encode())
-        print(text)
         drawn(shown, lambda: draw_regimes(mapped, shown))
 
     def _generalization(self) -> None:

@@ -376,7 +376,7 @@ def _sequence(
 def conditions_table(findings: Sequence[Finding]) -> str:
     """Return Markdown: a row a condition; of a cell "bound / measured" the whole sequence counts."""
     head = ["condition", "frames", "exposure, gain", "frame, one", "events, one", "frames, all", "events, all"]
-    head += ["both, all", "events - frames, 95 % interval", "events a pixel", "events kB", "frames kB"]
+    head += ["both, all", "events - frames, 95 % interval", "events per pixel", "events kB", "frames kB"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for one in findings:
         cells = [one.condition.name, str(one.counts[-1]), f"{1e3 * one.exposure_s:.3g} ms, {one.gain:g}"]
