@@ -493,7 +493,7 @@ def test_the_command_names_what_is_wrong(tmp_path, capsys) -> None:
 def test_the_papers_simulated_experiment_runs_on_a_small_scale(tmp_path, monkeypatch) -> None:
     from evnlos.data.simulations import paper
 
-    simulated = importlib.import_module("evnlos.experiment.conditions")
+    simulated = importlib.import_module("evnlos.experiment.simulated")
 
     sets = simulated.simulations(simulated.Simulated(tmp_path))
     assert [len(c.glyphs.objects()) for c in sets.values()] == [39 * 26, 26, 36]

@@ -512,7 +512,6 @@ class BegunError(Exception):
     "words",
     [
         ["experiment", "simulation", "--writers", "1", "--workers", "1"],
-        ["experiment", "conditions", "--writers", "1", "--workers", "1"],
         ["experiment", "mismatch", "--setups", "torch", "--seeds", "0", "--workers", "1"],
         ["demo", "--workers", "1"],
     ],

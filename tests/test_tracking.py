@@ -540,7 +540,7 @@ def test_the_command_takes_a_calibrated_folder_and_says_what_no_capture_is(captu
         ([str(folder), "--setup", str(folder)], "holds no setup.yaml; give the folder"),
         (
             [str(folder.parent)],
-            f"give the folder of one capture (it holds 1 captures, such as {folder.name})",
+            f"give the folder of one capture (it holds 1: {folder.parent}/*)",
         ),
         ([str(setup.parent)], "holds no capture.yaml; give the folder of one capture"),
     ):
