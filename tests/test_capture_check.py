@@ -192,6 +192,15 @@ def test_digits_may_be_names_and_a_mask_has_to_shine(tiny_captures, tmp_path) ->
         read_capture(tmp_path / "one")
 
 
+@pytest.mark.parametrize("others", ["5", "{name: 4}", "[7]"])
+def test_other_targets_that_are_none_are_one_line(tiny_captures, tmp_path, others) -> None:
+    shutil.copytree(tiny_captures[0], tmp_path / "one")
+    path = tmp_path / "one" / "capture.yaml"
+    path.write_text(f"{path.read_text()}\nothers: {others}\n")
+    with pytest.raises(ConfigError, match="others"):
+        read_capture(tmp_path / "one")
+
+
 def test_a_new_folder_explains_itself_and_is_read_back(tmp_path, capsys) -> None:
     main(
         [

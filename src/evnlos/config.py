@@ -106,13 +106,13 @@ def from_dict(
         found = _adapter(cls).validate_python(values)
     except ValidationError as error:
         first = error.errors()[0]
-        loc, value, fault, said = tuple(first["loc"]), first.get("input"), first["type"], first["msg"]
+        loc, value, fault, text = tuple(first["loc"]), first.get("input"), first["type"], first["msg"]
         if fault == NESTED and "ctx" in first:
             loc, value, fault = (*loc, *first["ctx"]["loc"]), first["ctx"]["input"], first["ctx"]["fault"]
         place = ".".join(str(part) for part in loc) or "(top level)"
-        cure = _CURES.get(fault, "").format(**first.get("ctx", {})) or said.removeprefix("Value error, ")
-        said = place if fault == "missing" else f"{place} = {_shown(value)}"
-        raise ConfigError(f"{source}: {said}: {cure}") from None
+        cure = _CURES.get(fault, "").format(**first.get("ctx", {})) or text.removeprefix("Value error, ")
+        what = place if fault == "missing" else f"{place} = {_shown(value)}"
+        raise ConfigError(f"{source}: {what}: {cure}") from None
     except (ArithmeticError, MemoryError, TypeError, LookupError) as error:  # a range that only fits together
         raise ConfigError(f"{source}: its numbers do not fit together ({error})") from None
     return found

@@ -10,12 +10,15 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from evnlos.errors import DataError
+
+if TYPE_CHECKING:
+    import torch
 
 OutFolder = Path
 """Type of a command's `out`: a folder that it makes, with the folders above it, or goes on with."""
@@ -340,3 +343,25 @@ def derive_seed(seed: int, *names: str | int) -> int:
     """
     text = "\x1f".join(str(part) for part in (seed, *names))
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
+
+
+@runtime_checkable
+class Irradiance(Protocol):
+    """The camera's image of the wall at every instant, before the sensor: no noise, no rounding."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W) of the camera image, pixels."""
+        ...
+
+    @property
+    def speed_px_s(self) -> float:
+        """Upper bound of the speed of the image on the sensor, pixels per second."""
+        ...
+
+    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
+        """Return the irradiance at times `t_s` (seconds, shape [] or [T]), float32 [H, W] or [T, H, W].
+
+        The unit is the camera's white level (1.0 = 255 DN); gain and ambient light are included.
+        """
+        ...

@@ -16,7 +16,7 @@ import torch
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_model import Irradiance, PixelSettings
+from evnlos.cameras.event_model import PixelSettings
 from evnlos.cameras.pixel import EventPixel, Mode, in_mode
 from evnlos.cameras.pixels.continuous_math import log_light
 from evnlos.cameras.random_numbers import check_seed
@@ -33,7 +33,7 @@ from evnlos.cameras.streams import (
     sort_times,
 )
 from evnlos.errors import ConfigError, DataError
-from evnlos.types import Events
+from evnlos.types import Events, Irradiance
 
 _BLOCK_STEPS = 256
 _CHUNK_BYTES = 64 << 20

@@ -12,17 +12,15 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
 from evnlos.registry import Kinded, Registry
 
 if TYPE_CHECKING:
-    import torch
-
     from evnlos.cameras.streams import Columns, Light
 
 Phase = Literal["random", "rest"]
@@ -38,24 +36,6 @@ KNEE_SLOPE = math.log(KNEE_DN) / KNEE_DN
 
 EVENT_MODELS: Registry[type[PixelSettings]] = Registry("evnlos.event_models", "event model")
 """The event models by kind."""
-
-
-class Irradiance(Protocol):
-    """What an event camera needs to know about the light: its image at any instant, and how fast it moves."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Size of the image (height, width), pixels."""
-        ...
-
-    @property
-    def speed_px_s(self) -> float:
-        """Upper bound of the speed of the image on the sensor, pixels per second."""
-        ...
-
-    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
-        """Return the image at the instants `t_s` [T] in seconds, float32 [T, H, W], 1.0 = white."""
-        ...
 
 
 class EventModel(ABC):

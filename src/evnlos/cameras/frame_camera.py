@@ -9,11 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from evnlos.cameras.event_model import Irradiance
 from evnlos.cameras.random_numbers import check_seed, fill_electrons
 from evnlos.config import check_made
 from evnlos.errors import ConfigError, DataError
-from evnlos.types import COLOURS, LUMA_601, Colour, Mosaic
+from evnlos.types import COLOURS, LUMA_601, Colour, Irradiance, Mosaic
 
 _GAUSS = {1: [(0.0, 1.0)], 3: [(-math.sqrt(0.6), 5 / 18), (0.0, 8 / 18), (math.sqrt(0.6), 5 / 18)]}
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from evnlos.cameras.event_camera import EventStream
-from evnlos.cameras.event_model import Irradiance, PixelSettings
+from evnlos.cameras.event_model import PixelSettings
 from evnlos.cameras.frame_camera import FrameCamera
 from evnlos.cameras.pixel import EventPixel, Mode
 from evnlos.cameras.video_files import (
@@ -35,7 +35,7 @@ from evnlos.cameras.video_files import (
     to_light,
 )
 from evnlos.errors import ConfigError, DataError
-from evnlos.types import Colour, Events
+from evnlos.types import Colour, Events, Irradiance
 from evnlos.untrusted import MOST_SENSOR_PIXELS, check_memory, no_file
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp")

@@ -302,7 +302,8 @@ def read_capture_info(
         held = f" (it holds {len(inside)}: {folder}/*)" if inside else ""
         raise ConfigError(f"{folder} holds no capture.yaml; give the folder of one capture{held}")
     values = read_yaml(path)
-    for one in (values.get("target"), *(values.get("others") or ())):  # digits are characters, too
+    others = values.get("others")
+    for one in (values.get("target"), *(others if isinstance(others, list) else ())):  # digits are characters
         if isinstance(one, dict) and type(one.get("name")) is int:
             one["name"] = str(one["name"])
     return from_dict(CaptureInfo, values, source=str(path))

@@ -7,7 +7,6 @@ gain.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import zlib
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from evnlos.analysis import bounds
 from evnlos.analysis.scores import paired_difference
 from evnlos.cameras import EventCamera, EventPixel, FlickeringWall, FrameCamera
-from evnlos.config import from_dict
+from evnlos.config import config_hash, from_dict, to_dict
 from evnlos.data.pool import run_in_order
 from evnlos.files import write_atomically
 from evnlos.inverse import (
@@ -209,8 +208,8 @@ def sweep_parameters(
         progress: Called when the work begins and of a condition and when it is done.
     """
     out.mkdir(parents=True, exist_ok=True)
-    keys = [json.dumps([asdict(one), characters]).encode() for one in chosen]
-    paths = [out / f"{hashlib.sha256(key).hexdigest()[:16]}.json" for key in keys]
+    keys = [config_hash({"condition": to_dict(one), "characters": characters}) for one in chosen]
+    paths = [out / f"{key}.json" for key in keys]
     todo = [k for k, path in enumerate(paths) if not path.is_file()]
     progress(Step("conditions", len(chosen) - len(todo), len(chosen), "conditions"))
     made = run_in_order(partial(measure, characters=characters), [chosen[k] for k in todo], workers)

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from evnlos.errors import ConfigError, DataError
 from evnlos.optics.interpolation import spline_coefficients, spline_weights
 from evnlos.optics.operator import DEPTH_STEP, DepthTransport, LinearTransport, MatrixTransport
-from evnlos.optics.wall import Irradiance, ambient_map, check_gain, checked_times
+from evnlos.optics.wall import ambient_map, check_gain, checked_times
 from evnlos.scene import Film, LineMotion, Motion, Pose, Scene, SeveralTargets, Target
-from evnlos.types import Plane
+from evnlos.types import Irradiance, Plane
 
 _CHUNK = 64  # positions drawn and carried over at a time
 _KEYFRAME_ERROR = 1e-3  # of the light's standard deviation

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -101,28 +100,6 @@ class ImageStrips:
 
 _MAX_CANVAS = 8192  # pixels per side
 _SAME_ROWS_PX = 1e-9
-
-
-@runtime_checkable
-class Irradiance(Protocol):
-    """The camera's image of the wall at every instant, before the sensor: no noise, no rounding."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Size (H, W) of the camera image, pixels."""
-        ...
-
-    @property
-    def speed_px_s(self) -> float:
-        """Upper bound of the speed of the image on the sensor, pixels per second."""
-        ...
-
-    def irradiance(self, t_s: ArrayLike) -> torch.Tensor:
-        """Return the irradiance at times `t_s` (seconds, shape [] or [T]), float32 [H, W] or [T, H, W].
-
-        The unit is the camera's white level (1.0 = 255 DN); gain and ambient light are included.
-        """
-        ...
 
 
 class SlidingWall:

@@ -27,7 +27,6 @@ from evnlos.cameras.event_model import (
     EVENT_MODELS,
     CrossingLaw,
     EventModel,
-    Irradiance,
     LogCurve,
     PixelSettings,
     check_pattern_seed,
@@ -50,6 +49,7 @@ from evnlos.cameras.random_numbers import (
 )
 from evnlos.cameras.streams import Columns, Light, sort_times
 from evnlos.errors import ConfigError
+from evnlos.types import Irradiance
 
 _WINDOW_US = 1000
 
