@@ -33,9 +33,8 @@ from numpy.typing import ArrayLike
 from evnlos.cameras import EventCamera, EventPixel, simulate_events
 from evnlos.cameras.pixel import Mode
 from evnlos.data.simulations import paper
-from evnlos.optics import Irradiance as CameraWall
 from evnlos.scene import Scene
-from evnlos.types import Events, derive_seed
+from evnlos.types import Events, Irradiance, derive_seed
 from machine import machine
 
 PAPER = EventPixel()
@@ -90,7 +89,7 @@ def long_video(height: int, width: int, steps: int) -> tuple[np.ndarray, np.ndar
     return frames, times
 
 
-def scene_wall(height: int, width: int) -> CameraWall:
+def scene_wall(height: int, width: int) -> Irradiance:
     """Return the wall of the first letter of the `paper` preset: 8 cm at 2 cm/s, handwriting."""
     config = paper()
     target = config.glyphs.target(config.glyphs.objects()[0], derive_seed(config.seed, "glyph"))

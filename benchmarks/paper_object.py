@@ -26,8 +26,8 @@ from evnlos.data import Simulation, make_samples
 from evnlos.data.sampling import edges_from
 from evnlos.data.simulations import paper
 from evnlos.machine import one_thread
-from evnlos.optics import Irradiance
 from evnlos.scene import Scene
+from evnlos.types import Irradiance
 from machine import machine
 
 PARTS = ("events", "frames", "maps")

@@ -25,12 +25,12 @@ from evnlos.data.capture import Capture
 from evnlos.data.capture_info import CameraInfo
 from evnlos.errors import EvnlosError
 from evnlos.metrics import psnr
-from evnlos.optics import FilmWall, Irradiance
+from evnlos.optics import FilmWall
 from evnlos.scene import Film, HandwritingGlyphs, LineMotion, PathMotion, Scene, SeveralTargets
 from evnlos.scene.handwriting import signed_distance
 from evnlos.setups import RadiometricSetup
 from evnlos.tracking import Tracking, Tracks, track_frames, track_several
-from evnlos.types import Events, Plane
+from evnlos.types import Events, Irradiance, Plane
 
 SENSOR, SECONDS, FRAMES = (32, 48), 8.0, 21
 PIXEL = EventPixel(0.18, 0.21, 0.04, 40.0, 0.0, 0.3, 0.0)

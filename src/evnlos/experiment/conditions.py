@@ -36,11 +36,10 @@ from evnlos.inverse import (
 )
 from evnlos.inverse.prior import TEST_CHARACTERS
 from evnlos.machine import Progress, Step, silent
-from evnlos.optics import Irradiance
 from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Scene, Target
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.setups.load import FAR_M
-from evnlos.types import Plane, derive_seed
+from evnlos.types import Irradiance, Plane, derive_seed
 
 FULL = 0.85
 """White levels of the brightest pixel of the base at 10 ms: nothing is clipped."""

@@ -15,7 +15,6 @@ from .corner import edge_irradiance as edge_irradiance
 from .corner import floor_bearing as floor_bearing
 from .corner import strip_response as strip_response
 from .matrix_wall import FilmWall as FilmWall
-from .matrix_wall import Irradiance as Irradiance
 from .matrix_wall import MatrixWall as MatrixWall
 from .matrix_wall import SeveralWall as SeveralWall
 from .matrix_wall import SpaceWall as SpaceWall

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
 from evnlos.errors import ConfigError
-from evnlos.optics import DepthTransport, Irradiance, LinearTransport, SeveralWall
+from evnlos.optics import DepthTransport, LinearTransport, SeveralWall
 from evnlos.optics.wall import ambient_plane
 from evnlos.registry import Kinded, Registry
 from evnlos.scene import Scene, SeveralTargets
 from evnlos.setups.files import Layout, Measurement, OperatorNoise
-from evnlos.types import Plane
+from evnlos.types import Irradiance, Plane
 
 S = TypeVar("S", bound="Setup")
 
