@@ -30,12 +30,13 @@ from evnlos.inverse import (
     SequenceLight,
     estimate_sequence,
     event_images,
+    handwritten_prior,
     record_of,
     sequence_light,
 )
 from evnlos.metrics import psnr
 from evnlos.models import SequenceConfig, Weights
-from evnlos.scene import HandwritingGlyphs
+from evnlos.scene import HandwritingGlyphs, Scene, Target
 from evnlos.setups import RadiometricSetup, SensorSize
 from evnlos.types import Events, Plane
 
@@ -61,6 +62,23 @@ def prior() -> PatternPrior:
 @cache
 def light() -> SequenceLight:
     return sequence_light(SETUP, prior(), BENCH.motion.position_m, (0.0, BENCH.duration_s))
+
+
+def test_the_light_is_right_on_sensors_of_any_ratio() -> None:
+    """The light path is computed for fewer pixels, of another ratio than the sensor's, and interpolated."""
+    target_plane = Plane(16, 16, 0.005)
+    known = handwritten_prior(target_plane, 100)
+    one = Target("E", np.clip(known.image(np.zeros(100)), 0, 1).astype(np.float32))
+    for shape in ((120, 100), (60, 160)):
+        setup = RadiometricSetup(cell_m=0.005, ambient=0.1, sensor=SensorSize(*shape))
+        times = np.array([0.0, 4.0, 8.0])
+        scene = Scene(one, BENCH.motion, 8.0)
+        made = sequence_light(setup, known, scene.motion.position_m, (0.0, 8.0))
+        rows = [
+            made.at(made(np.zeros(100)), np.arange(len(made.left)), np.full(len(made.left), t)) for t in times
+        ]
+        seen = setup.observe(scene).irradiance(times).double().numpy().reshape(3, -1)
+        assert np.linalg.norm(np.array(rows) - seen) / np.linalg.norm(seen - 0.1) < 0.01, shape
 
 
 def truth(seed: int) -> np.ndarray:

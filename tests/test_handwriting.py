@@ -1,5 +1,6 @@
 """NIST-like handwriting: consistent hands, the same on every run, different from writer to writer."""
 
+import dataclasses
 import hashlib
 import subprocess
 import sys
@@ -10,10 +11,15 @@ from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse import handwritten_prior
+from evnlos.inverse.prior import letters, written_alike
 from evnlos.scene import (
     TRAIN_WRITERS,
     HandwritingGlyphs,
+    Ink,
     Strokes,
+    Target,
+    TargetPlane,
     find_font,
     hand,
     held_out_writers,
@@ -22,7 +28,8 @@ from evnlos.scene import (
     redrawn,
     render_glyph,
 )
-from evnlos.scene.handwriting import signed_distance
+from evnlos.scene.handwriting import ink_box, signed_distance
+from evnlos.types import Plane
 
 STEMS = "BDEFHIKLPRT"  # letters whose upright strokes show the slant
 
@@ -37,16 +44,18 @@ def slant(mask):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_signed_distance_matches_scipy(seed):
-    rng = np.random.default_rng(seed)
-    mask = rng.random((37, 52)) > rng.choice([0.02, 0.5, 0.98])
-    reach = int(rng.integers(1, 25))
-    expected = np.where(
-        mask,
-        0.5 - np.minimum(distance_transform_edt(mask) if not mask.all() else 1e9, reach),
-        np.minimum(distance_transform_edt(~mask) if mask.any() else 1e9, reach) - 0.5,
-    )
-    np.testing.assert_allclose(signed_distance(mask.astype(np.float32), reach), expected, atol=1e-5)
+def test_signed_distance_is_that_of_a_search_over_all_pixels(seed):
+    draw = np.random.default_rng(seed)
+    mask = draw.random(draw.integers(3, 14, size=2)) < draw.random() if seed else np.zeros((4, 5))
+    inside = np.asarray(mask) >= 0.5
+    places = np.argwhere(np.ones_like(inside))
+
+    def to(chosen):
+        away = np.linalg.norm(places[:, None] - np.argwhere(chosen)[None], axis=-1)
+        return np.minimum(away.min(axis=1, initial=5), 5).reshape(inside.shape)
+
+    expected = np.where(inside, 0.5 - to(~inside), to(inside) - 0.5)
+    np.testing.assert_allclose(signed_distance(mask, 5), expected, atol=1e-6)
 
 
 def test_signed_distance_of_nothing_and_everything():
@@ -203,3 +212,54 @@ def test_redrawn_targets_are_objects_of_the_set(tmp_path) -> None:
     for folder in (tmp_path / "none", other):
         with pytest.raises(ConfigError, match="holds no images"):
             HandwritingGlyphs(known=str(folder), redrawn=1).objects()
+
+
+def test_hands_are_as_large_as_asked_and_where_asked():
+    small = nist_like(3, "R", 0, 128, 0.7, Strokes(height=(0.5, 0.5)), (0.1, -0.15))
+    box = ink_box(small) / 128
+    assert max(box[2:] - box[:2]) == pytest.approx(0.7 * 0.5, rel=0.1)
+    np.testing.assert_allclose((box[2:] + box[:2]) / 2, [0.1, -0.15], atol=0.02)
+    with pytest.raises(ConfigError, match="ascending"):
+        Strokes(height=(0.5, 1.2))
+    with pytest.raises(ConfigError, match="centre is"):
+        HandwritingGlyphs(centre=(0.0, 0.7))
+    again = redrawn(small, "R", 2, 0)
+    np.testing.assert_allclose(ink_box(again).reshape(2, 2).mean(axis=0) / 128, [0.1, -0.15], atol=0.02)
+
+
+def test_the_ink_of_targets_is_found():
+    mask = np.zeros((40, 40), np.float32)
+    mask[10:20, 4:34] = 1
+    one, empty = Target("bar", mask, 0.08), Target("nothing", np.zeros((8, 8)), 0.08)
+    assert Ink.of([one, empty]) == Ink(0.06, (-0.002, -0.01))
+    assert Ink.of([empty]) == Ink()
+
+
+def test_writers_write_as_the_known_targets_are_written():
+    plane = TargetPlane(size_m=0.1, size_px=128)
+    known = HandwritingGlyphs(
+        characters="ABC27",
+        writers=2,
+        strokes=Strokes("print", (0.1, 0.12), (0.9, 1.0)),
+        target_plane=dataclasses.replace(plane, letter_fraction=0.5, digit_fraction=0.4),
+        centre=(0.05, 0.1),
+    )
+    shown = [dataclasses.replace(known.target(name), name=name[-1]) for name in known.objects()]
+    alike = written_alike(HandwritingGlyphs(target_plane=plane), shown)
+    assert alike.target_plane.letter_fraction == pytest.approx(0.5, abs=0.03)
+    assert alike.target_plane.digit_fraction == pytest.approx(0.4, abs=0.03)
+    np.testing.assert_allclose(alike.centre, known.centre, atol=0.02)
+    assert alike.strokes.height == (0.85, 1.0) and 0.05 < alike.strokes.pen[0] < alike.strokes.pen[1] < 0.2
+    alone = written_alike(HandwritingGlyphs(target_plane=plane), [one for one in shown if one.name in "27"])
+    assert alone.target_plane.letter_fraction == pytest.approx(0.53, abs=0.04)
+    assert written_alike(known, [Target("nothing", np.zeros((8, 8)), 0.1)]) == known
+
+
+def test_the_prior_has_the_size_and_the_place_of_the_ink():
+    plane = Plane(32, 32, 0.002)
+    whole, part = handwritten_prior(plane, 50), handwritten_prior(plane, 50, ink=Ink(0.03, (0.01, 0.0)))
+    truth = dataclasses.replace(letters()[0], size_m=0.03).rasterise(plane, (0.01, 0.0))
+    left = [np.square(p.image(p.coefficients(truth)) - truth).mean() for p in (whole, part)]
+    assert left[1] < left[0] / 3
+    ys, xs = np.nonzero(part.mean.reshape(32, 32) > 0.1)
+    assert np.ptp(xs) * 0.002 < 0.04 and xs.mean() == pytest.approx(15.5 + 5, abs=1.5) and np.ptp(ys) < 20

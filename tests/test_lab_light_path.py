@@ -26,6 +26,13 @@ OPTICS = Optics(
 )
 
 
+def test_pixels_of_another_height_see_their_part():
+    plain = dataclasses.replace(OPTICS, aperture_m=0.0, samples=1)
+    tall = cast(dataclasses.replace(plain, shape=(2, 6), pixel_aspect=2.0)).point.reshape(2, 6, 3)
+    square = cast(plain).point.reshape(2, 2, 6, 3)
+    np.testing.assert_allclose(tall, square.mean(axis=1), atol=1e-3)
+
+
 def directions(draw: np.random.Generator, count: int, steepest: float = 1.2) -> np.ndarray:
     """Return unit vectors [count, 3] before the wall, at up to `steepest` radians from its normal."""
     polar, turn = steepest * np.sqrt(draw.random(count)), draw.uniform(0, 2 * np.pi, count)

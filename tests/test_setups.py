@@ -141,6 +141,30 @@ def test_a_smaller_image_has_the_mean_light(setup: Setup) -> None:
         assert float(setup.resized((5, 8)).operator(PLANE)(x).mean()) > 0
 
 
+def test_more_or_fewer_pixels_see_the_same(setup: Setup) -> None:
+    x = torch.zeros(PLANE.shape, dtype=torch.float64)
+    x[: PLANE.height // 2, PLANE.width // 3 :] = 1
+    height, width = SHAPE
+    seen = setup.linear_part(PLANE)(x)
+    for shape in ((3 * height, width), (height, 3 * width), (3 * height, 3 * width)):
+        other = setup.resized(shape)
+        assert other.resized(SHAPE) == setup and other.seen_by(SHAPE) == setup
+        if other.shape != shape:  # a scan has no more pixels than its camera
+            continue
+        assert other.sensor.pixel_aspect == pytest.approx(height / shape[0] * shape[1] / width)
+        fine = other.linear_part(PLANE)(x).reshape(height, shape[0] // height, width, shape[1] // width)
+        away = fine.mean(dim=(1, 3)) / fine.mean() - seen / seen.mean()
+        assert float(away.norm() / (seen / seen.mean()).norm()) < 0.02, shape
+
+
+def test_a_camera_of_another_ratio_has_square_pixels(setup: Setup) -> None:
+    other = setup.seen_by((16, 16))
+    if setup.kind == "measured":  # a scan knows no other camera than its own
+        assert other.shape == setup.resized((16, 16)).shape
+    else:
+        assert other.sensor == SensorSize(16, 16)
+
+
 def test_parameters_are_settings_that_can_be_moved(setup: Setup) -> None:
     parameters = setup.parameters()
     assert all(one.low <= one.value <= one.high and one.step > 0 for one in parameters)

@@ -145,7 +145,7 @@ def from_whole_sequence(recorded: Recorded) -> Reconstruction:
     light = object_light(frames, recorded.peak, setup, shape)
     strip = setup.target_cells()
     assert strip is not None  # `_known` refuses setups without
-    made = setup.resized(shape).operator(strip, dtype=torch.float32)
+    made = setup.seen_by(shape).operator(strip, dtype=torch.float32)
     places = recorded.motion.position_m(recorded.times_s)
     target_plane = Plane(_CELLS, _CELLS, size_m / _CELLS)
     problem = SequenceProblem(

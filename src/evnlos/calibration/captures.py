@@ -260,6 +260,7 @@ def _check_same_setup(first: Capture, other: Capture) -> None:
 Array = NDArray[np.float64]
 
 _SATURATED = 0.995
+_LATTICE = 0.382  # times the pixels of which one takes part: the step from row to row
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +332,7 @@ def wall_data(
     *,
     every: int = 4,
     first: int | None = None,
-    checkered: bool = False,
+    part: int = 1,
 ) -> WallData:
     """Return the frames of captures at a working size, and their targets as images on a plane's cells.
 
@@ -341,7 +342,7 @@ def wall_data(
         plane: Cells, over the whole travel.
         every: Only every n-th frame of a capture takes part.
         first: The first of them; None is the middle of the first n.
-        checkered: Whether only every second pixel takes part, in the pattern of a chessboard.
+        part: One pixel in so many takes part, evenly spread; 2 is the pattern of a chessboard.
     """
     height, width = capture_set.shape
     columns = min(columns, width)
@@ -358,7 +359,7 @@ def wall_data(
         places.append(place)
     seen, drawn = np.concatenate(frames), np.concatenate(pictures)
     v, u = np.meshgrid(np.arange(grid[0]), np.arange(grid[1]), indexing="ij")
-    keep = ((u + v) % 2 == 0).ravel() if checkered else np.ones(u.size, bool)
+    keep = ((u + round(_LATTICE * part + 0.5) * v) % part == 0).ravel()
     keep &= (seen < _SATURATED).all(axis=0).ravel()
     light = np.ascontiguousarray(seen.reshape(len(seen), -1).T[keep], dtype=np.float64)
     level = light.mean(axis=1)

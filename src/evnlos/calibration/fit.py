@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -26,8 +26,9 @@ from evnlos.cameras import PixelSettings
 from evnlos.cameras.pixel import continuous
 from evnlos.data.simulate import Simulation, ranges_around
 from evnlos.errors import ConfigError, DataError
+from evnlos.inverse.prior import written_alike
 from evnlos.machine import Progress, Step, silent
-from evnlos.scene import HandwritingGlyphs, LineMotion, Strokes, pen_width
+from evnlos.scene import HandwritingGlyphs, Ink, LineMotion, Strokes, Target
 from evnlos.setups import RadiometricSetup, SensorSize, Setup
 
 _AT_NOISE = 1.03  # times the noise's residual: what is below has nothing left to explain
@@ -79,6 +80,7 @@ class SetupFit:
         mean_frame: Residual of the frames held out where the mean of the fitted frames stands for the model.
         known: Masks of the known targets by capture, [S, S] each: pre-training draws them again.
         frame_doubt: By how much the variance of the frames' noise is raised when they are solved for a target.
+        ink: Where the known targets have their ink.
     """
 
     simulation: Simulation
@@ -94,6 +96,7 @@ class SetupFit:
     mean_frame: float = math.inf
     known: dict[str, NDArray[np.float32]] = field(default_factory=dict)
     frame_doubt: float = 1.0
+    ink: Ink = field(default_factory=Ink)
 
     @property
     def captures(self) -> tuple[str, ...]:
@@ -223,13 +226,13 @@ def fit_setup(
             residuals |= {f"{kind} {name}": r for kind, r in events.items()}
     progress(Step("calibrate", len(stages), len(stages), "stages"))
     examples = _examples(held, models["held out"], predicted["held out"].numpy(), surfaces)
-    strokes, known = Strokes().pen, dict[str, NDArray[np.float32]]()
+    known, shown = dict[str, NDArray[np.float32]](), list[Target]()
     if settings.targets == "known":
-        strokes = pens_of([scene.target.mask for scene in fit.scenes])
+        shown = [scene.target for scene in fit.scenes]
         seen_targets = [*zip(fit.names, fit.scenes, strict=True), *zip(held.names, held.scenes, strict=True)]
         side = simulation.glyphs.target_plane.size_m
         known = {name: scene.target.mask for name, scene in seen_targets if scene.target.size_m == side}
-    training = training_simulation(simulation, noise, pixel, strokes)
+    training = training_simulation(simulation, noise, pixel, shown)
     return SetupFit(
         simulation,
         training,
@@ -244,6 +247,7 @@ def fit_setup(
         float(seen.relative((seen.frames - models["fit"].frames.mean(dim=0)) * seen.weight)),
         known,
         1.0 if wall is None else frame_doubt(held, optics.setup, noise),
+        Ink.of(shown),
     )
 
 
@@ -311,7 +315,6 @@ def _examples(
     return tuple(chosen)
 
 
-_PEN_MARGIN = 0.1  # the pens' range is widened by this fraction at both ends
 _SPREAD = {
     "setup.roughness": 0.04,
     "setup.slopes": 0.03,
@@ -332,32 +335,24 @@ _SETUPS = 6  # different walls and cameras: each costs a light-transport matrix
 _LEAK_HZ = 0.1  # captures of some seconds do not show a smaller leak
 
 
-def pens_of(masks: Iterable[NDArray]) -> tuple[float, float]:
-    """Return the thinnest and the thickest pen of some drawings, parts of their ink's longer side."""
-    pens = [pen_width(mask) for mask in masks]
-    return min(pens), max(pens)
-
-
 def training_simulation(
-    fitted: Simulation, noise: FrameNoise, pixel: PixelFit | None, pens: tuple[float, float]
+    fitted: Simulation, noise: FrameNoise, pixel: PixelFit | None, shown: Sequence[Target]
 ) -> Simulation:
     """Return the simulation to pre-train on: the fitted one, varied from object to object.
 
-    The frame camera has the fixed pattern that stays after correction, a new one for each object. The pens'
-    range is that of the known targets, a tenth wider at both ends; their letters are not copied.
+    The frame camera has the fixed pattern that stays after correction, a new one for each object. Letters are
+    as large as those of the known targets, and with pens like theirs; they are not copied.
 
     Args:
         fitted: The simulation that matches the setup.
         noise: The frame camera's noise.
         pixel: The fitted event pixel; None where only frames were fitted.
-        pens: Thinnest and thickest pen of the known targets.
+        shown: The known targets; none where they are unknown.
     """
     prnu, dsnu = noise.remaining
     glyphs = fitted.glyphs
     if isinstance(glyphs, HandwritingGlyphs):
-        low, high = pens[0] * (1 - _PEN_MARGIN), pens[1] * (1 + _PEN_MARGIN)
-        strokes = Strokes("both", (max(0.02, round(low, 3)), min(0.4, round(high, 3))))
-        glyphs = replace(glyphs, strokes=strokes)
+        glyphs = written_alike(replace(glyphs, strokes=Strokes("both")), shown)
     vary = fitted.vary | ranges_around(fitted, _SPREAD)
     for one in fitted.setup.parameters():
         if one.role == "place":

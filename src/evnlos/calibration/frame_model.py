@@ -19,6 +19,7 @@ from evnlos.data.fixed_pattern import FixedPattern
 from evnlos.data.sampling import reduce_by_area
 from evnlos.errors import ConfigError, DataError
 from evnlos.inverse import FrameTerm, SequenceLight, handwritten_prior, sequence_light
+from evnlos.scene import Ink
 from evnlos.setups import Setup
 from evnlos.types import Plane
 
@@ -379,7 +380,8 @@ def frame_doubt(held: CaptureSet, setup: Setup, noise: FrameNoise) -> float:
     grid = (min(held.shape[0], _GRID[0]), min(held.shape[1], _GRID[1]))
     together = held.shape[0] * held.shape[1] / (grid[0] * grid[1])  # pixels whose mean is one of the grid
     plane = Plane(_CELLS, _CELLS, held.target_size_m / _CELLS)
-    prior, errors, lights = handwritten_prior(plane), np.zeros(len(FACTORS)), dict[Any, SequenceLight]()
+    prior = handwritten_prior(plane, ink=Ink.of(scene.target for scene in held.scenes))
+    errors, lights = np.zeros(len(FACTORS)), dict[Any, SequenceLight]()
     for k, (capture, scene) in enumerate(zip(held.captures, held.scenes, strict=True)):
         times_s = held.times_s(k)
         span_s = (float(times_s[0]), float(times_s[-1]))

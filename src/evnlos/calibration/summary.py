@@ -326,7 +326,7 @@ def _with_wall(fit: SetupFit, simulation: Simulation, out: Path) -> Simulation:
         write_atomically(path, Path(setup.file).read_bytes())
     left = round(fit.residuals["frames held out, without pattern"].unexplained, 4)
     told = {"misfit": "; ".join(warnings_of(fit)), "unexplained": left, "frame_doubt": fit.frame_doubt}
-    return simulation.with_setup(file=str(path), **told)
+    return simulation.with_setup(file=str(path), ink=fit.ink, **told)
 
 
 def _with_targets(fit: SetupFit, simulation: Simulation, folder: Path) -> Simulation:

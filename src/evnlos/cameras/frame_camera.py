@@ -18,6 +18,40 @@ _GAUSS = {1: [(0.0, 1.0)], 3: [(-math.sqrt(0.6), 5 / 18), (0.0, 8 / 18), (math.s
 
 
 @dataclass(frozen=True)
+class SensorSize:
+    """Pixels of the sensor that carries both the frame and the event pixels."""
+
+    height: int = 100
+    """Rows, pixels."""
+    width: int = 160
+    """Columns, pixels."""
+    pixel_aspect: float = 1.0
+    """Height of a pixel over its width."""
+
+    def __post_init__(self) -> None:
+        for name in ("height", "width"):
+            if not 1 <= getattr(self, name) <= 8192:
+                raise ConfigError(f"SensorSize.{name} is {getattr(self, name)}; give 1 to 8192 pixels")
+        if not 0.01 <= self.pixel_aspect <= 100:
+            raise ConfigError(f"SensorSize.pixel_aspect is {self.pixel_aspect}; give 0.01 to 100")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size (H, W), pixels."""
+        return self.height, self.width
+
+    def resized(self, shape: tuple[int, int]) -> SensorSize:
+        """Return a sensor of another size (H, W) that sees the same: its pixels are larger or smaller.
+
+        Example:
+            >>> SensorSize(260, 346).resized((50, 80)).pixel_aspect
+            1.2023121387283238
+        """
+        aspect = self.pixel_aspect * (self.height * shape[1]) / (self.width * shape[0])
+        return SensorSize(*shape, aspect)
+
+
+@dataclass(frozen=True)
 class FrameCamera:
     """A linear frame camera in the terms of the EMVA 1288 standard.
 

@@ -260,7 +260,7 @@ class InvertCommand:
         level = light.mean(dim=0) + setup.ambient_light(shape)
         averaged = height * width / (shape[0] * shape[1])  # of the sensor's pixels, each with its own noise
         noise = (setup.frame_camera.noise_variance(level) / averaged).sqrt()
-        operator = setup.resized((height, width)).operator(plane, shape)
+        operator = setup.seen_by((height, width)).operator(plane, shape)
         found = estimate_film(operator, light, capture.frame_times_us * 1e-6, noise, static=self.static)
         shown = np.linspace(0, len(found.mean) - 1, min(6, len(found.mean))).round().astype(int)
         panels = [(f"{found.times_s[k]:.2f} s", torch.from_numpy(found.mean[k])[None]) for k in shown]

@@ -110,7 +110,7 @@ def invert_captures(
             size *= 1.25  # a tracked position is that of the light's middle, which need not be the target's
         target_plane = Plane(options.cells, options.cells, size / options.cells)
         progress(Step("invert", done, total, "motions", within="light path of the setup"))
-        transport = matrix_of(setup.resized((height, width)).operator(strip_of(motion, target_plane), shape))
+        transport = matrix_of(setup.seen_by((height, width)).operator(strip_of(motion, target_plane), shape))
         gram = strip_gram_of(transport)
         for count in options.positions or (len(motion),):
             for chosen in position_subsets(len(motion), count, options.subsets):
@@ -302,12 +302,12 @@ def estimate_captures(
         if motion is None:
             raise ConfigError(f"{folder}: unknown motion; state it in capture.yaml (`evnlos track` finds it)")
         motion, size = motion.in_its_plane(), capture.info.target_size_m
-        prior = handwritten_prior(Plane(CELLS, CELLS, size / CELLS), COEFFICIENTS)
+        prior = handwritten_prior(Plane(CELLS, CELLS, size / CELLS), COEFFICIENTS, ink=setup.ink)
         span = (float(capture.frame_times_us[0]) * 1e-6, float(capture.frame_times_us[-1]) * 1e-6)
         shape = (capture.events.height, capture.events.width)
         key = (motion, span, shape, size)
         if key not in lights:
-            lights[key] = sequence_light(setup, prior, motion.position_m, span, shape)
+            lights[key] = sequence_light(setup.seen_by(shape), prior, motion.position_m, span, shape)
         light = lights[key]
         begun = time.process_time()
         frames = record = law = None

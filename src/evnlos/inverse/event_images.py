@@ -212,7 +212,7 @@ def event_images(
 def _solver(
     setup: str, motion: Motion, span_s: tuple[float, float], shape: tuple[int, int]
 ) -> tuple[EventSolver, PatternPrior]:
-    """Return the solver of a setup, and its prior: handwriting, as large as the usual target."""
+    """Return the solver of a setup, and its prior: letters as large as the known targets' or the usual one."""
     try:
         known = load_setup(setup)
     except UnknownNameError:
@@ -221,9 +221,10 @@ def _solver(
             "folder of `evnlos calibrate` that the samples were made with, from where its name leads to it, or "
             "put a folder `near` beside weights `near-....safetensors`"
         ) from None
-    prior = handwritten_prior(Plane(CELLS, CELLS, TargetPlane().size_m / CELLS), COEFFICIENTS)
+    plane = Plane(CELLS, CELLS, TargetPlane().size_m / CELLS)
+    prior = handwritten_prior(plane, COEFFICIENTS, ink=known.ink)
     note("light path of the events")
-    light = sequence_light(known, prior, motion.position_m, span_s, shape)
+    light = sequence_light(known.seen_by(shape), prior, motion.position_m, span_s, shape)
     law = known.pixel.crossing_law(light.typical_dn)
     if law is None:
         raise ConfigError(

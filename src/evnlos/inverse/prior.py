@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from evnlos.errors import ConfigError
 from evnlos.machine import note
-from evnlos.scene import TRAIN_WRITERS, HandwritingGlyphs, Strokes, Target
+from evnlos.scene import DIGITS, TRAIN_WRITERS, HandwritingGlyphs, Ink, Strokes, Target, pen_width
 from evnlos.types import Plane
 from evnlos.untrusted import open_image
 
@@ -36,6 +36,7 @@ LETTERS = HandwritingGlyphs(characters=TRAIN_CHARACTERS, writers=11, strokes=Str
 LETTERS_FILE, LETTER_PX = Path(__file__).with_name("letters.png"), 64
 """They are drawn there, a row a writer, on squares of so many cells (`tools/draw_letters.py`)."""
 
+_PEN_MARGIN = 0.1  # the pens' range is widened by this fraction at both ends
 _TEST_WRITERS = 2
 _RIDGE = 1e-3  # white part of the prior, share of its mean variance: no shape is impossible
 
@@ -71,12 +72,12 @@ def handwritten_targets(target_plane: Plane, writers: int = 6) -> TargetPrior:
     Training targets are also moved by a cell each way, so that the prior does not know the place to a cell.
 
     Args:
-        target_plane: Cells of the target plane, square.
+        target_plane: Cells of the target plane, square; the writers fill it.
         writers: Writers of the training targets.
     """
-    mean, root = _gaussian_of(_drawn(writers), target_plane)
+    mean, root = _gaussian_of(_drawn(writers), target_plane, Ink())
     testing = HandwritingGlyphs(characters=TEST_CHARACTERS, writers=_TEST_WRITERS, first_writer=TRAIN_WRITERS)
-    targets = [testing.target(name) for name in testing.objects()]
+    targets = [replace(testing.target(name), size_m=target_plane.extent_m[1]) for name in testing.objects()]
     test = torch.from_numpy(np.stack([one.rasterise(target_plane) for one in targets])).double().flatten(1)
     stroke = float(np.median([stroke_width_m(one) for one in targets]))
     return TargetPrior(mean, root, test, tuple(testing.objects()), stroke)
@@ -97,17 +98,50 @@ def letters() -> tuple[Target, ...]:
     with open_image(LETTERS_FILE) as sheet:
         drawn = np.asarray(sheet, np.float32) / np.float32(255)
     squares = drawn.reshape(-1, LETTER_PX, drawn.shape[1] // LETTER_PX, LETTER_PX).swapaxes(1, 2)
-    size_m = LETTERS.target_plane.size_m
-    return tuple(Target("letter", one, size_m) for one in squares.reshape(-1, LETTER_PX, LETTER_PX))
+    return tuple(Target("letter", one) for one in squares.reshape(-1, LETTER_PX, LETTER_PX))
 
 
-def _gaussian_of(targets: Iterable[Target], target_plane: Plane) -> tuple[torch.Tensor, torch.Tensor]:
+def _gaussian_of(targets: Iterable[Target], target_plane: Plane, ink: Ink) -> tuple[torch.Tensor, torch.Tensor]:
     """Return mean [n] and root [n, n] of targets, also moved by a cell; shortest columns first."""
-    drawn = np.stack([one.rasterise(target_plane) for one in targets]).astype(np.float64)
+    sized = [replace(one, size_m=ink.size_m or target_plane.extent_m[1]) for one in targets]
+    drawn = np.stack([one.rasterise(target_plane, ink.centre_m) for one in sized]).astype(np.float64)
     moved = [np.roll(drawn, (dy, dx), axis=(1, 2)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     samples = torch.from_numpy(np.concatenate(moved)).flatten(1)  # [9 N, n]
     variance, axes = torch.linalg.eigh(torch.cov(samples.mT))
     return samples.mean(dim=0), axes * (variance.clamp(min=0) + _RIDGE * variance.mean()).sqrt()
+
+
+def written_alike(glyphs: HandwritingGlyphs, shown: Iterable[Target]) -> HandwritingGlyphs:
+    """Return writers whose letters are as large as known ones, in their place, and with pens like theirs.
+
+    The pens' range is a tenth wider at both ends, and the smallest hand no larger than it was. Digits have
+    their own size where any is known, else they are to letters as they were.
+
+    Args:
+        glyphs: The writers.
+        shown: Known targets on planes of one size, by their names; those without ink do not count.
+    """
+    inked = [one for one in shown if (ink := Ink.of([one])) and ink.size_m > 0]
+    if not inked:
+        return glyphs
+    parts = [(one.name in DIGITS, Ink.of([one]).size_m / one.size_m) for one in inked]
+    digits, others = ([part for digit, part in parts if digit is wanted] for wanted in (True, False))
+    plane = glyphs.target_plane
+    ratio = plane.digit_fraction / plane.letter_fraction
+    letter = max(others) if others else min(1.0, max(digits) / ratio)
+    digit = max(digits) if digits else letter * ratio
+    smallest = min(part / (digit if is_digit else letter) for is_digit, part in parts)
+    pens = [pen_width(one.mask) for one in inked]
+    low, high = min(pens) * (1 - _PEN_MARGIN), max(pens) * (1 + _PEN_MARGIN)
+    pen = max(0.02, round(low, 3)), min(0.4, round(high, 3))
+    heights = max(0.1, round(min(glyphs.strokes.height[0], smallest), 3)), 1.0
+    x, y = Ink.of(inked).centre_m
+    return replace(
+        glyphs,
+        strokes=replace(glyphs.strokes, pen=pen, height=heights),
+        target_plane=replace(plane, letter_fraction=round(letter, 3), digit_fraction=round(digit, 3)),
+        centre=(round(x / inked[0].size_m, 3), round(y / inked[0].size_m, 3)),
+    )
 
 
 def stroke_width_m(target: Target) -> float:
@@ -177,6 +211,7 @@ def handwritten_prior(
     target_plane: Plane,
     coefficients: int = 150,
     writers: int | None = None,
+    ink: Ink | None = None,
 ) -> PatternPrior:
     """Return the Gaussian of written targets by its largest patterns.
 
@@ -187,6 +222,7 @@ def handwritten_prior(
         coefficients: Patterns that are kept.
         writers: Writers of handwritten targets. None: the letters that come with the package, print among them,
             since a prior of handwriting alone takes broad strokes for noise.
+        ink: How large the largest letters are, and where; None is as large as the target.
 
     Raises:
         ConfigError: More coefficients than cells, or none.
@@ -195,8 +231,9 @@ def handwritten_prior(
         raise ConfigError(
             f"coefficients is {coefficients}; give 1 to {target_plane.height * target_plane.width}, its cells"
         )
-    if writers is None:
-        mean, root = _gaussian_of(letters(), target_plane)
+    if writers is None or ink is not None:
+        drawn = letters() if writers is None else _drawn(writers)
+        mean, root = _gaussian_of(drawn, target_plane, ink or Ink())
     else:
         known = handwritten_targets(target_plane, writers)
         mean, root = known.mean, known.root

@@ -15,7 +15,6 @@ from functools import cached_property
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.nn.functional import interpolate
 
 from evnlos.cameras import FrameCamera
 from evnlos.cameras.streams import WHITE_DN
@@ -152,7 +151,7 @@ def sequence_light(
     """Return the light of a moving target on a camera.
 
     The setup's matrix is computed for pixels of at most 50 x 80 and for the coarsest cells that its blur
-    allows, and brought to the camera's pixels by cubic interpolation: the light of a rough wall is smooth. Its
+    allows, and brought to the camera's pixels by cubic splines: the light of a rough wall is smooth. Its
     factors are those of the largest eigenvalues of A^T A, down to 1e-4 of the largest singular value.
 
     Args:
@@ -196,9 +195,9 @@ def sequence_light(
     matrix = resized.operator(strip, coarse).dense()
     left, right = (factor.numpy() for factor in main_factors(matrix, rank))
     if coarse != shape:
-        images = torch.from_numpy(left.T.copy()).unflatten(1, coarse)[None]
-        fine = interpolate(images, size=shape, mode="bicubic", align_corners=False)
-        left = fine[0].flatten(1).mT.contiguous().numpy()
+        down, across = (_spline_matrix(*sizes) for sizes in zip(coarse, shape, strict=True))
+        images = np.einsum("yi,xj,ijr->yxr", down, across, left.reshape(*coarse, -1), optimize=True)
+        left = images.reshape(-1, left.shape[1])
     targets = np.concatenate([prior.mean[:, None], prior.patterns], axis=1).T.reshape(
         -1, *prior.target_plane.shape
     )
@@ -213,6 +212,16 @@ def sequence_light(
     if along is not None:
         still = still + along.flatten(1).T.numpy()
     return SequenceLight(left, responses, still, times, shape)
+
+
+def _spline_matrix(coarse: int, fine: int) -> Array:
+    """Return the cubic spline from pixels [n] to pixels [m] of another size over the same way, [m, n]."""
+    from scipy.interpolate import CubicSpline  # scipy loads slowly
+
+    if coarse == fine:
+        return np.eye(fine)
+    middles = (np.arange(fine) + 0.5) * coarse / fine - 0.5
+    return np.asarray(CubicSpline(np.arange(coarse), np.eye(coarse))(middles))
 
 
 def main_factors(matrix: torch.Tensor, rank: int, tail: float = _TAIL) -> tuple[torch.Tensor, torch.Tensor]:

@@ -235,6 +235,7 @@ class Optics:
         falloff: Loss of light in the corners beside the cosine's fourth power, 0..1.
         curvature: Curvatures of the wall along x and y, 1/metre; positive bulges into the room.
         samples: Rays a pixel.
+        pixel_aspect: Height of a pixel over its width.
     """
 
     shape: tuple[int, int]
@@ -249,6 +250,7 @@ class Optics:
     falloff: float
     curvature: tuple[float, float]
     samples: int
+    pixel_aspect: float = 1.0
 
 
 def camera_axes(optics: Optics) -> tuple[Array, Array, Array, Array]:
@@ -275,8 +277,9 @@ def cast(optics: Optics) -> Rays:
     tangent = 2 * math.tan(optics.fov / 2) / width
     rows, columns = np.divmod(np.arange(height * width), width)
     p = (columns[:, None] - (width - 1) / 2 + pixel[:, 0]) * tangent  # [P, S]
-    q = (rows[:, None] - (height - 1) / 2 + pixel[:, 1]) * tangent
-    r2 = (p * p + q * q) / ((width**2 + height**2) / 4 * tangent**2)  # 1 in the corners
+    tall = tangent * optics.pixel_aspect
+    q = (rows[:, None] - (height - 1) / 2 + pixel[:, 1]) * tall
+    r2 = (p * p + q * q) / (((width * tangent) ** 2 + (height * tall) ** 2) / 4)  # 1 in the corners
     stretch = 1 + optics.radial[0] * r2 + optics.radial[1] * r2 * r2
     p, q = p * stretch, q * stretch
     straight = forward + p[..., None] * right + q[..., None] * down  # [P, S, 3], of length 1 along the axis

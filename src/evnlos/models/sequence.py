@@ -260,7 +260,7 @@ class PooledFrames(nn.Module):
         light = torch.zeros(kept, *operator.size)
         light[:, rows] = carry.T.unflatten(1, (-1, operator.size[1]))
         self._take(basis, light, along, shifts.T @ shifts / count, white)
-        prior = handwritten_prior(self.target_plane, _COEFFICIENTS)
+        prior = handwritten_prior(self.target_plane, _COEFFICIENTS, ink=setup.ink)
         self.mean.copy_(torch.from_numpy(prior.mean).unflatten(0, self.target_plane.shape))
         self.patterns.copy_(torch.from_numpy(prior.patterns.T.copy()).unflatten(1, self.target_plane.shape))
         self._last.clear()

@@ -334,7 +334,9 @@ class Seen:
     eyes: Array
 
 
-def seen_points(pose: Pose, shape: tuple[int, int], columns: Array, rows: Array) -> Seen:
+def seen_points(
+    pose: Pose, shape: tuple[int, int], columns: Array, rows: Array, pixel_aspect: float = 1.0
+) -> Seen:
     """Return the wall points that a camera sees at given places of its image.
 
     The wall is z = (c_x x^2 + c_y y^2) / 2, with c its curvatures; the ray meets it after three Newton steps
@@ -345,13 +347,14 @@ def seen_points(pose: Pose, shape: tuple[int, int], columns: Array, rows: Array)
         shape: Size (H, W) of the camera image, pixels.
         columns: Columns of the places [P], pixels; pixel centres are whole numbers.
         rows: Their rows [P].
+        pixel_aspect: Height of a pixel over its width.
 
     Raises:
         ConfigError: Some of the pixels do not see the wall.
     """
     height, width = shape
     slope = 2 * math.tan(math.radians(pose.field_of_view_deg) / 2) / width
-    p, q = (columns - (width - 1) / 2) * slope, (rows - (height - 1) / 2) * slope
+    p, q = (columns - (width - 1) / 2) * slope, (rows - (height - 1) / 2) * (slope * pixel_aspect)
     grown = 1 + pose.distortion * (p * p + q * q) / (slope * width / 2) ** 2
     p, q = p * grown, q * grown
     roll = math.radians(pose.camera_roll_deg)
@@ -509,6 +512,7 @@ def facet_matrix(
     source: Plane,
     dtype: type = np.float32,
     samples: int = 1,
+    pixel_aspect: float = 1.0,
 ) -> NDArray:
     """Return the matrix from the brightness of target cells to the light of camera pixels, [H W, h w].
 
@@ -521,6 +525,7 @@ def facet_matrix(
         source: Cells, in the coordinates of the target's motion.
         dtype: float32 or float64.
         samples: Points of a pixel along either axis.
+        pixel_aspect: Height of a pixel over its width.
     """
     height, width = shape
     cells = target_cells(pose, source)
@@ -531,7 +536,7 @@ def facet_matrix(
     )
     for dv, du in np.ndindex(samples, samples):
         shift = [(k + 0.5) / samples - 0.5 for k in (du, dv)]
-        seen = seen_points(pose, shape, columns.ravel() + shift[0], rows.ravel() + shift[1])
+        seen = seen_points(pose, shape, columns.ravel() + shift[0], rows.ravel() + shift[1], pixel_aspect)
         with torchs_threads():
             fill_facets(
                 part, seen.points, seen.frames, seen.eyes, cells, source.pitch_m**2,

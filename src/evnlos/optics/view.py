@@ -63,6 +63,7 @@ class View:
         offset_px: tuple[float, float] = (0.0, 0.0),
         flip_x: bool = False,
         flip_y: bool = False,
+        pixel_aspect: float = 1.0,
     ) -> View:
         """Return the view of a far camera: pixel = middle + offset + scale rotation shear stretch flip (x, y).
 
@@ -75,6 +76,7 @@ class View:
             offset_px: Where the wall's origin falls, relative to the image's middle (columns, rows).
             flip_x: Whether x runs to the left.
             flip_y: Whether y runs upwards.
+            pixel_aspect: Height of a pixel over its width.
         """
         if not (math.isfinite(pixels_per_m) and pixels_per_m > 0):
             raise ConfigError(f"pixels_per_m is {pixels_per_m}; give a positive number")
@@ -84,7 +86,8 @@ class View:
         turn = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
         lean = torch.tensor([[1.0, shear], [0.0, stretch]], dtype=torch.float64)
         flip = torch.diag(torch.tensor([-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0], dtype=torch.float64))
-        to_wall = torch.linalg.inv(pixels_per_m * turn @ lean @ flip)
+        square = torch.tensor([1.0, pixel_aspect], dtype=torch.float64)  # a column and a row in square pixels
+        to_wall = torch.linalg.inv(pixels_per_m * turn @ lean @ flip) * square
         middle = to_wall.new_tensor([(shape[1] - 1) / 2 + offset_px[0], (shape[0] - 1) / 2 + offset_px[1]])
         (a, b), (d, e) = to_wall.tolist()
         tx, ty = (-to_wall @ middle).tolist()
@@ -98,16 +101,18 @@ class View:
         angle_rad: float,
         fov_rad: float,
         aim_m: tuple[float, float] = (0.0, 0.0),
+        pixel_aspect: float = 1.0,
     ) -> View:
         """Return the view of a pin-hole camera that looks at a point of the wall, turned about the vertical.
 
         Args:
-            shape: Size (H, W), pixels (square ones).
+            shape: Size (H, W), pixels.
             distance_m: Distance from the pin-hole to the aimed point, metres, above 0.
             angle_rad: Angle between the optical axis and the wall's normal, radians; positive puts the camera
                 at +x.
             fov_rad: Horizontal field of view over W pixels, radians, 0 to pi.
             aim_m: The aimed point (x, y), metres.
+            pixel_aspect: Height of a pixel over its width.
         """
         if not (math.isfinite(distance_m) and distance_m > 0):
             raise ConfigError(f"distance_m is {distance_m}; give a positive number of metres")
@@ -122,7 +127,8 @@ class View:
         # With tangents (p, q) of a pixel, the ray meets the wall at aim + D (p, q c) / (c + s p).
         w = (s * slope, 0.0, c - s * slope * u0)
         x = (distance_m * slope + aim_m[0] * w[0], 0.0, -distance_m * slope * u0 + aim_m[0] * w[2])
-        y = (aim_m[1] * w[0], distance_m * c * slope, -distance_m * c * slope * v0 + aim_m[1] * w[2])
+        rise = distance_m * c * slope * pixel_aspect
+        y = (aim_m[1] * w[0], rise, -rise * v0 + aim_m[1] * w[2])
         eye = (aim_m[0] + distance_m * s, aim_m[1], distance_m * c)
         return cls((int(height), int(width)), (x, y, w), eye)
 
@@ -153,16 +159,15 @@ class View:
 
     def pixel_size_m(self) -> torch.Tensor:
         """Return how far on the wall a column and a row step reach at each pixel, float64 [H, W, 2], metres."""
-        across = self.wall_points_m(0.5, 0.0) - self.wall_points_m(-0.5, 0.0)
-        down = self.wall_points_m(0.0, 0.5) - self.wall_points_m(0.0, -0.5)
-        return torch.stack([across.norm(dim=-1), down.norm(dim=-1)], dim=-1)
+        return self._steps_m().norm(dim=-2)
 
     def magnification(self) -> float:
         """Return the largest image motion of a wall point over the image, pixels per metre."""
-        across = self.wall_points_m(0.5, 0.0) - self.wall_points_m(-0.5, 0.0)
-        down = self.wall_points_m(0.0, 0.5) - self.wall_points_m(0.0, -0.5)
-        jacobian = torch.stack([across, down], dim=-1)  # [H, W, 2, 2], metres per pixel
-        return float(1.0 / torch.linalg.svdvals(jacobian)[..., -1].min())
+        return float(1.0 / torch.linalg.svdvals(self._steps_m())[..., -1].min())
+
+    def _steps_m(self) -> torch.Tensor:
+        ends = ((0.5, 0.0), (0.0, 0.5))
+        return torch.stack([self.wall_points_m(u, v) - self.wall_points_m(-u, -v) for u, v in ends], dim=-1)
 
 
 _MAX_SAMPLES = 8  # per pixel and axis
@@ -321,10 +326,7 @@ def visibility(
         shadow = wall_m[:, None] + (corners[:, :2] - wall_m[:, None]) * stretch[:, None]  # [P, K, 2]
         inside = torch.zeros_like(open_way)
         for k in range(len(corners)):
-            (x0, y0), (x1, y1) = (
-                shadow[:, k - 1, :, None].unbind(1),
-                shadow[:, k, :, None].unbind(1),
-            )  # [P, 1] each
+            (x0, y0), (x1, y1) = (shadow[:, at, :, None].unbind(1) for at in (k - 1, k))  # [P, 1] each
             crosses = (y0 > y_m) != (y1 > y_m)
             level = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
             inside ^= crosses & (x_m < x0 + (y_m - y0) / level * (x1 - x0))

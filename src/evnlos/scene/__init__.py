@@ -27,6 +27,7 @@ from evnlos.scene.glyph_sets import (
 from evnlos.scene.handwriting import (
     TRAIN_WRITERS,
     Hand,
+    Ink,
     Strokes,
     hand,
     held_out_writers,
@@ -50,6 +51,7 @@ __all__ = [
     "Hand",
     "HandwritingGlyphs",
     "Handwritten",
+    "Ink",
     "LineMotion",
     "Motion",
     "NistGlyphs",

@@ -61,8 +61,7 @@ class TargetPlane:
         size_m: Side of the target plane, metres.
         size_px: Side of the mask, pixels.
         letter_fraction: Longer side of a letter as a part of the target plane's side, 0..1.
-        digit_fraction: Longer side of a digit as a part of the target plane's side, 0..1; smaller, as in the
-            paper.
+        digit_fraction: The same of a digit; smaller, as in the paper.
     """
 
     size_m: float = 0.08
@@ -92,6 +91,7 @@ class HandwritingGlyphs:
         characters: Characters that each writer writes.
         strokes: Base faces and pens.
         target_plane: The target plane that carries a character.
+        centre: Middle of the writers' ink (x to the right, y downwards), parts of the target plane's side.
         known: Folder with images of known targets of this target's size, NAME.png; "" = none.
         redrawn: How often each known target is drawn again, as by another hand (see `redrawn`); these objects
             come after those of the writers.
@@ -103,6 +103,7 @@ class HandwritingGlyphs:
     characters: str = UPPER_CASE
     strokes: Strokes = field(default_factory=Strokes)
     target_plane: TargetPlane = field(default_factory=TargetPlane)
+    centre: tuple[float, float] = (0.0, 0.0)
     known: str = field(default="", metadata=BESIDE)
     redrawn: int = 0
 
@@ -112,6 +113,8 @@ class HandwritingGlyphs:
             raise ConfigError(f"redrawn is {self.redrawn}; give 0, or a number and a folder of `known` targets")
         if self.writers < 1 or self.first_writer < 0:
             raise ConfigError(f"writers {self.first_writer} + {self.writers}; give 1 writer or more, from 0 on")
+        if not all(abs(one) < 0.5 for one in self.centre):
+            raise ConfigError(f"centre is {self.centre}; give two parts of the side, each within +-0.5")
 
     def objects(self) -> list[ObjectId]:
         """Return the names of all objects, writer by writer, e.g. "writer03_A", then e.g. "redrawn03_A"."""
@@ -126,9 +129,8 @@ class HandwritingGlyphs:
             drawing = _look_up(_known_targets(self.known), name)
             return Target(object_id, redrawn(drawing, name, int(hand[7:]), seed), self.target_plane.size_m)
         writer, char = _look_up(_handwriting_index(self), object_id)
-        mask = nist_like(
-            writer, char, seed, self.target_plane.size_px, self.target_plane.fraction(char), self.strokes
-        )
+        plane = self.target_plane
+        mask = nist_like(writer, char, seed, plane.size_px, plane.fraction(char), self.strokes, self.centre)
         return Target(object_id, mask, self.target_plane.size_m)
 
     def notes(self) -> list[str]:

@@ -1,16 +1,12 @@
 """Handwriting made up: strokes, their ink, and many writers, each with one consistent hand.
 
-- Signed distance to the edge of a mask: what makes a pen thicker or thinner.
-- Measures of a drawing: where its ink is, and how wide its strokes are.
-
-NIST-like handwriting: many writers, each with one consistent hand.
-
 A stand-in for scanned forms, made from openly licensed handwriting fonts; none of it comes from NIST. A hand is
 a base face, a slant, proportions, a pen and an elastic deformation; each glyph adds a little variation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -21,6 +17,7 @@ from PIL import Image
 
 from evnlos.errors import ConfigError, DataError, MissingDependencyError
 from evnlos.scene.fonts import Font, check_size, find_font, render_glyph
+from evnlos.scene.moving import Target
 from evnlos.types import derive_seed
 
 
@@ -38,24 +35,17 @@ def signed_distance(mask: NDArray[np.float32], reach: int) -> NDArray[np.float32
         >>> signed_distance(np.array([[0, 0, 1, 1, 0]]), 3)
         array([[ 1.5,  0.5, -0.5, -0.5,  0.5]], dtype=float32)
     """
+    from scipy.ndimage import distance_transform_edt  # scipy loads slowly
+
+    def distance_to(chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+        return (
+            np.minimum(np.asarray(distance_transform_edt(~chosen)), reach)
+            if chosen.any()
+            else np.full(chosen.shape, float(reach))
+        )
+
     inside = np.asarray(mask) >= 0.5
-    outer = _distance_to(inside, reach)
-    inner = _distance_to(~inside, reach)
-    return np.where(inside, 0.5 - inner, outer - 0.5).astype(np.float32)
-
-
-def _distance_to(chosen: NDArray[np.bool_], reach: int) -> NDArray[np.float32]:
-    """Return the distance to the nearest chosen pixel's centre, cut at `reach`, float32 [H, W], pixels."""
-    height, width = chosen.shape
-    column = np.arange(width)
-    before = np.maximum.accumulate(np.where(chosen, column, -(reach + width)), axis=1)
-    after = np.minimum.accumulate(np.where(chosen, column, reach + 2 * width)[:, ::-1], axis=1)[:, ::-1]
-    along = np.minimum(np.minimum(column - before, after - column), reach).astype(np.float32) ** 2  # [H, W]
-    nearest = along.copy()
-    for step in range(1, min(reach, height - 1) + 1):
-        np.minimum(nearest[step:], along[:-step] + step * step, out=nearest[step:])
-        np.minimum(nearest[:-step], along[step:] + step * step, out=nearest[:-step])
-    return np.minimum(np.sqrt(nearest), reach)
+    return np.where(inside, 0.5 - distance_to(~inside), distance_to(inside) - 0.5).astype(np.float32)
 
 
 def pen_width(mask: NDArray[np.float32]) -> float:
@@ -78,13 +68,33 @@ def pen_px(ink: NDArray[np.float32]) -> float:
     return 4.0 * float(-distance[inside].mean()) if inside.any() else 1.0
 
 
-def ink_box(ink: NDArray[np.float32]) -> tuple[float, float, float, float]:
-    """Return left, top, right, bottom of the ink, pixels from the centre."""
+def ink_box(ink: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return left, top, right, bottom of the ink, pixels from the centre, [4]."""
     rows, columns = np.flatnonzero((ink > 0.5).any(1)), np.flatnonzero((ink > 0.5).any(0))
     if not len(rows):
         raise DataError("a glyph has no ink (no pixel above 0.5); choose another base face or drawing")
     half = len(ink) / 2
-    return columns[0] - half, rows[0] - half, columns[-1] + 1 - half, rows[-1] + 1 - half
+    return np.array([columns[0] - half, rows[0] - half, columns[-1] + 1 - half, rows[-1] + 1 - half])
+
+
+@dataclass(frozen=True)
+class Ink:
+    """Where targets have their ink."""
+
+    size_m: float = 0.0
+    """Longer side of the largest one's ink, metres; 0 = as large as the target plane."""
+    centre_m: tuple[float, float] = (0.0, 0.0)
+    """Middle of the ink's bounding box (x, y) beside the target plane's middle, metres; mean over targets."""
+
+    @classmethod
+    def of(cls, targets: Iterable[Target]) -> Ink:
+        """Return it for targets; the default where none of them has any."""
+        boxes = [ink_box(one.mask) * one.size_m / len(one.mask) for one in targets if (one.mask > 0.5).any()]
+        if not boxes:
+            return cls()
+        low, high = np.split(np.array(boxes), 2, axis=1)  # left and top, right and bottom
+        x, y = ((low + high) / 2).mean(axis=0)
+        return cls(round(float((high - low).max()), 5), (round(float(x), 5), round(float(y), 5)))
 
 
 BASE_FACES = (
@@ -101,8 +111,10 @@ PEN = (0.06, 0.18)
 
 _SLANT_DEG = (-18.0, 14.0)  # the base faces lean to the right themselves, by 0 to 10 degrees
 _REDRAWN_SLANT_DEG = (-14.0, 14.0)
+HEIGHT = (0.85, 1.0)
+"""Longer side of the ink as a part of the room for it."""
+
 _ASPECT = (0.80, 1.25)
-_HEIGHT = (0.85, 1.0)
 _WAVES = 4  # cosines a direction and axis of the elastic deformation
 _HAND_BEND, _GLYPH_BEND = 0.045, 0.018  # amplitudes, as parts of the glyph's height
 _WORK_PX = 192
@@ -152,6 +164,8 @@ class Strokes:
     """Base faces: handwriting, rounded printed letters as on signs and cut plates, or both."""
     pen: tuple[float, float] = PEN
     """Thinnest and thickest pen, parts of the glyph's longer side; a bold face has 0.12 to 0.2."""
+    height: tuple[float, float] = HEIGHT
+    """Longer side of the smallest and the largest hand's ink, parts of the room for it."""
 
     def __post_init__(self) -> None:
         if self.faces not in FACES:
@@ -159,6 +173,9 @@ class Strokes:
         low, high = self.pen
         if not 0.02 <= low <= high <= 0.4:
             raise ConfigError(f"Strokes.pen is ({low}, {high}); give two ascending numbers from 0.02 to 0.4")
+        low, high = self.height
+        if not 0.1 <= low <= high <= 1:
+            raise ConfigError(f"Strokes.height is ({low}, {high}); give two ascending numbers from 0.1 to 1")
 
 
 def hand(writer: int, seed: int, strokes: Strokes = Strokes()) -> Hand:
@@ -192,7 +209,7 @@ def hand(writer: int, seed: int, strokes: Strokes = Strokes()) -> Hand:
         slant_deg=_between(_SLANT_DEG, slant),
         tilt_deg=_between((-4.0, 4.0), rng.random()),
         aspect=_between(_ASPECT, aspect),
-        height=_between(_HEIGHT, height),
+        height=_between(strokes.height, height),
         pen=_between(strokes.pen, pen),
         waves=_waves(rng, _HAND_BEND),
     )
@@ -205,6 +222,7 @@ def nist_like(
     size_px: int = 256,
     fraction: float = 1.0,
     strokes: Strokes = Strokes(),
+    centre: tuple[float, float] = (0.0, 0.0),
 ) -> NDArray[np.float32]:
     """Write one character in a writer's hand on a square target plane: a stand-in for NIST's scanned
     handwriting.
@@ -216,9 +234,10 @@ def nist_like(
         size_px: Side of the mask, pixels, 8 to 2048.
         fraction: Room for the ink as a part of the target plane's side, above 0 to 1.
         strokes: Base faces and pens of the population of writers.
+        centre: Middle of the ink's bounding box (x to the right, y downwards), parts of the side.
 
     Returns:
-        float32 [size_px, size_px], 0..1, bright ink on dark ground, centred by its bounding box.
+        float32 [size_px, size_px], 0..1, bright ink on dark ground.
 
     Raises:
         DataError: An argument is outside its range.
@@ -250,7 +269,7 @@ def nist_like(
     # Thinning stops early: beyond it the thin parts of a stroke would break.
     thicken = max((pen - now) / 2, -0.22 * now)
     distance = signed_distance(drawn, reach=int(np.ceil(abs(thicken))) + 3)
-    return _to_target_plane(np.clip(thicken - distance + 0.5, 0.0, 1.0), size_px, room)
+    return _to_target_plane(np.clip(thicken - distance + 0.5, 0.0, 1.0), size_px, room, centre)
 
 
 def redrawn(drawing: NDArray[np.float32], name: str, number: int, seed: int) -> NDArray[np.float32]:
@@ -263,7 +282,7 @@ def redrawn(drawing: NDArray[np.float32], name: str, number: int, seed: int) -> 
         seed: Seed of the population.
 
     Returns:
-        float32 [S, S], 0..1, centred by its bounding box, at most as large as the drawing.
+        float32 [S, S], 0..1, in the drawing's place by its bounding box, and at most as large.
 
     Raises:
         DataError: The drawing has no ink.
@@ -277,6 +296,7 @@ def redrawn(drawing: NDArray[np.float32], name: str, number: int, seed: int) -> 
     shape = turn @ np.array([[1.0, -slant], [0.0, 1.0]]) @ np.diag([_between(_ASPECT, rng.random()), 1.0])
     waves = _waves(rng, _HAND_BEND)
     left, top, right, bottom = ink_box(base)
+    centre = (left + right) / (2 * _WORK_PX), (top + bottom) / (2 * _WORK_PX)
     room = max(right - left, bottom - top) * _between((0.88, 1.0), rng.random())
     left, top, right, bottom = ink_box(_deform(base, 0.5 * shape, waves, (0.0, 0.0), _CANVAS_PX))
     growth = 0.5 * room / max(right - left, bottom - top)
@@ -284,17 +304,19 @@ def redrawn(drawing: NDArray[np.float32], name: str, number: int, seed: int) -> 
     drawn = _deform(base, growth * shape, waves, (-middle[0], -middle[1]), _CANVAS_PX)
     thicken = pen_px(drawn) * _between((-0.12, 0.12), rng.random())
     distance = signed_distance(drawn, reach=int(np.ceil(abs(thicken))) + 3)
-    return _to_target_plane(np.clip(thicken - distance + 0.5, 0.0, 1.0), len(drawing), room)
+    return _to_target_plane(np.clip(thicken - distance + 0.5, 0.0, 1.0), len(drawing), room, centre)
 
 
-def _to_target_plane(ink: NDArray[np.float32], size_px: int, room: float) -> NDArray[np.float32]:
-    """Centre the ink, shrink it to `room` where it came out larger, and sample it at `size_px`."""
+def _to_target_plane(
+    ink: NDArray[np.float32], size_px: int, room: float, centre: tuple[float, float]
+) -> NDArray[np.float32]:
+    """Put the ink at `centre`, shrink it to `room` where it came out larger, and sample it at `size_px`."""
     left, top, right, bottom = ink_box(ink)
     excess = max((right - left) / room, (bottom - top) / room, 1.0)
     side = _WORK_PX * excess
     margin = _WORK_PX
-    x = margin + _CANVAS_PX / 2 + (left + right - side) / 2
-    y = margin + _CANVAS_PX / 2 + (top + bottom - side) / 2
+    x = margin + _CANVAS_PX / 2 + (left + right - side) / 2 - centre[0] * side
+    y = margin + _CANVAS_PX / 2 + (top + bottom - side) / 2 - centre[1] * side
     padded = Image.fromarray(np.pad(ink.astype(np.float32), margin))
     mask = padded.resize((size_px, size_px), Image.Resampling.BILINEAR, box=(x, y, x + side, y + side))
     return np.clip(np.asarray(mask, dtype=np.float32), 0.0, 1.0)

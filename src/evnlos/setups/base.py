@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -13,11 +14,12 @@ import torch
 from numpy.typing import ArrayLike
 
 from evnlos.cameras import EventCamera, EventPixel, FrameCamera, PixelSettings
+from evnlos.cameras.frame_camera import SensorSize
 from evnlos.errors import ConfigError
 from evnlos.optics import DepthTransport, LinearTransport, SeveralWall
 from evnlos.optics.wall import ambient_plane
 from evnlos.registry import Kinded, Registry
-from evnlos.scene import Scene, SeveralTargets
+from evnlos.scene import Ink, Scene, SeveralTargets
 from evnlos.setups.files import Layout, Measurement, OperatorNoise
 from evnlos.types import Irradiance, Plane
 
@@ -28,26 +30,7 @@ CAMERA_FIELDS = ("sensor", "frame_camera", "pixel", "time_step_s")
 LIGHT_FIELDS = ("gain", "ambient", "ambient_gradient")
 """Settings of a setup's light: they scale and add up, and change no geometry."""
 _PROBES = 65  # instants at which a scene's pose is looked at
-
-
-@dataclass(frozen=True)
-class SensorSize:
-    """Pixels of the sensor that carries both the frame and the event pixels."""
-
-    height: int = 100
-    """Rows, pixels."""
-    width: int = 160
-    """Columns, pixels."""
-
-    def __post_init__(self) -> None:
-        for name in ("height", "width"):
-            if not 1 <= getattr(self, name) <= 8192:
-                raise ConfigError(f"SensorSize.{name} is {getattr(self, name)}; give 1 to 8192 pixels")
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Size (H, W), pixels."""
-        return self.height, self.width
+_SAME_ASPECT = 0.03  # difference of logarithms: images of whole pixels hardly keep a sensor's ratio
 
 
 @dataclass(frozen=True)
@@ -100,6 +83,8 @@ class Setup(Kinded, ABC):
     """Share of the light that the setup gets wrong; 0 = not known. A calibrated setup has it as a setting."""
     frame_doubt: ClassVar[float] = 1.0
     """By how much the variance of the frames' noise is raised when they are solved; as a setting likewise."""
+    ink: ClassVar[Ink] = Ink()
+    """Where the known targets have their ink; likewise."""
 
     kind: str = ""
     """Kind of this setup."""
@@ -324,7 +309,16 @@ class Setup(Kinded, ABC):
 
     def resized(self: S, shape: tuple[int, int]) -> S:
         """Return the setup with another size (H, W) of its sensor, pixels, over the same part of the wall."""
-        return replace(self, sensor=SensorSize(*shape))
+        return replace(self, sensor=self.sensor.resized(shape))
+
+    def seen_by(self: S, shape: tuple[int, int]) -> S:
+        """Return the setup before a camera with images of a size (H, W), pixels; another one has square ones.
+
+        Images whose sides have the ratio of the sensor's are taken for its own, averaged.
+        """
+        other = self.sensor.resized(shape).pixel_aspect
+        is_own = abs(math.log(other / self.sensor.pixel_aspect)) < _SAME_ASPECT
+        return self.resized(shape) if is_own else replace(self, sensor=SensorSize(*shape))
 
     def with_cameras_of(self: S, other: Setup) -> S:
         """Return this wall, geometry and light with the sensor and the cameras of another setup."""
@@ -333,7 +327,8 @@ class Setup(Kinded, ABC):
     def optics(self: S) -> S:
         """Return wall and geometry alone, with default light and cameras: equal where the light paths are."""
         fresh = type(self)()
-        return replace(self, **{item: getattr(fresh, item) for item in (*LIGHT_FIELDS, *CAMERA_FIELDS)})
+        own = replace(self, **{item: getattr(fresh, item) for item in (*LIGHT_FIELDS, *CAMERA_FIELDS)})
+        return replace(own, sensor=self.sensor.resized(fresh.shape))
 
 
 def is_camera(path: str) -> bool:

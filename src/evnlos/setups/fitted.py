@@ -18,7 +18,7 @@ from evnlos.optics import MatrixTransport, MatrixWall, coarsest_keyframe_step_m
 from evnlos.optics.angular_spectrum import check_lengths
 from evnlos.optics.facets import Pose, SlopeTable, facet_matrix, seen_points
 from evnlos.optics.wall import ambient_map, ambient_plane
-from evnlos.scene import Scene, Target
+from evnlos.scene import Ink, Scene, Target
 from evnlos.setups.base import Layout, Parameter, Setup, stated_distance_m
 from evnlos.setups.files import WALL, FittedWall
 from evnlos.setups.measured import covered
@@ -83,6 +83,8 @@ class FittedSetup(Setup):
     """Share of the light of captures held out that the calibration left beside the noise; 0 = not known."""
     frame_doubt: float = 1.0  # pyright: ignore[reportIncompatibleVariableOverride]
     """By how much the variance of the frames' noise is raised when they are solved for a target, at least 1."""
+    ink: Ink = field(default_factory=Ink)  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Where the known targets have their ink, which the priors of estimates take over."""
 
     def fitted(self) -> FittedWall:
         """Return the fitted wall; the file is read once.
@@ -163,7 +165,9 @@ class FittedSetup(Setup):
         """
         fitted = self.fitted()
         kind = np.float32 if dtype == torch.float32 else np.float64
-        matrix = torch.from_numpy(facet_matrix(self.pose(), self.table(), shape, source, kind))
+        aspect = self.sensor.resized(shape).pixel_aspect
+        made = facet_matrix(self.pose(), self.table(), shape, source, kind, pixel_aspect=aspect)
+        matrix = torch.from_numpy(made)
         matrix *= fitted.image("sensitivity", shape).flatten().to(matrix)[:, None]
         if len(fitted.left) and self.correction:
             plane = fitted.about.corrected
@@ -288,7 +292,7 @@ class FittedSetup(Setup):
 
     def magnification_px_m(self, shape: tuple[int, int]) -> float:
         """Return an upper bound of the image motion, pixels per metre of the target's."""
-        return _magnification_px_m(self.pose(), shape)
+        return _magnification_px_m(self.pose(), shape, self.sensor.resized(shape).pixel_aspect)
 
     def _along(self, shape: tuple[int, int]) -> tuple[MatrixTransport, Target] | None:
         """Return matrix and image of what moves along; None where nothing shines beside the target."""
@@ -300,7 +304,7 @@ class FittedSetup(Setup):
         return _companion_transport(self._key(), shape), shown
 
     def _key(self) -> FittedSetup:
-        return replace(self.optics(), companion=1.0, misfit="", unexplained=0.0, frame_doubt=1.0)
+        return replace(self.optics(), companion=1.0, misfit="", unexplained=0.0, frame_doubt=1.0, ink=Ink())
 
     def _check_travel(self, scene: Scene) -> NDArray[np.float64]:
         """Return centres along the motion [65, 2], metres; refuse those off the strip."""
@@ -325,12 +329,14 @@ def _transport(setup: FittedSetup, shape: tuple[int, int]) -> MatrixTransport:
 
 
 @lru_cache(maxsize=8)
-def _magnification_px_m(pose: Pose, shape: tuple[int, int]) -> float:
+def _magnification_px_m(pose: Pose, shape: tuple[int, int], pixel_aspect: float) -> float:
     v, u = np.meshgrid(np.arange(shape[0], dtype=float), np.arange(shape[1], dtype=float), indexing="ij")
     sides = []
     for du, dv in ((0.5, 0.0), (0.0, 0.5)):
-        ends = [seen_points(pose, shape, u.ravel() + s * du, v.ravel() + s * dv).points[:, :2] for s in (1, -1)]
-        sides.append(ends[0] - ends[1])
+        after, before = (
+            seen_points(pose, shape, u.ravel() + s * du, v.ravel() + s * dv, pixel_aspect) for s in (1, -1)
+        )
+        sides.append((after.points - before.points)[:, :2])
     smallest = np.linalg.svd(np.stack(sides, axis=-1), compute_uv=False)[:, -1].min()
     bent = any(pose.curvature_per_m)
     return float((_FASTER if bent else 1.0) / smallest)

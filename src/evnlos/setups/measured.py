@@ -167,6 +167,10 @@ class MeasuredSetup(Setup):
         most = self.measurement().shape
         return super().resized((min(most[0], shape[0]), min(most[1], shape[1])))
 
+    def seen_by(self, shape: tuple[int, int]) -> MeasuredSetup:
+        """Return it at another size (H, W), pixels: the camera is the one of the scan."""
+        return self.resized(shape)
+
     def bytes_of_a_scene(self, target_m: float) -> int:
         """Return the size of the matrix and of the keyframes, bytes."""
         source = self.source()

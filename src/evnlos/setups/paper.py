@@ -81,17 +81,18 @@ class PaperSetup(Setup):
     def view(self, shape: tuple[int, int]) -> View:
         """Return the camera's view for an image of `shape` (H, W), pixels."""
         check_lengths(field_of_view_m=self.field_of_view_m, camera_distance_m=self.camera_distance_m)
+        pixels = self.sensor.resized(shape).pixel_aspect
         if self.camera_angle_deg:
             fov = 2 * math.atan(self.field_of_view_m / 2 / self.camera_distance_m)
             angle = math.radians(self.camera_angle_deg)
-            return View.perspective(shape, self.camera_distance_m, angle, fov, aim_m=self.offset_m)
+            return View.perspective(shape, self.camera_distance_m, angle, fov, self.offset_m, pixels)
         scale = shape[1] / self.field_of_view_m
         turn = math.radians(self.rotation_deg)
-        plain = View.affine(shape, scale, turn, self.shear, self.stretch)
+        plain = View.affine(shape, scale, turn, self.shear, self.stretch, pixel_aspect=pixels)
         # The aimed point goes to the middle of the image, whatever the turn.
         moved = plain.pixels(torch.tensor([(0.0, 0.0), self.offset_m], dtype=torch.float64))
         across, down = (moved[0] - moved[1]).tolist()
-        return View.affine(shape, scale, turn, self.shear, self.stretch, (across, down))
+        return View.affine(shape, scale, turn, self.shear, self.stretch, (across, down), pixel_aspect=pixels)
 
     def transport(self, size_m: float) -> Transport:
         """Return diffraction, then diffuse reflection, for a target of side `size_m`, metres; not linear."""

@@ -243,6 +243,7 @@ class RoomSetup(Setup):
                 self.vignetting,
                 self.curvature,
                 self.rays,
+                self.sensor.resized(shape).pixel_aspect,
             )
         )
         if (rays.eye[..., 2] < _GRAZING).any():

@@ -191,7 +191,7 @@ def images_of_targets(
     """
     plane, shape = Plane(_IMAGE_CELLS, _IMAGE_CELLS, size_m / _IMAGE_CELLS), (light.shape[1], light.shape[2])
     strip = strip_of(np.concatenate([one.position for one in tracks]), plane)
-    transport = matrix_of(setup.resized(shape).operator(strip, shape))
+    transport = matrix_of(setup.seen_by(shape).operator(strip, shape))
     parts = tuple(SequenceOperator(transport, plane, one.position) for one in tracks)
     problem = SequenceProblem(SeveralSequences(parts), _STATIC)
     return problem.tikhonov(light.double(), _PRIOR * noise**2).image.numpy()

@@ -284,7 +284,7 @@ def first_paths(
     cell_m = target_size_m / 10
     plane = Plane(round(REGION_M[1] / cell_m), round(REGION_M[0] / cell_m), cell_m)
     shape = (int(light.shape[1]), int(light.shape[2]))
-    matrix = setup.resized(shape).operator(plane, shape).dense()
+    matrix = setup.seen_by(shape).operator(plane, shape).dense()
     prior = _PRIOR * noise**2 * normal_matrix(Gradient("dark"), torch.zeros(plane.shape).double())
     used = np.unique(np.linspace(0, len(light) - 1, min(len(light), _FIRST_FRAMES)).round().astype(int))
     back = matrix.mT @ light[torch.from_numpy(used)].double().flatten(1).mT
@@ -351,13 +351,13 @@ class Lights:
     """
 
     def __init__(self, setup: Setup, strip: Plane, shape: tuple[int, int], depth: bool) -> None:
-        self.strip = strip
+        self.strip, setup = strip, setup.seen_by(shape)
         self._own_m = setup.default_distance_m or 1.0
         if depth:
             low_m, high_m = (self._own_m * math.exp(way * REACH) for way in (-1.01, 1.01))
             away = setup.at_distances(low_m, high_m, strip, shape)
         else:
-            own = setup.resized(shape).operator(strip, shape).dense()
+            own = setup.operator(strip, shape).dense()
             away = DepthTransport(lambda _: own, 0.99 * self._own_m, 1.01 * self._own_m, strip, shape)
         self._basis, self._away = away.basis.double(), copy(away)
         self._known: dict[float, tuple[torch.Tensor, torch.Tensor]] = {}
