@@ -19,6 +19,7 @@ from evnlos.data.capture import Capture, by_name, read_capture
 from evnlos.data.sampling import character_of, reduce_by_area
 from evnlos.data.simulate import Simulation
 from evnlos.errors import ConfigError, DataError
+from evnlos.optics.interpolation import point_samples
 from evnlos.scene import HandwritingGlyphs, LineMotion, Scene
 from evnlos.setups import PaperSetup, RadiometricSetup
 from evnlos.types import Plane, derive_seed
@@ -260,7 +261,6 @@ def _check_same_setup(first: Capture, other: Capture) -> None:
 Array = NDArray[np.float64]
 
 _SATURATED = 0.995
-_LATTICE = 0.382  # times the pixels of which one takes part: the step from row to row
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,9 +332,9 @@ def wall_data(
     *,
     every: int = 4,
     first: int | None = None,
-    part: int = 1,
+    checkered: bool = False,
 ) -> WallData:
-    """Return the frames of captures at a working size, and their targets as images on a plane's cells.
+    """Return frames of captures in the middles of larger pixels, and targets as images on a plane's cells.
 
     Args:
         capture_set: The captures.
@@ -342,7 +342,7 @@ def wall_data(
         plane: Cells, over the whole travel.
         every: Only every n-th frame of a capture takes part.
         first: The first of them; None is the middle of the first n.
-        part: One pixel in so many takes part, evenly spread; 2 is the pattern of a chessboard.
+        checkered: Whether only every second pixel takes part, in the pattern of a chessboard.
     """
     height, width = capture_set.shape
     columns = min(columns, width)
@@ -351,7 +351,8 @@ def wall_data(
     frames, pictures, capture, places = [], [], [], []
     for k, one in enumerate(capture_set.captures):
         picked = np.arange(begin, len(one.frames), every)
-        frames.append(reduce_by_area(one.frames[picked] / np.float32(capture_set.peak), grid))
+        means = reduce_by_area(one.frames[picked] / np.float32(capture_set.peak), grid)
+        frames.append(point_samples(means, (height / grid[0], width / grid[1])))
         scene = capture_set.scenes[k]
         place = scene.motion.position_m(capture_set.times_s(k)[picked])
         pictures.append(scene.target.rasterise(plane, place).reshape(len(picked), -1))
@@ -359,7 +360,7 @@ def wall_data(
         places.append(place)
     seen, drawn = np.concatenate(frames), np.concatenate(pictures)
     v, u = np.meshgrid(np.arange(grid[0]), np.arange(grid[1]), indexing="ij")
-    keep = ((u + round(_LATTICE * part + 0.5) * v) % part == 0).ravel()
+    keep = ((u + v) % 2 == 0).ravel() if checkered else np.ones(u.size, bool)
     keep &= (seen < _SATURATED).all(axis=0).ravel()
     light = np.ascontiguousarray(seen.reshape(len(seen), -1).T[keep], dtype=np.float64)
     level = light.mean(axis=1)

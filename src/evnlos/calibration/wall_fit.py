@@ -38,8 +38,8 @@ LOBES = np.array(
     [(a, a * r) for a in (0.02, 0.035, 0.06, 0.10, 0.17, 0.3) for r in (0.6, 1.0, 1.6)], dtype=np.float64
 )
 """Roughness along x and y of the GGX lobes that the search starts from."""
-EFFECTIVE = 600.0
-"""Independent numbers that the frames are worth: neighbouring pixels and places err alike."""
+EFFECTIVE = 60_000.0
+"""Independent numbers that frames are worth beside what is known before; few leave the wall where it began."""
 _BEND = 0.3  # standard deviation of the second differences of the slopes' log density about its start
 _LEVEL = 2.0  # that of the log density itself
 _TILT = 0.15  # of the coefficients of the sensitivity's polynomial
@@ -263,7 +263,7 @@ def refine(
     prior: Pose,
     freedoms: Sequence[Freedom] = FREEDOMS,
     iterations: int = 10,
-    tolerance: float = 2e-3,
+    tolerance: float = 1e-3,
 ) -> Progress:
     """Fit pose, slopes and sensitivity together: Gauss-Newton with damping, smooth slopes, and what is known.
 

@@ -99,8 +99,8 @@ def search_wall(
         quick.append((refine(coarse, state, prior=prior, freedoms=first, iterations=8), prior))
     quick.sort(key=lambda one: one[0].cost())
     best, prior = quick[0]
-    fine = wall_data(capture_set, columns, plane, every=max(1, frames // _FINE_FRAMES), part=2)
-    found = refine(fine, best.state, prior=prior, freedoms=freedoms, iterations=8)
+    fine = wall_data(capture_set, columns, plane, every=max(1, frames // _FINE_FRAMES), checkered=True)
+    found = refine(fine, best.state, prior=prior, freedoms=freedoms, iterations=12)
     error = uncertainty(fine, found.state, prior=prior, freedoms=freedoms)
     weights = np.array([math.exp(-0.5 * (one.cost() - best.cost())) for one, _ in quick])
     weights /= weights.sum()

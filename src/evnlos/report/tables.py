@@ -183,7 +183,8 @@ def refuse_seen(history: list[dict[str, Any]], dataset: Dataset, split: str) -> 
 def seen_in_training(history: list[dict[str, Any]], dataset: Dataset, split: str) -> list[str]:
     """Return the objects of a split that a training behind the weights saw, by origin and name."""
     tested = set(dataset.objects(split))
-    trained = [set(step["data"]["train"]) for step in history if step["data"]["origin"] == dataset.origin]
+    steps = [step["data"] for step in history if step["data"]["origin"] == dataset.origin]
+    trained = [set(data.get("train", ())) for data in steps]  # layers of many walls name no objects
     return sorted(tested & set().union(*trained))
 
 
