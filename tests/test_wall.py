@@ -11,7 +11,6 @@ from evnlos.errors import ConfigError, DataError
 from evnlos.optics import (
     DepthTransport,
     DiffuseReflection,
-    Irradiance,
     MatrixTransport,
     MatrixWall,
     SlidingWall,
@@ -29,7 +28,7 @@ from evnlos.optics.interpolation import (
 from evnlos.optics.wall import ambient_plane
 from evnlos.scene import LineMotion, PathMotion, Scene, SeveralTargets, Target
 from evnlos.setups import PaperSetup, RadiometricSetup
-from evnlos.types import Plane
+from evnlos.types import Irradiance, Plane
 
 SHAPE = (40, 64)
 PLANE = Plane(80, 90, 0.001, (0.002, -0.003))

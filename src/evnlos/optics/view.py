@@ -86,8 +86,7 @@ class View:
         turn = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
         lean = torch.tensor([[1.0, shear], [0.0, stretch]], dtype=torch.float64)
         flip = torch.diag(torch.tensor([-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0], dtype=torch.float64))
-        square = torch.tensor([1.0, pixel_aspect], dtype=torch.float64)  # a column and a row in square pixels
-        to_wall = torch.linalg.inv(pixels_per_m * turn @ lean @ flip) * square
+        to_wall = torch.linalg.inv(pixels_per_m * turn @ lean @ flip) * flip.new_tensor([1.0, pixel_aspect])
         middle = to_wall.new_tensor([(shape[1] - 1) / 2 + offset_px[0], (shape[0] - 1) / 2 + offset_px[1]])
         (a, b), (d, e) = to_wall.tolist()
         tx, ty = (-to_wall @ middle).tolist()
@@ -108,8 +107,7 @@ class View:
         Args:
             shape: Size (H, W), pixels.
             distance_m: Distance from the pin-hole to the aimed point, metres, above 0.
-            angle_rad: Angle between the optical axis and the wall's normal, radians; positive puts the camera
-                at +x.
+            angle_rad: Angle between axis and the wall's normal, radians; positive puts the camera at +x.
             fov_rad: Horizontal field of view over W pixels, radians, 0 to pi.
             aim_m: The aimed point (x, y), metres.
             pixel_aspect: Height of a pixel over its width.
@@ -127,7 +125,7 @@ class View:
         # With tangents (p, q) of a pixel, the ray meets the wall at aim + D (p, q c) / (c + s p).
         w = (s * slope, 0.0, c - s * slope * u0)
         x = (distance_m * slope + aim_m[0] * w[0], 0.0, -distance_m * slope * u0 + aim_m[0] * w[2])
-        rise = distance_m * c * slope * pixel_aspect
+        rise = distance_m * c * slope * pixel_aspect  # of a row
         y = (aim_m[1] * w[0], rise, -rise * v0 + aim_m[1] * w[2])
         eye = (aim_m[0] + distance_m * s, aim_m[1], distance_m * c)
         return cls((int(height), int(width)), (x, y, w), eye)

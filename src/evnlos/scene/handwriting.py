@@ -111,9 +111,7 @@ PEN = (0.06, 0.18)
 
 _SLANT_DEG = (-18.0, 14.0)  # the base faces lean to the right themselves, by 0 to 10 degrees
 _REDRAWN_SLANT_DEG = (-14.0, 14.0)
-HEIGHT = (0.85, 1.0)
-"""Longer side of the ink as a part of the room for it."""
-
+HEIGHT = (0.85, 1.0)  # longer side of the ink, parts of the room for it
 _ASPECT = (0.80, 1.25)
 _WAVES = 4  # cosines a direction and axis of the elastic deformation
 _HAND_BEND, _GLYPH_BEND = 0.045, 0.018  # amplitudes, as parts of the glyph's height
