@@ -5,6 +5,8 @@ import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ from evnlos.report import RunResult, write_report
 from evnlos.report.pictures import curves_svg
 from evnlos.report.provenance import Commands
 from evnlos.report.sections import _points, _worst, gains_of, setup_section
-from evnlos.report.tables import named
+from evnlos.report.tables import named, seen_in_training
 from evnlos.setups import PaperSetup, RadiometricSetup, calibrated_folder, named_setup, setup_preset
 
 POSITIONS = 12
@@ -331,3 +333,10 @@ def test_the_drawing_of_a_setup_is_to_scale() -> None:
 def test_a_run_of_one_epoch_has_a_curve(value: float) -> None:
     drawing = curves_svg({"run": [(1.0, value)]}, "epoch", "dB")
     assert "nan" not in drawing and drawing.count("<polyline") == 1
+
+
+def test_layers_that_name_no_objects_have_seen_none() -> None:
+    data: Any = SimpleNamespace(origin="simulated", objects=lambda _: ("a", "b"))
+    history = [{"data": {"origin": "simulated"}}, {"data": {"origin": "simulated", "train": ["b", "c"]}}]
+    assert seen_in_training(history[:1], data, "test") == []
+    assert seen_in_training(history, data, "test") == ["b"]
