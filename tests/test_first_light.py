@@ -53,7 +53,7 @@ def filmed(folder: Path, phone: Phone, plan: ScanPlan = PLAN) -> Path:
 def error_of(folder: Path) -> float:
     """Return the root mean square error of the imported matrix, of any gain, over that of the true one."""
     cells = PLAN.cells
-    true = SETUP.resized(SHAPE).operator(cells, SHAPE).dense().numpy()
+    true = SETUP.seen_by(SHAPE).operator(cells, SHAPE).dense().numpy()
     found = import_scan(folder).measurement.matrix.numpy()
     gain = (found * true).sum() / (true * true).sum()
     return float(np.linalg.norm(found / gain - true) / np.linalg.norm(true))

@@ -516,8 +516,9 @@ def test_commands_from_plan_to_image(tmp_path, capsys) -> None:
 
 
 def test_whole_sequences_are_inverted_under_a_measured_setup(tiny_captures, tmp_path, capsys) -> None:
-    setup, shape = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06), (48, 72)
-    save_yaml(Simulation(setup=replace(setup, sensor=SensorSize(*shape))), tmp_path / "setup.yaml")
+    shape = (48, 72)
+    setup = RadiometricSetup(cell_m=0.01, gain=0.7, ambient=0.06, sensor=SensorSize(*shape))
+    save_yaml(Simulation(setup=setup), tmp_path / "setup.yaml")
     matrix = setup.transport(shape).matrix * setup.gain
     flat = torch.full(shape, 0.06)
     measured = Measurement(matrix, torch.full(shape, 1e-4), flat, About(setup.source(), *shape, 400.0))

@@ -85,7 +85,7 @@ def test_a_notched_and_tilted_occluder():
     pytest.importorskip("mitsuba")
     flat = [(-0.15, -0.03), (-0.05, -0.03), (-0.05, 0.04), (-0.1, -0.01), (-0.15, 0.04)]
     notched = Occluder(tuple((x, y, 0.2 + 0.5 * y) for x, y in flat))
-    setup = RadiometricSetup(roughness=0.3)
+    setup = RadiometricSetup(roughness=0.3).seen_by(SHAPE)
     place = {"offset_m": setup.offset_m(), "occluders": (notched,)}
     matrix = light_transport_matrix(
         setup.view(SHAPE), PATTERN, 0.3, setup.brdf(), points=SHADOW_POINTS, **place
@@ -98,7 +98,7 @@ def test_a_notched_and_tilted_occluder():
 
 def test_same_seed_same_render():
     pytest.importorskip("mitsuba")
-    setup = WALLS["GGX 0.3"]
+    setup = WALLS["GGX 0.3"].seen_by((3, 4))
 
     def once(seed: int) -> np.ndarray:
         camera, place = setup.view((3, 4)), {"offset_m": setup.offset_m()}
@@ -144,7 +144,7 @@ def test_triangles_cover_a_notched_polygon():
 
 def test_bad_input():
     pytest.importorskip("mitsuba")
-    camera = WALLS["Lambert"].view((3, 4))
+    camera = WALLS["Lambert"].seen_by((3, 4)).view((3, 4))
     with pytest.raises(DataError, match="brightness"):
         trace(camera, PATTERN, np.ones((2, 2)), 0.3, Lambert())
     with pytest.raises(ConfigError, match="pin-hole"):

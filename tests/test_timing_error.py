@@ -23,7 +23,7 @@ def by_pixel(events: Events) -> tuple[np.ndarray, np.ndarray]:
 def test_chosen_steps_time_events_to_a_quarter_of_a_millisecond_rms() -> None:
     config = paper()
     target = config.glyphs.target(config.glyphs.objects()[0], derive_seed(config.seed, "glyph"))
-    wall = config.setup.resized(SHAPE).observe(Scene(target, config.motion, config.duration_s))
+    wall = config.setup.seen_by(SHAPE).observe(Scene(target, config.motion, config.duration_s))
     pixel = replace(config.pixel, leak_rate_hz=0.0, shot_noise_rate_hz=0.0, initial_phase="rest")
     fine = by_pixel(EventCamera(pixel, time_step_s=0.5e-3).record(wall, *SPAN_S, seed=1))
     found = by_pixel(EventCamera(pixel).record(wall, *SPAN_S, seed=1))

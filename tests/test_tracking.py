@@ -796,7 +796,7 @@ def test_a_straightened_step_is_that_of_a_penalty_on_bends() -> None:
     np.testing.assert_allclose(found.ravel(), expected, rtol=1e-9)
 
 
-WIDE = RadiometricSetup(cell_m=0.01, strip_m=(0.28, 0.16), gain=1.2, ambient=0.05).resized((18, 28))
+WIDE = RadiometricSetup(cell_m=0.01, strip_m=(0.28, 0.16), gain=1.2, ambient=0.05, sensor=SensorSize(18, 28))
 LETTERS = [
     (FontGlyphs(family="Nunito Black", characters="U"), LineMotion((-0.06, 0.012), 0.02)),
     (FontGlyphs(family="Nunito Black", characters="7"), LineMotion((0.065, -0.016), 0.02, (-1.0, 0.1))),

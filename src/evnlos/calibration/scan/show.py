@@ -374,7 +374,7 @@ def rehearse_film(
     folder, phone, show = Path(folder), phone or Phone(), read_show(folder)
     cells = show.info.plane
     fine = Plane(cells.height * _FINER, cells.width * _FINER, cells.pitch_m / _FINER, cells.center_m)
-    matrix = setup.resized(shape).operator(fine, shape, torch.float32).dense(torch.float32).numpy()
+    matrix = setup.seen_by(shape).operator(fine, shape, torch.float32).dense(torch.float32).numpy()
     matrix = matrix * np.float32(level / max(float(matrix.sum(axis=1).max()), 1e-12))
     y, x = (np.linspace(-1, 1, side) for side in shape)
     spot = np.exp(-((x + 0.5) ** 2 + (y[:, None] + 0.4) ** 2) / 0.02)
