@@ -121,10 +121,10 @@ def written_alike(glyphs: HandwritingGlyphs, shown: Iterable[Target]) -> Handwri
         glyphs: The writers.
         shown: Known targets on planes of one size, by their names; those without ink do not count.
     """
-    inked = [one for one in shown if (ink := Ink.of([one])) and ink.size_m > 0]
-    if not inked:
+    sized = [(one, size_m) for one in shown if (size_m := Ink.of([one]).size_m)]
+    if not sized:
         return glyphs
-    parts = [(one.name in DIGITS, Ink.of([one]).size_m / one.size_m) for one in inked]
+    inked, parts = [one for one, _ in sized], [(one.name in DIGITS, size / one.size_m) for one, size in sized]
     digits, others = ([part for digit, part in parts if digit is wanted] for wanted in (True, False))
     plane = glyphs.target_plane
     ratio = plane.digit_fraction / plane.letter_fraction
